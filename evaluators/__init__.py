@@ -1,0 +1,1 @@
+"""Measure what `mapper` makes: trajectories, maps, and the published tables."""

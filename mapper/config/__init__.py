@@ -1,0 +1,80 @@
+"""Every knob with its unit and default, and how files and overrides reach it."""
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import NonNegativeInt, ValidationError
+
+from mapper.config.base import Config
+from mapper.config.graph import GraphConfig
+from mapper.config.octree import LevelConfig, OctreeConfig, SliceConfig
+from mapper.config.odometry import LocalMapConfig, OdometryConfig
+from mapper.config.sources import SourceConfig
+from mapper.errors import ConfigError
+
+
+class McapConfig(Config):
+    """What goes into ``run.mcap``."""
+
+    image_stride: NonNegativeInt = 10
+    """Every n-th frame's colour image is logged; 0 logs none."""
+    image_width_px: NonNegativeInt = 320
+
+
+class BuildConfig(Config):
+    """Everything ``mapper build`` can be told."""
+
+    source: SourceConfig = SourceConfig()
+    odometry: OdometryConfig = LocalMapConfig()
+    graph: GraphConfig = GraphConfig()
+    octree: OctreeConfig = OctreeConfig()
+    level: LevelConfig = LevelConfig()
+    slice: SliceConfig = SliceConfig()
+    mcap: McapConfig = McapConfig()
+    workers: NonNegativeInt = 2
+    """Threads that decode and detect ahead; the result does not depend on it."""
+
+
+def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> BuildConfig:
+    """Return the configuration of a TOML file with ``key.path=value`` overrides on top.
+
+    Raises:
+        ConfigError: The file cannot be read or parsed, or the model refuses a name or a value.
+    """
+    tree: dict[str, Any] = {}
+    if path is not None:
+        try:
+            tree = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{path}: not valid TOML: {error}") from None
+        _validated(tree, str(path))
+    for override in overrides:
+        _put(tree, override)
+    return _validated(tree, "overrides" if overrides else str(path))
+
+
+def _put(tree: dict[str, Any], override: str) -> None:
+    """Set one dotted key; the value stays text, and the model parses it."""
+    dotted, equals, value = override.partition("=")
+    if not equals or not dotted:
+        raise ConfigError(f"override {override!r}: want key.path=value")
+    *parents, leaf = dotted.split(".")
+    node = tree
+    for key in parents:
+        node = node.setdefault(key, {})
+        if not isinstance(node, dict):
+            raise ConfigError(f"override {override!r}: {key} is a value, not a table")
+    node[leaf] = value
+
+
+def _validated(tree: dict[str, Any], where: str) -> BuildConfig:
+    try:
+        return BuildConfig.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"]) or "configuration"
+        raise ConfigError(f"{where}: {name}: {first['msg']}") from None

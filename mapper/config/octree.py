@@ -1,0 +1,44 @@
+"""The occupancy octree, levelling and the slice."""
+
+from typing import Annotated
+
+from pydantic import Field, PositiveFloat, PositiveInt
+
+from mapper.config.base import Config
+
+Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
+
+
+class OctreeConfig(Config):
+    """OctoMap's sensor model and geometry (Hornung et al. 2013); its defaults."""
+
+    resolution_m: PositiveFloat = 0.05
+    hit_probability: Probability = 0.7
+    miss_probability: Probability = 0.4
+    clamp_min_probability: Probability = 0.1192
+    clamp_max_probability: Probability = 0.971
+    occupied_probability: Probability = 0.5
+    max_range_m: PositiveFloat = 4.0
+    """Beyond it a ray only frees space, up to this range. Kinect depth is poor past 4 m."""
+    discretize: bool = True
+    """Cast one ray per end voxel (fast), not one per point; both are OctoMap's own modes."""
+
+
+class LevelConfig(Config):
+    """How "up" and the floor are found."""
+
+    frames: PositiveInt = 40
+    """How many frames, spread over the log, are looked at."""
+    points_per_frame: PositiveInt = 4000
+    plane_tolerance_m: PositiveFloat = 0.03
+
+
+class SliceConfig(Config):
+    """The 2D navigation map cut from the octree."""
+
+    min_height_m: float = 0.1
+    """Lower edge of the band above the floor."""
+    max_height_m: float = 1.2
+    """Upper edge of the band above the floor: the robot's height."""
+    min_cluster_cells: PositiveInt = 1
+    """Smaller 8-connected groups of occupied cells are taken for noise; 1 keeps all."""

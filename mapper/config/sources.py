@@ -1,0 +1,35 @@
+"""Which part of a log is used, and with which camera."""
+
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+
+from mapper.config.base import Config
+
+
+class CameraConfig(Config):
+    """Intrinsics that override what the log or its folder's name says."""
+
+    fx_px: PositiveFloat
+    fy_px: PositiveFloat
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3 (OpenCV's order)."""
+    depth_factor: PositiveFloat | None = None
+    """Depth image units per metre; None keeps the log's own (5000 for TUM)."""
+
+
+class SourceConfig(Config):
+    """The selection every kind of log understands."""
+
+    first_frame: NonNegativeInt = 0
+    """Index of the first frame to use."""
+    last_frame: NonNegativeInt | None = None
+    """Index of the last frame to use, inclusive; None is the end of the log."""
+    stride: PositiveInt = 1
+    """Use every n-th frame."""
+    require_truth: bool = False
+    """Drop frames without ground truth within ``max_truth_gap_s``."""
+    max_truth_gap_s: NonNegativeFloat = 0.02
+    max_pair_gap_s: NonNegativeFloat = 0.02
+    """Largest time between a colour image and its depth image."""
+    camera: CameraConfig | None = None

@@ -1,0 +1,40 @@
+"""What can go wrong in a way that a user can act on.
+
+Library code raises these; only ``cli`` turns them into one line and an exit status.
+"""
+
+
+class MapperError(Exception):
+    """An error whose message names the thing, the value, the limit and the remedy."""
+
+
+class ConfigError(MapperError):
+    """A configuration file or an override that the model refuses."""
+
+
+class DataError(MapperError):
+    """Data that break a promise: wrong shape, not finite, out of order."""
+
+
+class SourceError(MapperError):
+    """A log that cannot be opened or read."""
+
+
+class FrameError(SourceError):
+    """One frame that cannot be read; the rest of the log may still be good."""
+
+
+class TrackingError(MapperError):
+    """Too little of a log could be tracked to make a map from it."""
+
+
+class GraphError(MapperError):
+    """A pose graph that is inconsistent or cannot be solved."""
+
+
+class MapFileError(MapperError):
+    """A map file that is truncated, foreign or damaged."""
+
+
+class RunError(MapperError):
+    """A run folder that is missing, unfinished or already there."""

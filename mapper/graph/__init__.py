@@ -1,0 +1,1 @@
+"""The pose graph: its model, its solver, its text form."""

@@ -1,0 +1,113 @@
+"""The pose graph as data: nodes, relative-pose factors, and nothing about how it is solved."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from mapper.errors import GraphError
+from mapper.geometry import Array, Transform, is_rigid
+
+Origin = Literal["odometry", "loop", "wheel"]
+
+
+@dataclass(frozen=True, slots=True)
+class PoseSigmas:
+    """Isotropic standard deviations of a relative pose."""
+
+    rotation_rad: float
+    translation_m: float
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.rotation_rad < np.inf and 0.0 < self.translation_m < np.inf):
+            raise GraphError(
+                f"noise of {self.rotation_rad} rad and {self.translation_m} m: both must be finite and > 0"
+            )
+
+    @property
+    def information(self) -> Array:
+        """(6, 6) information matrix of the tangent (rotation, translation)."""
+        return np.diag([self.rotation_rad**-2.0] * 3 + [self.translation_m**-2.0] * 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BetweenFactor:
+    """A measured relative pose.
+
+    Attributes:
+        i: Node that the measurement is expressed in (the registration's target).
+        j: Node that is measured (the registration's source).
+        T_i_j: (4, 4) measured pose of j in i.
+        information: (6, 6) Fisher information of j's tangent (rotation, translation): rad⁻², m⁻².
+        origin: Where the measurement comes from.
+    """
+
+    i: int
+    j: int
+    T_i_j: Transform
+    information: Array
+    origin: Origin = "odometry"
+
+    def __post_init__(self) -> None:
+        if self.i == self.j:
+            raise GraphError(f"factor {self.i} → {self.j}: a node cannot be measured against itself")
+        if not is_rigid(self.T_i_j):
+            raise GraphError(f"factor {self.i} → {self.j}: T_i_j is not a finite rigid motion")
+        if self.information.shape != (6, 6) or not np.isfinite(self.information).all():
+            raise GraphError(f"factor {self.i} → {self.j}: information must be a finite (6, 6) matrix")
+        if np.linalg.eigvalsh(0.5 * (self.information + self.information.T))[0] <= 0.0:
+            raise GraphError(f"factor {self.i} → {self.j}: information is not positive definite")
+
+
+@dataclass(slots=True)
+class PoseGraph:
+    """Nodes with their estimates, and the factors between them. Grows while a log is tracked."""
+
+    T_world_node: dict[int, Transform] = field(default_factory=dict)
+    stamps_ns: dict[int, int] = field(default_factory=dict)
+    factors: list[BetweenFactor] = field(default_factory=list)
+
+    def add_node(self, node: int, stamp_ns: int, T_world_node: Transform) -> None:
+        """Add a node with its first estimate.
+
+        Raises:
+            GraphError: The node exists, or the estimate is not a rigid motion.
+        """
+        if node in self.T_world_node:
+            raise GraphError(f"node {node} is in the graph already")
+        if not is_rigid(T_world_node):
+            raise GraphError(f"node {node}: its pose is not a finite rigid motion")
+        self.T_world_node[node] = T_world_node
+        self.stamps_ns[node] = stamp_ns
+
+    def add_factors(self, factors: Iterable[BetweenFactor]) -> None:
+        """Add measurements between nodes that exist.
+
+        Raises:
+            GraphError: A factor names an unknown node.
+        """
+        for factor in factors:
+            for node in (factor.i, factor.j):
+                if node not in self.T_world_node:
+                    raise GraphError(f"factor {factor.i} → {factor.j}: node {node} is not in the graph")
+            self.factors.append(factor)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """What the solver made of a graph.
+
+    Attributes:
+        T_world_node: Solved pose of every node.
+        error_before: ½ χ² at the first estimates.
+        error_after: ½ χ² at the solution.
+        iterations: Solver iterations.
+        factor_errors: ½ χ² of each factor at the solution, in the graph's order.
+    """
+
+    T_world_node: dict[int, Transform]
+    error_before: float
+    error_after: float
+    iterations: int
+    factor_errors: tuple[float, ...]

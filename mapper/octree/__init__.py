@@ -1,0 +1,1 @@
+"""The occupancy octree and what is cut from it."""

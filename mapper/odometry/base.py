@@ -1,0 +1,76 @@
+"""The seam between a log and the pose graph: what tracking one frame yields."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, TypeVar
+
+from mapper.frames import Frame
+from mapper.geometry import Transform
+from mapper.graph.model import BetweenFactor
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnostics:
+    """How tracking one frame went.
+
+    Attributes:
+        features: Features found in the image.
+        matches: Pairs proposed by matching.
+        inliers: Pairs that agree with the pose.
+        residual: Root mean square residual of the inliers.
+        residual_unit: "m" or "px".
+        method: What placed the frame, e.g. "map", "fallback", "relocalised", "lost".
+    """
+
+    features: int
+    matches: int
+    inliers: int
+    residual: float
+    residual_unit: str
+    method: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """One tracked frame.
+
+    Attributes:
+        stamp_ns: The frame's stamp.
+        node: Graph node that the frame's pose hangs on, or None when the frame is lost.
+        T_node_body: (4, 4) pose of the body in that node.
+        T_world_body: (4, 4) the odometry's own running estimate; the last good one while lost.
+        is_keyframe: The frame itself became ``node``.
+        factors: Measurements that became final with this frame; their nodes are known by now.
+        diagnostics: How it went.
+    """
+
+    stamp_ns: int
+    node: int | None
+    T_node_body: Transform
+    T_world_body: Transform
+    is_keyframe: bool
+    diagnostics: Diagnostics
+    factors: Sequence[BetweenFactor] = field(default_factory=tuple)
+
+
+Observation = TypeVar("Observation")
+
+
+class Odometry(Protocol[Observation]):
+    """Frame-by-frame tracking, split so that the costly, stateless half can run ahead in threads."""
+
+    def observe(self, frame: Frame) -> Observation:
+        """Reduce a frame to what tracking needs. Pure: no state is read or written.
+
+        Raises:
+            FrameError: The frame is of a kind that this method cannot use.
+        """
+        ...
+
+    def track(self, observation: Observation) -> Track:
+        """Place the next observation, in time order."""
+        ...
+
+    def finish(self) -> Sequence[BetweenFactor]:
+        """Return the measurements that were still being refined when the log ended."""
+        ...

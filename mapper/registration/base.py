@@ -1,0 +1,42 @@
+"""What every registration answers."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.errors import DataError
+from mapper.geometry import Array, Transform, is_rigid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """The motion found between two observations, and how far it can be trusted.
+
+    Attributes:
+        T_target_source: (4, 4) pose of the source in the target.
+        converged: False means "no answer"; ``reason`` says why.
+        inlier_ratio: Share of the pairs that agree with the motion, 0 … 1.
+        inlier_rmse_m: Root mean square distance of those pairs, metres.
+        pairs: How many pairs agree.
+        reason: Why it did not converge; empty when it did.
+        information: (6, 6) Fisher information of the source's tangent (rotation, translation), where known.
+    """
+
+    T_target_source: Transform
+    converged: bool
+    inlier_ratio: float
+    inlier_rmse_m: float
+    pairs: int = 0
+    reason: str = ""
+    information: Array | None = None
+
+    def __post_init__(self) -> None:
+        if not is_rigid(self.T_target_source):
+            raise DataError("alignment: T_target_source is not a finite rigid motion")
+        if not self.converged and not self.reason:
+            raise DataError("alignment: one that did not converge must say why")
+
+
+def failed(reason: str) -> Alignment:
+    """Return the answer "I don't know": identity, not converged, with the reason."""
+    return Alignment(np.eye(4), converged=False, inlier_ratio=0.0, inlier_rmse_m=float("inf"), reason=reason)

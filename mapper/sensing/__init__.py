@@ -1,0 +1,1 @@
+"""What sensors do to a measurement, and how to undo it."""

@@ -1,0 +1,1 @@
+"""Recorded logs as sequences of frames."""

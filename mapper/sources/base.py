@@ -1,0 +1,78 @@
+"""The seam between recorded logs and everything else."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from mapper.frames import Frame
+from mapper.geometry import Array
+from mapper.timebase import Stamps
+from mapper.trajectory import Trajectory
+
+
+class Entry(Protocol):
+    """One frame of a log that has not been read yet, so that reading can run ahead in other threads."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Time of the frame, nanoseconds."""
+        ...
+
+    def load(self, *, colour: bool = True) -> Frame:
+        """Read and decode the frame; safe in any thread, and the same every time.
+
+        Args:
+            colour: False lets an RGB-D source decode a grey image only, which is faster.
+
+        Raises:
+            FrameError: This frame cannot be used; the message says which file and why.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Accelerations:
+    """Accelerometer readings of a log, in the accelerometer's own axes.
+
+    Attributes:
+        stamps_ns: (N,) int64 nanoseconds.
+        acceleration_mps2: (N, 3) float64; at rest it points up.
+    """
+
+    stamps_ns: Stamps
+    acceleration_mps2: Array
+
+
+class FrameSource(Protocol):
+    """A recorded log: the same frames in time order, however often it is read.
+
+    Attributes:
+        path: What was opened.
+        kind: Which format it was recognised as, e.g. "tum".
+        truth: Where the body really was, if the log tells.
+        accelerations: Accelerometer readings, if the log has them.
+        notes: What opening it had to leave out or assume, a sentence each.
+    """
+
+    path: Path
+    kind: str
+    truth: Trajectory | None
+    accelerations: Accelerations | None
+    notes: Sequence[str]
+
+    def __len__(self) -> int:
+        """Return how many entries there will be."""
+        ...
+
+    def entries(self) -> Iterator[Entry]:
+        """Yield every frame's entry in time order; nothing is decoded yet."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Skipped:
+    """A frame that could not be read, and why."""
+
+    stamp_ns: int
+    reason: str
