@@ -69,7 +69,7 @@ def rotation_log(R: Array) -> Array:
     else:  # near π the antisymmetric part vanishes: the axis is the largest column of (R + I) / 2
         B = 0.5 * (R + np.eye(3))
         column = B[:, int(np.argmax(np.diag(B)))]
-        axis = column * np.copysign(1.0 / np.linalg.norm(column), float(column @ w))
+        axis = column * np.copysign(1.0 / float(np.linalg.norm(column)), float(column @ w))
     return axis * angle
 
 
