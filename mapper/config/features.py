@@ -1,10 +1,16 @@
 """Detectors of image features."""
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt
 
 from mapper.config.base import Config
+
+if TYPE_CHECKING:
+    from mapper.features.detectors import Detector
+
+ScaleFactor = Annotated[float, Field(gt=1.0)]
+"""Size of a pixel on one pyramid level relative to the level below."""
 
 
 class SurfConfig(Config):
@@ -13,10 +19,17 @@ class SurfConfig(Config):
     kind: Literal["surf"] = "surf"
     max_features: PositiveInt = 1000
     threshold: PositiveFloat = 0.02
-    """Determinant-of-Hessian threshold to start from; lowered while an image gives too few features."""
+    """Determinant-of-Hessian threshold to start from; halved while an image gives too few features."""
+    min_threshold: PositiveFloat = 0.0005
     min_features: PositiveInt = 300
     octaves: PositiveInt = 4
     scales: PositiveInt = 6
+
+    def build(self) -> "Detector":
+        """Return the detector."""
+        from mapper.features.surf import Surf  # imported only when asked for
+
+        return Surf(self)
 
 
 class SiftConfig(Config):
@@ -25,8 +38,15 @@ class SiftConfig(Config):
     kind: Literal["sift"] = "sift"
     max_features: PositiveInt = 1000
     threshold: PositiveFloat = 0.04
-    """Contrast threshold to start from; lowered while an image gives too few features."""
+    """Contrast threshold to start from; halved while an image gives too few features."""
+    min_threshold: PositiveFloat = 0.01
     min_features: PositiveInt = 300
+
+    def build(self) -> "Detector":
+        """Return the detector."""
+        from mapper.features.opencv import Sift  # imported only when asked for
+
+        return Sift(self)
 
 
 class AkazeConfig(Config):
@@ -35,8 +55,15 @@ class AkazeConfig(Config):
     kind: Literal["akaze"] = "akaze"
     max_features: PositiveInt = 1000
     threshold: PositiveFloat = 0.001
-    """Detector response threshold to start from; lowered while an image gives too few features."""
+    """Detector response threshold to start from; halved while an image gives too few features."""
+    min_threshold: PositiveFloat = 0.0001
     min_features: PositiveInt = 300
+
+    def build(self) -> "Detector":
+        """Return the detector."""
+        from mapper.features.opencv import Akaze  # imported only when asked for
+
+        return Akaze(self)
 
 
 class OrbConfig(Config):
@@ -45,10 +72,17 @@ class OrbConfig(Config):
     kind: Literal["orb"] = "orb"
     max_features: PositiveInt = 1000
     threshold: PositiveInt = 20
-    """FAST threshold (grey levels) to start from; lowered while an image gives too few features."""
+    """FAST threshold (grey levels) to start from; halved while an image gives too few features."""
+    min_threshold: PositiveInt = 5
     min_features: PositiveInt = 300
     levels: PositiveInt = 8
-    scale_factor: PositiveFloat = 1.2
+    scale_factor: ScaleFactor = 1.2
+
+    def build(self) -> "Detector":
+        """Return the detector."""
+        from mapper.features.opencv import Orb  # imported only when asked for
+
+        return Orb(self)
 
 
 class UniformOrbConfig(Config):
@@ -62,7 +96,13 @@ class UniformOrbConfig(Config):
     """FAST threshold of cells in which the first finds nothing."""
     cell_px: PositiveInt = 30
     levels: PositiveInt = 8
-    scale_factor: PositiveFloat = 1.2
+    scale_factor: ScaleFactor = 1.2
+
+    def build(self) -> "Detector":
+        """Return the detector."""
+        from mapper.features.uniform_orb import UniformOrb  # imported only when asked for
+
+        return UniformOrb(self)
 
 
 DetectorConfig = Annotated[

@@ -1,0 +1,69 @@
+"""Image features and the seam behind which every detector hides."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.config.features import DetectorConfig
+from mapper.errors import DataError
+from mapper.frames import Image
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """Keypoints of one image with their descriptors, one row each.
+
+    Attributes:
+        pixels: (N, 2) float32 column and row, pixels of the raw (distorted) image.
+        octave: (N,) int32 pyramid level, 0 is the finest; one level up, a pixel is the detector's
+            ``scale_factor`` larger.
+        angle_rad: (N,) float32 orientation in the image, from the column axis towards the row axis.
+        response: (N,) float32 strength, comparable within one detector only.
+        descriptors: (N, D) uint8 bits (Hamming distance) or float32 (Euclidean distance).
+    """
+
+    pixels: NDArray[np.float32]
+    octave: NDArray[np.int32]
+    angle_rad: NDArray[np.float32]
+    response: NDArray[np.float32]
+    descriptors: NDArray[np.uint8] | NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        n = len(self.pixels)
+        shapes = (self.octave.shape, self.angle_rad.shape, self.response.shape)
+        if self.pixels.shape != (n, 2) or shapes != ((n,),) * 3:
+            raise DataError(
+                f"features: pixels {self.pixels.shape} and columns {shapes}, want (N, 2) and (N,)"
+            )
+        if self.descriptors.ndim != 2 or len(self.descriptors) != n:
+            raise DataError(f"features: descriptors {self.descriptors.shape}, want ({n}, D)")
+        if self.descriptors.dtype not in (np.uint8, np.float32):
+            raise DataError(f"features: descriptors are {self.descriptors.dtype}, want uint8 or float32")
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @property
+    def is_binary(self) -> bool:
+        """Descriptors are bits, compared by Hamming distance."""
+        return self.descriptors.dtype == np.uint8
+
+
+class Detector(Protocol):
+    """Finds features. Stateless: safe in any thread, and the answer depends on the image alone."""
+
+    @property
+    def scale_factor(self) -> float:
+        """How much larger a pixel gets from one octave to the next."""
+        ...
+
+    def detect(self, gray: Image) -> Features:
+        """Return the features of an (H, W) uint8 image; none where it has no texture."""
+        ...
+
+
+def build_detector(config: DetectorConfig) -> Detector:
+    """Return the detector that a configuration names."""
+    return config.build()
