@@ -4,6 +4,7 @@
 ``T_a_c = T_a_b @ T_b_c``. Tangent vectors are ordered (rotation, translation).
 """
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -67,9 +68,9 @@ def rotation_log(R: Array) -> Array:
     if sine > 1e-6:
         axis: Array = w * (0.5 / sine)
     else:  # near π the antisymmetric part vanishes: the axis is the largest column of (R + I) / 2
-        B = 0.5 * (R + np.eye(3))
+        B: Array = 0.5 * (R + np.eye(3))
         column = B[:, int(np.argmax(np.diag(B)))]
-        axis = column * np.copysign(1.0 / float(np.linalg.norm(column)), float(column @ w))
+        axis = column * math.copysign(1.0 / float(np.linalg.norm(column)), float(column @ w))
     return axis * angle
 
 

@@ -1,0 +1,253 @@
+"""Pose from map points and their images: compiled Levenberg–Marquardt, and the three-point RANSAC that starts it."""
+
+import numpy as np
+from numba import njit
+
+CHI2_2DOF, CHI2_3DOF = 5.991, 7.815
+"""95 % points of χ²: an image point without and with depth."""
+
+_HUBER_2DOF, _HUBER_3DOF = np.sqrt(CHI2_2DOF), np.sqrt(CHI2_3DOF)
+
+
+@njit(cache=True, nogil=True)
+def twist_exp(delta, T):
+    """Return exp(δ) · T for a (6,) twist (rotation, translation) and a (4, 4) motion."""
+    wx, wy, wz = delta[0], delta[1], delta[2]
+    K = np.array([[0.0, -wz, wy], [wz, 0.0, -wx], [-wy, wx, 0.0]])
+    angle = np.sqrt(wx * wx + wy * wy + wz * wz)
+    if angle < 1e-8:
+        a, b, c = 1.0, 0.5, 1.0 / 6.0
+    else:
+        a = np.sin(angle) / angle
+        b = (1.0 - np.cos(angle)) / angle**2
+        c = (angle - np.sin(angle)) / angle**3
+    KK = K @ K
+    R = np.eye(3) + a * K + b * KK
+    V = np.eye(3) + b * K + c * KK
+    moved = np.eye(4)
+    moved[:3, :3] = R @ T[:3, :3]
+    moved[:3, 3] = R @ np.ascontiguousarray(T[:3, 3]) + V @ np.ascontiguousarray(delta[3:6])
+    # Products of many small rotations drift off SO(3): one Gram–Schmidt step keeps them on it.
+    for i in range(3):
+        for j in range(i):
+            dot = 0.0
+            for k in range(3):
+                dot += moved[i, k] * moved[j, k]
+            for k in range(3):
+                moved[i, k] -= dot * moved[j, k]
+        norm = np.sqrt(moved[i, 0] ** 2 + moved[i, 1] ** 2 + moved[i, 2] ** 2)
+        for k in range(3):
+            moved[i, k] /= norm
+    return moved
+
+
+@njit(cache=True, nogil=True)
+def residual(T, point, measured, intrinsics, out):
+    """Write the residual (3,) of a world point seen in a camera, and return its camera-frame position.
+
+    Args:
+        T: (4, 4) T_camera_world.
+        point: (3,) metres, world.
+        measured: (3,) u, v in pixels and virtual disparity bf / z in pixels, NaN without depth.
+        intrinsics: (5,) fx, fy, cx, cy and bf.
+        out: (3,) receives measured − predicted, 0 in the third place without depth.
+    """
+    x = T[0, 0] * point[0] + T[0, 1] * point[1] + T[0, 2] * point[2] + T[0, 3]
+    y = T[1, 0] * point[0] + T[1, 1] * point[1] + T[1, 2] * point[2] + T[1, 3]
+    z = T[2, 0] * point[0] + T[2, 1] * point[1] + T[2, 2] * point[2] + T[2, 3]
+    inverse_z = 1.0 / max(z, 1e-3)
+    out[0] = measured[0] - (intrinsics[0] * x * inverse_z + intrinsics[2])
+    out[1] = measured[1] - (intrinsics[1] * y * inverse_z + intrinsics[3])
+    out[2] = 0.0 if np.isnan(measured[2]) else measured[2] - intrinsics[4] * inverse_z
+    return x, y, z
+
+
+@njit(cache=True, nogil=True)
+def chi2(r, weights):
+    """Return the squared Mahalanobis length of a residual (3,) with inverse variances (3,)."""
+    return weights[0] * r[0] * r[0] + weights[1] * r[1] * r[1] + weights[2] * r[2] * r[2]
+
+
+@njit(cache=True, nogil=True)
+def projection_jacobian(x, y, z, intrinsics, has_depth, J):
+    """Write d(u, v, bf/z) / d(x, y, z) (3, 3) at a camera-frame point."""
+    inverse_z = 1.0 / max(z, 1e-3)
+    inverse_z2 = inverse_z * inverse_z
+    J[:, :] = 0.0
+    J[0, 0] = intrinsics[0] * inverse_z
+    J[0, 2] = -intrinsics[0] * x * inverse_z2
+    J[1, 1] = intrinsics[1] * inverse_z
+    J[1, 2] = -intrinsics[1] * y * inverse_z2
+    if has_depth:
+        J[2, 2] = -intrinsics[4] * inverse_z2
+
+
+@njit(cache=True, nogil=True)
+def pose_jacobian(x, y, z, J, J_pose):
+    """Write d(u, v, bf/z) / dδ (3, 6) for T ← exp(δ) · T, from d(u, v, bf/z) / d(x, y, z)."""
+    for i in range(3):
+        a, b, c = J[i, 0], J[i, 1], J[i, 2]
+        J_pose[i, 0] = -b * z + c * y
+        J_pose[i, 1] = a * z - c * x
+        J_pose[i, 2] = -a * y + b * x
+        J_pose[i, 3] = a
+        J_pose[i, 4] = b
+        J_pose[i, 5] = c
+
+
+@njit(cache=True, nogil=True)
+def _linearise(T, points, measured, weights, intrinsics, inlier, robust, H, g):
+    """Fill the normal equations and return the robust cost (Huber 1964)."""
+    H[:, :] = 0.0
+    g[:] = 0.0
+    r = np.empty(3)
+    J = np.empty((3, 3))
+    J_pose = np.empty((3, 6))
+    cost = 0.0
+    for n in range(len(points)):
+        if not inlier[n]:
+            continue
+        x, y, z = residual(T, points[n], measured[n], intrinsics, r)
+        has_depth = not np.isnan(measured[n, 2])
+        e = chi2(r, weights[n])
+        k = _HUBER_3DOF if has_depth else _HUBER_2DOF
+        scale = 1.0
+        if robust and e > k * k:
+            root = np.sqrt(e)
+            scale = k / root
+            cost += 2.0 * k * root - k * k
+        else:
+            cost += e
+        projection_jacobian(x, y, z, intrinsics, has_depth, J)
+        pose_jacobian(x, y, z, J, J_pose)
+        for i in range(3):
+            w = scale * weights[n, i]
+            for a in range(6):
+                wa = w * J_pose[i, a]
+                g[a] += wa * r[i]
+                for b in range(a, 6):
+                    H[a, b] += wa * J_pose[i, b]
+    for a in range(6):
+        for b in range(a):
+            H[a, b] = H[b, a]
+    return cost
+
+
+@njit(cache=True, nogil=True)
+def classify(T, points, measured, weights, intrinsics, inlier):
+    """Mark as inliers the points in front of the camera whose χ² passes the 95 % test; return how many."""
+    r = np.empty(3)
+    count = 0
+    for n in range(len(points)):
+        _, _, z = residual(T, points[n], measured[n], intrinsics, r)
+        limit = CHI2_2DOF if np.isnan(measured[n, 2]) else CHI2_3DOF
+        inlier[n] = z > 0.05 and chi2(r, weights[n]) <= limit
+        count += inlier[n]
+    return count
+
+
+@njit(cache=True, nogil=True)
+def refine_pose(T_camera_world, points, measured, weights, intrinsics, rounds, iterations):
+    """Return the refined T_camera_world, the inlier mask and the (6, 6) normal matrix.
+
+    Levenberg–Marquardt on (u, v, bf/z) with Huber's kernel; after each round points are classified anew by χ², and
+    the last round has no kernel (Mur-Artal & Tardós 2017, §III-C).
+
+    Args:
+        T_camera_world: (4, 4) first guess.
+        points: (N, 3) metres, world.
+        measured: (N, 3) u, v, bf/z in pixels; NaN in the third place without depth.
+        weights: (N, 3) inverse variances of the three, px⁻².
+        intrinsics: (5,) fx, fy, cx, cy, bf.
+        rounds: How often the inliers are chosen.
+        iterations: Steps per round.
+    """
+    T = T_camera_world.copy()
+    inlier = np.ones(len(points), np.bool_)
+    H, trial_H = np.zeros((6, 6)), np.zeros((6, 6))
+    g, trial_g = np.zeros(6), np.zeros(6)
+    for k in range(rounds):
+        robust = k < rounds - 1
+        damping = 1e-4
+        cost = _linearise(T, points, measured, weights, intrinsics, inlier, robust, H, g)
+        for _ in range(iterations):
+            A = H.copy()
+            for a in range(6):
+                A[a, a] += damping * H[a, a] + 1e-9
+            delta = np.linalg.solve(A, g)
+            trial = twist_exp(delta, T)
+            trial_cost = _linearise(
+                trial, points, measured, weights, intrinsics, inlier, robust, trial_H, trial_g
+            )
+            if trial_cost <= cost:
+                settled = cost - trial_cost < 1e-5 * cost
+                T, cost, damping = trial, trial_cost, max(damping * 0.2, 1e-9)
+                H, trial_H = trial_H, H
+                g, trial_g = trial_g, g
+                if settled:
+                    break
+            else:
+                damping *= 10.0
+                if damping > 1e3:
+                    break
+        if classify(T, points, measured, weights, intrinsics, inlier) < 6:
+            break
+    return T, inlier, H
+
+
+@njit(cache=True, nogil=True)
+def _rigid3(world, camera):
+    """Return T_camera_world of three pairs by aligning their triads (Horn 1987, §2)."""
+    frames = np.empty((2, 3, 3))
+    for s in range(2):
+        p = world if s == 0 else camera
+        e1 = p[1] - p[0]
+        n1 = np.sqrt((e1 * e1).sum())
+        e2 = p[2] - p[0]
+        e3 = np.cross(e1, e2)
+        n3 = np.sqrt((e3 * e3).sum())
+        if n1 < 1e-6 or n3 < 1e-8:
+            return np.zeros((4, 4))
+        e1 = e1 / n1
+        e3 = e3 / n3
+        frames[s, :, 0] = e1
+        frames[s, :, 1] = np.cross(e3, e1)
+        frames[s, :, 2] = e3
+    T = np.eye(4)
+    T[:3, :3] = np.ascontiguousarray(frames[1]) @ np.ascontiguousarray(frames[0].T)
+    T[:3, 3] = (camera[0] + camera[1] + camera[2] - T[:3, :3] @ (world[0] + world[1] + world[2])) / 3.0
+    return T
+
+
+@njit(cache=True, nogil=True)
+def ransac_pose(points, measured, points_camera, weights, intrinsics, iterations, seed):
+    """Return the T_camera_world of three pairs that most pairs agree with, and how many do (Fischler & Bolles 1981).
+
+    Args:
+        points: (N, 3) metres, world.
+        measured: (N, 3) u, v, bf/z in pixels, all with depth.
+        points_camera: (N, 3) the same measurements back-projected, metres, camera frame.
+        weights: (N, 3) inverse variances, px⁻².
+        intrinsics: (5,) fx, fy, cx, cy, bf.
+        iterations: Samples to draw.
+        seed: Of the generator: the same seed gives the same answer.
+    """
+    np.random.seed(seed)  # numba's own generator state, private to compiled code
+    n = len(points)
+    best, best_T = 0, np.eye(4)
+    inlier = np.empty(n, np.bool_)
+    world, camera = np.empty((3, 3)), np.empty((3, 3))
+    for _ in range(iterations):
+        i, j, k = np.random.randint(n), np.random.randint(n), np.random.randint(n)
+        if i == j or j == k or i == k:
+            continue
+        for row, pick in enumerate((i, j, k)):
+            world[row] = points[pick]
+            camera[row] = points_camera[pick]
+        T = _rigid3(world, camera)
+        if T[3, 3] == 0.0:
+            continue
+        count = classify(T, points, measured, weights, intrinsics, inlier)
+        if count > best:
+            best, best_T = count, T
+    return best_T, best
