@@ -1,0 +1,88 @@
+import numpy as np
+import pytest
+
+from mapper.cloud import CloudBuilder
+from mapper.errors import DataError
+
+
+def random_cloud(n, *, seed=0, extent_m=2.0):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-extent_m, extent_m, (n, 3)).astype(np.float32)
+    return points, rng.integers(0, 256, (n, 3), dtype=np.uint8)
+
+
+def averaged_by_dictionary(points, colors, voxel_m):
+    voxels = {}
+    for point, color in zip(points.astype(np.float64), colors, strict=True):
+        voxels.setdefault(tuple(np.floor(point * (1.0 / voxel_m))), []).append([*point, *color])
+    means = np.array([np.mean(members, axis=0) for members in voxels.values()])
+    return means[:, :3], np.rint(means[:, 3:])
+
+
+def test_each_voxel_holds_the_mean_of_its_points():
+    points, colors = random_cloud(9000)
+    builder = CloudBuilder(0.5)
+    builder.add(points, colors)
+
+    got_points, got_colors = builder.points_and_colors()
+
+    want_points, want_colors = averaged_by_dictionary(points, colors, 0.5)
+    assert len(builder) == len(want_points) == 512
+    np.testing.assert_allclose(got_points, want_points, atol=1e-6)
+    np.testing.assert_array_equal(got_colors, want_colors)
+    assert got_points.dtype == np.float32
+    assert got_colors.dtype == np.uint8
+
+
+def test_batches_and_repeats_change_nothing():
+    points, colors = random_cloud(5000)
+    whole, parts = CloudBuilder(0.1), CloudBuilder(0.1)
+    whole.add(points, colors)
+    for first in range(0, 5000, 777):
+        parts.add(points[first : first + 777], colors[first : first + 777])
+
+    for got, want in zip(parts.points_and_colors(), whole.points_and_colors(), strict=True):
+        assert got.tobytes() == want.tobytes()
+
+
+def test_the_table_grows_past_its_first_size():
+    points, colors = random_cloud(400_000, extent_m=5.0)
+    builder = CloudBuilder(0.02)
+    builder.add(points, colors)
+
+    cells = np.floor(points.astype(np.float64) * (1.0 / 0.02)).astype(np.int64)
+    assert len(builder) == len(np.unique(cells, axis=0)) > 200_000
+
+
+def test_memory_follows_the_scene_not_the_log():
+    points, colors = random_cloud(100_000, extent_m=1.0)
+    builder = CloudBuilder(0.1)
+    for _ in range(8):
+        builder.add(points, colors)
+
+    assert len(builder) == 20**3
+    assert sum(a.nbytes for a in vars(builder).values() if isinstance(a, np.ndarray)) < 20e6
+
+
+def test_an_empty_cloud_is_empty():
+    builder = CloudBuilder(0.1)
+    builder.add(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))
+
+    points, colors = builder.points_and_colors()
+    assert points.shape == colors.shape == (0, 3)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e7])
+def test_refuses_what_has_no_voxel(bad):
+    points, colors = random_cloud(10)
+    points[3, 1] = bad
+    with pytest.raises(DataError, match="enlarge the voxel"):
+        CloudBuilder(0.1).add(points, colors)
+
+
+def test_refuses_unequal_shapes_and_senseless_voxels():
+    points, colors = random_cloud(10)
+    with pytest.raises(DataError, match=r"colors \(9, 3\)"):
+        CloudBuilder(0.1).add(points, colors[:9])
+    with pytest.raises(DataError, match=r"0\.0 m; want"):
+        CloudBuilder(0.0)
