@@ -3,9 +3,9 @@
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_args
 
-from pydantic import NonNegativeInt, ValidationError
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
 
 from mapper.config.base import Config
 from mapper.config.graph import GraphConfig
@@ -23,6 +23,15 @@ class McapConfig(Config):
     image_width_px: NonNegativeInt = 320
 
 
+class CloudConfig(Config):
+    """The coloured cloud."""
+
+    voxel_m: PositiveFloat = 0.02
+    """The cloud keeps one point, the mean, per cube of this edge."""
+    frame_stride: PositiveInt = 10
+    """Every n-th tracked frame gives its points."""
+
+
 class BuildConfig(Config):
     """Everything ``mapper build`` can be told."""
 
@@ -32,7 +41,12 @@ class BuildConfig(Config):
     octree: OctreeConfig = OctreeConfig()
     level: LevelConfig = LevelConfig()
     slice: SliceConfig = SliceConfig()
+    cloud: CloudConfig = CloudConfig()
     mcap: McapConfig = McapConfig()
+    min_tracked_frames: PositiveInt = 10
+    """With fewer frames tracked there is no map worth the name, and the build ends in an error."""
+    min_tracked_ratio: Annotated[float, Field(ge=0.0, le=1.0)] = 0.2
+    """The same, as a share of the frames that could be read."""
     workers: NonNegativeInt = 2
     """Threads that decode and detect ahead; the result does not depend on it."""
 
@@ -71,9 +85,28 @@ def _put(tree: dict[str, Any], override: str) -> None:
     node[leaf] = value
 
 
+def _with_kinds(tree: dict[str, Any], default: Config) -> dict[str, Any]:
+    """Return the tree with every ``kind`` it leaves out, so that a knob turns without repeating it."""
+    filled = dict(tree)
+    for name, value in tree.items():
+        member = getattr(default, name, None)
+        if not isinstance(value, dict) or not isinstance(member, Config):
+            continue
+        if "kind" in type(member).model_fields:
+            value = {"kind": _kind(type(member)), **value}
+            members = get_args(type(default).model_fields[name].annotation)
+            member = next((m() for m in members if _kind(m) == value["kind"]), member)
+        filled[name] = _with_kinds(value, member)
+    return filled
+
+
+def _kind(member: type[Config]) -> str:
+    return str(member.model_fields["kind"].default)
+
+
 def _validated(tree: dict[str, Any], where: str) -> BuildConfig:
     try:
-        return BuildConfig.model_validate(tree)
+        return BuildConfig.model_validate(_with_kinds(tree, BuildConfig()))
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"]) or "configuration"

@@ -1,0 +1,46 @@
+"""Seconds per stage and peak memory of this process."""
+
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+class Stopwatch:
+    """Wall seconds spent in named stages; a stage entered again adds up.
+
+    Attributes:
+        seconds: Seconds of every stage so far, in the order the stages began.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._started = time.perf_counter()
+
+    @property
+    def total_s(self) -> float:
+        """Seconds since the watch was made."""
+        return time.perf_counter() - self._started
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Count the time spent inside towards the stage."""
+        self.seconds.setdefault(name, 0.0)
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] += time.perf_counter() - began
+
+
+def peak_memory_mb() -> float:
+    """Return the largest resident memory this process has had, in megabytes of 10⁶ bytes."""
+    status = Path("/proc/self/status")
+    if status.exists():  # ru_maxrss also counts what the process that started us held before exec
+        for line in status.read_text(encoding="ascii", errors="replace").splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024 / 1e6
+    largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return largest / 1e6 if sys.platform == "darwin" else largest * 1024 / 1e6

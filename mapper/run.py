@@ -1,0 +1,172 @@
+"""The folder a build leaves: what is in it, how it is filled, and how other verbs read it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from mapper.atomic import write_text
+from mapper.config import BuildConfig
+from mapper.errors import MapperError, RunError
+from mapper.fingerprint import fingerprint
+from mapper.graph.g2o import read_g2o
+from mapper.graph.model import PoseGraph
+from mapper.manifest import Input, Manifest, Timing, library_versions, now_text, read_manifest
+from mapper.measure import Stopwatch
+from mapper.records import FrameRecord, read_records
+from mapper.sources.base import FrameSource
+from mapper.staging import MARK, partial_of, staged
+from mapper.trajectory import Trajectory, read_tum
+
+CONFIG = "config.json"
+MANIFEST = MARK
+TRAJECTORY = "trajectory.tum"
+KEYFRAMES = "keyframes.tum"
+TRUTH = "truth.tum"
+GRAPH = "graph.g2o"
+FRAMES = "frames.csv"
+OCTREE_BT = "map.bt"
+OCTREE_OT = "map.ot"
+CLOUD = "cloud.ply"
+SLICE = "slice"
+MCAP = "run.mcap"
+SUMMARY = "summary.png"
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A finished run.
+
+    Attributes:
+        path: Its folder.
+        config: What it was built with, every default spelled out.
+        manifest: What it says about itself.
+    """
+
+    path: Path
+    config: BuildConfig
+    manifest: Manifest
+
+    def trajectory(self) -> Trajectory:
+        """Return the solved body poses of all tracked frames, in the levelled world."""
+        return read_tum(self.path / TRAJECTORY)
+
+    def truth(self) -> Trajectory | None:
+        """Return where the body really was, in the truth's own frame, if the log told."""
+        path = self.path / TRUTH
+        return read_tum(path) if path.exists() else None
+
+    def graph(self) -> PoseGraph:
+        """Return the pose graph with its nodes at the solution, in the levelled world."""
+        return read_g2o(self.path / GRAPH)
+
+    def records(self) -> list[FrameRecord]:
+        """Return what became of every frame."""
+        return read_records(self.path / FRAMES)
+
+    def files(self) -> list[Path]:
+        """Return the folder's files, by name."""
+        return sorted(child for child in self.path.iterdir() if child.is_file())
+
+
+def load_run(path: Path) -> Run:
+    """Return a finished run.
+
+    Raises:
+        RunError: The folder is missing, is no run, or is not finished; the message says how it ended.
+    """
+    if not path.is_dir():
+        partial = partial_of(path)
+        if (partial / MANIFEST).is_file():
+            raise RunError(f"{path}: not finished: {_ending(partial)}")
+        raise RunError(f"{path}: no such run folder; make one with mapper build LOG --out {path}")
+    manifest = read_manifest(path / MANIFEST)
+    if manifest.status != "complete":
+        raise RunError(f"{path}: not finished: {_ending(path)}")
+    return Run(path, _read_config(path / CONFIG), manifest)
+
+
+class Draft:
+    """A run folder being filled; its manifest says "building" until the end is known.
+
+    Attributes:
+        folder: Where the files go.
+        clock: Times the stages.
+        manifest: What will be written at the end; ``update`` replaces parts of it.
+    """
+
+    def __init__(self, folder: Path, manifest: Manifest) -> None:
+        self.folder = folder
+        self.clock = Stopwatch()
+        self.manifest = manifest
+        self.save()
+
+    def update(self, **parts: Any) -> None:
+        """Replace fields of the manifest."""
+        self.manifest = self.manifest.model_copy(update=parts)
+
+    def save(self) -> None:
+        """Write the manifest as it stands."""
+        self.manifest.save(self.folder / MANIFEST)
+
+
+@contextmanager
+def drafting(out: Path, manifest: Manifest, config: BuildConfig, *, overwrite: bool) -> Iterator[Draft]:
+    """Yield a draft that becomes the run OUT on success and stays behind as ``OUT.partial`` otherwise.
+
+    A failure or an interruption is written into the manifest; a killed process leaves it at "building".
+
+    Raises:
+        RunError: OUT exists and may not be replaced, or is being built by another process.
+    """
+    with staged(out, overwrite=overwrite) as folder:
+        draft = Draft(folder, manifest)
+        try:
+            write_text(folder / CONFIG, config.model_dump_json(indent=2) + "\n")
+            yield draft
+        except BaseException as error:
+            status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+            reason = str(error) if isinstance(error, MapperError) else f"{type(error).__name__}: {error}"
+            draft.update(status=status, reason=reason)
+            draft.save()
+            raise
+        draft.update(status="complete")
+        draft.save()
+
+
+def first_manifest(source: FrameSource) -> Manifest:
+    """Return the manifest of a run that has just begun."""
+    return Manifest(
+        status="building",
+        libraries=library_versions(),
+        input=Input(
+            path=str(source.path.resolve()),
+            kind=source.kind,
+            fingerprint=fingerprint(source.path),
+            notes=tuple(source.notes),
+        ),
+        timing=Timing(started=now_text()),
+    )
+
+
+def _ending(folder: Path) -> str:
+    manifest = read_manifest(folder / MANIFEST)
+    if manifest.status == "building":
+        return f"{folder} is still being built, or its process was killed"
+    return f"{folder} {manifest.status}: {manifest.reason}"
+
+
+def _read_config(path: Path) -> BuildConfig:
+    try:
+        return BuildConfig.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        raise RunError(
+            f"{path}: {name}: {first['msg']}; built by another version?"
+        ) from None

@@ -1,0 +1,95 @@
+"""The first pass over a log: every frame tracked in order, and the pose graph that grows from it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from mapper.config import BuildConfig
+from mapper.errors import FrameError, TrackingError
+from mapper.geometry import Transform
+from mapper.graph.model import PoseGraph
+from mapper.odometry.base import Odometry, Track
+from mapper.parallel import ordered_map
+from mapper.progress import Progress
+from mapper.sources.base import Entry, FrameSource, Skipped
+from mapper.trajectory import Trajectory, trajectory_from
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracking:
+    """What the first pass found.
+
+    Attributes:
+        tracks: One per frame that could be read, in time order.
+        skipped: The frames that could not be read.
+        graph: Nodes at the odometry's estimates, with every factor.
+    """
+
+    tracks: tuple[Track, ...]
+    skipped: tuple[Skipped, ...]
+    graph: PoseGraph
+
+    @property
+    def placed(self) -> list[Track]:
+        """The tracks of the frames that were not lost."""
+        return [track for track in self.tracks if track.node is not None]
+
+    def trajectory(self, T_world_node: Mapping[int, Transform]) -> Trajectory:
+        """Return T_world_body = T_world_node · T_node_body of every frame that was not lost."""
+        return trajectory_from(
+            (track.stamp_ns, T_world_node[track.node] @ track.T_node_body)
+            for track in self.tracks
+            if track.node is not None
+        )
+
+
+def track_log(source: FrameSource, config: BuildConfig, *, progress: Progress) -> Tracking:
+    """Track every frame of a log, in time order; reading and detecting run ahead in threads.
+
+    A frame that cannot be read is skipped and reported, not fatal.
+    """
+    odometry: Odometry[Any] = config.odometry.build()
+    graph = PoseGraph()
+    tracks: list[Track] = []
+    skipped: list[Skipped] = []
+
+    def observe(entry: Entry) -> Any:
+        try:
+            return odometry.observe(entry.load(colour=False))
+        except FrameError as error:
+            return Skipped(entry.stamp_ns, str(error))
+
+    observations = ordered_map(observe, source.entries(), workers=config.workers)
+    for observation in progress.over(observations, stage="track", total=len(source)):
+        if isinstance(observation, Skipped):
+            skipped.append(observation)
+            progress.note(f"skipped: {observation.reason}")
+            continue
+        track = odometry.track(observation)
+        if track.is_keyframe and track.node is not None:
+            graph.add_node(track.node, track.stamp_ns, track.T_world_body)
+        graph.add_factors(track.factors)
+        tracks.append(track)
+    graph.add_factors(odometry.finish())
+    return Tracking(tuple(tracks), tuple(skipped), graph)
+
+
+def refuse_a_fragment(tracking: Tracking, config: BuildConfig) -> None:
+    """Refuse to make a map from too little.
+
+    Raises:
+        TrackingError: Fewer frames were tracked than the configuration asks for.
+    """
+    read, placed = len(tracking.tracks), len(tracking.placed)
+    enough = max(config.min_tracked_frames, config.min_tracked_ratio * read)
+    if placed >= enough:
+        return
+    if read == 0 and tracking.skipped:
+        raise TrackingError(
+            f"none of {len(tracking.skipped)} frames could be read; the first: {tracking.skipped[0].reason}"
+        )
+    raise TrackingError(
+        f"only {placed} of {read} frames read could be tracked, want at least {enough:.0f}; "
+        "is there texture, and depth within max_depth_m, in the images? "
+        "(min_tracked_frames and min_tracked_ratio set the limit)"
+    )
