@@ -87,6 +87,13 @@ def log(T_a_b: Transform) -> tuple[Array, Array]:
     return rotation_rad, translation_m
 
 
+def adjoint(T_a_b: Transform) -> Array:
+    """Return (6, 6): takes b's twists (rotation, translation) to a's (Murray, Li & Sastry 1994, §2.4)."""
+    R, t = T_a_b[:3, :3], T_a_b[:3, 3]
+    zero = np.zeros((3, 3))
+    return np.block([[R, zero], [skew(t) @ R, R]])
+
+
 def _left_jacobian(rotation_rad: Array) -> Array:
     angle = float(np.linalg.norm(rotation_rad))
     K = skew(rotation_rad)

@@ -1,11 +1,14 @@
 """Odometry methods and the ISVD registration inside the thesis's one."""
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from mapper.config.base import Config
-from mapper.config.features import DetectorConfig, OrbConfig, SurfConfig
+from mapper.config.features import DetectorConfig, OrbConfig, SurfConfig, UniformOrbConfig
+
+if TYPE_CHECKING:
+    from mapper.odometry.local_map.odometry import LocalMapOdometry
 
 
 class MatchConfig(Config):
@@ -56,9 +59,50 @@ class LocalMapConfig(Config):
     """Reprojection tracking against a local map of keyframes, refined by local bundle adjustment."""
 
     kind: Literal["local-map"] = "local-map"
-    detector: DetectorConfig = OrbConfig()
+    detector: Annotated[OrbConfig | UniformOrbConfig, Field(discriminator="kind")] = OrbConfig()
+    """The compiled matching reads 256-bit descriptors."""
     max_depth_m: PositiveFloat = 4.0
-    """Deeper features are tracked but do not become map points."""
+    """Deeper features are tracked but do not become landmarks."""
+    virtual_baseline_px_m: PositiveFloat = 40.0
+    """bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017); a Kinect's is 40 to 43."""
+    disparity_sigma_px: PositiveFloat = 1.0
+    """Noise of the virtual disparity relative to that of a pixel."""
+    search_px: PositiveFloat = 15.0
+    """Search radius around the predicted pixel in the finest octave; doubled once when too little matches."""
+    local_search_px: PositiveFloat = 4.0
+    """Search radius around the projected landmarks of the local map in the finest octave."""
+    local_keyframes: PositiveInt = 15
+    """How many covisible keyframes' landmarks are searched."""
+    min_start_features: PositiveInt = 100
+    """Features with depth that the first frame must have."""
+    min_motion_matches: PositiveInt = 20
+    """Fewer matches to the last frame mean that the prediction failed."""
+    min_inliers: PositiveInt = 30
+    """Fewer landmarks that agree with the pose mean that the frame is lost."""
+    max_predicted_steps: PositiveFloat = 10.0
+    """Longer gaps, in frame intervals, are not extrapolated over."""
+    keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.75
+    """Keyframe when the inliers fall below this share of the most since the last keyframe."""
+    weak_inliers: PositiveInt = 90
+    """Keyframe at once when fewer landmarks than this agree."""
+    min_keyframe_gap: PositiveInt = 4
+    max_keyframe_gap: PositiveInt = 20
+    bundle_keyframes: PositiveInt = 10
+    """Window of the local bundle adjustment."""
+    min_shared_landmarks: PositiveInt = 15
+    """Keyframes that share fewer are not covisible."""
+    min_found_ratio: Annotated[float, Field(ge=0.0, le=1.0)] = 0.25
+    """Young landmarks found in a smaller share of the frames that should show them are forgotten."""
+    factors_per_keyframe: PositiveInt = 4
+    ransac_iterations: PositiveInt = 300
+    relocalisation_keyframes: PositiveInt = 30
+    """How many of the nearest keyframes, and as many of the others in turn, a lost frame is compared with."""
+
+    def build(self) -> "LocalMapOdometry":
+        """Return the odometry this configures."""
+        from mapper.odometry.local_map.odometry import LocalMapOdometry
+
+        return LocalMapOdometry(self)
 
 
 OdometryConfig = Annotated[IsvdOdometryConfig | LocalMapConfig, Field(discriminator="kind")]

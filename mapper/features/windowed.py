@@ -1,4 +1,4 @@
-"""Matching predicted pixels to nearby features: compiled, because it runs for every map point of every frame."""
+"""Matching predicted pixels to nearby features; compiled, as it runs for every map point of every frame."""
 
 from dataclasses import dataclass
 
@@ -29,7 +29,7 @@ class FeatureGrid:
     rows: int
 
 
-def pack(descriptors: NDArray[np.uint8]) -> Words:
+def pack(descriptors: NDArray[np.uint8] | NDArray[np.float32]) -> Words:
     """Return (N, 32) uint8 binary descriptors as (N, 4) words."""
     return np.ascontiguousarray(descriptors).view(np.uint64).reshape(-1, 4)
 

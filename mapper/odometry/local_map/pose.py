@@ -1,4 +1,4 @@
-"""Pose from map points and their images: compiled Levenberg–Marquardt, and the three-point RANSAC that starts it."""
+"""Pose from map points and their images: compiled Levenberg–Marquardt, and the RANSAC that starts it."""
 
 import numpy as np
 from numba import njit
@@ -25,7 +25,7 @@ def twist_exp(delta, T):
     R = np.eye(3) + a * K + b * KK
     V = np.eye(3) + b * K + c * KK
     moved = np.eye(4)
-    moved[:3, :3] = R @ T[:3, :3]
+    moved[:3, :3] = R @ np.ascontiguousarray(T[:3, :3])
     moved[:3, 3] = R @ np.ascontiguousarray(T[:3, 3]) + V @ np.ascontiguousarray(delta[3:6])
     # Products of many small rotations drift off SO(3): one Gram–Schmidt step keeps them on it.
     for i in range(3):
@@ -134,6 +134,15 @@ def _linearise(T, points, measured, weights, intrinsics, inlier, robust, H, g):
 
 
 @njit(cache=True, nogil=True)
+def normal_matrix(T_camera_world, points, measured, weights, intrinsics):
+    """Return the (6, 6) robust normal matrix of exp(δ) · T_camera_world; arguments as for ``refine_pose``."""
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    inlier = np.ones(len(points), np.bool_)
+    _linearise(T_camera_world, points, measured, weights, intrinsics, inlier, True, H, g)
+    return H
+
+
+@njit(cache=True, nogil=True)
 def classify(T, points, measured, weights, intrinsics, inlier):
     """Mark as inliers the points in front of the camera whose χ² passes the 95 % test; return how many."""
     r = np.empty(3)
@@ -150,8 +159,8 @@ def classify(T, points, measured, weights, intrinsics, inlier):
 def refine_pose(T_camera_world, points, measured, weights, intrinsics, rounds, iterations):
     """Return the refined T_camera_world, the inlier mask and the (6, 6) normal matrix.
 
-    Levenberg–Marquardt on (u, v, bf/z) with Huber's kernel; after each round points are classified anew by χ², and
-    the last round has no kernel (Mur-Artal & Tardós 2017, §III-C).
+    Levenberg–Marquardt on (u, v, bf/z) with Huber's kernel; after each round points are classified anew by
+    χ², and the last round has no kernel (Mur-Artal & Tardós 2017, §III-C).
 
     Args:
         T_camera_world: (4, 4) first guess.
@@ -220,8 +229,10 @@ def _rigid3(world, camera):
 
 
 @njit(cache=True, nogil=True)
-def ransac_pose(points, measured, points_camera, weights, intrinsics, iterations, seed):
-    """Return the T_camera_world of three pairs that most pairs agree with, and how many do (Fischler & Bolles 1981).
+def ransac_pose(points, measured, points_camera, weights, intrinsics, samples):
+    """Return the T_camera_world of the three pairs that most agree with, and how many do.
+
+    RANSAC (Fischler & Bolles 1981).
 
     Args:
         points: (N, 3) metres, world.
@@ -229,22 +240,12 @@ def ransac_pose(points, measured, points_camera, weights, intrinsics, iterations
         points_camera: (N, 3) the same measurements back-projected, metres, camera frame.
         weights: (N, 3) inverse variances, px⁻².
         intrinsics: (5,) fx, fy, cx, cy, bf.
-        iterations: Samples to draw.
-        seed: Of the generator: the same seed gives the same answer.
+        samples: (S, 3) int64 rows of three pairs to try.
     """
-    np.random.seed(seed)  # numba's own generator state, private to compiled code
-    n = len(points)
     best, best_T = 0, np.eye(4)
-    inlier = np.empty(n, np.bool_)
-    world, camera = np.empty((3, 3)), np.empty((3, 3))
-    for _ in range(iterations):
-        i, j, k = np.random.randint(n), np.random.randint(n), np.random.randint(n)
-        if i == j or j == k or i == k:
-            continue
-        for row, pick in enumerate((i, j, k)):
-            world[row] = points[pick]
-            camera[row] = points_camera[pick]
-        T = _rigid3(world, camera)
+    inlier = np.empty(len(points), np.bool_)
+    for picks in samples:
+        T = _rigid3(points[picks], points_camera[picks])
         if T[3, 3] == 0.0:
             continue
         count = classify(T, points, measured, weights, intrinsics, inlier)

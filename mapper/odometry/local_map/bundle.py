@@ -1,0 +1,227 @@
+"""Local bundle adjustment: compiled Levenberg–Marquardt, points eliminated (Triggs et al. 2000, §6.1)."""
+
+import numpy as np
+from numba import njit
+
+from mapper.odometry.local_map.pose import (
+    CHI2_2DOF,
+    CHI2_3DOF,
+    chi2,
+    pose_jacobian,
+    projection_jacobian,
+    residual,
+    twist_exp,
+)
+
+_HUBER_2DOF, _HUBER_3DOF = np.sqrt(CHI2_2DOF), np.sqrt(CHI2_3DOF)
+
+
+@njit(cache=True, nogil=True)
+def _cost(poses, points, edges, measured, weights, intrinsics, active, robust):
+    r = np.empty(3)
+    total = 0.0
+    for e in range(len(edges)):
+        if not active[e]:
+            continue
+        residual(poses[edges[e, 0]], points[edges[e, 1]], measured[e], intrinsics, r)
+        value = chi2(r, weights[e])
+        k = _HUBER_2DOF if np.isnan(measured[e, 2]) else _HUBER_3DOF
+        if robust and value > k * k:
+            total += 2.0 * k * np.sqrt(value) - k * k
+        else:
+            total += value
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _linearise(
+    poses, free, points, edges, measured, weights, intrinsics, active, robust, Hcc, bc, Hpp, bp, W
+):
+    """Fill the blocks of the normal equations: cameras (6, 6), points (3, 3), and one (6, 3) per edge."""
+    Hcc[:] = 0.0
+    bc[:] = 0.0
+    Hpp[:] = 0.0
+    bp[:] = 0.0
+    r = np.empty(3)
+    J = np.empty((3, 3))
+    J_pose = np.empty((3, 6))
+    J_point = np.empty((3, 3))
+    for e in range(len(edges)):
+        if not active[e]:
+            continue
+        c, p = edges[e, 0], edges[e, 1]
+        T = poses[c]
+        x, y, z = residual(T, points[p], measured[e], intrinsics, r)
+        has_depth = not np.isnan(measured[e, 2])
+        value = chi2(r, weights[e])
+        k = _HUBER_3DOF if has_depth else _HUBER_2DOF
+        scale = k / np.sqrt(value) if robust and value > k * k else 1.0
+        projection_jacobian(x, y, z, intrinsics, has_depth, J)
+        for i in range(3):
+            for j in range(3):
+                J_point[i, j] = J[i, 0] * T[0, j] + J[i, 1] * T[1, j] + J[i, 2] * T[2, j]
+        for i in range(3):
+            w = scale * weights[e, i]
+            for a in range(3):
+                wa = w * J_point[i, a]
+                bp[p, a] += wa * r[i]
+                for b in range(3):
+                    Hpp[p, a, b] += wa * J_point[i, b]
+        f = free[c]
+        if f < 0:
+            continue
+        pose_jacobian(x, y, z, J, J_pose)
+        for a in range(6):
+            for b in range(3):
+                W[e, a, b] = 0.0
+        for i in range(3):
+            w = scale * weights[e, i]
+            for a in range(6):
+                wa = w * J_pose[i, a]
+                bc[f, a] += wa * r[i]
+                for b in range(6):
+                    Hcc[f, a, b] += wa * J_pose[i, b]
+                for b in range(3):
+                    W[e, a, b] += wa * J_point[i, b]
+
+
+@njit(cache=True, nogil=True)
+def _inverse3(M, out):
+    """Write the inverse of a symmetric positive definite (3, 3) matrix by its adjugate."""
+    a = M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1]
+    b = M[0, 2] * M[2, 1] - M[0, 1] * M[2, 2]
+    c = M[0, 1] * M[1, 2] - M[0, 2] * M[1, 1]
+    inverse_determinant = 1.0 / (M[0, 0] * a + M[1, 0] * b + M[2, 0] * c)
+    out[0, 0] = a * inverse_determinant
+    out[0, 1] = out[1, 0] = b * inverse_determinant
+    out[0, 2] = out[2, 0] = c * inverse_determinant
+    out[1, 1] = (M[0, 0] * M[2, 2] - M[0, 2] * M[2, 0]) * inverse_determinant
+    out[1, 2] = out[2, 1] = (M[0, 2] * M[1, 0] - M[0, 0] * M[1, 2]) * inverse_determinant
+    out[2, 2] = (M[0, 0] * M[1, 1] - M[0, 1] * M[1, 0]) * inverse_determinant
+
+
+@njit(cache=True, nogil=True)
+def _step(free, first_edge, edges, active, Hcc, bc, Hpp, bp, W, damping):
+    """Return the damped step of cameras (C, 6) and points (P, 3) through the Schur complement."""
+    cameras, points = len(Hcc), len(Hpp)
+    S = np.zeros((6 * cameras, 6 * cameras))
+    rhs = np.empty(6 * cameras)
+    for f in range(cameras):
+        for a in range(6):
+            rhs[6 * f + a] = bc[f, a]
+            for b in range(6):
+                S[6 * f + a, 6 * f + b] = Hcc[f, a, b]
+            S[6 * f + a, 6 * f + a] += damping * Hcc[f, a, a] + 1e-6
+    inverses = np.empty((points, 3, 3))
+    damped = np.empty((3, 3))
+    WV = np.empty((6, 3))
+    for p in range(points):
+        damped[:] = Hpp[p]
+        for a in range(3):
+            damped[a, a] += damping * Hpp[p, a, a] + 1e-6
+        _inverse3(damped, inverses[p])
+        V = inverses[p]
+        for e in range(first_edge[p], first_edge[p + 1]):
+            f = free[edges[e, 0]]
+            if f < 0 or not active[e]:
+                continue
+            for a in range(6):
+                for b in range(3):
+                    WV[a, b] = W[e, a, 0] * V[0, b] + W[e, a, 1] * V[1, b] + W[e, a, 2] * V[2, b]
+                rhs[6 * f + a] -= WV[a, 0] * bp[p, 0] + WV[a, 1] * bp[p, 1] + WV[a, 2] * bp[p, 2]
+            for other in range(first_edge[p], first_edge[p + 1]):
+                g = free[edges[other, 0]]
+                if g < f or not active[other]:
+                    continue
+                for a in range(6):
+                    for b in range(6):
+                        S[6 * f + a, 6 * g + b] -= (
+                            WV[a, 0] * W[other, b, 0] + WV[a, 1] * W[other, b, 1] + WV[a, 2] * W[other, b, 2]
+                        )
+    for i in range(6 * cameras):
+        for j in range(i):
+            S[i, j] = S[j, i]
+    step_cameras = np.linalg.solve(S, rhs).reshape(cameras, 6)
+    step_points = np.empty((points, 3))
+    residue = np.empty(3)
+    for p in range(points):
+        residue[:] = bp[p]
+        for e in range(first_edge[p], first_edge[p + 1]):
+            f = free[edges[e, 0]]
+            if f < 0 or not active[e]:
+                continue
+            for a in range(6):
+                for b in range(3):
+                    residue[b] -= W[e, a, b] * step_cameras[f, a]
+        step_points[p] = inverses[p] @ residue
+    return step_cameras, step_points
+
+
+@njit(cache=True, nogil=True)
+def adjust(poses, free, points, first_edge, edges, measured, weights, intrinsics, rounds, iterations):
+    """Return refined poses and points, and which edges passed the last χ² test.
+
+    Args:
+        poses: (K, 4, 4) T_camera_world of free and fixed keyframes.
+        free: (K,) int32: rank among the free keyframes, −1 for a fixed one.
+        points: (P, 3) metres, world.
+        first_edge: (P + 1,) int32: where each point's edges begin; edges are grouped by point.
+        edges: (E, 2) int32 keyframe and point of each observation.
+        measured: (E, 3) u, v, bf/z in pixels; NaN in the third place without depth.
+        weights: (E, 3) inverse variances, px⁻².
+        intrinsics: (5,) fx, fy, cx, cy, bf.
+        rounds: How often outlying edges are chosen; only the first round is robust.
+        iterations: Steps per round.
+    """
+    poses, points = poses.copy(), points.copy()
+    cameras = int(free.max()) + 1
+    Hcc, bc = np.empty((cameras, 6, 6)), np.empty((cameras, 6))
+    Hpp, bp = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
+    W = np.zeros((len(edges), 6, 3))
+    active = np.ones(len(edges), np.bool_)
+    r = np.empty(3)
+    for k in range(rounds):
+        robust = k == 0
+        damping = 1e-4
+        cost = _cost(poses, points, edges, measured, weights, intrinsics, active, robust)
+        _linearise(
+            poses, free, points, edges, measured, weights, intrinsics, active, robust, Hcc, bc, Hpp, bp, W
+        )
+        for _ in range(iterations):
+            step_cameras, step_points = _step(free, first_edge, edges, active, Hcc, bc, Hpp, bp, W, damping)
+            trial_poses = poses.copy()
+            for c in range(len(poses)):
+                if free[c] >= 0:
+                    trial_poses[c] = twist_exp(step_cameras[free[c]], poses[c])
+            trial_points = points + step_points
+            trial = _cost(trial_poses, trial_points, edges, measured, weights, intrinsics, active, robust)
+            if trial <= cost:
+                settled = cost - trial < 1e-4 * cost
+                poses, points, cost, damping = trial_poses, trial_points, trial, damping * 0.2
+                if settled:
+                    break
+                _linearise(
+                    poses,
+                    free,
+                    points,
+                    edges,
+                    measured,
+                    weights,
+                    intrinsics,
+                    active,
+                    robust,
+                    Hcc,
+                    bc,
+                    Hpp,
+                    bp,
+                    W,
+                )
+            else:
+                damping *= 10.0
+                if damping > 1e3:
+                    break
+        for e in range(len(edges)):
+            _, _, z = residual(poses[edges[e, 0]], points[edges[e, 1]], measured[e], intrinsics, r)
+            limit = CHI2_2DOF if np.isnan(measured[e, 2]) else CHI2_3DOF
+            active[e] = z > 0.05 and chi2(r, weights[e]) <= limit
+    return poses, points, active

@@ -1,0 +1,227 @@
+"""The map that frames are tracked against: keyframes, landmarks, and which sees which."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.geometry import Array, Transform, adjoint, apply, inverse
+from mapper.odometry.local_map.bundle import adjust
+from mapper.odometry.local_map.gather import count_observers, observations_of
+from mapper.odometry.local_map.observation import Observation
+from mapper.odometry.local_map.pose import normal_matrix
+from mapper.odometry.local_map.table import Table
+
+Ids = NDArray[np.int32]
+
+_WEAK_PRIOR = np.diag([1.0] * 3 + [0.01] * 3)
+"""1 rad and 10 m: keeps the information positive definite where a few landmarks leave directions open."""
+_BUNDLE_ROUNDS, _BUNDLE_ITERATIONS = 2, 5
+
+
+@dataclass(slots=True, eq=False)
+class Keyframe:
+    """A frame that stays in the map.
+
+    Attributes:
+        observation: Its features.
+        T_camera_world: (4, 4) current estimate.
+        landmark_of_feature: (N,) int32 landmark that each feature shows, −1 for none.
+    """
+
+    observation: Observation
+    T_camera_world: Transform
+    landmark_of_feature: Ids
+
+
+class LandmarkMap:
+    """Keyframes and landmarks, refined together in windows.
+
+    A landmark's observations form a linked list, newest first, so that adding one is cheap and compiled code
+    can walk them without Python objects.
+    """
+
+    def __init__(self, *, scale_factor: float) -> None:
+        self.keyframes: list[Keyframe] = []
+        self.landmarks = Table(
+            position=((3,), np.float64),
+            direction=((3,), np.float64),
+            words=((4,), np.uint64),
+            reach_m=((), np.float64),
+            newest=((), np.int32),
+            visible=((), np.int32),
+            found=((), np.int32),
+            observers=((), np.int32),
+        )
+        self._observations = Table(
+            older=((), np.int32),
+            keyframe=((), np.int32),
+            feature=((), np.int32),
+            measured=((3,), np.float64),
+            weights=((3,), np.float64),
+        )
+        self._scale_factor = scale_factor
+        self._first_landmark: list[int] = []
+
+    def add_keyframe(
+        self,
+        observation: Observation,
+        T_camera_world: Transform,
+        landmark_of_feature: Ids,
+        *,
+        new: NDArray[np.bool_],
+    ) -> int:
+        """Add a keyframe that sees known landmarks, and create landmarks from its ``new`` features.
+
+        Args:
+            observation: The frame's features.
+            T_camera_world: (4, 4).
+            landmark_of_feature: (N,) known landmark of each feature, −1 for none.
+            new: (N,) features with depth that become landmarks.
+
+        Returns:
+            The keyframe's index.
+        """
+        index = len(self.keyframes)
+        self._first_landmark.append(self.landmarks.size)
+        landmark_of_feature = landmark_of_feature.copy()
+        features = np.flatnonzero(new)
+        points_world = apply(inverse(T_camera_world), observation.points_camera[features])
+        landmark_of_feature[features] = self.landmarks.append(
+            len(features),
+            position=points_world,
+            direction=0.0,
+            words=observation.words[features],
+            reach_m=np.linalg.norm(observation.points_camera[features], axis=1)
+            * self._scale_factor ** observation.octave[features],
+            newest=-1,
+            visible=1,
+            found=1,
+            observers=0,
+        )
+        self.keyframes.append(Keyframe(observation, T_camera_world, landmark_of_feature))
+        self._link(index)
+        return index
+
+    def _link(self, index: int) -> None:
+        keyframe = self.keyframes[index]
+        features = np.flatnonzero(keyframe.landmark_of_feature >= 0)
+        ids = keyframe.landmark_of_feature[features]
+        centre_world = inverse(keyframe.T_camera_world)[:3, 3]
+        view = self.landmarks["position"][ids] - centre_world
+        self.landmarks["observers"][ids] += 1
+        self.landmarks["direction"][ids] += view / np.linalg.norm(view, axis=1, keepdims=True)
+        self.landmarks["newest"][ids] = self._observations.append(
+            len(features),
+            older=self.landmarks["newest"][ids],
+            keyframe=index,
+            feature=features,
+            measured=keyframe.observation.measured[features],
+            weights=keyframe.observation.weights[features],
+        )
+
+    def shared(self, landmarks: Ids) -> NDArray[np.int64]:
+        """Return (K,) how many of the landmarks each keyframe sees."""
+        counts: NDArray[np.int64] = count_observers(
+            landmarks,
+            self.landmarks["newest"],
+            self._observations["older"],
+            self._observations["keyframe"],
+            len(self.keyframes),
+        )
+        return counts
+
+    def seen_by(self, index: int) -> Ids:
+        """Return the landmarks that a keyframe sees, in feature order."""
+        ids = self.keyframes[index].landmark_of_feature
+        return ids[ids >= 0]
+
+    def covisible(self, index: int, *, min_shared: int) -> list[tuple[int, int]]:
+        """Return (keyframe, shared landmarks) of those that share enough; most first, newer wins a tie."""
+        counts = self.shared(self.seen_by(index))
+        counts[index] = 0
+        others = np.flatnonzero(counts >= min_shared)
+        order = np.lexsort((-others, -counts[others]))
+        return [(int(k), int(counts[k])) for k in others[order]]
+
+    def refine(self, index: int, *, window: int, min_shared: int) -> None:
+        """Adjust a keyframe, its most covisible ones and all they see; drop observations that then disagree.
+
+        Keyframes outside the window that see the same landmarks hold them in place; the first never moves.
+        """
+        members = [index, *(k for k, _ in self.covisible(index, min_shared=min_shared)[: window - 1])]
+        movable = sorted(set(members) - {0})
+        if not movable:
+            return
+        landmarks = np.unique(np.concatenate([self.seen_by(k) for k in members]))
+        first, observations = observations_of(
+            landmarks, self.landmarks["newest"], self._observations["older"], self._observations["keyframe"]
+        )
+        keyframe_ids, local = np.unique(self._observations["keyframe"][observations], return_inverse=True)
+        free = np.full(len(keyframe_ids), -1, np.int32)
+        free[np.searchsorted(keyframe_ids, movable)] = np.arange(len(movable))
+        rows = np.repeat(np.arange(len(landmarks)), np.diff(first))
+        poses, points, agree = adjust(
+            np.array([self.keyframes[k].T_camera_world for k in keyframe_ids]),
+            free,
+            self.landmarks["position"][landmarks],
+            first,
+            np.column_stack([local, rows]).astype(np.int32),
+            self._observations["measured"][observations],
+            self._observations["weights"][observations],
+            self.keyframes[index].observation.intrinsics,
+            _BUNDLE_ROUNDS,
+            _BUNDLE_ITERATIONS,
+        )
+        for k, f in zip(keyframe_ids, free, strict=True):
+            if f >= 0:
+                self.keyframes[k].T_camera_world = poses[np.searchsorted(keyframe_ids, k)]
+        self.landmarks["position"][landmarks] = points
+        self._unlink(observations[~agree])
+
+    def _unlink(self, observations: Ids) -> None:
+        keyframes, features = self._observations["keyframe"], self._observations["feature"]
+        landmarks = []
+        for e in observations:
+            landmarks.append(self.keyframes[keyframes[e]].landmark_of_feature[features[e]])
+            self.keyframes[keyframes[e]].landmark_of_feature[features[e]] = -1
+        keyframes[observations] = -1
+        np.subtract.at(self.landmarks["observers"], np.array(landmarks, dtype=np.intp), 1)
+
+    def cull(self, *, min_found_ratio: float) -> None:
+        """Forget landmarks past their probation that no second keyframe confirmed or tracking rarely finds.
+
+        Two keyframes after its birth a landmark must have a second observer; mismatches and depth errors at
+        object edges rarely get one (Mur-Artal & Tardós 2017, §VI-B).
+        """
+        index = len(self.keyframes) - 1
+        recent = np.arange(self._first_landmark[max(index - 3, 0)], self._first_landmark[max(index - 1, 0)])
+        unconfirmed = self.landmarks["observers"][recent] == 1
+        found, visible = self.landmarks["found"][recent], self.landmarks["visible"][recent]
+        forgotten = recent[unconfirmed | (found < min_found_ratio * visible)].astype(np.int32)
+        _, observations = observations_of(
+            forgotten, self.landmarks["newest"], self._observations["older"], self._observations["keyframe"]
+        )
+        self._unlink(observations)
+
+    def information(self, target: int, source: int) -> Array:
+        """Return the (6, 6) information that shared landmarks give about the source's pose in the target.
+
+        The landmarks are taken as fixed in the target. They were measured no better than the source's
+        features, so the information is halved. Tangent of the source's body, (rotation, translation).
+        """
+        keyframe = self.keyframes[source]
+        shared, _, features = np.intersect1d(
+            self.seen_by(target), keyframe.landmark_of_feature, return_indices=True
+        )
+        observation = keyframe.observation
+        H_camera = 0.5 * normal_matrix(
+            keyframe.T_camera_world,
+            self.landmarks["position"][shared],
+            observation.measured[features],
+            observation.weights[features],
+            observation.intrinsics,
+        )
+        to_camera = adjoint(inverse(observation.T_body_camera))
+        H_body: Array = to_camera.T @ H_camera @ to_camera
+        return H_body + _WEAK_PRIOR

@@ -1,0 +1,97 @@
+"""What tracking keeps of one RGB-D frame: features with depth, ready for the compiled kernels."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.config.odometry import LocalMapConfig
+from mapper.errors import FrameError
+from mapper.features.detectors import Detector
+from mapper.features.windowed import FeatureGrid, Words, build_grid, pack
+from mapper.frames import Frame, RgbdFrame
+from mapper.geometry import Array, Points, Transform
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """The features of one frame.
+
+    Attributes:
+        stamp_ns: The frame's stamp.
+        pixels: (N, 2) undistorted pixels.
+        octave: (N,) int32 pyramid level.
+        words: (N, 4) uint64 descriptors.
+        measured: (N, 3) u, v and virtual disparity bf / z in pixels; NaN in the third place without depth.
+        weights: (N, 3) inverse variances of the three, px⁻².
+        points_camera: (N, 3) metres; NaN without depth.
+        grid: The pixels sorted into cells.
+        intrinsics: (5,) fx, fy, cx, cy, bf in pixels (bf in pixel metres).
+        size_px: Image width and height.
+        T_body_camera: (4, 4) pose of the camera in the body frame.
+    """
+
+    stamp_ns: int
+    pixels: Array
+    octave: NDArray[np.int32]
+    words: Words
+    measured: Array
+    weights: Array
+    points_camera: Points
+    grid: FeatureGrid
+    intrinsics: Array
+    size_px: tuple[int, int]
+    T_body_camera: Transform
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @property
+    def has_depth(self) -> NDArray[np.bool_]:
+        """(N,) which features have depth."""
+        return ~np.isnan(self.measured[:, 2])
+
+
+def observe(frame: Frame, detector: Detector, config: LocalMapConfig) -> Observation:
+    """Detect features, look their depth up at the raw pixel, and undistort them.
+
+    Raises:
+        FrameError: The frame is a bare scan, or the detector's descriptors are not 256 bits.
+    """
+    if not isinstance(frame, RgbdFrame):
+        raise FrameError(
+            f"frame {frame.stamp_ns}: odometry 'local-map' needs colour and depth images, got a bare scan; "
+            "choose another odometry.kind"
+        )
+    camera = frame.camera
+    features = detector.detect(frame.gray)
+    if features.descriptors.dtype != np.uint8 or features.descriptors.shape[1] != 32:
+        raise FrameError(
+            "odometry 'local-map' needs 256-bit descriptors; choose detector 'orb' or 'uniform-orb'"
+        )
+    raw = np.rint(features.pixels).astype(np.intp)
+    column, row = raw[:, 0].clip(0, camera.width_px - 1), raw[:, 1].clip(0, camera.height_px - 1)
+    depth_m = frame.depth_m[row, column].astype(np.float64)
+    depth_m[depth_m <= 0.0] = np.nan
+    pixels = camera.undistort(features.pixels)
+    bf = config.virtual_baseline_px_m
+    sigma_px = detector.scale_factor ** features.octave.astype(np.float64)
+    return Observation(
+        stamp_ns=frame.stamp_ns,
+        pixels=pixels,
+        octave=features.octave,
+        words=pack(features.descriptors),
+        measured=np.column_stack([pixels, bf / depth_m]),
+        weights=np.column_stack([sigma_px, sigma_px, sigma_px * config.disparity_sigma_px]) ** -2.0,
+        points_camera=np.column_stack(
+            [
+                (pixels[:, 0] - camera.cx_px) / camera.fx_px * depth_m,
+                (pixels[:, 1] - camera.cy_px) / camera.fy_px * depth_m,
+                depth_m,
+            ]
+        ),
+        grid=build_grid(pixels, camera.width_px, camera.height_px),
+        intrinsics=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, bf]),
+        size_px=(camera.width_px, camera.height_px),
+        T_body_camera=frame.T_body_camera,
+    )

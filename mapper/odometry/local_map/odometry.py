@@ -1,0 +1,163 @@
+"""Frame by frame against a local map of keyframes (after Mur-Artal & Tardós 2017; Zhao et al. 2020)."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mapper.config.odometry import LocalMapConfig
+from mapper.features.detectors import build_detector
+from mapper.frames import Frame
+from mapper.geometry import Transform, inverse
+from mapper.graph.model import BetweenFactor
+from mapper.odometry.base import Diagnostics, Track
+from mapper.odometry.local_map.landmarks import LandmarkMap
+from mapper.odometry.local_map.observation import Observation, observe
+from mapper.odometry.local_map.placing import Placement, Placer
+
+
+class LocalMapOdometry:
+    """Tracks against keyframes' landmarks and refines both by local bundle adjustment.
+
+    Keyframes are the graph's nodes, numbered from 0. Their poses keep improving while they are in the window,
+    so all factors are handed out by ``finish``.
+    """
+
+    def __init__(self, config: LocalMapConfig) -> None:
+        self._config = config
+        self._detector = build_detector(config.detector)
+        self._map = LandmarkMap(scale_factor=self._detector.scale_factor)
+        self._placer = Placer(config, self._map, scale_factor=self._detector.scale_factor)
+        self._last: Placement | None = None
+        self._before_last: Placement | None = None
+        self._most_inliers = 0  # since the last keyframe
+        self._frames_since_keyframe = 0
+        self._lost_frames = 0
+
+    def observe(self, frame: Frame) -> Observation:
+        """Detect features and look up their depth. Pure; safe in any thread.
+
+        Raises:
+            FrameError: The frame is a bare scan.
+        """
+        return observe(frame, self._detector, self._config)
+
+    def track(self, observation: Observation) -> Track:
+        """Place the next frame, in time order."""
+        if self._last is None:
+            return self._start(observation)
+        placement = self._place(observation, self._last)
+        if placement is None:
+            return self._lost(observation)
+        self._lost_frames = 0
+        self._frames_since_keyframe += 1
+        self._most_inliers = max(self._most_inliers, placement.inliers)
+        is_keyframe = self._wants_keyframe(placement)
+        if is_keyframe:
+            placement = self._keep(placement)
+        self._before_last, self._last = self._last, placement
+        return self._track(placement, is_keyframe=is_keyframe)
+
+    def finish(self) -> Sequence[BetweenFactor]:
+        """Return a factor from every keyframe to those earlier ones that share most landmarks with it."""
+        T_world_body = [_body_pose(k.observation, k.T_camera_world) for k in self._map.keyframes]
+        factors = []
+        for j in range(1, len(T_world_body)):
+            earlier = [(k, shared) for k, shared in self._map.covisible(j, min_shared=1) if k < j]
+            strong = [k for k, shared in earlier if shared >= self._config.min_shared_landmarks]
+            weak = [k for k, _ in earlier[:1]] or [j - 1]
+            for i in strong[: self._config.factors_per_keyframe] or weak:
+                T_i_j = inverse(T_world_body[i]) @ T_world_body[j]
+                factors.append(BetweenFactor(i, j, T_i_j, self._map.information(i, j)))
+        return factors
+
+    def _start(self, observation: Observation) -> Track:
+        """Make the first frame with enough depth the world's origin."""
+        usable = int((observation.points_camera[:, 2] <= self._config.max_depth_m).sum())
+        if usable < self._config.min_start_features:
+            return self._lost(observation)
+        nothing = np.full(len(observation), -1, np.int32)
+        origin = Placement(observation, observation.T_body_camera, nothing, 0, 0, 0.0, "start")
+        self._last = self._keep(origin)
+        return self._track(self._last, is_keyframe=True)
+
+    def _place(self, observation: Observation, last: Placement) -> Placement | None:
+        """Try, in this order: the predicted motion, the latest keyframes, all that look alike."""
+        if self._lost_frames == 0:
+            placement = self._placer.by_motion(observation, last, self._before_last)
+            if placement is not None:
+                return placement
+            newest = range(len(self._map.keyframes) - 1, max(len(self._map.keyframes) - 4, -1), -1)
+            latest = list(dict.fromkeys([last.reference, *newest]))
+            placement = self._placer.by_matching(observation, latest, method="fallback")
+            if placement is not None:
+                return placement
+        here_world = inverse(last.T_camera_world)[:3, 3]
+        lookalikes = self._placer.lookalikes(observation, here_world, turn=self._lost_frames)
+        return self._placer.by_matching(observation, lookalikes, method="relocalised")
+
+    def _wants_keyframe(self, placement: Placement) -> bool:
+        config = self._config
+        if self._frames_since_keyframe >= config.max_keyframe_gap or placement.inliers < config.weak_inliers:
+            return True
+        fading = placement.inliers < config.keyframe_ratio * self._most_inliers
+        return fading and self._frames_since_keyframe >= config.min_keyframe_gap
+
+    def _keep(self, placement: Placement) -> Placement:
+        """Turn a placed frame into a keyframe, refine the map around it, and return it as refined."""
+        config, observation = self._config, placement.observation
+        near = observation.points_camera[:, 2] <= config.max_depth_m
+        index = self._map.add_keyframe(
+            observation,
+            placement.T_camera_world,
+            placement.landmark_of_feature,
+            new=near & (placement.landmark_of_feature < 0),
+        )
+        self._map.refine(index, window=config.bundle_keyframes, min_shared=config.min_shared_landmarks)
+        self._map.cull(min_found_ratio=config.min_found_ratio)
+        self._most_inliers, self._frames_since_keyframe = 0, 0
+        keyframe = self._map.keyframes[index]
+        return replace(
+            placement,
+            T_camera_world=keyframe.T_camera_world,
+            landmark_of_feature=keyframe.landmark_of_feature,
+            reference=index,
+        )
+
+    def _track(self, placement: Placement, *, is_keyframe: bool) -> Track:
+        T_world_body = _body_pose(placement.observation, placement.T_camera_world)
+        node = self._map.keyframes[placement.reference]
+        T_world_node = _body_pose(node.observation, node.T_camera_world)
+        diagnostics = Diagnostics(
+            features=len(placement.observation),
+            matches=placement.matches,
+            inliers=placement.inliers,
+            residual=placement.residual_px,
+            residual_unit="px",
+            method=placement.method,
+        )
+        return Track(
+            stamp_ns=placement.observation.stamp_ns,
+            node=placement.reference,
+            T_node_body=inverse(T_world_node) @ T_world_body,
+            T_world_body=T_world_body,
+            is_keyframe=is_keyframe,
+            diagnostics=diagnostics,
+        )
+
+    def _lost(self, observation: Observation) -> Track:
+        self._lost_frames += 1
+        last = self._last
+        return Track(
+            stamp_ns=observation.stamp_ns,
+            node=None,
+            T_node_body=np.eye(4),
+            T_world_body=np.eye(4) if last is None else _body_pose(last.observation, last.T_camera_world),
+            is_keyframe=False,
+            diagnostics=Diagnostics(len(observation), 0, 0, 0.0, "px", "lost"),
+        )
+
+
+def _body_pose(observation: Observation, T_camera_world: Transform) -> Transform:
+    """Return T_world_body."""
+    return inverse(observation.T_body_camera @ T_camera_world)
