@@ -71,8 +71,10 @@ def trajectory_from(poses: Iterable[tuple[int, Transform]]) -> Trajectory:
 def read_tum(path: Path) -> Trajectory:
     """Read ``stamp tx ty tz qx qy qz qw`` lines (Sturm et al. 2012); quaternions are normalised.
 
+    Of two poses with the same stamp the first counts: fr2_desk's truth rounds two samples to one stamp.
+
     Raises:
-        DataError: A line that is not eight finite numbers, a zero quaternion, or stamps that do not increase.
+        DataError: A line that is not eight finite numbers, a zero quaternion, or stamps that decrease.
     """
     stamps_ns: list[int] = []
     poses: list[Transform] = []
@@ -87,10 +89,10 @@ def read_tum(path: Path) -> Trajectory:
             poses.append(transform(rotation_from_quaternion(values[3:]), values[:3]))
         except (DataError, ValueError) as error:
             raise DataError(f"{path}:{number}: {error}") from None
-        if len(stamps_ns) > 1 and stamps_ns[-1] <= stamps_ns[-2]:
-            raise DataError(
-                f"{path}:{number}: stamp {words[0]} does not come after the line before; sort the file"
-            )
+        if len(stamps_ns) > 1 and stamps_ns[-1] == stamps_ns[-2]:
+            del stamps_ns[-1], poses[-1]
+        elif len(stamps_ns) > 1 and stamps_ns[-1] < stamps_ns[-2]:
+            raise DataError(f"{path}:{number}: stamp {words[0]} comes before the line above; sort the file")
     if not poses:
         raise DataError(f"{path}: no poses; want lines of stamp tx ty tz qx qy qz qw")
     return Trajectory(np.array(stamps_ns, dtype=np.int64), np.array(poses))

@@ -1,0 +1,60 @@
+"""One measured number with its name and unit, and tables of them."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+from mapper.errors import DataError
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """What was measured, the value, and in which unit.
+
+    Attributes:
+        name: What a reader would call it, with whatever it depends on: "ATE RMSE, SE(3)-aligned".
+        value: A finite number; what could not be measured is not a metric.
+        unit: "m", "rad", "s", or what was counted: "pairs", "frames".
+    """
+
+    name: str
+    value: float
+    unit: str
+
+    def __post_init__(self) -> None:
+        if not self.name or not self.unit:
+            raise DataError(
+                f"metric {self.name!r} of {self.value}: needs a name and a unit, not {self.unit!r}"
+            )
+        if not math.isfinite(self.value):
+            raise DataError(f"metric {self.name!r} is {self.value}; leave out what could not be measured")
+
+
+def text_table(metrics: Sequence[Metric]) -> str:
+    """Return aligned lines of name, value and unit for a terminal; angles in degrees."""
+    rows = [_shown(metric) for metric in metrics]
+    name_width = max((len(name) for name, _, _ in rows), default=0)
+    value_width = max((len(value) for _, value, _ in rows), default=0)
+    return "\n".join(f"{name:<{name_width}}  {value:>{value_width}} {unit}" for name, value, unit in rows)
+
+
+def markdown_table(metrics: Sequence[Metric]) -> str:
+    """Return a Markdown table for a report; angles in degrees."""
+    lines = ["| metric | value | unit |", "| --- | ---: | --- |"]
+    lines += [f"| {name} | {value} | {unit} |" for name, value, unit in map(_shown, metrics)]
+    return "\n".join(lines)
+
+
+def json_text(metrics: Sequence[Metric]) -> str:
+    """Return a JSON list for other programs: every digit, angles in radians."""
+    return json.dumps([asdict(metric) for metric in metrics], indent=2, ensure_ascii=False)
+
+
+def _shown(metric: Metric) -> tuple[str, str, str]:
+    """Degrees exist only here, on the screen."""
+    if metric.unit == "rad":
+        return metric.name, f"{math.degrees(metric.value):.6g}", "°"
+    if isinstance(metric.value, int):
+        return metric.name, str(metric.value), metric.unit
+    return metric.name, f"{metric.value:.6g}", metric.unit
