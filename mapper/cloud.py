@@ -118,19 +118,20 @@ def _rehash(slots, keys, size):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _fold(points, colors, voxels_per_m, slots, keys, sums, size):  # type: ignore[no-untyped-def]
     """Add each point to its voxel's sums and return how many voxels there are now."""
+    last_key, voxel = np.int64(-1), np.int64(-1)
     for i in range(len(points)):
         key = np.int64(0)
         for axis in range(3):
             cell = np.int64(np.floor(np.float64(points[i, axis]) * voxels_per_m))
             key = (key << _KEY_BITS) | (cell + _HALF_SPAN)
-        slot = _slot_of(slots, keys, key)
-        voxel = slots[slot]
-        if voxel < 0:
-            voxel = size
-            slots[slot] = voxel
-            keys[voxel] = key
-            sums[voxel] = 0.0
-            size += 1
+        if key != last_key:  # neighbouring pixels mostly share a voxel, and a look-up is what costs
+            slot = _slot_of(slots, keys, key)
+            if slots[slot] < 0:
+                slots[slot] = size
+                keys[size] = key
+                sums[size] = 0.0
+                size += 1
+            last_key, voxel = key, np.int64(slots[slot])
         for axis in range(3):
             sums[voxel, axis] += points[i, axis]
             sums[voxel, 3 + axis] += colors[i, axis]
