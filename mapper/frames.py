@@ -7,8 +7,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.back_projection import back_project
 from mapper.errors import DataError
-from mapper.geometry import Array, Points, Transform, apply, is_rigid
+from mapper.geometry import Array, Points, Transform, is_rigid
 
 Image = NDArray[np.uint8]
 DepthImage = NDArray[np.float32]
@@ -161,22 +162,28 @@ class RgbdFrame:
         return rgb
 
     def scan(self, *, stride_px: int = 1, max_depth_m: float = np.inf) -> Scan:
-        """Return the measured pixels as a coloured scan in the body frame (thesis alg. 3, eq. 2.47–2.48).
+        """Return the measured pixels as a scan in the body frame; a colour image colours it.
 
         Args:
             stride_px: Keep every n-th row and column.
             max_depth_m: Drop deeper measurements.
         """
-        depth_m = self.depth_m[::stride_px, ::stride_px]
-        valid = (depth_m > 0.0) & (depth_m <= max_depth_m)
-        z = depth_m[valid]
-        rays = ray_table(self.camera)[::stride_px, ::stride_px][valid]
-        points_camera = np.column_stack([rays[:, 0] * z, rays[:, 1] * z, z])
+        points_body = back_project(
+            self.depth_m,
+            ray_table(self.camera),
+            self.T_body_camera,
+            stride_px=stride_px,
+            max_depth_m=max_depth_m,
+        )
+        colors = None
+        if self.image.ndim == 3:
+            depth_m = self.depth_m[::stride_px, ::stride_px]
+            colors = self.image[::stride_px, ::stride_px][(depth_m > 0.0) & (depth_m <= max_depth_m)]
         return Scan(
             stamp_ns=self.stamp_ns,
-            points_body=apply(self.T_body_camera, points_camera).astype(np.float32),
+            points_body=points_body,
             origin_body=self.T_body_camera[:3, 3],
-            colors=self.rgb[::stride_px, ::stride_px][valid],
+            colors=colors,
         )
 
 
