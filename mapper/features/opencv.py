@@ -1,7 +1,7 @@
 """The detectors that OpenCV brings: ORB, SIFT and AKAZE."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -11,7 +11,6 @@ from mapper.config.features import AkazeConfig, OrbConfig, SiftConfig
 from mapper.features.detectors import Features
 from mapper.frames import Image
 
-KeyPoints = tuple[cv2.KeyPoint, ...]
 # Detector objects are made anew for every image: it costs microseconds, and shared ones are not thread-safe.
 
 
@@ -31,7 +30,7 @@ class Orb:
         config = self._config
 
         def attempt(threshold: float) -> Features:
-            orb = cv2.ORB_create(
+            orb = cv2.ORB.create(
                 nfeatures=config.max_features,
                 scaleFactor=config.scale_factor,
                 nlevels=config.levels,
@@ -56,7 +55,7 @@ class Sift:
         config = self._config
 
         def attempt(threshold: float) -> Features:
-            sift = cv2.SIFT_create(nfeatures=config.max_features, contrastThreshold=threshold)
+            sift = cv2.SIFT.create(nfeatures=config.max_features, contrastThreshold=threshold)
             keypoints, descriptors = sift.detectAndCompute(gray, None)
             # The low byte is the octave; 255 is -1, the doubled image that SIFT starts from.
             octaves = [(k.octave + 1) & 0xFF for k in keypoints]
@@ -78,7 +77,7 @@ class Akaze:
         config = self._config
 
         def attempt(threshold: float) -> Features:
-            akaze = cv2.xfeatures2d.AKAZE_create(threshold=threshold)
+            akaze = cv2.xfeatures2d.AKAZE.create(threshold=threshold)
             keypoints, descriptors = akaze.detectAndCompute(gray, None)
             features = features_from(keypoints, descriptors, [k.octave for k in keypoints], width=61)
             return strongest(features, config.max_features)
@@ -119,7 +118,7 @@ def strongest(features: Features, count: int) -> Features:
 
 
 def features_from(
-    keypoints: KeyPoints,
+    keypoints: Sequence[cv2.KeyPoint],
     descriptors: NDArray[np.uint8] | NDArray[np.float32] | None,
     octaves: list[int],
     *,
@@ -136,7 +135,7 @@ def features_from(
         )
     n = len(keypoints)
     return Features(
-        pixels=cv2.KeyPoint_convert(keypoints),
+        pixels=np.asarray(cv2.KeyPoint.convert(keypoints), np.float32),
         octave=np.array(octaves, np.int32),
         angle_rad=np.fromiter((k.angle for k in keypoints), np.float32, n) * np.float32(math.pi / 180.0),
         response=np.fromiter((k.response for k in keypoints), np.float32, n),

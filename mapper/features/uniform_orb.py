@@ -1,0 +1,95 @@
+"""ORB features spread evenly over the image."""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.config.features import UniformOrbConfig
+from mapper.features.detectors import Features
+from mapper.features.fast import Pixels, corners, fast_scores, orientations
+from mapper.features.quadtree import spread
+from mapper.frames import Image
+
+_MARGIN_PX = 19  # the rotated descriptor's tests reach this far
+_PATCH_PX = 31
+_DESCRIPTOR_BYTES = 32
+
+
+class UniformOrb:
+    """Oriented FAST corners from every part of every pyramid level, described by OpenCV's ORB.
+
+    Zhao et al. 2020, §2.1, after Mur-Artal & Tardós 2017: FAST in cells with two thresholds, then one
+    quadtree per level. A level's share of the features falls with its side length; what a coarse level
+    cannot fill, the finer ones get.
+    """
+
+    def __init__(self, config: UniformOrbConfig) -> None:
+        self._config = config
+
+    @property
+    def scale_factor(self) -> float:
+        """How much larger a pixel gets from one octave to the next."""
+        return self._config.scale_factor
+
+    def detect(self, gray: Image) -> Features:
+        """Return the features of an (H, W) uint8 image; none where it has no texture."""
+        levels = list(self._pyramid(gray))
+        shares = np.power(self._config.scale_factor, -np.arange(len(levels), dtype=np.float64))
+        wanted = 0.0
+        parts: list[Features] = []
+        for octave in reversed(range(len(levels))):
+            wanted += self._config.max_features * shares[octave] / shares.sum()
+            part = self._describe(levels[octave], octave, *self._corners(levels[octave], round(wanted)))
+            wanted -= len(part)
+            parts.append(part)
+        return _joined(parts[::-1])
+
+    def _pyramid(self, gray: Image) -> Iterator[Image]:
+        """Yield the levels, finest first, while they are large enough to hold a descriptor."""
+        height, width = gray.shape
+        level = gray
+        for octave in range(self._config.levels):
+            scale = self._config.scale_factor**octave
+            size = round(width / scale), round(height / scale)
+            if min(size) <= 2 * _MARGIN_PX:
+                return
+            if octave:
+                level = cv2.resize(level, size, interpolation=cv2.INTER_LINEAR_EXACT)
+            yield level
+
+    def _corners(self, level: Image, wanted: int) -> tuple[Pixels, NDArray[np.uint8]]:
+        config = self._config
+        scores = fast_scores(level, config.min_threshold, _MARGIN_PX)
+        pixels, strength = corners(scores, config.threshold, config.cell_px, _MARGIN_PX)
+        kept = spread(pixels, strength, level.shape[1], level.shape[0], wanted)
+        return pixels[kept], strength[kept]
+
+    def _describe(self, level: Image, octave: int, pixels: Pixels, strength: NDArray[np.uint8]) -> Features:
+        angle_rad = orientations(level, pixels)
+        degrees = np.degrees(angle_rad).tolist()
+        keypoints = [
+            cv2.KeyPoint(x, y, _PATCH_PX, angle)
+            for (x, y), angle in zip(pixels.astype(np.float32).tolist(), degrees, strict=True)
+        ]
+        # Each level is described on its own: OpenCV would build the pyramid again.
+        orb = cv2.ORB.create(nlevels=1, edgeThreshold=_MARGIN_PX, patchSize=_PATCH_PX)
+        descriptors = orb.compute(level, keypoints)[1] if keypoints else None
+        return Features(
+            pixels=((pixels + 0.5) * self._config.scale_factor**octave - 0.5).astype(np.float32),
+            octave=np.full(len(pixels), octave, np.int32),
+            angle_rad=angle_rad,
+            response=strength.astype(np.float32),
+            descriptors=np.empty((0, _DESCRIPTOR_BYTES), np.uint8) if descriptors is None else descriptors,
+        )
+
+
+def _joined(parts: list[Features]) -> Features:
+    return Features(
+        np.concatenate([part.pixels for part in parts]),
+        np.concatenate([part.octave for part in parts]),
+        np.concatenate([part.angle_rad for part in parts]),
+        np.concatenate([part.response for part in parts]),
+        np.concatenate([part.descriptors for part in parts]),
+    )
