@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 CELL_PX = 16
@@ -14,17 +15,17 @@ Words = NDArray[np.uint64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureGrid:
-    """Features sorted into square cells, so that a search touches only its neighbourhood.
+    """Where the features of each square cell begin, once they are sorted by cell.
+
+    Sorted, the candidates of a search lie side by side in memory.
 
     Attributes:
-        start: (cells + 1,) int32: where each cell's features begin in ``order``; cells run row by row.
-        order: (N,) int32 feature indices, grouped by cell.
+        start: (cells + 1,) int32 first feature of each cell; cells run row by row.
         columns: How many cells a row has.
         rows: How many rows of cells.
     """
 
     start: NDArray[np.int32]
-    order: NDArray[np.int32]
     columns: int
     rows: int
 
@@ -34,28 +35,35 @@ def pack(descriptors: NDArray[np.uint8] | NDArray[np.float32]) -> Words:
     return np.ascontiguousarray(descriptors).view(np.uint64).reshape(-1, 4)
 
 
-def build_grid(pixels: NDArray[np.float64], width_px: int, height_px: int) -> FeatureGrid:
-    """Sort (N, 2) pixels into cells; those that undistortion pushed outside join the border cells."""
+def sort_into_grid(
+    pixels: NDArray[np.float64], *, width_px: int, height_px: int
+) -> tuple[NDArray[np.intp], FeatureGrid]:
+    """Return the order that sorts (N, 2) pixels by cell, and the grid of the sorted pixels.
+
+    Pixels that undistortion pushed outside the image join the border cells.
+    """
     columns, rows = -(-width_px // CELL_PX), -(-height_px // CELL_PX)
     cell = np.clip(pixels // CELL_PX, 0, [columns - 1, rows - 1]).astype(np.int32)
     index = cell[:, 1] * columns + cell[:, 0]
-    order = np.argsort(index, kind="stable").astype(np.int32)
+    order = np.argsort(index, kind="stable")
     start = np.searchsorted(index[order], np.arange(columns * rows + 1)).astype(np.int32)
-    return FeatureGrid(start, order, columns, rows)
+    return order, FeatureGrid(start, columns, rows)
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _popcount(x):
-    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
-    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
-    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
+@intrinsic
+def _popcount(_context, x):
+    """Count the set bits of a uint64 with the processor's own instruction, which numba does not expose."""
+
+    def generate(_typing, builder, _signature, arguments):
+        return builder.ctpop(arguments[0])
+
+    return x(x), generate
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def hamming(a, i, b, j):
     """Return how many of the 256 bits of row i of a and row j of b differ."""
-    return (
+    return np.int64(
         _popcount(a[i, 0] ^ b[j, 0])
         + _popcount(a[i, 1] ^ b[j, 1])
         + _popcount(a[i, 2] ^ b[j, 2])
@@ -74,7 +82,6 @@ def match_windows(
     words,
     taken,
     start,
-    order,
     columns,
     rows,
     max_hamming,
@@ -90,12 +97,11 @@ def match_windows(
         predicted_octave: (M,) int32.
         radius_px: (M,) float64 search radius.
         predicted_words: (M, 4) uint64 descriptors.
-        pixels: (N, 2) float64 features' pixels.
+        pixels: (N, 2) float64 features' pixels, sorted by cell.
         octave: (N,) int32 features' octaves.
         words: (N, 4) uint64 features' descriptors.
         taken: (N,) bool: features that are not to be used.
         start: The FeatureGrid's.
-        order: The FeatureGrid's.
         columns: The FeatureGrid's.
         rows: The FeatureGrid's.
         max_hamming: Largest distance in bits.
@@ -112,8 +118,7 @@ def match_windows(
         bottom = min(int((v + r) // CELL_PX), rows - 1)
         best, second, best_octave, second_octave, best_feature = 257, 257, -1, -1, -1
         for row in range(top, bottom + 1):
-            for k in range(start[row * columns + left], start[row * columns + right + 1]):
-                f = order[k]
+            for f in range(start[row * columns + left], start[row * columns + right + 1]):
                 if taken[f] or abs(octave[f] - predicted_octave[m]) > 1:
                     continue
                 if abs(pixels[f, 0] - u) > r or abs(pixels[f, 1] - v) > r:

@@ -1,5 +1,6 @@
 """The map that frames are tracked against: keyframes, landmarks, and which sees which."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -136,6 +137,15 @@ class LandmarkMap:
         ids = self.keyframes[index].landmark_of_feature
         return ids[ids >= 0]
 
+    def seen_by_any(self, keyframes: Iterable[int], *, except_for: Ids) -> Ids:
+        """Return, in increasing order, the landmarks that any of the keyframes sees."""
+        seen = np.zeros(self.landmarks.size + 1, np.bool_)
+        for k in keyframes:
+            seen[self.keyframes[k].landmark_of_feature] = True  # −1, "none", marks the spare last place
+        seen[-1] = False
+        seen[except_for] = False
+        return np.flatnonzero(seen).astype(np.int32)
+
     def covisible(self, index: int, *, min_shared: int) -> list[tuple[int, int]]:
         """Return (keyframe, shared landmarks) of those that share enough; most first, newer wins a tie."""
         counts = self.shared(self.seen_by(index))
@@ -153,7 +163,7 @@ class LandmarkMap:
         movable = sorted(set(members) - {0})
         if not movable:
             return
-        landmarks = np.unique(np.concatenate([self.seen_by(k) for k in members]))
+        landmarks = self.seen_by_any(members, except_for=np.empty(0, np.int32))
         first, observations = observations_of(
             landmarks, self.landmarks["newest"], self._observations["older"], self._observations["keyframe"]
         )

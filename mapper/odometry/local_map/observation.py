@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from mapper.config.odometry import LocalMapConfig
 from mapper.errors import FrameError
 from mapper.features.detectors import Detector
-from mapper.features.windowed import FeatureGrid, Words, build_grid, pack
+from mapper.features.windowed import FeatureGrid, Words, pack, sort_into_grid
 from mapper.frames import Frame, RgbdFrame
 from mapper.geometry import Array, Points, Transform
 
@@ -25,7 +25,7 @@ class Observation:
         measured: (N, 3) u, v and virtual disparity bf / z in pixels; NaN in the third place without depth.
         weights: (N, 3) inverse variances of the three, px⁻².
         points_camera: (N, 3) metres; NaN without depth.
-        grid: The pixels sorted into cells.
+        grid: Which of the features, sorted by cell, lie where.
         intrinsics: (5,) fx, fy, cx, cy, bf in pixels (bf in pixel metres).
         size_px: Image width and height.
         T_body_camera: (4, 4) pose of the camera in the body frame.
@@ -69,29 +69,28 @@ def observe(frame: Frame, detector: Detector, config: LocalMapConfig) -> Observa
         raise FrameError(
             "odometry 'local-map' needs 256-bit descriptors; choose detector 'orb' or 'uniform-orb'"
         )
-    raw = np.rint(features.pixels).astype(np.intp)
+    pixels = camera.undistort(features.pixels)
+    order, grid = sort_into_grid(pixels, width_px=camera.width_px, height_px=camera.height_px)
+    pixels, octave = pixels[order], features.octave[order]
+    raw = np.rint(features.pixels[order]).astype(np.intp)
     column, row = raw[:, 0].clip(0, camera.width_px - 1), raw[:, 1].clip(0, camera.height_px - 1)
     depth_m = frame.depth_m[row, column].astype(np.float64)
     depth_m[depth_m <= 0.0] = np.nan
-    pixels = camera.undistort(features.pixels)
-    bf = config.virtual_baseline_px_m
-    sigma_px = detector.scale_factor ** features.octave.astype(np.float64)
+    intrinsics = np.array(
+        [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, config.virtual_baseline_px_m]
+    )
+    sigma_px = detector.scale_factor ** octave.astype(np.float64)
+    rays = (pixels - intrinsics[2:4]) / intrinsics[:2]
     return Observation(
         stamp_ns=frame.stamp_ns,
         pixels=pixels,
-        octave=features.octave,
-        words=pack(features.descriptors),
-        measured=np.column_stack([pixels, bf / depth_m]),
+        octave=octave,
+        words=pack(features.descriptors[order]),
+        measured=np.column_stack([pixels, config.virtual_baseline_px_m / depth_m]),
         weights=np.column_stack([sigma_px, sigma_px, sigma_px * config.disparity_sigma_px]) ** -2.0,
-        points_camera=np.column_stack(
-            [
-                (pixels[:, 0] - camera.cx_px) / camera.fx_px * depth_m,
-                (pixels[:, 1] - camera.cy_px) / camera.fy_px * depth_m,
-                depth_m,
-            ]
-        ),
-        grid=build_grid(pixels, camera.width_px, camera.height_px),
-        intrinsics=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, bf]),
+        points_camera=np.column_stack([rays * depth_m[:, None], depth_m]),
+        grid=grid,
+        intrinsics=intrinsics,
         size_px=(camera.width_px, camera.height_px),
         T_body_camera=frame.T_body_camera,
     )

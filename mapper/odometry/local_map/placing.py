@@ -189,8 +189,7 @@ class Placer:
         counts = self._map.shared(matched)
         order = np.argsort(-counts, kind="stable")[: config.local_keyframes]
         local = [int(k) for k in order if counts[k] > 0] or [reference]
-        nearby = np.unique(np.concatenate([self._map.seen_by(k) for k in local]))
-        nearby = np.setdiff1d(nearby, matched, assume_unique=True)
+        nearby = self._map.seen_by_any(local, except_for=matched)
         rows, pixels, octave = project_visible(
             nearby,
             landmarks["position"],
@@ -263,7 +262,6 @@ class Placer:
             observation.words,
             taken,
             grid.start,
-            grid.order,
             grid.columns,
             grid.rows,
             max_hamming,

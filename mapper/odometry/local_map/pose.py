@@ -223,8 +223,9 @@ def _rigid3(world, camera):
         frames[s, :, 1] = np.cross(e3, e1)
         frames[s, :, 2] = e3
     T = np.eye(4)
-    T[:3, :3] = np.ascontiguousarray(frames[1]) @ np.ascontiguousarray(frames[0].T)
-    T[:3, 3] = (camera[0] + camera[1] + camera[2] - T[:3, :3] @ (world[0] + world[1] + world[2])) / 3.0
+    R = np.ascontiguousarray(frames[1]) @ np.ascontiguousarray(frames[0].T)
+    T[:3, :3] = R
+    T[:3, 3] = (camera[0] + camera[1] + camera[2] - R @ (world[0] + world[1] + world[2])) / 3.0
     return T
 
 
