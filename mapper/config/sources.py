@@ -32,4 +32,6 @@ class SourceConfig(Config):
     max_truth_gap_s: NonNegativeFloat = 0.02
     max_pair_gap_s: NonNegativeFloat = 0.02
     """Largest time between a colour image and its depth image."""
+    rate_hz: PositiveFloat | None = None
+    """Frames per second of numbered images without stamps; None is the format's own (30, Poznań 10)."""
     camera: CameraConfig | None = None

@@ -1,1 +1,34 @@
 """Recorded logs as sequences of frames."""
+
+from pathlib import Path
+
+from mapper.config.sources import SourceConfig
+from mapper.errors import SourceError
+from mapper.sources import mbag, numbered, poznan, tum
+from mapper.sources.base import FrameSource
+from mapper.sources.selection import select
+
+__all__ = ["open_source"]
+
+# The first that recognises a path opens it. Poznań's images are numbered too, so it is asked before.
+_FORMATS = (tum, mbag, poznan, numbered)
+_DEFAULTS = SourceConfig()
+
+
+def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> FrameSource:
+    """Return a recorded log, recognised by its files, with the configured selection of its frames.
+
+    Args:
+        path: Folder of a TUM, Poznań, 7-Scenes or Redwood log, or an mbag file or its folder.
+        config: Selection, pairing and camera.
+
+    Raises:
+        SourceError: Nothing is there, no format fits, the log is malformed or nothing of it is selected.
+    """
+    if not path.exists():
+        raise SourceError(f"{path}: no such file or folder")
+    for log_format in _FORMATS:
+        if log_format.recognise(path):
+            return select(log_format.open_log(path, config), config)
+    looked_for = "; ".join(log_format.LOOKED_FOR for log_format in _FORMATS)
+    raise SourceError(f"{path}: not a log of a known format; looked for {looked_for}")

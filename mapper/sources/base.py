@@ -11,12 +11,34 @@ from mapper.timebase import Stamps
 from mapper.trajectory import Trajectory
 
 
+@dataclass(frozen=True, slots=True)
+class ImageFiles:
+    """The files behind an RGB-D frame, so that a log can be converted without decoding its images.
+
+    Attributes:
+        colour: Colour image.
+        depth: 16-bit depth image.
+        depth_stamp_ns: Time of the depth image, nanoseconds.
+        depth_units_per_m: Depth image units per metre.
+    """
+
+    colour: Path
+    depth: Path
+    depth_stamp_ns: int
+    depth_units_per_m: float
+
+
 class Entry(Protocol):
     """One frame of a log that has not been read yet, so that reading can run ahead in other threads."""
 
     @property
     def stamp_ns(self) -> int:
         """Time of the frame, nanoseconds."""
+        ...
+
+    @property
+    def files(self) -> ImageFiles | None:
+        """The frame's own image files, where it has any."""
         ...
 
     def load(self, *, colour: bool = True) -> Frame:
@@ -49,6 +71,7 @@ class FrameSource(Protocol):
 
     Attributes:
         path: What was opened.
+        name: What the log calls itself; the folder's name where it does not say.
         kind: Which format it was recognised as, e.g. "tum".
         truth: Where the body really was, if the log tells.
         accelerations: Accelerometer readings, if the log has them.
@@ -56,6 +79,7 @@ class FrameSource(Protocol):
     """
 
     path: Path
+    name: str
     kind: str
     truth: Trajectory | None
     accelerations: Accelerations | None

@@ -1,0 +1,80 @@
+"""Intrinsics of a log, and the cameras of well-known data sets."""
+
+import re
+from dataclasses import dataclass
+
+from mapper.errors import SourceError
+from mapper.frames import NO_DISTORTION, PinholeCamera
+
+_Distortion = tuple[float, float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Intrinsics of a log's images, whose size may not be known before one is read.
+
+    Attributes:
+        origin: Where it comes from, for messages.
+        fx_px: Focal length along a row.
+        fy_px: Focal length along a column.
+        cx_px: Principal point's column.
+        cy_px: Principal point's row.
+        distortion: (k1, k2, p1, p2, k3).
+        size_px: (width, height) the numbers hold for, if stated.
+        depth_units_per_m: Depth image units per metre, if stated.
+    """
+
+    origin: str
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: _Distortion = NO_DISTORTION
+    size_px: tuple[int, int] | None = None
+    depth_units_per_m: float | None = None
+
+    def camera(self, *, width_px: int, height_px: int) -> PinholeCamera:
+        """Return the camera of images of this size.
+
+        Raises:
+            SourceError: The calibration holds for another size.
+        """
+        if self.size_px not in (None, (width_px, height_px)):
+            width, height = self.size_px or (0, 0)
+            raise SourceError(
+                f"{self.origin}: holds for {width}×{height} px, but the images have {width_px}×{height_px}; "
+                "give theirs in a calibration.toml beside the log"
+            )
+        numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px)
+        return PinholeCamera(width_px, height_px, *numbers, distortion=self.distortion)
+
+
+_VGA = (640, 480)
+# https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats (Sturm et al. 2012)
+FREIBURG = {
+    "1": Calibration(
+        "camera of TUM freiburg1",
+        *(517.306408, 516.469215, 318.643040, 255.313989),
+        distortion=(0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
+        size_px=_VGA,
+    ),
+    "2": Calibration(
+        "camera of TUM freiburg2",
+        *(520.908620, 521.007327, 325.141442, 249.701764),
+        distortion=(0.231222, -0.784899, -0.003257, -0.000105, 0.917205),
+        size_px=_VGA,
+    ),
+    "3": Calibration("camera of TUM freiburg3", 535.4, 539.2, 320.1, 247.6, size_px=_VGA),
+}
+SEVEN_SCENES = Calibration("camera of 7-Scenes", 585.0, 585.0, 320.0, 240.0, size_px=_VGA)
+PRIMESENSE = Calibration("PrimeSense's nominal camera", 525.0, 525.0, 319.5, 239.5, size_px=_VGA)
+
+_FREIBURG_NAME = re.compile(r"(?:^|[^a-z])(?:freiburg|fr)([123])(?!\d)", re.IGNORECASE)
+
+
+def freiburg_camera(*names: str) -> Calibration | None:
+    """Return the camera of the first name that speaks of freiburg1, 2 or 3, or of fr1_, fr2_ or fr3_."""
+    for name in names:
+        if found := _FREIBURG_NAME.search(name):
+            return FREIBURG[found[1]]
+    return None

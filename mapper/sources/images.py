@@ -1,0 +1,105 @@
+"""Image files as arrays: whole and of the right kind, or an error that names the file."""
+
+from pathlib import Path
+from typing import cast
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mapper.errors import DataError, FrameError
+from mapper.frames import DepthImage, Image
+from mapper.sources import png
+
+SATURATED = 65535
+"""The largest 16-bit depth is a sensor's way to say "nothing" (7-Scenes) or "too far": no measurement."""
+
+# A camera's calibration holds for the pixels as stored, so a rotation tag must not turn them.
+_RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+_GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+_JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
+_PNG_END = b"IEND\xae\x42\x60\x82"
+
+
+def read_colour(path: Path) -> Image:
+    """Return the (H, W, 3) uint8 RGB image of a file.
+
+    Raises:
+        FrameError: The file is missing, empty, cut short, damaged or not an image.
+    """
+    return _eight_bit(path, _read(path, _RGB))
+
+
+def read_grey(path: Path) -> Image:
+    """Return the (H, W) uint8 luminance of a file; cheaper than colour for a JPEG.
+
+    Raises:
+        FrameError: As :func:`read_colour`.
+    """
+    image = _eight_bit(path, _read(path, _GREY))
+    if image.ndim == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    return image
+
+
+def read_depth_m(path: Path, units_per_m: float) -> DepthImage:
+    """Return the (H, W) float32 depth in metres of a 16-bit image; 0 is no measurement.
+
+    Args:
+        path: One-channel 16-bit image.
+        units_per_m: Image units per metre, e.g. 5000 for TUM and 1000 for millimetres.
+
+    Raises:
+        FrameError: As :func:`read_colour`, or the image is not one channel of 16 bits.
+    """
+    units = _read(path, cv2.IMREAD_UNCHANGED)
+    if units.dtype != np.uint16 or units.ndim != 2:
+        raise FrameError(f"{path}: depth image of {units.dtype} {units.shape}, want one channel of 16 bits")
+    depth_m: DepthImage = _metres(units, np.float32(units_per_m))
+    return depth_m
+
+
+def _eight_bit(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> Image:
+    if image.dtype != np.uint8:
+        raise FrameError(f"{path}: colour image of {image.dtype} {image.shape}, want 8 bits a channel")
+    return cast(Image, image)
+
+
+def _read(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Decode a file; plain PNGs come as they are stored, everything else as OpenCV's flags say."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise FrameError(f"{path}: cannot be read: {error.strerror}") from None
+    if not data:
+        raise FrameError(f"{path}: empty file")
+    try:
+        if png.is_plain(data):
+            return png.decode(data)
+        _check_whole(data)
+        image: NDArray[np.uint8] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except (DataError, cv2.error) as error:
+        raise FrameError(f"{path}: {error}") from None
+    if image is None:
+        raise FrameError(f"{path}: not an image that OpenCV can decode ({len(data)} bytes)")
+    return image
+
+
+def _check_whole(data: bytes) -> None:
+    """OpenCV reports a truncated file on stderr only, so look for the end marker first."""
+    tail = data.rstrip(b"\0")[-64:]
+    if data.startswith(_JPEG_START) and _JPEG_END not in tail:
+        raise DataError("truncated JPEG: it ends before its end marker")
+    if data.startswith(png.SIGNATURE) and _PNG_END not in tail:
+        raise DataError("truncated PNG: it ends before its last chunk")
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # Python's check for division by zero bars SIMD
+def _metres(units: NDArray[np.uint16], units_per_m: np.float32) -> DepthImage:
+    depth_m = np.empty(units.shape, np.float32)
+    for y in range(units.shape[0]):
+        for x in range(units.shape[1]):
+            value = units[y, x]
+            depth_m[y, x] = np.float32(0.0) if value == SATURATED else np.float32(value) / units_per_m
+    return depth_m

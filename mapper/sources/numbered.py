@@ -1,0 +1,206 @@
+"""Folders of numbered images: 7-Scenes (Shotton et al. 2013) and Redwood (Choi et al. 2015).
+
+7-Scenes keeps ``frame-000000.color.png``, ``.depth.png`` and ``.pose.txt`` together; Redwood keeps colour
+and depth in two folders and the poses in one ``.log``. Names such as ``000001-000000033369.jpg`` carry a
+number and microseconds; other names carry a number only, and stamps follow from the frame rate.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mapper.config.sources import SourceConfig
+from mapper.errors import SourceError
+from mapper.geometry import Transform, nearest_rotation, transform
+from mapper.sources.calibration import PRIMESENSE, SEVEN_SCENES
+from mapper.sources.rgbd import RgbdLog, Shot, entries_of, find_calibration, read_accelerations
+from mapper.sources.text import parse_numbers, rows, time_order, truth_from
+from mapper.timebase import NS_PER_S
+from mapper.trajectory import Trajectory
+
+DEPTH_UNITS_PER_M = 1000.0
+RATE_HZ = 30.0
+LOOKED_FOR = "frame-000000.color.png and .depth.png (7-Scenes), numbered images in rgb/ and depth/ (Redwood)"
+
+_COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images")
+_IMAGE_ENDINGS = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
+_NUMBERED = re.compile(r"\D*(?P<number>\d+)(?:-(?P<microseconds>\d+))?\D*")
+_SEVEN_SCENES = re.compile(r"frame-\d+\.color\.\w+")
+_ROUGHLY_RIGID = 1e-2  # text of a few digits; anything further off is no rotation
+
+
+@dataclass(frozen=True, slots=True)
+class NumberedPair:
+    """A colour and a depth image with the same number."""
+
+    number: int
+    colour: Path
+    depth: Path
+    microseconds: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class NumberedImages:
+    """The pairs of a folder, by increasing number, and notes on images without a partner."""
+
+    pairs: Sequence[NumberedPair]
+    notes: Sequence[str]
+
+
+def recognise(path: Path) -> bool:
+    """Tell whether a path is a folder of numbered colour and depth images, or holds ``seq-01`` and the like."""
+    return find_images(path) is not None or bool(_sequences(path))
+
+
+def open_log(path: Path, config: SourceConfig) -> RgbdLog:
+    """Open a folder of numbered images; a folder with a single sequence opens that.
+
+    Raises:
+        SourceError: The folder holds several sequences, a pose file is malformed, or the camera's size differs.
+    """
+    if sequences := _sequences(path):
+        if len(sequences) > 1:
+            names = ", ".join(folder.name for folder in sequences)
+            raise SourceError(f"{path}: holds {len(sequences)} sequences; open one of {names}")
+        path = sequences[0]
+    images = find_images(path)
+    if images is None:
+        raise SourceError(f"{path}: no colour and depth images with the same numbers; want {LOOKED_FOR}")
+    is_seven_scenes = _SEVEN_SCENES.fullmatch(images.pairs[0].colour.name) is not None
+    known = SEVEN_SCENES if is_seven_scenes else PRIMESENSE
+    calibration, units_per_m = find_calibration(
+        path, config.camera, known=known, depth_units_per_m=DEPTH_UNITS_PER_M
+    )
+    notes = list(images.notes)
+    if calibration is known:
+        notes.append(
+            f"camera assumed to be the {known.origin}; if not, put a calibration.toml beside the log"
+        )
+    shots, stamp_notes = stamped(images.pairs, rate_hz=config.rate_hz or RATE_HZ)
+    truth, truth_notes = _read_truth(path, images.pairs, shots)
+    accelerations, acceleration_notes = read_accelerations(path)
+    order, order_notes = time_order(np.array([shot.stamp_ns for shot in shots]), what="image names")
+    return RgbdLog(
+        path=path,
+        name=path.resolve().name,
+        kind="7-scenes" if is_seven_scenes else "redwood",
+        truth=truth,
+        accelerations=accelerations,
+        notes=[*notes, *stamp_notes, *order_notes, *truth_notes, *acceleration_notes],
+        images=entries_of([shots[i] for i in order], calibration, depth_units_per_m=units_per_m),
+    )
+
+
+def find_images(folder: Path) -> NumberedImages | None:
+    """Return the numbered pairs of a folder, in ``rgb/`` and ``depth/`` or side by side; None without any."""
+    if not folder.is_dir():
+        return None
+    colour_folder = next((folder / name for name in _COLOUR_FOLDERS if (folder / name).is_dir()), None)
+    if colour_folder is not None and (folder / "depth").is_dir():
+        colour, depth = _by_number(colour_folder, r""), _by_number(folder / "depth", r"")
+    else:
+        colour, depth = _by_number(folder, r"colou?r|rgb"), _by_number(folder, r"depth")
+    both = sorted(colour.keys() & depth.keys())
+    if not both:
+        return None
+    notes = [
+        f"{len(images) - len(both)} {what} images have no partner of the same number; left out"
+        for what, images in (("colour", colour), ("depth", depth))
+        if len(images) > len(both)
+    ]
+    pairs = [NumberedPair(n, colour[n][0], depth[n][0], colour[n][1]) for n in both]
+    return NumberedImages(pairs, notes)
+
+
+def stamped(pairs: Sequence[NumberedPair], *, rate_hz: float) -> tuple[list[Shot], list[str]]:
+    """Return the pairs with stamps from their names, or else from their numbers at a rate."""
+    if all(pair.microseconds is not None for pair in pairs):
+        stamps_ns = [1000 * (pair.microseconds or 0) for pair in pairs]
+        notes = []
+    else:
+        stamps_ns = [stamp_at(pair.number, rate_hz=rate_hz) for pair in pairs]
+        notes = [f"file names carry no time; {rate_hz:g} frames a second assumed (source.rate_hz)"]
+    shots = [
+        Shot(stamp_ns, pair.colour, stamp_ns, pair.depth)
+        for stamp_ns, pair in zip(stamps_ns, pairs, strict=True)
+    ]
+    return shots, notes
+
+
+def stamp_at(number: int, *, rate_hz: float) -> int:
+    """Return when the image of this number was taken, nanoseconds; number 0 at time 0."""
+    return round(number * NS_PER_S / rate_hz)
+
+
+def _sequences(path: Path) -> list[Path]:
+    return sorted(folder for folder in path.glob("seq-*") if find_images(folder) is not None)
+
+
+def _by_number(folder: Path, word: str) -> dict[int, tuple[Path, int | None]]:
+    """Return path and microseconds of a folder's numbered images whose names contain the word, by number."""
+    found: dict[int, tuple[Path, int | None]] = {}
+    for path in sorted(folder.iterdir()):
+        name = _NUMBERED.fullmatch(path.stem)
+        if name and path.suffix.lower() in _IMAGE_ENDINGS and re.search(word, path.stem, re.IGNORECASE):
+            microseconds = name["microseconds"]
+            found[int(name["number"])] = (path, None if microseconds is None else int(microseconds))
+    return found
+
+
+def _read_truth(
+    folder: Path, pairs: Sequence[NumberedPair], shots: Sequence[Shot]
+) -> tuple[Trajectory | None, list[str]]:
+    """Read one pose file a frame if there are any, else a Redwood trajectory."""
+    poses: list[tuple[int, Transform | None]] = []
+    for pair, shot in zip(pairs, shots, strict=True):
+        beside = pair.colour.with_name(f"{pair.colour.stem.split('.')[0]}.pose.txt")
+        path = beside if beside.is_file() else folder / "pose" / f"{pair.colour.stem}.txt"
+        if path.is_file():
+            matrix = [numbers for number, words in rows(path) for numbers in [_row_of_4(path, number, words)]]
+            poses.append((shot.stamp_ns, _pose_of(matrix, path)))
+    if poses:
+        return truth_from(poses, what="pose files")
+    path = next(
+        (p for name in ("*traj*.log", "*traj*.txt", "*.log") for p in sorted(folder.glob(name))), None
+    )
+    return (None, []) if path is None else _read_redwood(path, shots)
+
+
+def _read_redwood(path: Path, shots: Sequence[Shot]) -> tuple[Trajectory | None, list[str]]:
+    """Read blocks of a line ``i i i+1`` and a 4×4 matrix; block i belongs to the i-th image, counted from 0."""
+    lines = list(rows(path))
+    if len(lines) % 5:
+        raise SourceError(f"{path}: {len(lines)} lines, want blocks of 5: i i i+1 and a 4×4 matrix")
+    poses: list[tuple[int, Transform | None]] = []
+    for block in range(0, len(lines), 5):
+        number, words = lines[block]
+        if len(words) != 3 or not words[0].isdigit():
+            raise SourceError(f"{path}:{number}: {' '.join(words)!r}, want the block's number, as in: 0 0 1")
+        index = int(words[0])
+        if index >= len(shots):
+            raise SourceError(
+                f"{path}:{number}: pose of image {index}, but there are only {len(shots)} images"
+            )
+        matrix = [_row_of_4(path, row_number, row) for row_number, row in lines[block + 1 : block + 5]]
+        poses.append((shots[index].stamp_ns, _pose_of(matrix, path)))
+    return truth_from(poses, what=path.name)
+
+
+def _row_of_4(path: Path, number: int, words: list[str]) -> list[float]:
+    if len(words) != 4:
+        raise SourceError(f"{path}:{number}: {len(words)} columns, want 4: a row of a 4×4 pose")
+    return [float(value) for value in parse_numbers(words, where=f"{path}:{number}")]
+
+
+def _pose_of(matrix: list[list[float]], path: Path) -> Transform | None:
+    """Return camera-to-world with a rotation made exact; None where the file says the camera was lost."""
+    if len(matrix) != 4:
+        raise SourceError(f"{path}: {len(matrix)} rows, want a 4×4 camera-to-world pose")
+    T = np.array(matrix)
+    if not np.isfinite(T).all():
+        return None
+    R = nearest_rotation(T[:3, :3])
+    return transform(R, T[:3, 3]) if np.abs(R - T[:3, :3]).max() < _ROUGHLY_RIGID else None

@@ -1,0 +1,99 @@
+"""Poznań folders: numbered images, and the truth of each as ``number x y z roll pitch yaw`` (thesis §3.5).
+
+Images lie in ``rgb/`` and ``depth/`` (``rgb_0.png``, ``depth_0.png``, with or without leading zeros) or side by
+side. The truth is the text file whose name speaks of "ground" or "gt" and whose rows have seven columns, the
+first an image number. Positions are metres. Angles are degrees if a comment line says "deg", radians if it
+says "rad"; without either they are degrees if any exceeds a full turn of 2π, radians if none does.
+"""
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+
+from mapper.config.sources import SourceConfig
+from mapper.errors import SourceError
+from mapper.geometry import Transform, transform
+from mapper.rotations import rotation_from_euler
+from mapper.sources.numbered import find_images, stamp_at, stamped
+from mapper.sources.rgbd import RgbdLog, entries_of, find_calibration, read_accelerations
+from mapper.sources.text import parse_numbers, read_lines, rows, truth_from
+from mapper.trajectory import Trajectory
+
+DEPTH_UNITS_PER_M = 1000.0
+RATE_HZ = 10.0  # "every 100 ms" (thesis §5.6)
+LOOKED_FOR = "groundtruth.txt of number x y z roll pitch yaw with numbered images (Poznań)"
+
+_TRUTH_NAME = re.compile(r"ground|(?:^|[^a-z])gt(?:[^a-z]|$)", re.IGNORECASE)
+
+
+def recognise(path: Path) -> bool:
+    """Tell whether a path is a folder of numbered images with a truth of seven columns."""
+    return _truth_file(path) is not None and find_images(path) is not None
+
+
+def open_log(path: Path, config: SourceConfig) -> RgbdLog:
+    """Open a Poznań folder.
+
+    Raises:
+        SourceError: Images or truth are missing or malformed, or the camera is unknown.
+    """
+    images, truth_path = find_images(path), _truth_file(path)
+    if images is None or truth_path is None:
+        raise SourceError(f"{path}: not a Poznań log; want {LOOKED_FOR}")
+    rate_hz = config.rate_hz or RATE_HZ
+    shots, stamp_notes = stamped(images.pairs, rate_hz=rate_hz)
+    calibration, units_per_m = find_calibration(
+        path, config.camera, known=None, depth_units_per_m=DEPTH_UNITS_PER_M
+    )
+    stamps_ns = {pair.number: shot.stamp_ns for pair, shot in zip(images.pairs, shots, strict=True)}
+    truth, truth_notes = _read_truth(truth_path, stamps_ns, rate_hz=rate_hz)
+    accelerations, acceleration_notes = read_accelerations(path)
+    return RgbdLog(
+        path=path,
+        name=path.resolve().name,
+        kind="poznan",
+        truth=truth,
+        accelerations=accelerations,
+        notes=[*images.notes, *stamp_notes, *truth_notes, *acceleration_notes],
+        images=entries_of(shots, calibration, depth_units_per_m=units_per_m),
+    )
+
+
+def _truth_file(folder: Path) -> Path | None:
+    for path in sorted(folder.glob("*.txt")):
+        if _TRUTH_NAME.search(path.stem):
+            first = next((words for _, words in rows(path)), [])
+            if len(first) == 7 and first[0].isdigit():
+                return path
+    return None
+
+
+def _read_truth(
+    path: Path, stamps_ns: dict[int, int], *, rate_hz: float
+) -> tuple[Trajectory | None, list[str]]:
+    numbers, values = [], []
+    for line, words in rows(path):
+        where = f"{path}:{line}"
+        if len(words) != 7 or not words[0].isdigit():
+            raise SourceError(f"{where}: {' '.join(words)!r}, want: number x y z roll pitch yaw")
+        numbers.append(int(words[0]))
+        values.append(parse_numbers(words[1:], where=where))
+    table = np.array(values)
+    in_degrees = _in_degrees(path, table[:, 3:])
+    note = f"{path.name}: angles taken as {'degrees' if in_degrees else 'radians'}"
+    poses: list[tuple[int, Transform | None]] = []
+    for number, row in zip(numbers, table, strict=True):
+        stamp_ns = stamps_ns.get(number, stamp_at(number, rate_hz=rate_hz))
+        roll, pitch, yaw = np.deg2rad(row[3:]) if in_degrees else row[3:]
+        poses.append((stamp_ns, transform(rotation_from_euler(roll, pitch, yaw), row[:3])))
+    truth, notes = truth_from(poses, what=path.name)
+    return truth, [note, *notes]
+
+
+def _in_degrees(path: Path, angles: np.ndarray) -> bool:
+    header = " ".join(line for line in read_lines(path) if line.lstrip().startswith(("#", "!")))
+    if unit := re.search(r"deg|rad", header, re.IGNORECASE):
+        return unit[0].lower() == "deg"
+    return bool((np.abs(angles[np.isfinite(angles)]) > 2.0 * math.pi).any())

@@ -1,0 +1,104 @@
+"""Line-by-line text files of a log, with errors that name the line, and rows put in time order."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.errors import DataError, SourceError
+from mapper.geometry import Array, Transform, is_rigid, transform
+from mapper.rotations import rotation_from_quaternion
+from mapper.timebase import Stamps, ns_from_seconds_text
+from mapper.trajectory import Trajectory
+
+
+def read_lines(path: Path) -> list[str]:
+    """Return a text file's lines.
+
+    Raises:
+        SourceError: The file is missing, unreadable or not text.
+    """
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise SourceError(f"{path}: not a text file") from None
+
+
+def rows(path: Path, *, separator: str | None = None) -> Iterator[tuple[int, list[str]]]:
+    """Yield (line number, words) of every line that is neither blank nor a ``#`` or ``!`` comment.
+
+    Raises:
+        SourceError: As :func:`read_lines`.
+    """
+    for number, line in enumerate(read_lines(path), start=1):
+        if line.strip() and not line.lstrip().startswith(("#", "!")):
+            yield number, [word.strip() for word in line.split(separator)]
+
+
+def parse_stamp(text: str, *, where: str) -> int:
+    """Return decimal seconds as nanoseconds.
+
+    Raises:
+        SourceError: The text is no finite number; the message starts with ``where``.
+    """
+    try:
+        return ns_from_seconds_text(text)
+    except DataError as error:
+        raise SourceError(f"{where}: {error}") from None
+
+
+def parse_numbers(words: Sequence[str], *, where: str) -> Array:
+    """Return the words as float64; they may be NaN or infinite.
+
+    Raises:
+        SourceError: A word is no number; the message starts with ``where``.
+    """
+    try:
+        return np.array([float(word) for word in words])
+    except ValueError as error:
+        raise SourceError(f"{where}: {error}") from None
+
+
+def time_order(stamps_ns: Stamps, *, what: str) -> tuple[NDArray[np.intp], list[str]]:
+    """Return the indices that sort stamps, the first of equal ones only, and a note on what that changed."""
+    order = np.argsort(stamps_ns, kind="stable")
+    ordered = stamps_ns[order]
+    is_first = np.ones(len(order), dtype=bool)
+    is_first[1:] = np.diff(ordered) > 0
+    notes = []
+    if misplaced := int((np.diff(stamps_ns) < 0).sum()):
+        notes.append(f"{what}: out of time order in {misplaced} places; sorted")
+    if repeated := int((~is_first).sum()):
+        notes.append(f"{what}: {repeated} stamps appear twice; the first was kept")
+    return order[is_first], notes
+
+
+def pose_from_numbers(numbers: Array) -> Transform | None:
+    """Return the pose of x y z qx qy qz qw; None where motion capture wrote no pose (NaN, or no rotation)."""
+    if not np.isfinite(numbers).all() or np.linalg.norm(numbers[3:]) < 1e-9:
+        return None
+    return transform(rotation_from_quaternion(numbers[3:]), numbers[:3])
+
+
+def truth_from(
+    poses: Sequence[tuple[int, Transform | None]], *, what: str
+) -> tuple[Trajectory | None, list[str]]:
+    """Return the truth of (stamp_ns, T_world_body) rows, and notes on rows that had to go.
+
+    Args:
+        poses: In any order; a pose that is None or not a finite rigid motion is dropped.
+        what: The file's name, for the notes.
+    """
+    usable = [(stamp_ns, T) for stamp_ns, T in poses if T is not None and is_rigid(T)]
+    notes = []
+    if dropped := len(poses) - len(usable):
+        notes.append(f"{what}: {dropped} of {len(poses)} poses are not finite rigid motions; dropped")
+    if not usable:
+        return None, [*notes, f"{what}: no usable ground truth"]
+    stamps_ns = np.array([stamp_ns for stamp_ns, _ in usable], dtype=np.int64)
+    order, more = time_order(stamps_ns, what=what)
+    T_world_body = np.array([T for _, T in usable])[order]
+    return Trajectory(stamps_ns[order], T_world_body), [*notes, *more]

@@ -1,0 +1,154 @@
+"""TUM RGB-D folders: rgb.txt, depth.txt, groundtruth.txt (Sturm et al. 2012)."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mapper.config.sources import SourceConfig
+from mapper.errors import SourceError
+from mapper.geometry import Transform
+from mapper.sources.calibration import freiburg_camera
+from mapper.sources.rgbd import (
+    RgbdLog,
+    Shot,
+    entries_of,
+    find_calibration,
+    present,
+    read_accelerations,
+)
+from mapper.sources.text import (
+    parse_numbers,
+    parse_stamp,
+    pose_from_numbers,
+    read_lines,
+    rows,
+    time_order,
+    truth_from,
+)
+from mapper.timebase import NS_PER_S, Stamps, nearest
+from mapper.trajectory import Trajectory
+
+DEPTH_UNITS_PER_M = 5000.0
+LOOKED_FOR = "rgb.txt and depth.txt (TUM)"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _ImageList:
+    stamps_ns: Stamps
+    paths: list[Path]
+
+
+def recognise(path: Path) -> bool:
+    """Tell whether a path is a folder with TUM's list of colour images."""
+    return (path / "rgb.txt").is_file()
+
+
+def open_log(path: Path, config: SourceConfig) -> RgbdLog:
+    """Open a TUM folder: each colour image with its nearest depth image.
+
+    Raises:
+        SourceError: A list is missing, empty or malformed, no two images pair, or the camera is unknown.
+    """
+    notes: list[str] = []
+    colour = _read_list(path, "rgb.txt", notes)
+    depth = _read_list(path, "depth.txt", notes)
+    shots = _pair(colour, depth, max_gap_s=config.max_pair_gap_s, path=path, notes=notes)
+    name = _name_of(path)
+    calibration, units_per_m = find_calibration(
+        path,
+        config.camera,
+        known=freiburg_camera(path.resolve().name, name),
+        depth_units_per_m=DEPTH_UNITS_PER_M,
+    )
+    truth, truth_notes = read_truth(path / "groundtruth.txt")
+    accelerations, acceleration_notes = read_accelerations(path)
+    return RgbdLog(
+        path=path,
+        name=name,
+        kind="tum",
+        truth=truth,
+        accelerations=accelerations,
+        notes=[*notes, *truth_notes, *acceleration_notes],
+        images=entries_of(shots, calibration, depth_units_per_m=units_per_m),
+    )
+
+
+def read_truth(path: Path) -> tuple[Trajectory | None, list[str]]:
+    """Return the truth in lines of ``stamp tx ty tz qx qy qz qw``, if any, and notes on dropped lines.
+
+    Raises:
+        SourceError: A line is not eight numbers.
+    """
+    if not path.is_file():
+        return None, []
+    poses: list[tuple[int, Transform | None]] = []
+    for number, words in rows(path):
+        where = f"{path}:{number}"
+        if len(words) != 8:
+            raise SourceError(f"{where}: {len(words)} columns, want 8: stamp tx ty tz qx qy qz qw")
+        numbers = parse_numbers(words, where=where)
+        if np.isfinite(numbers[0]):
+            poses.append((parse_stamp(words[0], where=where), pose_from_numbers(numbers[1:])))
+        else:
+            poses.append((0, None))
+    return truth_from(poses, what=path.name)
+
+
+def _read_list(folder: Path, name: str, notes: list[str]) -> _ImageList:
+    """Read ``stamp filename`` lines in time order, without the files that do not exist."""
+    path = folder / name
+    stamps_ns, paths = [], []
+    for number, words in rows(path):
+        if len(words) != 2:
+            raise SourceError(f"{path}:{number}: {len(words)} columns, want 2: stamp filename")
+        stamps_ns.append(parse_stamp(words[0], where=f"{path}:{number}"))
+        paths.append(folder / words[1])
+    if not paths:
+        raise SourceError(f"{path}: empty list; want lines of: stamp filename")
+    exists = present(paths)
+    kept = [i for i, found in enumerate(exists) if found]
+    if not kept:
+        raise SourceError(f"{path}: none of its {len(paths)} images exists; the first is {paths[0]}")
+    if len(kept) < len(paths):
+        notes.append(f"{name}: {len(paths) - len(kept)} of {len(paths)} listed images do not exist; dropped")
+    stamps = np.array([stamps_ns[i] for i in kept], dtype=np.int64)
+    order, order_notes = time_order(stamps, what=name)
+    notes.extend(order_notes)
+    return _ImageList(stamps[order], [paths[kept[i]] for i in order])
+
+
+def _pair(
+    colour: _ImageList, depth: _ImageList, *, max_gap_s: float, path: Path, notes: list[str]
+) -> list[Shot]:
+    """Pair each colour image with the nearest depth image, at most ``max_gap_s`` apart."""
+    partner, gap_ns = nearest(depth.stamps_ns, colour.stamps_ns)
+    paired = np.flatnonzero(gap_ns <= round(max_gap_s * NS_PER_S))
+    if len(paired) == 0:
+        raise SourceError(
+            f"{path}: no colour image has a depth image within {max_gap_s * 1e3:g} ms; "
+            f"the closest pair is {int(gap_ns.min()) / NS_PER_S:g} s apart (source.max_pair_gap_s)"
+        )
+    if alone := len(gap_ns) - len(paired):
+        without = f"no depth image within {max_gap_s * 1e3:g} ms"
+        notes.append(f"{alone} of {len(gap_ns)} colour images have {without}; left out")
+    return [
+        Shot(
+            stamp_ns=int(colour.stamps_ns[i]),
+            colour=colour.paths[i],
+            depth_stamp_ns=int(depth.stamps_ns[partner[i]]),
+            depth=depth.paths[partner[i]],
+        )
+        for i in paired
+    ]
+
+
+def _name_of(path: Path) -> str:
+    """TUM's lists say which recording they come from: ``# file: 'rgbd_dataset_freiburg1_xyz.bag'``."""
+    for line in read_lines(path / "rgb.txt"):
+        if not line.startswith("#"):
+            break
+        if found := re.match(r"#\s*file:\s*'(.+)'", line):
+            return found[1]
+    return path.resolve().name
