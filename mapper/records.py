@@ -1,8 +1,8 @@
-"""What became of every frame of a log: ``frames.csv``."""
+"""What became of every frame of a log, and how long it took."""
 
 import csv
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -103,6 +103,28 @@ def read_records(path: Path) -> list[FrameRecord]:
         return [_record(row) for row in rows]
     except (KeyError, ValueError, TypeError) as error:
         raise DataError(f"{path}: not a list of frames with columns {', '.join(_COLUMNS)}: {error}") from None
+
+
+def write_frame_ms(path: Path, frame_ms: Mapping[int, float]) -> None:
+    """Write how many milliseconds each frame took, by stamp."""
+    lines = [f"{stamp_ns},{ms:.3f}" for stamp_ns, ms in frame_ms.items()]
+    write_text(path, "\n".join(["stamp_ns,ms", *lines]) + "\n")
+
+
+def read_frame_ms(path: Path) -> dict[int, float]:
+    """Return what ``write_frame_ms`` wrote.
+
+    Raises:
+        RunError: The file cannot be read.
+        DataError: It is something else.
+    """
+    try:
+        rows = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()[1:]]
+        return {int(stamp_ns): float(ms) for stamp_ns, ms in rows}
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise DataError(f"{path}: not a list of stamp_ns,ms: {error}") from None
 
 
 def _record(row: dict[str, str]) -> FrameRecord:

@@ -16,7 +16,7 @@ from mapper.graph.g2o import read_g2o
 from mapper.graph.model import PoseGraph
 from mapper.manifest import Input, Manifest, Timing, library_versions, now_text, read_manifest
 from mapper.measure import Stopwatch
-from mapper.records import FrameRecord, read_records
+from mapper.records import FrameRecord, read_frame_ms, read_records
 from mapper.sources.base import FrameSource
 from mapper.staging import MARK, partial_of, staged
 from mapper.trajectory import Trajectory, read_tum
@@ -28,12 +28,14 @@ KEYFRAMES = "keyframes.tum"
 TRUTH = "truth.tum"
 GRAPH = "graph.g2o"
 FRAMES = "frames.csv"
+FRAME_MS = "frame_ms.csv"
 OCTREE_BT = "map.bt"
 OCTREE_OT = "map.ot"
 CLOUD = "cloud.ply"
 SLICE = "slice"
 MCAP = "run.mcap"
 SUMMARY = "summary.png"
+CLOUD_VIEWS = "cloud.png"
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +68,10 @@ class Run:
     def records(self) -> list[FrameRecord]:
         """Return what became of every frame."""
         return read_records(self.path / FRAMES)
+
+    def frame_ms(self) -> dict[int, float]:
+        """Return how many milliseconds each frame took to track, by stamp."""
+        return read_frame_ms(self.path / FRAME_MS)
 
     def files(self) -> list[Path]:
         """Return the folder's files, by name."""
@@ -167,6 +173,4 @@ def _read_config(path: Path) -> BuildConfig:
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
-        raise RunError(
-            f"{path}: {name}: {first['msg']}; built by another version?"
-        ) from None
+        raise RunError(f"{path}: {name}: {first['msg']}; built by another version?") from None

@@ -1,5 +1,6 @@
 """The first pass over a log: every frame tracked in order, and the pose graph that grows from it."""
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -23,11 +24,13 @@ class Tracking:
         tracks: One per frame that could be read, in time order.
         skipped: The frames that could not be read.
         graph: Nodes at the odometry's estimates, with every factor.
+        frame_ms: Wall milliseconds that each frame took to read, detect and track, by stamp.
     """
 
     tracks: tuple[Track, ...]
     skipped: tuple[Skipped, ...]
     graph: PoseGraph
+    frame_ms: Mapping[int, float]
 
     @property
     def placed(self) -> list[Track]:
@@ -52,26 +55,31 @@ def track_log(source: FrameSource, config: BuildConfig, *, progress: Progress) -
     graph = PoseGraph()
     tracks: list[Track] = []
     skipped: list[Skipped] = []
+    frame_ms: dict[int, float] = {}
 
-    def observe(entry: Entry) -> Any:
+    def observe(entry: Entry) -> tuple[Any, float]:
+        began = time.perf_counter()
         try:
-            return odometry.observe(entry.load(colour=False))
+            observation = odometry.observe(entry.load(colour=False))
         except FrameError as error:
-            return Skipped(entry.stamp_ns, str(error))
+            observation = Skipped(entry.stamp_ns, str(error))
+        return observation, time.perf_counter() - began
 
     observations = ordered_map(observe, source.entries(), workers=config.workers)
-    for observation in progress.over(observations, stage="track", total=len(source)):
+    for observation, observed_s in progress.over(observations, stage="track", total=len(source)):
         if isinstance(observation, Skipped):
             skipped.append(observation)
             progress.note(f"skipped: {observation.reason}")
             continue
+        began = time.perf_counter()
         track = odometry.track(observation)
+        frame_ms[track.stamp_ns] = 1e3 * (observed_s + time.perf_counter() - began)
         if track.is_keyframe and track.node is not None:
             graph.add_node(track.node, track.stamp_ns, track.T_world_body)
         graph.add_factors(track.factors)
         tracks.append(track)
     graph.add_factors(odometry.finish())
-    return Tracking(tuple(tracks), tuple(skipped), graph)
+    return Tracking(tuple(tracks), tuple(skipped), graph, frame_ms)
 
 
 def refuse_a_fragment(tracking: Tracking, config: BuildConfig) -> None:

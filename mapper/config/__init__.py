@@ -1,9 +1,10 @@
 """Every knob with its unit and default, and how files and overrides reach it."""
 
+import json
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
 
@@ -14,13 +15,20 @@ from mapper.config.odometry import LocalMapConfig, OdometryConfig
 from mapper.config.sources import SourceConfig
 from mapper.errors import ConfigError
 
+AnyConfig = TypeVar("AnyConfig", bound=Config)
+
 
 class McapConfig(Config):
     """What goes into ``run.mcap``."""
 
     image_stride: NonNegativeInt = 10
     """Every n-th frame's colour image is logged; 0 logs none."""
-    image_width_px: NonNegativeInt = 320
+    image_width_px: PositiveInt = 320
+    """Wider images are shrunk."""
+    image_quality: Annotated[int, Field(ge=1, le=100)] = 80
+    """As libjpeg counts."""
+    frame_times: bool = True
+    """Log the milliseconds of every frame; without them two builds of a log give the same bytes."""
 
 
 class CloudConfig(Config):
@@ -52,7 +60,7 @@ class BuildConfig(Config):
 
 
 def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> BuildConfig:
-    """Return the configuration of a TOML file with ``key.path=value`` overrides on top.
+    """Return the configuration of a TOML file, or a run's JSON, with ``key.path=value`` overrides on top.
 
     Raises:
         ConfigError: The file cannot be read or parsed, or the model refuses a name or a value.
@@ -60,15 +68,28 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Buil
     tree: dict[str, Any] = {}
     if path is not None:
         try:
-            tree = tomllib.loads(path.read_text(encoding="utf-8"))
+            text = path.read_text(encoding="utf-8")
+            tree = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
         except OSError as error:
             raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path}: not valid TOML: {error}") from None
-        _validated(tree, str(path))
+        except ValueError as error:  # what either parser raises, and text that is not UTF-8
+            raise ConfigError(f"{path}: not valid {path.suffix.upper()[1:] or 'TOML'}: {error}") from None
+        _validated(BuildConfig, tree, str(path))
     for override in overrides:
         _put(tree, override)
-    return _validated(tree, "overrides" if overrides else str(path))
+    return _validated(BuildConfig, tree, "overrides" if overrides else str(path))
+
+
+def overridden(config: AnyConfig, overrides: Sequence[str]) -> AnyConfig:
+    """Return a configuration of any kind with ``key.path=value`` overrides on top.
+
+    Raises:
+        ConfigError: The model refuses a name or a value.
+    """
+    tree = config.model_dump()
+    for override in overrides:
+        _put(tree, override)
+    return _validated(type(config), tree, "overrides")
 
 
 def _put(tree: dict[str, Any], override: str) -> None:
@@ -104,9 +125,9 @@ def _kind(member: type[Config]) -> str:
     return str(member.model_fields["kind"].default)
 
 
-def _validated(tree: dict[str, Any], where: str) -> BuildConfig:
+def _validated(model: type[AnyConfig], tree: dict[str, Any], where: str) -> AnyConfig:
     try:
-        return BuildConfig.model_validate(_with_kinds(tree, BuildConfig()))
+        return model.model_validate(_with_kinds(tree, model()))
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"]) or "configuration"

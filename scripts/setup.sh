@@ -1,0 +1,112 @@
+#!/usr/bin/env bash
+# Makes .venv and installs the project into it; does nothing the second time.
+# usage: bash scripts/setup.sh [--dev]     --dev adds what the tests need
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+extra=""
+[ "${1:-}" = "--dev" ] && extra="[dev]"
+venv=.venv
+stamp="$venv/.installed${extra}"
+
+say() { printf 'setup: %s\n' "$*" >&2; }
+fail() {
+  say "$*"
+  exit 1
+}
+
+# Installs Debian packages if we may; otherwise says exactly what to type.
+need_packages() {
+  local as_root=()
+  if [ "$(id -u)" != 0 ]; then
+    if sudo -n true 2>/dev/null; then
+      as_root=(sudo -n)
+    else
+      fail "missing system packages; run: sudo apt-get install -y $*    and then this again"
+    fi
+  fi
+  command -v apt-get >/dev/null || fail "missing system packages ($*), and there is no apt-get to install them"
+  say "installing $*"
+  "${as_root[@]}" apt-get update -qq >&2
+  "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive \
+    apt-get install -y -qq --no-install-recommends "$@" >&2 || fail "apt-get could not install: $*"
+}
+
+is_new_enough() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; }
+
+find_python() {
+  local name
+  for name in python3 python3.11 python3.12 python3.13 python3.14; do
+    if command -v "$name" >/dev/null && is_new_enough "$name"; then
+      command -v "$name"
+      return
+    fi
+  done
+  return 1
+}
+
+make_venv() {
+  local python version
+  python=$(find_python) || {
+    need_packages python3 python3-venv
+    python=$(find_python) || fail "want Python 3.11 or newer; $(python3 --version 2>&1) is all there is"
+  }
+  if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then # Debian ships them apart
+    version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+    need_packages "python$version-venv"
+  fi
+  say "making $venv with $("$python" --version)"
+  rm -rf "$venv"
+  "$python" -m venv "$venv"
+}
+
+# Prints the first shared library that a wheel expects from the system and does not find.
+missing_library() {
+  "$venv/bin/python" - <<'PYTHON'
+import importlib
+import re
+
+for name in ("numpy", "cv2", "numba", "gtsam", "mahotas", "matplotlib", "foxglove", "mcap"):
+    try:
+        importlib.import_module(name)
+    except ImportError as error:
+        found = re.search(r"(lib\S+\.so[.\d]*): cannot open shared object file", str(error))
+        print(found[1] if found else f"{name}: {error}")
+        break
+PYTHON
+}
+
+package_of() {
+  case "$1" in
+    libgomp.so.*) echo libgomp1 ;;
+    libstdc++.so.*) echo libstdc++6 ;;
+    libgcc_s.so.*) echo libgcc-s1 ;;
+    libGL.so.*) echo libgl1 ;;
+    libglib-2.0.so.* | libgthread-2.0.so.*) echo libglib2.0-0 ;;
+    libz.so.*) echo zlib1g ;;
+    libatomic.so.*) echo libatomic1 ;;
+    *) return 1 ;;
+  esac
+}
+
+install_missing_libraries() {
+  local library package before=""
+  while library=$(missing_library) && [ -n "$library" ]; do
+    package=$(package_of "$library") || fail "cannot load $library"
+    [ "$package" != "$before" ] || fail "cannot load $library, although $package is installed"
+    need_packages "$package"
+    before=$package
+  done
+}
+
+[ -x "$venv/bin/python" ] && is_new_enough "$venv/bin/python" || make_venv
+"$venv/bin/python" -m pip --version >/dev/null 2>&1 || "$venv/bin/python" -m ensurepip >/dev/null
+
+# The folder counts as well: an editable install and its scripts name it.
+want=$( (pwd; "$venv/bin/python" --version; cat pyproject.toml scripts/setup.sh) | sha256sum)
+if [ "$(cat "$stamp" 2>/dev/null)" != "$want" ]; then
+  say "installing the project${extra:+ and what its tests need}"
+  "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable ".$extra" >&2
+  install_missing_libraries
+  printf '%s\n' "$want" >"$stamp"
+fi

@@ -1,0 +1,159 @@
+import fcntl
+import os
+
+import pytest
+
+from mapper.config import BuildConfig
+from mapper.errors import RunError, TrackingError
+from mapper.fingerprint import fingerprint
+from mapper.manifest import Input, Manifest, read_manifest
+from mapper.odometry.base import Diagnostics
+from mapper.records import FrameRecord, read_frame_ms, read_records, write_frame_ms, write_records
+from mapper.run import drafting, load_run
+from mapper.staging import partial_of, staged
+
+MANIFEST = Manifest(status="building", input=Input(path="/log", kind="tum", fingerprint="sha256:0"))
+
+
+def draft_of(out, *, overwrite=False):
+    return drafting(out, MANIFEST, BuildConfig(workers=1), overwrite=overwrite)
+
+
+def make_run(out, text, *, overwrite=False, error=None):
+    with draft_of(out, overwrite=overwrite) as draft:
+        (draft.folder / "trajectory.tum").write_text(text)
+        if error is not None:
+            raise error
+
+
+def test_a_run_appears_only_when_it_is_whole(tmp_path):
+    out = tmp_path / "runs" / "lab"
+
+    with draft_of(out) as draft:
+        assert not out.exists()
+        assert read_manifest(draft.folder / "manifest.json").status == "building"
+
+    run = load_run(out)
+    assert run.manifest.status == "complete"
+    assert run.config == BuildConfig(workers=1)
+    assert not partial_of(out).exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "reason"),
+    [
+        (TrackingError("only 3 frames"), "failed", "only 3 frames"),
+        (KeyboardInterrupt(), "interrupted", "KeyboardInterrupt"),
+        (ZeroDivisionError("x"), "failed", "ZeroDivisionError: x"),
+    ],
+)
+def test_a_run_that_ends_early_says_how(tmp_path, error, status, reason):
+    out = tmp_path / "lab"
+
+    with pytest.raises(type(error)):
+        make_run(out, "saved", error=error)
+
+    assert not out.exists()
+    manifest = read_manifest(partial_of(out) / "manifest.json")
+    assert manifest.status == status
+    assert reason in manifest.reason
+    assert (partial_of(out) / "trajectory.tum").read_text() == "saved"
+    with pytest.raises(RunError, match=status):
+        load_run(out)
+
+
+def test_a_killed_process_leaves_a_folder_that_says_so(tmp_path):
+    child = os.fork()
+    if child == 0:
+        with draft_of(tmp_path / "lab"):
+            os.kill(os.getpid(), 9)
+    os.waitpid(child, 0)
+
+    with pytest.raises(RunError, match="still being built, or its process was killed"):
+        load_run(tmp_path / "lab")
+    make_run(tmp_path / "lab", "second try")
+    assert load_run(tmp_path / "lab").manifest.status == "complete"
+
+
+def test_an_existing_run_is_refused_before_any_work(tmp_path):
+    make_run(tmp_path / "lab", "old")
+
+    with pytest.raises(RunError, match="--overwrite"), draft_of(tmp_path / "lab"):
+        pytest.fail("the body must not run")
+
+
+def test_overwriting_keeps_the_old_run_until_the_new_one_is_whole(tmp_path):
+    out = tmp_path / "lab"
+    make_run(out, "old")
+
+    with pytest.raises(TrackingError):
+        make_run(out, "new", overwrite=True, error=TrackingError("too little"))
+    assert (out / "trajectory.tum").read_text() == "old"
+
+    make_run(out, "new", overwrite=True)
+    assert (out / "trajectory.tum").read_text() == "new"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["lab"]
+
+
+@pytest.mark.parametrize("place", ["lab", "lab.partial"])
+def test_folders_that_are_not_ours_are_never_replaced(tmp_path, place):
+    precious = tmp_path / place / "thesis.tex"
+    precious.parent.mkdir()
+    precious.write_text("years")
+
+    with pytest.raises(RunError), staged(tmp_path / "lab", overwrite=True):
+        pytest.fail("the body must not run")
+    assert precious.read_text() == "years"
+
+
+def test_two_builds_of_one_run_do_not_mix(tmp_path):
+    with staged(tmp_path / "lab") as partial:
+        handle = os.open(partial, os.O_RDONLY)
+        with pytest.raises(BlockingIOError):
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with pytest.raises(RunError, match="another process"), staged(tmp_path / "lab"):
+            pytest.fail("the body must not run")
+        os.close(handle)
+
+
+def test_folders_that_are_no_runs(tmp_path):
+    with pytest.raises(RunError, match="no such run folder"):
+        load_run(tmp_path / "none")
+    with pytest.raises(RunError, match="run folder"):
+        load_run(tmp_path)
+    (tmp_path / "manifest.json").write_text('{"status": "complete"}')
+    with pytest.raises(RunError, match="input: Field required"):
+        load_run(tmp_path)
+
+
+def test_records_survive_the_disk(tmp_path):
+    how = Diagnostics(
+        features=900, matches=300, inliers=250, residual=0.1 + 0.2, residual_unit="px", method="map"
+    )
+    nothing = Diagnostics(features=0, matches=0, inliers=0, residual=0.0, residual_unit="", method="")
+    records = [
+        FrameRecord(10, "tracked", 0, is_keyframe=True, diagnostics=how),
+        FrameRecord(20, "skipped", None, is_keyframe=False, diagnostics=nothing),
+        FrameRecord(30, "lost", None, is_keyframe=False, diagnostics=how),
+    ]
+
+    write_records(tmp_path / "frames.csv", records)
+    write_frame_ms(tmp_path / "ms.csv", {10: 1.25, 30: 2.5})
+
+    assert read_records(tmp_path / "frames.csv") == records
+    assert read_frame_ms(tmp_path / "ms.csv") == {10: 1.25, 30: 2.5}
+
+
+def test_a_fingerprint_follows_names_sizes_and_lists_but_not_the_place(tmp_path):
+    def make(name, *, listed="1 a.png\n", image=b"123"):
+        folder = tmp_path / name
+        (folder / "rgb").mkdir(parents=True)
+        (folder / "rgb.txt").write_text(listed)
+        (folder / "rgb" / "a.png").write_bytes(image)
+        return fingerprint(folder)
+
+    first = make("a")
+    assert make("b") == first
+    assert make("c", listed="2 a.png\n") != first
+    assert make("d", image=b"1234") != first
+    assert fingerprint(tmp_path / "a" / "rgb" / "a.png") != fingerprint(tmp_path / "d" / "rgb" / "a.png")
