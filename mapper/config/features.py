@@ -14,16 +14,15 @@ ScaleFactor = Annotated[float, Field(gt=1.0)]
 
 
 class SurfConfig(Config):
-    """SURF (Bay et al. 2008) by mahotas; the thesis's choice (A4)."""
+    """SURF (Bay et al. 2008), described by mahotas; the thesis's choice (A4)."""
 
     kind: Literal["surf"] = "surf"
     max_features: PositiveInt = 1000
-    threshold: PositiveFloat = 0.02
-    """Determinant-of-Hessian threshold to start from; halved while an image gives too few features."""
-    min_threshold: PositiveFloat = 0.0005
+    threshold: PositiveFloat = 20.0
+    """Determinant of the Hessian, grey levels², to start from; halved while there are too few features."""
+    min_threshold: PositiveFloat = 1.0
     min_features: PositiveInt = 300
     octaves: PositiveInt = 4
-    scales: PositiveInt = 6
 
     def build(self) -> "Detector":
         """Return the detector."""

@@ -8,6 +8,7 @@ from mapper.config.base import Config
 from mapper.config.features import DetectorConfig, OrbConfig, SurfConfig, UniformOrbConfig
 
 if TYPE_CHECKING:
+    from mapper.odometry.isvd import IsvdOdometry
     from mapper.odometry.local_map.odometry import LocalMapOdometry
 
 
@@ -26,13 +27,23 @@ class IsvdConfig(Config):
     """Iterative SVD on matched 3D points (thesis alg. 7, eq. 4.1–4.2)."""
 
     kind: Literal["isvd"] = "isvd"
+    threshold: Literal["power", "halving"] = "power"
+    """How the largest pair distance shrinks: α·j^β (alg. 7), or by half from ``start_error_mm`` (alg. 6)."""
     alpha_mm: PositiveFloat = 1200.0
     beta: Annotated[float, Field(lt=0.0)] = -2.6
+    start_error_mm: PositiveFloat = 1000.0
+    """e_start of the halving threshold; the thesis leaves it open."""
+    step: Literal["svd", "icp"] = "svd"
+    """The motion in each iteration: the SVD of the pairs (alg. 6, 7), or ICP on their points (alg. 5)."""
     max_iterations: PositiveInt = 25
     min_error_mm: NonNegativeFloat = 0.0
-    """Stop once the threshold α·j^β falls below this."""
+    """Stop once the threshold falls below this (e_min of alg. 5, 6)."""
     min_pairs: PositiveInt = 20
     """Stop before fewer pairs than this would remain ("Auto")."""
+    agreement_mm: PositiveFloat = 50.0
+    """Pairs this close after the motion are said to agree with it."""
+    min_agreement_ratio: Annotated[float, Field(ge=0.0, le=1.0)] = 0.25
+    """A motion that a smaller share of the pairs agrees with is refused."""
 
 
 class IsvdOdometryConfig(Config):
@@ -41,6 +52,8 @@ class IsvdOdometryConfig(Config):
     kind: Literal["isvd"] = "isvd"
     detector: DetectorConfig = SurfConfig()
     match: MatchConfig = MatchConfig()
+    fallback: MatchConfig = MatchConfig(filter="none", max_ratio=0.9)
+    """How pairs are sought once ``match`` has led to no motion."""
     registration: IsvdConfig = IsvdConfig()
     previous_frames: PositiveInt = 4
     """MP: how many earlier frames each frame is registered against."""
@@ -50,9 +63,19 @@ class IsvdOdometryConfig(Config):
     """The nearest frame's rotation, or the weighted mean on SO(3); the thesis leaves it open."""
     depth_filter: bool = False
     """DIF (A2) before back-projection."""
+    undistort: bool = True
+    """Correct features for the lens before back-projection; the thesis says nothing of it."""
     max_depth_m: PositiveFloat = 5.0
     keyframe_interval: PositiveInt = 20
     """At least one keyframe, the sharpest, in this many frames (A8)."""
+    relocalisation_keyframes: PositiveInt = 20
+    """How many of the nearest keyframes, and as many of the others in turn, a lost frame is compared with."""
+
+    def build(self) -> "IsvdOdometry":
+        """Return the odometry this configures."""
+        from mapper.odometry.isvd import IsvdOdometry  # imported only when asked for
+
+        return IsvdOdometry(self)
 
 
 class LocalMapConfig(Config):
@@ -83,6 +106,8 @@ class LocalMapConfig(Config):
     """Longer gaps, in frame intervals, are not extrapolated over."""
     keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.75
     """Keyframe when the inliers fall below this share of the most since the last keyframe."""
+    hasty_keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
+    """The same share while the last keyframe is younger than ``min_keyframe_gap``: for fast motion."""
     weak_inliers: PositiveInt = 90
     """Keyframe at once when fewer landmarks than this agree."""
     min_keyframe_gap: PositiveInt = 4

@@ -10,6 +10,9 @@ from mapper.config.features import DetectorConfig
 from mapper.errors import DataError
 from mapper.frames import Image
 
+Descriptors = NDArray[np.uint8] | NDArray[np.float32]
+"""(N, D) bits, compared by Hamming distance, or numbers, compared by Euclidean distance."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Features:
@@ -28,7 +31,7 @@ class Features:
     octave: NDArray[np.int32]
     angle_rad: NDArray[np.float32]
     response: NDArray[np.float32]
-    descriptors: NDArray[np.uint8] | NDArray[np.float32]
+    descriptors: Descriptors
 
     def __post_init__(self) -> None:
         n = len(self.pixels)

@@ -171,7 +171,7 @@ def orientations(image: Image, pixels: Pixels) -> NDArray[np.float32]:
                 level = np.int32(row[k] * weights[k])
                 total = np.int32(total + level)
                 lever = np.int32(lever + np.int32(level * np.int32(k - PATCH_RADIUS_PX)))
-            moment_x += lever
-            moment_y += dy * total
+            moment_x += int(lever)
+            moment_y += dy * int(total)
         angles[i] = math.atan2(moment_y, moment_x)
     return angles

@@ -5,10 +5,9 @@ from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mapper.config.features import AkazeConfig, OrbConfig, SiftConfig
-from mapper.features.detectors import Features
+from mapper.features.detectors import Descriptors, Features
 from mapper.frames import Image
 
 # Detector objects are made anew for every image: it costs microseconds, and shared ones are not thread-safe.
@@ -37,7 +36,9 @@ class Orb:
                 fastThreshold=round(threshold),
             )
             keypoints, descriptors = orb.detectAndCompute(gray, None)
-            return features_from(keypoints, descriptors, [k.octave for k in keypoints], width=32)
+            return features_from(
+                keypoints, descriptors, [k.octave for k in keypoints], none=np.empty((0, 32), np.uint8)
+            )
 
         return until_enough(attempt, config.threshold, floor=config.min_threshold, want=config.min_features)
 
@@ -59,7 +60,10 @@ class Sift:
             keypoints, descriptors = sift.detectAndCompute(gray, None)
             # The low byte is the octave; 255 is -1, the doubled image that SIFT starts from.
             octaves = [(k.octave + 1) & 0xFF for k in keypoints]
-            return strongest(features_from(keypoints, descriptors, octaves, width=128), config.max_features)
+            return strongest(
+                features_from(keypoints, descriptors, octaves, none=np.empty((0, 128), np.float32)),
+                config.max_features,
+            )
 
         return until_enough(attempt, config.threshold, floor=config.min_threshold, want=config.min_features)
 
@@ -79,7 +83,9 @@ class Akaze:
         def attempt(threshold: float) -> Features:
             akaze = cv2.xfeatures2d.AKAZE.create(threshold=threshold)
             keypoints, descriptors = akaze.detectAndCompute(gray, None)
-            features = features_from(keypoints, descriptors, [k.octave for k in keypoints], width=61)
+            features = features_from(
+                keypoints, descriptors, [k.octave for k in keypoints], none=np.empty((0, 61), np.uint8)
+            )
             return strongest(features, config.max_features)
 
         return until_enough(attempt, config.threshold, floor=config.min_threshold, want=config.min_features)
@@ -119,19 +125,19 @@ def strongest(features: Features, count: int) -> Features:
 
 def features_from(
     keypoints: Sequence[cv2.KeyPoint],
-    descriptors: NDArray[np.uint8] | NDArray[np.float32] | None,
+    descriptors: Descriptors | None,
     octaves: list[int],
     *,
-    width: int,
+    none: Descriptors,
 ) -> Features:
-    """Return OpenCV's keypoints as arrays; ``width`` is the descriptor length where there are none."""
+    """Return OpenCV's keypoints as arrays; ``none`` stands for the descriptors where there are none."""
     if descriptors is None or len(keypoints) == 0:
         return Features(
             np.empty((0, 2), np.float32),
             np.empty(0, np.int32),
             np.empty(0, np.float32),
             np.empty(0, np.float32),
-            np.empty((0, width), np.float32 if width == 128 else np.uint8),
+            none,
         )
     n = len(keypoints)
     return Features(

@@ -1,0 +1,137 @@
+"""Pairs of mutually nearest features, and the homography by which thesis alg. 8 filters them."""
+
+import cv2
+import numpy as np
+from numba import njit
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from mapper.errors import DataError
+from mapper.features.detectors import Features
+
+Pairs = NDArray[np.intp]
+"""(M, 2) indices into the first and the second image's features."""
+
+_HOMOGRAPHY_POINTS = 4
+_CONFIDENCE = 0.995
+
+
+def match_mutual(a: Features, b: Features, *, max_ratio: float) -> Pairs:
+    """Return the pairs of mutually nearest descriptors that pass Lowe's ratio test (Lowe 2004, §7.1).
+
+    Every descriptor is compared with every other: Hamming distance for bits, Euclidean for numbers.
+
+    Args:
+        a: Features of the first image.
+        b: Features of the second image, of the same detector.
+        max_ratio: Largest distance of a's best partner relative to its second best.
+
+    Returns:
+        (M, 2) pairs, ascending in a's index.
+
+    Raises:
+        DataError: The descriptors are of different kinds.
+    """
+    if a.descriptors.dtype != b.descriptors.dtype or a.descriptors.shape[1] != b.descriptors.shape[1]:
+        raise DataError(
+            f"matching: descriptors {a.descriptors.shape} {a.descriptors.dtype} and {b.descriptors.shape} "
+            f"{b.descriptors.dtype} are of different kinds; use one detector for both images"
+        )
+    if len(a) == 0 or len(b) == 0:
+        return np.empty((0, 2), np.intp)
+    if a.is_binary:
+        pairs: Pairs = _match_bits(_words(a), _words(b), max_ratio)
+        return pairs
+    squares_a = np.einsum("ij,ij->i", a.descriptors, a.descriptors)
+    squares_b = np.einsum("ij,ij->i", b.descriptors, b.descriptors)
+    squared = squares_a[:, None] + squares_b[None, :] - 2.0 * (a.descriptors @ b.descriptors.T)
+    nearest: Pairs = _match_distances(np.maximum(squared, np.float32(0.0)), max_ratio**2)
+    return nearest
+
+
+def homography_inliers(
+    a: NDArray[np.float32], b: NDArray[np.float32], *, tolerance_px: float, iterations: int
+) -> NDArray[np.bool_]:
+    """Return which pairs agree with the homography that most pairs agree with (thesis alg. 8).
+
+    RANSAC over four pairs (Fischler & Bolles 1981), by OpenCV, whose random numbers are the same every time.
+
+    Args:
+        a: (M, 2) pixels in the first image.
+        b: (M, 2) their partners in the second.
+        tolerance_px: How far from its partner a pixel may be mapped.
+        iterations: Most samples to try; fewer are needed when many pairs agree.
+
+    Returns:
+        (M,) mask; all False when no homography exists.
+    """
+    none = np.zeros(len(a), np.bool_)
+    if len(a) < _HOMOGRAPHY_POINTS:
+        return none
+    found, mask = cv2.findHomography(
+        a, b, cv2.RANSAC, tolerance_px, maxIters=iterations, confidence=_CONFIDENCE
+    )
+    return none if found is None else mask.ravel().astype(np.bool_)
+
+
+def _words(features: Features) -> NDArray[np.uint64]:
+    """Return the bits as (N, W) whole words, filled up with zeros."""
+    n, width = features.descriptors.shape
+    padded = np.zeros((n, -(-width // 8) * 8), np.uint8)
+    padded[:, :width] = features.descriptors
+    words: NDArray[np.uint64] = padded.view(np.uint64)
+    return words
+
+
+@intrinsic
+def _popcount(_context, x):  # type: ignore[no-untyped-def]
+    """Count the set bits of a uint64 with the processor's own instruction, which numba does not expose."""
+
+    def generate(_typing, builder, _signature, arguments):  # type: ignore[no-untyped-def]
+        return builder.ctpop(arguments[0])
+
+    return x(x), generate
+
+
+@njit(cache=True, nogil=True)
+def _match_bits(a: NDArray[np.uint64], b: NDArray[np.uint64], max_ratio: float) -> Pairs:
+    distances = np.empty((len(a), len(b)), np.float32)
+    words = a.shape[1]
+    for i in range(len(a)):
+        for j in range(len(b)):
+            differing = np.uint64(0)
+            for k in range(words):
+                differing += _popcount(a[i, k] ^ b[j, k])
+            distances[i, j] = differing
+    nearest: Pairs = _match_distances(distances, max_ratio)
+    return nearest
+
+
+@njit(cache=True, nogil=True)
+def _match_distances(distances: NDArray[np.float32], max_ratio: float) -> Pairs:
+    """Return the mutual best entries of a (N, M) table; among equals the first one counts."""
+    rows, columns = distances.shape
+    column_best = np.full(columns, np.inf, np.float32)
+    column_row = np.zeros(columns, np.intp)
+    partner = np.zeros(rows, np.intp)
+    distinct = np.zeros(rows, np.bool_)
+    for i in range(rows):
+        best, second = np.float32(np.inf), np.float32(np.inf)
+        for j in range(columns):
+            distance = distances[i, j]
+            if distance < best:
+                best, second, partner[i] = distance, best, j
+            elif distance < second:
+                second = distance
+            if distance < column_best[j]:
+                column_best[j] = distance
+                column_row[j] = i
+        distinct[i] = best < max_ratio * second
+    pairs = np.empty((rows, 2), np.intp)
+    count = 0
+    for i in range(rows):
+        if distinct[i] and column_row[partner[i]] == i:
+            pairs[count] = i, partner[i]
+            count += 1
+    mutual: Pairs = pairs[:count].copy()
+    return mutual

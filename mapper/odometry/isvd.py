@@ -1,0 +1,225 @@
+"""The thesis's odometry: each frame registered against the frames before it ("ISLAM", alg. 7)."""
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.config.odometry import IsvdOdometryConfig, MatchConfig
+from mapper.errors import FrameError
+from mapper.features.detectors import Features, build_detector
+from mapper.features.matching import homography_inliers, match_mutual
+from mapper.frames import Frame, RgbdFrame
+from mapper.geometry import Array, Points, Transform, apply, mean_rotation, transform
+from mapper.graph.model import BetweenFactor
+from mapper.odometry.base import Diagnostics, Track
+from mapper.odometry.keyframes import SharpestKeyframes
+from mapper.registration.base import Alignment
+from mapper.registration.isvd import Isvd
+from mapper.sensing.depth_filter import dif
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IsvdObservation:
+    """A frame's features and where they are.
+
+    Attributes:
+        stamp_ns: The frame's stamp.
+        features: Of the image.
+        points_body: (N, 3) metres, body frame; NaN where the depth image has no measurement.
+    """
+
+    stamp_ns: int
+    features: Features
+    points_body: Points
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """A frame that has its place: node, what it saw, and T_world_body as estimated then."""
+
+    node: int
+    observation: IsvdObservation
+    T_world_body: Transform
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A frame's registration against an earlier one.
+
+    Attributes:
+        earlier: The frame it was registered against.
+        alignment: The motion found, earlier ← new.
+        weight: Its quality W, 1/m (eq. 4.1).
+        matches: Feature pairs it began with, with or without depth.
+        T_world_body: The new frame's pose as this registration sees it.
+    """
+
+    earlier: Placed
+    alignment: Alignment
+    weight: float
+    matches: int
+    T_world_body: Transform
+
+
+class IsvdOdometry:
+    """Registers every frame against the MP frames before it and averages what they say.
+
+    Every frame that finds its place is a node, and every registration that led to it is a factor. Their
+    information is that of the rigid fit; it counts pairs as independent, although frames in a row share
+    features and depth errors, so it is right in proportion rather than in size.
+    """
+
+    def __init__(self, config: IsvdOdometryConfig) -> None:
+        self._config = config
+        self._detector = build_detector(config.detector)
+        self._isvd = Isvd(config.registration)
+        self._recent: deque[Placed] = deque(maxlen=max(config.previous_frames, config.keyframe_interval))
+        self._keyframes: list[Placed] = []
+        self._sharpest = SharpestKeyframes(config.keyframe_interval)
+        self._next_node = 0
+        self._turn = 0
+
+    def observe(self, frame: Frame) -> IsvdObservation:
+        """Return a frame's features with their 3D points. Pure.
+
+        Raises:
+            FrameError: The frame is a bare scan.
+        """
+        if not isinstance(frame, RgbdFrame):
+            raise FrameError(f"frame {frame.stamp_ns}: ISVD odometry needs an image with depth, not a scan")
+        features = self._detector.detect(frame.gray)
+        return IsvdObservation(frame.stamp_ns, features, self._points_body(frame, features))
+
+    def track(self, observation: IsvdObservation) -> Track:
+        """Place the next observation, in time order."""
+        if not self._recent:
+            return self._place(observation, np.eye(4), [], method="start")
+        recent = list(self._recent)[-self._config.previous_frames :][::-1]
+        for match, method in ((self._config.match, "isvd"), (self._config.fallback, "fallback")):
+            candidates = self._register(observation, recent, match)
+            if candidates:
+                return self._place(observation, self._combine(candidates), candidates, method=method)
+        candidates = self._relocalise(observation)
+        if candidates:
+            return self._place(observation, self._combine(candidates), candidates, method="relocalised")
+        diagnostics = Diagnostics(len(observation.features), 0, 0, 0.0, "m", "lost")
+        return Track(observation.stamp_ns, None, np.eye(4), self._recent[-1].T_world_body, False, diagnostics)
+
+    def finish(self) -> Sequence[BetweenFactor]:
+        """Return nothing: every measurement was final when its frame was tracked."""
+        return ()
+
+    def _points_body(self, frame: RgbdFrame, features: Features) -> Points:
+        config, camera = self._config, frame.camera
+        depth_m = dif(frame.depth_m) if config.depth_filter else frame.depth_m
+        # Depth is registered to the raw image, so it is looked up before the lens is corrected for.
+        nearest = np.rint(features.pixels).astype(np.intp)
+        columns = np.clip(nearest[:, 0], 0, camera.width_px - 1)
+        rows = np.clip(nearest[:, 1], 0, camera.height_px - 1)
+        z = depth_m[rows, columns].astype(np.float64)
+        z[(z <= 0.0) | (z > config.max_depth_m)] = np.nan
+        pixels = camera.undistort(features.pixels) if config.undistort else features.pixels
+        rays = (pixels - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
+        return apply(frame.T_body_camera, np.column_stack([rays * z[:, None], z]))
+
+    def _register(
+        self, observation: IsvdObservation, earlier: Iterable[Placed], match: MatchConfig
+    ) -> list[Candidate]:
+        """Return the registrations that succeeded, in the order of the earlier frames."""
+        candidates = []
+        for placed in earlier:
+            target, source, matches = matched_points(placed.observation, observation, match)
+            alignment, weight = self._isvd.fit_weighted(target, source)
+            if alignment.converged:
+                T_world_body = placed.T_world_body @ alignment.T_target_source
+                candidates.append(Candidate(placed, alignment, weight, matches, T_world_body))
+        return candidates
+
+    def _combine(self, candidates: Sequence[Candidate]) -> Transform:
+        """Return one T_world_body; the nearest earlier frame comes first (alg. 7, lines 21 to 27)."""
+        weights = np.array([candidate.weight for candidate in candidates])
+        if self._config.average == "mean":
+            weights = np.ones(len(candidates))
+        poses = np.array([candidate.T_world_body for candidate in candidates])
+        translation: Array = weights @ poses[:, :3, 3] / weights.sum()
+        R_world_body = poses[0, :3, :3]
+        if self._config.rotation == "mean":
+            R_world_body = mean_rotation(poses[:, :3, :3], weights)
+        return transform(R_world_body, translation)
+
+    def _relocalise(self, observation: IsvdObservation) -> list[Candidate]:
+        """Return the registration against the keyframe that most features match, if one succeeds."""
+        candidates = self._register(observation, self._keyframes_to_try(), self._config.match)
+        return sorted(candidates, key=lambda candidate: -candidate.alignment.pairs)[:1]
+
+    def _keyframes_to_try(self) -> list[Placed]:
+        """Return the keyframes nearest to where tracking ended, and some of the others in turn."""
+        count = self._config.relocalisation_keyframes
+        last_world = self._recent[-1].T_world_body[:3, 3]
+        by_distance = sorted(
+            self._keyframes, key=lambda k: float(np.linalg.norm(k.T_world_body[:3, 3] - last_world))
+        )
+        far = by_distance[count:]
+        in_turn = [far[(self._turn + i) % len(far)] for i in range(min(count, len(far)))]
+        self._turn += len(in_turn)
+        return by_distance[:count] + in_turn
+
+    def _place(
+        self,
+        observation: IsvdObservation,
+        T_world_body: Transform,
+        candidates: Sequence[Candidate],
+        *,
+        method: str,
+    ) -> Track:
+        """Make the frame a node, remember it, and report its measurements."""
+        node = self._next_node
+        self._next_node += 1
+        self._recent.append(Placed(node, observation, T_world_body))
+        keyframe = self._sharpest.add(node, len(observation.features))
+        self._keyframes.extend(placed for placed in self._recent if placed.node == keyframe)
+        nearest = candidates[0].alignment if candidates else None
+        return Track(
+            stamp_ns=observation.stamp_ns,
+            node=node,
+            T_node_body=np.eye(4),
+            T_world_body=T_world_body,
+            is_keyframe=True,
+            diagnostics=Diagnostics(
+                features=len(observation.features),
+                matches=candidates[0].matches if candidates else 0,
+                inliers=nearest.pairs if nearest else 0,
+                residual=nearest.inlier_rmse_m if nearest else 0.0,
+                residual_unit="m",
+                method=method,
+            ),
+            factors=tuple(
+                BetweenFactor(candidate.earlier.node, node, alignment.T_target_source, alignment.information)
+                for candidate in candidates
+                if (alignment := candidate.alignment).information is not None
+            ),
+        )
+
+
+def matched_points(
+    target: IsvdObservation, source: IsvdObservation, match: MatchConfig
+) -> tuple[Points, Points, int]:
+    """Return the (M, 3) points that two frames share, each in its own body frame, and the number of matches.
+
+    Thesis alg. 8: matches filtered by a homography are counted; those with depth on both sides give points.
+    """
+    pairs = match_mutual(target.features, source.features, max_ratio=match.max_ratio)
+    if match.filter == "homography":
+        pairs = pairs[
+            homography_inliers(
+                target.features.pixels[pairs[:, 0]],
+                source.features.pixels[pairs[:, 1]],
+                tolerance_px=match.homography_tolerance_px,
+                iterations=match.homography_iterations,
+            )
+        ]
+    points_target, points_source = target.points_body[pairs[:, 0]], source.points_body[pairs[:, 1]]
+    measured = np.isfinite(points_target[:, 2]) & np.isfinite(points_source[:, 2])
+    return points_target[measured], points_source[measured], len(pairs)

@@ -1,0 +1,125 @@
+"""Iterative SVD on matched points (Somlyai, PhD thesis, Óbuda University, alg. 5 to 7)."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.config.odometry import IsvdConfig
+from mapper.geometry import Array, Points, Transform, apply, fit_rigid
+from mapper.registration.base import Alignment, failed
+
+_MM_PER_M = 1000.0
+_MIN_SPREAD_M = 0.01  # points nearer than this to a common line leave a rotation about it open
+_MIN_SIGMA_M = 1e-3  # trimming must not make the pairs look better than the sensor
+_ICP_STEPS = 20
+
+
+class Isvd:
+    """Fits a motion to matched points and drops the pairs farther apart than an ever smaller threshold."""
+
+    def __init__(self, config: IsvdConfig) -> None:
+        self._config = config
+
+    def fit(self, target: Points, source: Points) -> Alignment:
+        """Return the motion that takes the source points to their target partners.
+
+        Args:
+            target: (N, 3) points in the target frame, metres (the thesis's D).
+            source: (N, 3) their partners in the source frame, metres (the thesis's S).
+
+        Returns:
+            The alignment. Its ratio, residual and information are those of all pairs within
+            ``agreement_mm``; it has not converged when too few of them remain to tell.
+        """
+        return self.fit_weighted(target, source)[0]
+
+    def fit_weighted(self, target: Points, source: Points) -> tuple[Alignment, float]:
+        """Return ``fit``'s alignment and its quality W in 1/m (eq. 4.1), 0 when it did not converge."""
+        config = self._config
+        if len(target) < max(config.min_pairs, 3):
+            return failed(f"{len(target)} pairs with depth, fewer than {max(config.min_pairs, 3)}"), 0.0
+        T_target_source, used = self._trim(target, source)
+        residuals = target - apply(T_target_source, source)
+        distances = np.linalg.norm(residuals, axis=1)
+        agreeing = distances <= config.agreement_mm / _MM_PER_M
+        ratio = float(agreeing.mean())
+        if agreeing.sum() < max(config.min_pairs, 3) or ratio < config.min_agreement_ratio:
+            return failed(
+                f"{agreeing.sum()} of {len(target)} pairs agree within {config.agreement_mm} mm"
+            ), 0.0
+        spread_m = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(source[agreeing].T)), 0.0))
+        if spread_m[1] < _MIN_SPREAD_M:
+            return failed(f"the pairs lie within {1e3 * spread_m[1]:.1f} mm of a line"), 0.0
+        weight = 1.0 / max(float(np.abs(residuals[used]).sum(axis=1).mean()), np.finfo(float).eps)
+        alignment = Alignment(
+            T_target_source,
+            converged=True,
+            inlier_ratio=ratio,
+            inlier_rmse_m=float(np.sqrt((distances[agreeing] ** 2).mean())),
+            pairs=int(agreeing.sum()),
+            information=rigid_fit_information(source[agreeing], distances[agreeing]),
+        )
+        return alignment, weight
+
+    def _trim(self, target: Points, source: Points) -> tuple[Transform, NDArray[np.intp]]:
+        """Return the motion of the last iteration and the indices of the pairs that it rests on."""
+        T_target_source = np.eye(4)
+        used = kept = np.arange(len(target), dtype=np.intp)
+        for threshold_m in self._thresholds_m():
+            used = kept
+            if self._config.step == "icp":
+                T_target_source = _icp(target[used], source[used], T_target_source)
+            else:
+                T_target_source, _ = fit_rigid(target[used], source[used])
+            distances = np.linalg.norm(target[used] - apply(T_target_source, source[used]), axis=1)
+            kept = used[distances <= threshold_m]
+            if threshold_m * _MM_PER_M < self._config.min_error_mm or len(kept) < self._config.min_pairs:
+                break
+        return T_target_source, used
+
+    def _thresholds_m(self) -> Iterator[float]:
+        config = self._config
+        for j in range(1, config.max_iterations + 1):
+            if config.threshold == "power":
+                yield config.alpha_mm * j**config.beta / _MM_PER_M  # eq. 4.2
+            else:
+                yield config.start_error_mm * 0.5 ** (j - 1) / _MM_PER_M
+
+
+def rigid_fit_information(source: Points, distances_m: Array) -> Array:
+    """Return the (6, 6) Fisher information of a rigid fit for the source's tangent (rotation, translation).
+
+    A pair's residual d - T·s changes by -R·(ω × s + v) when T is multiplied by exp(ω, v) on the right.
+    With equal, independent noise σ on each axis the pairs' information is Σ JᵀJ / σ², where J = [-[s]×, I];
+    σ² is what 3N - 6 degrees of freedom leave unexplained. Points spread wide fix the rotation, many
+    points the translation, and what they leave loose stays loose in the pose graph.
+
+    Args:
+        source: (N, 3) points in the source frame, metres.
+        distances_m: (N,) lengths of the residuals.
+    """
+    n = len(source)
+    sigma_m = max(float(np.sqrt((distances_m**2).sum() / max(3 * n - 6, 1))), _MIN_SIGMA_M)
+    x, y, z = source.sum(axis=0)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    squares = source.T @ source
+    information = np.empty((6, 6))
+    information[:3, :3] = np.trace(squares) * np.eye(3) - squares  # Σ -[s]×²
+    information[:3, 3:] = cross
+    information[3:, :3] = cross.T
+    information[3:, 3:] = n * np.eye(3)
+    return information / sigma_m**2
+
+
+def _icp(target: Points, source: Points, T_target_source: Transform) -> Transform:
+    """Return point-to-point ICP's motion from a first guess (Besl & McKay 1992)."""
+    nearest = np.empty(0, np.intp)
+    for _ in range(_ICP_STEPS):
+        moved = apply(T_target_source, source)
+        squared = (moved**2).sum(axis=1)[:, None] - 2.0 * moved @ target.T + (target**2).sum(axis=1)
+        before, nearest = nearest, squared.argmin(axis=1)
+        if np.array_equal(before, nearest):
+            break
+        T_target_source, _ = fit_rigid(target[nearest], source)
+    return T_target_source
