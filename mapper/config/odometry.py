@@ -108,8 +108,8 @@ class LocalMapConfig(Config):
     """Keyframe when the inliers fall below this share of the most since the last keyframe."""
     hasty_keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
     """The same share while the last keyframe is younger than ``min_keyframe_gap``: for fast motion."""
-    weak_inliers: PositiveInt = 90
-    """Keyframe at once when fewer landmarks than this agree."""
+    weak_inliers: PositiveInt = 150
+    """With fewer, what the prediction found has to compete with what matching without it finds."""
     min_keyframe_gap: PositiveInt = 4
     max_keyframe_gap: PositiveInt = 20
     bundle_keyframes: PositiveInt = 10

@@ -84,24 +84,27 @@ class LocalMapOdometry:
     def _place(self, observation: Observation, last: Placement) -> Placement | None:
         """Try, in this order: the predicted motion, the latest keyframes, all that look alike."""
         if self._lost_frames == 0:
-            placement = self._placer.by_motion(observation, last, self._before_last)
-            if placement is not None:
-                return placement
+            predicted = self._placer.by_motion(observation, last, self._before_last)
+            if predicted is not None and predicted.inliers >= self._config.weak_inliers:
+                return predicted
+            # A weak answer may be a wrong one: a placement that owes nothing to the prediction competes with it.
             newest = range(len(self._map.keyframes) - 1, max(len(self._map.keyframes) - 4, -1), -1)
             latest = list(dict.fromkeys([last.reference, *newest]))
-            placement = self._placer.by_matching(observation, latest, method="fallback")
-            if placement is not None:
-                return placement
+            matched = self._placer.by_matching(observation, latest, method="fallback")
+            found = [placement for placement in (predicted, matched) if placement is not None]
+            if found:
+                return max(found, key=lambda placement: placement.inliers)
         here_world = inverse(last.T_camera_world)[:3, 3]
         lookalikes = self._placer.lookalikes(observation, here_world, turn=self._lost_frames)
         return self._placer.by_matching(observation, lookalikes, method="relocalised")
 
     def _wants_keyframe(self, placement: Placement) -> bool:
         config = self._config
-        if self._frames_since_keyframe >= config.max_keyframe_gap or placement.inliers < config.weak_inliers:
+        if self._frames_since_keyframe >= config.max_keyframe_gap:
             return True
-        fading = placement.inliers < config.keyframe_ratio * self._most_inliers
-        return fading and self._frames_since_keyframe >= config.min_keyframe_gap
+        kept_ratio = placement.inliers / self._most_inliers
+        settled = self._frames_since_keyframe >= config.min_keyframe_gap
+        return kept_ratio < (config.keyframe_ratio if settled else config.hasty_keyframe_ratio)
 
     def _keep(self, placement: Placement) -> Placement:
         """Turn a placed frame into a keyframe, refine the map around it, and return it as refined."""

@@ -16,7 +16,7 @@ from mapper.odometry.local_map.observation import Observation
 from mapper.odometry.local_map.pose import ransac_pose, refine_pose
 
 _LM_ROUNDS, _LM_ITERATIONS = 3, 8
-_MAX_HAMMING, _MAX_HAMMING_LOCAL = 64, 100
+_MAX_HAMMING = 64
 _LAST_FRAME_RATIO, _LOCAL_MAP_RATIO, _FALLBACK_RATIO = 0.9, 0.8, 0.85
 _SIMILARITY_FEATURES = 200
 _BEST_LOOKALIKES = 5
@@ -209,7 +209,7 @@ class Placer:
             landmarks["words"][visible],
             search_px=config.local_search_px,
             taken=landmark_of_feature >= 0,
-            max_hamming=_MAX_HAMMING_LOCAL,
+            max_hamming=_MAX_HAMMING,
             max_ratio=_LOCAL_MAP_RATIO,
         )
         hits = np.flatnonzero(feature >= 0)
