@@ -87,7 +87,7 @@ class LocalMapOdometry:
             predicted = self._placer.by_motion(observation, last, self._before_last)
             if predicted is not None and predicted.inliers >= self._config.weak_inliers:
                 return predicted
-            # A weak answer may be a wrong one: a placement that owes nothing to the prediction competes with it.
+            # A weak answer may be a wrong one: let a placement that owes nothing to the prediction compete.
             newest = range(len(self._map.keyframes) - 1, max(len(self._map.keyframes) - 4, -1), -1)
             latest = list(dict.fromkeys([last.reference, *newest]))
             matched = self._placer.by_matching(observation, latest, method="fallback")
