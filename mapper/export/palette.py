@@ -1,0 +1,36 @@
+"""The colours that every picture and viewer file shares, as (R, G, B) bytes."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.graph.model import Origin
+
+Rgb = tuple[int, int, int]
+
+ESTIMATE: Rgb = (214, 69, 37)
+TRUTH: Rgb = (45, 108, 178)
+START: Rgb = (38, 145, 87)
+END: Rgb = (30, 33, 41)
+FACTORS: dict[Origin, Rgb] = {
+    "odometry": (140, 146, 158),
+    "loop": (196, 40, 140),
+    "wheel": (224, 160, 32),
+}
+UNKNOWN_CELL: Rgb = (214, 218, 224)
+FREE_CELL: Rgb = (255, 255, 255)
+OCCUPIED_CELL: Rgb = (35, 41, 54)
+
+
+def height_colors(heights_m: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Return (N, 3) uint8 RGB for (N,) heights: blue at the 2nd percentile to red at the 98th.
+
+    The palette is Turbo (Mikhailov 2019).
+    """
+    if len(heights_m) == 0:
+        return np.empty((0, 3), np.uint8)
+    low, high = np.percentile(heights_m, [2.0, 98.0])
+    share = np.clip((heights_m - low) / max(float(high - low), 1e-9), 0.0, 1.0)
+    levels = np.rint(255.0 * share).astype(np.uint8).reshape(-1, 1)
+    bgr = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)
+    return np.ascontiguousarray(bgr.reshape(-1, 3)[:, ::-1], dtype=np.uint8)
