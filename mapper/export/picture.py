@@ -1,0 +1,234 @@
+"""Pictures of a finished run: the trajectory over the slice, and the coloured cloud from two sides.
+
+Matplotlib is driven through its objects: pyplot would keep global state and pick a GUI backend.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.atomic import replacing
+from mapper.export.grid import grid_image
+from mapper.export.palette import END, ESTIMATE, START, TRUTH, UNKNOWN_CELL, Rgb
+from mapper.frames import Points32
+from mapper.geometry import Array
+from mapper.octree.slice import FREE, OCCUPIED, OccupancyGrid
+from mapper.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_DPI = 130
+_INK = "#1e2129"
+_FAINT = "#6c7280"
+_LINE = "#c3c8d0"
+_MARGIN_M = 0.3
+_HEADROOM_M = 0.3  # above the highest camera position; what lies higher would hide the rooms from above
+_VIEW_PX = 900
+_TILT_RAD = np.deg2rad(32.0)
+_TURN_RAD = np.deg2rad(-35.0)
+_BACKDROP: Rgb = (22, 24, 30)
+
+
+def write_summary(
+    path: Path,
+    *,
+    grid: OccupancyGrid,
+    trajectory: Trajectory,
+    truth: Trajectory | None,
+    title: str,
+    lines: Sequence[str] = (),
+) -> None:
+    """Draw the trajectory over the slice.
+
+    Args:
+        path: PNG file to write.
+        grid: The slice, world frame.
+        trajectory: The estimate, world frame.
+        truth: Where the body really was, already aligned to the world frame, or None.
+        title: Headline.
+        lines: Figures worth knowing, shown below the headline.
+    """
+    low, high = _extent(grid, [trajectory] if truth is None else [trajectory, truth])
+    figure, axes = _map_page(title, lines, aspect=float(np.divide(*(high - low)[::-1])))
+    x, y = grid.origin_world_m
+    height_m, width_m = (n * grid.resolution_m for n in grid.cells.shape)
+    axes.imshow(
+        grid_image(grid), origin="lower", interpolation="nearest", extent=(x, x + width_m, y, y + height_m)
+    )
+    positions = trajectory.positions_world
+    if truth is not None:
+        reference = truth.positions_world
+        axes.plot(*reference[:, :2].T, color=_hex(TRUTH), linewidth=2.6, alpha=0.65, label="truth")
+    axes.plot(*positions[:, :2].T, color=_hex(ESTIMATE), linewidth=1.3, label="estimate")
+    _mark(axes, positions[0], color=START, marker="o", label="start")
+    _mark(axes, positions[-1], color=END, marker="s", label="end")
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal", adjustable="datalim")
+    _scale_bar(axes, low, high, color=_INK)
+    axes.legend(loc="best", fontsize=8, framealpha=0.92, edgecolor=_LINE)
+    _save(figure, path)
+
+
+def write_cloud_views(
+    path: Path, points: Points32, colors: NDArray[np.uint8], trajectory: Trajectory
+) -> None:
+    """Draw a coloured cloud from above and from an oblique side, with the trajectory through it.
+
+    What lies over the camera's head is left out of both, so that ceilings do not hide the rooms.
+
+    Args:
+        path: PNG file to write.
+        points: (N, 3) float32 metres, world frame, z up; N ≥ 1.
+        colors: (N, 3) uint8 RGB.
+        trajectory: World frame.
+    """
+    positions = trajectory.positions_world
+    below = points[:, 2] <= positions[:, 2].max() + _HEADROOM_M
+    if below.any():
+        points, colors = points[below], colors[below]
+    figure = _figure(13.0, 6.6, background=_BACKDROP)
+    views = {"from above": _view(0.0, np.pi / 2), "from the side": _view(_TURN_RAD, _TILT_RAD)}
+    for column, (name, R_view_world) in enumerate(views.items()):
+        axes = figure.add_axes((0.01 + 0.5 * column, 0.02, 0.48, 0.9))
+        _draw_view(axes, R_view_world, points, colors=colors, positions=positions)
+        axes.set_title(name, color=_LINE, fontsize=11)
+    _save(figure, path)
+
+
+def _draw_view(
+    axes: "Axes", R_view_world: Array, points: Points32, *, colors: NDArray[np.uint8], positions: Array
+) -> None:
+    cloud, path = points @ R_view_world.T.astype(np.float32), positions @ R_view_world.T
+    # A few stray points must not shrink the scene.
+    low, high = np.percentile(cloud[:, :2], [0.5, 99.5], axis=0)
+    low = np.minimum(low, path[:, :2].min(axis=0)) - _MARGIN_M
+    high = np.maximum(high, path[:, :2].max(axis=0)) + _MARGIN_M
+    pixel_m = float((high - low).max()) / _VIEW_PX
+    image = splat(cloud, colors, low=low, pixel_m=pixel_m, shape=np.ceil((high - low)[::-1] / pixel_m))
+    axes.imshow(image, origin="lower", interpolation="antialiased", extent=(low[0], high[0], low[1], high[1]))
+    axes.plot(*path[:, :2].T, color="white", linewidth=2.4, alpha=0.75)
+    axes.plot(*path[:, :2].T, color=_hex(ESTIMATE), linewidth=1.3)
+    _scale_bar(axes, low, high, color="white")
+    axes.set_axis_off()
+
+
+def splat(
+    cloud: Points32, colors: NDArray[np.uint8], *, low: Array, pixel_m: float, shape: Array
+) -> NDArray[np.uint8]:
+    """Return an orthographic image in which the nearest point wins every pixel.
+
+    A point covers 3×3 pixels, so that a cloud thinned to voxels still looks closed.
+
+    Args:
+        cloud: (N, 3) float32 metres: right, up, and towards the viewer.
+        colors: (N, 3) uint8 RGB.
+        low: (2,) right and up of the image's corner, metres.
+        pixel_m: Size of a pixel.
+        shape: Height and width in pixels.
+
+    Returns:
+        (H, W, 3) uint8 RGB, row 0 = lowest.
+    """
+    height, width = (int(n) for n in shape)
+    image = np.empty((height + 2, width + 2, 3), np.uint8)
+    image[:] = _BACKDROP
+    cell = np.floor((cloud[:, :2] - low) / pixel_m).astype(np.int64) + 1
+    inside = (cell >= 1).all(axis=1) & (cell[:, 0] <= width) & (cell[:, 1] <= height)
+    nearest_last = np.flatnonzero(inside)[np.argsort(cloud[inside, 2], kind="stable")]
+    flat = cell[nearest_last, 1] * (width + 2) + cell[nearest_last, 0]
+    rank = np.full(image.shape[0] * image.shape[1], -1, np.int64)
+    for row in (-1, 0, 1):
+        for column in (-1, 0, 1):
+            np.maximum.at(rank, flat + row * (width + 2) + column, np.arange(len(flat)))
+    covered = rank >= 0
+    image.reshape(-1, 3)[covered] = colors[nearest_last[rank[covered]]]
+    return image[1:-1, 1:-1]
+
+
+def _view(turn_rad: float, tilt_rad: float) -> Array:
+    """Return the rotation to (right, up, towards the viewer) of a viewer at an azimuth and elevation."""
+    towards = np.array(
+        [np.sin(turn_rad) * np.cos(tilt_rad), -np.cos(turn_rad) * np.cos(tilt_rad), np.sin(tilt_rad)]
+    )
+    right = np.array([np.cos(turn_rad), np.sin(turn_rad), 0.0])
+    return np.array([right, np.cross(towards, right), towards])
+
+
+def _extent(grid: OccupancyGrid, trajectories: Sequence[Trajectory]) -> tuple[Array, Array]:
+    """Return the lower and upper corner, metres, around everything known."""
+    rows, columns = np.nonzero((grid.cells == FREE) | (grid.cells == OCCUPIED))
+    cells = grid.origin_world_m + (np.column_stack([columns, rows]) + 0.5) * grid.resolution_m
+    seen = np.concatenate([cells, *(t.positions_world[:, :2] for t in trajectories)])
+    return seen.min(axis=0) - _MARGIN_M, seen.max(axis=0) + _MARGIN_M
+
+
+def _round_length(length_m: float) -> float:
+    """Return the largest of 1, 2 or 5 times a power of ten that is not longer."""
+    decade = 10.0 ** np.floor(np.log10(length_m))
+    return float(max(step * decade for step in (1.0, 2.0, 5.0) if step * decade <= length_m))
+
+
+def _scale_bar(axes: "Axes", low: Array, high: Array, *, color: str) -> None:
+    length_m = _round_length(0.2 * float(high[0] - low[0]))
+    x, y = low + 0.035 * (high - low)
+    axes.plot([x, x + length_m], [y, y], color=color, linewidth=3, solid_capstyle="butt")
+    axes.annotate(f"{length_m:g} m", (x, y), (0, 5), textcoords="offset points", color=color, fontsize=9)
+
+
+def _mark(axes: "Axes", position: Array, *, color: Rgb, marker: str, label: str) -> None:
+    axes.plot(
+        position[0],
+        position[1],
+        marker,
+        color=_hex(color),
+        markersize=8,
+        markeredgecolor="white",
+        markeredgewidth=1.4,
+        label=label,
+    )
+
+
+def _map_page(title: str, lines: Sequence[str], *, aspect: float) -> tuple["Figure", "Axes"]:
+    """Return a page with a headline, and axes in metres that fit a map of this height over width."""
+    width_in, left_in, right_in, bottom_in = 8.0, 0.65, 0.25, 0.6
+    map_width_in = width_in - left_in - right_in
+    map_height_in = map_width_in * min(max(aspect, 0.4), 1.3)
+    top_in = 0.65 + 0.19 * len(lines)
+    height_in = bottom_in + map_height_in + top_in
+    figure = _figure(width_in, height_in)
+    left, bottom = left_in / width_in, bottom_in / height_in
+    figure.text(left, 1 - 0.2 / height_in, title, fontsize=14, fontweight="bold", color=_INK, va="top")
+    figure.text(left, 1 - 0.52 / height_in, "\n".join(lines), fontsize=9, color=_FAINT, va="top")
+    axes = figure.add_axes((left, bottom, map_width_in / width_in, map_height_in / height_in))
+    axes.set_facecolor(_hex(UNKNOWN_CELL))
+    axes.set_xlabel("x (m)", color=_FAINT, fontsize=9)
+    axes.set_ylabel("y (m)", color=_FAINT, fontsize=9)
+    axes.tick_params(colors=_FAINT, labelsize=8)
+    for spine in axes.spines.values():
+        spine.set_color(_LINE)
+    return figure, axes
+
+
+def _figure(width_in: float, height_in: float, *, background: Rgb = (255, 255, 255)) -> "Figure":
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second
+    from matplotlib.figure import Figure
+
+    figure = Figure((width_in, height_in), dpi=_DPI, facecolor=_hex(background))
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _save(figure: Any, path: Path) -> None:
+    with replacing(path) as part:
+        # Matplotlib would sign with its version: the same run must give the same bytes.
+        figure.savefig(part, format="png", metadata={"Software": None})
+
+
+def _hex(color: Rgb) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*color)

@@ -1,0 +1,119 @@
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from mapper.export.palette import ESTIMATE, TRUTH, height_colors
+from mapper.export.picture import splat, write_cloud_views, write_summary
+from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from mapper.trajectory import Trajectory
+
+
+def room():
+    cells = np.full((60, 100), FREE, np.int8)
+    cells[[0, -1], :] = OCCUPIED
+    cells[:, [0, -1]] = OCCUPIED
+    cells[40:50, 20:30] = UNKNOWN
+    return OccupancyGrid(cells, np.array([-2.5, -1.5]), 0.05)
+
+
+def loop(*, radius_m=1.0):
+    angles = np.linspace(0.0, 2.0 * np.pi, 200)
+    poses = np.repeat(np.eye(4)[None], 200, axis=0)
+    poses[:, :3, 3] = np.column_stack([radius_m * np.cos(angles), np.sin(angles), np.full(200, 1.2)])
+    return Trajectory(np.arange(200, dtype=np.int64), poses)
+
+
+def pixels_like(picture, rgb):
+    return int((np.abs(picture.astype(int) - rgb[::-1]).max(axis=2) <= 12).sum())
+
+
+def test_summary_shows_estimate_and_truth(tmp_path):
+    path = tmp_path / "summary.png"
+    drawing = {"grid": room(), "trajectory": loop(), "title": "a room", "lines": ["200 frames"]}
+    write_summary(path, truth=loop(radius_m=1.4), **drawing)
+    both = cv2.imread(str(path))
+    write_summary(path, truth=None, **drawing)
+    alone = cv2.imread(str(path))
+
+    assert min(both.shape[:2]) > 500
+    assert pixels_like(both, ESTIMATE) > 500
+    assert pixels_like(alone, ESTIMATE) > 500
+    with_alpha = tuple(round(0.65 * c + 0.35 * 255) for c in TRUTH)
+    assert pixels_like(both, with_alpha) > 500
+    assert pixels_like(alone, with_alpha) == 0
+
+
+@pytest.mark.parametrize("shape", [(10, 400), (400, 10), (1, 1)])
+def test_summary_fits_maps_of_any_shape(tmp_path, shape):
+    grid = OccupancyGrid(np.zeros(shape, np.int8), np.array([0.0, 0.0]), 0.05)
+    write_summary(tmp_path / "s.png", grid=grid, trajectory=loop(), truth=None, title="odd")
+    height, width = cv2.imread(str(tmp_path / "s.png")).shape[:2]
+    assert width == 1040
+    assert 400 < height < 1500
+
+
+def test_pictures_are_the_same_bytes_again_and_leave_no_pyplot(tmp_path):
+    loaded_before = set(sys.modules)
+    cloud = np.random.default_rng(0).normal(size=(2000, 3)).astype(np.float32)
+    colors = height_colors(cloud[:, 2])
+    for name in ("a.png", "b.png"):
+        write_summary(tmp_path / name, grid=room(), trajectory=loop(), truth=loop(), title="a room")
+        write_cloud_views(tmp_path / f"views_{name}", cloud, colors, loop())
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert (tmp_path / "views_a.png").read_bytes() == (tmp_path / "views_b.png").read_bytes()
+    assert len(list(tmp_path.iterdir())) == 4
+    assert "matplotlib.pyplot" not in set(sys.modules) - loaded_before
+
+
+def test_views_leave_the_ceiling_out(tmp_path):
+    side = np.linspace(-2.0, 2.0, 200)
+    x, y = (a.ravel() for a in np.meshgrid(side, side))
+    floor = np.column_stack([x, y, np.zeros_like(x)]).astype(np.float32)
+    ceiling = floor + np.float32([0.0, 0.0, 2.5])
+    green, magenta = (
+        np.full(floor.shape, (20, 180, 20), np.uint8),
+        np.full(floor.shape, (250, 0, 250), np.uint8),
+    )
+
+    write_cloud_views(
+        tmp_path / "v.png", np.concatenate([ceiling, floor]), np.concatenate([magenta, green]), loop()
+    )
+
+    picture = cv2.imread(str(tmp_path / "v.png"))
+    assert pixels_like(picture, (20, 180, 20)) > 50_000
+    assert pixels_like(picture, (250, 0, 250)) == 0
+
+
+def test_the_nearest_point_wins_whatever_the_order():
+    near_and_far = np.array([[0.5, 0.5, 1.0], [0.5, 0.5, -1.0]], np.float32)
+    red_and_blue = np.array([[255, 0, 0], [0, 0, 255]], np.uint8)
+    for order in ([0, 1], [1, 0]):
+        image = splat(
+            near_and_far[order],
+            red_and_blue[order],
+            low=np.zeros(2),
+            pixel_m=0.1,
+            shape=np.array([10, 12]),
+        )
+        assert image.shape == (10, 12, 3)
+        np.testing.assert_array_equal(image[4:7, 4:7], np.broadcast_to([255, 0, 0], (3, 3, 3)))
+        assert (image[..., 0] == 255).sum() == 9
+
+
+def test_points_outside_the_view_are_not_drawn():
+    cloud = np.array([[-0.05, 0.5, 0.0], [0.5, 1.05, 0.0], [50.0, 50.0, 0.0]], np.float32)
+    white = np.full((3, 3), 255, np.uint8)
+    image = splat(cloud, white, low=np.zeros(2), pixel_m=0.1, shape=np.array([10, 10]))
+    assert image.max() < 255
+
+
+def test_height_colours_run_from_blue_to_red():
+    colors = height_colors(np.linspace(0.0, 2.0, 500))
+    assert colors.shape == (500, 3)
+    low, high = colors[50].astype(int), colors[450].astype(int)
+    assert low[2] > low[0] + 50
+    assert high[0] > high[2] + 50
+    assert height_colors(np.empty(0)).shape == (0, 3)
+    assert len(np.unique(height_colors(np.full(5, 1.0)), axis=0)) == 1
