@@ -1,0 +1,326 @@
+"""A run as one MCAP file that Foxglove and Rerun both open.
+
+What each viewer makes of it (Foxglove's own documentation; Rerun 0.41's importer, which the tests run):
+
+=====================  ============================  ==================  ===========================
+topic                  schema                        Foxglove            Rerun
+=====================  ============================  ==================  ===========================
+/tf                    foxglove.FrameTransform       transform tree      Transform3D
+/camera/image          foxglove.CompressedImage      image               EncodedImage
+/camera/calibration    foxglove.CameraCalibration    projection          Pinhole
+/trajectory/NAME       foxglove.PosesInFrame         line or axes        InstancePoses3D
+/trajectory/NAME/dots  foxglove.PointCloud           points              Points3D
+/graph/factors         foxglove.SceneUpdate          lines               a bare record: no lines yet
+/graph/factors/dots    foxglove.PointCloud           points              Points3D
+/map/NAME              foxglove.PointCloud           points              Points3D
+/map/slice             nav_msgs/msg/OccupancyGrid    map                 GridMap
+/diagnostics           mapper/msg/Diagnostics        plots, raw values   plots, raw values
+=====================  ============================  ==================  ===========================
+
+So lines are logged as dots too, the slice is a ROS message (Rerun ignores foxglove.Grid) and so are the
+diagnostics (Rerun keeps JSON as opaque bytes).
+
+Every message's ``log_time`` and ``publish_time`` is the stamp of the data. Results of the whole log have no
+moment of their own: log them at the first stamp, for both viewers show the latest message at or before the
+playhead, and the transforms beside them are in hindsight too.
+
+The writer is the ``mcap`` package and not the one inside foxglove-sdk, which keeps quiet about a full disk
+until the file is closed; foxglove-sdk encodes the messages.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from foxglove import messages
+from foxglove.messages import PackedElementFieldNumericType as NumericType
+from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
+
+from mapper.atomic import replacing
+from mapper.errors import DataError
+from mapper.export import ros2
+from mapper.export.palette import ESTIMATE, FACTORS, Rgb
+from mapper.frames import PinholeCamera
+from mapper.geometry import Points, Transform
+from mapper.graph.model import BetweenFactor
+from mapper.octree.slice import OccupancyGrid
+from mapper.rotations import quaternion_from_rotation
+from mapper.timebase import NS_PER_S
+from mapper.trajectory import Trajectory
+
+WORLD = "world"
+
+_LIBRARY = "mapper"
+_LAST_SECOND = 2**31  # builtin_interfaces/Time counts seconds in an int32
+_DOT_SPACING_M = 0.01
+_MOST_DOTS = 100_000
+_LINE_WIDTH_PX = 2.0
+_POINT = np.dtype([("position", "<f4", 3), ("rgba", "u1", 4)])
+
+
+class McapLog:
+    """Context manager that writes one MCAP file; the file appears when the block ends well, or not at all.
+
+    Messages may come in any order of stamps: the file is chunked and indexed. The same calls give the
+    same bytes.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Prepare to write ``path``; nothing is touched until the block is entered."""
+        self._opened = self._open(path)
+        self._writer: Writer
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._diagnostics_fields = ""
+
+    def __enter__(self) -> Self:
+        self._opened.__enter__()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._opened.__exit__(kind, error, trace)
+
+    @contextmanager
+    def _open(self, path: Path) -> Iterator[None]:
+        with replacing(path) as part, part.open("wb") as file:
+            self._writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
+            self._writer.start(profile="", library=_LIBRARY)
+            yield
+            self._writer.finish()
+
+    def transform(self, stamp_ns: int, T_parent_child: Transform, *, parent: str, child: str) -> None:
+        """Log where a frame is in its parent, on /tf."""
+        self._publish(
+            "/tf",
+            messages.FrameTransform(
+                timestamp=_timestamp(stamp_ns),
+                parent_frame_id=parent,
+                child_frame_id=child,
+                translation=_vector(T_parent_child),
+                rotation=_quaternion(T_parent_child),
+            ),
+            stamp_ns,
+        )
+
+    def image(self, stamp_ns: int, jpeg: bytes, *, frame: str) -> None:
+        """Log a JPEG on /camera/image, as :func:`mapper.export.jpeg.encode_jpeg` makes it."""
+        self._publish(
+            "/camera/image",
+            messages.CompressedImage(
+                timestamp=_timestamp(stamp_ns), frame_id=frame, data=jpeg, format="jpeg"
+            ),
+            stamp_ns,
+        )
+
+    def calibration(self, stamp_ns: int, camera: PinholeCamera, *, frame: str) -> None:
+        """Log the camera of the images as logged: a shrunk image needs the shrunk camera."""
+        K = camera.matrix
+        self._publish(
+            "/camera/calibration",
+            messages.CameraCalibration(
+                timestamp=_timestamp(stamp_ns),
+                frame_id=frame,
+                width=camera.width_px,
+                height=camera.height_px,
+                distortion_model="plumb_bob",
+                D=list(camera.distortion),
+                K=K.ravel().tolist(),
+                R=np.eye(3).ravel().tolist(),
+                P=np.column_stack([K, np.zeros(3)]).ravel().tolist(),
+            ),
+            stamp_ns,
+        )
+
+    def trajectory(self, stamp_ns: int, trajectory: Trajectory, *, name: str, color: Rgb = ESTIMATE) -> None:
+        """Log a whole trajectory on /trajectory/NAME, and its path as dots below that."""
+        topic = f"/trajectory/{name}"
+        self._publish(
+            topic,
+            messages.PosesInFrame(
+                timestamp=_timestamp(stamp_ns),
+                frame_id=WORLD,
+                poses=[_pose(T) for T in trajectory.T_world_body],
+            ),
+            stamp_ns,
+        )
+        positions = trajectory.positions_world
+        points = dotted(positions[:-1], positions[1:])
+        self._points(
+            f"{topic}/dots", stamp_ns, points, np.broadcast_to(np.array(color, np.uint8), points.shape)
+        )
+
+    def factors(
+        self,
+        stamp_ns: int,
+        factors: Iterable[BetweenFactor],
+        *,
+        T_world_node: Mapping[int, Transform],
+    ) -> None:
+        """Log the graph's factors as lines between their nodes, coloured by origin.
+
+        Args:
+            stamp_ns: The messages' time.
+            factors: The measurements.
+            T_world_node: Pose of every node that they name, e.g. as solved.
+        """
+        entities = []
+        clouds, colors = [np.empty((0, 3))], [np.empty((0, 3), np.uint8)]
+        factors = list(factors)
+        for origin, color in FACTORS.items():
+            pairs = [(factor.i, factor.j) for factor in factors if factor.origin == origin]
+            if not pairs:
+                continue
+            ends = np.array([[T_world_node[node][:3, 3] for node in pair] for pair in pairs])
+            entities.append(_lines(ends.reshape(-1, 3), color, stamp_ns=stamp_ns, name=origin))
+            points = dotted(ends[:, 0], ends[:, 1])
+            clouds.append(points)
+            colors.append(np.broadcast_to(np.array(color, np.uint8), points.shape))
+        self._publish("/graph/factors", messages.SceneUpdate(entities=entities), stamp_ns)
+        self._points("/graph/factors/dots", stamp_ns, np.concatenate(clouds), np.concatenate(colors))
+
+    def cloud(
+        self, stamp_ns: int, points_world: NDArray[np.floating], *, colors: NDArray[np.uint8], name: str
+    ) -> None:
+        """Log (N, 3) points in metres with (N, 3) RGB bytes on /map/NAME, in the world frame."""
+        if points_world.ndim != 2 or points_world.shape[1] != 3 or colors.shape != points_world.shape:
+            raise DataError(
+                f"/map/{name}: points {points_world.shape} and colors {colors.shape}, want two of (N, 3)"
+            )
+        self._points(f"/map/{name}", stamp_ns, points_world, colors)
+
+    def grid(self, stamp_ns: int, grid: OccupancyGrid) -> None:
+        """Log the 2D slice on /map/slice, in the world's z = 0 plane."""
+        _check_stamp(stamp_ns)
+        topic = "/map/slice"
+        if topic not in self._channels:
+            self._register(
+                topic,
+                ros2.OCCUPANCY_GRID_NAME,
+                encoding="ros2msg",
+                text=ros2.OCCUPANCY_GRID_SCHEMA.encode(),
+            )
+        self._write(topic, ros2.encode_occupancy_grid(grid, stamp_ns=stamp_ns, frame_id=WORLD), stamp_ns)
+
+    def diagnostics(self, stamp_ns: int, record: Mapping[str, ros2.Value]) -> None:
+        """Log one frame's numbers and words on /diagnostics.
+
+        Args:
+            stamp_ns: The frame's stamp.
+            record: Name to int, float or str; the same names and types every time.
+
+        Raises:
+            DataError: Another kind of value, or another record than the first.
+        """
+        _check_stamp(stamp_ns)
+        topic = "/diagnostics"
+        fields = ros2.record_schema(record)
+        if topic not in self._channels:
+            self._diagnostics_fields = fields
+            self._register(topic, "mapper/msg/Diagnostics", encoding="ros2msg", text=fields.encode())
+        if fields != self._diagnostics_fields:
+            raise DataError(
+                f"{topic} at {stamp_ns}: fields {fields.split()}, "
+                f"want those of the first record: {self._diagnostics_fields.split()}"
+            )
+        self._write(topic, ros2.encode_record(record), stamp_ns)
+
+    def _points(
+        self, topic: str, stamp_ns: int, points: NDArray[np.floating], colors: NDArray[np.uint8]
+    ) -> None:
+        packed = np.empty(len(points), _POINT)
+        packed["position"] = points
+        packed["rgba"][:, :3] = colors
+        packed["rgba"][:, 3] = 255
+        layout = [("x", 0, NumericType.Float32), ("y", 4, NumericType.Float32), ("z", 8, NumericType.Float32)]
+        layout += [
+            (name, 12 + i, NumericType.Uint8) for i, name in enumerate(("red", "green", "blue", "alpha"))
+        ]
+        self._publish(
+            topic,
+            messages.PointCloud(
+                timestamp=_timestamp(stamp_ns),
+                frame_id=WORLD,
+                pose=_pose(np.eye(4)),
+                point_stride=_POINT.itemsize,
+                fields=[
+                    messages.PackedElementField(name=name, offset=offset, type=kind)
+                    for name, offset, kind in layout
+                ],
+                data=packed.tobytes(),
+            ),
+            stamp_ns,
+        )
+
+    def _publish(self, topic: str, message: Any, stamp_ns: int) -> None:
+        if topic not in self._channels:
+            schema = message.get_schema()
+            self._register(topic, schema.name, encoding=schema.encoding, text=schema.data)
+        self._write(topic, message.encode(), stamp_ns)
+
+    def _register(self, topic: str, schema: str, *, encoding: str, text: bytes) -> None:
+        if schema not in self._schemas:
+            self._schemas[schema] = self._writer.register_schema(schema, encoding, text)
+        message_encoding = "cdr" if encoding == "ros2msg" else encoding
+        self._channels[topic] = self._writer.register_channel(topic, message_encoding, self._schemas[schema])
+
+    def _write(self, topic: str, data: bytes, stamp_ns: int) -> None:
+        self._writer.add_message(self._channels[topic], log_time=stamp_ns, data=data, publish_time=stamp_ns)
+
+
+def dotted(starts: Points, ends: Points) -> Points:
+    """Return points along (S, 3) segments, ends included: 1 cm apart, or further where that is too many."""
+    lengths_m = np.linalg.norm(ends - starts, axis=1)
+    spacing_m = max(_DOT_SPACING_M, float(lengths_m.sum()) / _MOST_DOTS)
+    counts = np.ceil(lengths_m / spacing_m).astype(np.intp) + 1
+    segment = np.repeat(np.arange(len(starts)), counts)
+    step = np.arange(len(segment)) - np.repeat(np.cumsum(counts) - counts, counts)
+    share = (step / np.maximum(counts[segment] - 1, 1))[:, None]
+    points: Points = starts[segment] * (1.0 - share) + ends[segment] * share
+    return points
+
+
+def _check_stamp(stamp_ns: int) -> None:
+    if not 0 <= stamp_ns < _LAST_SECOND * NS_PER_S:
+        raise DataError(f"stamp {stamp_ns} ns: MCAP messages hold 0 … 2³¹ s (1970 to 2038); shift the log")
+
+
+def _timestamp(stamp_ns: int) -> messages.Timestamp:
+    _check_stamp(stamp_ns)
+    return messages.Timestamp(int(stamp_ns // NS_PER_S), int(stamp_ns % NS_PER_S))
+
+
+def _vector(T: Transform) -> messages.Vector3:
+    x, y, z = T[:3, 3].tolist()
+    return messages.Vector3(x=x, y=y, z=z)
+
+
+def _quaternion(T: Transform) -> messages.Quaternion:
+    x, y, z, w = (float(value) for value in quaternion_from_rotation(T[:3, :3]))
+    return messages.Quaternion(x=x, y=y, z=z, w=w)
+
+
+def _pose(T: Transform) -> messages.Pose:
+    return messages.Pose(position=_vector(T), orientation=_quaternion(T))
+
+
+def _lines(points: Points, color: Rgb, *, stamp_ns: int, name: str) -> messages.SceneEntity:
+    """Return an entity of separate lines: points 2k and 2k + 1 are the ends of line k."""
+    red, green, blue = (channel / 255.0 for channel in color)
+    line = messages.LinePrimitive(
+        type=messages.LinePrimitiveLineType.LineList,
+        pose=_pose(np.eye(4)),
+        thickness=_LINE_WIDTH_PX,
+        scale_invariant=True,
+        points=[messages.Point3(x=x, y=y, z=z) for x, y, z in points.tolist()],
+        color=messages.Color(r=red, g=green, b=blue, a=1.0),
+    )
+    return messages.SceneEntity(timestamp=_timestamp(stamp_ns), frame_id=WORLD, id=name, lines=[line])
