@@ -51,7 +51,7 @@ class NumberedImages:
 
 
 def recognise(path: Path) -> bool:
-    """Tell whether a path is a folder of numbered colour and depth images, or holds ``seq-01`` and the like."""
+    """Tell whether a path is a folder of numbered colour and depth images, or holds ``seq-*`` folders."""
     return find_images(path) is not None or bool(_sequences(path))
 
 
@@ -59,7 +59,7 @@ def open_log(path: Path, config: SourceConfig) -> RgbdLog:
     """Open a folder of numbered images; a folder with a single sequence opens that.
 
     Raises:
-        SourceError: The folder holds several sequences, a pose file is malformed, or the camera's size differs.
+        SourceError: The folder holds several sequences, or a pose file or the calibration is malformed.
     """
     if sequences := _sequences(path):
         if len(sequences) > 1:
@@ -159,18 +159,18 @@ def _read_truth(
         beside = pair.colour.with_name(f"{pair.colour.stem.split('.')[0]}.pose.txt")
         path = beside if beside.is_file() else folder / "pose" / f"{pair.colour.stem}.txt"
         if path.is_file():
-            matrix = [numbers for number, words in rows(path) for numbers in [_row_of_4(path, number, words)]]
+            matrix = [_row_of_4(path, number, words) for number, words in rows(path)]
             poses.append((shot.stamp_ns, _pose_of(matrix, path)))
     if poses:
         return truth_from(poses, what="pose files")
-    path = next(
-        (p for name in ("*traj*.log", "*traj*.txt", "*.log") for p in sorted(folder.glob(name))), None
-    )
-    return (None, []) if path is None else _read_redwood(path, shots)
+    trajectories = [
+        path for name in ("*traj*.log", "*traj*.txt", "*.log") for path in sorted(folder.glob(name))
+    ]
+    return _read_redwood(trajectories[0], shots) if trajectories else (None, [])
 
 
 def _read_redwood(path: Path, shots: Sequence[Shot]) -> tuple[Trajectory | None, list[str]]:
-    """Read blocks of a line ``i i i+1`` and a 4×4 matrix; block i belongs to the i-th image, counted from 0."""
+    """Read blocks of a line ``i i i+1`` and a 4×4 matrix; i counts the images from 0."""
     lines = list(rows(path))
     if len(lines) % 5:
         raise SourceError(f"{path}: {len(lines)} lines, want blocks of 5: i i i+1 and a 4×4 matrix")

@@ -1,9 +1,9 @@
 """Poznań folders: numbered images, and the truth of each as ``number x y z roll pitch yaw`` (thesis §3.5).
 
-Images lie in ``rgb/`` and ``depth/`` (``rgb_0.png``, ``depth_0.png``, with or without leading zeros) or side by
-side. The truth is the text file whose name speaks of "ground" or "gt" and whose rows have seven columns, the
-first an image number. Positions are metres. Angles are degrees if a comment line says "deg", radians if it
-says "rad"; without either they are degrees if any exceeds a full turn of 2π, radians if none does.
+Images lie in ``rgb/`` and ``depth/`` (``rgb_0.png``, ``depth_0.png``, with or without leading zeros) or side
+by side. The truth is the text file whose name speaks of "ground" or "gt" and whose rows have seven columns,
+the first an image number. Positions are metres. Angles are degrees if a comment line says "deg", radians if
+it says "rad"; without either they are degrees if any exceeds a full turn of 2π, radians if none does.
 """
 
 import math
@@ -94,6 +94,6 @@ def _read_truth(
 
 def _in_degrees(path: Path, angles: np.ndarray) -> bool:
     header = " ".join(line for line in read_lines(path) if line.lstrip().startswith(("#", "!")))
-    if unit := re.search(r"deg|rad", header, re.IGNORECASE):
+    if unit := re.search(r"\b(?:deg|rad)", header, re.IGNORECASE):
         return unit[0].lower() == "deg"
     return bool((np.abs(angles[np.isfinite(angles)]) > 2.0 * math.pi).any())

@@ -1,0 +1,161 @@
+"""Logs written as TUM folders or in the thesis's mbag format (A12)."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.atomic import write_bytes, write_text
+from mapper.errors import FrameError, SourceError
+from mapper.frames import PinholeCamera, RgbdFrame
+from mapper.rotations import quaternion_from_rotation
+from mapper.sources.base import Accelerations, Entry, FrameSource, ImageFiles, Skipped
+from mapper.sources.calibration_file import calibration_text
+from mapper.sources.images import SATURATED
+from mapper.sources.mbag import HEADER
+from mapper.timebase import nearest, seconds_text_from_ns
+from mapper.trajectory import Trajectory, write_tum
+
+LogKind = Literal["tum", "mbag"]
+
+DEPTH_UNITS_PER_M = 5000.0
+"""Depth units of images that are encoded here; copied images keep their own."""
+
+_MAX_TRUTH_GAP_NS = 20_000_000
+_NO_POSE = ["nan"] * 7
+
+
+def write_log(
+    source: FrameSource, out: Path, *, kind: LogKind, on_progress: Callable[[int], None] | None = None
+) -> list[Skipped]:
+    """Write an RGB-D log as a folder of another format and return the frames that could not be.
+
+    Image files are copied byte for byte under names that are their stamps; frames without files are encoded
+    as PNG, depth at 0.2 mm. ``calibration.toml`` keeps the camera and depth units. TUM keeps the whole truth;
+    mbag has room for one pose a frame, the nearest within 20 ms. The lists, by which a log is recognised,
+    are written last.
+
+    Args:
+        source: What to write.
+        out: Folder to make; it must not exist or be empty.
+        kind: "tum" or "mbag".
+        on_progress: Told how many frames are done, after each.
+
+    Raises:
+        SourceError: The folder is not empty, or no frame of the source is a readable RGB-D frame.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise SourceError(f"{out}: already there; give a folder that does not exist yet")
+    camera = _camera_of(source)
+    written: list[tuple[int, ImageFiles]] = []
+    skipped: list[Skipped] = []
+    for done, entry in enumerate(source.entries(), start=1):
+        try:
+            written.append((entry.stamp_ns, _write_images(entry, out)))
+        except FrameError as error:
+            skipped.append(Skipped(entry.stamp_ns, str(error)))
+        if on_progress is not None:
+            on_progress(done)
+    units_per_m = written[0][1].depth_units_per_m
+    write_text(out / "calibration.toml", calibration_text(camera, depth_units_per_m=units_per_m))
+    if source.accelerations is not None:
+        write_text(out / "accelerometer.txt", _accelerations_text(source.accelerations, source.name))
+    if kind == "mbag":
+        write_text(out / f"{out.resolve().name}.mbag", _mbag_text(written, source))
+    else:
+        if source.truth is not None:
+            write_tum(out / "groundtruth.txt", source.truth)
+        depth_files = {files.depth_stamp_ns: files.depth for _, files in written}
+        colour_files = {stamp_ns: files.colour for stamp_ns, files in written}
+        write_text(out / "depth.txt", _list_text("depth maps", source.name, depth_files))
+        write_text(out / "rgb.txt", _list_text("color images", source.name, colour_files))
+    return skipped
+
+
+def _camera_of(source: FrameSource) -> PinholeCamera:
+    """Return the camera of the first readable frame: one without any is no RGB-D log."""
+    reason = "it has no frames"
+    for entry in source.entries():
+        try:
+            return _load(entry).camera
+        except FrameError as error:
+            reason = str(error)
+    raise SourceError(f"{source.path}: no frame can be written: {reason}")
+
+
+def _load(entry: Entry) -> RgbdFrame:
+    frame = entry.load()
+    if not isinstance(frame, RgbdFrame):
+        raise FrameError(f"frame {entry.stamp_ns}: a scan without images; TUM and mbag hold RGB-D frames")
+    return frame
+
+
+def _write_images(entry: Entry, out: Path) -> ImageFiles:
+    """Copy or encode both images; return their paths relative to ``out``."""
+    stamp = seconds_text_from_ns(entry.stamp_ns)
+    if (files := entry.files) is not None:
+        depth_stamp = seconds_text_from_ns(files.depth_stamp_ns)
+        colour = Path("rgb", stamp + files.colour.suffix)
+        depth = Path("depth", depth_stamp + files.depth.suffix)
+        write_bytes(out / colour, _bytes_of(files.colour))
+        write_bytes(out / depth, _bytes_of(files.depth))
+        return ImageFiles(colour, depth, files.depth_stamp_ns, files.depth_units_per_m)
+    frame = _load(entry)
+    colour, depth = Path("rgb", f"{stamp}.png"), Path("depth", f"{stamp}.png")
+    units = np.rint(frame.depth_m * DEPTH_UNITS_PER_M)
+    write_bytes(out / colour, _png(np.ascontiguousarray(frame.rgb[:, :, ::-1])))
+    write_bytes(out / depth, _png(np.where(units < SATURATED, units, 0).astype(np.uint16)))
+    return ImageFiles(colour, depth, entry.stamp_ns, DEPTH_UNITS_PER_M)
+
+
+def _bytes_of(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise FrameError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
+    _, encoded = cv2.imencode(".png", pixels)
+    data: bytes = encoded.tobytes()
+    return data
+
+
+def _list_text(title: str, name: str, files: dict[int, Path]) -> str:
+    lines = [f"# {title}", f"# file: '{name}'", "# timestamp filename"]
+    lines += [
+        f"{seconds_text_from_ns(stamp_ns)} {path.as_posix()}" for stamp_ns, path in sorted(files.items())
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _accelerations_text(accelerations: Accelerations, name: str) -> str:
+    lines = ["# accelerometer data", f"# file: '{name}'", "# timestamp ax ay az"]
+    for stamp_ns, reading in zip(accelerations.stamps_ns, accelerations.acceleration_mps2, strict=True):
+        lines.append(" ".join([seconds_text_from_ns(int(stamp_ns)), *(repr(float(a)) for a in reading)]))
+    return "\n".join(lines) + "\n"
+
+
+def _mbag_text(written: list[tuple[int, ImageFiles]], source: FrameSource) -> str:
+    lines = [HEADER, f"!dbName: {source.name}"]
+    poses = _pose_words(np.array([stamp_ns for stamp_ns, _ in written], dtype=np.int64), source.truth)
+    for (stamp_ns, files), pose in zip(written, poses, strict=True):
+        paths = [files.colour.as_posix(), files.depth.as_posix()]
+        lines.append("; ".join([seconds_text_from_ns(stamp_ns), *paths, *pose]))
+    return "\n".join(lines) + "\n"
+
+
+def _pose_words(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> list[list[str]]:
+    """Return x y z qx qy qz qw of the truth nearest to each stamp, or ``nan`` where none is near."""
+    if truth is None:
+        return [_NO_POSE] * len(stamps_ns)
+    index, gap_ns = nearest(truth.stamps_ns, stamps_ns)
+    words = []
+    for i, gap in zip(index, gap_ns, strict=True):
+        T = truth.T_world_body[i]
+        numbers = [*T[:3, 3], *quaternion_from_rotation(T[:3, :3])]
+        words.append([repr(float(n)) for n in numbers] if gap <= _MAX_TRUTH_GAP_NS else _NO_POSE)
+    return words

@@ -1,0 +1,147 @@
+import pytest
+
+from mapper.errors import SourceError
+from mapper.frames import PinholeCamera
+from mapper.sources.calibration import FREIBURG, freiburg_camera
+from mapper.sources.calibration_file import calibration_text, read_calibration
+
+ROS = """
+image_width: 640
+image_height: 480
+camera_name: kinect
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [517.3, 0, 318.6, 0, 516.5,
+         255.3, 0, 0, 1]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [0.26, -0.95, -0.005, 0.0026, 1.16]
+"""
+ROS_ECHO = """height: 480
+width: 640
+distortion_model: plumb_bob
+d:
+- 0.26
+- -0.95
+- -0.005
+- 0.0026
+- 1.16
+k:
+- 517.3
+- 0.0
+- 318.6
+- 0.0
+- 516.5
+- 255.3
+- 0.0
+- 0.0
+- 1.0
+"""
+OPENCV = """%YAML:1.0
+---
+image_width: 640
+image_height: 480
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 517.3, 0., 318.6, 0., 516.5, 255.3, 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [ 0.26, -0.95, -0.005, 0.0026, 1.16 ]
+"""
+ORB_SLAM = """%YAML:1.0
+# Camera calibration
+Camera.fx: 517.3  # px
+Camera.fy: 516.5
+Camera.cx: 318.6
+Camera.cy: 255.3
+Camera.k1: 0.26
+Camera.k2: -0.95
+Camera.p1: -0.005
+Camera.p2: 0.0026
+Camera.k3: 1.16
+Camera.width: 640
+Camera.height: 480
+"""
+OURS = """
+[camera]
+width_px = 640
+height_px = 480
+fx_px = 517.3
+fy_px = 516.5
+cx_px = 318.6
+cy_px = 255.3
+distortion = [0.26, -0.95, -0.005, 0.0026, 1.16]
+"""
+WANT = PinholeCamera(640, 480, 517.3, 516.5, 318.6, 255.3, (0.26, -0.95, -0.005, 0.0026, 1.16))
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("a.yaml", ROS), ("b.yaml", ROS_ECHO), ("c.yml", OPENCV), ("d.yaml", ORB_SLAM), ("e.toml", OURS)],
+)
+def test_every_dialect_gives_the_same_camera(tmp_path, name, text):
+    path = tmp_path / name
+    path.write_text(text)
+    calibration = read_calibration(path)
+    assert calibration.camera(width_px=640, height_px=480) == WANT
+    assert calibration.depth_units_per_m is None
+
+
+def test_what_is_written_reads_back_exactly(tmp_path):
+    camera = PinholeCamera(321, 243, 1 / 3, 2.0 / 7, -0.1, 1e-9, (0.1, 0.2, 0.3, 0.4, 0.5))
+    path = tmp_path / "calibration.toml"
+    path.write_text(calibration_text(camera, depth_units_per_m=999.7))
+    calibration = read_calibration(path)
+    assert calibration.camera(width_px=321, height_px=243) == camera
+    assert calibration.depth_units_per_m == 999.7
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.toml", "fx_px = 5.0\nfy_px = 5.0\ncx_px = 1.0\n", "no number cy_px"),
+        ("a.toml", "fx_px = 'five'\n", "fx_px = 'five' is not a number"),
+        ("a.toml", OURS + "depht_factor = 5000\n", "depht_factor: unknown key; known are"),
+        ("a.toml", OURS + "depth_factor = 0\n", r"depth_factor 0\.0 must be > 0"),
+        ("a.toml", OURS.replace("1.16]", "1.16, 0.0, 3.0]"), "7 distortion coefficients"),
+        ("a.yaml", ROS.replace("plumb_bob", "equidistant"), "equidistant lens; only Brown–Conrady"),
+        ("a.yaml", "name: kinect\n", "no number fx_px"),
+    ],
+)
+def test_a_bad_file_is_named_with_the_reason(tmp_path, name, text, message):
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(SourceError, match=rf"{name}: {message}"):
+        read_calibration(path)
+
+
+def test_another_image_size_is_refused(tmp_path):
+    path = tmp_path / "calibration.toml"
+    path.write_text(OURS)
+    with pytest.raises(SourceError, match=r"holds for 640×480 px, but the images have 320×240"):
+        read_calibration(path).camera(width_px=320, height_px=240)
+
+
+@pytest.mark.parametrize(
+    ("name", "camera"),
+    [
+        ("rgbd_dataset_freiburg1_xyz", "1"),
+        ("rgbd_dataset_Freiburg2_desk.bag", "2"),
+        ("fr3_office", "3"),
+        ("tum_fr1_xyz", "1"),
+    ],
+)
+def test_freiburg_cameras_are_known_by_name(name, camera):
+    assert freiburg_camera("something", name) is FREIBURG[camera]
+
+
+@pytest.mark.parametrize("name", ["desk", "fr4_desk", "freiburg12", "afr1_x", "frame1"])
+def test_other_names_are_not_mistaken_for_freiburg(name):
+    assert freiburg_camera(name) is None

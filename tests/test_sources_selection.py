@@ -1,0 +1,63 @@
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from mapper.config.sources import SourceConfig
+from mapper.errors import SourceError
+from mapper.sources import open_source
+
+
+def indices_of(source, everything):
+    stamps = [entry.stamp_ns for entry in everything.entries()]
+    return [stamps.index(entry.stamp_ns) for entry in source.entries()]
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(first=st.integers(0, 9), last=st.one_of(st.none(), st.integers(0, 12)), stride=st.integers(1, 5))
+def test_selects_like_a_slice(tiny_tum_log, first, last, stride):
+    log = tiny_tum_log(7)
+    want = list(range(7))[first : None if last is None else last + 1 : stride]
+    config = SourceConfig(first_frame=first, last_frame=last, stride=stride)
+    if not want:
+        with pytest.raises(SourceError, match=r"the log has 7 frames, 0 … 6"):
+            open_source(log, config)
+        return
+    source = open_source(log, config)
+    assert indices_of(source, open_source(log)) == want
+    assert len(source) == len(want)
+    assert indices_of(source, open_source(log)) == want, "repeatable"
+
+
+def test_says_the_range_that_left_nothing(tiny_tum_log):
+    with pytest.raises(SourceError, match=r"range 9 … end; the log has 3 frames"):
+        open_source(tiny_tum_log(3), SourceConfig(first_frame=9))
+    with pytest.raises(SourceError, match=r"range 2 … 1; the log has 3 frames"):
+        open_source(tiny_tum_log(3, folder="again"), SourceConfig(first_frame=2, last_frame=1))
+
+
+def test_drops_frames_without_truth_and_counts_them(tiny_tum_log):
+    log = tiny_tum_log(6)
+    truth = log / "groundtruth.txt"
+    truth.write_text("\n".join(truth.read_text().splitlines()[:-2]))
+    config = SourceConfig(first_frame=1, require_truth=True)
+    source = open_source(log, config)
+    assert indices_of(source, open_source(log)) == [1, 2, 3]
+    assert source.notes == ["2 frames have no ground truth within 20 ms; left out", "3 of 6 frames selected"]
+    with pytest.raises(SourceError, match="no selected frame has ground truth within 20 ms"):
+        open_source(log, SourceConfig(first_frame=5, require_truth=True))
+
+
+def test_cannot_require_truth_of_a_log_without(tiny_tum_log):
+    log = tiny_tum_log(2)
+    (log / "groundtruth.txt").unlink()
+    with pytest.raises(SourceError, match=r"ground truth is required .*the log has none"):
+        open_source(log, SourceConfig(require_truth=True))
+
+
+def test_what_is_no_log_says_what_was_looked_for(tmp_path):
+    with pytest.raises(SourceError, match=r"nowhere: no such file or folder"):
+        open_source(tmp_path / "nowhere")
+    (tmp_path / "notes.txt").write_text("hello")
+    for path in (tmp_path, tmp_path / "notes.txt"):
+        with pytest.raises(SourceError, match=r"known format; looked for rgb\.txt.*mbag.*Poznań.*7-Scenes"):
+            open_source(path)
