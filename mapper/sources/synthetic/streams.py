@@ -1,0 +1,21 @@
+"""Independent random streams of one seed, so that no part of a log depends on the order of the others."""
+
+from enum import IntEnum
+
+import numpy as np
+
+
+class Stream(IntEnum):
+    """What a stream is for; the numbers are part of what a seed means."""
+
+    PLAN = 0
+    SURFACES = 1
+    FURNITURE = 2
+    PATH = 3
+    SENSOR = 4
+    DROPS = 5
+
+
+def rng_of(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
+    """Return the generator of a stream's index-th part, e.g. of one frame's noise."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(stream), index)))
