@@ -1,22 +1,18 @@
 """How a long job tells that it is alive, without knowing who watches."""
 
-from collections.abc import Iterable, Iterator
-from typing import Protocol, TypeVar
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from typing import Protocol
 
-Item = TypeVar("Item")
+Report = Callable[[int, int], None]
+"""Takes how many items are done, and how many there will be."""
 
 
 class Progress(Protocol):
     """Whoever watches a job."""
 
-    def over(self, items: Iterable[Item], *, stage: str, total: int) -> Iterator[Item]:
-        """Yield the items unchanged, showing how many of the total have passed.
-
-        Args:
-            items: What the stage works on.
-            stage: What is being done, in a word or two.
-            total: How many items are expected.
-        """
+    def stage(self, name: str) -> AbstractContextManager[Report]:
+        """Enter a stage of the job, named in a word or two; it is told how far it is."""
         ...
 
     def note(self, message: str) -> None:
@@ -27,9 +23,10 @@ class Progress(Protocol):
 class Silent:
     """Nobody watches."""
 
-    def over(self, items: Iterable[Item], *, stage: str, total: int) -> Iterator[Item]:  # noqa: ARG002
-        """Yield the items."""
-        yield from items
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Report]:  # noqa: ARG002
+        """Ignore the stage."""
+        yield lambda _done, _total: None
 
     def note(self, message: str) -> None:
         """Ignore the message."""

@@ -66,18 +66,20 @@ def track_log(source: FrameSource, config: BuildConfig, *, progress: Progress) -
         return observation, time.perf_counter() - began
 
     observations = ordered_map(observe, source.entries(), workers=config.workers)
-    for observation, observed_s in progress.over(observations, stage="track", total=len(source)):
-        if isinstance(observation, Skipped):
-            skipped.append(observation)
-            progress.note(f"skipped: {observation.reason}")
-            continue
-        began = time.perf_counter()
-        track = odometry.track(observation)
-        frame_ms[track.stamp_ns] = 1e3 * (observed_s + time.perf_counter() - began)
-        if track.is_keyframe and track.node is not None:
-            graph.add_node(track.node, track.stamp_ns, track.T_world_body)
-        graph.add_factors(track.factors)
-        tracks.append(track)
+    with progress.stage("track") as report:
+        for done, (observation, observed_s) in enumerate(observations, start=1):
+            report(done, len(source))
+            if isinstance(observation, Skipped):
+                skipped.append(observation)
+                progress.note(f"skipped: {observation.reason}")
+                continue
+            began = time.perf_counter()
+            track = odometry.track(observation)
+            frame_ms[track.stamp_ns] = 1e3 * (observed_s + time.perf_counter() - began)
+            if track.is_keyframe and track.node is not None:
+                graph.add_node(track.node, track.stamp_ns, track.T_world_body)
+            graph.add_factors(track.factors)
+            tracks.append(track)
     graph.add_factors(odometry.finish())
     return Tracking(tuple(tracks), tuple(skipped), graph, frame_ms)
 

@@ -1,0 +1,72 @@
+"""``mapper build``: a log becomes a run."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli.console import progress_for
+from cli.environment import prepare_libraries
+from cli.options import (
+    ConfigFile,
+    First,
+    Last,
+    Overrides,
+    Quiet,
+    RequireTruth,
+    Stride,
+    merged,
+    selection,
+)
+
+if TYPE_CHECKING:
+    from evaluators.metric import Metric
+    from mapper.config import BuildConfig
+    from mapper.run import Run
+
+
+def build(
+    log: Annotated[
+        Path, typer.Argument(metavar="LOG", help="Recorded log: a TUM, Poznań or numbered folder, or .mbag.")
+    ],
+    out: Annotated[Path, typer.Option(help="Run folder to create.")],
+    config: ConfigFile = None,
+    set_: Overrides = None,
+    first: First = None,
+    last: Last = None,
+    stride: Stride = None,
+    require_truth: RequireTruth = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace OUT, once the new run is whole.")
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Turn a recorded log into a pose graph, an octree map, a 2D slice and an MCAP log.
+
+    Example: mapper build rgbd_dataset_freiburg1_xyz --out runs/xyz --set octree.resolution_m=0.1
+    """
+    from mapper.config import load_config
+
+    overrides = merged(selection(first, last, stride, require_truth), set_)
+    run, metrics = built(log, load_config(config, overrides), out, overwrite=overwrite, quiet=quiet)
+    if not quiet:
+        from cli.summary import summary_text
+
+        print(summary_text(run, metrics))
+
+
+def built(
+    log: Path, config: "BuildConfig", out: Path, *, overwrite: bool, quiet: bool
+) -> "tuple[Run, list[Metric]]":
+    """Build a run and judge its trajectory by the truth, if the log has any."""
+    from evaluators.evaluate import evaluate
+    from mapper.pipeline import build as build_run
+    from mapper.sources import open_source
+
+    prepare_libraries()
+    source = open_source(log, config.source)
+    progress = progress_for(quiet=quiet)
+    for note in source.notes:
+        progress.note(note)
+    run = build_run(source, config, out, progress=progress, overwrite=overwrite)
+    return run, evaluate(run.trajectory(), run.truth())

@@ -1,0 +1,85 @@
+"""What a user sees while a job runs: bars on a terminal, a line now and then elsewhere. All on stderr."""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from mapper.progress import SILENT, Progress, Report
+
+_SECONDS_BETWEEN_LINES = 10.0
+_MOST_NOTES = 5
+
+
+def progress_for(*, quiet: bool) -> Progress:
+    """Return who watches a job: nobody, a terminal, or a file."""
+    if quiet:
+        return SILENT
+    return Bars() if sys.stderr.isatty() else Lines()
+
+
+class _Notes:
+    """Notes as lines, the first few only: a damaged log may have thousands."""
+
+    def __init__(self) -> None:
+        self._seen = 0
+
+    def note(self, message: str) -> None:
+        """Print the message."""
+        self._seen += 1
+        if self._seen <= _MOST_NOTES:
+            self._show(f"mapper: {message}")
+        elif self._seen == _MOST_NOTES + 1:
+            self._show("mapper: … and more of these; the manifest lists all")
+
+    def _show(self, line: str) -> None:
+        print(line, file=sys.stderr)
+
+
+class Bars(_Notes):
+    """One progress bar per stage, with the rate and the time left."""
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Report]:
+        """Show the bar while inside."""
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = (
+            TextColumn("{task.description:<7}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}"),
+            TimeRemainingColumn(elapsed_when_finished=True),
+        )
+        with Progress(*columns, console=Console(stderr=True)) as bars:
+            task = bars.add_task(name, total=None, rate="")
+            began = time.monotonic()
+
+            def report(done: int, total: int) -> None:
+                rate = done / max(time.monotonic() - began, 1e-3)
+                bars.update(task, completed=done, total=total, rate=f"{rate:.0f}/s")
+
+            yield report
+
+
+class Lines(_Notes):
+    """A line at the end of each stage, and every ten seconds before."""
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Report]:
+        """Print how far it is while inside."""
+        began = said = time.monotonic()
+        reached = (0, 0)
+
+        def report(done: int, total: int) -> None:
+            nonlocal said, reached
+            reached = done, total
+            now = time.monotonic()
+            if now - said > _SECONDS_BETWEEN_LINES and done < total:
+                said = now
+                rate = done / (now - began)
+                self._show(f"{name}: {done}/{total}, {rate:.0f}/s, {(total - done) / rate:.0f} s left")
+
+        yield report
+        self._show(f"{name}: {reached[0]}/{reached[1]} in {time.monotonic() - began:.1f} s")

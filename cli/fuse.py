@@ -1,0 +1,37 @@
+"""``mapper fuse``: a run's maps again, without tracking again."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cli.console import progress_for
+from cli.environment import prepare_libraries
+from cli.options import Overrides, Quiet
+
+
+def fuse(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder that a build left.")],
+    set_: Overrides = None,
+    quiet: Quiet = False,
+) -> None:
+    """Make a run's maps again, for instance finer or with another slice, without tracking again.
+
+    Octree, slice, cloud and MCAP settings can change; the old maps stay until the new ones are whole.
+
+    Example: mapper fuse runs/xyz --set octree.resolution_m=0.1 --set slice.max_height_m=1.8
+    """
+    from cli.summary import summary_text
+    from evaluators.evaluate import evaluate
+    from mapper.config import overridden
+    from mapper.pipeline import fuse as fuse_run
+    from mapper.run import load_run
+    from mapper.sources import open_source
+
+    prepare_libraries()
+    built = load_run(run)
+    config = overridden(built.config, set_ or ())
+    source = open_source(Path(built.manifest.input.path), config.source)
+    fused = fuse_run(source, built, config, progress=progress_for(quiet=quiet))
+    if not quiet:
+        print(summary_text(fused, evaluate(fused.trajectory(), fused.truth())))

@@ -1,0 +1,75 @@
+"""The command line: its verbs, and the one place that turns an error into a line and an exit status."""
+
+import errno
+import sys
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from cli.build import build
+from cli.convert import convert
+from cli.demo import demo
+from cli.environment import prepare_environment
+from cli.evaluate import evaluate
+from cli.fuse import fuse
+from cli.show_config import show_config
+from cli.synth import synth
+from mapper import __version__
+from mapper.errors import MapperError
+
+_INTERRUPTED = 130  # 128 + SIGINT, as shells count
+_USER_CAN_HELP = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS}
+
+
+class Guarded(TyperGroup):
+    """Turns a user's mistake into one line; a bug keeps its traceback."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the verb."""
+        try:
+            return super().invoke(ctx)
+        except MapperError as error:
+            print(f"mapper: {error}", file=sys.stderr)
+            raise typer.Exit(1) from None
+        except OSError as error:
+            if error.errno not in _USER_CAN_HELP:
+                raise
+            print(f"mapper: {error.filename or 'a file'}: {error.strerror}", file=sys.stderr)
+            raise typer.Exit(1) from None
+        except KeyboardInterrupt:
+            print("mapper: interrupted", file=sys.stderr)
+            raise typer.Exit(_INTERRUPTED) from None
+
+
+app = typer.Typer(
+    cls=Guarded,
+    epilog="Example: mapper demo, or: mapper build LOG --out RUN",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # its pretty help takes longer to import than everything else to run
+    add_completion=False,
+)
+app.command("build")(build)
+app.command("fuse")(fuse)
+app.command("eval")(evaluate)
+app.command("convert")(convert)
+app.command("synth")(synth)
+app.command("demo")(demo)
+app.command("config")(show_config)
+
+
+@app.callback(invoke_without_command=True)
+def version(
+    show: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    """Map recorded RGB-D logs: a trajectory, a pose graph, an octree, a 2D slice and an MCAP log."""
+    if show:
+        print(f"mapper {__version__}")
+        raise typer.Exit
+
+
+def main() -> None:
+    """Run the command line."""
+    prepare_environment()
+    app()

@@ -1,0 +1,46 @@
+"""Options that several verbs share."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option("--config", help="TOML file, or a run's config.json; omit for the defaults."),
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY.PATH=VALUE", help="Turn one knob; mapper config lists them all."),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print errors only.")]
+First = Annotated[int | None, typer.Option("--first", help="Index of the first frame to use.")]
+Last = Annotated[int | None, typer.Option("--last", help="Index of the last frame to use.")]
+Stride = Annotated[int | None, typer.Option("--stride", help="Use every n-th frame.")]
+RequireTruth = Annotated[
+    bool | None, typer.Option("--require-truth", help="Drop frames that have no ground truth.")
+]
+
+
+def selection(
+    first: int | None, last: int | None, stride: int | None, require_truth: bool | None
+) -> list[str]:
+    """Return the overrides that short options stand for; what was not given keeps the configured value."""
+    given = {
+        "source.first_frame": first,
+        "source.last_frame": last,
+        "source.stride": stride,
+        "source.require_truth": require_truth or None,
+    }
+    return assignments(given)
+
+
+def assignments(given: Mapping[str, object]) -> list[str]:
+    """Return ``key=value`` for every value that is not None."""
+    return [f"{key}={value}" for key, value in given.items() if value is not None]
+
+
+def merged(sugar: Sequence[str], overrides: Sequence[str] | None) -> list[str]:
+    """Return all overrides in the order in which they win: what is spelled out by --set comes last."""
+    return [*sugar, *(overrides or ())]

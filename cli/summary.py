@@ -1,0 +1,47 @@
+"""The table at the end of a build."""
+
+from collections.abc import Sequence
+from math import degrees
+from pathlib import Path
+
+from evaluators.metric import Metric
+from mapper.run import Run
+
+_SHOWN = ("ATE RMSE", "RPE translation RMSE", "RPE rotation RMSE", "path length", "start-to-end offset")
+
+
+def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
+    """Return what a run amounts to, a line per fact."""
+    counts, timing = run.manifest.counts, run.manifest.timing
+    rows = [
+        ("frames", f"{counts.tracked} tracked, {counts.lost} lost, {counts.skipped} skipped"),
+        ("keyframes", f"{counts.nodes}, with {counts.factors} factors"),
+        *((metric.name, _value_text(metric)) for metric in metrics if metric.name.startswith(_SHOWN)),
+        ("octree", f"{counts.leaves} leaves of {run.config.octree.resolution_m:g} m"),
+    ]
+    if run.manifest.levelling is not None:
+        rows.append(("levelled by", f"{run.manifest.levelling.method}: {run.manifest.levelling.detail}"))
+    stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in timing.stage_s.items())
+    rows += [
+        ("seconds", f"{timing.total_s:.1f} ({stages})"),
+        ("speed", f"{timing.frames_per_s:.1f} frames/s, {timing.real_time_factor:.2f} × real time"),
+        ("peak memory", f"{timing.peak_memory_mb:.0f} MB"),
+        ("files", _files_text(run.files())),
+        ("in", str(run.path)),
+    ]
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"{name:<{width}}  {text}" for name, text in rows)
+
+
+def _value_text(metric: Metric) -> str:
+    if metric.unit == "rad":
+        return f"{degrees(metric.value):.3f}°"
+    return f"{metric.value:.4f} {metric.unit}"
+
+
+def _files_text(paths: Sequence[Path]) -> str:
+    return ", ".join(f"{path.name} ({_size_text(path.stat().st_size)})" for path in paths)
+
+
+def _size_text(size: int) -> str:
+    return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{size / 1e3:.0f} kB"

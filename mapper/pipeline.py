@@ -1,0 +1,234 @@
+"""From a recorded log to a run folder: the whole story."""
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from mapper import run as files
+from mapper.config import BuildConfig
+from mapper.errors import ConfigError, FrameError, RunError
+from mapper.export.grid import write_grid
+from mapper.export.mcap_log import McapLog
+from mapper.export.picture import write_cloud_views, write_summary
+from mapper.export.ply import write_ply
+from mapper.fingerprint import fingerprint
+from mapper.fusion import Maps, fuse_log
+from mapper.geometry import Transform, fit_rigid
+from mapper.graph.g2o import write_g2o
+from mapper.graph.model import PoseGraph
+from mapper.graph.optimize import optimize
+from mapper.levelling import Level, find_level
+from mapper.manifest import Counts, Levelling, SkippedFrame, Solve, Status, Timing
+from mapper.measure import peak_memory_mb
+from mapper.octree.octomap_file import write_bt, write_ot
+from mapper.progress import SILENT, Progress
+from mapper.records import records_of, write_frame_ms, write_records
+from mapper.run import Draft, Run, drafting, first_manifest, load_run
+from mapper.run_log import Story, log_maps, log_snapshot, log_story
+from mapper.sources.base import FrameSource
+from mapper.timebase import NS_PER_S, nearest
+from mapper.tracking import Tracking, refuse_a_fragment, track_log
+from mapper.trajectory import Trajectory, trajectory_from, write_tum
+
+_FUSE_CONFIGS = frozenset({"octree", "slice", "cloud", "mcap", "workers"})
+_KEPT_BY_FUSE = (files.TRAJECTORY, files.KEYFRAMES, files.TRUTH, files.GRAPH, files.FRAMES, files.FRAME_MS)
+_MAX_TRUTH_GAP_NS = 20_000_000
+
+
+def build(
+    source: FrameSource,
+    config: BuildConfig,
+    out: Path,
+    *,
+    progress: Progress = SILENT,
+    overwrite: bool = False,
+) -> Run:
+    """Track every frame, solve the graph once, level the world, then fuse every frame at its final pose.
+
+    Args:
+        source: The log.
+        config: Every knob.
+        out: Run folder to create; until it is whole it is called ``OUT.partial``.
+        progress: Who watches.
+        overwrite: Replace a run that is there, once the new one is whole.
+
+    Raises:
+        TrackingError: Too few frames could be tracked; what there is stays in ``OUT.partial``.
+        RunError: OUT is there already, or cannot be made.
+    """
+    with drafting(out, first_manifest(source), config, overwrite=overwrite) as draft:
+        with draft.clock.stage("track"):
+            tracking = track_log(source, config, progress=progress)
+        _save_tracking(draft, tracking, tracking.graph.T_world_node, source.truth)
+        refuse_a_fragment(tracking, config)
+        with draft.clock.stage("solve"):
+            solution = optimize(tracking.graph, config.graph)
+        with draft.clock.stage("level"):
+            level = _level(source, tracking.trajectory(solution.T_world_node), config)
+        T_level_node = {node: level.T_level_world @ T for node, T in solution.T_world_node.items()}
+        _save_tracking(draft, tracking, T_level_node, source.truth)
+        draft.update(
+            solve=Solve(
+                error_before=solution.error_before,
+                error_after=solution.error_after,
+                iterations=solution.iterations,
+            ),
+            levelling=Levelling(method=level.method, detail=level.detail),
+        )
+        _fuse_into(draft, source, config, progress)
+    return load_run(out)
+
+
+def fuse(source: FrameSource, run: Run, config: BuildConfig, *, progress: Progress = SILENT) -> Run:
+    """Make a run's maps again from its trajectory, with another octree, slice, cloud or MCAP configuration.
+
+    The run stays as it is until the new maps are whole.
+
+    Args:
+        source: The log that the run was built from.
+        run: A finished run.
+        config: The run's own configuration with the map's knobs turned.
+        progress: Who watches.
+
+    Raises:
+        ConfigError: The configuration differs in something that tracking has already settled.
+        RunError: The log is not the one that the run was built from.
+    """
+    for name in sorted(set(BuildConfig.model_fields) - _FUSE_CONFIGS):
+        if getattr(config, name) != getattr(run.config, name):
+            raise ConfigError(f"{name}: fuse keeps what was tracked and cannot change it; run mapper build")
+    if fingerprint(source.path) != run.manifest.input.fingerprint:
+        raise RunError(f"{source.path}: changed since {run.path} was built from it; build it again")
+    status: Status = "building"
+    manifest = run.manifest.model_copy(update={"status": status})
+    with drafting(run.path, manifest, config, overwrite=True) as draft:
+        draft.clock.seconds.update(manifest.timing.stage_s)
+        for name in _KEPT_BY_FUSE:
+            if (run.path / name).exists():
+                shutil.copy2(run.path / name, draft.folder / name)
+        _fuse_into(draft, source, config, progress)
+    return load_run(run.path)
+
+
+def _save_tracking(
+    draft: Draft, tracking: Tracking, T_world_node: Mapping[int, Transform], truth: Trajectory | None
+) -> None:
+    """Write what the first pass found, with the nodes where they are believed to be by now."""
+    graph = PoseGraph(dict(T_world_node), tracking.graph.stamps_ns, tracking.graph.factors)
+    write_records(draft.folder / files.FRAMES, records_of(tracking.tracks, tracking.skipped))
+    write_frame_ms(draft.folder / files.FRAME_MS, tracking.frame_ms)
+    write_tum(draft.folder / files.TRAJECTORY, tracking.trajectory(T_world_node))
+    if truth is not None:
+        write_tum(draft.folder / files.TRUTH, truth)
+    if T_world_node:
+        write_g2o(draft.folder / files.GRAPH, graph)
+        keyframes = trajectory_from((graph.stamps_ns[node], T) for node, T in T_world_node.items())
+        write_tum(draft.folder / files.KEYFRAMES, keyframes)
+    draft.update(
+        counts=Counts(
+            listed=len(tracking.tracks) + len(tracking.skipped),
+            read=len(tracking.tracks),
+            skipped=len(tracking.skipped),
+            lost=len(tracking.tracks) - len(tracking.placed),
+            tracked=len(tracking.placed),
+            nodes=len(graph.T_world_node),
+            factors=len(graph.factors),
+        ),
+        skipped=tuple(SkippedFrame(stamp_ns=s.stamp_ns, reason=s.reason) for s in tracking.skipped),
+    )
+
+
+def _level(source: FrameSource, trajectory: Trajectory, config: BuildConfig) -> Level:
+    """Find the level frame from a few frames, spread over the trajectory."""
+    spread = np.unique(np.linspace(0, len(trajectory) - 1, config.level.frames).round().astype(int))
+    T_world_body = {int(trajectory.stamps_ns[i]): trajectory.T_world_body[i] for i in spread}
+    scans = []
+    for entry in source.entries():
+        if entry.stamp_ns in T_world_body:
+            try:
+                scans.append((entry.load(colour=False).scan(), T_world_body[entry.stamp_ns]))
+            except FrameError:
+                continue  # it was readable a moment ago; the second pass will tell
+    return find_level(scans, trajectory=trajectory, accelerations=source.accelerations, config=config.level)
+
+
+def _fuse_into(draft: Draft, source: FrameSource, config: BuildConfig, progress: Progress) -> None:
+    """Fuse a draft's trajectory and write everything that is made from the maps."""
+    tracked = Run(draft.folder, config, draft.manifest)
+    trajectory, truth = tracked.trajectory(), tracked.truth()
+    if truth is not None:
+        truth = _laid_over(truth, trajectory)
+    frame_ms = tracked.frame_ms() if config.mcap.frame_times else {}
+    story = Story(trajectory, tracked.graph(), tracked.records(), frame_ms, truth)
+    with McapLog(draft.folder / files.MCAP) as log:
+        with draft.clock.stage("fuse"):
+            maps = fuse_log(
+                source,
+                trajectory,
+                config,
+                progress=progress,
+                on_snapshot=lambda snapshot: log_snapshot(log, snapshot),
+            )
+        with draft.clock.stage("write"):
+            log_story(log, story)
+            log_maps(log, maps, stamp_ns=int(trajectory.stamps_ns[0]))
+            _write_maps(draft.folder, maps)
+            _write_pictures(draft, maps, trajectory, truth)
+    counts = draft.manifest.counts.model_copy(
+        update={"leaves": len(maps.octree), "cloud_points": len(maps.cloud_points_world)}
+    )
+    draft.update(counts=counts, timing=_timing(draft, trajectory, counts.read))
+
+
+def _write_maps(folder: Path, maps: Maps) -> None:
+    write_bt(folder / files.OCTREE_BT, maps.octree)
+    write_ot(folder / files.OCTREE_OT, maps.octree)
+    write_ply(folder / files.CLOUD, maps.cloud_points_world, maps.cloud_colors)
+    write_grid(folder, files.SLICE, maps.grid)
+
+
+def _write_pictures(draft: Draft, maps: Maps, trajectory: Trajectory, truth: Trajectory | None) -> None:
+    counts, levelling = draft.manifest.counts, draft.manifest.levelling
+    lines = [f"{len(trajectory)} frames, {counts.nodes} keyframes, {trajectory.path_length_m:.2f} m of path"]
+    if levelling is not None:
+        lines.append(f"levelled by {levelling.method}")
+    write_summary(
+        draft.folder / files.SUMMARY,
+        grid=maps.grid,
+        trajectory=trajectory,
+        truth=truth,
+        title=Path(draft.manifest.input.path).name,
+        lines=lines,
+    )
+    if len(maps.cloud_points_world):
+        write_cloud_views(
+            draft.folder / files.CLOUD_VIEWS, maps.cloud_points_world, maps.cloud_colors, trajectory
+        )
+
+
+def _laid_over(truth: Trajectory, trajectory: Trajectory) -> Trajectory | None:
+    """Return the truth moved to where it fits the trajectory best; None if they share no three stamps."""
+    index, gap_ns = nearest(truth.stamps_ns, trajectory.stamps_ns)
+    near = gap_ns <= _MAX_TRUTH_GAP_NS
+    if near.sum() < 3:
+        return None
+    T_level_truth, _ = fit_rigid(trajectory.positions_world[near], truth.positions_world[index[near]])
+    return truth.moved(T_level_truth)
+
+
+def _timing(draft: Draft, trajectory: Trajectory, frames: int) -> Timing:
+    seconds = {stage: round(value, 3) for stage, value in draft.clock.seconds.items()}
+    total_s = sum(seconds.values())
+    log_s = float(trajectory.stamps_ns[-1] - trajectory.stamps_ns[0]) / NS_PER_S
+    return draft.manifest.timing.model_copy(
+        update={
+            "stage_s": seconds,
+            "total_s": round(total_s, 3),
+            "log_s": log_s,
+            "frames_per_s": round(frames / total_s, 2),
+            "real_time_factor": round(log_s / total_s, 3),
+            "peak_memory_mb": round(peak_memory_mb(), 1),
+        }
+    )

@@ -1,0 +1,77 @@
+"""What a run tells in its MCAP log."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+
+from mapper.export.mcap_log import WORLD, McapLog
+from mapper.export.palette import TRUTH, height_colors
+from mapper.fusion import Maps, Snapshot
+from mapper.graph.model import PoseGraph
+from mapper.records import FrameRecord
+from mapper.trajectory import Trajectory
+
+BODY = "body"
+CAMERA = "camera"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Story:
+    """A tracked log, ready to be told.
+
+    Attributes:
+        trajectory: Final body poses in the levelled world; at least one.
+        graph: Nodes at the solution, same world.
+        records: What became of every frame.
+        frame_ms: Milliseconds that each frame took, by stamp; empty leaves them out.
+        truth: Where the body really was, laid over the trajectory, if known.
+    """
+
+    trajectory: Trajectory
+    graph: PoseGraph
+    records: Iterable[FrameRecord]
+    frame_ms: Mapping[int, float]
+    truth: Trajectory | None
+
+
+def log_story(log: McapLog, story: Story) -> None:
+    """Log the transforms, diagnostics, trajectories and factors.
+
+    What belongs to the whole log is logged at its first stamp, as :class:`McapLog` advises.
+    """
+    begin_ns = int(story.trajectory.stamps_ns[0])
+    log.trajectory(begin_ns, story.trajectory, name="estimate")
+    if story.truth is not None:
+        log.trajectory(begin_ns, story.truth, name="truth", color=TRUTH)
+    log.factors(begin_ns, story.graph.factors, T_world_node=story.graph.T_world_node)
+    for stamp_ns, T_world_body in zip(story.trajectory.stamps_ns, story.trajectory.T_world_body, strict=True):
+        log.transform(int(stamp_ns), T_world_body, parent=WORLD, child=BODY)
+    for record in story.records:
+        log.diagnostics(record.stamp_ns, _fields(record, story.frame_ms))
+
+
+def log_snapshot(log: McapLog, snapshot: Snapshot) -> None:
+    """Log an image with its camera and where that sits on the body."""
+    log.transform(snapshot.stamp_ns, snapshot.T_body_camera, parent=BODY, child=CAMERA)
+    log.calibration(snapshot.stamp_ns, snapshot.camera, frame=CAMERA)
+    log.image(snapshot.stamp_ns, snapshot.jpeg, frame=CAMERA)
+
+
+def log_maps(log: McapLog, maps: Maps, *, stamp_ns: int) -> None:
+    """Log the occupied voxels by height, the coloured cloud and the slice."""
+    leaves = maps.octree.leaves()
+    occupied_world = leaves.centres_world[leaves.log_odds >= maps.octree.occupied_log_odds]
+    log.cloud(stamp_ns, occupied_world, colors=height_colors(occupied_world[:, 2]), name="octree")
+    log.cloud(stamp_ns, maps.cloud_points_world, colors=maps.cloud_colors, name="cloud")
+    log.grid(stamp_ns, maps.grid)
+
+
+def _fields(record: FrameRecord, frame_ms: Mapping[int, float]) -> dict[str, int | float | str]:
+    fields = {
+        "outcome": record.outcome,
+        "node": -1 if record.node is None else record.node,
+        "is_keyframe": int(record.is_keyframe),
+        **asdict(record.diagnostics),
+    }
+    if frame_ms:
+        fields["ms"] = frame_ms.get(record.stamp_ns, 0.0)
+    return fields
