@@ -47,15 +47,15 @@ class UniformOrb:
         return _joined(parts[::-1])
 
     def _pyramid(self, gray: Image) -> Iterator[Image]:
-        """Yield the levels, finest first, while they are large enough to hold a descriptor."""
+        """Yield the image and its coarser levels, while they are large enough to hold a descriptor."""
         height, width = gray.shape
         level = gray
         for octave in range(self._config.levels):
             scale = self._config.scale_factor**octave
             size = round(width / scale), round(height / scale)
-            if min(size) <= 2 * _MARGIN_PX:
-                return
             if octave:
+                if min(size) <= 2 * _MARGIN_PX:
+                    return
                 level = cv2.resize(level, size, interpolation=cv2.INTER_LINEAR_EXACT)
             yield level
 

@@ -1,7 +1,7 @@
 """The thesis's odometry: each frame registered against the frames before it ("ISLAM", alg. 7)."""
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +33,9 @@ class IsvdObservation:
     stamp_ns: int
     features: Features
     points_body: Points
+
+
+SharedPoints = Callable[[IsvdObservation, IsvdObservation, MatchConfig], tuple[Points, Points, int]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,8 +74,16 @@ class IsvdOdometry:
     features and depth errors, so it is right in proportion rather than in size.
     """
 
-    def __init__(self, config: IsvdOdometryConfig) -> None:
+    def __init__(self, config: IsvdOdometryConfig, *, shared_points: SharedPoints | None = None) -> None:
+        """Start before the first frame.
+
+        Args:
+            config: Every knob.
+            shared_points: Stands in for ``find_shared_points``, so that runs that differ only in what they
+                make of the pairs need not match again.
+        """
         self._config = config
+        self._shared_points = shared_points or find_shared_points
         self._detector = build_detector(config.detector)
         self._isvd = Isvd(config.registration)
         self._recent: deque[Placed] = deque(maxlen=max(config.previous_frames, config.keyframe_interval))
@@ -130,7 +141,7 @@ class IsvdOdometry:
         """Return the registrations that succeeded, in the order of the earlier frames."""
         candidates = []
         for placed in earlier:
-            target, source, matches = matched_points(placed.observation, observation, match)
+            target, source, matches = self._shared_points(placed.observation, observation, match)
             alignment, weight = self._isvd.fit_weighted(target, source)
             if alignment.converged:
                 T_world_body = placed.T_world_body @ alignment.T_target_source
@@ -203,7 +214,7 @@ class IsvdOdometry:
         )
 
 
-def matched_points(
+def find_shared_points(
     target: IsvdObservation, source: IsvdObservation, match: MatchConfig
 ) -> tuple[Points, Points, int]:
     """Return the (M, 3) points that two frames share, each in its own body frame, and the number of matches.
