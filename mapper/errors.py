@@ -32,6 +32,10 @@ class GraphError(MapperError):
     """A pose graph that is inconsistent or cannot be solved."""
 
 
+class MapSizeError(MapperError):
+    """A map or a scan that would not fit into memory, refused before it is allocated."""
+
+
 class MapFileError(MapperError):
     """A map file that is truncated, foreign or damaged."""
 

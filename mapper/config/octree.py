@@ -13,10 +13,10 @@ class OctreeConfig(Config):
     """OctoMap's sensor model and geometry (Hornung et al. 2013); its defaults."""
 
     resolution_m: PositiveFloat = 0.05
-    hit_probability: Probability = 0.7
-    miss_probability: Probability = 0.4
-    clamp_min_probability: Probability = 0.1192
-    clamp_max_probability: Probability = 0.971
+    hit_probability: Annotated[float, Field(ge=0.5, lt=1.0)] = 0.7
+    miss_probability: Annotated[float, Field(gt=0.0, le=0.5)] = 0.4
+    clamp_min_probability: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.1192
+    clamp_max_probability: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.971
     occupied_probability: Probability = 0.5
     max_range_m: PositiveFloat = 4.0
     """Beyond it a ray only frees space, up to this range. Kinect depth is poor past 4 m."""

@@ -1,0 +1,151 @@
+"""A sparse grid of voxels: an open-addressing hash from Morton codes to 8³ blocks of log-odds."""
+
+import os
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mapper.errors import MapSizeError
+from mapper.octree.keys import BLOCK_VOXELS
+
+BLOCK_BYTES = BLOCK_VOXELS * 4
+_FIRST_BLOCKS = 64
+_GROWTH = 1.25
+"""A pool that doubles would hold half its memory in reserve."""
+_VACANT = -1
+_FIBONACCI = -7046029254386353131  # 2⁶⁴/φ as int64 (Knuth, TAOCP 3, §6.4): spreads neighbouring codes
+
+
+class BlockTable(NamedTuple):
+    """The arrays that compiled code needs to find a voxel.
+
+    Attributes:
+        codes: (C,) int64 block codes by hash, −1 where vacant; C is a power of two.
+        slots: (C,) int32 rows of ``values``.
+        values: (capacity, 512) float32 log-odds in Morton order inside the block; NaN is unknown.
+    """
+
+    codes: NDArray[np.int64]
+    slots: NDArray[np.int32]
+    values: NDArray[np.float32]
+
+
+class BlockStore:
+    """Blocks that are never given back; slots number them in the order of their birth."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._codes = np.full(_FIRST_BLOCKS, _VACANT, dtype=np.int64)  # by slot
+        self.table = _table(_FIRST_BLOCKS, values=np.empty((_FIRST_BLOCKS, BLOCK_VOXELS), np.float32))
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes held, spare capacity included."""
+        return sum(array.nbytes for array in (self._codes, *self.table))
+
+    @property
+    def codes(self) -> NDArray[np.int64]:
+        """(B,) Morton codes of the blocks, by slot."""
+        return self._codes[: self._count]
+
+    def sorted_slots(self) -> NDArray[np.int64]:
+        """Return the (B,) slots in Morton order, which does not depend on the order of insertion."""
+        return np.argsort(self.codes)
+
+    def claim(self, codes: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Return the slots of distinct block codes; blocks that did not exist are born unknown.
+
+        Raises:
+            MapSizeError: The map would not fit into this machine's memory; nothing has changed then.
+        """
+        slots = np.empty(len(codes), dtype=np.int32)
+        missing = find_slots(self.table, codes, slots)
+        if missing:
+            self._reserve(self._count + missing)
+            self._count = _add_missing(self.table, codes, slots, self._codes, self._count)
+        return slots
+
+    def _reserve(self, count: int) -> None:
+        capacity = len(self._codes)
+        if count > capacity:
+            check_memory(count * BLOCK_BYTES, f"a map of {count} blocks of 8³ voxels")
+            capacity = max(count, int(capacity * _GROWTH))
+            self._codes = np.concatenate([self._codes, np.empty(capacity - len(self._codes), np.int64)])
+            values = np.empty((capacity, BLOCK_VOXELS), np.float32)
+            values[: self._count] = self.table.values[: self._count]
+            self.table = self.table._replace(values=values)
+        if 2 * count > len(self.table.codes):
+            self.table = _table(count, values=self.table.values)
+            _index(self.table, self.codes)
+
+
+def check_memory(needed_bytes: int, what: str) -> None:
+    """Refuse what could not fit before anything is allocated.
+
+    Raises:
+        MapSizeError: More is needed than the machine has.
+    """
+    limit_bytes = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if needed_bytes > limit_bytes:
+        raise MapSizeError(
+            f"{what} needs {needed_bytes / 2**30:.1f} GiB and this machine has {limit_bytes / 2**30:.1f}; "
+            "raise resolution_m or lower max_range_m"
+        )
+
+
+def _table(count: int, *, values: NDArray[np.float32]) -> BlockTable:
+    """Return an empty hash for up to ``count`` blocks at a load between a quarter and a half."""
+    size = 1 << (2 * count - 1).bit_length()
+    return BlockTable(np.full(size, _VACANT, np.int64), np.zeros(size, np.int32), values)
+
+
+@njit(cache=True, nogil=True)
+def probe(codes, code):
+    """Return where in the hash a code is, or the vacant place where it belongs (linear probing)."""
+    mask = len(codes) - 1
+    place = ((code * _FIBONACCI) >> 24) & mask
+    while codes[place] != code and codes[place] != _VACANT:
+        place = (place + 1) & mask
+    return place
+
+
+@njit(cache=True, nogil=True)
+def find_slots(table, codes, slots):
+    """Write each code's slot, or −1; return how many are missing."""
+    missing = 0
+    for i in range(len(codes)):
+        place = probe(table.codes, codes[i])
+        if table.codes[place] == _VACANT:
+            slots[i] = -1
+            missing += 1
+        else:
+            slots[i] = table.slots[place]
+    return missing
+
+
+@njit(cache=True, nogil=True)
+def _add_missing(table, codes, slots, codes_by_slot, count):
+    """Give every code whose slot is −1 the next slot, filled with NaN; return the new count."""
+    for i in range(len(codes)):
+        if slots[i] < 0:
+            place = probe(table.codes, codes[i])
+            table.codes[place] = codes[i]
+            table.slots[place] = count
+            table.values[count] = np.nan
+            codes_by_slot[count] = codes[i]
+            slots[i] = count
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _index(table, codes_by_slot):
+    for slot in range(len(codes_by_slot)):
+        place = probe(table.codes, codes_by_slot[slot])
+        table.codes[place] = codes_by_slot[slot]
+        table.slots[place] = slot

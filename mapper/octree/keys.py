@@ -1,0 +1,59 @@
+"""Voxel keys as OctoMap numbers them, and the Morton codes that order them.
+
+A key is ``floor(coordinate / resolution) + 32768`` per axis, 0 … 65535. A Morton code interleaves the three
+keys with x lowest, so its base-8 digits, from the top, are the child indices on the way down the octree.
+"""
+
+from math import floor
+
+from numba import njit
+from numpy import float64, int64
+
+KEY_BITS = 16
+KEY_ZERO = 1 << (KEY_BITS - 1)
+KEY_COUNT = 1 << KEY_BITS
+KEY_MASK = KEY_COUNT - 1
+
+BLOCK_BITS = 3
+"""A block is 8³ voxels: the lowest three levels of the tree."""
+BLOCK_VOXELS = 1 << (3 * BLOCK_BITS)
+BLOCK_DEPTH = KEY_BITS - BLOCK_BITS
+"""Depth of the tree node that a block is."""
+
+
+@njit(cache=True, nogil=True, inline="always")
+def key_of(coordinate_m, inverse_resolution):
+    """Return the key of a finite coordinate; OctoMap floors before it adds the offset."""
+    return int64(floor(inverse_resolution * float64(coordinate_m))) + KEY_ZERO
+
+
+@njit(cache=True, nogil=True, inline="always")
+def centre_of(key, resolution_m):
+    """Return the coordinate of a voxel's centre, float64 metres."""
+    return (float64(key - KEY_ZERO) + 0.5) * resolution_m
+
+
+@njit(cache=True, nogil=True)
+def spread(key):
+    """Return the 16 bits of a key spread to every third bit."""
+    code = key & 0xFFFF
+    code = (code | (code << 16)) & 0x0000FF0000FF
+    code = (code | (code << 8)) & 0x00F00F00F00F
+    code = (code | (code << 4)) & 0x0C30C30C30C3
+    return (code | (code << 2)) & 0x249249249249
+
+
+@njit(cache=True, nogil=True)
+def gather(code):
+    """Return the key whose bits are every third bit of a code: the inverse of :func:`spread`."""
+    key = code & 0x249249249249
+    key = (key | (key >> 2)) & 0x0C30C30C30C3
+    key = (key | (key >> 4)) & 0x00F00F00F00F
+    key = (key | (key >> 8)) & 0x0000FF0000FF
+    return (key | (key >> 16)) & 0xFFFF
+
+
+@njit(cache=True, nogil=True)
+def morton(x, y, z):
+    """Return the Morton code of three keys."""
+    return spread(x) | (spread(y) << 1) | (spread(z) << 2)

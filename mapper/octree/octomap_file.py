@@ -1,0 +1,180 @@
+"""OctoMap's files: ``.bt`` (free or occupied) and ``.ot`` (log-odds), byte for byte as the C++ library's."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper import atomic
+from mapper.config.octree import OctreeConfig
+from mapper.errors import MapFileError
+from mapper.octree import tree_reader
+from mapper.octree.keys import KEY_BITS
+from mapper.octree.map import OctreeMap, log_odds
+from mapper.octree.tree import build_tree, preorder, preorder_words
+
+_FULL = b"# Octomap OcTree file"
+_BINARY = b"# Octomap OcTree binary file"
+_TREE_NAMES = {"OcTree": "OcTree", "1": "OcTree", "ColorOcTree": "ColorOcTree"}
+_NODE = np.dtype([("value", "<f4"), ("mask", "u1")])
+_COLOR_NODE = np.dtype([("value", "<f4"), ("rgb", "u1", 3), ("mask", "u1")])
+_NOT_A_NUMBER = np.float32(np.nan)
+
+_FAULTS = {
+    tree_reader.CUT_SHORT: "ends before its tree does; it is truncated",
+    tree_reader.TRAILING: "goes on after its tree has ended; it is damaged",
+    tree_reader.TOO_DEEP: f"has nodes deeper than {KEY_BITS} levels; it is damaged",
+    tree_reader.CHILDLESS: "has an inner node without children; it is damaged",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Header:
+    binary: bool
+    tree_name: str
+    node_count: int
+    resolution_m: float
+
+
+def write_ot(path: Path, octree: OctreeMap) -> None:
+    """Write all log-odds as an OcTree, pruned; atomic."""
+    node_count, payload = 0, b""
+    if len(octree):
+        tree = build_tree(octree.blocks, _NOT_A_NUMBER)
+        values, masks = preorder(tree, octree.blocks)
+        nodes = np.empty(tree.node_count, dtype=_NODE)
+        nodes["value"], nodes["mask"] = values, masks
+        node_count, payload = tree.node_count, nodes.tobytes()
+    atomic.write_bytes(path, _header_bytes(_FULL, node_count, octree.resolution_m) + payload)
+
+
+def write_bt(path: Path, octree: OctreeMap) -> None:
+    """Write the maximum-likelihood map (each voxel free or occupied) as an OcTree, pruned; atomic."""
+    node_count, payload = 0, b""
+    if len(octree):
+        tree = build_tree(octree.blocks, octree.occupied_log_odds)
+        words = preorder_words(tree, octree.blocks, octree.occupied_log_odds)
+        node_count, payload = tree.node_count, words.astype("<u2").tobytes()
+    atomic.write_bytes(path, _header_bytes(_BINARY, node_count, octree.resolution_m) + payload)
+
+
+def _header_bytes(first_line: bytes, node_count: int, resolution_m: float) -> bytes:
+    return first_line + (
+        "\n# (feel free to add / change comments, but leave the first line as it is!)\n#\n"
+        f"id OcTree\nsize {node_count}\nres {resolution_m:g}\ndata\n"
+    ).encode("ascii")
+
+
+def read_map(path: Path, config: OctreeConfig | None = None) -> OctreeMap:
+    """Return the map of a ``.bt`` or ``.ot`` file of an OcTree or a ColorOcTree, whose colours are left out.
+
+    Leaves of a ``.bt`` file take the clamping values of the sensor model. The file says which kind it is, not
+    its name.
+
+    Args:
+        path: The file.
+        config: Sensor model for what is inserted later; the resolution is always the file's.
+
+    Raises:
+        MapFileError: The file cannot be read, is truncated, foreign or damaged.
+        MapSizeError: Its leaves, expanded to voxels, would not fit into memory.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise MapFileError(f"{path}: cannot be read: {error.strerror}") from None
+    header, start = _parse_header(path, data)
+    config = (config or OctreeConfig()).model_copy(update={"resolution_m": header.resolution_m})
+    octree = OctreeMap(config)
+    if header.node_count == 0:
+        if start != len(data):
+            raise MapFileError(f"{path}: size 0, but {len(data) - start} bytes follow; it is damaged")
+        return octree
+    payload = memoryview(data)[start:]
+    if header.binary:
+        leaves = _binary_leaves(path, header, payload, config)
+    else:
+        leaves = _full_leaves(path, header, payload)
+    octree.restore(leaves)
+    return octree
+
+
+def _parse_header(path: Path, data: bytes) -> tuple[_Header, int]:
+    """Return the header and where the payload starts; keys come in any order, unknown ones are skipped."""
+    first_line, _, _ = data.partition(b"\n")
+    binary = first_line.startswith(_BINARY)
+    if not binary and not first_line.startswith(_FULL):
+        what = "it is empty" if not data else f"it starts with {first_line[:32]!r}"
+        raise MapFileError(
+            f"{path}: not an OctoMap file: {what}, want {_FULL.decode()!r} or {_BINARY.decode()!r}"
+        )
+    fields: dict[str, str] = {}
+    start = len(first_line) + 1
+    while True:
+        end = data.find(b"\n", start)
+        if end < 0:
+            raise MapFileError(f"{path}: the header has no line 'data'; the file is truncated")
+        line = data[start:end].decode("ascii", errors="replace").strip()
+        start = end + 1
+        if line == "data":
+            break
+        name, _, value = line.partition(" ")
+        if name and not name.startswith("#"):
+            fields[name] = value.strip()
+    for name in ("id", "size", "res"):
+        if name not in fields:
+            raise MapFileError(f"{path}: the header has no line {name!r}; the file is damaged")
+    if fields["id"] not in _TREE_NAMES:
+        raise MapFileError(f"{path}: holds a {fields['id'][:32]!r}; only OcTree and ColorOcTree can be read")
+    node_count = int(fields["size"]) if fields["size"].isdecimal() else -1
+    try:
+        resolution_m = float(fields["res"])
+    except ValueError:
+        resolution_m = -1.0
+    if node_count < 0 or not 0.0 < resolution_m < np.inf:
+        raise MapFileError(
+            f"{path}: size {fields['size'][:32]!r} must be a count, res {fields['res'][:32]!r} a length > 0 m"
+        )
+    return _Header(binary, _TREE_NAMES[fields["id"]], node_count, resolution_m), start
+
+
+def _binary_leaves(
+    path: Path, header: _Header, payload: memoryview, config: OctreeConfig
+) -> tree_reader.TreeLeaves:
+    # A word describes at most eight nodes, so a damaged count cannot make us allocate much.
+    if len(payload) % 2 or header.node_count > 1 + 4 * len(payload):
+        raise MapFileError(
+            f"{path}: {len(payload)} bytes cannot hold {header.node_count} nodes; it is truncated"
+        )
+    leaves: tree_reader.TreeLeaves
+    leaves, nodes, fault = tree_reader.leaves_of_words(
+        np.frombuffer(payload, dtype="<u2"),
+        header.node_count,
+        log_odds(config.clamp_min_probability),
+        log_odds(config.clamp_max_probability),
+    )
+    if fault:
+        raise MapFileError(f"{path}: {_FAULTS[fault]}")
+    if nodes != header.node_count:
+        more = "more" if nodes > header.node_count else f"{nodes}"
+        raise MapFileError(f"{path}: the header promises {header.node_count} nodes, the tree has {more}")
+    return leaves
+
+
+def _full_leaves(path: Path, header: _Header, payload: memoryview) -> tree_reader.TreeLeaves:
+    record = _COLOR_NODE if header.tree_name == "ColorOcTree" else _NODE
+    if len(payload) != header.node_count * record.itemsize:
+        raise MapFileError(
+            f"{path}: the header promises {header.node_count} nodes of {record.itemsize} bytes, "
+            f"but {len(payload)} bytes follow"
+        )
+    nodes = np.frombuffer(payload, dtype=record)
+    values: NDArray[np.float32] = np.ascontiguousarray(nodes["value"], dtype=np.float32)
+    leaves: tree_reader.TreeLeaves
+    leaves, fault = tree_reader.leaves_of_nodes(values, np.ascontiguousarray(nodes["mask"]))
+    if fault:
+        raise MapFileError(f"{path}: {_FAULTS[fault]}")
+    if not np.isfinite(leaves.values).all():
+        raise MapFileError(f"{path}: has leaves whose log-odds are not finite; it is damaged")
+    return leaves

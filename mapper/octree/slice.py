@@ -1,0 +1,130 @@
+"""The 2D navigation map: a horizontal band of the octree looked at from above."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy import uint8
+from numpy.typing import NDArray
+
+from mapper.config.octree import SliceConfig
+from mapper.errors import DataError
+from mapper.geometry import Array
+from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, gather
+from mapper.octree.map import OctreeMap
+
+UNKNOWN, FREE, OCCUPIED = -1, 0, 100
+"""ROS OccupancyGrid codes, ordered by how much they matter: the maximum over a column is its state."""
+
+_SEEN_FREE, _SEEN_OCCUPIED = 1, 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OccupancyGrid:
+    """What a robot may drive over, seen from above.
+
+    Attributes:
+        cells: (H, W) int8 of UNKNOWN, FREE and OCCUPIED; row 0 has the lowest y, column 0 the lowest x.
+        origin_world_m: (2,) x and y of the lower left corner of cell (0, 0), metres.
+        resolution_m: Edge of a cell.
+    """
+
+    cells: NDArray[np.int8]
+    origin_world_m: Array
+    resolution_m: float
+
+    def __post_init__(self) -> None:
+        if self.cells.ndim != 2 or self.cells.size == 0 or self.cells.dtype != np.int8:
+            raise DataError(
+                f"grid: cells {self.cells.shape} {self.cells.dtype}, want (H, W) int8 of some size"
+            )
+        codes = np.unique(self.cells)
+        if not np.isin(codes, (UNKNOWN, FREE, OCCUPIED)).all():
+            raise DataError(f"grid: codes {codes.tolist()}, want only {UNKNOWN}, {FREE} and {OCCUPIED}")
+        if self.origin_world_m.shape != (2,) or not np.isfinite(self.origin_world_m).all():
+            raise DataError(f"grid: origin {self.origin_world_m}, want two finite numbers")
+        if not 0.0 < self.resolution_m < np.inf:
+            raise DataError(f"grid: resolution {self.resolution_m} m, want > 0")
+
+
+def cut_slice(octree: OctreeMap, config: SliceConfig, *, floor_z_m: float = 0.0) -> OccupancyGrid:
+    """Return the band between two heights above the floor as a grid just large enough for it.
+
+    A voxel belongs to the band if its centre does. A cell is occupied if any voxel of its column is, else
+    free if any is, else unknown. Occupied cells in too small a group become what else their columns saw.
+
+    Args:
+        octree: The map in a world with z up.
+        config: Heights and the smallest group.
+        floor_z_m: Height of the floor in the world.
+
+    Raises:
+        DataError: The band is empty or nothing is known inside it.
+    """
+    lowest, highest = _band(octree, config, floor_z_m)
+    slots = octree.blocks.sorted_slots()
+    codes = octree.blocks.codes[slots]
+    z = gather(codes >> 2) << BLOCK_BITS
+    inside = (z + (1 << BLOCK_BITS) > lowest) & (z <= highest)
+    codes, slots = codes[inside], slots[inside]
+    x, y = gather(codes) << BLOCK_BITS, gather(codes >> 1) << BLOCK_BITS
+    if len(codes):
+        first = np.array([x.min(), y.min()])
+        shape = (int(y.max() - first[1]) + (1 << BLOCK_BITS), int(x.max() - first[0]) + (1 << BLOCK_BITS))
+        seen = np.zeros(shape, dtype=np.uint8)
+        _flatten(
+            codes, slots, octree.blocks.table.values, octree.occupied_log_odds, first, lowest, highest, seen
+        )
+    if not len(codes) or not seen.any():
+        raise DataError(
+            f"slice: nothing is known {config.min_height_m:g} to {config.max_height_m:g} m above the floor "
+            f"at z = {floor_z_m:g} m; set slice.min_height_m and slice.max_height_m to where the map is"
+        )
+    rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+    seen = _without_speckles(
+        seen[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], min_cells=config.min_cluster_cells
+    )
+    cells = np.full(seen.shape, UNKNOWN, dtype=np.int8)
+    cells[seen & _SEEN_FREE != 0] = FREE
+    cells[seen & _SEEN_OCCUPIED != 0] = OCCUPIED
+    corner = np.array([first[0] + columns[0], first[1] + rows[0]]) - KEY_ZERO
+    return OccupancyGrid(cells, corner * octree.resolution_m, octree.resolution_m)
+
+
+def _band(octree: OctreeMap, config: SliceConfig, floor_z_m: float) -> tuple[int, int]:
+    """Return the lowest and the highest z key whose voxel centres lie in the band."""
+    bottom_m, top_m = floor_z_m + config.min_height_m, floor_z_m + config.max_height_m
+    # The allowance keeps a centre that lies on the edge, as 0.075 m at 5 cm, from hanging on a rounding.
+    lowest = int(np.ceil(bottom_m / octree.resolution_m - 0.5 - 1e-9)) + KEY_ZERO
+    highest = int(np.floor(top_m / octree.resolution_m - 0.5 + 1e-9)) + KEY_ZERO
+    if lowest > highest:
+        raise DataError(
+            f"slice: no voxel of {octree.resolution_m:g} m has its centre {config.min_height_m:g} to "
+            f"{config.max_height_m:g} m above the floor; raise slice.max_height_m"
+        )
+    return lowest, highest
+
+
+@njit(cache=True, nogil=True)
+def _flatten(codes, slots, values, threshold, first, lowest, highest, seen):
+    """Or what every voxel of the band says into its column of ``seen`` (H, W) uint8."""
+    for b in range(len(codes)):
+        for voxel in range(BLOCK_VOXELS):
+            value = values[slots[b], voxel]
+            if value != value:
+                continue
+            code = (codes[b] << (3 * BLOCK_BITS)) | voxel
+            z = gather(code >> 2)
+            if z >= lowest and z <= highest:
+                row, column = gather(code >> 1) - first[1], gather(code) - first[0]
+                seen[row, column] |= uint8(_SEEN_OCCUPIED if value >= threshold else _SEEN_FREE)
+
+
+def _without_speckles(seen: NDArray[np.uint8], *, min_cells: int) -> NDArray[np.uint8]:
+    """Return ``seen`` without the occupied flag of 8-connected groups smaller than ``min_cells``."""
+    occupied = (seen & _SEEN_OCCUPIED).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(occupied, connectivity=8)
+    small = stats[:, cv2.CC_STAT_AREA] < min_cells
+    small[0] = False  # label 0 is everything that is not occupied
+    return np.where(small[labels], seen & ~np.uint8(_SEEN_OCCUPIED), seen)

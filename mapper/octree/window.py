@@ -1,0 +1,168 @@
+"""The scratch grid in which one scan is rasterised before it touches the map.
+
+A ray loop that looks every voxel up in a hash is slow. Here a voxel's place is three masked integers or-ed
+together, and a step along an axis adds one number to one of them. The grid wraps around at powers of two, so
+scans may lie anywhere. Cells are in Morton order while all axes have bits left; the lowest nine are a block.
+"""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mapper.errors import MapSizeError
+from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_MASK, morton
+
+UNTOUCHED, FREE, OCCUPIED = 0, 1, 2
+"""What a scan says about a voxel, ordered so that occupied wins."""
+
+_LIMIT_BYTES = 1 << 33
+"""Address space, not memory: only pages that a ray crosses are ever backed by memory."""
+
+
+class Window(NamedTuple):
+    """A window placed around one scan, as compiled code sees it.
+
+    Attributes:
+        cells: (C,) uint8, all UNTOUCHED between scans.
+        touched: (C / 512,) uint8, 1 for each block with a cell that is not UNTOUCHED.
+        base: (3,) int64 lowest key of the block that holds the ray origin; its cell is 0.
+        wrap: (3,) int64 cells per axis − 1.
+        bits: (3,) int64 which bits of a cell's index belong to each axis.
+        places: (3, S) int64 index of each axis's n-th cell: n with its bits deposited into ``bits``.
+    """
+
+    cells: NDArray[np.uint8]
+    touched: NDArray[np.uint8]
+    base: NDArray[np.int64]
+    wrap: NDArray[np.int64]
+    bits: NDArray[np.int64]
+    places: NDArray[np.int64]
+
+
+class WindowBuffer:
+    """Memory that is kept from scan to scan and only grows."""
+
+    def __init__(self) -> None:
+        self._cells = np.zeros(0, dtype=np.uint8)
+        self._touched = np.zeros(0, dtype=np.uint8)
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of address space held."""
+        return self._cells.nbytes + self._touched.nbytes
+
+    def place(
+        self, lowest: NDArray[np.int64], highest: NDArray[np.int64], *, origin: NDArray[np.int64]
+    ) -> Window:
+        """Return a window in which no two voxels between two corners share a cell.
+
+        Args:
+            lowest: (3,) smallest keys that can be touched.
+            highest: (3,) largest keys that can be touched.
+            origin: (3,) key where the rays begin.
+
+        Raises:
+            MapSizeError: The scan is too large for its resolution; nothing has been allocated then.
+        """
+        blocks = (highest >> BLOCK_BITS) - (lowest >> BLOCK_BITS) + 1
+        # At least two blocks per axis, so that the touched flags fill whole 8-byte words.
+        lengths = tuple(BLOCK_BITS + max(1, (int(n) - 1).bit_length()) for n in blocks)
+        size = 1 << sum(lengths)
+        extent = "×".join(str(n) for n in highest - lowest + 1)
+        if size > _LIMIT_BYTES:
+            raise MapSizeError(
+                f"a scan of {extent} voxels needs {size / 2**30:.0f} GiB of working space, "
+                f"the limit is {_LIMIT_BYTES >> 30}; raise resolution_m or lower max_range_m"
+            )
+        if size > len(self._cells):
+            try:
+                self._cells = np.zeros(size, dtype=np.uint8)
+            except MemoryError:
+                raise MapSizeError(
+                    f"a scan of {extent} voxels needs {size / 2**30:.0f} GiB of address space, which the "
+                    "system refuses; raise resolution_m or lower max_range_m"
+                ) from None
+            self._touched = np.zeros(size // BLOCK_VOXELS, dtype=np.uint8)
+        bits, places = _layout(lengths)
+        base = origin >> BLOCK_BITS << BLOCK_BITS
+        wrap = np.array([(1 << n) - 1 for n in lengths], dtype=np.int64)
+        return Window(self._cells[:size], self._touched[: size // BLOCK_VOXELS], base, wrap, bits, places)
+
+
+@lru_cache(maxsize=64)
+def _layout(lengths: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return (bits, places) of a window with 2^n cells per axis; the axes interleave from the bottom."""
+    bits = np.zeros(3, dtype=np.int64)
+    places = np.zeros((3, 1 << max(lengths)), dtype=np.int64)
+    position = 0
+    for level in range(max(lengths)):
+        for axis in range(3):
+            if level < lengths[axis]:
+                n = np.arange(1 << lengths[axis])
+                places[axis, : len(n)] |= (n >> level & 1) << position
+                bits[axis] |= 1 << position
+                position += 1
+    return bits, places
+
+
+@njit(cache=True, nogil=True)
+def cell_of(window, x, y, z):
+    """Return the cell of three keys."""
+    return (
+        window.places[0, (x - window.base[0]) & window.wrap[0]]
+        | window.places[1, (y - window.base[1]) & window.wrap[1]]
+        | window.places[2, (z - window.base[2]) & window.wrap[2]]
+    )
+
+
+@njit(cache=True, nogil=True)
+def touched_blocks(window, lowest):
+    """Return the touched blocks and forget that they were touched.
+
+    Args:
+        window: Where a scan has been rasterised.
+        lowest: (3,) int64 the ``lowest`` that the window was placed with: it resolves the wrap-around.
+
+    Returns:
+        (B,) int64 positions of the blocks in the window and (B,) int64 Morton codes of the blocks.
+    """
+    words = window.touched.view(np.int64)
+    count = 0
+    for flag in window.touched:
+        count += flag
+    positions = np.empty(count, dtype=np.int64)
+    codes = np.empty(count, dtype=np.int64)
+    count = 0
+    for i in range(len(words)):
+        if words[i]:
+            for position in range(8 * i, 8 * i + 8):
+                if window.touched[position]:
+                    positions[count] = position
+                    codes[count] = morton(
+                        _block_key(window, lowest, position, 0),
+                        _block_key(window, lowest, position, 1),
+                        _block_key(window, lowest, position, 2),
+                    )
+                    count += 1
+            words[i] = 0
+    return positions, codes
+
+
+@njit(cache=True, nogil=True)
+def _block_key(window, lowest, position, axis):
+    """Return a block's key along one axis: the key of any of its voxels without the lowest three bits."""
+    bits = window.bits[axis] >> (3 * BLOCK_BITS)
+    offset, weight = 0, 1
+    while bits:
+        if bits & 1:
+            offset |= weight * (position & 1)
+            weight <<= 1
+        bits >>= 1
+        position >>= 1
+    first = lowest[axis] >> BLOCK_BITS
+    wrap = window.wrap[axis] >> BLOCK_BITS
+    base = window.base[axis] >> BLOCK_BITS
+    return (first + ((base + offset - first) & wrap)) & (KEY_MASK >> BLOCK_BITS)
