@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
+from mapper.config.synthetic import SynthConfig
+from mapper.sources.synthetic import write_tum_log
 from mapper.timebase import seconds_text_from_ns
 
 FIRST_NS = 1_305_031_102_175_304_000
@@ -53,3 +55,23 @@ def tiny_tum_log(tmp_path: Path) -> Callable[..., Path]:
         return log
 
     return make
+
+
+@pytest.fixture(scope="session")
+def desk_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A synthetic TUM log of two seconds before a desk, with truth; tests that damage it work on a copy."""
+    log = tmp_path_factory.mktemp("synthetic") / "desk"
+    write_tum_log(
+        log,
+        SynthConfig(
+            path="desk",
+            duration_s=2.0,
+            frame_rate_hz=15.0,
+            width_px=320,
+            height_px=240,
+            texture_px_per_m=64,
+            posters_per_room=3,
+            furniture_per_room=4,
+        ),
+    )
+    return log
