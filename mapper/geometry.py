@@ -65,10 +65,10 @@ def rotation_log(R: Array) -> Array:
     angle = float(np.arctan2(sine, cosine))
     if angle < _SMALL_ANGLE_RAD:
         return 0.5 * w
-    if sine > 1e-6:
+    if sine > 1e-6 or cosine > 0.0:
         axis: Array = w * (0.5 / sine)
-    else:  # near π the antisymmetric part vanishes: the axis is the largest column of (R + I) / 2
-        B: Array = 0.5 * (R + np.eye(3))
+    else:  # near π the antisymmetric part vanishes: the axis is the largest column of the symmetric part
+        B: Array = 0.25 * (R + R.T) + 0.5 * np.eye(3)
         column = B[:, int(np.argmax(np.diag(B)))]
         axis = column * math.copysign(1.0 / float(np.linalg.norm(column)), float(column @ w))
     return axis * angle
@@ -83,8 +83,8 @@ def exp(rotation_rad: Array, translation_m: Array) -> Transform:
 def log(T_a_b: Transform) -> tuple[Array, Array]:
     """Return the twist (rotation_rad (3,), translation_m (3,)) with ``exp(*log(T)) == T``."""
     rotation_rad = rotation_log(T_a_b[:3, :3])
-    translation_m: Array = np.linalg.solve(_left_jacobian(rotation_rad), T_a_b[:3, 3])
-    return rotation_rad, translation_m
+    translation_m = np.linalg.solve(_left_jacobian(rotation_rad), T_a_b[:3, 3])
+    return rotation_rad, np.asarray(translation_m, dtype=np.float64)
 
 
 def adjoint(T_a_b: Transform) -> Array:

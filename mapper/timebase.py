@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from mapper.errors import DataError
 
 NS_PER_S = 1_000_000_000
+_LARGEST_S = (2**63 - 1) // NS_PER_S
 
 Stamps = NDArray[np.int64]
 """(N,) int64 nanoseconds since the Unix epoch (or the log's own zero)."""
@@ -17,7 +18,7 @@ def ns_from_seconds_text(text: str) -> int:
     """Parse decimal seconds exactly: "1305031102.175304" becomes 1305031102175304000.
 
     Raises:
-        DataError: The text is not a finite decimal number.
+        DataError: The text is not a finite decimal number, or too large for int64 nanoseconds.
     """
     try:
         seconds = Decimal(text)
@@ -25,6 +26,8 @@ def ns_from_seconds_text(text: str) -> int:
         raise DataError(f"stamp {text!r} is not a decimal number of seconds") from None
     if not seconds.is_finite():
         raise DataError(f"stamp {text!r} is not finite")
+    if not -_LARGEST_S <= seconds <= _LARGEST_S:
+        raise DataError(f"stamp {text!r} lies more than 292 years from zero, which 64 bits cannot hold")
     return int(seconds * NS_PER_S)
 
 
