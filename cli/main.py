@@ -30,16 +30,20 @@ class Guarded(TyperGroup):
         try:
             return super().invoke(ctx)
         except MapperError as error:
-            print(f"mapper: {error}", file=sys.stderr)
+            _say(str(error), error)
             raise typer.Exit(1) from None
         except OSError as error:
             if error.errno not in _USER_CAN_HELP:
                 raise
-            print(f"mapper: {error.filename or 'a file'}: {error.strerror}", file=sys.stderr)
+            _say(f"{error.filename or 'a file'}: {error.strerror}", error)
             raise typer.Exit(1) from None
-        except KeyboardInterrupt:
-            print("mapper: interrupted", file=sys.stderr)
+        except KeyboardInterrupt as error:
+            _say("interrupted", error)
             raise typer.Exit(_INTERRUPTED) from None
+
+
+def _say(what: str, error: BaseException) -> None:
+    print("; ".join([f"mapper: {what}", *getattr(error, "__notes__", ())]), file=sys.stderr)
 
 
 app = typer.Typer(

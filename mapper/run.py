@@ -138,6 +138,7 @@ def drafting(out: Path, manifest: Manifest, config: BuildConfig, *, overwrite: b
             reason = str(error) if isinstance(error, MapperError) else f"{type(error).__name__}: {error}"
             draft.update(status=status, reason=reason)
             draft.save()
+            error.add_note(f"what there is so far stays in {folder}")
             raise
         draft.update(status="complete")
         draft.save()
