@@ -27,7 +27,7 @@ def as_dict(octree):
     return {tuple(key): value for key, value in zip(leaves.keys.tolist(), leaves.log_odds, strict=True)}
 
 
-def random_scans(seed, *, scans=6, points=60, spread_m=2.0):
+def random_scans(seed, *, scans=4, points=50, spread_m=2.0):
     rng = np.random.default_rng(seed)
     centre = rng.uniform(-20.0, 20.0, 3)
     return [
@@ -41,7 +41,7 @@ def random_scans(seed, *, scans=6, points=60, spread_m=2.0):
 
 @BOTH_MODES
 @pytest.mark.parametrize("resolution_m", [0.05, 0.1, 0.37])
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_equals_octomap_on_random_clouds(seed, resolution_m, discretize):
     # Half of the rays are longer than 2.5 m, so both kinds occur; keys are negative and positive.
     settings = {"resolution_m": resolution_m, "max_range_m": 2.5, "discretize": discretize}
@@ -176,25 +176,27 @@ def test_what_was_never_seen_is_unknown():
 
 @pytest.mark.parametrize("through_unknown", [True, False])
 def test_rays_end_where_octomap_ends_them(through_unknown):
-    scans = random_scans(4, points=400)
-    octree, tree = mapped(scans), fuse(scans, resolution_m=0.05, max_range_m=4.0, discretize=True)
     rng = np.random.default_rng(0)
-    origins = (scans[0][1] + rng.normal(0.0, 0.7, (300, 3))).astype(np.float32).astype(np.float64)
-    directions = rng.normal(0.0, 1.0, (300, 3)).astype(np.float32).astype(np.float64)
+    rough_sphere = rng.normal(0.0, 1.0, (3000, 3))
+    rough_sphere *= rng.uniform(1.2, 1.4, (3000, 1)) / np.linalg.norm(rough_sphere, axis=1, keepdims=True)
+    scans = [(rough_sphere.astype(np.float32), np.zeros(3))]
+    octree, tree = mapped(scans), fuse(scans, resolution_m=0.05, max_range_m=4.0, discretize=True)
+    origins = rng.normal(0.0, 0.5, (200, 3)).astype(np.float32).astype(np.float64)
+    directions = rng.normal(0.0, 1.0, (200, 3)).astype(np.float32).astype(np.float64)
     directions[:6] = np.vstack([np.eye(3), -np.eye(3)])
 
-    rays = octree.cast_rays(origins, directions, max_range_m=3.0, through_unknown=through_unknown)
+    rays = octree.cast_rays(origins, directions, max_range_m=1.5, through_unknown=through_unknown)
 
     hits = 0
     for i in range(len(origins)):
         end = np.zeros(3)
-        hit = tree.castRay(origins[i], directions[i], end, ignoreUnknownCells=through_unknown, maxRange=3.0)
+        hit = tree.castRay(origins[i], directions[i], end, ignoreUnknownCells=through_unknown, maxRange=1.5)
         assert hit == rays.hits[i]
         if hit:
             hits += 1
             np.testing.assert_allclose(rays.centres_world[i], end, atol=1e-5)
             assert rays.distances_m[i] == pytest.approx(np.linalg.norm(rays.centres_world[i] - origins[i]))
-    assert hits > (20 if through_unknown else 0)
+    assert 40 < hits < 160  # both outcomes were compared
 
 
 def test_rays_that_cannot_be_cast_are_refused():

@@ -1,0 +1,139 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from mapper.config.octree import OctreeConfig, SliceConfig
+from mapper.errors import DataError
+from mapper.octree.map import OctreeMap
+from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, cut_slice
+
+CELL = 0.05
+
+
+def scanned(points, origin=(0.025, 0.025, 0.525), *, octree=None):
+    octree = octree or OctreeMap(OctreeConfig(max_range_m=20.0))
+    octree.insert_points(np.asarray(points, np.float32), np.asarray(origin))
+    return octree
+
+
+def wall(start, end, *, z=(0.525,)):
+    """Points every 2 cm along a wall seen from above, at the given heights."""
+    start, end = np.array(start), np.array(end)
+    n = int(np.linalg.norm(end - start) / 0.02) + 1
+    line = start + np.linspace(0.0, 1.0, n)[:, np.newaxis] * (end - start)
+    return np.vstack([np.column_stack([line, np.full(n, height)]) for height in z])
+
+
+def code_at(grid, x, y):
+    column, row = np.floor((np.array([x, y]) - grid.origin_world_m) / grid.resolution_m).astype(int)
+    return grid.cells[row, column]
+
+
+def test_an_l_shaped_room_lies_the_right_way_round():
+    # The L is 4 m × 3 m without its corner of high x and high y.
+    corners = [(-1.0, -1.0), (3.0, -1.0), (3.0, 0.5), (1.0, 0.5), (1.0, 2.0), (-1.0, 2.0), (-1.0, -1.0)]
+    points = np.vstack([wall(a, b) for a, b in pairwise(corners)])
+    octree = scanned(points + np.array([0.025, 0.025, 0.0]))
+
+    grid = cut_slice(octree, SliceConfig())
+
+    np.testing.assert_allclose(grid.origin_world_m, [-1.0, -1.0], atol=1e-9)
+    assert grid.cells.shape == (61, 81)  # rows are y, columns are x
+    for x, y in corners:
+        assert code_at(grid, x + 0.025, y + 0.025) == OCCUPIED
+    assert code_at(grid, 2.5, -0.5) == FREE  # along x
+    assert code_at(grid, -0.5, 1.5) == FREE  # along y
+    assert code_at(grid, 2.5, 1.5) == UNKNOWN  # the missing corner
+    assert (grid.cells[0] == OCCUPIED).all()  # row 0 is the wall of lowest y
+    assert (grid.cells[:, 0] == OCCUPIED).all()
+    assert (grid.cells[-1, 50:] == UNKNOWN).all()
+
+
+def test_occupied_beats_free_beats_unknown():
+    ahead = [1.025, 0.025, 0.525]
+    octree = scanned([ahead])
+    scanned([[2.025, 0.025, 0.725]], (0.025, 0.025, 0.725), octree=octree)  # free above the first end
+
+    grid = cut_slice(octree, SliceConfig())
+
+    assert code_at(grid, 1.025, 0.025) == OCCUPIED
+    assert code_at(grid, 1.525, 0.025) == FREE
+    assert grid.cells.tolist() == [[FREE] * 20 + [OCCUPIED] + [FREE] * 19 + [OCCUPIED]]
+
+
+def test_unknown_is_kept_apart_from_free():
+    octree = scanned([[1.025, 0.025, 0.525], [0.025, 1.025, 0.525]])
+
+    grid = cut_slice(octree, SliceConfig())
+
+    assert grid.cells.shape == (21, 21)
+    assert (grid.cells[1:, 1:] == UNKNOWN).all()
+    assert (grid.cells[0, :20] == FREE).all()
+    assert (grid.cells[:20, 0] == FREE).all()
+
+
+@pytest.mark.parametrize(
+    ("height_m", "inside"), [(0.075, False), (0.125, True), (0.475, True), (0.525, False), (-0.475, False)]
+)
+def test_the_band_is_measured_from_the_floor(height_m, inside):
+    floor_z_m = -1.3
+    origin = [0.025, 0.025, floor_z_m + 0.3]
+    octree = scanned([[1.025, 0.025, floor_z_m + 0.275], [1.225, 0.025, floor_z_m + height_m]], origin)
+
+    grid = cut_slice(octree, SliceConfig(min_height_m=0.1, max_height_m=0.5), floor_z_m=floor_z_m)
+
+    assert (grid.cells == OCCUPIED).sum() == 1 + inside
+
+
+def test_speckles_fall_back_to_what_else_their_columns_saw():
+    octree = scanned(wall((1.025, -0.5), (1.025, 0.5)))
+    scanned([[0.525, 0.025, 0.725]], (0.525, 0.025, 1.0), octree=octree)  # a speck over free space
+    scanned([[1.525, 1.525, 0.325]], (1.525, 1.525, 0.325), octree=octree)  # one in the unknown
+
+    every = cut_slice(octree, SliceConfig())
+    clean = cut_slice(octree, SliceConfig(min_cluster_cells=2))
+
+    assert code_at(every, 0.525, 0.025) == code_at(every, 1.525, 1.525) == OCCUPIED
+    assert code_at(clean, 0.525, 0.025) == FREE
+    assert code_at(clean, 1.525, 1.525) == UNKNOWN
+    assert code_at(clean, 1.025, 0.025) == OCCUPIED
+    assert (clean.cells == OCCUPIED).sum() == (every.cells == OCCUPIED).sum() - 2
+
+
+def test_groups_are_8_connected():
+    diagonal = [[0.025 + CELL * n, 0.025 + CELL * n, 0.525] for n in range(20, 25)]
+    octree = scanned(diagonal, (3.025, 0.025, 0.525))
+
+    assert (cut_slice(octree, SliceConfig(min_cluster_cells=5)).cells == OCCUPIED).sum() == 5
+    assert (cut_slice(octree, SliceConfig(min_cluster_cells=6)).cells == OCCUPIED).sum() == 0
+
+
+@pytest.mark.parametrize(
+    "octree", [OctreeMap(OctreeConfig()), scanned([[1.0, 0.0, 0.5]])], ids=["empty", "above"]
+)
+def test_a_band_in_which_nothing_is_known_is_refused(octree):
+    with pytest.raises(DataError, match=r"nothing is known 1 to 2 m above the floor at z = 5 m"):
+        cut_slice(octree, SliceConfig(min_height_m=1.0, max_height_m=2.0), floor_z_m=5.0)
+
+
+def test_a_band_thinner_than_a_voxel_is_refused():
+    with pytest.raises(DataError, match=r"no voxel of 0\.05 m has its centre 0\.1 to 0\.12 m"):
+        cut_slice(scanned([[1.0, 0.0, 0.5]]), SliceConfig(min_height_m=0.1, max_height_m=0.12))
+
+
+@pytest.mark.parametrize(
+    ("cells", "origin", "resolution_m", "message"),
+    [
+        (np.full((2, 2), 50, np.int8), np.zeros(2), 0.05, r"codes \[50\]"),
+        (np.zeros((2, 2), np.int16), np.zeros(2), 0.05, "int16"),
+        (np.zeros((0, 2), np.int8), np.zeros(2), 0.05, "of some size"),
+        (np.zeros(4, np.int8), np.zeros(2), 0.05, r"\(4,\)"),
+        (np.zeros((2, 2), np.int8), np.zeros(3), 0.05, "two finite numbers"),
+        (np.zeros((2, 2), np.int8), np.array([0.0, np.nan]), 0.05, "two finite numbers"),
+        (np.zeros((2, 2), np.int8), np.zeros(2), 0.0, "resolution 0"),
+    ],
+)
+def test_a_grid_checks_itself_at_birth(cells, origin, resolution_m, message):
+    with pytest.raises(DataError, match=message):
+        OccupancyGrid(cells, origin, resolution_m)
