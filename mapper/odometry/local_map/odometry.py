@@ -77,7 +77,7 @@ class LocalMapOdometry:
         if usable < self._config.min_start_features:
             return self._lost(observation)
         nothing = np.full(len(observation), -1, np.int32)
-        origin = Placement(observation, observation.T_body_camera, nothing, 0, 0, 0.0, "start")
+        origin = Placement(observation, inverse(observation.T_body_camera), nothing, 0, 0, 0.0, "start")
         self._last = self._keep(origin)
         return self._track(self._last, is_keyframe=True)
 
