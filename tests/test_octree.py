@@ -177,11 +177,11 @@ def test_what_was_never_seen_is_unknown():
 @pytest.mark.parametrize("through_unknown", [True, False])
 def test_rays_end_where_octomap_ends_them(through_unknown):
     rng = np.random.default_rng(0)
-    rough_sphere = rng.normal(0.0, 1.0, (3000, 3))
-    rough_sphere *= rng.uniform(1.2, 1.4, (3000, 1)) / np.linalg.norm(rough_sphere, axis=1, keepdims=True)
+    rough_sphere = rng.normal(0.0, 1.0, (20000, 3))
+    rough_sphere *= rng.uniform(1.2, 1.3, (20000, 1)) / np.linalg.norm(rough_sphere, axis=1, keepdims=True)
     scans = [(rough_sphere.astype(np.float32), np.zeros(3))]
     octree, tree = mapped(scans), fuse(scans, resolution_m=0.05, max_range_m=4.0, discretize=True)
-    origins = rng.normal(0.0, 0.5, (200, 3)).astype(np.float32).astype(np.float64)
+    origins = rng.normal(0.0, 0.3, (200, 3)).astype(np.float32).astype(np.float64)
     directions = rng.normal(0.0, 1.0, (200, 3)).astype(np.float32).astype(np.float64)
     directions[:6] = np.vstack([np.eye(3), -np.eye(3)])
 
@@ -196,7 +196,7 @@ def test_rays_end_where_octomap_ends_them(through_unknown):
             hits += 1
             np.testing.assert_allclose(rays.centres_world[i], end, atol=1e-5)
             assert rays.distances_m[i] == pytest.approx(np.linalg.norm(rays.centres_world[i] - origins[i]))
-    assert 40 < hits < 160  # both outcomes were compared
+    assert 20 < hits < 180  # both outcomes were compared
 
 
 def test_rays_that_cannot_be_cast_are_refused():
