@@ -30,7 +30,7 @@ def back_project(
     rows, columns = (-(-size // stride_px) for size in depth_m.shape)
     points_body = np.empty((rows * columns, 3), np.float32)
     found = _back_project(depth_m, rays, T_body_camera, stride_px, max_depth_m, points_body)
-    return points_body[:found].copy()  # without the copy a sparse image would hold a full one's memory
+    return points_body[:found]
 
 
 @njit(cache=True, nogil=True)

@@ -127,9 +127,11 @@ def _jobs(source: FrameSource, trajectory: Trajectory, config: BuildConfig) -> I
 
 
 def _prepared(job: _Job, config: McapConfig) -> _Fused:
-    """Read one frame; colour costs most of the decoding, so only those who want it pay."""
+    """Read one frame; its image costs most of the decoding, so only those who want it pay."""
     try:
-        frame = job.entry.load(colour=job.feeds_cloud or job.feeds_log)
+        if not (job.feeds_cloud or job.feeds_log):
+            return _Fused(job, job.entry.scan())
+        frame = job.entry.load()
     except FrameError as error:  # it was readable in the first pass, so the log changed under us
         return _Fused(job, reason=str(error))
     return _Fused(job, frame.scan(), _snapshot(frame, config) if job.feeds_log else None)

@@ -148,7 +148,7 @@ def _level(source: FrameSource, trajectory: Trajectory, config: BuildConfig) -> 
     for entry in source.entries():
         if entry.stamp_ns in T_world_body:
             try:
-                scans.append((entry.load(colour=False).scan(), T_world_body[entry.stamp_ns]))
+                scans.append((entry.scan(), T_world_body[entry.stamp_ns]))
             except FrameError:
                 continue  # it was readable a moment ago; the second pass will tell
     return find_level(scans, trajectory=trajectory, accelerations=source.accelerations, config=config.level)

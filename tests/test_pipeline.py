@@ -207,6 +207,11 @@ def test_an_interrupted_build_says_so_and_spares_the_old_run(run, desk_log, tmp_
     assert not list((tmp_path / "run.partial").glob(".*"))
 
 
+def test_a_scan_alone_is_the_frame_s(desk_log):
+    entry = next(iter(open_source(desk_log).entries()))
+    np.testing.assert_array_equal(entry.scan().points_body, entry.load().scan().points_body)
+
+
 def _black_png():
     import cv2
 

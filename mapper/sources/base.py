@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from mapper.frames import Frame
+from mapper.frames import Frame, Scan
 from mapper.geometry import Array
 from mapper.timebase import Stamps
 from mapper.trajectory import Trajectory
@@ -49,6 +49,14 @@ class Entry(Protocol):
 
         Raises:
             FrameError: This frame cannot be used; the message says which file and why.
+        """
+        ...
+
+    def scan(self) -> Scan:
+        """Read the returns alone: the same points as ``load().scan()``, without the cost of an image.
+
+        Raises:
+            FrameError: As ``load``.
         """
         ...
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.config.sources import CameraConfig
 from mapper.errors import FrameError, SourceError
-from mapper.frames import PinholeCamera, RgbdFrame
+from mapper.frames import DepthImage, PinholeCamera, RgbdFrame, Scan
 from mapper.sources.base import Accelerations, Entry, ImageFiles
 from mapper.sources.calibration import Calibration
 from mapper.sources.calibration_file import FILE_NAMES, read_calibration
@@ -32,12 +32,28 @@ class RgbdEntry:
             FrameError: A file is missing, damaged, of the wrong kind or of another size than the camera's.
         """
         image = read_colour(self.files.colour) if colour else read_grey(self.files.colour)
+        self._check_size(self.files.colour, image.shape[:2])
+        return RgbdFrame(self.stamp_ns, image, self._depth_m(), self.camera)
+
+    def scan(self) -> Scan:
+        """Read and decode the depth image alone.
+
+        Raises:
+            FrameError: As ``load``.
+        """
+        depth_m = self._depth_m()
+        no_image = np.broadcast_to(np.uint8(0), depth_m.shape)
+        return RgbdFrame(self.stamp_ns, no_image, depth_m, self.camera).scan()
+
+    def _depth_m(self) -> DepthImage:
         depth_m = read_depth_m(self.files.depth, self.files.depth_units_per_m)
+        self._check_size(self.files.depth, depth_m.shape)
+        return depth_m
+
+    def _check_size(self, path: Path, shape: tuple[int, ...]) -> None:
         want = (self.camera.height_px, self.camera.width_px)
-        for path, shape in ((self.files.colour, image.shape[:2]), (self.files.depth, depth_m.shape)):
-            if shape != want:
-                raise FrameError(f"{path}: {shape[1]}×{shape[0]} px, but the log has {want[1]}×{want[0]}")
-        return RgbdFrame(self.stamp_ns, image, depth_m, self.camera)
+        if shape != want:
+            raise FrameError(f"{path}: {shape[1]}×{shape[0]} px, but the log has {want[1]}×{want[0]}")
 
 
 @dataclass(slots=True, eq=False)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mapper.config.synthetic import SynthConfig
-from mapper.frames import DepthImage, Image, PinholeCamera, RgbdFrame
+from mapper.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
 from mapper.geometry import angle_between
 from mapper.sources.base import Accelerations
 from mapper.sources.synthetic.path import Motion, frame_stamps, make_motion, seconds_of
@@ -48,6 +48,10 @@ class SyntheticEntry:
         image, depth_m = self.source.observe(self.index)
         frame = RgbdFrame(self.stamp_ns, image, depth_m, self.source.camera)
         return frame if colour else RgbdFrame(self.stamp_ns, frame.gray, depth_m, self.source.camera)
+
+    def scan(self) -> Scan:
+        """Render the frame and keep its returns."""
+        return self.load(colour=False).scan()
 
 
 class SyntheticSource:
