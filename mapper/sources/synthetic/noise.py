@@ -70,12 +70,20 @@ def scatter(
     return rng.uniform(0.0, 1.0, (round(area_m2 * per_m2), 2)) * [shape[1], shape[0]]
 
 
+def blobs(
+    rng: np.random.Generator, centers: NDArray[np.float64], *, radii_px: NDArray[np.float64], corners: int
+) -> NDArray[np.int32]:
+    """Return (N, corners, 2) irregular polygons for ``cv2.fillPoly`` around (N, 2) centres."""
+    angles = np.sort(rng.uniform(0.0, 2.0 * np.pi, (len(centers), corners)), axis=1)
+    reach_px = radii_px[:, None] * rng.uniform(0.5, 1.1, (len(centers), corners))
+    spokes = np.stack([np.cos(angles), np.sin(angles)], axis=2)
+    polygons: NDArray[np.int32] = np.rint(centers[:, None] + reach_px[:, :, None] * spokes).astype(np.int32)
+    return polygons
+
+
 def blob(
     rng: np.random.Generator, center: NDArray[np.float64], *, radius_px: float, corners: int
 ) -> NDArray[np.int32]:
-    """Return an irregular polygon for ``cv2.fillPoly``."""
-    angles = np.sort(rng.uniform(0.0, 2.0 * np.pi, corners))
-    radii = radius_px * rng.uniform(0.5, 1.1, corners)
-    outline = center + radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
-    polygon: NDArray[np.int32] = np.round(outline).astype(np.int32)
+    """Return one irregular polygon, (corners, 2)."""
+    polygon: NDArray[np.int32] = blobs(rng, center[None], radii_px=np.array([radius_px]), corners=corners)[0]
     return polygon

@@ -120,6 +120,7 @@ def paint(
             f = level - fine
             taps = 2 if apart * long_px > _TAPS_APART * level_px else 1
             s_tap, t_tap = (taps - 1) * apart * s_tap, (taps - 1) * apart * t_tap
+            s_unit, t_unit = 1.0 / widths[texture, 0], 1.0 / heights[texture, 0]
             red, green, blue = 0.0, 0.0, 0.0
             for tap in range(taps):
                 s_here, t_here = s + (2 * tap - 1) * s_tap, t + (2 * tap - 1) * t_tap
@@ -127,8 +128,8 @@ def paint(
                     weight = (1.0 - f if k == fine else f) / taps
                     rows, columns, start = heights[texture, k], widths[texture, k], starts[texture, k]
                     # Sizes halve with rounding, so a level's true scale is its own size over the first one's.
-                    column = s_here * columns / widths[texture, 0] - 0.5
-                    row = t_here * rows / heights[texture, 0] - 0.5
+                    column = s_here * (columns * s_unit) - 0.5
+                    row = t_here * (rows * t_unit) - 0.5
                     left, top = np.floor(column), np.floor(row)
                     right_share, low_share = column - left, row - top
                     c0, r0 = _wrapped(int(left), columns), _wrapped(int(top), rows)

@@ -14,6 +14,7 @@ from mapper.sources.synthetic.noise import (
     Color,
     any_color,
     blob,
+    blobs,
     fractal,
     jittered,
     muted_color,
@@ -121,9 +122,10 @@ def terrazzo(rng: np.random.Generator, shape: tuple[int, int], px_per_m: float) 
     """Stone chips in cement."""
     image = tinted((176, 172, 164), 0.04 * fractal(rng, shape, cell_px=(0.4 * px_per_m, 0.4 * px_per_m)))
     inks = [jittered(rng, (120, 110, 100), 45.0) for _ in range(6)]
-    for center in scatter(rng, shape, px_per_m=px_per_m, per_m2=180.0):
-        outline = blob(rng, center, radius_px=rng.uniform(0.006, 0.03) * px_per_m, corners=7)
-        cv2.fillPoly(image, [outline], inks[rng.integers(len(inks))], cv2.LINE_AA)
+    centers = scatter(rng, shape, px_per_m=px_per_m, per_m2=180.0)
+    outlines = blobs(rng, centers, radii_px=rng.uniform(0.006, 0.03, len(centers)) * px_per_m, corners=7)
+    for outline, ink in zip(outlines, rng.integers(len(inks), size=len(centers)), strict=True):
+        cv2.fillPoly(image, [outline], inks[ink], cv2.LINE_AA)
     return image
 
 
@@ -191,12 +193,14 @@ def _grained(rng: np.random.Generator, shape: tuple[int, int], px_per_m: float, 
 
 def _chip(rng: np.random.Generator, image: Image, px_per_m: float, *, per_m2: float) -> None:
     """Small marks, darker or lighter than what they are on."""
-    for center in scatter(rng, image.shape[:2], px_per_m=px_per_m, per_m2=per_m2):
-        under = image[int(center[1]), int(center[0])].astype(np.float64)
-        factor = rng.uniform(0.35, 0.75) if rng.random() < 0.7 else rng.uniform(1.2, 1.5)
-        mark = tuple(int(level) for level in np.clip(under * factor, 0, 255))
-        outline = blob(rng, center, radius_px=rng.uniform(0.004, 0.022) * px_per_m, corners=6)
-        cv2.fillPoly(image, [outline], mark, cv2.LINE_AA)
+    centers = scatter(rng, image.shape[:2], px_per_m=px_per_m, per_m2=per_m2)
+    outlines = blobs(rng, centers, radii_px=rng.uniform(0.004, 0.022, len(centers)) * px_per_m, corners=6)
+    darker = rng.random(len(centers)) < 0.7
+    factors = np.where(darker, rng.uniform(0.35, 0.75, len(centers)), rng.uniform(1.2, 1.5, len(centers)))
+    columns, rows = centers.astype(np.intp).T
+    inks = np.clip(image[rows, columns] * factors[:, None], 0, 255).astype(np.uint8).tolist()
+    for outline, ink in zip(outlines, inks, strict=True):
+        cv2.fillPoly(image, [outline], ink, cv2.LINE_AA)
 
 
 def _crack(rng: np.random.Generator, image: Image, px_per_m: float) -> None:
