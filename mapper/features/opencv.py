@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 
 import cv2
 import numpy as np
@@ -9,6 +10,8 @@ import numpy as np
 from mapper.config.features import AkazeConfig, OrbConfig, SiftConfig
 from mapper.features.detectors import Descriptors, Features
 from mapper.frames import Image
+
+_OCTAVE, _ANGLE, _RESPONSE = (attrgetter(name) for name in ("octave", "angle", "response"))
 
 # Detector objects are made anew for every image: it costs microseconds, and shared ones are not thread-safe.
 
@@ -37,7 +40,7 @@ class Orb:
             )
             keypoints, descriptors = orb.detectAndCompute(gray, None)
             return features_from(
-                keypoints, descriptors, [k.octave for k in keypoints], none=np.empty((0, 32), np.uint8)
+                keypoints, descriptors, list(map(_OCTAVE, keypoints)), none=np.empty((0, 32), np.uint8)
             )
 
         return until_enough(attempt, config.threshold, floor=config.min_threshold, want=config.min_features)
@@ -84,7 +87,7 @@ class Akaze:
             akaze = cv2.xfeatures2d.AKAZE.create(threshold=threshold)
             keypoints, descriptors = akaze.detectAndCompute(gray, None)
             features = features_from(
-                keypoints, descriptors, [k.octave for k in keypoints], none=np.empty((0, 61), np.uint8)
+                keypoints, descriptors, list(map(_OCTAVE, keypoints)), none=np.empty((0, 61), np.uint8)
             )
             return strongest(features, config.max_features)
 
@@ -143,7 +146,7 @@ def features_from(
     return Features(
         pixels=np.asarray(cv2.KeyPoint.convert(keypoints), np.float32),
         octave=np.array(octaves, np.int32),
-        angle_rad=np.fromiter((k.angle for k in keypoints), np.float32, n) * np.float32(math.pi / 180.0),
-        response=np.fromiter((k.response for k in keypoints), np.float32, n),
+        angle_rad=np.fromiter(map(_ANGLE, keypoints), np.float32, n) * np.float32(math.pi / 180.0),
+        response=np.fromiter(map(_RESPONSE, keypoints), np.float32, n),
         descriptors=descriptors,
     )
