@@ -38,10 +38,12 @@ class IsvdConfig(Config):
     max_iterations: PositiveInt = 25
     min_error_mm: NonNegativeFloat = 0.0
     """Stop once the threshold falls below this (e_min of alg. 5, 6)."""
-    min_pairs: PositiveInt = 20
-    """Stop before fewer pairs than this would remain ("Auto")."""
+    min_pairs: PositiveInt = 100
+    """Stop before fewer pairs than this, or than half of a smaller set, would remain ("Auto")."""
     agreement_mm: PositiveFloat = 50.0
     """Pairs this close after the motion are said to agree with it."""
+    min_agreeing: Annotated[int, Field(ge=3)] = 20
+    """A motion that fewer pairs agree with is refused."""
     min_agreement_ratio: Annotated[float, Field(ge=0.0, le=1.0)] = 0.25
     """A motion that a smaller share of the pairs agrees with is refused."""
 

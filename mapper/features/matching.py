@@ -42,10 +42,7 @@ def match_mutual(a: Features, b: Features, *, max_ratio: float) -> Pairs:
     if a.is_binary:
         pairs: Pairs = _match_bits(_words(a), _words(b), max_ratio)
         return pairs
-    squares_a = np.einsum("ij,ij->i", a.descriptors, a.descriptors)
-    squares_b = np.einsum("ij,ij->i", b.descriptors, b.descriptors)
-    squared = squares_a[:, None] + squares_b[None, :] - 2.0 * (a.descriptors @ b.descriptors.T)
-    nearest: Pairs = _match_distances(np.maximum(squared, np.float32(0.0)), max_ratio**2)
+    nearest: Pairs = _match_numbers(a.descriptors @ b.descriptors.T, _squares(a), _squares(b), max_ratio)
     return nearest
 
 
@@ -83,6 +80,11 @@ def _words(features: Features) -> NDArray[np.uint64]:
     return words
 
 
+def _squares(features: Features) -> NDArray[np.float32]:
+    squares: NDArray[np.float32] = np.einsum("ij,ij->i", features.descriptors, features.descriptors)
+    return squares
+
+
 @intrinsic
 def _popcount(_context, x):  # type: ignore[no-untyped-def]
     """Count the set bits of a uint64 with the processor's own instruction, which numba does not expose."""
@@ -104,6 +106,24 @@ def _match_bits(a: NDArray[np.uint64], b: NDArray[np.uint64], max_ratio: float) 
                 differing += _popcount(a[i, k] ^ b[j, k])
             distances[i, j] = differing
     nearest: Pairs = _match_distances(distances, max_ratio)
+    return nearest
+
+
+@njit(cache=True, nogil=True)
+def _match_numbers(
+    products: NDArray[np.float32],
+    squares_a: NDArray[np.float32],
+    squares_b: NDArray[np.float32],
+    max_ratio: float,
+) -> Pairs:
+    """Return the mutual nearest of (N, M) scalar products: |a - b|² = |a|² + |b|² - 2 a·b."""
+    squared = np.empty_like(products)
+    for i in range(len(squares_a)):
+        for j in range(len(squares_b)):
+            squared[i, j] = max(
+                squares_a[i] + squares_b[j] - np.float32(2.0) * products[i, j], np.float32(0.0)
+            )
+    nearest: Pairs = _match_distances(squared, max_ratio**2)
     return nearest
 
 

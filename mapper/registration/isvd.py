@@ -37,14 +37,14 @@ class Isvd:
     def fit_weighted(self, target: Points, source: Points) -> tuple[Alignment, float]:
         """Return ``fit``'s alignment and its quality W in 1/m (eq. 4.1), 0 when it did not converge."""
         config = self._config
-        if len(target) < max(config.min_pairs, 3):
-            return failed(f"{len(target)} pairs with depth, fewer than {max(config.min_pairs, 3)}"), 0.0
+        if len(target) < config.min_agreeing:
+            return failed(f"{len(target)} pairs with depth, fewer than {config.min_agreeing}"), 0.0
         T_target_source, used = self._trim(target, source)
         residuals = target - apply(T_target_source, source)
         distances = np.linalg.norm(residuals, axis=1)
         agreeing = distances <= config.agreement_mm / _MM_PER_M
         ratio = float(agreeing.mean())
-        if agreeing.sum() < max(config.min_pairs, 3) or ratio < config.min_agreement_ratio:
+        if agreeing.sum() < config.min_agreeing or ratio < config.min_agreement_ratio:
             return failed(
                 f"{agreeing.sum()} of {len(target)} pairs agree within {config.agreement_mm} mm"
             ), 0.0
@@ -66,6 +66,7 @@ class Isvd:
         """Return the motion of the last iteration and the indices of the pairs that it rests on."""
         T_target_source = np.eye(4)
         used = kept = np.arange(len(target), dtype=np.intp)
+        enough = min(self._config.min_pairs, len(target) // 2)
         for threshold_m in self._thresholds_m():
             used = kept
             if self._config.step == "icp":
@@ -74,7 +75,7 @@ class Isvd:
                 T_target_source, _ = fit_rigid(target[used], source[used])
             distances = np.linalg.norm(target[used] - apply(T_target_source, source[used]), axis=1)
             kept = used[distances <= threshold_m]
-            if threshold_m * _MM_PER_M < self._config.min_error_mm or len(kept) < self._config.min_pairs:
+            if threshold_m * _MM_PER_M < self._config.min_error_mm or len(kept) < max(enough, 3):
                 break
         return T_target_source, used
 
