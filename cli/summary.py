@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 from math import degrees
 from pathlib import Path
+from textwrap import wrap
 
 from evaluators.metric import Metric
 from mapper.run import Run
 
+_LINE_WIDTH = 110
 _SHOWN = ("ATE RMSE", "RPE translation RMSE", "RPE rotation RMSE", "path length", "start-to-end offset")
 
 
@@ -30,7 +32,12 @@ def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
         ("in", str(run.path)),
     ]
     width = max(len(name) for name, _ in rows)
-    return "\n".join(f"{name:<{width}}  {text}" for name, text in rows)
+    return "\n".join(_row(name, text, indent=width + 2) for name, text in rows)
+
+
+def _row(name: str, text: str, *, indent: int) -> str:
+    lines = wrap(text, _LINE_WIDTH - indent, break_long_words=False, break_on_hyphens=False)
+    return "\n".join([f"{name:<{indent}}{lines[0]}", *(" " * indent + line for line in lines[1:])])
 
 
 def _value_text(metric: Metric) -> str:
@@ -40,8 +47,5 @@ def _value_text(metric: Metric) -> str:
 
 
 def _files_text(paths: Sequence[Path]) -> str:
-    return ", ".join(f"{path.name} ({_size_text(path.stat().st_size)})" for path in paths)
-
-
-def _size_text(size: int) -> str:
-    return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{size / 1e3:.0f} kB"
+    size_mb = sum(path.stat().st_size for path in paths) / 1e6
+    return f"{', '.join(path.name for path in paths)} ({size_mb:.1f} MB)"

@@ -33,6 +33,7 @@ from mapper.tracking import Tracking, refuse_a_fragment, track_log
 from mapper.trajectory import Trajectory, trajectory_from, write_tum
 
 _FUSE_CONFIGS = frozenset({"octree", "slice", "cloud", "mcap", "workers"})
+_TRACKING_STAGES = ("track", "solve", "level")
 _KEPT_BY_FUSE = (files.TRAJECTORY, files.KEYFRAMES, files.TRUTH, files.GRAPH, files.FRAMES, files.FRAME_MS)
 _MAX_TRUTH_GAP_NS = 20_000_000
 
@@ -104,7 +105,8 @@ def fuse(source: FrameSource, run: Run, config: BuildConfig, *, progress: Progre
     status: Status = "building"
     manifest = run.manifest.model_copy(update={"status": status})
     with drafting(run.path, manifest, config, overwrite=True) as draft:
-        draft.clock.seconds.update(manifest.timing.stage_s)
+        for stage in _TRACKING_STAGES:
+            draft.clock.seconds[stage] = manifest.timing.stage_s[stage]
         for name in _KEPT_BY_FUSE:
             if (run.path / name).exists():
                 shutil.copy2(run.path / name, draft.folder / name)
@@ -229,6 +231,6 @@ def _timing(draft: Draft, trajectory: Trajectory, frames: int) -> Timing:
             "log_s": log_s,
             "frames_per_s": round(frames / total_s, 2),
             "real_time_factor": round(log_s / total_s, 3),
-            "peak_memory_mb": round(peak_memory_mb(), 1),
+            "peak_memory_mb": round(max(peak_memory_mb(), draft.manifest.timing.peak_memory_mb), 1),
         }
     )

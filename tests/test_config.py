@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import pytest
 
 from mapper.config import BuildConfig, load_config, overridden
@@ -92,3 +94,8 @@ def test_any_configuration_can_be_overridden():
 
     assert config.sensor.axial_noise_ratio == 0.0
     assert config.seed == 5
+
+
+@pytest.mark.parametrize("path", sorted((Path(__file__).parents[1] / "configs").rglob("*.toml")), ids=lambda p: p.stem)
+def test_every_shipped_configuration_is_valid(path):
+    assert load_config(path) != BuildConfig()

@@ -141,6 +141,10 @@ def test_fusing_again_changes_the_maps_alone(run, desk_log, tmp_path):
     for name in ours.keys() - {"manifest.json", "frame_ms.csv"}:
         assert ours[name] == theirs[name], name
     assert fused.manifest.counts == direct.manifest.counts
+    before, after = run.manifest.timing, fused.manifest.timing
+    assert after.stage_s.keys() == before.stage_s.keys()
+    assert after.stage_s["track"] == before.stage_s["track"]
+    assert after.total_s == pytest.approx(sum(after.stage_s.values()))
 
 
 def test_fusing_refuses_what_it_cannot_change(run, desk_log):

@@ -1,0 +1,85 @@
+"""What README.md shows is run, on a small log under the name that the README uses."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+LOG = "rgbd_dataset_freiburg1_xyz"
+
+BLOCK = re.compile(r"<!-- run[^>]*-->\n```(console|python)\n(.*?)```", re.DOTALL)
+CONSOLE = [text for kind, text in BLOCK.findall(README) if kind == "console"]
+PYTHON = [text for kind, text in BLOCK.findall(README) if kind == "python"]
+
+
+def commands_in(block):
+    """Pairs of a command and the output that the README claims for it."""
+    for part in block.split("$ ")[1:]:
+        command, _, output = part.partition("\n")
+        yield command, output.splitlines()
+
+
+def row_names(lines):
+    """The first column of a table: what stands before two spaces."""
+    return [re.split(r"\s{2,}", line)[0] for line in lines if not line.startswith(" ")]
+
+
+@pytest.fixture(scope="module")
+def place(desk_log, tmp_path_factory):
+    place = tmp_path_factory.mktemp("readme")
+    (place / LOG).symlink_to(desk_log)
+    (place / "configs").symlink_to(ROOT / "configs")
+    return place
+
+
+def test_there_is_something_to_run():
+    assert len(CONSOLE) >= 2
+    assert len(PYTHON) >= 1
+
+
+@pytest.mark.parametrize("block", CONSOLE)
+def test_commands_print_the_rows_that_the_readme_shows(place, block):
+    for command, shown in commands_in(block):
+        words = shlex.split(command)
+        assert words[0] == "mapper"
+        done = subprocess.run(
+            [sys.executable, "-c", "from cli.main import main; main()", *words[1:]],
+            cwd=place,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, f"{command}\n{done.stderr}"
+        if len(shown) > 1:
+            assert row_names(done.stdout.splitlines()) == row_names(shown), command
+        else:
+            assert bool(done.stdout.strip()) == bool(shown), command
+
+
+@pytest.mark.parametrize("code", PYTHON)
+def test_the_library_example_works(place, code, monkeypatch, capsys):
+    monkeypatch.chdir(place)
+    exec(compile(code, "README.md", "exec"), {})
+    assert 0.1 < float(capsys.readouterr().out) < 3.0
+
+
+def test_the_files_it_names_exist():
+    for name in re.findall(r"\]\(([^)#:]+)\)", README):
+        assert (ROOT / name).is_file(), name
+
+
+def test_the_set_up_commands_exist_and_ci_calls_the_second():
+    demo, test = re.findall(r"^bash (scripts/\S+)", README, re.MULTILINE)
+    assert (ROOT / demo).is_file()
+    assert f"bash {test}" in (ROOT / ".ci" / "run").read_text()
+    assert subprocess.run(["bash", "-n", ROOT / test], check=False).returncode == 0
+
+
+def test_every_file_of_a_run_is_explained(place):
+    for path in (place / "runs" / "xyz").iterdir():
+        assert f"`{path.name}`" in README, path.name
