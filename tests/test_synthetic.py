@@ -96,7 +96,7 @@ def test_the_flat_has_rooms_joined_by_doors_and_things_in_every_room(source):
 
 
 def test_the_same_seed_is_the_same_flat_and_another_seed_is_not():
-    once, again, other = (make_scene(config) for config in (PLAIN, PLAIN, changed(PLAIN, seed=1)))
+    once, again, other = (make_scene(changed(PLAIN, furniture_per_room=2, seed=seed)) for seed in (0, 0, 1))
 
     assert again.boxes.as_json() == once.boxes.as_json() != other.boxes.as_json()
     np.testing.assert_array_equal(again.atlas.texels, once.atlas.texels)
@@ -217,7 +217,7 @@ def test_a_distorted_camera_is_refused(source):
 # Paths
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_the_camera_keeps_clear_of_everything(seed):
     config = changed(PLAIN, seed=seed, rooms=4 + 2 * (seed % 2))
     scene = make_scene(config)

@@ -14,7 +14,14 @@ from mapper.sources.synthetic.path import seconds_of
 from mapper.sources.synthetic.sensor import BASELINE_M, DISPARITY_FOCAL_PX, axial_sigma_m
 from mapper.trajectory import read_tum
 
-PLAIN = SynthConfig(texture_px_per_m=16, width_px=160, height_px=120, sensor=IDEAL_SENSOR)
+PLAIN = SynthConfig(
+    furniture_per_room=2,
+    posters_per_room=1,
+    texture_px_per_m=16,
+    width_px=160,
+    height_px=120,
+    sensor=IDEAL_SENSOR,
+)
 
 
 def changed(config, **knobs):
