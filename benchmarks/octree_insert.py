@@ -2,9 +2,9 @@
 
     python benchmarks/octree_insert.py [--data ../shared/data] [--frames 20] [--repeats 3]
 
-Times are CPU time per scan. ``lazy_eval=True`` is OctoMap's faster way. "no binding" takes off what pyoctomap needs
-for a cloud of the same size whose points all lie in the sensor's own voxel: the wrapper and one key per point. So it
-is a lower bound for the ratio to the bare C++ library. The leaves of both maps are compared bit by bit.
+Times are CPU time per scan. ``lazy_eval=True`` is OctoMap's faster way. "no binding" takes off what pyoctomap
+needs for a cloud of the same size whose points all lie in the sensor's own voxel: the wrapper and one key per
+point: a lower bound for the ratio to the bare C++ library. Both maps' leaves are compared bit by bit.
 """
 
 import argparse

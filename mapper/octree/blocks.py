@@ -22,13 +22,12 @@ class BlockTable(NamedTuple):
     """The arrays that compiled code needs to find a voxel.
 
     Attributes:
-        codes: (C,) int64 block codes by hash, −1 where vacant; C is a power of two.
-        slots: (C,) int32 rows of ``values``.
+        entries: (C, 2) int64 block codes by hash, −1 where vacant, each beside its row in ``values``: one
+            cache line answers. C is a power of two.
         values: (capacity, 512) float32 log-odds in Morton order inside the block; NaN is unknown.
     """
 
-    codes: NDArray[np.int64]
-    slots: NDArray[np.int32]
+    entries: NDArray[np.int64]
     values: NDArray[np.float32]
 
 
@@ -57,13 +56,13 @@ class BlockStore:
         """Return the (B,) slots in Morton order, which does not depend on the order of insertion."""
         return np.argsort(self.codes)
 
-    def claim(self, codes: NDArray[np.int64]) -> NDArray[np.int32]:
+    def claim(self, codes: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the slots of distinct block codes; blocks that did not exist are born unknown.
 
         Raises:
             MapSizeError: The map would not fit into this machine's memory; nothing has changed then.
         """
-        slots = np.empty(len(codes), dtype=np.int32)
+        slots = np.empty(len(codes), dtype=np.int64)
         missing = find_slots(self.table, codes, slots)
         if missing:
             self._reserve(self._count + missing)
@@ -79,12 +78,14 @@ class BlockStore:
             values = np.empty((capacity, BLOCK_VOXELS), np.float32)
             values[: self._count] = self.table.values[: self._count]
             self.table = self.table._replace(values=values)
-        if 2 * count > len(self.table.codes):
+        if 2 * count > len(self.table.entries):
             self.table = _table(count, values=self.table.values)
             _index(self.table, self.codes)
 
 
-def check_memory(needed_bytes: int, what: str) -> None:
+def check_memory(
+    needed_bytes: int, what: str, *, remedy: str = "raise resolution_m or lower max_range_m"
+) -> None:
     """Refuse what could not fit before anything is allocated.
 
     Raises:
@@ -94,24 +95,30 @@ def check_memory(needed_bytes: int, what: str) -> None:
     if needed_bytes > limit_bytes:
         raise MapSizeError(
             f"{what} needs {needed_bytes / 2**30:.1f} GiB and this machine has {limit_bytes / 2**30:.1f}; "
-            "raise resolution_m or lower max_range_m"
+            f"{remedy}"
         )
 
 
 def _table(count: int, *, values: NDArray[np.float32]) -> BlockTable:
     """Return an empty hash for up to ``count`` blocks at a load between a quarter and a half."""
     size = 1 << (2 * count - 1).bit_length()
-    return BlockTable(np.full(size, _VACANT, np.int64), np.zeros(size, np.int32), values)
+    return BlockTable(np.full((size, 2), _VACANT, np.int64), values)
 
 
 @njit(cache=True, nogil=True)
-def probe(codes, code):
+def _probe(entries, code):
     """Return where in the hash a code is, or the vacant place where it belongs (linear probing)."""
-    mask = len(codes) - 1
+    mask = len(entries) - 1
     place = ((code * _FIBONACCI) >> 24) & mask
-    while codes[place] != code and codes[place] != _VACANT:
+    while entries[place, 0] != code and entries[place, 0] != _VACANT:
         place = (place + 1) & mask
     return place
+
+
+@njit(cache=True, nogil=True)
+def slot_of(table, code):
+    """Return the slot of a block, or −1: a vacant entry holds −1 twice."""
+    return table.entries[_probe(table.entries, code), 1]
 
 
 @njit(cache=True, nogil=True)
@@ -119,12 +126,8 @@ def find_slots(table, codes, slots):
     """Write each code's slot, or −1; return how many are missing."""
     missing = 0
     for i in range(len(codes)):
-        place = probe(table.codes, codes[i])
-        if table.codes[place] == _VACANT:
-            slots[i] = -1
-            missing += 1
-        else:
-            slots[i] = table.slots[place]
+        slots[i] = slot_of(table, codes[i])
+        missing += slots[i] < 0
     return missing
 
 
@@ -133,9 +136,8 @@ def _add_missing(table, codes, slots, codes_by_slot, count):
     """Give every code whose slot is −1 the next slot, filled with NaN; return the new count."""
     for i in range(len(codes)):
         if slots[i] < 0:
-            place = probe(table.codes, codes[i])
-            table.codes[place] = codes[i]
-            table.slots[place] = count
+            place = _probe(table.entries, codes[i])
+            table.entries[place, 0], table.entries[place, 1] = codes[i], count
             table.values[count] = np.nan
             codes_by_slot[count] = codes[i]
             slots[i] = count
@@ -146,6 +148,5 @@ def _add_missing(table, codes, slots, codes_by_slot, count):
 @njit(cache=True, nogil=True)
 def _index(table, codes_by_slot):
     for slot in range(len(codes_by_slot)):
-        place = probe(table.codes, codes_by_slot[slot])
-        table.codes[place] = codes_by_slot[slot]
-        table.slots[place] = slot
+        place = _probe(table.entries, codes_by_slot[slot])
+        table.entries[place, 0], table.entries[place, 1] = codes_by_slot[slot], slot

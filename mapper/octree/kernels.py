@@ -249,7 +249,6 @@ def merge(window, positions, slots, values, sensor):
         How many voxels became known.
     """
     hit, miss, lowest, highest = sensor.hit, sensor.miss, sensor.lowest, sensor.highest
-    words = window.cells.view(np.int64)
     born = 0
     for i in range(len(positions)):
         start = positions[i] * BLOCK_VOXELS
@@ -270,5 +269,5 @@ def merge(window, positions, slots, values, sensor):
             block[j] = old if seen == UNTOUCHED else new
             block_born += int32(unknown & (seen != UNTOUCHED))
         born += block_born
-        words[start // 8 : (start + BLOCK_VOXELS) // 8] = 0
+        seen_block[:] = UNTOUCHED
     return born

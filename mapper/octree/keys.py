@@ -6,8 +6,10 @@ keys with x lowest, so its base-8 digits, from the top, are the child indices on
 
 from math import floor
 
+import numpy as np
 from numba import njit
 from numpy import float64, int64
+from numpy.typing import NDArray
 
 KEY_BITS = 16
 KEY_ZERO = 1 << (KEY_BITS - 1)
@@ -51,6 +53,11 @@ def gather(code):
     key = (key | (key >> 4)) & 0x00F00F00F00F
     key = (key | (key >> 8)) & 0x0000FF0000FF
     return (key | (key >> 16)) & 0xFFFF
+
+
+def block_keys(codes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the (B, 3) key of the lowest voxel of each block, given the blocks' (B,) Morton codes."""
+    return np.column_stack([gather.py_func(codes >> axis) << BLOCK_BITS for axis in range(3)])
 
 
 @njit(cache=True, nogil=True)

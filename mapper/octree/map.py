@@ -13,7 +13,7 @@ from mapper.octree import kernels, queries
 from mapper.octree.blocks import BlockStore
 from mapper.octree.keys import KEY_COUNT, KEY_ZERO
 from mapper.octree.tree_reader import TreeLeaves, fill
-from mapper.octree.window import WindowBuffer, touched_blocks
+from mapper.octree.window import WindowBuffer, block_codes, take_touched
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,9 +129,9 @@ class OctreeMap:
         self._refuse(outside, len(ends_world))
         window = self._window.place(lowest, highest, origin=origin_key)
         kernels.cast_rays(stops, hits, origin, self.resolution_m, window)
-        positions, codes = touched_blocks(window, lowest)
+        positions = take_touched(window)
         try:
-            slots = self.blocks.claim(codes)
+            slots = self.blocks.claim(block_codes(window, positions, lowest))
         except MapSizeError:
             self._window = WindowBuffer()  # the old one still holds this scan
             raise

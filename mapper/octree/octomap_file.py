@@ -12,14 +12,12 @@ from mapper.errors import MapFileError
 from mapper.octree import tree_reader
 from mapper.octree.keys import KEY_BITS
 from mapper.octree.map import OctreeMap, log_odds
-from mapper.octree.tree import build_tree, preorder, preorder_words
+from mapper.octree.tree import NODE, nodes_in_preorder, words_in_preorder
 
 _FULL = b"# Octomap OcTree file"
 _BINARY = b"# Octomap OcTree binary file"
 _TREE_NAMES = {"OcTree": "OcTree", "1": "OcTree", "ColorOcTree": "ColorOcTree"}
-_NODE = np.dtype([("value", "<f4"), ("mask", "u1")])
 _COLOR_NODE = np.dtype([("value", "<f4"), ("rgb", "u1", 3), ("mask", "u1")])
-_NOT_A_NUMBER = np.float32(np.nan)
 
 _FAULTS = {
     tree_reader.CUT_SHORT: "ends before its tree does; it is truncated",
@@ -39,24 +37,22 @@ class _Header:
 
 def write_ot(path: Path, octree: OctreeMap) -> None:
     """Write all log-odds as an OcTree, pruned; atomic."""
-    node_count, payload = 0, b""
-    if len(octree):
-        tree = build_tree(octree.blocks, _NOT_A_NUMBER)
-        values, masks = preorder(tree, octree.blocks)
-        nodes = np.empty(tree.node_count, dtype=_NODE)
-        nodes["value"], nodes["mask"] = values, masks
-        node_count, payload = tree.node_count, nodes.tobytes()
-    atomic.write_bytes(path, _header_bytes(_FULL, node_count, octree.resolution_m) + payload)
+    nodes = nodes_in_preorder(octree.blocks) if len(octree) else np.empty(0, NODE)
+    _write(path, _header_bytes(_FULL, len(nodes), octree.resolution_m), nodes)
 
 
 def write_bt(path: Path, octree: OctreeMap) -> None:
     """Write the maximum-likelihood map (each voxel free or occupied) as an OcTree, pruned; atomic."""
-    node_count, payload = 0, b""
+    words, node_count = np.empty(0, np.uint16), 0
     if len(octree):
-        tree = build_tree(octree.blocks, octree.occupied_log_odds)
-        words = preorder_words(tree, octree.blocks, octree.occupied_log_odds)
-        node_count, payload = tree.node_count, words.astype("<u2").tobytes()
-    atomic.write_bytes(path, _header_bytes(_BINARY, node_count, octree.resolution_m) + payload)
+        words, node_count = words_in_preorder(octree.blocks, octree.occupied_log_odds)
+    _write(path, _header_bytes(_BINARY, node_count, octree.resolution_m), words.astype("<u2", copy=False))
+
+
+def _write(path: Path, header: bytes, payload: NDArray[np.generic]) -> None:
+    with atomic.replacing(path) as part, part.open("wb") as file:
+        file.write(header)
+        file.write(payload.data)
 
 
 def _header_bytes(first_line: bytes, node_count: int, resolution_m: float) -> bytes:
@@ -163,7 +159,7 @@ def _binary_leaves(
 
 
 def _full_leaves(path: Path, header: _Header, payload: memoryview) -> tree_reader.TreeLeaves:
-    record = _COLOR_NODE if header.tree_name == "ColorOcTree" else _NODE
+    record = _COLOR_NODE if header.tree_name == "ColorOcTree" else NODE
     if len(payload) != header.node_count * record.itemsize:
         raise MapFileError(
             f"{path}: the header promises {header.node_count} nodes of {record.itemsize} bytes, "

@@ -6,37 +6,49 @@ import numpy as np
 from numba import njit
 from numpy import float32, float64, int64
 
-from mapper.octree.blocks import probe
+from mapper.octree.blocks import slot_of
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_COUNT, KEY_ZERO, centre_of, gather, morton
 
 HIT, STOPPED_UNKNOWN, STOPPED_RANGE = 1, 2, 3
 """How a ray ended: in an occupied voxel, in an unknown one, or at the maximum range or the map's border."""
 
+_CHUNK = 256  # points worked on at a time: their codes stay in the first-level cache
+_NOWHERE = int64(1) << 60  # a Morton code that no voxel has
 _NEVER = float64(np.finfo(np.float64).max)
 
 
 @njit(cache=True, nogil=True)
 def _value_at(table, code):
     """Return the log-odds of a voxel by its Morton code; NaN is unknown."""
-    place = probe(table.codes, code >> (3 * BLOCK_BITS))
-    if table.codes[place] < 0:
-        return float32(np.nan)
-    return table.values[table.slots[place], code & (BLOCK_VOXELS - 1)]
+    slot = slot_of(table, code >> (3 * BLOCK_BITS))
+    value = table.values[max(slot, 0), code & (BLOCK_VOXELS - 1)]  # read anyway: a branch would cost more
+    return value if slot >= 0 else float32(np.nan)
 
 
 @njit(cache=True, nogil=True)
 def values_at(table, points_world, resolution_m):
     """Return the (N,) float32 log-odds of (N, 3) float64 points, metres; NaN is unknown or out of range."""
+    n = len(points_world)
     inverse_resolution = 1.0 / resolution_m
-    found = np.empty(len(points_world), float32)
-    for i in range(len(points_world)):
-        x = np.floor(inverse_resolution * points_world[i, 0]) + KEY_ZERO
-        y = np.floor(inverse_resolution * points_world[i, 1]) + KEY_ZERO
-        z = np.floor(inverse_resolution * points_world[i, 2]) + KEY_ZERO
-        if x >= 0 and x < KEY_COUNT and y >= 0 and y < KEY_COUNT and z >= 0 and z < KEY_COUNT:
-            found[i] = _value_at(table, morton(int64(x), int64(y), int64(z)))
-        else:
-            found[i] = np.nan
+    found = np.empty(n, float32)
+    x_m, y_m, z_m = np.empty(_CHUNK), np.empty(_CHUNK), np.empty(_CHUNK)
+    codes = np.empty(_CHUNK, int64)
+    for start in range(0, n, _CHUNK):
+        size = min(_CHUNK, n - start)
+        for j in range(size):
+            x_m[j], y_m[j], z_m[j] = (
+                points_world[start + j, 0],
+                points_world[start + j, 1],
+                points_world[start + j, 2],
+            )
+        for j in range(size):  # this loop vectorises: one array per axis, no branch
+            x = np.floor(inverse_resolution * x_m[j]) + KEY_ZERO
+            y = np.floor(inverse_resolution * y_m[j]) + KEY_ZERO
+            z = np.floor(inverse_resolution * z_m[j]) + KEY_ZERO
+            inside = (x >= 0) & (x < KEY_COUNT) & (y >= 0) & (y < KEY_COUNT) & (z >= 0) & (z < KEY_COUNT)
+            codes[j] = morton(int64(x), int64(y), int64(z)) if inside else _NOWHERE
+        for j in range(size):
+            found[start + j] = _value_at(table, codes[j])
     return found
 
 
@@ -95,7 +107,8 @@ def first_obstacles(table, origins, directions, resolution_m, max_range_m, thres
             if square > max_range_m * max_range_m:
                 outcome[i] = STOPPED_RANGE
                 break
-        last[i] = key
+        for j in range(3):
+            last[i, j] = key[j]
     return last, outcome
 
 

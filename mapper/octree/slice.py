@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mapper.config.octree import SliceConfig
 from mapper.errors import DataError
 from mapper.geometry import Array
-from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, gather
+from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100
@@ -65,14 +65,12 @@ def cut_slice(octree: OctreeMap, config: SliceConfig, *, floor_z_m: float = 0.0)
     lowest, highest = _band(octree, config, floor_z_m)
     slots = octree.blocks.sorted_slots()
     codes = octree.blocks.codes[slots]
-    z = gather(codes >> 2) << BLOCK_BITS
-    inside = (z + (1 << BLOCK_BITS) > lowest) & (z <= highest)
-    codes, slots = codes[inside], slots[inside]
-    x, y = gather(codes) << BLOCK_BITS, gather(codes >> 1) << BLOCK_BITS
+    keys = block_keys(codes)
+    inside = (keys[:, 2] + (1 << BLOCK_BITS) > lowest) & (keys[:, 2] <= highest)
+    codes, slots, keys = codes[inside], slots[inside], keys[inside]
     if len(codes):
-        first = np.array([x.min(), y.min()])
-        shape = (int(y.max() - first[1]) + (1 << BLOCK_BITS), int(x.max() - first[0]) + (1 << BLOCK_BITS))
-        seen = np.zeros(shape, dtype=np.uint8)
+        first, last = keys.min(axis=0), keys.max(axis=0) + (1 << BLOCK_BITS)
+        seen = np.zeros((last[1] - first[1], last[0] - first[0]), dtype=np.uint8)
         _flatten(
             codes, slots, octree.blocks.table.values, octree.occupied_log_odds, first, lowest, highest, seen
         )

@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.errors import MapSizeError
-from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_MASK, morton
+from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS, KEY_MASK, morton
 
 UNTOUCHED, FREE, OCCUPIED = 0, 1, 2
 """What a scan says about a voxel, ordered so that occupied wins."""
@@ -32,6 +32,8 @@ class Window(NamedTuple):
         wrap: (3,) int64 cells per axis − 1.
         bits: (3,) int64 which bits of a cell's index belong to each axis.
         places: (3, S) int64 index of each axis's n-th cell: n with its bits deposited into ``bits``.
+        offsets: (4, 256) int64 the inverse for blocks: what each byte of a block's position in the window
+            adds to its offset from ``base``, x in bits 0 … 15, y in 16 … 31, z in 32 … 47.
     """
 
     cells: NDArray[np.uint8]
@@ -40,6 +42,7 @@ class Window(NamedTuple):
     wrap: NDArray[np.int64]
     bits: NDArray[np.int64]
     places: NDArray[np.int64]
+    offsets: NDArray[np.int64]
 
 
 class WindowBuffer:
@@ -68,8 +71,7 @@ class WindowBuffer:
             MapSizeError: The scan is too large for its resolution; nothing has been allocated then.
         """
         blocks = (highest >> BLOCK_BITS) - (lowest >> BLOCK_BITS) + 1
-        # At least two blocks per axis, so that the touched flags fill whole 8-byte words.
-        lengths = tuple(BLOCK_BITS + max(1, (int(n) - 1).bit_length()) for n in blocks)
+        lengths = tuple(BLOCK_BITS + (int(n) - 1).bit_length() for n in blocks)
         size = 1 << sum(lengths)
         extent = "×".join(str(n) for n in highest - lowest + 1)
         if size > _LIMIT_BYTES:
@@ -86,17 +88,20 @@ class WindowBuffer:
                     "system refuses; raise resolution_m or lower max_range_m"
                 ) from None
             self._touched = np.zeros(size // BLOCK_VOXELS, dtype=np.uint8)
-        bits, places = _layout(lengths)
+        bits, places, offsets = _layout(lengths)
         base = origin >> BLOCK_BITS << BLOCK_BITS
         wrap = np.array([(1 << n) - 1 for n in lengths], dtype=np.int64)
-        return Window(self._cells[:size], self._touched[: size // BLOCK_VOXELS], base, wrap, bits, places)
+        return Window(
+            self._cells[:size], self._touched[: size // BLOCK_VOXELS], base, wrap, bits, places, offsets
+        )
 
 
 @lru_cache(maxsize=64)
-def _layout(lengths: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return (bits, places) of a window with 2^n cells per axis; the axes interleave from the bottom."""
+def _layout(lengths: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return (bits, places, offsets) of a window with 2^n cells per axis, interleaved from the bottom."""
     bits = np.zeros(3, dtype=np.int64)
     places = np.zeros((3, 1 << max(lengths)), dtype=np.int64)
+    offsets = np.zeros((4, 256), dtype=np.int64)
     position = 0
     for level in range(max(lengths)):
         for axis in range(3):
@@ -104,8 +109,11 @@ def _layout(lengths: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.int
                 n = np.arange(1 << lengths[axis])
                 places[axis, : len(n)] |= (n >> level & 1) << position
                 bits[axis] |= 1 << position
+                if level >= BLOCK_BITS:
+                    byte, bit = divmod(position - 3 * BLOCK_BITS, 8)
+                    offsets[byte] += (np.arange(256) >> bit & 1) << (level - BLOCK_BITS + KEY_BITS * axis)
                 position += 1
-    return bits, places
+    return bits, places, offsets
 
 
 @njit(cache=True, nogil=True)
@@ -118,51 +126,39 @@ def cell_of(window, x, y, z):
     )
 
 
+def take_touched(window: Window) -> NDArray[np.int64]:
+    """Return the (B,) positions of the touched blocks and forget that they were touched."""
+    positions: NDArray[np.int64] = np.flatnonzero(window.touched.view(np.bool_))
+    window.touched[positions] = 0
+    return positions
+
+
 @njit(cache=True, nogil=True)
-def touched_blocks(window, lowest):
-    """Return the touched blocks and forget that they were touched.
+def block_codes(window, positions, lowest):
+    """Return the (B,) Morton codes of blocks.
 
     Args:
-        window: Where a scan has been rasterised.
-        lowest: (3,) int64 the ``lowest`` that the window was placed with: it resolves the wrap-around.
-
-    Returns:
-        (B,) int64 positions of the blocks in the window and (B,) int64 Morton codes of the blocks.
+        window: The window that the blocks lie in.
+        positions: (B,) int64 where in the window.
+        lowest: (3,) int64 that the window was placed with: it resolves the wrap-around.
     """
-    words = window.touched.view(np.int64)
-    count = 0
-    for flag in window.touched:
-        count += flag
-    positions = np.empty(count, dtype=np.int64)
-    codes = np.empty(count, dtype=np.int64)
-    count = 0
-    for i in range(len(words)):
-        if words[i]:
-            for position in range(8 * i, 8 * i + 8):
-                if window.touched[position]:
-                    positions[count] = position
-                    codes[count] = morton(
-                        _block_key(window, lowest, position, 0),
-                        _block_key(window, lowest, position, 1),
-                        _block_key(window, lowest, position, 2),
-                    )
-                    count += 1
-            words[i] = 0
-    return positions, codes
+    codes = np.empty(len(positions), np.int64)
+    for i in range(len(positions)):
+        packed = 0
+        for byte in range(4):
+            packed += window.offsets[byte, (positions[i] >> (8 * byte)) & 0xFF]
+        codes[i] = morton(
+            _unwrapped(window, lowest, packed, 0),
+            _unwrapped(window, lowest, packed, 1),
+            _unwrapped(window, lowest, packed, 2),
+        )
+    return codes
 
 
 @njit(cache=True, nogil=True)
-def _block_key(window, lowest, position, axis):
+def _unwrapped(window, lowest, packed, axis):
     """Return a block's key along one axis: the key of any of its voxels without the lowest three bits."""
-    bits = window.bits[axis] >> (3 * BLOCK_BITS)
-    offset, weight = 0, 1
-    while bits:
-        if bits & 1:
-            offset |= weight * (position & 1)
-            weight <<= 1
-        bits >>= 1
-        position >>= 1
+    offset = (packed >> (KEY_BITS * axis)) & KEY_MASK
     first = lowest[axis] >> BLOCK_BITS
-    wrap = window.wrap[axis] >> BLOCK_BITS
-    base = window.base[axis] >> BLOCK_BITS
-    return (first + ((base + offset - first) & wrap)) & (KEY_MASK >> BLOCK_BITS)
+    beyond = (window.base[axis] >> BLOCK_BITS) + offset - first
+    return (first + (beyond & (window.wrap[axis] >> BLOCK_BITS))) & (KEY_MASK >> BLOCK_BITS)
