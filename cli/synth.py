@@ -15,7 +15,7 @@ def synth(
     seconds: Annotated[float | None, typer.Option(help="Length of the log.")] = None,
     path: Annotated[str | None, typer.Option(help="loop, desk or spin.")] = None,
     rooms: Annotated[int | None, typer.Option(help="Rooms of the flat, an even number from 4.")] = None,
-    noise: Annotated[float | None, typer.Option(help="Times a Kinect's depth noise; 0 is exact.")] = None,
+    noise: Annotated[float | None, typer.Option(help="Times a Kinect's noise; 0 is exact.")] = None,
     seed: Annotated[int | None, typer.Option(help="Another flat, another walk.")] = None,
     set_: Annotated[
         list[str] | None,
@@ -35,8 +35,8 @@ def synth(
         "duration_s": seconds,
         "path": path,
         "rooms": rooms,
-        "sensor.axial_noise_ratio": noise,
         "seed": seed,
+        **_noise_knobs(noise),
     }
     config = overridden(SynthConfig(), merged(assignments(given), set_))
     prepare_libraries()
@@ -44,3 +44,19 @@ def synth(
         write_tum_log(out, config, on_progress=report)
     if not quiet:
         print(f"{out}: a TUM log; map it with mapper build {out} --out RUN")
+
+
+def _noise_knobs(noise: float | None) -> dict[str, float]:
+    """Return every knob of the sensor's noise, scaled from its default."""
+    from mapper.config.synthetic import SensorConfig
+
+    if noise is None:
+        return {}
+    usual = SensorConfig()
+    return {
+        "sensor.axial_noise_ratio": noise,
+        "sensor.lateral_noise_px": noise * usual.lateral_noise_px,
+        "sensor.disparity_step_px": noise * usual.disparity_step_px,
+        "sensor.image_noise_levels": noise * usual.image_noise_levels,
+        "sensor.dropout_ratio": min(noise * usual.dropout_ratio, 1.0),
+    }
