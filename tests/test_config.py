@@ -96,6 +96,8 @@ def test_any_configuration_can_be_overridden():
     assert config.seed == 5
 
 
-@pytest.mark.parametrize("path", sorted((Path(__file__).parents[1] / "configs").rglob("*.toml")), ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", sorted((Path(__file__).parents[1] / "configs").rglob("*.toml")), ids=lambda p: p.stem
+)
 def test_every_shipped_configuration_is_valid(path):
     assert load_config(path) != BuildConfig()
