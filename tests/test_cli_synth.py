@@ -3,15 +3,17 @@
 import json
 
 import pytest
+from typer.testing import CliRunner
 
-from cli.main import main
+from cli.main import app
 
 TINY = ["--path", "desk", "--seconds", "0.2", "--set", "width_px=64", "--set", "height_px=48", "--quiet"]
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])
 def test_noise_scales_every_imperfection(tmp_path, noise):
-    assert main(["synth", str(tmp_path / "log"), "--noise", str(noise), *TINY]) == 0
+    arguments = ["synth", str(tmp_path / "log"), "--noise", str(noise), *TINY]
+    assert CliRunner().invoke(app, arguments, catch_exceptions=False).exit_code == 0
     sensor = json.loads((tmp_path / "log/scene.json").read_text())["config"]["sensor"]
     assert sensor["axial_noise_ratio"] == noise
     assert sensor["dropout_ratio"] == noise
