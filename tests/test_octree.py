@@ -1,3 +1,6 @@
+import resource
+from pathlib import Path
+
 import numpy as np
 import pytest
 from octomap_oracle import FR1_XYZ, KITTI, fr1_xyz_scans, fuse, kitti_scans, voxels
@@ -250,6 +253,20 @@ def test_a_scan_too_large_for_its_resolution_is_refused_before_it_is_allocated()
 
     with pytest.raises(MapSizeError, match=r"scan of 600\d×600\d×600\d voxels needs 512 GiB .* resolution_m"):
         mapped([(corners, np.zeros(3))], resolution_m=0.01, max_range_m=200.0)
+
+
+def test_working_space_is_only_as_large_as_what_rays_cross():
+    def resident_bytes():
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+    octree = mapped([(np.zeros((1, 3), np.float32), np.ones(3))], resolution_m=0.1, max_range_m=80.0)
+    corners = np.array([[40, 40, 20], [-40, -40, -20], [40, -40, 20]], np.float32)
+    before = resident_bytes()
+
+    octree.insert_points(corners, np.zeros(3))
+
+    assert octree.working_bytes >= 800 * 800 * 400
+    assert resident_bytes() - before < octree.working_bytes / 20
 
 
 def test_a_map_too_large_for_memory_is_refused_and_stays_as_it_was(monkeypatch):

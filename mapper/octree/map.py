@@ -78,6 +78,11 @@ class OctreeMap:
         """Bytes of the map itself, spare capacity included, without the scan window."""
         return self.blocks.memory_bytes
 
+    @property
+    def working_bytes(self) -> int:
+        """Bytes of address space of the scan window; only what rays have crossed is backed by memory."""
+        return self._window.memory_bytes
+
     def insert(self, scan: Scan, T_world_body: Transform) -> None:
         """Fuse one scan: a miss along every ray, a hit at its end; each voxel changes once, and a hit wins.
 

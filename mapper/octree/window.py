@@ -5,6 +5,8 @@ together, and a step along an axis adds one number to one of them. The grid wrap
 scans may lie anywhere. Cells are in Morton order while all axes have bits left; the lowest nine are a block.
 """
 
+import mmap
+from contextlib import suppress
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -81,8 +83,8 @@ class WindowBuffer:
             )
         if size > len(self._cells):
             try:
-                self._cells = np.zeros(size, dtype=np.uint8)
-            except MemoryError:
+                self._cells = _sparse_zeros(size)
+            except OSError:
                 raise MapSizeError(
                     f"a scan of {extent} voxels needs {size / 2**30:.0f} GiB of address space, which the "
                     "system refuses; raise resolution_m or lower max_range_m"
@@ -94,6 +96,17 @@ class WindowBuffer:
         return Window(
             self._cells[:size], self._touched[: size // BLOCK_VOXELS], base, wrap, bits, places, offsets
         )
+
+
+def _sparse_zeros(size: int) -> NDArray[np.uint8]:
+    """Return (size,) zeros that take memory only where they are written.
+
+    ``np.zeros`` asks for huge pages: a ray that enters one would pay for clearing and keeping 2 MiB.
+    """
+    memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    with suppress(OSError):  # a kernel without huge pages refuses advice about them
+        memory.madvise(mmap.MADV_NOHUGEPAGE)
+    return np.frombuffer(memory, dtype=np.uint8)
 
 
 @lru_cache(maxsize=64)
