@@ -40,5 +40,13 @@ class MapFileError(MapperError):
     """A map file that is truncated, foreign or damaged."""
 
 
+class PlanError(MapperError):
+    """A path that does not exist, or an end of it where the robot has no room."""
+
+
+class DependencyError(MapperError):
+    """A library that an optional part needs, and that is not installed or cannot be loaded."""
+
+
 class RunError(MapperError):
     """A run folder that is missing, unfinished or already there."""

@@ -1,0 +1,247 @@
+"""Shortest collision-free paths for a disc on a grid, or for a ball in the octree."""
+
+from dataclasses import dataclass
+from itertools import pairwise, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.config.navigation import PlanConfig
+from mapper.errors import PlanError
+from mapper.geometry import Array
+from mapper.navigation.distance import DistanceField, distance_field
+from mapper.navigation.search import Cell, shortest_path
+from mapper.navigation.sight import in_sight, path_length, shortened
+from mapper.navigation.voxels import LIMIT_BYTES, VoxelGrid, cut_box, known_box, layer
+from mapper.octree.map import OctreeMap
+from mapper.octree.slice import UNKNOWN, OccupancyGrid
+
+_BYTES_PER_VOXEL = 30  # a distance field's 14, what is free, and the search's costs and steps
+_ROUNDING_M = 1e-6
+_SAMPLES_PER_CELL = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """A path.
+
+    Attributes:
+        waypoints_world: (N, D) metres, D = 2 on a grid and 3 in the octree; the ends are those asked for.
+        length_m: Of the straight lines between them.
+        min_clearance_m: The path's least distance to what counts as blocked; +inf if nothing does.
+        config: What was asked for.
+    """
+
+    waypoints_world: Array
+    length_m: float
+    min_clearance_m: float
+    config: PlanConfig
+
+    @property
+    def dimensions(self) -> int:
+        """2 or 3."""
+        return int(self.waypoints_world.shape[1])
+
+    @property
+    def summary(self) -> str:
+        """What it amounts to, in a line."""
+        config = self.config
+        where = "the octree" if self.dimensions == 3 else f"the {config.layer}"
+        return (
+            f"{self.length_m:.2f} m in {where}, {len(self.waypoints_world)} waypoints, "
+            f"{self.min_clearance_m:.2f} m clear at the narrowest; radius {config.radius_m:g} m, "
+            f"unknown {config.unknown}"
+        )
+
+
+def plan_2d(grid: OccupancyGrid, start_world: Array, goal_world: Array, *, config: PlanConfig) -> Plan:
+    """Return a shortest path for a disc on a grid; what lies around the grid is unknown.
+
+    The distance field, linear between the centres of cells, stays at or above the radius all along the path.
+    The path is never longer than the shortest one over the centres of neighbouring cells (8 in a plane, 26
+    in space) that keep the radius: that one is searched for, then pulled tight between the obstacles.
+
+    Args:
+        grid: The slice, or the traversable floor.
+        start_world: (2,) metres.
+        goal_world: (2,) metres.
+        config: Radius and what unknown cells count as.
+
+    Raises:
+        PlanError: An end is outside, unknown or too close to an obstacle, or no path joins the two.
+    """
+    ends = [np.append(np.asarray(point, np.float64), 0.0) for point in (start_world, goal_world)]
+    return _planned(layer(grid), ends[0], ends[1], config)
+
+
+def plan_3d(
+    octree: OctreeMap,
+    start_world: Array,
+    goal_world: Array,
+    *,
+    config: PlanConfig,
+    limit_bytes: int = LIMIT_BYTES,
+) -> Plan:
+    """Return a shortest path for a ball through the known part of the octree, as :func:`plan_2d` does.
+
+    Args:
+        octree: The map; its floor and ceiling are obstacles like any other.
+        start_world: (3,) metres.
+        goal_world: (3,) metres.
+        config: Radius and what unknown voxels count as.
+        limit_bytes: Working space that it may take.
+
+    Raises:
+        PlanError: As :func:`plan_2d`.
+        MapSizeError: The known part of the map is too large.
+    """
+    voxels = cut_box(octree, known_box(octree), bytes_per_voxel=_BYTES_PER_VOXEL, limit_bytes=limit_bytes)
+    return _planned(voxels, np.asarray(start_world, np.float64), np.asarray(goal_world, np.float64), config)
+
+
+def _planned(voxels: VoxelGrid, start_world: Array, goal_world: Array, config: PlanConfig) -> Plan:
+    space = _space(voxels, config)
+    start, goal = space.cell(start_world, "start"), space.cell(goal_world, "goal")
+    found = shortest_path(space.free, start, goal)
+    if not found.reached:
+        reached_world = space.centre(found.cells[-1])
+        raise PlanError(
+            f"no path from {space.text(start_world)} to {space.text(goal_world)} for a radius of "
+            f"{config.radius_m:g} m; the nearest to the goal that can be reached is "
+            f"{space.text(reached_world)}, {np.linalg.norm(goal_world - reached_world):.2f} m from it: go "
+            f"there, or plan with a smaller radius{_or_unknown(config)}"
+        )
+    path = np.vstack([space.place(start_world), found.cells + 0.5, space.place(goal_world)])
+    waypoints_world = space.world(shortened(space.field, path, radius_m=space.least_m))
+    return Plan(
+        waypoints_world[:, : space.dimensions],
+        path_length(waypoints_world),
+        _clearance(space.field, waypoints_world),
+        config,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Space:
+    """Where the middle of a robot may be.
+
+    Attributes:
+        voxels: The map.
+        field: Distances to what is blocked.
+        free: (Z, Y, X) where the centre of a voxel keeps the radius.
+        config: What was asked for.
+    """
+
+    voxels: VoxelGrid
+    field: DistanceField
+    free: NDArray[np.bool_]
+    config: PlanConfig
+
+    @property
+    def dimensions(self) -> int:
+        return 2 if len(self.free) == 1 else 3
+
+    @property
+    def least_m(self) -> float:
+        """The radius less what rounding may take."""
+        return self.config.radius_m - _ROUNDING_M
+
+    def place(self, point_world: Array) -> Array:
+        """Return a point's z, y, x in cells."""
+        place: Array = ((point_world - self.voxels.corner_world_m) / self.voxels.resolution_m)[::-1]
+        return place
+
+    def world(self, places: Array) -> Array:
+        """Return points from their (N, 3) z, y, x in cells."""
+        points_world: Array = self.voxels.corner_world_m + places[:, ::-1] * self.voxels.resolution_m
+        return points_world
+
+    def centre(self, cell: NDArray[np.int64]) -> Array:
+        """Return the centre of a cell."""
+        centre_world: Array = self.world((cell.astype(np.float64) + 0.5)[np.newaxis])[0]
+        return centre_world
+
+    def text(self, point_world: Array) -> str:
+        """Return a point as the user writes it."""
+        return point_text(point_world[: self.dimensions])
+
+    def cell(self, point_world: Array, name: str) -> Cell:
+        """Return a free cell whose centre one end of the path can go to.
+
+        Raises:
+            PlanError: There is none.
+        """
+        if point_world.shape != (3,) or not np.isfinite(point_world).all():
+            raise PlanError(f"the {name} {point_world.tolist()} is no point; want finite coordinates, metres")
+        place = self.place(point_world)
+        z, y, x = (int(n) for n in np.floor(place).clip(-1, 2**31))
+        if not all(0 <= n < count for n, count in zip((z, y, x), self.free.shape, strict=True)):
+            known = np.argwhere(self.voxels.states != UNKNOWN)
+            low, high = self.world(np.array([known.min(axis=0), known.max(axis=0) + 1]).astype(np.float64))
+            raise PlanError(
+                f"the {name} {self.text(point_world)} lies outside the map, which spans {self.text(low)} to "
+                f"{self.text(high)} m; {self._nearest(point_world)}"
+            )
+        clearance_m = float(self.field.distance(point_world[np.newaxis])[0])
+        if clearance_m >= self.least_m:
+            for cell in self._around(place):
+                if self.free[cell] and in_sight(
+                    self.field, place, np.array(cell) + 0.5, radius_m=self.least_m
+                ):
+                    return cell
+        remedy = self._nearest(point_world)
+        if self.voxels.states[z, y, x] == UNKNOWN and self.config.unknown == "blocked":
+            raise PlanError(
+                f"the {name} {self.text(point_world)} lies in unknown space; {remedy}"
+                f"{_or_unknown(self.config)}"
+            )
+        if clearance_m <= 0.0:
+            raise PlanError(f"the {name} {self.text(point_world)} lies in an obstacle; {remedy}")
+        raise PlanError(
+            f"the {name} {self.text(point_world)} is {clearance_m:.3f} m from what is blocked, too close for "
+            f"a radius of {self.config.radius_m:g} m; {remedy}{_or_unknown(self.config)}"
+        )
+
+    def _around(self, place: Array) -> list[Cell]:
+        """Return the cells whose centres surround a place, the nearest first."""
+        low = np.floor(place - 0.5).astype(np.int64)
+        cells = np.array(list(product(*((n, n + 1) for n in low)))).clip(0, np.array(self.free.shape) - 1)
+        order = np.argsort(np.linalg.norm(cells + 0.5 - place, axis=1), kind="stable")
+        return [(int(z), int(y), int(x)) for z, y, x in cells[order]]
+
+    def _nearest(self, point_world: Array) -> str:
+        cells = np.argwhere(self.free)
+        if not len(cells):
+            raise PlanError(
+                f"nowhere in the map is there room for a radius of {self.config.radius_m:g} m; plan with a "
+                f"smaller one{_or_unknown(self.config)}"
+            )
+        squares = np.square(cells + 0.5 - self.place(point_world)).sum(axis=1)
+        nearest_world = self.centre(cells[int(np.argmin(squares))])
+        away_m = float(np.sqrt(squares.min())) * self.voxels.resolution_m
+        return f"the nearest free point is {self.text(nearest_world)}, {away_m:.2f} m away"
+
+
+def point_text(point_world: Array) -> str:
+    """Return a point as messages and headlines name it."""
+    return f"({', '.join(f'{value:.2f}' for value in point_world)})"
+
+
+def _space(voxels: VoxelGrid, config: PlanConfig) -> _Space:
+    field = distance_field(voxels, unknown_blocks=config.unknown == "blocked")
+    return _Space(voxels, field, field.distances_m >= config.radius_m - _ROUNDING_M, config)
+
+
+def _or_unknown(config: PlanConfig) -> str:
+    return ", or let unknown space count as free" if config.unknown == "blocked" else ""
+
+
+def _clearance(field: DistanceField, path_world: Array) -> float:
+    """Return the least distance of points along a path, four in every cell."""
+    spacing_m = field.resolution_m / _SAMPLES_PER_CELL
+    lowest_m = np.inf
+    for begin, end in pairwise(path_world):
+        count = int(np.ceil(np.linalg.norm(end - begin) / spacing_m)) + 1
+        points = begin + (end - begin) * np.linspace(0.0, 1.0, count)[:, np.newaxis]
+        lowest_m = min(lowest_m, float(field.distance(points).min()))
+    return lowest_m

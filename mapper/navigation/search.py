@@ -1,0 +1,187 @@
+"""A* over free cells (Hart, Nilsson & Raphael 1968), with 8 neighbours in a plane and 26 in space."""
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mapper.geometry import Array
+
+Cell = tuple[int, int, int]
+Cells = NDArray[np.int64]
+
+_START = 255  # in the table of steps: where the search began
+_UNREACHED = 254
+_ROOT_2, _ROOT_3 = 2.0**0.5, 3.0**0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """How a search ended.
+
+    Attributes:
+        cells: (N, 3) z, y, x from the start to the goal, or to the nearest cell that can be reached.
+        reached: Whether the last cell is the goal.
+    """
+
+    cells: Cells
+    reached: bool
+
+
+def shortest_path(free: NDArray[np.bool_], start: Cell, goal: Cell) -> Found:
+    """Return a shortest path over the centres of free cells; a step costs its Euclidean length.
+
+    A diagonal step needs all cells that it touches to be free, so the line between two centres never leaves
+    free cells.
+
+    Args:
+        free: (Z, Y, X); a plane is (1, H, W).
+        start: A free z, y, x.
+        goal: A free z, y, x.
+    """
+    padding = tuple((0, 0) if n == 1 else (1, 1) for n in free.shape)  # walls, so that steps need no test
+    walled = np.pad(free, padding)
+    shift = np.array([before for before, _ in padding])
+    begin, end = (_flat(np.add(cell, shift), walled.shape) for cell in (start, goal))
+    moves, lengths, touched = _moves(walled.shape)
+    shape = np.array(walled.shape)
+    steps, last = _search(walled.ravel(), shape, begin, end, moves, lengths, touched)
+    flat = _walk_back(steps, moves, last)
+    cells = np.column_stack(np.unravel_index(flat, walled.shape)).astype(np.int64) - shift
+    return Found(cells, reached=bool(last == end))
+
+
+def _flat(cell: NDArray[np.int64], shape: tuple[int, ...]) -> int:
+    return int((cell[0] * shape[1] + cell[1]) * shape[2] + cell[2])
+
+
+def _moves(shape: tuple[int, ...]) -> tuple[Cells, Array, Cells]:
+    """Return every step as (K,) change of a flat index, (K,) length and (K, 6) changes to what it touches.
+
+    What a step touches besides its two ends is padded with the end itself.
+    """
+    reaches = [range(1) if n == 1 else range(-1, 2) for n in shape]
+    moves, lengths, touched = [], [], []
+    for step in product(*reaches):
+        if not any(step):
+            continue
+        corners = [
+            _flat(np.array(c), shape) for c in product(*({0, d} for d in step)) if any(c) and c != step
+        ]
+        moves.append(_flat(np.array(step), shape))
+        lengths.append(float(np.linalg.norm(step)))
+        touched.append(sorted(corners) + [moves[-1]] * (6 - len(corners)))
+    return np.array(moves), np.array(lengths), np.array(touched)
+
+
+@njit(cache=True, nogil=True)
+def _search(
+    free: NDArray[np.bool_], shape: Cells, start: int, goal: int, moves: Cells, lengths: Array, touched: Cells
+) -> tuple[NDArray[np.uint8], int]:
+    """Return which move led to each cell, and the goal or the reachable cell nearest to it."""
+    cost = np.full(len(free), np.inf)
+    steps = np.full(len(free), _UNREACHED, np.uint8)
+    keys, heap, count = np.empty(1024), np.empty(1024, np.int64), 0
+    goal_z, goal_y, goal_x = _unflat(goal, shape)
+    cost[start], steps[start] = 0.0, _START
+    keys, heap, count = _push(keys, heap, count, 0.0, start)
+    nearest, nearest_square = start, np.inf
+    done = np.zeros(len(free), np.bool_)
+    while count > 0:
+        cell = heap[0]
+        count = _pop(keys, heap, count)
+        if done[cell]:
+            continue
+        done[cell] = True
+        if cell == goal:
+            return steps, goal
+        z, y, x = _unflat(cell, shape)
+        square = (z - goal_z) ** 2 + (y - goal_y) ** 2 + (x - goal_x) ** 2
+        if square < nearest_square:
+            nearest, nearest_square = cell, square
+        for k in range(len(moves)):
+            other = cell + moves[k]
+            if not free[other] or done[other]:
+                continue
+            through = cost[cell] + lengths[k]
+            if through >= cost[other]:
+                continue
+            open_way = True
+            for j in range(6):
+                open_way &= free[cell + touched[k, j]]
+            if not open_way:
+                continue
+            cost[other], steps[other] = through, k
+            z, y, x = _unflat(other, shape)
+            ahead = _octile(abs(z - goal_z), abs(y - goal_y), abs(x - goal_x))
+            keys, heap, count = _push(keys, heap, count, through + ahead, other)
+    return steps, nearest
+
+
+@njit(cache=True, nogil=True)
+def _octile(a: int, b: int, c: int) -> float:
+    """Return the length of the shortest way over that many cells if nothing stands in it."""
+    longest, shortest = max(a, b, c), min(a, b, c)
+    middle = a + b + c - longest - shortest
+    return float(_ROOT_3 * shortest + _ROOT_2 * (middle - shortest) + (longest - middle))
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _unflat(index: int, shape: Cells) -> tuple[int, int, int]:
+    row = index // shape[2]
+    return row // shape[1], row % shape[1], index % shape[2]
+
+
+@njit(cache=True, nogil=True)
+def _push(keys: Array, heap: Cells, count: int, key: float, item: int) -> tuple[Array, Cells, int]:
+    """Add an item to a binary heap; return the heap, which grows when it is full."""
+    if count == len(keys):
+        keys = np.concatenate((keys, np.empty_like(keys)))
+        heap = np.concatenate((heap, np.empty_like(heap)))
+    hole = count
+    while hole > 0:
+        above = (hole - 1) >> 1
+        if keys[above] <= key:
+            break
+        keys[hole], heap[hole] = keys[above], heap[above]
+        hole = above
+    keys[hole], heap[hole] = key, item
+    return keys, heap, count + 1
+
+
+@njit(cache=True, nogil=True)
+def _pop(keys: Array, heap: Cells, count: int) -> int:
+    """Remove the smallest item; return how many are left."""
+    count -= 1
+    key, item = keys[count], heap[count]
+    hole = 0
+    while True:
+        below = 2 * hole + 1
+        if below >= count:
+            break
+        if below + 1 < count and keys[below + 1] < keys[below]:
+            below += 1
+        if keys[below] >= key:
+            break
+        keys[hole], heap[hole] = keys[below], heap[below]
+        hole = below
+    keys[hole], heap[hole] = key, item
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _walk_back(steps: NDArray[np.uint8], moves: Cells, last: int) -> Cells:
+    """Return the flat indices from the start to a reached cell."""
+    count, cell = 1, last
+    while steps[cell] != _START:
+        cell -= moves[steps[cell]]
+        count += 1
+    path = np.empty(count, np.int64)
+    cell = last
+    for n in range(count - 1, -1, -1):
+        path[n] = cell
+        if n > 0:
+            cell -= moves[steps[cell]]
+    return path
