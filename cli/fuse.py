@@ -7,12 +7,13 @@ import typer
 
 from cli.console import progress_for
 from cli.environment import prepare_libraries
-from cli.options import Overrides, Quiet
+from cli.options import MovedLog, Overrides, Quiet
 
 
 def fuse(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder that a build left.")],
     set_: Overrides = None,
+    log: MovedLog = None,
     quiet: Quiet = False,
 ) -> None:
     """Make a run's maps again, for instance finer or with another slice, without tracking again.
@@ -25,13 +26,13 @@ def fuse(
     from evaluators.evaluate import evaluate
     from mapper.config import overridden
     from mapper.pipeline import fuse as fuse_run
-    from mapper.run import load_run
-    from mapper.sources import open_source
+    from mapper.run import load_run, moved_log, open_log
 
     prepare_libraries()
     built = load_run(run)
+    if log is not None:
+        built = moved_log(built, log)
     config = overridden(built.config, set_ or ())
-    source = open_source(Path(built.manifest.input.path), config.source)
-    fused = fuse_run(source, built, config, progress=progress_for(quiet=quiet))
+    fused = fuse_run(open_log(built), built, config, progress=progress_for(quiet=quiet))
     if not quiet:
         print(summary_text(fused, evaluate(fused.trajectory(), fused.truth())))

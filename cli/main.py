@@ -12,6 +12,7 @@ from cli.convert import convert
 from cli.demo import demo
 from cli.environment import prepare_environment
 from cli.evaluate import evaluate
+from cli.export import export
 from cli.fuse import fuse
 from cli.show_config import show_config
 from cli.synth import synth
@@ -57,6 +58,7 @@ app = typer.Typer(
 app.command("build")(build)
 app.command("fuse")(fuse)
 app.command("eval")(evaluate)
+app.command("export")(export)
 app.command("convert")(convert)
 app.command("synth")(synth)
 app.command("demo")(demo)

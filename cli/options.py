@@ -15,6 +15,9 @@ Overrides = Annotated[
     typer.Option("--set", metavar="KEY.PATH=VALUE", help="Turn one knob; mapper config lists them all."),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print errors only.")]
+MovedLog = Annotated[
+    Path | None, typer.Option("--log", help="Where the log lies now, if it has moved since the build.")
+]
 First = Annotated[int | None, typer.Option("--first", help="Index of the first frame to use.")]
 Last = Annotated[int | None, typer.Option("--last", help="Index of the last frame to use.")]
 Stride = Annotated[int | None, typer.Option("--stride", help="Use every n-th frame.")]

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from mapper.graph.model import PoseGraph
 from mapper.manifest import Input, Manifest, Timing, library_versions, now_text, read_manifest
 from mapper.measure import Stopwatch
 from mapper.records import FrameRecord, read_frame_ms, read_records
+from mapper.sources import open_source
 from mapper.sources.base import FrameSource
 from mapper.staging import MARK, partial_of, staged
 from mapper.trajectory import Trajectory, read_tum
@@ -33,9 +34,12 @@ OCTREE_BT = "map.bt"
 OCTREE_OT = "map.ot"
 CLOUD = "cloud.ply"
 SLICE = "slice"
+TRAVERSABLE = "traversable"
 MCAP = "run.mcap"
 SUMMARY = "summary.png"
 CLOUD_VIEWS = "cloud.png"
+PLAN = "plan.json"
+PLAN_VIEW = "plan.png"
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +97,37 @@ def load_run(path: Path) -> Run:
     if manifest.status != "complete":
         raise RunError(f"{path}: not finished: {_ending(path)}")
     return Run(path, _read_config(path / CONFIG), manifest)
+
+
+def moved_log(run: Run, log: Path) -> Run:
+    """Return the run, knowing that its log lies elsewhere by now."""
+    known = run.manifest.input.model_copy(update={"path": str(log.resolve())})
+    return replace(run, manifest=run.manifest.model_copy(update={"input": known}))
+
+
+def open_log(run: Run) -> FrameSource:
+    """Return the log that a run was built from, with the same frames selected.
+
+    Raises:
+        RunError: It is no longer there, or is not what it was.
+        SourceError: It cannot be opened.
+    """
+    path = Path(run.manifest.input.path)
+    if not path.exists():
+        raise RunError(f"{path}: the log of {run.path} is no longer there; tell its new place with --log")
+    source = open_source(path, run.config.source)
+    refuse_another_log(run, source.path)
+    return source
+
+
+def refuse_another_log(run: Run, log: Path) -> None:
+    """Refuse a log that is not the one that a run was built from.
+
+    Raises:
+        RunError: Its fingerprint differs.
+    """
+    if fingerprint(log) != run.manifest.input.fingerprint:
+        raise RunError(f"{log}: changed since {run.path} was built from it; build it again")
 
 
 class Draft:

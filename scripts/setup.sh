@@ -1,19 +1,29 @@
 #!/usr/bin/env bash
 # Makes .venv and installs the project into it; does nothing the second time.
-# usage: bash scripts/setup.sh [--dev]     --dev adds what the tests need
+# usage: bash scripts/setup.sh [--dev] [--mesh]
+#   --dev   adds what the tests need
+#   --mesh  adds Open3D and the system libraries it needs, for mapper export --as mesh
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
-
-extra=""
-[ "${1:-}" = "--dev" ] && extra="[dev]"
-venv=.venv
-stamp="$venv/.installed${extra}"
 
 say() { printf 'setup: %s\n' "$*" >&2; }
 fail() {
   say "$*"
   exit 1
 }
+
+extra=""
+wheels="numpy cv2 numba gtsam mahotas matplotlib foxglove mcap"
+for option in "$@"; do
+  case "$option" in
+    --dev) extra="${extra:+$extra,}dev" ;;
+    --mesh) extra="${extra:+$extra,}mesh" wheels="$wheels open3d" ;;
+    *) fail "unknown option $option; want --dev or --mesh" ;;
+  esac
+done
+extra="${extra:+[$extra]}"
+venv=.venv
+stamp="$venv/.installed${extra}"
 
 # Installs Debian packages if we may; otherwise says exactly what to type.
 need_packages() {
@@ -62,14 +72,16 @@ make_venv() {
 
 # Prints the first shared library that a wheel expects from the system and does not find.
 missing_library() {
-  "$venv/bin/python" - <<'PYTHON'
+  # shellcheck disable=SC2086 # one word per wheel
+  "$venv/bin/python" - $wheels <<'PYTHON'
 import importlib
 import re
+import sys
 
-for name in ("numpy", "cv2", "numba", "gtsam", "mahotas", "matplotlib", "foxglove", "mcap"):
+for name in sys.argv[1:]:
     try:
         importlib.import_module(name)
-    except ImportError as error:
+    except (ImportError, OSError) as error:
         found = re.search(r"(lib\S+\.so[.\d]*): cannot open shared object file", str(error))
         print(found[1] if found else f"{name}: {error}")
         break
@@ -82,6 +94,11 @@ package_of() {
     libstdc++.so.*) echo libstdc++6 ;;
     libgcc_s.so.*) echo libgcc-s1 ;;
     libGL.so.*) echo libgl1 ;;
+    libEGL.so.*) echo libegl1 ;;
+    libX11.so.*) echo libx11-6 ;;
+    libudev.so.*) echo libudev1 ;;
+    libidn2.so.*) echo libidn2-0 ;;
+    libusb-1.0.so.*) echo libusb-1.0-0 ;;
     libglib-2.0.so.* | libgthread-2.0.so.*) echo libglib2.0-0 ;;
     libz.so.*) echo zlib1g ;;
     libatomic.so.*) echo libatomic1 ;;
@@ -105,7 +122,7 @@ install_missing_libraries() {
 # The folder counts as well: an editable install and its scripts name it.
 want=$( (pwd; "$venv/bin/python" --version; cat pyproject.toml scripts/setup.sh) | sha256sum)
 if [ "$(cat "$stamp" 2>/dev/null)" != "$want" ]; then
-  say "installing the project${extra:+ and what its tests need}"
+  say "installing the project${extra:+ with its extras $extra}"
   "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable ".$extra" >&2
   install_missing_libraries
   printf '%s\n' "$want" >"$stamp"

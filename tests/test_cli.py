@@ -14,7 +14,7 @@ from evaluators.evaluate import evaluate
 from mapper.run import load_run
 from mapper.trajectory import read_tum
 
-VERBS = ["build", "fuse", "eval", "convert", "synth", "demo", "config"]
+VERBS = ["build", "fuse", "eval", "export", "convert", "synth", "demo", "config"]
 HEAVY = {"cv2", "numba", "gtsam", "matplotlib", "mahotas", "foxglove", "mcap", "pydantic", "numpy", "rich"}
 
 
@@ -78,6 +78,11 @@ def test_spelled_out_overrides_win(desk_log, tmp_path):
         (["build", "LOG", "--out", "run", "--config", "no.toml"], "mapper: no.toml: cannot be read"),
         (["fuse", "nowhere"], "mapper: nowhere: no such run folder"),
         (["fuse", "RUN", "--set", "graph.solve=none"], "mapper: graph: fuse keeps what was tracked"),
+        (["fuse", "RUN", "--log", "gone"], "gone: the log of RUN is no longer there; tell its new place"),
+        (["export", "nowhere", "--as", "ply"], "mapper: nowhere: no such run folder"),
+        (["export", "RUN", "--as", "jpeg"], "mapper: no exporter 'jpeg'; want one of octomap, ply, voxels"),
+        (["export", "RUN", "--as", "ply", "--out", "a.obj"], "mapper: a.obj: ply files end with .ply"),
+        (["export", "RUN", "--as", "tum", "--set", "a.b=1"], "mapper: overrides: a: Extra inputs"),
         (["eval", "nowhere"], "mapper: nowhere: no such run folder"),
         (["eval", "RUN", "--truth", "nowhere"], "mapper: nowhere: cannot be read"),
         (["convert", "nowhere", "--out", "log", "--as", "tum"], "mapper: nowhere: no such file or folder"),
@@ -92,7 +97,7 @@ def test_a_mistake_is_one_line(run_folder, desk_log, tmp_path, monkeypatch, argu
     result = mapper(*(places.get(word, word) for word in arguments), status=1)
 
     assert len(result.stderr.splitlines()) == 1
-    assert message in result.stderr
+    assert message.replace("RUN", str(run_folder)) in result.stderr
 
 
 def test_a_failed_build_says_where_its_rest_is(desk_log, tmp_path):
@@ -125,6 +130,18 @@ def test_fuse_changes_the_map_of_a_run(run_folder, tmp_path):
 
     assert load_run(run).manifest.counts.leaves < load_run(run_folder).manifest.counts.leaves
     assert (run / "trajectory.tum").read_bytes() == (run_folder / "trajectory.tum").read_bytes()
+
+
+def test_export_prints_where_its_file_is(run_folder, tmp_path):
+    assert mapper("export", run_folder, "--as", "tum").stdout == f"{run_folder / 'trajectory.tum'}\n"
+
+    out = tmp_path / "poses.txt"
+    assert mapper("export", run_folder, "--as", "kitti", "--out", out).stdout == f"{out}\n"
+    again = mapper("export", run_folder, "--as", "kitti", "--out", out, status=1)
+    assert again.stderr == (
+        f"mapper: {out}: exists already; choose another --out, or pass --overwrite to replace it\n"
+    )
+    assert mapper("export", run_folder, "--as", "kitti", "--out", out, "--overwrite", "--quiet").output == ""
 
 
 def test_eval_states_the_alignment_and_agrees_with_the_library(run_folder, desk_log):

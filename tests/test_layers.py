@@ -16,6 +16,7 @@ HOMES = {
     "mahotas": ("mapper/features/",),
     "typer": ("cli/",),
     "rich": ("cli/",),
+    "open3d": ("mapper/export/mesh.py",),
     "pyoctomap": (),
     "evo": (),
     "rerun": (),

@@ -9,6 +9,7 @@ from typing import Annotated, Any, TypeVar, get_args
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
 
 from mapper.config.base import Config
+from mapper.config.export import MeshConfig
 from mapper.config.graph import GraphConfig
 from mapper.config.octree import LevelConfig, OctreeConfig, SliceConfig
 from mapper.config.odometry import LocalMapConfig, OdometryConfig
@@ -51,6 +52,7 @@ class BuildConfig(Config):
     slice: SliceConfig = SliceConfig()
     cloud: CloudConfig = CloudConfig()
     mcap: McapConfig = McapConfig()
+    mesh: MeshConfig = MeshConfig()
     min_tracked_frames: PositiveInt = 10
     """With fewer frames tracked there is no map worth the name, and the build ends in an error."""
     min_tracked_ratio: Annotated[float, Field(ge=0.0, le=1.0)] = 0.2

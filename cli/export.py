@@ -1,0 +1,43 @@
+"""``mapper export``: one file of a run, in the format that another program reads."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cli.console import progress_for
+from cli.environment import prepare_libraries
+from cli.options import MovedLog, Overrides, Quiet
+from mapper.export.exporters import EXPORTERS
+
+_KINDS = "; ".join(f"{kind}: {exporter.summary}" for kind, exporter in EXPORTERS.items())
+
+
+def export(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder that a build left.")],
+    as_: Annotated[str, typer.Option("--as", metavar="KIND", help=f"What to write. {_KINDS}.")],
+    out: Annotated[
+        Path | None, typer.Option(help="File to write; omit to keep it in RUN under its usual name.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
+    set_: Overrides = None,
+    log: MovedLog = None,
+    quiet: Quiet = False,
+) -> None:
+    """Write a run's map, cloud, surface, slice, trajectory or graph for other programs, and tell where it is.
+
+    Example: mapper export runs/xyz --as octomap --out xyz.ot, or: mapper export runs/xyz --as mesh
+    """
+    from mapper.config import overridden
+    from mapper.export.exporters import export as export_run
+    from mapper.run import load_run, moved_log
+
+    prepare_libraries()
+    built = load_run(run)
+    if log is not None:
+        built = moved_log(built, log)
+    config = overridden(built.config, set_) if set_ else None
+    progress = progress_for(quiet=quiet)
+    path = export_run(built, as_, out, config=config, overwrite=overwrite, progress=progress)
+    if not quiet:
+        print(path)

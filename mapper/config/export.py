@@ -1,0 +1,21 @@
+"""What is made from a run on demand."""
+
+from typing import Annotated
+
+from pydantic import Field, PositiveFloat, PositiveInt
+
+from mapper.config.base import Config
+
+
+class MeshConfig(Config):
+    """The surface of ``mapper export --as mesh``: truncated signed distances (Curless & Levoy 1996)."""
+
+    voxel_m: PositiveFloat = 0.01
+    truncation_voxels: Annotated[float, Field(ge=1.0)] = 4.0
+    """How far from the surface distances count; thinner than the depth noise tears holes."""
+    max_depth_m: PositiveFloat = 4.0
+    """Deeper measurements are left out."""
+    frame_stride: PositiveInt = 5
+    """Every n-th tracked frame is fused."""
+    min_observations: PositiveInt = 3
+    """Surface seen in fewer fused frames is left out."""

@@ -1,0 +1,120 @@
+"""The kinds of file that a run can be taken away as, and the one way to write any of them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mapper.errors import ConfigError, RunError
+from mapper.progress import SILENT, Progress
+
+if TYPE_CHECKING:
+    from mapper.config import BuildConfig
+    from mapper.run import Run
+
+Write = Callable[["Run", Path, Progress], None]
+"""Writes one file of a run, whole or not at all; a job of seconds tells how far it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Exporter:
+    """One kind of file.
+
+    Attributes:
+        summary: What it is, in a few words.
+        function: ``module:name`` of the ``Write``, below :mod:`mapper.export`; imported when asked for.
+        file_name: Its name inside the run; some are there since the build.
+        endings: What another name may end with.
+        beside: Endings of the files that come with it.
+        settings: The part of the configuration that it reads, if any.
+    """
+
+    summary: str
+    function: str
+    file_name: str
+    endings: tuple[str, ...]
+    beside: tuple[str, ...] = ()
+    settings: str | None = None
+
+    @property
+    def write(self) -> Write:
+        """The function that writes it."""
+        module, _, name = self.function.partition(":")
+        found: Write = getattr(import_module(f"mapper.export.{module}"), name)
+        return found
+
+
+_MESH_ENDINGS = (".ply", ".obj", ".glb")
+
+EXPORTERS = {
+    "octomap": Exporter("octree for OctoMap and ROS", "run_files:octomap", "map.bt", (".bt", ".ot")),
+    "ply": Exporter("coloured cloud", "run_files:cloud", "cloud.ply", (".ply",)),
+    "voxels": Exporter("occupied voxels' centres", "voxels:centres", "voxels.ply", (".ply",)),
+    "voxel-mesh": Exporter("occupied voxels as cubes", "voxels:cubes", "voxel_mesh.ply", _MESH_ENDINGS),
+    "mesh": Exporter("coloured surface", "mesh:surface", "mesh.ply", _MESH_ENDINGS, settings="mesh"),
+    "grid": Exporter(
+        "slice for nav2", "run_files:grid", "slice.yaml", (".yaml", ".yml"), beside=(".pgm", ".png")
+    ),
+    "tum": Exporter("trajectory as TUM text", "run_files:tum", "trajectory.tum", (".tum", ".txt")),
+    "kitti": Exporter("trajectory as KITTI text", "run_files:kitti", "trajectory.kitti", (".kitti", ".txt")),
+    "g2o": Exporter("pose graph", "run_files:g2o", "graph.g2o", (".g2o",)),
+}
+
+
+def export(
+    run: "Run",
+    kind: str,
+    out: Path | None = None,
+    *,
+    config: "BuildConfig | None" = None,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
+) -> Path:
+    """Write one kind of file and return where it is.
+
+    Args:
+        run: A finished run.
+        kind: A key of ``EXPORTERS``.
+        out: The file; None keeps it in the run, under the name that this kind has there.
+        config: The run's own configuration with the kind's settings turned.
+        overwrite: Replace what is at OUT.
+        progress: Who watches.
+
+    Raises:
+        ConfigError: No such kind, a name that does not end like one, or settings that the kind does not read.
+        RunError: OUT is there already, or a file of the run is missing.
+    """
+    if kind not in EXPORTERS:
+        raise ConfigError(f"no exporter {kind!r}; want one of {', '.join(EXPORTERS)}")
+    exporter = EXPORTERS[kind]
+    if config is not None:
+        _refuse_idle_settings(run, config, kind=kind)
+        run = replace(run, config=config)
+    if out is None:
+        path = run.path / exporter.file_name
+    else:
+        path = out
+        _refuse_out(path, exporter, kind=kind, overwrite=overwrite)
+    exporter.write(run, path, progress)
+    return path
+
+
+def _refuse_idle_settings(run: "Run", config: "BuildConfig", *, kind: str) -> None:
+    settings = EXPORTERS[kind].settings
+    for name in type(config).model_fields:
+        if name != settings and getattr(config, name) != getattr(run.config, name):
+            reads = f"reads {settings} settings only" if settings else "has no settings"
+            raise ConfigError(f"{name}: export --as {kind} {reads}; to change the maps run mapper fuse")
+
+
+def _refuse_out(path: Path, exporter: Exporter, *, kind: str, overwrite: bool) -> None:
+    if path.suffix.lower() not in exporter.endings:
+        raise ConfigError(
+            f"{path}: {kind} files end with {' or '.join(exporter.endings)}; choose such a name"
+        )
+    for file in (path, *(path.with_suffix(ending) for ending in exporter.beside)):
+        if file.is_dir():
+            raise RunError(f"{file}: is a folder; name a file")
+        if file.exists() and not overwrite:
+            raise RunError(f"{file}: exists already; choose another --out, or pass --overwrite to replace it")

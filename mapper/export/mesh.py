@@ -1,0 +1,221 @@
+"""A coloured surface from depth images at their final poses, fused by Open3D (Zhou, Park & Koltun 2018)."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper import run as files
+from mapper.cloud import Colors
+from mapper.config.export import MeshConfig
+from mapper.errors import DependencyError, FrameError, RunError
+from mapper.export.mesh_files import Triangles, write_mesh
+from mapper.frames import NO_DISTORTION, DepthImage, PinholeCamera, Points32, RgbdFrame
+from mapper.geometry import Transform, inverse
+from mapper.octree.blocks import check_memory
+from mapper.octree.octomap_file import read_map
+from mapper.parallel import ordered_map
+from mapper.progress import Progress
+from mapper.run import Run, open_log
+from mapper.sources.base import Entry
+
+_BLOCK_VOXELS = 8
+"""Edge of a block. Of Open3D's usual 16 two thirds would lie beyond the truncation, and be computed."""
+_VOXEL_BYTES = 4 + 4 + 12  # distance, weight and colour, all float32: integers would round at every frame
+_LIBRARIES = "libgl1 libegl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0 libgomp1"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """Triangles in an order that depends on the surface alone.
+
+    Attributes:
+        points_world: (V, 3) float32 metres.
+        colors: (V, 3) uint8 RGB.
+        triangles: (T, 3) int32 indices of points, counterclockwise seen from outside.
+    """
+
+    points_world: Points32
+    colors: Colors
+    triangles: Triangles
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _View:
+    """One frame as Open3D takes it: no lens distortion, colours as float32."""
+
+    depth_m: DepthImage
+    colors: NDArray[np.float32]
+    camera: PinholeCamera
+    T_world_camera: Transform
+
+
+def surface(run: Run, path: Path, progress: Progress) -> None:
+    """Fuse every ``mesh.frame_stride``-th tracked frame of the log and write the surface.
+
+    Memory grows with the surface seen, not with the log.
+
+    Raises:
+        DependencyError: Open3D or a system library that it needs is missing.
+        RunError: The log has moved or changed, holds no depth images, or too little of it was seen.
+        MapSizeError: The surface would not fit into memory at ``mesh.voxel_m``.
+    """
+    o3d = _open3d()
+    config = run.config.mesh
+    volume = _Volume(o3d, config, blocks=_expected_blocks(run))
+    for view in _views(run, progress):
+        volume.add(view)
+    found = volume.surface()
+    if not len(found.triangles):
+        raise RunError(
+            f"{run.path}: no surface within {config.max_depth_m:g} m was seen in {config.min_observations} "
+            "fused frames; lower mesh.min_observations or mesh.frame_stride"
+        )
+    write_mesh(path, found.points_world, found.colors, found.triangles)
+
+
+class _Volume:
+    """Open3D's hash of voxel blocks."""
+
+    def __init__(self, o3d: Any, config: MeshConfig, *, blocks: int) -> None:
+        self._o3d = o3d
+        self._config = config
+        number = o3d.core.float32
+        self._grid = o3d.t.geometry.VoxelBlockGrid(
+            attr_names=("tsdf", "weight", "color"),
+            attr_dtypes=(number, number, number),
+            attr_channels=(1, 1, 3),
+            voxel_size=config.voxel_m,
+            block_resolution=_BLOCK_VOXELS,
+            block_count=blocks,  # growing means copying everything, and triples the time
+        )
+
+    def add(self, view: _View) -> None:
+        """Fuse one view."""
+        tensor, image = self._o3d.core.Tensor, self._o3d.t.geometry.Image
+        depth, color = image(tensor(view.depth_m)), image(tensor(view.colors))
+        intrinsic, extrinsic = tensor(view.camera.matrix), tensor(inverse(view.T_world_camera))
+        # Depth is in metres already, so Open3D's scale is 1.
+        reach = (1.0, self._config.max_depth_m, self._config.truncation_voxels)
+        blocks = self._grid.compute_unique_block_coordinates(depth, intrinsic, extrinsic, *reach)
+        self._grid.integrate(blocks, depth, color, intrinsic, extrinsic, *reach)
+
+    def surface(self) -> Surface:
+        """Extract where the distance changes sign (marching cubes, Lorensen & Cline 1987)."""
+        mesh = self._grid.extract_triangle_mesh(weight_threshold=float(self._config.min_observations))
+        if not len(mesh.triangle.indices):
+            return Surface(
+                np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8), np.empty((0, 3), np.int32)
+            )
+        colors = np.rint(np.clip(mesh.vertex.colors.numpy(), 0.0, 1.0) * 255.0).astype(np.uint8)
+        return _in_order(mesh.vertex.positions.numpy(), colors, mesh.triangle.indices.numpy())
+
+
+def _in_order(points: Points32, colors: Colors, triangles: Triangles) -> Surface:
+    """Sort vertices and triangles: Open3D gives them in the order of its threads."""
+    order = np.lexsort((*colors.T, *points.T))
+    points, colors = points[order], colors[order]
+    is_new = np.ones(len(order), np.bool_)  # equal vertices have no order, so they become one
+    is_new[1:] = (np.diff(points, axis=0) != 0).any(axis=1) | (colors[1:] != colors[:-1]).any(axis=1)
+    rank = np.empty(len(order), np.int32)
+    rank[order] = np.cumsum(is_new, dtype=np.int32) - 1
+    triangles = rank[triangles]
+    triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(axis=1)]
+    first = triangles.argmin(axis=1)[:, np.newaxis]
+    triangles = np.take_along_axis(triangles, (first + np.arange(3)) % 3, axis=1)  # turned, not mirrored
+    return Surface(points[is_new], colors[is_new], triangles[np.lexsort(triangles.T[::-1])])
+
+
+def _views(run: Run, progress: Progress) -> Iterator[_View]:
+    """Yield the frames to fuse, read and rectified ahead in threads."""
+    trajectory = run.trajectory()
+    stride = run.config.mesh.frame_stride
+    T_world_body = dict(
+        zip(trajectory.stamps_ns[::stride].tolist(), trajectory.T_world_body[::stride], strict=True)
+    )
+    source = open_log(run)
+    entries = (entry for entry in source.entries() if entry.stamp_ns in T_world_body)
+
+    def prepare(entry: Entry) -> _View | str:
+        try:
+            frame = entry.load()
+        except FrameError as error:
+            return str(error)
+        if not isinstance(frame, RgbdFrame):
+            raise RunError(f"{source.path}: a mesh needs depth images, and this log has none")
+        return _rectified(frame, T_world_body[entry.stamp_ns])
+
+    with progress.stage("mesh") as report:
+        for done, view in enumerate(ordered_map(prepare, entries, workers=run.config.workers), start=1):
+            report(done, len(T_world_body))
+            if isinstance(view, str):
+                progress.note(f"not fused: {view}")
+            else:
+                yield view
+
+
+def _rectified(frame: RgbdFrame, T_world_body: Transform) -> _View:
+    """Resample a frame as an ideal pinhole camera would have seen it; depths are not mixed."""
+    depth_m, image = frame.depth_m, frame.rgb
+    if frame.camera.distortion != NO_DISTORTION:
+        columns, rows = _undistortion(frame.camera)
+        depth_m = cv2.remap(depth_m, columns, rows, cv2.INTER_NEAREST)
+        image = cv2.remap(image, columns, rows, cv2.INTER_LINEAR)
+    return _View(
+        np.ascontiguousarray(depth_m, np.float32),
+        np.asarray(image, np.float32) / np.float32(255.0),
+        frame.camera,
+        T_world_body @ frame.T_body_camera,
+    )
+
+
+@lru_cache(maxsize=8)
+def _undistortion(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return where every pixel of the ideal image lies in the real one."""
+    columns, rows = cv2.initUndistortRectifyMap(
+        camera.matrix,
+        np.array(camera.distortion),
+        np.eye(3),
+        camera.matrix,
+        (camera.width_px, camera.height_px),
+        cv2.CV_32FC1,
+    )
+    return columns, rows
+
+
+def _expected_blocks(run: Run) -> int:
+    """Estimate from the octree how many blocks the surface will fill, and refuse what could not fit."""
+    config = run.config.mesh
+    octree = read_map(run.path / files.OCTREE_OT, run.config.octree)
+    occupied = int((octree.leaves().log_odds >= octree.occupied_log_odds).sum())
+    block_m = _BLOCK_VOXELS * config.voxel_m
+    shell_blocks = 1.0 + 2.0 * config.truncation_voxels / _BLOCK_VOXELS
+    blocks = int(occupied * (octree.resolution_m / block_m) ** 2 * shell_blocks) + 1
+    check_memory(
+        blocks * _BLOCK_VOXELS**3 * _VOXEL_BYTES,
+        f"a mesh of {config.voxel_m:g} m voxels",
+        remedy="raise mesh.voxel_m",
+    )
+    return blocks
+
+
+def _open3d() -> Any:
+    try:
+        import open3d
+    except ModuleNotFoundError as error:
+        raise DependencyError(
+            f"mesh needs an extra ({error.name} is missing): pip install 'mapper[mesh]'"
+        ) from None
+    except (ImportError, OSError) as error:
+        found = re.search(r"lib[\w.+-]+\.so[.\d]*", str(error))
+        raise DependencyError(
+            f"mesh: Open3D cannot be loaded, {found[0] if found else error} is missing; "
+            f"apt-get install {_LIBRARIES}"
+        ) from None
+    return open3d

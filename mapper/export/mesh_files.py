@@ -1,0 +1,101 @@
+"""Coloured triangle meshes as PLY, Wavefront OBJ and binary glTF 2.0 (Khronos 2021), by the file's ending."""
+
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.atomic import write_bytes, write_text
+from mapper.cloud import Colors
+from mapper.export.ply import write_ply
+from mapper.frames import Points32
+
+Triangles = NDArray[np.int32]
+Write = Callable[[Path, Points32, Colors, Triangles], None]
+
+_FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125  # OpenGL's names of the types
+_VERTICES, _INDICES = 34962, 34963  # and of what a buffer is for
+
+# glTF's y is up; ours is z.
+_R_GLTF_WORLD = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float32)
+
+
+def write_mesh(path: Path, points: Points32, colors: Colors, triangles: Triangles) -> None:
+    """Write a mesh in the format that the path's ending names, atomically.
+
+    Args:
+        path: File that ends like a key of ``MESH_WRITERS``.
+        points: (V, 3) float32 metres, z up.
+        colors: (V, 3) uint8 RGB.
+        triangles: (T, 3) int32 indices of points, counterclockwise seen from outside.
+    """
+    MESH_WRITERS[path.suffix.lower()](path, points, colors, triangles)
+
+
+def _write_ply(path: Path, points: Points32, colors: Colors, triangles: Triangles) -> None:
+    write_ply(path, points, colors, triangles=triangles)
+
+
+def _write_obj(path: Path, points: Points32, colors: Colors, triangles: Triangles) -> None:
+    """Write the colours behind the coordinates, as MeshLab, Blender and Open3D read them."""
+    rows = np.column_stack([points, colors / 255.0]).tolist()
+    lines = ["# units: metres, z up"]
+    lines += [f"v {x:.9g} {y:.9g} {z:.9g} {r:.4f} {g:.4f} {b:.4f}" for x, y, z, r, g, b in rows]
+    lines += [f"f {a} {b} {c}" for a, b, c in (triangles + 1).tolist()]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def _write_glb(path: Path, points: Points32, colors: Colors, triangles: Triangles) -> None:
+    """Write one self-contained file, to be drawn as photographed: without a lamp of the viewer's own."""
+    positions = np.ascontiguousarray(points @ _R_GLTF_WORLD.T, "<f4")
+    rgba = np.full((len(points), 4), 0xFFFF, "<u2")  # rows of four, for glTF wants them aligned
+    rgba[:, :3] = _linear_light()[colors]
+    parts = [positions.tobytes(), rgba.tobytes(), triangles.astype("<u4").tobytes()]
+    starts = np.cumsum([0, *map(len, parts)]).tolist()
+    bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+    content = {
+        "asset": {"version": "2.0", "generator": "mapper"},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [
+            {"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "material": 0}]}
+        ],
+        "materials": [{"doubleSided": True, "extensions": {"KHR_materials_unlit": {}}}],
+        "accessors": [
+            {"bufferView": 0, "componentType": _FLOAT, "count": len(points), "type": "VEC3", **bounds},
+            {
+                "bufferView": 1,
+                "componentType": _UINT16,
+                "normalized": True,
+                "count": len(points),
+                "type": "VEC4",
+            },
+            {"bufferView": 2, "componentType": _UINT32, "count": triangles.size, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": start, "byteLength": len(part), "target": target}
+            for start, part, target in zip(starts, parts, (_VERTICES, _VERTICES, _INDICES), strict=False)
+        ],
+        "buffers": [{"byteLength": starts[-1]}],
+    }
+    text = json.dumps(content, separators=(",", ":")).encode("ascii")
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", starts[-1], b"BIN\0") + b"".join(parts)
+    write_bytes(path, struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+def _linear_light() -> NDArray[np.uint16]:
+    """Return (256,) uint16: the light behind every byte of an image (IEC 61966-2-1), which glTF stores."""
+    level = np.arange(256) / 255.0
+    light = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
+    rounded: NDArray[np.uint16] = np.rint(light * 0xFFFF).astype(np.uint16)
+    return rounded
+
+
+MESH_WRITERS: dict[str, Write] = {".ply": _write_ply, ".obj": _write_obj, ".glb": _write_glb}

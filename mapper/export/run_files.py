@@ -1,0 +1,58 @@
+"""What a run already holds, under another name or in another text form."""
+
+import shutil
+from pathlib import Path
+
+from mapper import run as files
+from mapper.atomic import replacing
+from mapper.errors import RunError
+from mapper.export.grid import read_grid, write_grid
+from mapper.progress import Progress
+from mapper.run import Run
+from mapper.trajectory import write_kitti
+
+
+def octomap(run: Run, path: Path, _progress: Progress) -> None:
+    """Copy the octree: free or occupied as ``.bt``, log-odds as ``.ot``."""
+    _copy(run, files.OCTREE_OT if path.suffix.lower() == ".ot" else files.OCTREE_BT, path)
+
+
+def cloud(run: Run, path: Path, _progress: Progress) -> None:
+    """Copy the coloured cloud, binary PLY."""
+    _copy(run, files.CLOUD, path)
+
+
+def tum(run: Run, path: Path, _progress: Progress) -> None:
+    """Copy the trajectory with exact stamps."""
+    _copy(run, files.TRAJECTORY, path)
+
+
+def g2o(run: Run, path: Path, _progress: Progress) -> None:
+    """Copy the pose graph with its nodes at the solution."""
+    _copy(run, files.GRAPH, path)
+
+
+def kitti(run: Run, path: Path, _progress: Progress) -> None:
+    """Write the trajectory without its stamps, for which KITTI text has no place."""
+    write_kitti(path, run.trajectory())
+
+
+def grid(run: Run, path: Path, _progress: Progress) -> None:
+    """Write the slice's YAML with PGM and PNG beside it; the YAML names the PGM, so this is no copy."""
+    source = run.path / f"{files.SLICE}.yaml"
+    if not _is_same(source, path):
+        slice_world = read_grid(source)
+        write_grid(path.parent, path.stem, slice_world)
+
+
+def _copy(run: Run, name: str, path: Path) -> None:
+    source = run.path / name
+    if not source.is_file():
+        raise RunError(f"{source}: is missing from the run; build it again")
+    if not _is_same(source, path):
+        with replacing(path) as part:
+            shutil.copyfile(source, part)
+
+
+def _is_same(source: Path, path: Path) -> bool:
+    return path.exists() and source.exists() and source.samefile(path)
