@@ -8,12 +8,12 @@ import numpy as np
 
 from mapper import run as files
 from mapper.config import BuildConfig
-from mapper.errors import ConfigError, FrameError, RunError
+from mapper.errors import ConfigError, FrameError
+from mapper.export.exporters import EXPORTERS
 from mapper.export.grid import write_grid
 from mapper.export.mcap_log import McapLog
 from mapper.export.picture import write_cloud_views, write_summary
 from mapper.export.ply import write_ply
-from mapper.fingerprint import fingerprint
 from mapper.fusion import Maps, fuse_log
 from mapper.geometry import Transform, fit_rigid
 from mapper.graph.g2o import write_g2o
@@ -25,16 +25,30 @@ from mapper.measure import peak_memory_mb
 from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.progress import SILENT, Progress
 from mapper.records import records_of, write_frame_ms, write_records
-from mapper.run import Draft, Run, drafting, first_manifest, load_run
+from mapper.run import Draft, Run, drafting, first_manifest, load_run, moved_log, refuse_another_log
 from mapper.run_log import Story, log_maps, log_snapshot, log_story
 from mapper.sources.base import FrameSource
 from mapper.timebase import NS_PER_S, nearest
 from mapper.tracking import Tracking, refuse_a_fragment, track_log
 from mapper.trajectory import Trajectory, trajectory_from, write_tum
 
-_FUSE_CONFIGS = frozenset({"octree", "slice", "cloud", "mcap", "workers"})
+_FUSE_CONFIGS = frozenset({"octree", "slice", "cloud", "mcap", "mesh", "workers"})
 _TRACKING_STAGES = ("track", "solve", "level")
-_KEPT_BY_FUSE = (files.TRAJECTORY, files.KEYFRAMES, files.TRUTH, files.GRAPH, files.FRAMES, files.FRAME_MS)
+_REMADE_BY_FUSE = frozenset(
+    {
+        files.CONFIG,
+        files.MANIFEST,
+        files.OCTREE_BT,
+        files.OCTREE_OT,
+        files.CLOUD,
+        files.CLOUD_VIEWS,
+        files.MCAP,
+        files.SUMMARY,
+    }
+)
+_OUTDATED_BY_FUSE = frozenset(
+    {EXPORTERS["voxels"].file_name, EXPORTERS["voxel-mesh"].file_name, files.PLAN, files.PLAN_VIEW}
+)
 _MAX_TRUTH_GAP_NS = 20_000_000
 
 
@@ -85,7 +99,7 @@ def build(
 def fuse(source: FrameSource, run: Run, config: BuildConfig, *, progress: Progress = SILENT) -> Run:
     """Make a run's maps again from its trajectory, with another octree, slice, cloud or MCAP configuration.
 
-    The run stays as it is until the new maps are whole.
+    The run stays as it is until the new maps are whole, and files that are not ours stay in it.
 
     Args:
         source: The log that the run was built from.
@@ -100,18 +114,26 @@ def fuse(source: FrameSource, run: Run, config: BuildConfig, *, progress: Progre
     for name in sorted(set(BuildConfig.model_fields) - _FUSE_CONFIGS):
         if getattr(config, name) != getattr(run.config, name):
             raise ConfigError(f"{name}: fuse keeps what was tracked and cannot change it; run mapper build")
-    if fingerprint(source.path) != run.manifest.input.fingerprint:
-        raise RunError(f"{source.path}: changed since {run.path} was built from it; build it again")
+    refuse_another_log(run, source.path)
     status: Status = "building"
-    manifest = run.manifest.model_copy(update={"status": status})
+    manifest = moved_log(run, source.path).manifest.model_copy(update={"status": status})
     with drafting(run.path, manifest, config, overwrite=True) as draft:
         for stage in _TRACKING_STAGES:
             draft.clock.seconds[stage] = manifest.timing.stage_s[stage]
-        for name in _KEPT_BY_FUSE:
-            if (run.path / name).exists():
-                shutil.copy2(run.path / name, draft.folder / name)
+        _keep_the_rest(run.path, draft.folder)
         _fuse_into(draft, source, config, progress)
     return load_run(run.path)
+
+
+def _keep_the_rest(folder: Path, new: Path) -> None:
+    """Copy what was tracked, and whatever a user has put there; what was made from the old maps goes."""
+    for child in folder.iterdir():
+        if child.name in _REMADE_BY_FUSE | _OUTDATED_BY_FUSE:
+            continue
+        if child.is_dir() and not child.is_symlink():
+            shutil.copytree(child, new / child.name, symlinks=True)
+        else:
+            shutil.copy2(child, new / child.name, follow_symlinks=False)
 
 
 def _save_tracking(

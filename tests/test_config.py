@@ -89,6 +89,19 @@ def test_a_run_s_own_json_gives_the_same_configuration(tmp_path):
     assert load_config(path) == config
 
 
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("octree.resolution_m=inf", "octree.resolution_m: Input should be a finite number"),
+        ("slice.min_height_m=nan", "slice.min_height_m: Input should be a finite number"),
+        ("slice.min_height_m=1.2", "slice: .*max_height_m 1.2 must be above min_height_m 1.2"),
+    ],
+)
+def test_values_that_would_fail_late_are_refused_early(override, message):
+    with pytest.raises(ConfigError, match=message):
+        load_config(None, [override])
+
+
 def test_any_configuration_can_be_overridden():
     config = overridden(SynthConfig(), ["sensor.axial_noise_ratio=0", "seed=5"])
 

@@ -147,6 +147,22 @@ def test_fusing_again_changes_the_maps_alone(run, desk_log, tmp_path):
     assert after.total_s == pytest.approx(sum(after.stage_s.values()))
 
 
+def test_fusing_spares_a_user_s_files_and_learns_where_the_log_is(run, desk_log, tmp_path):
+    own = load_run(shutil.copytree(run.path, tmp_path / "own"))
+    (own.path / "notes").mkdir()
+    (own.path / "notes" / "monday.txt").write_text("the door was open")
+    (own.path / "mesh.ply").write_bytes(b"of the same trajectory")
+    (own.path / "voxels.ply").write_bytes(b"of the old map")
+    moved = shutil.copytree(desk_log, tmp_path / "moved")
+
+    fused = fuse(open_source(moved), own, overridden(own.config, ["octree.resolution_m=0.2"]))
+
+    assert (own.path / "notes" / "monday.txt").read_text() == "the door was open"
+    assert (own.path / "mesh.ply").exists()
+    assert not (own.path / "voxels.ply").exists()
+    assert fused.manifest.input == run.manifest.input.model_copy(update={"path": str(moved)})
+
+
 def test_fusing_refuses_what_it_cannot_change(run, desk_log):
     before = files_of(run.path)
     with pytest.raises(ConfigError, match="odometry: fuse keeps what was tracked"):

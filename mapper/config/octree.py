@@ -1,8 +1,8 @@
 """The occupancy octree, levelling and the slice."""
 
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from mapper.config.base import Config
 
@@ -42,3 +42,12 @@ class SliceConfig(Config):
     """Upper edge of the band above the floor: the robot's height."""
     min_cluster_cells: PositiveInt = 1
     """Smaller 8-connected groups of occupied cells are taken for noise; 1 keeps all."""
+
+    @model_validator(mode="after")
+    def _refuse_an_empty_band(self) -> Self:
+        """Refuse before a log is fused what could not be cut after it."""
+        if self.max_height_m <= self.min_height_m:
+            raise ValueError(
+                f"max_height_m {self.max_height_m} must be above min_height_m {self.min_height_m}"
+            )
+        return self
