@@ -235,11 +235,11 @@ def _axis(direction, origin, key, bits, resolution_m):
 
 
 @njit(cache=True, nogil=True)
-def merge(window, positions, slots, values, sensor):
-    """Add what a scan saw to the map and leave the window's cells UNTOUCHED.
+def merge(cells, positions, slots, values, sensor):
+    """Add what a scan saw to the map and leave its cells UNTOUCHED.
 
     Args:
-        window: Where the scan has been rasterised.
+        cells: (C,) uint8 of the window where the scan has been rasterised.
         positions: (B,) int64 its touched blocks.
         slots: (B,) int32 the same blocks' rows in ``values``.
         values: (capacity, 512) float32 log-odds; NaN is unknown.
@@ -252,7 +252,7 @@ def merge(window, positions, slots, values, sensor):
     born = 0
     for i in range(len(positions)):
         start = positions[i] * BLOCK_VOXELS
-        seen_block = window.cells[start : start + BLOCK_VOXELS]
+        seen_block = cells[start : start + BLOCK_VOXELS]
         block = values[slots[i]]
         block_born = int32(0)
         for j in range(BLOCK_VOXELS):  # this loop vectorises: selections only, no branch

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from mapper.config.octree import OctreeConfig
 from mapper.errors import DataError, MapSizeError
 from mapper.frames import Points32, Scan
-from mapper.geometry import Array, Points, Transform, apply
+from mapper.geometry import Array, Points, Transform
 from mapper.octree import kernels, queries
 from mapper.octree.blocks import BlockStore
-from mapper.octree.keys import KEY_COUNT, KEY_ZERO
+from mapper.octree.casting import Cast, Caster, origin_key
+from mapper.octree.keys import KEY_ZERO
 from mapper.octree.tree_reader import TreeLeaves, fill
-from mapper.octree.window import WindowBuffer, block_codes, take_touched
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +61,7 @@ class OctreeMap:
     def __init__(self, config: OctreeConfig) -> None:
         self.config = config
         self.blocks = BlockStore()
-        self._window = WindowBuffer()
+        self._caster = Caster(config)
         self._known = 0
 
     @property
@@ -81,7 +81,7 @@ class OctreeMap:
     @property
     def working_bytes(self) -> int:
         """Bytes of address space of the scan window; only what rays have crossed is backed by memory."""
-        return self._window.memory_bytes
+        return self._caster.memory_bytes
 
     def insert(self, scan: Scan, T_world_body: Transform) -> None:
         """Fuse one scan: a miss along every ray, a hit at its end; each voxel changes once, and a hit wins.
@@ -90,12 +90,7 @@ class OctreeMap:
             DataError: A point or the origin has no key.
             MapSizeError: The scan or the map would be too large; the map has not changed then.
         """
-        origin_world = apply(T_world_body, scan.origin_body[np.newaxis])[0]
-        points_body = np.ascontiguousarray(scan.points_body)
-        if self.config.discretize:
-            self._insert_discretized(points_body, T_world_body, origin_world)
-        else:
-            self._insert_rays(kernels.to_world(points_body, np.ascontiguousarray(T_world_body)), origin_world)
+        self._merge(self._caster.cast(scan, T_world_body))
 
     def insert_points(self, points_world: Points32, origin_world: Array) -> None:
         """Fuse world points as OctoMap's ``insertPointCloud`` does.
@@ -108,39 +103,17 @@ class OctreeMap:
             DataError: The points are not (N, 3), or one of them or the origin has no key.
             MapSizeError: The scan or the map would be too large; the map has not changed then.
         """
-        if points_world.ndim != 2 or points_world.shape[1] != 3:
-            raise DataError(f"octree: points {points_world.shape}, want (N, 3)")
-        points_world = np.ascontiguousarray(points_world, dtype=np.float32)
-        if self.config.discretize:
-            self._insert_discretized(points_world, np.eye(4), origin_world)
-        else:
-            self._insert_rays(points_world, origin_world)
+        self._merge(self._caster.cast_points(points_world, origin_world))
 
-    def _insert_discretized(
-        self, points_body: Points32, T_world_body: Transform, origin_world: Array
-    ) -> None:
-        centres_world, outside = kernels.end_voxels(
-            points_body, np.ascontiguousarray(T_world_body), self.resolution_m
-        )
-        self._refuse(outside, len(points_body))
-        self._insert_rays(centres_world, origin_world)
-
-    def _insert_rays(self, ends_world: Points32, origin_world: Array) -> None:
-        origin = np.asarray(origin_world, dtype=np.float32)
-        origin_key = self._origin_key(origin)
-        stops, hits, lowest, highest, outside = kernels.clip_rays(
-            ends_world, origin, self.resolution_m, self.config.max_range_m
-        )
-        self._refuse(outside, len(ends_world))
-        window = self._window.place(lowest, highest, origin=origin_key)
-        kernels.cast_rays(stops, hits, origin, self.resolution_m, window)
-        positions = take_touched(window)
+    def _merge(self, cast: Cast) -> None:
         try:
-            slots = self.blocks.claim(block_codes(window, positions, lowest))
+            slots = self.blocks.claim(cast.codes)
         except MapSizeError:
-            self._window = WindowBuffer()  # the old one still holds this scan
+            self._caster.forget()
             raise
-        self._known += kernels.merge(window, positions, slots, self.blocks.table.values, self._sensor())
+        self._known += kernels.merge(
+            cast.window.cells, cast.positions, slots, self.blocks.table.values, self._sensor()
+        )
 
     def _sensor(self) -> kernels.Sensor:
         config = self.config
@@ -155,26 +128,6 @@ class OctreeMap:
     def occupied_log_odds(self) -> np.float32:
         """Log-odds from which a voxel counts as occupied."""
         return log_odds(self.config.occupied_probability)
-
-    @property
-    def _reach_m(self) -> float:
-        return KEY_ZERO * self.resolution_m
-
-    def _origin_key(self, origin: NDArray[np.float32]) -> NDArray[np.int64]:
-        keys = np.floor((1.0 / self.resolution_m) * origin.astype(np.float64)) + KEY_ZERO
-        if not ((keys >= 0) & (keys < KEY_COUNT)).all():
-            raise DataError(
-                f"octree: sensor origin {origin.tolist()} is not within ±{self._reach_m:g} m, the reach of "
-                f"{self.resolution_m:g} m voxels; raise resolution_m or shift the map"
-            )
-        return keys.astype(np.int64)
-
-    def _refuse(self, outside: int, total: int) -> None:
-        if outside:
-            raise DataError(
-                f"octree: {outside} of {total} points are not finite or not within ±{self._reach_m:g} m, the "
-                f"reach of {self.resolution_m:g} m voxels; drop them or raise resolution_m"
-            )
 
     def query(self, points_world: Points) -> NDArray[np.float32]:
         """Return the (N,) log-odds of (N, 3) points in metres; NaN where nothing is known or can be."""
@@ -203,7 +156,7 @@ class OctreeMap:
         if not np.isfinite(directions).all() or not directions.any(axis=1).all():
             raise DataError("octree: every ray needs a finite direction other than zero")
         for corner in (origins.min(axis=0, initial=0.0), origins.max(axis=0, initial=0.0)):
-            self._origin_key(corner)
+            origin_key(corner, self.resolution_m)
         keys, outcomes = queries.first_obstacles(
             self.blocks.table,
             origins,

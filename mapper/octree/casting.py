@@ -1,0 +1,118 @@
+"""From one scan at its pose to the voxels that its rays saw, before any map is touched."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.config.octree import OctreeConfig
+from mapper.errors import DataError
+from mapper.frames import Points32, Scan
+from mapper.geometry import Array, Transform, apply
+from mapper.octree import kernels
+from mapper.octree.keys import KEY_COUNT, KEY_ZERO
+from mapper.octree.window import Window, WindowBuffer, block_codes, take_touched
+
+
+class Cast(NamedTuple):
+    """A scan rasterised into a window; whoever reads the cells leaves them UNTOUCHED.
+
+    Attributes:
+        window: Where it lies.
+        positions: (B,) int64 the window's touched blocks.
+        codes: (B,) int64 the same blocks' Morton codes.
+    """
+
+    window: Window
+    positions: NDArray[np.int64]
+    codes: NDArray[np.int64]
+
+
+class Caster:
+    """Casts scans, one at a time, into working memory that is kept from scan to scan."""
+
+    def __init__(self, config: OctreeConfig) -> None:
+        self.config = config
+        self._buffer = WindowBuffer()
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of address space held."""
+        return self._buffer.memory_bytes
+
+    def forget(self) -> None:
+        """Drop the working memory, with a cast in it that nobody will read."""
+        self._buffer = WindowBuffer()
+
+    def cast(self, scan: Scan, T_world_body: Transform) -> Cast:
+        """Return what a scan saw: free along every ray, occupied at its end, and occupied wins.
+
+        Raises:
+            DataError: A point or the origin has no key.
+            MapSizeError: The scan is too large for its resolution.
+        """
+        origin_world = apply(T_world_body, scan.origin_body[np.newaxis])[0]
+        points_body, T = np.ascontiguousarray(scan.points_body), np.ascontiguousarray(T_world_body)
+        if self.config.discretize:
+            return self._discretized(points_body, T, origin_world)
+        return self._rays(kernels.to_world(points_body, T), origin_world)
+
+    def cast_points(self, points_world: Points32, origin_world: Array) -> Cast:
+        """Return what (N, 3) world points saw from (3,) their origin, metres.
+
+        Raises:
+            DataError: The points are not (N, 3), or one of them or the origin has no key.
+            MapSizeError: The scan is too large for its resolution.
+        """
+        if points_world.ndim != 2 or points_world.shape[1] != 3:
+            raise DataError(f"octree: points {points_world.shape}, want (N, 3)")
+        points_world = np.ascontiguousarray(points_world, dtype=np.float32)
+        if self.config.discretize:
+            return self._discretized(points_world, np.eye(4), origin_world)
+        return self._rays(points_world, origin_world)
+
+    def _discretized(self, points_body: Points32, T_world_body: Transform, origin_world: Array) -> Cast:
+        centres_world, outside = kernels.end_voxels(points_body, T_world_body, self.config.resolution_m)
+        self._refuse(outside, len(points_body))
+        return self._rays(centres_world, origin_world)
+
+    def _rays(self, ends_world: Points32, origin_world: Array) -> Cast:
+        resolution_m = self.config.resolution_m
+        origin = np.asarray(origin_world, dtype=np.float32)
+        base = origin_key(origin, resolution_m)
+        stops, hits, lowest, highest, outside = kernels.clip_rays(
+            ends_world, origin, resolution_m, self.config.max_range_m
+        )
+        self._refuse(outside, len(ends_world))
+        window = self._buffer.place(lowest, highest, origin=base)
+        kernels.cast_rays(stops, hits, origin, resolution_m, window)
+        positions = take_touched(window)
+        return Cast(window, positions, block_codes(window, positions, lowest))
+
+    def _refuse(self, outside: int, total: int) -> None:
+        if outside:
+            resolution_m = self.config.resolution_m
+            raise DataError(
+                f"octree: {outside} of {total} points are not finite or not within "
+                f"±{_reach_m(resolution_m):g} m, the reach of {resolution_m:g} m voxels; "
+                "drop them or raise resolution_m"
+            )
+
+
+def origin_key(origin: NDArray[np.float32], resolution_m: float) -> NDArray[np.int64]:
+    """Return the (3,) key of where rays begin, (3,) metres.
+
+    Raises:
+        DataError: It has none.
+    """
+    keys = np.floor((1.0 / resolution_m) * origin.astype(np.float64)) + KEY_ZERO
+    if not ((keys >= 0) & (keys < KEY_COUNT)).all():
+        raise DataError(
+            f"octree: sensor origin {origin.tolist()} is not within ±{_reach_m(resolution_m):g} m, "
+            f"the reach of {resolution_m:g} m voxels; raise resolution_m or shift the map"
+        )
+    return keys.astype(np.int64)
+
+
+def _reach_m(resolution_m: float) -> float:
+    return KEY_ZERO * resolution_m
