@@ -13,6 +13,7 @@ from mapper.octree import kernels, queries
 from mapper.octree.blocks import BlockStore
 from mapper.octree.casting import Cast, Caster, origin_key
 from mapper.octree.keys import KEY_ZERO
+from mapper.octree.sight import Sight
 from mapper.octree.tree_reader import TreeLeaves, fill
 
 
@@ -105,15 +106,25 @@ class OctreeMap:
         """
         self._merge(self._caster.cast_points(points_world, origin_world))
 
+    def merge(self, sight: Sight) -> None:
+        """Fuse what a frame saw: the same as inserting its scan, to the last bit.
+
+        Raises:
+            MapSizeError: The map would be too large; it has not changed then.
+        """
+        slots = self.blocks.claim(sight.codes)
+        self._add(sight.cells(), np.arange(len(sight)), slots)
+
     def _merge(self, cast: Cast) -> None:
         try:
             slots = self.blocks.claim(cast.codes)
         except MapSizeError:
             self._caster.forget()
             raise
-        self._known += kernels.merge(
-            cast.window.cells, cast.positions, slots, self.blocks.table.values, self._sensor()
-        )
+        self._add(cast.window.cells, cast.positions, slots)
+
+    def _add(self, cells: NDArray[np.uint8], positions: NDArray[np.int64], slots: NDArray[np.int64]) -> None:
+        self._known += kernels.merge(cells, positions, slots, self.blocks.table.values, self._sensor())
 
     def _sensor(self) -> kernels.Sensor:
         config = self.config
