@@ -14,6 +14,7 @@ from cli.environment import prepare_environment
 from cli.evaluate import evaluate
 from cli.export import export
 from cli.fuse import fuse
+from cli.plan import WithPoints, plan
 from cli.show_config import show_config
 from cli.synth import synth
 from mapper import __version__
@@ -59,6 +60,7 @@ app.command("build")(build)
 app.command("fuse")(fuse)
 app.command("eval")(evaluate)
 app.command("export")(export)
+app.command("plan", cls=WithPoints)(plan)
 app.command("convert")(convert)
 app.command("synth")(synth)
 app.command("demo")(demo)

@@ -11,6 +11,7 @@ from mapper.errors import FrameError
 from mapper.export.jpeg import encode_jpeg, shrunk_camera
 from mapper.frames import Frame, PinholeCamera, Points32, RgbdFrame, Scan
 from mapper.geometry import Transform
+from mapper.navigation.traversable import traversable
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import OccupancyGrid, cut_slice
 from mapper.parallel import ordered_map
@@ -47,12 +48,14 @@ class Maps:
         cloud_points_world: (N, 3) float32 metres, levelled world.
         cloud_colors: (N, 3) uint8 RGB.
         grid: The slice through the octree above the floor.
+        traversable: The floor that a robot can drive on.
     """
 
     octree: OctreeMap
     cloud_points_world: Points32
     cloud_colors: Colors
     grid: OccupancyGrid
+    traversable: OccupancyGrid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +112,8 @@ def fuse_log(
                 _add_to_cloud(cloud, fused.scan, fused.job.T_world_body)
             if fused.snapshot is not None:
                 on_snapshot(fused.snapshot)
-    return Maps(octree, *cloud.points_and_colors(), cut_slice(octree, config.slice))
+    grid, floor = cut_slice(octree, config.slice), traversable(octree, config.traversable)
+    return Maps(octree, *cloud.points_and_colors(), grid, floor)
 
 
 def _jobs(source: FrameSource, trajectory: Trajectory, config: BuildConfig) -> Iterator[_Job]:

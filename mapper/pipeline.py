@@ -32,7 +32,7 @@ from mapper.timebase import NS_PER_S, nearest
 from mapper.tracking import Tracking, refuse_a_fragment, track_log
 from mapper.trajectory import Trajectory, trajectory_from, write_tum
 
-_FUSE_CONFIGS = frozenset({"octree", "slice", "cloud", "mcap", "mesh", "workers"})
+_FUSE_CONFIGS = frozenset({"octree", "slice", "traversable", "cloud", "mcap", "mesh", "workers"})
 _TRACKING_STAGES = ("track", "solve", "level")
 _REMADE_BY_FUSE = frozenset(
     {
@@ -211,6 +211,7 @@ def _write_maps(folder: Path, maps: Maps) -> None:
     write_ot(folder / files.OCTREE_OT, maps.octree)
     write_ply(folder / files.CLOUD, maps.cloud_points_world, maps.cloud_colors)
     write_grid(folder, files.SLICE, maps.grid)
+    write_grid(folder, files.TRAVERSABLE, maps.traversable)
 
 
 def _write_pictures(draft: Draft, maps: Maps, trajectory: Trajectory, truth: Trajectory | None) -> None:

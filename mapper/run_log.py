@@ -57,12 +57,13 @@ def log_snapshot(log: McapLog, snapshot: Snapshot) -> None:
 
 
 def log_maps(log: McapLog, maps: Maps, *, stamp_ns: int) -> None:
-    """Log the occupied voxels by height, the coloured cloud and the slice."""
+    """Log the occupied voxels by height, the coloured cloud, the slice and the traversable floor."""
     leaves = maps.octree.leaves()
     occupied_world = leaves.centres_world[leaves.log_odds >= maps.octree.occupied_log_odds]
     log.cloud(stamp_ns, occupied_world, colors=height_colors(occupied_world[:, 2]), name="octree")
     log.cloud(stamp_ns, maps.cloud_points_world, colors=maps.cloud_colors, name="cloud")
     log.grid(stamp_ns, maps.grid)
+    log.grid(stamp_ns, maps.traversable, name="traversable")
 
 
 def _fields(record: FrameRecord, frame_ms: Mapping[int, float]) -> dict[str, int | float | str]:

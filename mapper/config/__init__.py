@@ -11,6 +11,7 @@ from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, Validati
 from mapper.config.base import Config
 from mapper.config.export import MeshConfig
 from mapper.config.graph import GraphConfig
+from mapper.config.navigation import TraversableConfig
 from mapper.config.octree import LevelConfig, OctreeConfig, SliceConfig
 from mapper.config.odometry import LocalMapConfig, OdometryConfig
 from mapper.config.sources import SourceConfig
@@ -50,6 +51,7 @@ class BuildConfig(Config):
     octree: OctreeConfig = OctreeConfig()
     level: LevelConfig = LevelConfig()
     slice: SliceConfig = SliceConfig()
+    traversable: TraversableConfig = TraversableConfig()
     cloud: CloudConfig = CloudConfig()
     mcap: McapConfig = McapConfig()
     mesh: MeshConfig = MeshConfig()

@@ -14,6 +14,9 @@ topic                  schema                        Foxglove            Rerun
 /graph/factors/dots    foxglove.PointCloud           points              Points3D
 /map/NAME              foxglove.PointCloud           points              Points3D
 /map/slice             nav_msgs/msg/OccupancyGrid    map                 GridMap
+/map/traversable       nav_msgs/msg/OccupancyGrid    map                 GridMap
+/plan                  foxglove.PosesInFrame         line                InstancePoses3D
+/plan/dots             foxglove.PointCloud           points              Points3D
 /diagnostics           mapper/msg/Diagnostics        plots, raw values   plots, raw values
 =====================  ============================  ==================  ===========================
 
@@ -28,7 +31,7 @@ The writer is the ``mcap`` package and not the one inside foxglove-sdk, which ke
 until the file is closed; foxglove-sdk encodes the messages.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -37,13 +40,16 @@ from typing import Any, Self
 import numpy as np
 from foxglove import messages
 from foxglove.messages import PackedElementFieldNumericType as NumericType
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from mapper.atomic import replacing
 from mapper.errors import DataError
 from mapper.export import ros2
-from mapper.export.palette import ESTIMATE, FACTORS, Rgb
+from mapper.export.palette import ESTIMATE, FACTORS, PLAN, Rgb
 from mapper.frames import PinholeCamera
 from mapper.geometry import Points, Transform
 from mapper.graph.model import BetweenFactor
@@ -53,6 +59,7 @@ from mapper.timebase import NS_PER_S
 from mapper.trajectory import Trajectory
 
 WORLD = "world"
+PLAN_TOPICS = ("/plan", "/plan/dots")
 
 _LIBRARY = "mapper"
 _LAST_SECOND = 2**31  # builtin_interfaces/Time counts seconds in an int32
@@ -197,10 +204,70 @@ class McapLog:
             )
         self._points(f"/map/{name}", stamp_ns, points_world, colors)
 
-    def grid(self, stamp_ns: int, grid: OccupancyGrid) -> None:
-        """Log the 2D slice on /map/slice, in the world's z = 0 plane."""
+    def plan(self, stamp_ns: int, waypoints_world: Points) -> None:
+        """Log a planned path through (N, 3) points on /plan, and as dots below that.
+
+        The poses are not turned: a path says where to be, not which way to look.
+        """
+        T_world_waypoint = np.tile(np.eye(4), (len(waypoints_world), 1, 1))
+        T_world_waypoint[:, :3, 3] = waypoints_world
+        topic, dots_topic = PLAN_TOPICS
+        self._publish(
+            topic,
+            messages.PosesInFrame(
+                timestamp=_timestamp(stamp_ns), frame_id=WORLD, poses=[_pose(T) for T in T_world_waypoint]
+            ),
+            stamp_ns,
+        )
+        points = dotted(waypoints_world[:-1], waypoints_world[1:])
+        self._points(dots_topic, stamp_ns, points, np.broadcast_to(np.array(PLAN, np.uint8), points.shape))
+
+    def copy(self, path: Path, *, without: Container[str]) -> None:
+        """Log every message of another log, in its order, but those on some topics.
+
+        Raises:
+            DataError: The file is no MCAP log, or is damaged.
+        """
+        channels: dict[int, int] = {}
+        try:
+            with path.open("rb") as file:
+                for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages(
+                    log_time_order=False
+                ):
+                    if channel.topic in without:
+                        continue
+                    if channel.id not in channels:
+                        channels[channel.id] = self._copy_channel(schema, channel)
+                    self._writer.add_message(
+                        channels[channel.id],
+                        log_time=message.log_time,
+                        data=message.data,
+                        publish_time=message.publish_time,
+                        sequence=message.sequence,
+                    )
+        except (OSError, McapError) as error:
+            raise DataError(
+                f"{path}: cannot be read as MCAP: {error}; make it again with mapper fuse"
+            ) from None
+
+    def _copy_channel(self, schema: Schema | None, channel: Channel) -> int:
+        schema_id = 0
+        if schema is not None:
+            if schema.name not in self._schemas:
+                self._schemas[schema.name] = self._writer.register_schema(
+                    schema.name, schema.encoding, schema.data
+                )
+            schema_id = self._schemas[schema.name]
+        return int(
+            self._writer.register_channel(
+                channel.topic, channel.message_encoding, schema_id, dict(channel.metadata)
+            )
+        )
+
+    def grid(self, stamp_ns: int, grid: OccupancyGrid, *, name: str = "slice") -> None:
+        """Log a 2D grid on /map/NAME, in the world's z = 0 plane."""
         _check_stamp(stamp_ns)
-        topic = "/map/slice"
+        topic = f"/map/{name}"
         if topic not in self._channels:
             self._register(
                 topic,

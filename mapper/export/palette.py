@@ -12,6 +12,7 @@ ESTIMATE: Rgb = (214, 69, 37)
 TRUTH: Rgb = (45, 108, 178)
 START: Rgb = (38, 145, 87)
 END: Rgb = (30, 33, 41)
+PLAN: Rgb = (124, 58, 196)
 FACTORS: dict[Origin, Rgb] = {
     "odometry": (140, 146, 158),
     "loop": (196, 40, 140),

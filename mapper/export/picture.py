@@ -1,4 +1,4 @@
-"""Pictures of a finished run: the trajectory over the slice, and the coloured cloud from two sides.
+"""Pictures of a finished run: the trajectory or a path over the slice, and the cloud from two sides.
 
 Matplotlib is driven through its objects: pyplot would keep global state and pick a GUI backend.
 """
@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.atomic import replacing
 from mapper.export.grid import grid_image
-from mapper.export.palette import END, ESTIMATE, START, TRUTH, UNKNOWN_CELL, Rgb
+from mapper.export.palette import END, ESTIMATE, PLAN, START, TRUTH, UNKNOWN_CELL, Rgb
 from mapper.frames import Points32
 from mapper.geometry import Array
 from mapper.octree.slice import FREE, OCCUPIED, OccupancyGrid
@@ -31,6 +32,8 @@ _HEADROOM_M = 0.3  # above the highest camera position; what lies higher would h
 _VIEW_PX = 900
 _TILT_RAD = np.deg2rad(32.0)
 _TURN_RAD = np.deg2rad(-35.0)
+_SWEPT_PX = 4  # pixels per cell
+_SWEPT_ALPHA = 70
 _BACKDROP: Rgb = (22, 24, 30)
 
 
@@ -53,26 +56,75 @@ def write_summary(
         title: Headline.
         lines: Figures worth knowing, shown below the headline.
     """
-    low, high = _extent(grid, [trajectory] if truth is None else [trajectory, truth])
-    figure, axes = _map_page(title, lines, aspect=float(np.divide(*(high - low)[::-1])))
-    x, y = grid.origin_world_m
-    height_m, width_m = (n * grid.resolution_m for n in grid.cells.shape)
-    axes.imshow(
-        grid_image(grid), origin="lower", interpolation="nearest", extent=(x, x + width_m, y, y + height_m)
-    )
     positions = trajectory.positions_world
+    reached = [positions] if truth is None else [positions, truth.positions_world]
+    low, high = _extent(grid, reached)
+    figure, axes = _map_page(title, lines, aspect=float(np.divide(*(high - low)[::-1])))
+    _draw_over(axes, grid_image(grid), grid)
     if truth is not None:
         reference = truth.positions_world
         axes.plot(*reference[:, :2].T, color=_hex(TRUTH), linewidth=2.6, alpha=0.65, label="truth")
     axes.plot(*positions[:, :2].T, color=_hex(ESTIMATE), linewidth=1.3, label="estimate")
     _mark(axes, positions[0], color=START, marker="o", label="start")
     _mark(axes, positions[-1], color=END, marker="s", label="end")
+    _finish_map(axes, low, high)
+    _save(figure, path)
+
+
+def write_path(
+    path: Path,
+    *,
+    grid: OccupancyGrid,
+    waypoints_world: Array,
+    radius_m: float,
+    title: str,
+    lines: Sequence[str] = (),
+) -> None:
+    """Draw a planned path over a grid, as wide as the robot that takes it.
+
+    Args:
+        path: PNG file to write.
+        grid: What the path lies over, world frame.
+        waypoints_world: (N, 2) or (N, 3) metres, seen from above.
+        radius_m: Of the robot.
+        title: Headline.
+        lines: Figures worth knowing, shown below the headline.
+    """
+    ends = waypoints_world[:, :2]
+    low, high = _extent(grid, [ends])
+    figure, axes = _map_page(title, lines, aspect=float(np.divide(*(high - low)[::-1])))
+    _draw_over(axes, grid_image(grid), grid)
+    _draw_over(axes, _swept(grid, ends, radius_m), grid)
+    axes.plot(*ends.T, color=_hex(PLAN), linewidth=1.6, label=f"path, {2 * radius_m:g} m wide")
+    axes.plot(*ends[1:-1].T, ".", color=_hex(PLAN), markersize=5)
+    _mark(axes, ends[0], color=START, marker="o", label="start")
+    _mark(axes, ends[-1], color=END, marker="s", label="goal")
+    _finish_map(axes, low, high)
+    _save(figure, path)
+
+
+def _swept(grid: OccupancyGrid, ends: Array, radius_m: float) -> NDArray[np.uint8]:
+    """Return an RGBA image over the grid that shows where a disc passes along a path."""
+    pixel_m = grid.resolution_m / _SWEPT_PX
+    mask = np.zeros([n * _SWEPT_PX for n in grid.cells.shape], np.uint8)
+    corners = np.rint((ends - grid.origin_world_m) / pixel_m - 0.5).astype(np.int32)
+    width_px = max(1, round(2.0 * radius_m / pixel_m))
+    cv2.polylines(mask, [corners], isClosed=False, color=_SWEPT_ALPHA, thickness=width_px)
+    return np.dstack([np.broadcast_to(np.array(PLAN, np.uint8), (*mask.shape, 3)), mask])
+
+
+def _draw_over(axes: "Axes", image: NDArray[np.uint8], grid: OccupancyGrid) -> None:
+    x, y = grid.origin_world_m
+    height_m, width_m = (n * grid.resolution_m for n in grid.cells.shape)
+    axes.imshow(image, origin="lower", interpolation="nearest", extent=(x, x + width_m, y, y + height_m))
+
+
+def _finish_map(axes: "Axes", low: Array, high: Array) -> None:
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal", adjustable="datalim")
     _scale_bar(axes, low, high, color=_INK)
     axes.legend(loc="best", fontsize=8, framealpha=0.92, edgecolor=_LINE)
-    _save(figure, path)
 
 
 def write_cloud_views(
@@ -160,11 +212,11 @@ def _view(turn_rad: float, tilt_rad: float) -> Array:
     return np.array([right, np.cross(towards, right), towards])
 
 
-def _extent(grid: OccupancyGrid, trajectories: Sequence[Trajectory]) -> tuple[Array, Array]:
+def _extent(grid: OccupancyGrid, paths_world: Sequence[Array]) -> tuple[Array, Array]:
     """Return the lower and upper corner, metres, around everything known."""
     rows, columns = np.nonzero((grid.cells == FREE) | (grid.cells == OCCUPIED))
     cells = grid.origin_world_m + (np.column_stack([columns, rows]) + 0.5) * grid.resolution_m
-    seen = np.concatenate([cells, *(t.positions_world[:, :2] for t in trajectories)])
+    seen = np.concatenate([cells, *(path[:, :2] for path in paths_world)])
     return seen.min(axis=0) - _MARGIN_M, seen.max(axis=0) + _MARGIN_M
 
 

@@ -113,6 +113,7 @@ def _planned(voxels: VoxelGrid, start_world: Array, goal_world: Array, config: P
         )
     path = np.vstack([space.place(start_world), found.cells + 0.5, space.place(goal_world)])
     waypoints_world = space.world(shortened(space.field, path, radius_m=space.least_m))
+    waypoints_world[[0, -1]] = start_world, goal_world  # to the last digit
     return Plan(
         waypoints_world[:, : space.dimensions],
         path_length(waypoints_world),
@@ -224,7 +225,7 @@ class _Space:
 
 def point_text(point_world: Array) -> str:
     """Return a point as messages and headlines name it."""
-    return f"({', '.join(f'{value:.2f}' for value in point_world)})"
+    return f"({', '.join(f'{value:.3f}' for value in point_world)})"
 
 
 def _space(voxels: VoxelGrid, config: PlanConfig) -> _Space:

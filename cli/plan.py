@@ -1,0 +1,112 @@
+"""``mapper plan``: a path for a robot through a finished map."""
+
+from enum import StrEnum
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperCommand
+
+from cli.options import Quiet, assignments
+
+if TYPE_CHECKING:
+    from mapper.geometry import Array
+
+_POINT_OPTIONS = ("--from", "--to")
+
+
+class Unknown(StrEnum):
+    """What unknown space counts as."""
+
+    BLOCKED = "blocked"
+    FREE = "free"
+
+
+class Layer(StrEnum):
+    """Which grid a path in 2D is planned on."""
+
+    SLICE = "slice"
+    TRAVERSABLE = "traversable"
+
+
+class WithPoints(TyperCommand):
+    """Lets ``--from`` and ``--to`` take two numbers or three, negative ones too."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Join the numbers that follow each point option to one word."""
+        joined: list[str] = []
+        takes_numbers = False
+        for word in args:
+            if takes_numbers and _is_number(word):
+                joined[-1] = f"{joined[-1]} {word}" if "=" in joined[-1] else f"{joined[-1]}={word}"
+            else:
+                joined.append(word)
+                takes_numbers = word in _POINT_OPTIONS
+        return list(super().parse_args(ctx, joined))
+
+
+def plan(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder that a build left.")],
+    from_: Annotated[str, typer.Option("--from", metavar="X Y [Z]", help="Where it starts, metres.")],
+    to: Annotated[str, typer.Option("--to", metavar="X Y [Z]", help="Where it goes, metres.")],
+    in_3d: Annotated[
+        bool, typer.Option("--3d", help="Plan for a ball in the octree; the points have a height then.")
+    ] = False,
+    radius: Annotated[float | None, typer.Option(help="Radius of the robot, metres.  [default: 0.2]")] = None,
+    unknown: Annotated[
+        Unknown | None, typer.Option(help="What unknown space counts as.  [default: blocked]")
+    ] = None,
+    layer: Annotated[Layer | None, typer.Option(help="Grid for a path in 2D.  [default: slice]")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Plan the shortest collision-free path, and draw it into the run: plan.json, plan.png, run.mcap.
+
+    Example: mapper plan runs/xyz --from 2.1 -0.3 --to 1.9 1.4 --radius 0.15
+    """
+    from mapper import run as files
+    from mapper.config import overridden
+    from mapper.config.navigation import PlanConfig
+    from mapper.export.grid import read_grid
+    from mapper.export.plan import write_plan
+    from mapper.navigation.planner import plan_2d, plan_3d
+    from mapper.octree.octomap_file import read_map
+    from mapper.run import load_run
+
+    start, goal = (
+        _point(text, name, in_3d=in_3d) for text, name in zip((from_, to), _POINT_OPTIONS, strict=True)
+    )
+    config = overridden(PlanConfig(), assignments({"radius_m": radius, "unknown": unknown, "layer": layer}))
+    built = load_run(run)
+    grid = read_grid(run / f"{config.layer}.yaml")
+    if in_3d:
+        found = plan_3d(read_map(run / files.OCTREE_OT), start, goal, config=config)
+    else:
+        found = plan_2d(grid, start, goal, config=config)
+    write_plan(built, found, grid=grid)
+    if not quiet:
+        print(found.summary)
+        for waypoint in found.waypoints_world:
+            print("  ".join(f"{value:7.3f}" for value in waypoint))
+        print(run / files.PLAN_VIEW)
+
+
+def _point(text: str, name: str, *, in_3d: bool) -> "Array":
+    import numpy as np
+
+    from mapper.errors import ConfigError
+
+    words = text.replace(",", " ").split()
+    wanted = 3 if in_3d else 2
+    if len(words) != wanted or not all(_is_number(word) and isfinite(float(word)) for word in words):
+        hint = "; a height needs --3d" if len(words) == 3 and not in_3d else ""
+        raise ConfigError(f"{name} {text}: want {'x y z' if in_3d else 'x y'} in metres{hint}")
+    return np.array([float(word) for word in words])
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

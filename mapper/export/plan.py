@@ -1,0 +1,65 @@
+"""A planned path in its run: as JSON, as a picture, and as channels of the run's MCAP log."""
+
+import json
+from math import isfinite
+
+import numpy as np
+
+from mapper import run as files
+from mapper.atomic import write_text
+from mapper.errors import RunError
+from mapper.export.mcap_log import PLAN_TOPICS, McapLog
+from mapper.export.picture import write_path
+from mapper.geometry import Points
+from mapper.navigation.planner import Plan, point_text
+from mapper.octree.slice import OccupancyGrid
+from mapper.run import Run
+
+
+def write_plan(run: Run, plan: Plan, *, grid: OccupancyGrid) -> None:
+    """Write ``plan.json`` and ``plan.png``, and put the path into ``run.mcap``; an earlier plan gives way.
+
+    Args:
+        run: A finished run.
+        plan: The path.
+        grid: What it is drawn over.
+
+    Raises:
+        RunError: The run has no MCAP log.
+        DataError: The log cannot be read; it stays as it is.
+    """
+    log_path = run.path / files.MCAP
+    if not log_path.is_file():
+        raise RunError(f"{log_path}: is missing from the run; make it again with mapper fuse {run.path}")
+    write_text(run.path / files.PLAN, plan_json(plan))
+    write_path(
+        run.path / files.PLAN_VIEW,
+        grid=grid,
+        waypoints_world=plan.waypoints_world,
+        radius_m=plan.config.radius_m,
+        title=f"{point_text(plan.waypoints_world[0])} to {point_text(plan.waypoints_world[-1])} m",
+        lines=[plan.summary],
+    )
+    with McapLog(log_path) as log:
+        log.copy(log_path, without=PLAN_TOPICS)
+        log.plan(int(run.trajectory().stamps_ns[0]), _in_space(plan))
+
+
+def plan_json(plan: Plan) -> str:
+    """Return what ``plan.json`` holds."""
+    record = {
+        "map": "octree" if plan.dimensions == 3 else plan.config.layer,
+        "radius_m": plan.config.radius_m,
+        "unknown": plan.config.unknown,
+        "length_m": plan.length_m,
+        "min_clearance_m": plan.min_clearance_m if isfinite(plan.min_clearance_m) else None,
+        "waypoints_world_m": plan.waypoints_world.tolist(),
+    }
+    return json.dumps(record, indent=1) + "\n"
+
+
+def _in_space(plan: Plan) -> Points:
+    """Return the waypoints as (N, 3); a path on a grid lies on the floor."""
+    if plan.dimensions == 3:
+        return plan.waypoints_world
+    return np.column_stack([plan.waypoints_world, np.zeros(len(plan.waypoints_world))])
