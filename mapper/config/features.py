@@ -18,7 +18,7 @@ class SurfConfig(Config):
 
     kind: Literal["surf"] = "surf"
     max_features: PositiveInt = 1000
-    threshold: PositiveFloat = 20.0
+    threshold: PositiveFloat = 100.0
     """Determinant of the Hessian, grey levels², to start from; halved while there are too few features."""
     min_threshold: PositiveFloat = 1.0
     min_features: PositiveInt = 300

@@ -17,9 +17,10 @@ class MatchConfig(Config):
 
     filter: Literal["homography", "none"] = "homography"
     """"homography": RANSAC with four pairs, as published; "none": every mutual match goes on to ISVD."""
-    max_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.8
+    max_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.9
     """Lowe's ratio between the best and the second-best descriptor distance."""
-    homography_tolerance_px: PositiveFloat = 3.0
+    homography_tolerance_px: PositiveFloat = 4.0
+    """ε of alg. 8; the thesis leaves it open, as it does the ratio."""
     homography_iterations: PositiveInt = 2000
 
 
@@ -54,7 +55,7 @@ class IsvdOdometryConfig(Config):
     kind: Literal["isvd"] = "isvd"
     detector: DetectorConfig = SurfConfig()
     match: MatchConfig = MatchConfig()
-    fallback: MatchConfig = MatchConfig(filter="none", max_ratio=0.9)
+    fallback: MatchConfig = MatchConfig(filter="none", max_ratio=0.95)
     """How pairs are sought once ``match`` has led to no motion."""
     registration: IsvdConfig = IsvdConfig()
     previous_frames: PositiveInt = 4
