@@ -14,6 +14,9 @@ def fuse(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder that a build left.")],
     set_: Overrides = None,
     log: MovedLog = None,
+    trajectory: Annotated[
+        Path | None, typer.Option(help="TUM file of better poses; only frames that moved are fused again.")
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Make a run's maps again, for instance finer or with another slice, without tracking again.
@@ -27,12 +30,19 @@ def fuse(
     from mapper.config import overridden
     from mapper.pipeline import fuse as fuse_run
     from mapper.run import load_run, moved_log, open_log
+    from mapper.trajectory import read_tum
 
     prepare_libraries()
     built = load_run(run)
     if log is not None:
         built = moved_log(built, log)
     config = overridden(built.config, set_ or ())
-    fused = fuse_run(open_log(built), built, config, progress=progress_for(quiet=quiet))
+    fused = fuse_run(
+        open_log(built),
+        built,
+        config,
+        trajectory=None if trajectory is None else read_tum(trajectory),
+        progress=progress_for(quiet=quiet),
+    )
     if not quiet:
         print(summary_text(fused, evaluate(fused.trajectory(), fused.truth())))

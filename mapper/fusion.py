@@ -1,5 +1,6 @@
 """The second pass over a log: every tracked frame fused at its final pose."""
 
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -7,12 +8,16 @@ import numpy as np
 
 from mapper.cloud import CloudBuilder, Colors
 from mapper.config import BuildConfig, McapConfig
+from mapper.config.octree import OctreeConfig
 from mapper.errors import FrameError
 from mapper.export.jpeg import encode_jpeg, shrunk_camera
 from mapper.frames import Frame, PinholeCamera, Points32, RgbdFrame, Scan
 from mapper.geometry import Transform
 from mapper.navigation.traversable import traversable
+from mapper.octree.casting import Caster
 from mapper.octree.map import OctreeMap
+from mapper.octree.sight import Sight, pack
+from mapper.octree.sight_file import Remembered, SightFile, SightWriter, remember
 from mapper.octree.slice import OccupancyGrid, cut_slice
 from mapper.parallel import ordered_map
 from mapper.progress import Progress
@@ -60,19 +65,22 @@ class Maps:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Job:
-    """A frame to fuse: where it was, and who wants to see it in colour."""
+    """A frame to fuse: where it was, what it saw from there before, and who wants to see it in colour."""
 
     entry: Entry
     T_world_body: Transform
+    known: Remembered | None
     feeds_cloud: bool
     feeds_log: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fused:
-    """A frame decoded and back-projected, or the reason why not."""
+    """What a frame saw, or the reason why nobody knows; its points only where somebody wants them."""
 
     job: _Job
+    sight: Sight | None = None
+    remembered: Remembered | None = None
     scan: Scan | None = None
     snapshot: Snapshot | None = None
     reason: str = ""
@@ -85,8 +93,12 @@ def fuse_log(
     *,
     progress: Progress,
     on_snapshot: Callable[[Snapshot], None],
+    before: SightFile | None,
+    after: SightWriter,
 ) -> Maps:
-    """Fuse every frame of the trajectory, in time order; decoding and back-projection run ahead in threads.
+    """Fuse every frame of the trajectory, in time order; decoding and casting run ahead in threads.
+
+    What a frame saw from where it still is, is merged without reading the frame again, to the same bits.
 
     Args:
         source: The log that was tracked.
@@ -94,51 +106,84 @@ def fuse_log(
         config: The octree, cloud, slice and mcap parts matter.
         progress: Who watches.
         on_snapshot: Gets every ``mcap.image_stride``-th frame's image.
+        before: What the frames saw when they were fused the last time.
+        after: Gets what they see now.
     """
     octree, cloud = OctreeMap(config.octree), CloudBuilder(config.cloud.voxel_m)
+    casters, moved = _Casters(config.octree), 0
 
     def prepare(job: _Job) -> _Fused:
-        return _prepared(job, config.mcap)
+        return _prepared(job, config, casters.caster)
 
-    prepared = ordered_map(prepare, _jobs(source, trajectory, config), workers=config.workers)
+    if before is not None and (config.octree.attributes or not before.holds_for(config.octree)):
+        before = None  # colours are in no sight
+    prepared = ordered_map(prepare, _jobs(source, trajectory, config, before), workers=config.workers)
     with progress.stage("fuse") as report:
         for done, fused in enumerate(prepared, start=1):
             report(done, len(trajectory))
-            if fused.scan is None:
+            if fused.sight is None or fused.remembered is None:
                 progress.note(f"not fused: {fused.reason}")
                 continue
-            octree.insert(fused.scan, fused.job.T_world_body)
-            if fused.job.feeds_cloud:
+            if fused.scan is not None and config.octree.attributes:
+                octree.insert(fused.scan, fused.job.T_world_body)
+            else:
+                octree.merge(fused.sight)
+            after.add(fused.remembered)
+            moved += fused.job.known is None
+            if fused.scan is not None and fused.job.feeds_cloud:
                 _add_to_cloud(cloud, fused.scan, fused.job.T_world_body)
             if fused.snapshot is not None:
                 on_snapshot(fused.snapshot)
+    if before is not None:
+        progress.note(f"fused again: {moved} of {len(trajectory)} frames, which had moved or were not known")
     grid, floor = cut_slice(octree, config.slice), traversable(octree, config.traversable)
     return Maps(octree, *cloud.points_and_colors(), grid, floor)
 
 
-def _jobs(source: FrameSource, trajectory: Trajectory, config: BuildConfig) -> Iterator[_Job]:
+class _Casters(threading.local):
+    """A caster for every thread that asks."""
+
+    def __init__(self, config: OctreeConfig) -> None:
+        self.caster = Caster(config)
+
+
+def _jobs(
+    source: FrameSource, trajectory: Trajectory, config: BuildConfig, before: SightFile | None
+) -> Iterator[_Job]:
     index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
     image_stride = config.mcap.image_stride
     for entry in source.entries():
         index = index_of.get(entry.stamp_ns)
         if index is not None:
+            T_world_body, known = trajectory.T_world_body[index], None
+            if before is not None:
+                known = before.recall(entry.stamp_ns, T_world_body, config=config.octree)
             yield _Job(
                 entry,
-                trajectory.T_world_body[index],
+                T_world_body,
+                known,
                 feeds_cloud=index % config.cloud.frame_stride == 0,
                 feeds_log=image_stride > 0 and index % image_stride == 0,
             )
 
 
-def _prepared(job: _Job, config: McapConfig) -> _Fused:
-    """Read one frame; its image costs most of the decoding, so only those who want it pay."""
+def _prepared(job: _Job, config: BuildConfig, caster: Caster) -> _Fused:
+    """Read and cast one frame as far as needed: its image costs most, and what is known nothing at all."""
+    scan, snapshot = None, None
     try:
-        if not (job.feeds_cloud or job.feeds_log):
-            return _Fused(job, job.entry.scan())
-        frame = job.entry.load()
+        if job.feeds_cloud or job.feeds_log or config.octree.attributes:
+            frame = job.entry.load()
+            scan = frame.scan()
+            snapshot = _snapshot(frame, config.mcap) if job.feeds_log else None
+        elif job.known is None:
+            scan = job.entry.scan()
     except FrameError as error:  # it was readable in the first pass, so the log changed under us
         return _Fused(job, reason=str(error))
-    return _Fused(job, frame.scan(), _snapshot(frame, config) if job.feeds_log else None)
+    if job.known is not None:
+        return _Fused(job, job.known.sight(), job.known, scan, snapshot)
+    assert scan is not None
+    sight = pack(caster.cast(scan, job.T_world_body))
+    return _Fused(job, sight, remember(job.entry.stamp_ns, job.T_world_body, sight), scan, snapshot)
 
 
 def _snapshot(frame: Frame, config: McapConfig) -> Snapshot | None:

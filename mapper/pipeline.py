@@ -2,13 +2,14 @@
 
 import shutil
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 
 from mapper import run as files
 from mapper.config import BuildConfig
-from mapper.errors import ConfigError, FrameError
+from mapper.errors import ConfigError, FrameError, RunError
 from mapper.export.exporters import EXPORTERS
 from mapper.export.grid import write_grid
 from mapper.export.mcap_log import McapLog
@@ -23,6 +24,7 @@ from mapper.levelling import Level, find_level
 from mapper.manifest import Counts, Levelling, SkippedFrame, Solve, Status, Timing
 from mapper.measure import peak_memory_mb
 from mapper.octree.octomap_file import write_bt, write_ot
+from mapper.octree.sight_file import SightWriter, open_sights
 from mapper.progress import SILENT, Progress
 from mapper.records import records_of, write_frame_ms, write_records
 from mapper.run import Draft, Run, drafting, first_manifest, load_run, moved_log, refuse_another_log
@@ -40,6 +42,7 @@ _REMADE_BY_FUSE = frozenset(
         files.MANIFEST,
         files.OCTREE_BT,
         files.OCTREE_OT,
+        files.SIGHTS,
         files.CLOUD,
         files.CLOUD_VIEWS,
         files.MCAP,
@@ -96,20 +99,30 @@ def build(
     return load_run(out)
 
 
-def fuse(source: FrameSource, run: Run, config: BuildConfig, *, progress: Progress = SILENT) -> Run:
-    """Make a run's maps again from its trajectory, with another octree, slice, cloud or MCAP configuration.
+def fuse(
+    source: FrameSource,
+    run: Run,
+    config: BuildConfig,
+    *,
+    trajectory: Trajectory | None = None,
+    progress: Progress = SILENT,
+) -> Run:
+    """Make a run's maps again, with another octree, slice, cloud or MCAP configuration or along other poses.
 
-    The run stays as it is until the new maps are whole, and files that are not ours stay in it.
+    What a frame saw is taken from the old run where pose and rays are the same; the maps are those of fusing
+    everything from scratch. The run stays as it is until the new maps are whole, and files that are not ours
+    stay in it.
 
     Args:
         source: The log that the run was built from.
         run: A finished run.
         config: The run's own configuration with the map's knobs turned.
+        trajectory: Body poses in the levelled world by which to replace the run's; None keeps those.
         progress: Who watches.
 
     Raises:
         ConfigError: The configuration differs in something that tracking has already settled.
-        RunError: The log is not the one that the run was built from.
+        RunError: The log is not the one that the run was built from, or the trajectory has no frame of it.
     """
     for name in sorted(set(BuildConfig.model_fields) - _FUSE_CONFIGS):
         if getattr(config, name) != getattr(run.config, name):
@@ -121,8 +134,22 @@ def fuse(source: FrameSource, run: Run, config: BuildConfig, *, progress: Progre
         for stage in _TRACKING_STAGES:
             draft.clock.seconds[stage] = manifest.timing.stage_s[stage]
         _keep_the_rest(run.path, draft.folder)
-        _fuse_into(draft, source, config, progress)
+        if trajectory is not None:
+            _move(draft.folder, run, trajectory)
+        _fuse_into(draft, source, config, progress, before=run.path / files.SIGHTS)
     return load_run(run.path)
+
+
+def _move(folder: Path, run: Run, trajectory: Trajectory) -> None:
+    """Replace a run's trajectory, and move the nodes of its graph along with it."""
+    T_world_body = dict(zip(trajectory.stamps_ns.tolist(), trajectory.T_world_body, strict=True))
+    if T_world_body.keys().isdisjoint(run.trajectory().stamps_ns.tolist()):
+        raise RunError(f"{run.path}: none of the trajectory's {len(trajectory)} stamps is one of the run's")
+    write_tum(folder / files.TRAJECTORY, trajectory)
+    graph = run.graph()
+    moved = {node: T_world_body.get(graph.stamps_ns[node], T) for node, T in graph.T_world_node.items()}
+    _write_graph(folder, PoseGraph(moved, graph.stamps_ns, graph.factors))
+    (folder / EXPORTERS["mesh"].file_name).unlink(missing_ok=True)
 
 
 def _keep_the_rest(folder: Path, new: Path) -> None:
@@ -147,9 +174,7 @@ def _save_tracking(
     if truth is not None:
         write_tum(draft.folder / files.TRUTH, truth)
     if T_world_node:
-        write_g2o(draft.folder / files.GRAPH, graph)
-        keyframes = trajectory_from((graph.stamps_ns[node], T) for node, T in T_world_node.items())
-        write_tum(draft.folder / files.KEYFRAMES, keyframes)
+        _write_graph(draft.folder, graph)
     draft.update(
         counts=Counts(
             listed=len(tracking.tracks) + len(tracking.skipped),
@@ -162,6 +187,12 @@ def _save_tracking(
         ),
         skipped=tuple(SkippedFrame(stamp_ns=s.stamp_ns, reason=s.reason) for s in tracking.skipped),
     )
+
+
+def _write_graph(folder: Path, graph: PoseGraph) -> None:
+    write_g2o(folder / files.GRAPH, graph)
+    keyframes = trajectory_from((graph.stamps_ns[node], T) for node, T in graph.T_world_node.items())
+    write_tum(folder / files.KEYFRAMES, keyframes)
 
 
 def _level(source: FrameSource, trajectory: Trajectory, config: BuildConfig) -> Level:
@@ -178,7 +209,14 @@ def _level(source: FrameSource, trajectory: Trajectory, config: BuildConfig) -> 
     return find_level(scans, trajectory=trajectory, accelerations=source.accelerations, config=config.level)
 
 
-def _fuse_into(draft: Draft, source: FrameSource, config: BuildConfig, progress: Progress) -> None:
+def _fuse_into(
+    draft: Draft,
+    source: FrameSource,
+    config: BuildConfig,
+    progress: Progress,
+    *,
+    before: Path | None = None,
+) -> None:
     """Fuse a draft's trajectory and write everything that is made from the maps."""
     tracked = Run(draft.folder, config, draft.manifest)
     trajectory, truth = tracked.trajectory(), tracked.truth()
@@ -187,13 +225,19 @@ def _fuse_into(draft: Draft, source: FrameSource, config: BuildConfig, progress:
     frame_ms = tracked.frame_ms() if config.mcap.frame_times else {}
     story = Story(trajectory, tracked.graph(), tracked.records(), frame_ms, truth)
     with McapLog(draft.folder / files.MCAP) as log:
-        with draft.clock.stage("fuse"):
+        with (
+            draft.clock.stage("fuse"),
+            open_sights(before) if before is not None and before.exists() else nullcontext() as known,
+            SightWriter(draft.folder / files.SIGHTS, config.octree) as sights,
+        ):
             maps = fuse_log(
                 source,
                 trajectory,
                 config,
                 progress=progress,
                 on_snapshot=lambda snapshot: log_snapshot(log, snapshot),
+                before=known,
+                after=sights,
             )
         with draft.clock.stage("write"):
             log_story(log, story)

@@ -1,8 +1,8 @@
 """The occupancy octree, levelling and the slice."""
 
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 from mapper.config.base import Config
 
@@ -22,6 +22,16 @@ class OctreeConfig(Config):
     """Beyond it a ray only frees space, up to this range. Kinect depth is poor past 4 m."""
     discretize: bool = True
     """Cast one ray per end voxel (fast), not one per point; both are OctoMap's own modes."""
+    attributes: bool = False
+    """Keep mean colour, hit count and last sight of the voxels where rays end, beside their log-odds."""
+    stays_within_m: NonNegativeFloat = 0.0
+    """Fusing again along another trajectory leaves a frame as it was fused if no end of a ray moves further;
+    0 moves it at any change."""
+    dynamic: Literal["none", "seen-through"] = "none"
+    """"none" is OctoMap. "seen-through": see ``seen_through_scans``."""
+    seen_through_scans: Annotated[int, Field(ge=1, le=255)] = 3
+    """When so many scans in a row saw an occupied voxel free, what stood there is gone: its log-odds are
+    those of the misses alone. Only with ``dynamic = "seen-through"``."""
 
 
 class LevelConfig(Config):
