@@ -13,6 +13,7 @@ from mapper.octree import kernels, queries
 from mapper.octree.blocks import BlockStore
 from mapper.octree.casting import Cast, Caster, origin_key
 from mapper.octree.keys import KEY_ZERO
+from mapper.octree.seen_through import SeenThrough
 from mapper.octree.sight import Sight
 from mapper.octree.tree_reader import TreeLeaves, fill
 
@@ -63,6 +64,11 @@ class OctreeMap:
         self.config = config
         self.blocks = BlockStore()
         self._caster = Caster(config)
+        self._seen_through = None
+        if config.dynamic == "seen-through":
+            self._seen_through = SeenThrough(
+                config.seen_through_scans, occupied_log_odds=self.occupied_log_odds
+            )
         self._known = 0
 
     @property
@@ -124,7 +130,8 @@ class OctreeMap:
         self._add(cast.window.cells, cast.positions, slots)
 
     def _add(self, cells: NDArray[np.uint8], positions: NDArray[np.int64], slots: NDArray[np.int64]) -> None:
-        self._known += kernels.merge(cells, positions, slots, self.blocks.table.values, self._sensor())
+        merge = kernels.merge if self._seen_through is None else self._seen_through.merge
+        self._known += merge(cells, positions, slots, self.blocks.table.values, self._sensor())
 
     def _sensor(self) -> kernels.Sensor:
         config = self.config

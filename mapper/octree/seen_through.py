@@ -1,0 +1,84 @@
+"""Voxels that something has left: a policy for places where things move.
+
+OctoMap weighs all scans alike, so what stood somewhere for long takes as many scans to be forgotten. Here a
+run of scans that all see an occupied voxel free marks the moment when its content left. Evidence from before
+that moment is about something else; what remains is the log-odds of the run alone. A hit ends the run, so a
+surface that is missed now and then is as safe as before. The rest of the map is OctoMap's to the last bit.
+"""
+
+import numpy as np
+from numba import njit
+from numpy import float32, int32
+from numpy.typing import NDArray
+
+from mapper.octree.kernels import Sensor
+from mapper.octree.keys import BLOCK_VOXELS
+from mapper.octree.window import OCCUPIED, UNTOUCHED
+
+
+class SeenThrough:
+    """Counts, for every voxel, the scans in a row that saw it free.
+
+    Args:
+        scans: How many of them release an occupied voxel.
+        occupied_log_odds: From where a voxel is occupied.
+    """
+
+    def __init__(self, scans: int, *, occupied_log_odds: np.float32) -> None:
+        self._scans = scans
+        self._occupied_log_odds = occupied_log_odds
+        self._runs = np.zeros((0, BLOCK_VOXELS), np.uint8)
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes held."""
+        return self._runs.nbytes
+
+    def merge(
+        self,
+        cells: NDArray[np.uint8],
+        positions: NDArray[np.int64],
+        slots: NDArray[np.int64],
+        values: NDArray[np.float32],
+        sensor: Sensor,
+    ) -> int:
+        """Do what ``kernels.merge`` does and release what was seen through; return how many voxels are new."""
+        missing = len(values) - len(self._runs)
+        if missing > 0:
+            self._runs = np.concatenate([self._runs, np.zeros((missing, BLOCK_VOXELS), np.uint8)])
+        born: int = _merge(
+            cells, positions, slots, values, sensor, self._runs, self._scans, self._occupied_log_odds
+        )
+        return born
+
+
+@njit(cache=True, nogil=True)
+def _merge(cells, positions, slots, values, sensor, runs, scans, occupied_log_odds):
+    hit, miss, lowest, highest = sensor.hit, sensor.miss, sensor.lowest, sensor.highest
+    released = max(lowest, float32(scans) * miss)
+    born = 0
+    for i in range(len(positions)):
+        start = positions[i] * BLOCK_VOXELS
+        seen_block = cells[start : start + BLOCK_VOXELS]
+        block, runs_block = values[slots[i]], runs[slots[i]]
+        block_born = int32(0)
+        for j in range(BLOCK_VOXELS):
+            seen = int32(seen_block[j])
+            if seen == UNTOUCHED:
+                continue
+            old = block[j]
+            unknown = old != old
+            block_born += int32(unknown)
+            value = float32(0.0) if unknown else old
+            if seen == OCCUPIED:
+                runs_block[j] = 0
+                block[j] = value if value >= highest else min(value + hit, highest)
+                continue
+            runs_block[j] = min(int32(runs_block[j]) + 1, 255)
+            new = value if value <= lowest else max(value + miss, lowest)
+            if runs_block[j] >= scans and new >= occupied_log_odds:
+                new = released
+            block[j] = new
+        born += block_born
+        seen_block[:] = UNTOUCHED
+    return born
