@@ -64,3 +64,17 @@ def block_keys(codes: NDArray[np.int64]) -> NDArray[np.int64]:
 def morton(x, y, z):
     """Return the Morton code of three keys."""
     return spread(x) | (spread(y) << 1) | (spread(z) << 2)
+
+
+@njit(cache=True, nogil=True)
+def codes_of(points_world, resolution_m):
+    """Return the (N,) int64 Morton codes of (N, 3) float64 points, metres; −1 is out of range."""
+    inverse_resolution = 1.0 / resolution_m
+    codes = np.empty(len(points_world), int64)
+    for i in range(len(points_world)):
+        x = np.floor(inverse_resolution * points_world[i, 0]) + KEY_ZERO
+        y = np.floor(inverse_resolution * points_world[i, 1]) + KEY_ZERO
+        z = np.floor(inverse_resolution * points_world[i, 2]) + KEY_ZERO
+        inside = (x >= 0) & (x < KEY_COUNT) & (y >= 0) & (y < KEY_COUNT) & (z >= 0) & (z < KEY_COUNT)
+        codes[i] = morton(int64(x), int64(y), int64(z)) if inside else int64(-1)
+    return codes

@@ -8,11 +8,15 @@ from numpy.typing import NDArray
 from mapper.config.octree import OctreeConfig
 from mapper.errors import DataError, MapSizeError
 from mapper.frames import Points32, Scan
-from mapper.geometry import Array, Points, Transform
-from mapper.octree import kernels, queries
+from mapper.geometry import Array, Points, Transform, apply
+from mapper.octree import kernels, levels, queries
+from mapper.octree.attributes import NEVER_SEEN, AttributeLayer, ended_blocks
 from mapper.octree.blocks import BlockStore
+from mapper.octree.boxes import BoxCounts, count_boxes
 from mapper.octree.casting import Cast, Caster, origin_key
-from mapper.octree.keys import KEY_ZERO
+from mapper.octree.keys import KEY_BITS, KEY_ZERO
+from mapper.octree.levels import Parent
+from mapper.octree.nearest import Nearest, nearest_occupied
 from mapper.octree.seen_through import SeenThrough
 from mapper.octree.sight import Sight
 from mapper.octree.tree_reader import TreeLeaves, fill
@@ -20,22 +24,30 @@ from mapper.octree.tree_reader import TreeLeaves, fill
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Leaves:
-    """Known voxels at the finest level, in Morton order.
+    """Known voxels, or nodes above them, in Morton order.
 
     Attributes:
-        keys: (N, 3) uint16, OctoMap's.
+        keys: (N, 3) uint16, OctoMap's; above the voxels they count nodes.
         log_odds: (N,) float32.
         resolution_m: Edge of a voxel.
+        depth: Of the nodes in the tree; 16 are the voxels.
     """
 
     keys: NDArray[np.uint16]
     log_odds: NDArray[np.float32]
     resolution_m: float
+    depth: int = KEY_BITS
+
+    @property
+    def edge_m(self) -> float:
+        """Edge of a node."""
+        return self.resolution_m * (1 << (KEY_BITS - self.depth))
 
     @property
     def centres_world(self) -> Points:
-        """(N, 3) float64 voxel centres, metres."""
-        return (self.keys.astype(np.float64) - (KEY_ZERO - 0.5)) * self.resolution_m
+        """(N, 3) float64 centres, metres."""
+        voxels = 1 << (KEY_BITS - self.depth)
+        return (self.keys.astype(np.float64) * voxels - (KEY_ZERO - 0.5 * voxels)) * self.resolution_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,6 +75,7 @@ class OctreeMap:
     def __init__(self, config: OctreeConfig) -> None:
         self.config = config
         self.blocks = BlockStore()
+        self.attributes = AttributeLayer(self.blocks, config.resolution_m) if config.attributes else None
         self._caster = Caster(config)
         self._seen_through = None
         if config.dynamic == "seen-through":
@@ -83,7 +96,7 @@ class OctreeMap:
     @property
     def memory_bytes(self) -> int:
         """Bytes of the map itself, spare capacity included, without the scan window."""
-        return self.blocks.memory_bytes
+        return self.blocks.memory_bytes + (self.attributes.memory_bytes if self.attributes else 0)
 
     @property
     def working_bytes(self) -> int:
@@ -98,6 +111,15 @@ class OctreeMap:
             MapSizeError: The scan or the map would be too large; the map has not changed then.
         """
         self._merge(self._caster.cast(scan, T_world_body))
+        if self.attributes is not None:
+            self.attributes.add(
+                scan.points_body,
+                T_world_body,
+                origin_world=apply(T_world_body, scan.origin_body[np.newaxis])[0],
+                config=self.config,
+                colors=scan.colors,
+                stamp_ns=scan.stamp_ns,
+            )
 
     def insert_points(self, points_world: Points32, origin_world: Array) -> None:
         """Fuse world points as OctoMap's ``insertPointCloud`` does.
@@ -111,9 +133,18 @@ class OctreeMap:
             MapSizeError: The scan or the map would be too large; the map has not changed then.
         """
         self._merge(self._caster.cast_points(points_world, origin_world))
+        if self.attributes is not None:
+            self.attributes.add(
+                points_world,
+                np.eye(4),
+                origin_world=origin_world,
+                config=self.config,
+                colors=None,
+                stamp_ns=NEVER_SEEN,
+            )
 
     def merge(self, sight: Sight) -> None:
-        """Fuse what a frame saw: the same as inserting its scan, to the last bit.
+        """Fuse what a frame saw: the same as inserting its scan, to the last bit, but without attributes.
 
         Raises:
             MapSizeError: The map would be too large; it has not changed then.
@@ -124,6 +155,8 @@ class OctreeMap:
     def _merge(self, cast: Cast) -> None:
         try:
             slots = self.blocks.claim(cast.codes)
+            if self.attributes is not None:
+                self.attributes.claim(slots[ended_blocks(cast.window.cells, cast.positions)])
         except MapSizeError:
             self._caster.forget()
             raise
@@ -147,9 +180,25 @@ class OctreeMap:
         """Log-odds from which a voxel counts as occupied."""
         return log_odds(self.config.occupied_probability)
 
-    def query(self, points_world: Points) -> NDArray[np.float32]:
-        """Return the (N,) log-odds of (N, 3) points in metres; NaN where nothing is known or can be."""
+    def query(
+        self, points_world: Points, *, depth: int = KEY_BITS, parent: Parent = "max"
+    ) -> NDArray[np.float32]:
+        """Return the (N,) log-odds of (N, 3) points in metres; NaN where nothing is known or can be.
+
+        Args:
+            points_world: Any points.
+            depth: Level of the tree that is asked, 0 (root) … 16 (voxels). Others than 16 are worked out for
+                the whole map, at every call.
+            parent: What a node above the voxels holds: ``max`` or ``mean`` of its known children.
+
+        Raises:
+            DataError: No such depth or parent.
+        """
         points_world = np.ascontiguousarray(points_world, dtype=np.float64)
+        if depth != KEY_BITS:
+            return levels.values_at_depth(
+                self.blocks, points_world, resolution_m=self.resolution_m, depth=depth, parent=parent
+            )
         found: NDArray[np.float32] = queries.values_at(self.blocks.table, points_world, self.resolution_m)
         return found
 
@@ -188,6 +237,26 @@ class OctreeMap:
         distances_m = np.linalg.norm(centres_world - origins_world, axis=1)
         return RayEnds(centres_world, distances_m, outcomes == queries.HIT)
 
+    def count_boxes(self, lower_world: Points, upper_world: Points) -> BoxCounts:
+        """Return what (N,) boxes between (N, 3) corners in metres overlap; see :mod:`mapper.octree.boxes`."""
+        return count_boxes(
+            self.blocks,
+            lower_world,
+            upper_world,
+            resolution_m=self.resolution_m,
+            threshold=self.occupied_log_odds,
+        )
+
+    def nearest_obstacles(self, points_world: Points, *, max_range_m: float) -> Nearest:
+        """Return the obstacle nearest to each of (N, 3) points; see :mod:`mapper.octree.nearest`."""
+        return nearest_occupied(
+            self.blocks,
+            points_world,
+            resolution_m=self.resolution_m,
+            max_range_m=max_range_m,
+            threshold=self.occupied_log_odds,
+        )
+
     def restore(self, leaves: TreeLeaves) -> None:
         """Take over the leaves of a file; the map must be empty.
 
@@ -199,8 +268,37 @@ class OctreeMap:
             raise DataError(f"octree: holds {self._known} voxels already; restore into a new map")
         self._known = fill(self.blocks, leaves)
 
-    def leaves(self) -> Leaves:
-        """Return every known voxel, in Morton order: the order does not depend on that of the scans."""
+    def restore_blocks(
+        self, codes: NDArray[np.int64], known: NDArray[np.bool_], values: NDArray[np.float32]
+    ) -> None:
+        """Take over whole blocks; the map must be empty.
+
+        Args:
+            codes: (B,) distinct Morton codes of the blocks.
+            known: (B, 512) which of their voxels are known.
+            values: (K,) log-odds of those, block after block.
+
+        Raises:
+            MapSizeError: They would not fit into memory.
+        """
+        slots = self.blocks.claim(codes)
+        blocks, voxels = np.nonzero(known)
+        self.blocks.table.values[slots[blocks], voxels] = values
+        self._known = len(values)
+
+    def leaves(self, *, depth: int = KEY_BITS, parent: Parent = "max") -> Leaves:
+        """Return every known voxel, in Morton order: the order does not depend on that of the scans.
+
+        Args:
+            depth: 16, or that of the nodes to return instead: see :meth:`query`.
+            parent: See :meth:`query`.
+
+        Raises:
+            DataError: No such depth or parent.
+        """
+        if depth != KEY_BITS:
+            codes, node_values = levels.nodes_at(self.blocks, depth=depth, parent=parent)
+            return Leaves(levels.keys_at_depth(codes), node_values, self.resolution_m, depth)
         slots = self.blocks.sorted_slots()
         keys, values = queries.known_voxels(
             self.blocks.codes[slots], slots, self.blocks.table.values, self._known

@@ -10,14 +10,16 @@ from mapper import atomic
 from mapper.config.octree import OctreeConfig
 from mapper.errors import MapFileError
 from mapper.octree import tree_reader
+from mapper.octree.attributes import UNSET
+from mapper.octree.color_tree import COLOR_NODE, colored
 from mapper.octree.keys import KEY_BITS
 from mapper.octree.map import OctreeMap, log_odds
+from mapper.octree.map_file import MAGIC, parse_map
 from mapper.octree.tree import NODE, nodes_in_preorder, words_in_preorder
 
 _FULL = b"# Octomap OcTree file"
 _BINARY = b"# Octomap OcTree binary file"
 _TREE_NAMES = {"OcTree": "OcTree", "1": "OcTree", "ColorOcTree": "ColorOcTree"}
-_COLOR_NODE = np.dtype([("value", "<f4"), ("rgb", "u1", 3), ("mask", "u1")])
 
 _FAULTS = {
     tree_reader.CUT_SHORT: "ends before its tree does; it is truncated",
@@ -36,9 +38,12 @@ class _Header:
 
 
 def write_ot(path: Path, octree: OctreeMap) -> None:
-    """Write all log-odds as an OcTree, pruned; atomic."""
+    """Write all log-odds as an OcTree, pruned, or as a ColorOcTree if the map has colours; atomic."""
     nodes = nodes_in_preorder(octree.blocks) if len(octree) else np.empty(0, NODE)
-    _write(path, _header_bytes(_FULL, len(nodes), octree.resolution_m), nodes)
+    tree_name = "OcTree"
+    if octree.attributes is not None and octree.attributes.has_colors:
+        nodes, tree_name = colored(nodes, octree.blocks, octree.attributes), "ColorOcTree"
+    _write(path, _header_bytes(_FULL, len(nodes), octree.resolution_m, tree_name=tree_name), nodes)
 
 
 def write_bt(path: Path, octree: OctreeMap) -> None:
@@ -55,22 +60,25 @@ def _write(path: Path, header: bytes, payload: NDArray[np.generic]) -> None:
         file.write(payload.data)
 
 
-def _header_bytes(first_line: bytes, node_count: int, resolution_m: float) -> bytes:
+def _header_bytes(
+    first_line: bytes, node_count: int, resolution_m: float, *, tree_name: str = "OcTree"
+) -> bytes:
     return first_line + (
         "\n# (feel free to add / change comments, but leave the first line as it is!)\n#\n"
-        f"id OcTree\nsize {node_count}\nres {resolution_m:g}\ndata\n"
+        f"id {tree_name}\nsize {node_count}\nres {resolution_m:g}\ndata\n"
     ).encode("ascii")
 
 
 def read_map(path: Path, config: OctreeConfig | None = None) -> OctreeMap:
-    """Return the map of a ``.bt`` or ``.ot`` file of an OcTree or a ColorOcTree, whose colours are left out.
+    """Return the map of a ``.bt`` or ``.ot`` file of an OcTree or a ColorOcTree, or of our own ``.octree``.
 
-    Leaves of a ``.bt`` file take the clamping values of the sensor model. The file says which kind it is, not
-    its name.
+    Leaves of a ``.bt`` file take the clamping values of the sensor model. A file with colours makes a map
+    with attributes. The file says which kind it is, not its name.
 
     Args:
         path: The file.
-        config: Sensor model for what is inserted later; the resolution is always the file's.
+        config: Sensor model for what is inserted later; None takes our own file's, or OctoMap's defaults. The
+            resolution is always the file's.
 
     Raises:
         MapFileError: The file cannot be read, is truncated, foreign or damaged.
@@ -80,19 +88,26 @@ def read_map(path: Path, config: OctreeConfig | None = None) -> OctreeMap:
         data = path.read_bytes()
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read: {error.strerror}") from None
+    if data.startswith(MAGIC):
+        return parse_map(path, data, config)
     header, start = _parse_header(path, data)
     config = (config or OctreeConfig()).model_copy(update={"resolution_m": header.resolution_m})
-    octree = OctreeMap(config)
     if header.node_count == 0:
         if start != len(data):
             raise MapFileError(f"{path}: size 0, but {len(data) - start} bytes follow; it is damaged")
-        return octree
+        return OctreeMap(config)
     payload = memoryview(data)[start:]
     if header.binary:
-        leaves = _binary_leaves(path, header, payload, config)
-    else:
-        leaves = _full_leaves(path, header, payload)
+        octree = OctreeMap(config)
+        octree.restore(_binary_leaves(path, header, payload, config))
+        return octree
+    leaves, colors = _full_leaves(path, header, payload)
+    if (colors != UNSET).any():
+        config = config.model_copy(update={"attributes": True})
+    octree = OctreeMap(config)
     octree.restore(leaves)
+    if octree.attributes is not None:
+        octree.attributes.restore_colors(leaves.codes, leaves.depths, colors)
     return octree
 
 
@@ -158,8 +173,11 @@ def _binary_leaves(
     return leaves
 
 
-def _full_leaves(path: Path, header: _Header, payload: memoryview) -> tree_reader.TreeLeaves:
-    record = _COLOR_NODE if header.tree_name == "ColorOcTree" else NODE
+def _full_leaves(
+    path: Path, header: _Header, payload: memoryview
+) -> tuple[tree_reader.TreeLeaves, NDArray[np.uint8]]:
+    """Return the leaves and their (L, 3) uint8 colours, white where there are none."""
+    record = COLOR_NODE if header.tree_name == "ColorOcTree" else NODE
     if len(payload) != header.node_count * record.itemsize:
         raise MapFileError(
             f"{path}: the header promises {header.node_count} nodes of {record.itemsize} bytes, "
@@ -173,4 +191,6 @@ def _full_leaves(path: Path, header: _Header, payload: memoryview) -> tree_reade
         raise MapFileError(f"{path}: {_FAULTS[fault]}")
     if not np.isfinite(leaves.values).all():
         raise MapFileError(f"{path}: has leaves whose log-odds are not finite; it is damaged")
-    return leaves
+    if record is NODE:
+        return leaves, np.full((len(leaves.codes), 3), UNSET, np.uint8)
+    return leaves, nodes["rgb"][nodes["mask"] == 0]

@@ -1,0 +1,125 @@
+"""Colours of the nodes of a ColorOcTree, as OctoMap works them out when it prunes and updates inner nodes."""
+
+import numpy as np
+from numba import njit
+from numpy import int64, uint8
+from numpy.typing import NDArray
+
+from mapper.octree.attributes import UNSET, AttributeLayer
+from mapper.octree.blocks import BlockStore
+from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS
+
+COLOR_NODE = np.dtype([("value", "<f4"), ("rgb", "u1", 3), ("mask", "u1")])
+"""A node as a ColorOcTree's ``.ot`` file lists it: log-odds, RGB, and a bit for each child that exists."""
+
+
+def colored(nodes: NDArray[np.void], store: BlockStore, attributes: AttributeLayer) -> NDArray[np.void]:
+    """Return (N,) COLOR_NODE: the nodes of a pruned tree in preorder, with their colours.
+
+    A leaf above the voxels has the mean colour of the voxels that were pruned into it, and an inner node that
+    of its children, level by level, fractions dropped, white being no colour. OctoMap leaves a pruned node
+    white if its first child was, and so do we.
+
+    Args:
+        nodes: (N,) NODE of the same map.
+        store: Its blocks.
+        attributes: Their attributes.
+    """
+    out = np.empty(len(nodes), COLOR_NODE)
+    out["value"], out["mask"] = nodes["value"], nodes["mask"]
+    slots = attributes.slots
+    colors = attributes.block_colors(slots)
+    rgb = np.empty((len(nodes), 3), np.uint8)
+    _colors_in_preorder(np.ascontiguousarray(nodes["mask"]), store.codes[slots], colors, rgb)
+    out["rgb"] = rgb
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _colors_in_preorder(masks, codes, colors, rgb):
+    """Write the (N, 3) colours of nodes.
+
+    Args:
+        masks: (N,) uint8 of the nodes in preorder.
+        codes: (B,) int64 increasing codes of the blocks that have colours.
+        colors: (B, 512, 3) uint8 those.
+        rgb: What is written.
+    """
+    pending, index = np.zeros(KEY_BITS + 1, int64), np.zeros(KEY_BITS + 1, int64)
+    prefix = np.zeros(KEY_BITS + 2, int64)
+    sums, counts = np.zeros((KEY_BITS + 1, 3), int64), np.zeros(KEY_BITS + 1, int64)
+    depth = 0
+    for i in range(len(masks)):
+        pending[depth], index[depth] = masks[i], i
+        sums[depth], counts[depth] = 0, 0
+        if masks[i] == 0:
+            rgb[i] = _leaf_color(prefix[depth], depth, codes, colors)
+        while depth >= 0 and pending[depth] == 0:
+            node = index[depth]
+            if masks[node]:
+                rgb[node] = _mean(sums[depth], counts[depth])
+            depth -= 1
+            if depth >= 0 and _is_set(rgb[node]):
+                counts[depth] += 1
+                for channel in range(3):
+                    sums[depth, channel] += rgb[node, channel]
+        if depth >= 0:
+            child = 0
+            while not (pending[depth] >> child) & 1:
+                child += 1
+            pending[depth] &= ~(1 << child)
+            prefix[depth + 1] = (prefix[depth] << 3) | child
+            depth += 1
+
+
+@njit(cache=True, nogil=True)
+def _leaf_color(prefix, depth, codes, colors):
+    """Return the (3,) colour of the leaf that the voxels below a node were pruned into."""
+    levels = KEY_BITS - depth
+    voxels = int64(1) << (3 * levels)
+    first = prefix << (3 * levels)
+    color = np.full(3, UNSET, uint8)
+    at = np.searchsorted(codes, first >> (3 * BLOCK_BITS))
+    end = np.searchsorted(codes, ((first + voxels - 1) >> (3 * BLOCK_BITS)) + 1)
+    if at == end:
+        return color
+    if levels <= BLOCK_BITS:
+        start = first & (BLOCK_VOXELS - 1)
+        below = colors[at, start : start + voxels].copy()
+    else:
+        below = np.full((voxels >> (3 * BLOCK_BITS), 3), UNSET, uint8)
+        for block in range(at, end):
+            below[codes[block] - (first >> (3 * BLOCK_BITS))] = _pruned(colors[block].copy())
+    return _pruned(below)
+
+
+@njit(cache=True, nogil=True)
+def _pruned(colors):
+    """Return the (3,) colour that (8^n, 3) colours are pruned to; ``colors`` is overwritten."""
+    size = len(colors)
+    while size > 1:
+        size //= 8
+        for i in range(size):
+            count = 0
+            sums = np.zeros(3, int64)
+            for child in range(8 * i, 8 * i + 8):
+                if _is_set(colors[child]):
+                    count += 1
+                    for channel in range(3):
+                        sums[channel] += colors[child, channel]
+            colors[i] = _mean(sums, count if _is_set(colors[8 * i]) else 0)
+    return colors[0]
+
+
+@njit(cache=True, nogil=True)
+def _is_set(color):
+    return color[0] != UNSET or color[1] != UNSET or color[2] != UNSET
+
+
+@njit(cache=True, nogil=True)
+def _mean(sums, count):
+    color = np.full(3, UNSET, uint8)
+    if count:
+        for channel in range(3):
+            color[channel] = sums[channel] // count
+    return color

@@ -1,0 +1,176 @@
+"""Our own map file: everything that a map knows, compressed, checked, and the same bytes for the same map.
+
+Layout, little-endian: ``MAGIC``, version (uint32), length of the header (uint32), CRC-32 of header and body
+(uint32), header (JSON), body (Zstandard). The body holds, one after the other: Morton codes of the blocks as
+differences (int64), which of their voxels are known (64 bytes per block) and those voxels' log-odds
+(float32); then, if the map has attributes, the same two for voxels that have any, and these voxels' red,
+green and blue sums, colour weights, hits (uint32) and last stamps (int64).
+"""
+
+import json
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from mapper import atomic
+from mapper.config.octree import OctreeConfig
+from mapper.errors import MapFileError
+from mapper.octree.attributes import AttributeLayer
+from mapper.octree.blocks import BLOCK_BYTES, check_memory, find_slots
+from mapper.octree.keys import BLOCK_VOXELS
+from mapper.octree.map import OctreeMap
+
+MAGIC = b"\x89mapper-octree\r\n"
+"""Not text, and damaged by whoever takes it for text."""
+VERSION = 1
+
+_FIXED = struct.Struct("<III")
+_LEVEL = 3  # Zstandard's default
+_MASK_BYTES = BLOCK_VOXELS // 8
+_COUNTS = ("blocks", "voxels", "attribute_blocks", "attribute_voxels")
+
+
+def write_map(path: Path, octree: OctreeMap) -> None:
+    """Write a map with its sensor model and all attributes; atomic."""
+    slots = octree.blocks.sorted_slots()
+    values = octree.blocks.table.values[slots]
+    known = ~np.isnan(values)
+    columns: list[NDArray[Any]] = [*_places(octree.blocks.codes[slots], known), values[known]]
+    counts = [len(slots), int(np.count_nonzero(known)), 0, 0]
+    if octree.attributes is not None:
+        attribute_columns, counts[2:] = _attribute_columns(octree, octree.attributes)
+        columns += attribute_columns
+    header = {"config": octree.config.model_dump(mode="json"), **dict(zip(_COUNTS, counts, strict=True))}
+    head = json.dumps(header, sort_keys=True, separators=(",", ":")).encode()
+    plain = b"".join(
+        column.astype(column.dtype.newbyteorder("<"), copy=False).tobytes() for column in columns
+    )
+    rest = head + zstandard.ZstdCompressor(level=_LEVEL).compress(plain)
+    atomic.write_bytes(path, MAGIC + _FIXED.pack(VERSION, len(head), zlib.crc32(rest)) + rest)
+
+
+def _attribute_columns(
+    octree: OctreeMap, layer: AttributeLayer
+) -> tuple[list[NDArray[Any]], tuple[int, int]]:
+    slots, arrays = layer.slots, layer.arrays
+    rows = arrays.rows[slots]
+    held = (arrays.hits[rows] > 0) | (arrays.color_weights[rows] > 0)
+    places = _places(octree.blocks.codes[slots], held)
+    sums = arrays.color_sums[rows][held]
+    columns: list[NDArray[Any]] = [*places, *(np.ascontiguousarray(sums[:, channel]) for channel in range(3))]
+    columns += [array[rows][held] for array in (arrays.color_weights, arrays.hits, arrays.last_seen_ns)]
+    return columns, (len(slots), int(np.count_nonzero(held)))
+
+
+def _places(codes: NDArray[np.int64], held: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    return np.diff(codes, prepend=np.int64(0)), np.packbits(held, axis=1, bitorder="little")
+
+
+def parse_map(path: Path, data: bytes, config: OctreeConfig | None) -> OctreeMap:
+    """Return the map of a file's bytes, which begin with ``MAGIC``.
+
+    Args:
+        path: Names the file in errors.
+        data: All of it.
+        config: Replaces the file's sensor model for what is inserted later, the resolution excepted.
+
+    Raises:
+        MapFileError: The file is of another version, truncated or damaged.
+        MapSizeError: The map would not fit into memory.
+    """
+    start = len(MAGIC) + _FIXED.size
+    if len(data) < start:
+        raise MapFileError(f"{path}: ends inside its header; it is truncated")
+    version, head_bytes, checksum = _FIXED.unpack_from(data, len(MAGIC))
+    if version != VERSION:
+        raise MapFileError(f"{path}: is of version {version}, only {VERSION} can be read; update mapper")
+    if zlib.crc32(memoryview(data)[start:]) != checksum:
+        raise MapFileError(f"{path}: its checksum does not match; it is truncated or damaged")
+    counts, own_config = _parse_header(path, data[start : start + head_bytes])
+    blocks, voxels, attribute_blocks, attribute_voxels = counts
+    sizes = [
+        *((blocks, "<i8"), (blocks * _MASK_BYTES, "u1"), (voxels, "<f4")),
+        *((attribute_blocks, "<i8"), (attribute_blocks * _MASK_BYTES, "u1")),
+        *[(attribute_voxels, "<u4")] * 5,
+        (attribute_voxels, "<i8"),
+    ]
+    check_memory(blocks * BLOCK_BYTES, f"the map in {path}")
+    plain_bytes = sum(count * np.dtype(kind).itemsize for count, kind in sizes)
+    plain = _decompressed(path, data[start + head_bytes :], plain_bytes)
+    columns: list[NDArray[Any]] = []
+    at = 0
+    for count, kind in sizes:
+        columns.append(np.frombuffer(plain, kind, count=count, offset=at))
+        at += columns[-1].nbytes
+    if config is None:
+        config = own_config
+    else:
+        kept = {"resolution_m": own_config.resolution_m, "attributes": own_config.attributes}
+        config = config.model_copy(update=kept)
+    octree = OctreeMap(config)
+    _fill(path, octree, *columns[:3])
+    if octree.attributes is not None:
+        _fill_attributes(path, octree, octree.attributes, columns[3:])
+    return octree
+
+
+def _parse_header(path: Path, head: bytes) -> tuple[list[int], OctreeConfig]:
+    try:
+        header = json.loads(head)
+        counts = [header[name] for name in _COUNTS]
+        config = OctreeConfig.model_validate(header["config"])
+    except (ValueError, KeyError, TypeError, ValidationError):
+        raise MapFileError(f"{path}: its header does not describe a map; it is damaged") from None
+    if not all(isinstance(count, int) and count >= 0 for count in counts):
+        raise MapFileError(f"{path}: its header has counts {counts}; it is damaged")
+    return counts, config
+
+
+def _decompressed(path: Path, body: bytes, size: int) -> bytes:
+    try:
+        if zstandard.frame_content_size(body) != size:
+            raise MapFileError(f"{path}: its body is not the {size} bytes that its header describes")
+        return zstandard.ZstdDecompressor().decompress(body)
+    except zstandard.ZstdError as error:
+        raise MapFileError(f"{path}: cannot be decompressed: {error}; it is damaged") from None
+
+
+def _held(path: Path, steps: NDArray[np.int64], bits: NDArray[np.uint8], count: int) -> NDArray[np.bool_]:
+    held = np.unpackbits(bits.reshape(len(steps), _MASK_BYTES), axis=1, bitorder="little").view(np.bool_)
+    if np.count_nonzero(held) != count or (steps[1:] <= 0).any():
+        raise MapFileError(f"{path}: its voxels are not {count} in rising blocks; it is damaged")
+    return held
+
+
+def _fill(
+    path: Path,
+    octree: OctreeMap,
+    steps: NDArray[np.int64],
+    bits: NDArray[np.uint8],
+    values: NDArray[np.float32],
+) -> None:
+    known = _held(path, steps, bits, len(values))
+    octree.restore_blocks(np.cumsum(steps), known, values)
+
+
+def _fill_attributes(
+    path: Path, octree: OctreeMap, layer: AttributeLayer, columns: list[NDArray[Any]]
+) -> None:
+    steps, bits, red, green, blue, weights, hits, last_seen_ns = columns
+    held = _held(path, steps, bits, len(hits))
+    slots = np.empty(len(steps), np.int64)
+    if find_slots(octree.blocks.table, np.cumsum(steps), slots):
+        raise MapFileError(f"{path}: has attributes of blocks that it does not have; it is damaged")
+    rows = layer.claim(slots)
+    blocks, voxels = np.nonzero(held)
+    places = rows[blocks], voxels
+    layer.arrays.color_sums[places] = np.column_stack([red, green, blue])
+    layer.arrays.color_weights[places] = weights
+    layer.arrays.hits[places] = hits
+    layer.arrays.last_seen_ns[places] = last_seen_ns

@@ -1,0 +1,134 @@
+import json
+import struct
+import zlib
+
+import numpy as np
+import pytest
+
+from mapper.config.octree import OctreeConfig
+from mapper.errors import MapFileError, MapSizeError
+from mapper.frames import Scan
+from mapper.octree import blocks
+from mapper.octree.map import OctreeMap
+from mapper.octree.map_file import MAGIC, write_map
+from mapper.octree.octomap_file import read_map
+
+HEADER = len(MAGIC) + 12
+
+
+def mapped(*, attributes, order=(0, 1, 2)):
+    octree = OctreeMap(OctreeConfig(resolution_m=0.1, hit_probability=0.8, attributes=attributes))
+    for seed in order:
+        rng = np.random.default_rng(seed)
+        points = rng.normal(0.0, 1.0, (300, 3)).astype(np.float32)
+        octree.insert(
+            Scan(seed, points, colors=rng.integers(0, 256, points.shape, dtype=np.uint8)), np.eye(4)
+        )
+    return octree
+
+
+@pytest.fixture
+def path(tmp_path):
+    write_map(tmp_path / "map.octree", mapped(attributes=True))
+    return tmp_path / "map.octree"
+
+
+@pytest.mark.parametrize("attributes", [False, True])
+def test_everything_comes_back(attributes, tmp_path):
+    octree = mapped(attributes=attributes)
+    write_map(tmp_path / "map.octree", octree)
+
+    again = read_map(tmp_path / "map.octree")
+
+    assert again.config == octree.config
+    assert len(again) == len(octree)
+    np.testing.assert_array_equal(again.leaves().keys, octree.leaves().keys)
+    np.testing.assert_array_equal(again.leaves().log_odds, octree.leaves().log_odds)
+    if attributes:
+        found, before = again.attributes.of_leaves(), octree.attributes.of_leaves()
+        for name in ("colors", "colored", "hits", "last_seen_ns"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(before, name))
+    else:
+        assert again.attributes is None
+
+
+def test_a_map_that_was_read_goes_on_as_if_it_had_not_been_written(path):
+    again, octree = read_map(path), mapped(attributes=True)
+    scan = Scan(9, np.random.default_rng(9).normal(0.0, 1.0, (300, 3)).astype(np.float32))
+    for each in (again, octree):
+        each.insert(scan, np.eye(4))
+    write_map(path.with_name("again.octree"), again)
+    write_map(path.with_name("octree.octree"), octree)
+
+    assert path.with_name("again.octree").read_bytes() == path.with_name("octree.octree").read_bytes()
+
+
+def test_bytes_do_not_depend_on_how_blocks_came_about(path):
+    write_map(path.with_name("again.octree"), read_map(path))
+
+    assert path.with_name("again.octree").read_bytes() == path.read_bytes()
+
+
+def test_an_empty_map_comes_back(tmp_path):
+    write_map(tmp_path / "map.octree", OctreeMap(OctreeConfig(resolution_m=0.2, attributes=True)))
+
+    again = read_map(tmp_path / "map.octree")
+
+    assert (len(again), again.resolution_m) == (0, 0.2)
+
+
+def test_another_sensor_model_replaces_the_file_s_but_not_its_resolution(path):
+    again = read_map(path, OctreeConfig(resolution_m=0.5, hit_probability=0.6))
+
+    assert (again.resolution_m, again.config.hit_probability) == (0.1, 0.6)
+    assert again.attributes is not None
+
+
+def resealed(data, change):
+    """The file with its header changed and its checksum right."""
+    version, length, _ = struct.unpack_from("<III", data, len(MAGIC))
+    header = json.loads(data[HEADER : HEADER + length])
+    change(header)
+    head = json.dumps(header).encode()
+    rest = head + data[HEADER + length :]
+    return MAGIC + struct.pack("<III", version, len(head), zlib.crc32(rest)) + rest
+
+
+@pytest.mark.parametrize(
+    ("damage", "complaint"),
+    [
+        (lambda data: data[: HEADER - 3], "it is truncated"),
+        (lambda data: data[:-1], "truncated or damaged"),
+        (lambda data: data[:100] + bytes([data[100] ^ 1]) + data[101:], "truncated or damaged"),
+        (lambda data: data + b"more", "truncated or damaged"),
+        (lambda data: MAGIC + struct.pack("<I", 7) + data[len(MAGIC) + 4 :], "is of version 7, only 1"),
+        (lambda data: resealed(data, lambda header: header.pop("config")), "does not describe a map"),
+        (lambda data: resealed(data, lambda header: header.update(voxels=-1)), "has counts"),
+        (lambda data: resealed(data, lambda header: header.update(voxels=5)), "its body is not the"),
+        (lambda data: data[2:], "not an OctoMap file"),
+    ],
+)
+def test_damage_is_one_line(path, damage, complaint):
+    path.write_bytes(damage(path.read_bytes()))
+
+    with pytest.raises(MapFileError, match=complaint) as caught:
+        read_map(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_map_larger_than_memory_is_refused_before_it_is_unpacked(path, monkeypatch):
+    monkeypatch.setattr(blocks.os, "sysconf", lambda _name: 10)
+
+    with pytest.raises(MapSizeError, match="GiB"):
+        read_map(path)
+
+
+def test_a_failed_write_leaves_the_old_file(path, monkeypatch):
+    before = path.read_bytes()
+    monkeypatch.setattr("pathlib.Path.replace", lambda *_: (_ for _ in ()).throw(OSError("full")))
+
+    with pytest.raises(OSError, match="full"):
+        write_map(path, mapped(attributes=False))
+    assert path.read_bytes() == before
+    assert [file.name for file in path.parent.iterdir()] == ["map.octree"]
