@@ -10,6 +10,7 @@ from mapper.frames import Image
 
 _DIMENSIONS = 64
 _SCALE_OF_OCTAVE_0 = 2.4  # of its two layers' filters, 15 and 21 px, the middle one's σ
+_REACH_SCALES = 16.0  # mahotas drops points whose descriptor would leave the image
 
 
 class Surf:
@@ -30,6 +31,7 @@ class Surf:
 
         config = self._config
         points = interest_points(gray, config.octaves, config.min_threshold)
+        points = points[_describable(points, gray.shape)]
         points = points[np.argsort(-points[:, 3], kind="stable")]
         threshold = config.threshold
         while threshold > config.min_threshold and (points[:, 3] >= threshold).sum() < config.min_features:
@@ -39,6 +41,13 @@ class Surf:
             return _features(np.empty((0, 6 + _DIMENSIONS)))
         integral = surf.integral(gray.astype(np.float64))
         return _features(surf.descriptors(integral, points[:, :5].copy(), is_integral=True))
+
+
+def _describable(points: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return which points are far enough from the border."""
+    to_border_px = np.minimum(points[:, :2], np.array(shape) - points[:, :2]).min(axis=1)
+    inside: NDArray[np.bool_] = to_border_px > _REACH_SCALES * points[:, 2]
+    return inside
 
 
 def _features(rows: NDArray[np.float64]) -> Features:
