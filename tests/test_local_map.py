@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from evaluators.trajectory import align, associate, ate
-from mapper.config.features import UniformOrbConfig
+from mapper.config.features import OrbConfig
 from mapper.config.graph import GraphConfig
 from mapper.config.odometry import LocalMapConfig
 from mapper.config.synthetic import SynthConfig
@@ -65,8 +65,8 @@ def test_it_follows_the_truth(source, frames):
     assert 1 < sum(step.is_keyframe for step in tracks) < len(frames) // 2
 
 
-def test_uniform_orb_serves_as_well(source, frames):
-    _, trajectory = track(frames, LocalMapConfig(detector=UniformOrbConfig()))
+def test_plain_orb_serves_as_well(source, frames):
+    _, trajectory = track(frames, LocalMapConfig(detector=OrbConfig()))
     assert len(trajectory) == len(frames)
     assert ate_rmse_m(trajectory, source) < 0.01
 

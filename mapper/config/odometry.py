@@ -85,10 +85,12 @@ class LocalMapConfig(Config):
     """Reprojection tracking against a local map of keyframes, refined by local bundle adjustment."""
 
     kind: Literal["local-map"] = "local-map"
-    detector: Annotated[OrbConfig | UniformOrbConfig, Field(discriminator="kind")] = OrbConfig()
-    """The compiled matching reads 256-bit descriptors."""
+    detector: Annotated[OrbConfig | UniformOrbConfig, Field(discriminator="kind")] = UniformOrbConfig()
+    """Spread features survive views in which plain ORB crowds into one far corner."""
     max_depth_m: PositiveFloat = 4.0
-    """Deeper features are tracked but do not become landmarks."""
+    """Deeper features are tracked, but become landmarks only where near ones are few."""
+    min_keyframe_landmarks: PositiveInt = 200
+    """Keyframes that see fewer landmarks take deeper ones in, the nearest first."""
     virtual_baseline_px_m: PositiveFloat = 40.0
     """bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017); a Kinect's is 40 to 43."""
     disparity_sigma_px: PositiveFloat = 1.0

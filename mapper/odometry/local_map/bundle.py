@@ -3,6 +3,7 @@
 import numpy as np
 from numba import njit
 
+from mapper.odometry.local_map.linear import solve_positive, turned
 from mapper.odometry.local_map.pose import (
     CHI2_2DOF,
     CHI2_3DOF,
@@ -141,7 +142,7 @@ def _step(free, first_edge, edges, active, Hcc, bc, Hpp, bp, W, damping):
     for i in range(6 * cameras):
         for j in range(i):
             S[i, j] = S[j, i]
-    step_cameras = np.linalg.solve(S, rhs).reshape(cameras, 6)
+    step_cameras = solve_positive(S, rhs).reshape(cameras, 6)
     step_points = np.empty((points, 3))
     residue = np.empty(3)
     for p in range(points):
@@ -153,7 +154,7 @@ def _step(free, first_edge, edges, active, Hcc, bc, Hpp, bp, W, damping):
             for a in range(6):
                 for b in range(3):
                     residue[b] -= W[e, a, b] * step_cameras[f, a]
-        step_points[p] = inverses[p] @ residue
+        step_points[p] = turned(inverses[p], residue)
     return step_cameras, step_points
 
 

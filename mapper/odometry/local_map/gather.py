@@ -3,6 +3,8 @@
 import numpy as np
 from numba import njit
 
+from mapper.odometry.local_map.linear import turned
+
 MIN_DEPTH_M = 0.1
 MIN_VIEW_COSINE = 0.5
 """A landmark is searched for while its viewing direction is within 60° of those it was seen from."""
@@ -72,8 +74,8 @@ def project_visible(
     rows = np.empty(len(landmarks), np.int32)
     pixels = np.empty((len(landmarks), 2))
     octave = np.empty(len(landmarks), np.int32)
-    R, t = np.ascontiguousarray(T_camera_world[:3, :3]), np.ascontiguousarray(T_camera_world[:3, 3])
-    centre = -(R.T @ t)
+    R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
+    centre = -turned(R.T, t)
     n = 0
     for m in range(len(landmarks)):
         point = positions[landmarks[m]]

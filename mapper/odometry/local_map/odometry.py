@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.config.odometry import LocalMapConfig
 from mapper.features.detectors import build_detector
@@ -109,12 +110,11 @@ class LocalMapOdometry:
     def _keep(self, placement: Placement) -> Placement:
         """Turn a placed frame into a keyframe, refine the map around it, and return it as refined."""
         config, observation = self._config, placement.observation
-        near = observation.points_camera[:, 2] <= config.max_depth_m
         index = self._map.add_keyframe(
             observation,
             placement.T_camera_world,
             placement.landmark_of_feature,
-            new=near & (placement.landmark_of_feature < 0),
+            new=self._worth_mapping(placement),
         )
         self._map.refine(index, window=config.bundle_keyframes, min_shared=config.min_shared_landmarks)
         self._map.cull(min_found_ratio=config.min_found_ratio)
@@ -126,6 +126,17 @@ class LocalMapOdometry:
             landmark_of_feature=keyframe.landmark_of_feature,
             reference=index,
         )
+
+    def _worth_mapping(self, placement: Placement) -> NDArray[np.bool_]:
+        """Return (N,) which features become landmarks: the near ones, and deeper ones while those are few."""
+        depth_m = placement.observation.points_camera[:, 2]
+        unmapped = placement.observation.has_depth & (placement.landmark_of_feature < 0)
+        worth = unmapped & (depth_m <= self._config.max_depth_m)
+        missing = self._config.min_keyframe_landmarks - placement.inliers - int(worth.sum())
+        if missing > 0:
+            deep = np.flatnonzero(unmapped & ~worth)
+            worth[deep[np.argsort(depth_m[deep], kind="stable")[:missing]]] = True
+        return worth
 
     def _track(self, placement: Placement, *, is_keyframe: bool) -> Track:
         T_world_body = _body_pose(placement.observation, placement.T_camera_world)

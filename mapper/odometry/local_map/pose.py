@@ -3,6 +3,8 @@
 import numpy as np
 from numba import njit
 
+from mapper.odometry.local_map.linear import product, solve_positive, turned
+
 CHI2_2DOF, CHI2_3DOF = 5.991, 7.815
 """95 % points of χ²: an image point without and with depth."""
 
@@ -21,12 +23,12 @@ def twist_exp(delta, T):
         a = np.sin(angle) / angle
         b = (1.0 - np.cos(angle)) / angle**2
         c = (angle - np.sin(angle)) / angle**3
-    KK = K @ K
+    KK = product(K, K)
     R = np.eye(3) + a * K + b * KK
     V = np.eye(3) + b * K + c * KK
     moved = np.eye(4)
-    moved[:3, :3] = R @ np.ascontiguousarray(T[:3, :3])
-    moved[:3, 3] = R @ np.ascontiguousarray(T[:3, 3]) + V @ np.ascontiguousarray(delta[3:6])
+    moved[:3, :3] = product(R, T)
+    moved[:3, 3] = turned(R, T[:3, 3]) + turned(V, delta[3:])
     # Products of many small rotations drift off SO(3): one Gram–Schmidt step keeps them on it.
     for i in range(3):
         for j in range(i):
@@ -183,7 +185,7 @@ def refine_pose(T_camera_world, points, measured, weights, intrinsics, rounds, i
             A = H.copy()
             for a in range(6):
                 A[a, a] += damping * H[a, a] + 1e-9
-            delta = np.linalg.solve(A, g)
+            delta = solve_positive(A, g)
             trial = twist_exp(delta, T)
             trial_cost = _linearise(
                 trial, points, measured, weights, intrinsics, inlier, robust, trial_H, trial_g
@@ -223,9 +225,9 @@ def _rigid3(world, camera):
         frames[s, :, 1] = np.cross(e3, e1)
         frames[s, :, 2] = e3
     T = np.eye(4)
-    R = np.ascontiguousarray(frames[1]) @ np.ascontiguousarray(frames[0].T)
+    R = product(frames[1], frames[0].T)
     T[:3, :3] = R
-    T[:3, 3] = (camera[0] + camera[1] + camera[2] - R @ (world[0] + world[1] + world[2])) / 3.0
+    T[:3, 3] = (camera[0] + camera[1] + camera[2] - turned(R, world[0] + world[1] + world[2])) / 3.0
     return T
 
 

@@ -1,0 +1,56 @@
+"""Small dense linear algebra, compiled without BLAS: numba's own imports SciPy and is no faster here."""
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True)
+def product(A, B):
+    """Return the product of two (3, 3) matrices, or of the (3, 3) corners of larger ones."""
+    C = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+    return C
+
+
+@njit(cache=True, nogil=True)
+def turned(A, v):
+    """Return the (3,) product of a (3, 3) matrix with a (3,) vector."""
+    w = np.empty(3)
+    for i in range(3):
+        w[i] = A[i, 0] * v[0] + A[i, 1] * v[1] + A[i, 2] * v[2]
+    return w
+
+
+@njit(cache=True, nogil=True)
+def solve_positive(A, b):
+    """Return x with A x = b by Cholesky's factorisation; zeros where A (N, N) is not positive definite.
+
+    A step of zero is what an optimiser does with a system that says nothing.
+    """
+    n = len(b)
+    L = np.empty((n, n))
+    x = np.zeros(n)
+    for i in range(n):
+        for j in range(i + 1):
+            total = A[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i > j:
+                L[i, j] = total / L[j, j]
+            elif total > 0.0:
+                L[i, i] = np.sqrt(total)
+            else:
+                return x
+    for i in range(n):
+        total = b[i]
+        for k in range(i):
+            total -= L[i, k] * x[k]
+        x[i] = total / L[i, i]
+    for i in range(n - 1, -1, -1):
+        total = x[i]
+        for k in range(i + 1, n):
+            total -= L[k, i] * x[k]
+        x[i] = total / L[i, i]
+    return x
