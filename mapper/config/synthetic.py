@@ -42,6 +42,8 @@ class SynthConfig(Config):
     room_height_m: Annotated[float, Field(ge=2.3)] = 2.6
     furniture_per_room: NonNegativeInt = 9
     posters_per_room: NonNegativeInt = 8
+    moving_boxes: NonNegativeInt = 0
+    """Boxes that travel round the flat all the time."""
     texture_px_per_m: PositiveInt = 256
     """Detail of walls and floors; smaller is faster to make and enough for small images."""
 

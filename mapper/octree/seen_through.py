@@ -42,7 +42,7 @@ class SeenThrough:
         values: NDArray[np.float32],
         sensor: Sensor,
     ) -> int:
-        """Do what ``kernels.merge`` does and release what was seen through; return how many voxels are new."""
+        """Do what ``kernels.merge`` does, and release what was seen through."""
         missing = len(values) - len(self._runs)
         if missing > 0:
             self._runs = np.concatenate([self._runs, np.zeros((missing, BLOCK_VOXELS), np.uint8)])

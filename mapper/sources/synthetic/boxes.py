@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -73,9 +74,14 @@ class Boxes:
         ]
 
 
-def write_scene(path: Path, boxes: Boxes, config: dict[str, Any]) -> None:
-    """Write the exact geometry, and the configuration that made it, as JSON."""
-    write_text(path, json.dumps({"config": config, "boxes": boxes.as_json()}, indent=1) + "\n")
+def write_scene(
+    path: Path, boxes: Boxes, config: dict[str, Any], *, moving: Sequence[dict[str, Any]] = ()
+) -> None:
+    """Write the exact geometry, and what made it, as JSON; ``moving`` only if anything does."""
+    scene: dict[str, Any] = {"config": config, "boxes": boxes.as_json()}
+    if moving:
+        scene["moving"] = list(moving)
+    write_text(path, json.dumps(scene, indent=1) + "\n")
 
 
 def read_scene(path: Path) -> Boxes:

@@ -13,6 +13,7 @@ from mapper.errors import SourceError
 from mapper.frames import PinholeCamera, RgbdFrame
 from mapper.parallel import ordered_map
 from mapper.sources.synthetic.boxes import write_scene
+from mapper.sources.synthetic.path import seconds_of
 from mapper.sources.synthetic.source import SyntheticEntry, SyntheticSource
 from mapper.timebase import seconds_text_from_ns
 from mapper.trajectory import write_tum
@@ -83,7 +84,11 @@ def _write(folder: Path, source: SyntheticSource, on_progress: Callable[[int, in
         (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     write_tum(folder / "groundtruth.txt", source.truth)
     (folder / "calibration.toml").write_text(_calibration_text(source.camera), encoding="utf-8")
-    write_scene(folder / "scene.json", source.scene.boxes, config.model_dump(mode="json"))
+    knobs = config.model_dump(mode="json")
+    if not config.moving_boxes:  # a flat in which nothing moves says what it always said
+        del knobs["moving_boxes"]
+    moving = source.movers.as_json(seconds_of(source.stamps_ns))
+    write_scene(folder / "scene.json", source.scene.boxes, knobs, moving=moving)
 
 
 def _save_images(folder: Path, name: str, frame: RgbdFrame, *, image_format: str) -> None:

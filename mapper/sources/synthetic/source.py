@@ -12,6 +12,7 @@ from mapper.config.synthetic import SynthConfig
 from mapper.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
 from mapper.geometry import angle_between
 from mapper.sources.base import Accelerations
+from mapper.sources.synthetic.movers import Movers, make_movers
 from mapper.sources.synthetic.path import Motion, frame_stamps, make_motion, seconds_of
 from mapper.sources.synthetic.raycast import Rendering, render
 from mapper.sources.synthetic.scene import Scene, make_scene
@@ -59,7 +60,8 @@ class SyntheticSource:
 
     Attributes:
         config: What it is made from.
-        scene: The world.
+        scene: The world, without what moves in it.
+        movers: What moves in it.
         camera: The camera.
         motion: Its pose at any time.
         stamps_ns: (N,) stamps of all frames, also of those that the log drops.
@@ -73,6 +75,7 @@ class SyntheticSource:
     def __init__(self, config: SynthConfig, scene: Scene | None = None) -> None:
         self.config = config
         self.scene = make_scene(config) if scene is None else scene
+        self.movers: Movers = make_movers(config, self.scene)
         self.camera = camera_of(config)
         self.motion: Motion = make_motion(config, self.scene)
         self.stamps_ns: Stamps = frame_stamps(config, self.motion)
@@ -102,15 +105,19 @@ class SyntheticSource:
 
     def render(self, index: int) -> Rendering:
         """Return the exact image and depth of a frame, blurred by motion during the exposure."""
-        exact = render(self.scene, self.camera, self.truth.T_world_body[index])
+        middle_s = seconds_of(self.stamps_ns[index : index + 1])
+        scene = self.movers.scene_at(self.scene, float(middle_s[0]))
+        exact = render(scene, self.camera, self.truth.T_world_body[index])
         exposure_s = self.config.sensor.exposure_s
         if exposure_s == 0.0:
             return exact
         count = self._subexposures(index)
         moments_s = exposure_s * ((np.arange(count) + 0.5) / count - 0.5)
         total = np.zeros(exact.rgb.shape, dtype=np.uint16)
-        for T_world_camera in self.motion.poses(seconds_of(self.stamps_ns[index : index + 1]) + moments_s):
-            total += render(self.scene, self.camera, T_world_camera).rgb
+        times_s = middle_s + moments_s
+        for time_s, T_world_camera in zip(times_s, self.motion.poses(times_s), strict=True):
+            scene = self.movers.scene_at(self.scene, float(time_s))
+            total += render(scene, self.camera, T_world_camera).rgb
         blurred = ((total + count // 2) // count).astype(np.uint8)
         return Rendering(blurred, exact.depth_m, exact.surface, exact.cosine)
 

@@ -14,6 +14,7 @@ class Stream(IntEnum):
     PATH = 3
     SENSOR = 4
     DROPS = 5
+    MOVERS = 6
 
 
 def rng_of(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
