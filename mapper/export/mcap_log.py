@@ -31,6 +31,7 @@ The writer is the ``mcap`` package and not the one inside foxglove-sdk, which ke
 until the file is closed; foxglove-sdk encodes the messages.
 """
 
+import struct
 from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,6 +46,7 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
+from zstandard import ZstdError
 
 from mapper.atomic import replacing
 from mapper.errors import DataError
@@ -245,7 +247,7 @@ class McapLog:
                         publish_time=message.publish_time,
                         sequence=message.sequence,
                     )
-        except (OSError, McapError) as error:
+        except (OSError, McapError, ValueError, struct.error, ZstdError) as error:
             raise DataError(
                 f"{path}: cannot be read as MCAP: {error}; make it again with mapper fuse"
             ) from None

@@ -31,6 +31,9 @@ def write_plan(run: Run, plan: Plan, *, grid: OccupancyGrid) -> None:
     log_path = run.path / files.MCAP
     if not log_path.is_file():
         raise RunError(f"{log_path}: is missing from the run; make it again with mapper fuse {run.path}")
+    with McapLog(log_path) as log:
+        log.copy(log_path, without=PLAN_TOPICS)
+        log.plan(int(run.trajectory().stamps_ns[0]), _in_space(plan))
     write_text(run.path / files.PLAN, plan_json(plan))
     write_path(
         run.path / files.PLAN_VIEW,
@@ -40,9 +43,6 @@ def write_plan(run: Run, plan: Plan, *, grid: OccupancyGrid) -> None:
         title=f"{point_text(plan.waypoints_world[0])} to {point_text(plan.waypoints_world[-1])} m",
         lines=[plan.summary],
     )
-    with McapLog(log_path) as log:
-        log.copy(log_path, without=PLAN_TOPICS)
-        log.plan(int(run.trajectory().stamps_ns[0]), _in_space(plan))
 
 
 def plan_json(plan: Plan) -> str:

@@ -75,11 +75,14 @@ def _anchors(distances: Distances, resolution_m: float, radius_m: float, path: A
     kept = np.empty(len(path), np.int64)
     kept[0], count, anchor = 0, 1, 0
     while anchor < len(path) - 1:
-        ahead = anchor + 1
-        while ahead + 1 < len(path) and _visible(
-            distances, resolution_m, radius_m, path[anchor], path[ahead + 1]
-        ):
-            ahead += 1
+        ahead, stride, grows = anchor + 1, 1, True
+        while stride > 0:  # doubled while points are in sight, then halved: looking at each is quadratic
+            further = min(ahead + stride, len(path) - 1)
+            if further > ahead and _visible(distances, resolution_m, radius_m, path[anchor], path[further]):
+                ahead = further
+            else:
+                grows = False
+            stride = stride * 2 if grows else stride // 2
         kept[count] = anchor = ahead
         count += 1
     return kept[:count]
