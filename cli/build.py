@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli.console import progress_for
-from cli.environment import prepare_libraries
+from cli.environment import has_compiled_code, prepare_libraries
 from cli.options import (
     ConfigFile,
     First,
@@ -66,6 +66,8 @@ def built(
     prepare_libraries()
     source = open_source(log, config.source)
     progress = progress_for(quiet=quiet)
+    if not has_compiled_code():
+        progress.note("first run here: the kernels are compiled once, which takes about a minute")
     for note in source.notes:
         progress.note(note)
     run = build_run(source, config, out, progress=progress, overwrite=overwrite)

@@ -119,6 +119,13 @@ install_missing_libraries() {
 [ -x "$venv/bin/python" ] && is_new_enough "$venv/bin/python" || make_venv
 "$venv/bin/python" -m pip --version >/dev/null 2>&1 || "$venv/bin/python" -m ensurepip >/dev/null
 
+# numba notices a changed kernel, but not a changed kernel that another module's kernel calls.
+kernels=$(grep -rl njit mapper --include='*.py' | sort | xargs cat | sha256sum)
+if [ "$(cat "$venv/.kernels" 2>/dev/null)" != "$kernels" ]; then
+  find mapper -name '*.nb[ic]' -delete
+  printf '%s\n' "$kernels" >"$venv/.kernels"
+fi
+
 # The folder counts as well: an editable install and its scripts name it.
 want=$( (pwd; "$venv/bin/python" --version; cat pyproject.toml scripts/setup.sh) | sha256sum)
 if [ "$(cat "$stamp" 2>/dev/null)" != "$want" ]; then
