@@ -18,7 +18,7 @@ class OctreeConfig(Config):
     clamp_min_probability: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.1192
     clamp_max_probability: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.971
     occupied_probability: Probability = 0.5
-    max_range_m: PositiveFloat = 4.0
+    max_range_m: Annotated[float, Field(gt=0.0, allow_inf_nan=True)] = 4.0
     """Beyond it a ray only frees space, up to this range. Kinect depth is poor past 4 m."""
     discretize: bool = True
     """Cast one ray per end voxel (fast), not one per point; both are OctoMap's own modes."""
