@@ -24,9 +24,9 @@ class OctreeConfig(Config):
     """Cast one ray per end voxel (fast), not one per point; both are OctoMap's own modes."""
     attributes: bool = False
     """Keep mean colour, hit count and last sight of the voxels where rays end, beside their log-odds."""
-    stays_within_m: NonNegativeFloat = 0.0
+    stays_within_m: NonNegativeFloat = 1e-9
     """Fusing again along another trajectory leaves a frame as it was fused if no end of a ray moves further;
-    0 moves it at any change."""
+    the default forgives the rounding of poses that were text."""
     dynamic: Literal["none", "seen-through"] = "none"
     """"none" is OctoMap. "seen-through": see ``seen_through_scans``."""
     seen_through_scans: Annotated[int, Field(ge=1, le=255)] = 3
