@@ -3,10 +3,10 @@
 import cv2
 import numpy as np
 from numba import njit
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from mapper.errors import DataError
+from mapper.features.bits import popcount
 from mapper.features.detectors import Features
 
 Pairs = NDArray[np.intp]
@@ -85,16 +85,6 @@ def _squares(features: Features) -> NDArray[np.float32]:
     return squares
 
 
-@intrinsic
-def _popcount(_context, x):  # type: ignore[no-untyped-def]
-    """Count the set bits of a uint64 with the processor's own instruction, which numba does not expose."""
-
-    def generate(_typing, builder, _signature, arguments):  # type: ignore[no-untyped-def]
-        return builder.ctpop(arguments[0])
-
-    return x(x), generate
-
-
 @njit(cache=True, nogil=True)
 def _match_bits(a: NDArray[np.uint64], b: NDArray[np.uint64], max_ratio: float) -> Pairs:
     distances = np.empty((len(a), len(b)), np.float32)
@@ -103,7 +93,7 @@ def _match_bits(a: NDArray[np.uint64], b: NDArray[np.uint64], max_ratio: float) 
         for j in range(len(b)):
             differing = np.uint64(0)
             for k in range(words):
-                differing += _popcount(a[i, k] ^ b[j, k])
+                differing += popcount(a[i, k] ^ b[j, k])
             distances[i, j] = differing
     nearest: Pairs = _match_distances(distances, max_ratio)
     return nearest

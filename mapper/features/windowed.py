@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numba.extending import intrinsic
 from numpy.typing import NDArray
+
+from mapper.features.bits import popcount
 
 CELL_PX = 16
 
@@ -50,24 +51,14 @@ def sort_into_grid(
     return order, FeatureGrid(start, columns, rows)
 
 
-@intrinsic
-def _popcount(_context, x):
-    """Count the set bits of a uint64 with the processor's own instruction, which numba does not expose."""
-
-    def generate(_typing, builder, _signature, arguments):
-        return builder.ctpop(arguments[0])
-
-    return x(x), generate
-
-
 @njit(cache=True, nogil=True)
 def hamming(a, i, b, j):
     """Return how many of the 256 bits of row i of a and row j of b differ."""
     return np.int64(
-        _popcount(a[i, 0] ^ b[j, 0])
-        + _popcount(a[i, 1] ^ b[j, 1])
-        + _popcount(a[i, 2] ^ b[j, 2])
-        + _popcount(a[i, 3] ^ b[j, 3])
+        popcount(a[i, 0] ^ b[j, 0])
+        + popcount(a[i, 1] ^ b[j, 1])
+        + popcount(a[i, 2] ^ b[j, 2])
+        + popcount(a[i, 3] ^ b[j, 3])
     )
 
 
