@@ -7,14 +7,14 @@ from mapper.odometry.local_map.linear import solve_positive, turned
 from mapper.odometry.local_map.pose import (
     CHI2_2DOF,
     CHI2_3DOF,
+    HUBER_2DOF,
+    HUBER_3DOF,
     chi2,
     pose_jacobian,
     projection_jacobian,
     residual,
     twist_exp,
 )
-
-_HUBER_2DOF, _HUBER_3DOF = np.sqrt(CHI2_2DOF), np.sqrt(CHI2_3DOF)
 
 
 @njit(cache=True, nogil=True)
@@ -26,7 +26,7 @@ def _cost(poses, points, edges, measured, weights, intrinsics, active, robust):
             continue
         residual(poses[edges[e, 0]], points[edges[e, 1]], measured[e], intrinsics, r)
         value = chi2(r, weights[e])
-        k = _HUBER_2DOF if np.isnan(measured[e, 2]) else _HUBER_3DOF
+        k = HUBER_2DOF if np.isnan(measured[e, 2]) else HUBER_3DOF
         if robust and value > k * k:
             total += 2.0 * k * np.sqrt(value) - k * k
         else:
@@ -55,7 +55,7 @@ def _linearise(
         x, y, z = residual(T, points[p], measured[e], intrinsics, r)
         has_depth = not np.isnan(measured[e, 2])
         value = chi2(r, weights[e])
-        k = _HUBER_3DOF if has_depth else _HUBER_2DOF
+        k = HUBER_3DOF if has_depth else HUBER_2DOF
         scale = k / np.sqrt(value) if robust and value > k * k else 1.0
         projection_jacobian(x, y, z, intrinsics, has_depth, J)
         for i in range(3):

@@ -8,7 +8,8 @@ from mapper.odometry.local_map.linear import product, solve_positive, turned
 CHI2_2DOF, CHI2_3DOF = 5.991, 7.815
 """95 % points of χ²: an image point without and with depth."""
 
-_HUBER_2DOF, _HUBER_3DOF = np.sqrt(CHI2_2DOF), np.sqrt(CHI2_3DOF)
+HUBER_2DOF, HUBER_3DOF = np.sqrt(CHI2_2DOF), np.sqrt(CHI2_3DOF)
+"""Residual lengths at which Huber's kernel turns linear."""
 
 
 @njit(cache=True, nogil=True)
@@ -112,7 +113,7 @@ def _linearise(T, points, measured, weights, intrinsics, inlier, robust, H, g):
         x, y, z = residual(T, points[n], measured[n], intrinsics, r)
         has_depth = not np.isnan(measured[n, 2])
         e = chi2(r, weights[n])
-        k = _HUBER_3DOF if has_depth else _HUBER_2DOF
+        k = HUBER_3DOF if has_depth else HUBER_2DOF
         scale = 1.0
         if robust and e > k * k:
             root = np.sqrt(e)
