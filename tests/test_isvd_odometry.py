@@ -37,7 +37,7 @@ class Wall:
 def observation(stamp_ns, pixels, points, descriptors) -> IsvdObservation:
     zeros = np.zeros(len(pixels), np.float32)
     features = Features(pixels.astype(np.float32), np.zeros(len(pixels), np.int32), zeros, zeros, descriptors)
-    return IsvdObservation(stamp_ns, features, points)
+    return IsvdObservation(stamp_ns, features, points, CAMERA, np.eye(4))
 
 
 def strangers(stamp_ns: int) -> IsvdObservation:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
+from mapper.features.view import View
 from mapper.frames import Frame
 from mapper.geometry import Transform
 from mapper.graph.model import BetweenFactor
@@ -42,6 +43,8 @@ class Track:
         is_keyframe: The frame itself became ``node``.
         factors: Measurements that became final with this frame; their nodes are known by now.
         diagnostics: How it went.
+        links: Where the new node lies from earlier ones, as far as is known now; ``factors`` may come later
+            and better, but until then this is what ties the node to the path.
     """
 
     stamp_ns: int
@@ -51,6 +54,7 @@ class Track:
     is_keyframe: bool
     diagnostics: Diagnostics
     factors: Sequence[BetweenFactor] = field(default_factory=tuple)
+    links: Sequence[BetweenFactor] = field(default_factory=tuple)
 
 
 Observation = TypeVar("Observation")
@@ -69,6 +73,10 @@ class Odometry(Protocol[Observation]):
 
     def track(self, observation: Observation) -> Track:
         """Place the next observation, in time order."""
+        ...
+
+    def view(self, observation: Observation) -> View:
+        """Return what a place is recognised by. Pure."""
         ...
 
     def finish(self) -> Sequence[BetweenFactor]:

@@ -10,8 +10,9 @@ from mapper.config.odometry import IsvdOdometryConfig, MatchConfig
 from mapper.errors import FrameError
 from mapper.features.detectors import Features, build_detector
 from mapper.features.matching import homography_inliers, match_mutual
-from mapper.frames import Frame, RgbdFrame
-from mapper.geometry import Array, Points, Transform, apply, mean_rotation, transform
+from mapper.features.view import View
+from mapper.frames import Frame, PinholeCamera, RgbdFrame
+from mapper.geometry import Array, Points, Transform, apply, inverse, mean_rotation, transform
 from mapper.graph.model import BetweenFactor
 from mapper.odometry.base import Diagnostics, Track
 from mapper.odometry.keyframes import SharpestKeyframes
@@ -28,11 +29,15 @@ class IsvdObservation:
         stamp_ns: The frame's stamp.
         features: Of the image.
         points_body: (N, 3) metres, body frame; NaN where the depth image has no measurement.
+        camera: What took the image.
+        T_body_camera: (4, 4) pose of the camera in the body frame.
     """
 
     stamp_ns: int
     features: Features
     points_body: Points
+    camera: PinholeCamera
+    T_body_camera: Transform
 
 
 SharedPoints = Callable[[IsvdObservation, IsvdObservation, MatchConfig], tuple[Points, Points, int]]
@@ -101,7 +106,8 @@ class IsvdOdometry:
         if not isinstance(frame, RgbdFrame):
             raise FrameError(f"frame {frame.stamp_ns}: ISVD odometry needs an image with depth, not a scan")
         features = self._detector.detect(frame.gray)
-        return IsvdObservation(frame.stamp_ns, features, self._points_body(frame, features))
+        points_body = self._points_body(frame, features)
+        return IsvdObservation(frame.stamp_ns, features, points_body, frame.camera, frame.T_body_camera)
 
     def track(self, observation: IsvdObservation) -> Track:
         """Place the next observation, in time order."""
@@ -117,6 +123,20 @@ class IsvdOdometry:
             return self._place(observation, self._combine(candidates), candidates, method="relocalised")
         diagnostics = Diagnostics(len(observation.features), 0, 0, 0.0, "m", "lost")
         return Track(observation.stamp_ns, None, np.eye(4), self._recent[-1].T_world_body, False, diagnostics)
+
+    def view(self, observation: IsvdObservation) -> View:
+        """Return what a place is recognised by. Pure."""
+        features, camera = observation.features, observation.camera
+        pixels: Array = features.pixels.astype(np.float64)
+        return View(
+            stamp_ns=observation.stamp_ns,
+            pixels=camera.undistort(pixels) if self._config.undistort else pixels,
+            sigma_px=self._detector.scale_factor ** features.octave.astype(np.float64),
+            descriptors=features.descriptors,
+            points_camera=apply(inverse(observation.T_body_camera), observation.points_body),
+            intrinsics=np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]),
+            T_body_camera=observation.T_body_camera,
+        )
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return nothing: every measurement was final when its frame was tracked."""
@@ -192,6 +212,11 @@ class IsvdOdometry:
         keyframe = self._sharpest.add(node, len(observation.features))
         self._keyframes.extend(placed for placed in self._recent if placed.node == keyframe)
         nearest = candidates[0].alignment if candidates else None
+        factors = tuple(
+            BetweenFactor(candidate.earlier.node, node, alignment.T_target_source, alignment.information)
+            for candidate in candidates
+            if (alignment := candidate.alignment).information is not None
+        )
         return Track(
             stamp_ns=observation.stamp_ns,
             node=node,
@@ -206,11 +231,8 @@ class IsvdOdometry:
                 residual_unit="m",
                 method=method,
             ),
-            factors=tuple(
-                BetweenFactor(candidate.earlier.node, node, alignment.T_target_source, alignment.information)
-                for candidate in candidates
-                if (alignment := candidate.alignment).information is not None
-            ),
+            factors=factors,
+            links=factors,
         )
 
 

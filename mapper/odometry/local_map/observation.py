@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from mapper.config.odometry import LocalMapConfig
 from mapper.errors import FrameError
 from mapper.features.detectors import Detector
+from mapper.features.view import View
 from mapper.features.windowed import FeatureGrid, Words, pack, sort_into_grid
 from mapper.frames import Frame, RgbdFrame
 from mapper.geometry import Array, Points, Transform
@@ -50,6 +51,18 @@ class Observation:
     def has_depth(self) -> NDArray[np.bool_]:
         """(N,) which features have depth."""
         return ~np.isnan(self.measured[:, 2])
+
+    def view(self) -> View:
+        """Return what a place is recognised by."""
+        return View(
+            stamp_ns=self.stamp_ns,
+            pixels=self.pixels,
+            sigma_px=self.weights[:, 0] ** -0.5,
+            descriptors=self.words.view(np.uint8).reshape(len(self), -1),
+            points_camera=self.points_camera,
+            intrinsics=self.intrinsics[:4],
+            T_body_camera=self.T_body_camera,
+        )
 
 
 def observe(frame: Frame, detector: Detector, config: LocalMapConfig) -> Observation:

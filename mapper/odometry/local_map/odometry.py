@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from mapper.config.odometry import LocalMapConfig
 from mapper.features.detectors import build_detector
+from mapper.features.view import View
 from mapper.frames import Frame
 from mapper.geometry import Transform, inverse
 from mapper.graph.model import BetweenFactor
@@ -53,24 +54,34 @@ class LocalMapOdometry:
         self._lost_frames = 0
         self._frames_since_keyframe += 1
         self._most_inliers = max(self._most_inliers, placement.inliers)
-        is_keyframe = self._wants_keyframe(placement)
+        is_keyframe, seen_from = self._wants_keyframe(placement), placement.reference
         if is_keyframe:
             placement = self._keep(placement)
         self._before_last, self._last = self._last, placement
-        return self._track(placement, is_keyframe=is_keyframe)
+        links = [self._factor(seen_from, placement.reference)] if is_keyframe else []
+        return self._track(placement, is_keyframe=is_keyframe, links=links)
+
+    def view(self, observation: Observation) -> View:
+        """Return what a place is recognised by. Pure."""
+        return observation.view()
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return a factor from every keyframe to those earlier ones that share most landmarks with it."""
-        T_world_body = [_body_pose(k.observation, k.T_camera_world) for k in self._map.keyframes]
         factors = []
-        for j in range(1, len(T_world_body)):
+        for j in range(1, len(self._map.keyframes)):
             earlier = [(k, shared) for k, shared in self._map.covisible(j, min_shared=1) if k < j]
             strong = [k for k, shared in earlier if shared >= self._config.min_shared_landmarks]
             weak = [k for k, _ in earlier[:1]] or [j - 1]
-            for i in strong[: self._config.factors_per_keyframe] or weak:
-                T_i_j = inverse(T_world_body[i]) @ T_world_body[j]
-                factors.append(BetweenFactor(i, j, T_i_j, self._map.information(i, j)))
+            factors += [self._factor(i, j) for i in strong[: self._config.factors_per_keyframe] or weak]
         return factors
+
+    def _factor(self, i: int, j: int) -> BetweenFactor:
+        """Return how two keyframes lie to each other by the map as it is."""
+        T_world_i, T_world_j = (
+            _body_pose(keyframe.observation, keyframe.T_camera_world)
+            for keyframe in (self._map.keyframes[i], self._map.keyframes[j])
+        )
+        return BetweenFactor(i, j, inverse(T_world_i) @ T_world_j, self._map.information(i, j))
 
     def _start(self, observation: Observation) -> Track:
         """Make the first frame with enough depth the world's origin."""
@@ -138,7 +149,9 @@ class LocalMapOdometry:
             worth[deep[np.argsort(depth_m[deep], kind="stable")[:missing]]] = True
         return worth
 
-    def _track(self, placement: Placement, *, is_keyframe: bool) -> Track:
+    def _track(
+        self, placement: Placement, *, is_keyframe: bool, links: Sequence[BetweenFactor] = ()
+    ) -> Track:
         T_world_body = _body_pose(placement.observation, placement.T_camera_world)
         node = self._map.keyframes[placement.reference]
         T_world_node = _body_pose(node.observation, node.T_camera_world)
@@ -157,6 +170,7 @@ class LocalMapOdometry:
             T_world_body=T_world_body,
             is_keyframe=is_keyframe,
             diagnostics=diagnostics,
+            links=links,
         )
 
     def _lost(self, observation: Observation) -> Track:
