@@ -40,6 +40,10 @@ class MapFileError(MapperError):
     """A map file that is truncated, foreign or damaged."""
 
 
+class VocabularyError(MapperError):
+    """A vocabulary that is missing or damaged, or descriptors that it has no words for."""
+
+
 class PlanError(MapperError):
     """A path that does not exist, or an end of it where the robot has no room."""
 

@@ -1,0 +1,32 @@
+"""Place recognition by visual words."""
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, PositiveInt
+
+from mapper.config.base import Config
+from mapper.config.features import OrbConfig, UniformOrbConfig
+
+
+class VocabularyConfig(Config):
+    """Training of a vocabulary: a tree of k-means++ clusters (B2; Arthur & Vassilvitskii 2007)."""
+
+    detector: Annotated[OrbConfig | UniformOrbConfig, Field(discriminator="kind")] = UniformOrbConfig()
+    frames_per_log: PositiveInt = 200
+    """This many frames of a log are used, evenly spread."""
+    branching: Annotated[int, Field(ge=2, le=255)] = 10
+    """k: parts that a cluster is split into."""
+    levels: Annotated[int, Field(ge=1, le=8)] = 4
+    """d: how often; the words are at most branching ** levels."""
+    max_iterations: PositiveInt = 12
+    """Of each split."""
+
+
+class PlacesConfig(Config):
+    """When two images are taken to show the same place (B5)."""
+
+    path: Path | None = None
+    """File of the vocabulary; None is the one trained on synthetic logs that comes with the toolkit."""
+    min_similarity: Annotated[float, Field(ge=0.0, le=1.0)] = 0.32
+    """Of two images' words (eq. 10), as published."""

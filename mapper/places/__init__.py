@@ -1,0 +1,1 @@
+"""Places recognised by the visual words that their images share."""

@@ -1,0 +1,229 @@
+"""Compiled loops over binary descriptors, visual words and postings."""
+
+import numpy as np
+from numba import njit
+
+from mapper.features.windowed import hamming
+
+_BITS = 256
+_FARTHER = _BITS + 1
+
+
+@njit(cache=True, nogil=True)
+def descend(bits, centres, first_child, children, word):
+    """Return (N,) int32, the word of each descriptor: always on to the nearest child, the first of equals.
+
+    Args:
+        bits: (N, 4) uint64 descriptors.
+        centres: (T, 4) uint64 centre of every node; node 0 is the root.
+        first_child: (T,) int32.
+        children: (T,) uint8 how many children each node has; they lie side by side.
+        word: (T,) int32 word of every leaf.
+    """
+    words = np.empty(len(bits), np.int32)
+    for i in range(len(bits)):
+        node = 0
+        while children[node] > 0:
+            nearest, best = -1, _FARTHER
+            for child in range(first_child[node], first_child[node] + children[node]):
+                distance = hamming(bits, i, centres, child)
+                if distance < best:
+                    nearest, best = child, distance
+            node = nearest
+        words[i] = word[node]
+    return words
+
+
+@njit(cache=True, nogil=True)
+def seed_centres(bits, draws):
+    """Return up to len(draws) rows of bits spread by k-means++ (Arthur & Vassilvitskii 2007).
+
+    Each next centre is drawn with the probability of its squared Euclidean distance to the nearest one so
+    far, which for bits is the Hamming distance. There are fewer centres where there are fewer distinct rows.
+
+    Args:
+        bits: (N, 4) uint64 descriptors, N ≥ 1.
+        draws: (k,) float64 uniform in [0, 1).
+    """
+    centres = np.empty((len(draws), 4), np.uint64)
+    distance = np.full(len(bits), _FARTHER, np.int64)
+    chosen = int(draws[0] * len(bits))
+    for c in range(len(draws)):
+        centres[c] = bits[chosen]
+        total = 0
+        for i in range(len(bits)):
+            distance[i] = min(distance[i], hamming(bits, i, centres, c))
+            total += distance[i]
+        if total == 0:
+            return centres[: c + 1]
+        if c + 1 < len(draws):
+            left = int(draws[c + 1] * total)
+            chosen = 0
+            while left >= distance[chosen]:
+                left -= distance[chosen]
+                chosen += 1
+    return centres
+
+
+@njit(cache=True, nogil=True)
+def k_majority(bits, seeds, max_iterations):
+    """Return the centres (k, 4) of Lloyd's iteration on bits, and the cluster (N,) int32 of each row.
+
+    A centre takes each bit that most of its rows have, and keeps it where they are even (Grana et al. 2013),
+    so the summed distance never grows. A centre may end without rows.
+
+    Args:
+        bits: (N, 4) uint64 descriptors.
+        seeds: (k, 4) uint64 centres to start from.
+        max_iterations: Stop here even if rows still change clusters.
+    """
+    centres = seeds.copy()
+    cluster = np.full(len(bits), -1, np.int32)
+    one = np.uint64(1)
+    for _ in range(max_iterations):
+        changed = False
+        for i in range(len(bits)):
+            nearest, best = -1, _FARTHER
+            for c in range(len(centres)):
+                distance = hamming(bits, i, centres, c)
+                if distance < best:
+                    nearest, best = c, distance
+            if nearest != cluster[i]:
+                cluster[i] = nearest
+                changed = True
+        if not changed:
+            break
+        excess = np.zeros((len(centres), _BITS), np.int64)  # rows with the bit less rows without
+        for i in range(len(bits)):
+            for bit in range(_BITS):
+                is_set = (bits[i, bit >> 6] >> np.uint64(bit & 63)) & one
+                excess[cluster[i], bit] += 2 * np.int64(is_set) - 1
+        for c in range(len(centres)):
+            for bit in range(_BITS):
+                mask = one << np.uint64(bit & 63)
+                if excess[c, bit] > 0:
+                    centres[c, bit >> 6] |= mask
+                elif excess[c, bit] < 0:
+                    centres[c, bit >> 6] &= ~mask
+    return centres, cluster
+
+
+@njit(cache=True, nogil=True)
+def shared_weight(ids_a, weights_a, ids_b, weights_b):
+    """Return Σ min(fA, fB) over the words that two vectors with ascending ids share."""
+    total = 0.0
+    i, j = 0, 0
+    while i < len(ids_a) and j < len(ids_b):
+        if ids_a[i] < ids_b[j]:
+            i += 1
+        elif ids_a[i] > ids_b[j]:
+            j += 1
+        else:
+            total += min(weights_a[i], weights_b[j])
+            i += 1
+            j += 1
+    return total
+
+
+@njit(cache=True, nogil=True)
+def append_postings(ids, weights, row, first, last, following, filled, rows, posted, used):
+    """Append (row, weight) to the posting list of every word, and return how many blocks are used then.
+
+    A word's postings lie in a chain of blocks, in order of rows.
+
+    Args:
+        ids: (M,) int32 words.
+        weights: (M,) float32.
+        row: The row that has these words; larger than every row before.
+        first: (W,) int32 first block of each word, −1 before it has any.
+        last: (W,) int32 last block of each word.
+        following: (B,) int32 next block of the same word, −1 at the end.
+        filled: (B,) int32 how many postings a block holds.
+        rows: (B, block) int32 rows.
+        posted: (B, block) float32 weights.
+        used: How many blocks are in use; at least M more must be there.
+    """
+    for m in range(len(ids)):
+        word = ids[m]
+        block = last[word]
+        if block < 0 or filled[block] == rows.shape[1]:
+            if block < 0:
+                first[word] = used
+            else:
+                following[block] = used
+            last[word] = used
+            block = used
+            following[block] = -1
+            filled[block] = 0
+            used += 1
+        rows[block, filled[block]] = row
+        posted[block, filled[block]] = weights[m]
+        filled[block] += 1
+    return used
+
+
+@njit(cache=True, nogil=True)
+def accumulate(ids, weights, before, first, following, filled, rows, posted):
+    """Return (before,) float64, the similarity (``shared_weight``) of a vector to each of the first rows.
+
+    Args:
+        ids: (M,) int32 ascending words of the vector.
+        weights: (M,) float32.
+        before: How many rows take part.
+        first: As in ``append_postings``, like all that follow.
+        following: Next block.
+        filled: Postings per block.
+        rows: Rows.
+        posted: Weights.
+    """
+    similarity = np.zeros(before)
+    for m in range(len(ids)):
+        weight = weights[m]
+        block = first[ids[m]]
+        while block >= 0 and rows[block, 0] < before:
+            for p in range(filled[block]):
+                row = rows[block, p]
+                if row >= before:
+                    break
+                similarity[row] += min(weight, posted[block, p])
+            block = following[block]
+    return similarity
+
+
+@njit(cache=True, nogil=True)
+def match_sorted(bits_a, nodes_a, bits_b, nodes_b, max_hamming, max_ratio):
+    """Return, per row of a, its mutually nearest row of b under the same node, or −1.
+
+    Args:
+        bits_a: (Na, 4) uint64 descriptors, sorted by node.
+        nodes_a: (Na,) int32 ascending.
+        bits_b: (Nb, 4) uint64 descriptors, sorted by node.
+        nodes_b: (Nb,) int32 ascending.
+        max_hamming: Largest distance in bits.
+        max_ratio: Largest ratio of best to second-best distance.
+    """
+    matched = np.full(len(nodes_a), -1, np.int32)
+    owner = np.full(len(nodes_b), -1, np.int32)
+    best_of_b = np.full(len(nodes_b), _FARTHER, np.int32)
+    start = 0
+    for i in range(len(nodes_a)):
+        while start < len(nodes_b) and nodes_b[start] < nodes_a[i]:
+            start += 1
+        best, second, best_j = _FARTHER, _FARTHER, -1
+        j = start
+        while j < len(nodes_b) and nodes_b[j] == nodes_a[i]:
+            distance = hamming(bits_a, i, bits_b, j)
+            if distance < best_of_b[j]:
+                best_of_b[j] = distance
+                owner[j] = i
+            if distance < best:
+                second, best, best_j = best, distance, j
+            elif distance < second:
+                second = distance
+            j += 1
+        if best <= max_hamming and best <= max_ratio * second:
+            matched[i] = best_j
+    for i in range(len(nodes_a)):
+        if matched[i] >= 0 and owner[matched[i]] != i:
+            matched[i] = -1
+    return matched

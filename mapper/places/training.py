@@ -1,0 +1,90 @@
+"""Vocabularies made from images: hierarchical k-means++ on bits (B2)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.config.places import VocabularyConfig
+from mapper.errors import VocabularyError
+from mapper.places.kernels import k_majority, seed_centres
+from mapper.places.tree import Bits, WordTree
+from mapper.places.vocabulary import Vocabulary
+from mapper.progress import SILENT, Progress
+
+MIN_IMAGES = 2
+"""Of one image alone, every word would be in all images and tell nothing."""
+
+
+def train(
+    images: Sequence[Bits],
+    *,
+    config: VocabularyConfig,
+    trained_on: str,
+    rng: np.random.Generator,
+    progress: Progress = SILENT,
+) -> Vocabulary:
+    """Return a vocabulary of the descriptors of some images, weighted by how few images have each word.
+
+    Args:
+        images: (N_i, 4) uint64 descriptors of each image.
+        config: Shape of the tree.
+        trained_on: A line that says what the images are.
+        rng: Draws the seeds of k-means++.
+        progress: Who watches.
+
+    Raises:
+        VocabularyError: Fewer than two images have descriptors.
+    """
+    images = [bits for bits in images if len(bits)]
+    if len(images) < MIN_IMAGES:
+        raise VocabularyError(
+            f"nothing to train on: {len(images)} images have features, want at least {MIN_IMAGES}"
+        )
+    tree = grow(np.concatenate(images), config=config, rng=rng, progress=progress)
+    return Vocabulary(tree, _inverse_document_frequency(tree, images), trained_on)
+
+
+def grow(
+    bits: Bits, *, config: VocabularyConfig, rng: np.random.Generator, progress: Progress = SILENT
+) -> WordTree:
+    """Return the tree that splits (N, 4) descriptors into clusters of clusters, level by level."""
+    centres, children = [np.zeros((1, 4), np.uint64)], []
+    clusters = [np.arange(len(bits))]
+    with progress.stage("cluster") as report:
+        for level in range(config.levels):
+            parts: list[NDArray[np.intp]] = []
+            done = level * len(bits)
+            for members in clusters:
+                middles, split = _split(bits, members, config=config, rng=rng)
+                centres.append(middles)
+                children.append(len(split))
+                parts += split
+                done += len(members)
+                report(done, config.levels * len(bits))
+            clusters = parts
+    children += [0] * len(clusters)
+    return WordTree(np.concatenate(centres), np.array(children, np.uint8))
+
+
+def _split(
+    bits: Bits, members: NDArray[np.intp], *, config: VocabularyConfig, rng: np.random.Generator
+) -> tuple[Bits, list[NDArray[np.intp]]]:
+    """Return the centres and the members of a cluster's parts; none where all members are equal."""
+    own = bits[members]
+    seeds = seed_centres(own, rng.random(config.branching))
+    if len(seeds) == 1:
+        return seeds[:0], []
+    centres, cluster = k_majority(own, seeds, config.max_iterations)
+    kept, sizes = np.unique(cluster, return_counts=True)
+    order = np.argsort(cluster, kind="stable")
+    return centres[kept], np.split(members[order], np.cumsum(sizes)[:-1])
+
+
+def _inverse_document_frequency(tree: WordTree, images: Sequence[Bits]) -> NDArray[np.float64]:
+    """Return ln(N / N_w); a word that no image ends in weighs as if one did."""
+    having = np.zeros(len(tree.leaves), np.int64)
+    for bits in images:
+        having[np.unique(tree.words_of(bits))] += 1
+    idf: NDArray[np.float64] = np.log(len(images) / np.maximum(having, 1))
+    return idf

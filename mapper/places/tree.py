@@ -1,0 +1,89 @@
+"""The k-ary tree of binary centres whose leaves are the visual words."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.errors import DataError
+from mapper.places.kernels import descend
+
+Bits = NDArray[np.uint64]
+"""(N, 4) uint64: 256-bit binary descriptors, as ``mapper.features.windowed.pack`` makes them."""
+Ids = NDArray[np.int32]
+"""(N,) int32: words or nodes."""
+
+
+@dataclass(frozen=True, eq=False)
+class WordTree:
+    """Nodes level by level from the root, node 0; siblings lie side by side.
+
+    Attributes:
+        centres: (T, 4) uint64 centre of every node; the root's has no meaning.
+        children: (T,) uint8 how many children each node has; those with none are the words, in this order.
+    """
+
+    centres: Bits
+    children: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        nodes = len(self.children)
+        if self.centres.shape != (nodes, 4) or self.centres.dtype != np.uint64:
+            raise DataError(
+                f"word tree: {nodes} nodes with centres {self.centres.shape} of {self.centres.dtype}, "
+                "want (nodes, 4) of uint64"
+            )
+        reached = 1 + np.cumsum(self.children, dtype=np.int64)  # node i has children only below this
+        if nodes == 0 or reached[-1] != nodes or (reached[:-1] <= np.arange(nodes - 1)).any():
+            raise DataError(f"word tree: the child counts of {nodes} nodes do not make one tree")
+
+    @cached_property
+    def leaves(self) -> Ids:
+        """(W,) node of every word."""
+        return np.flatnonzero(self.children == 0).astype(np.int32)
+
+    @cached_property
+    def depth(self) -> NDArray[np.int32]:
+        """(T,) how many steps each node is below the root."""
+        depth = np.zeros(len(self.children), np.int32)
+        for node in range(1, len(depth)):
+            depth[node] = depth[self._parent[node]] + 1
+        return depth
+
+    @cached_property
+    def _parent(self) -> Ids:
+        nodes = np.arange(len(self.children), dtype=np.int32)
+        return np.concatenate([nodes[:1], np.repeat(nodes, self.children)])
+
+    @cached_property
+    def _first_child(self) -> Ids:
+        counts = self.children.astype(np.int32)
+        return (1 + np.cumsum(counts, dtype=np.int32) - counts).astype(np.int32)
+
+    @cached_property
+    def _word(self) -> Ids:
+        word = np.full(len(self.children), -1, np.int32)
+        word[self.leaves] = np.arange(len(self.leaves), dtype=np.int32)
+        return word
+
+    def words_of(self, bits: Bits) -> Ids:
+        """Return (N,) the word of each of (N, 4) descriptors.
+
+        Raises:
+            DataError: The descriptors are not of 256 bits in four words.
+        """
+        if bits.ndim != 2 or bits.shape[1] != 4 or bits.dtype != np.uint64:
+            raise DataError(f"descriptors {bits.shape} of {bits.dtype}, want (N, 4) of uint64: 256 bits each")
+        words: Ids = descend(bits, self.centres, self._first_child, self.children, self._word)
+        return words
+
+    def ancestors_of(self, words: Ids, *, level: int) -> Ids:
+        """Return (N,) the node ``level`` steps below the root that each word lies under; at most itself."""
+        return self._ancestors(level)[words]
+
+    def _ancestors(self, level: int) -> Ids:
+        node = self.leaves
+        while (deeper := self.depth[node] > level).any():
+            node = np.where(deeper, self._parent[node], node)
+        return node

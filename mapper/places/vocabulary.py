@@ -1,0 +1,198 @@
+"""Images as bags of visual words (B2; Sivic & Zisserman 2003, Nistér & Stewénius 2006).
+
+A vocabulary's file: ``_MAGIC``; version, header length and CRC-32 of all that follows (little-endian uint32
+each); a JSON header; then columns: child counts (uint8) and centres (4 × uint64) of the nodes, weights
+(float64) of the words.
+"""
+
+import json
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper import atomic
+from mapper.errors import DataError, VocabularyError
+from mapper.features.detectors import Descriptors
+from mapper.features.windowed import pack
+from mapper.places.kernels import shared_weight
+from mapper.places.tree import Bits, Ids, WordTree
+
+DESCRIPTOR = "orb"
+"""What the bits are: detectors "orb" and "uniform-orb" both describe with it."""
+DESCRIPTOR_BYTES = 32
+
+_MAGIC = b"\x89mapper-words\r\n"
+"""Not text, and damaged by whoever takes it for text."""
+_VERSION = 1
+SHIPPED = Path(__file__).with_name("orb.words")
+"""Trained on synthetic logs by ``scripts/train_vocabulary.py``."""
+
+_FIXED = struct.Struct("<III")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WordVector:
+    """What an image looks like: how much each word weighs in it, all weights together 1.
+
+    Attributes:
+        ids: (M,) int32 ascending words.
+        weights: (M,) float32 positive; there are none in an image without features.
+    """
+
+    ids: Ids
+    weights: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        if self.ids.ndim != 1 or self.ids.shape != self.weights.shape:
+            raise DataError(
+                f"word vector: ids {self.ids.shape}, weights {self.weights.shape}, want (M,) both"
+            )
+        if (self.ids[1:] <= self.ids[:-1]).any():
+            raise DataError("word vector: its ids do not ascend; make it with Vocabulary.vector")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Vocabulary:
+    """Words of 256-bit binary descriptors, and how telling each word is.
+
+    Attributes:
+        tree: Finds words.
+        idf: (W,) float64 inverse document frequency ln(N / N_w) of each word.
+        trained_on: What it was trained on, in one line.
+    """
+
+    tree: WordTree
+    idf: NDArray[np.float64]
+    trained_on: str
+
+    def __post_init__(self) -> None:
+        words = len(self.tree.leaves)
+        if self.idf.shape != (words,):
+            raise DataError(f"vocabulary: {self.idf.shape} weights for {words} words")
+        if not (np.isfinite(self.idf) & (self.idf >= 0.0)).all():
+            raise DataError("vocabulary: a word's weight is negative or not finite")
+
+    @property
+    def words(self) -> int:
+        """How many words there are."""
+        return len(self.idf)
+
+    @property
+    def levels(self) -> int:
+        """How many steps the deepest word is below the root."""
+        return int(self.tree.depth.max())
+
+    def words_of(self, bits: Bits) -> Ids:
+        """Return (N,) the word of each of (N, 4) descriptors; see ``bits_of``."""
+        return self.tree.words_of(bits)
+
+    def nodes_of(self, bits: Bits, *, level: int) -> Ids:
+        """Return (N,) the node of each of (N, 4) descriptors, ``level`` steps below the root.
+
+        Whoever needs words too asks ``ancestors_of(words, level=level)`` and descends once.
+        """
+        return self.ancestors_of(self.words_of(bits), level=level)
+
+    def ancestors_of(self, words: Ids, *, level: int) -> Ids:
+        """Return (N,) the node ``level`` steps below the root that each word lies under."""
+        return self.tree.ancestors_of(words, level=level)
+
+    def vector(self, words: Ids) -> WordVector:
+        """Return the tf·idf weights of (N,) words, normalised to the sum 1."""
+        ids, counts = np.unique(words, return_counts=True)
+        weights = counts * self.idf[ids]
+        told = weights > 0.0
+        weights = weights[told]
+        return WordVector(ids[told].astype(np.int32), (weights / weights.sum()).astype(np.float32))
+
+    def save(self, path: Path) -> None:
+        """Write it to a file; the same vocabulary gives the same bytes. Atomic."""
+        header = {
+            "descriptor": DESCRIPTOR,
+            "descriptor_bytes": DESCRIPTOR_BYTES,
+            "nodes": len(self.tree.children),
+            "words": self.words,
+            "trained_on": self.trained_on,
+        }
+        head = json.dumps(header, sort_keys=True, separators=(",", ":")).encode()
+        columns = self.tree.children, self.tree.centres.astype("<u8"), self.idf.astype("<f8")
+        rest = head + b"".join(column.tobytes() for column in columns)
+        atomic.write_bytes(path, _MAGIC + _FIXED.pack(_VERSION, len(head), zlib.crc32(rest)) + rest)
+
+
+def similarity(a: WordVector, b: WordVector) -> float:
+    """Return s = ½ Σ (|fA| + |fB| − |fA − fB|), 0 … 1 up to rounding (B5; Zhao et al. 2020, eq. 10).
+
+    Weights are not negative, so that each term is the smaller of the two.
+    """
+    return float(shared_weight(a.ids, a.weights, b.ids, b.weights))
+
+
+def bits_of(descriptors: Descriptors) -> Bits:
+    """Return an image's (N, 32) uint8 descriptors as (N, 4) uint64.
+
+    Raises:
+        VocabularyError: They are not of 256 bits.
+    """
+    if descriptors.dtype != np.uint8 or descriptors.shape[1:] != (DESCRIPTOR_BYTES,):
+        raise VocabularyError(
+            f"descriptors {descriptors.shape} of {descriptors.dtype} have no visual words, which are of "
+            f"{8 * DESCRIPTOR_BYTES} bits; use the detector orb or uniform-orb"
+        )
+    return pack(descriptors)
+
+
+def load_vocabulary(path: Path | None = None) -> Vocabulary:
+    """Return the vocabulary of a file; None is the one that comes with the toolkit.
+
+    Raises:
+        VocabularyError: There is no such file, or it is foreign, damaged, of another version or of other
+            descriptors than ORB's.
+    """
+    path = path or SHIPPED
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise VocabularyError(
+            f"{path}: no vocabulary can be read: {error.strerror}; make one with mapper vocabulary train"
+        ) from None
+    if not data.startswith(_MAGIC):
+        raise VocabularyError(f"{path}: is not a vocabulary; make one with mapper vocabulary train")
+    start = len(_MAGIC) + _FIXED.size
+    if len(data) < start:
+        raise VocabularyError(f"{path}: ends inside its header; it is truncated")
+    version, head_bytes, checksum = _FIXED.unpack_from(data, len(_MAGIC))
+    if version != _VERSION:
+        raise VocabularyError(f"{path}: is of version {version}, only {_VERSION} can be read; train it again")
+    if zlib.crc32(memoryview(data)[start:]) != checksum:
+        raise VocabularyError(f"{path}: its checksum does not match; it is truncated or damaged")
+    return _parsed(path, data[start : start + head_bytes], memoryview(data)[start + head_bytes :])
+
+
+def _parsed(path: Path, head: bytes, body: memoryview) -> Vocabulary:
+    try:
+        header = json.loads(head)
+        descriptor, descriptor_bytes = header["descriptor"], header["descriptor_bytes"]
+        nodes, words, trained_on = header["nodes"], header["words"], header["trained_on"]
+    except (ValueError, KeyError, TypeError):
+        raise VocabularyError(f"{path}: its header does not describe a vocabulary; it is damaged") from None
+    if (descriptor, descriptor_bytes) != (DESCRIPTOR, DESCRIPTOR_BYTES):
+        raise VocabularyError(
+            f"{path}: has words of {descriptor} descriptors of {descriptor_bytes} bytes; only {DESCRIPTOR}'s "
+            f"of {DESCRIPTOR_BYTES} can be used"
+        )
+    if len(body) != nodes * (1 + DESCRIPTOR_BYTES) + 8 * words:
+        raise VocabularyError(
+            f"{path}: its body does not hold {nodes} nodes and {words} words; it is damaged"
+        )
+    children = np.frombuffer(body, np.uint8, nodes).copy()
+    centres = np.frombuffer(body, "<u8", 4 * nodes, nodes).reshape(nodes, 4).astype(np.uint64)
+    idf = np.frombuffer(body, "<f8", words, nodes * (1 + DESCRIPTOR_BYTES)).astype(np.float64)
+    try:
+        return Vocabulary(WordTree(centres, children), idf, trained_on)
+    except DataError as error:
+        raise VocabularyError(f"{path}: {error}; it is damaged") from None
