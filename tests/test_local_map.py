@@ -13,7 +13,6 @@ from mapper.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.geometry import exp, inverse
 from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
-from mapper.odometry.local_map.odometry import LocalMapOdometry
 from mapper.sources.synthetic.source import SyntheticSource
 from mapper.trajectory import trajectory_from
 
@@ -39,7 +38,7 @@ def blank(frame):
 
 def track(frames, config=None):
     """Track, solve as the pipeline does, and return tracks and trajectory."""
-    odometry = LocalMapOdometry(config or LocalMapConfig())
+    odometry = (config or LocalMapConfig()).build()
     graph = PoseGraph()
     tracks = []
     for frame in frames:
@@ -122,7 +121,7 @@ def test_nothing_starts_before_there_is_texture(frames):
 
 
 def test_factors_tie_every_keyframe_to_an_earlier_one(frames):
-    odometry = LocalMapOdometry(LocalMapConfig())
+    odometry = LocalMapConfig().build()
     keyframes = sum(odometry.track(odometry.observe(frame)).is_keyframe for frame in frames)
     factors = odometry.finish()
     assert {factor.j for factor in factors} == set(range(1, keyframes))
@@ -135,10 +134,10 @@ def test_factors_tie_every_keyframe_to_an_earlier_one(frames):
 def test_a_bare_scan_is_refused():
     scan = Scan(7, np.zeros((3, 3), np.float32))
     with pytest.raises(FrameError, match="needs colour and depth"):
-        LocalMapOdometry(LocalMapConfig()).observe(scan)
+        LocalMapConfig().build().observe(scan)
 
 
 def test_an_image_without_features_is_observed_as_empty():
     camera = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
     frame = RgbdFrame(0, np.zeros((48, 64), np.uint8), np.zeros((48, 64), np.float32), camera)
-    assert len(LocalMapOdometry(LocalMapConfig()).observe(frame)) == 0
+    assert len(LocalMapConfig().build().observe(frame)) == 0

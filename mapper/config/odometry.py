@@ -1,5 +1,6 @@
 """Odometry methods and the ISVD registration inside the thesis's one."""
 
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
@@ -9,7 +10,7 @@ from mapper.config.features import DetectorConfig, OrbConfig, SurfConfig, Unifor
 
 if TYPE_CHECKING:
     from mapper.odometry.isvd import IsvdOdometry
-    from mapper.odometry.local_map.odometry import LocalMapOdometry
+    from mapper.odometry.local_map.odometry import KeyframeOdometry
 
 
 class MatchConfig(Config):
@@ -81,10 +82,10 @@ class IsvdOdometryConfig(Config):
         return IsvdOdometry(self)
 
 
-class LocalMapConfig(Config):
-    """Reprojection tracking against a local map of keyframes, refined by local bundle adjustment."""
+class KeyframeConfig(Config):
+    """What the odometries share that track against keyframes' landmarks and adjust both in bundles."""
 
-    kind: Literal["local-map"] = "local-map"
+    kind: str
     detector: Annotated[OrbConfig | UniformOrbConfig, Field(discriminator="kind")] = UniformOrbConfig()
     """Spread features survive views in which plain ORB crowds into one far corner."""
     max_depth_m: PositiveFloat = 4.0
@@ -95,8 +96,6 @@ class LocalMapConfig(Config):
     """bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017); a Kinect's is 40 to 43."""
     disparity_sigma_px: PositiveFloat = 1.0
     """Noise of the virtual disparity relative to that of a pixel."""
-    search_px: PositiveFloat = 15.0
-    """Search radius around the predicted pixel in the finest octave; doubled once when too little matches."""
     local_search_px: PositiveFloat = 4.0
     """Search radius around the projected landmarks of the local map in the finest octave."""
     local_keyframes: PositiveInt = 15
@@ -104,17 +103,13 @@ class LocalMapConfig(Config):
     min_start_features: PositiveInt = 100
     """Features with depth that the first frame must have."""
     min_motion_matches: PositiveInt = 20
-    """Fewer matches to the last frame mean that the prediction failed."""
+    """Fewer matches to the last frame, or to a keyframe, say nothing about the motion."""
     min_inliers: PositiveInt = 30
     """Fewer landmarks that agree with the pose mean that the frame is lost."""
-    max_predicted_steps: PositiveFloat = 10.0
-    """Longer gaps, in frame intervals, are not extrapolated over."""
     keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.75
     """Keyframe when the inliers fall below this share of the most since the last keyframe."""
     hasty_keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
     """The same share while the last keyframe is younger than ``min_keyframe_gap``: for fast motion."""
-    weak_inliers: PositiveInt = 150
-    """With fewer, what the prediction found has to compete with what matching without it finds."""
     min_keyframe_gap: PositiveInt = 4
     max_keyframe_gap: PositiveInt = 20
     bundle_keyframes: PositiveInt = 10
@@ -128,11 +123,24 @@ class LocalMapConfig(Config):
     relocalisation_keyframes: PositiveInt = 30
     """How many of the nearest keyframes, and as many of the others in turn, a lost frame is compared with."""
 
-    def build(self) -> "LocalMapOdometry":
-        """Return the odometry this configures."""
-        from mapper.odometry.local_map.odometry import LocalMapOdometry
 
-        return LocalMapOdometry(self)
+class LocalMapConfig(KeyframeConfig):
+    """Reprojection tracking against a local map of keyframes, refined by local bundle adjustment."""
+
+    kind: Literal["local-map"] = "local-map"
+    search_px: PositiveFloat = 15.0
+    """Search radius around the predicted pixel in the finest octave; doubled once when too little matches."""
+    max_predicted_steps: PositiveFloat = 10.0
+    """Longer gaps, in frame intervals, are not extrapolated over."""
+    weak_inliers: PositiveInt = 150
+    """With fewer, what the prediction found has to compete with what matching without it finds."""
+
+    def build(self) -> "KeyframeOdometry":
+        """Return the odometry this configures."""
+        from mapper.odometry.local_map.motion import MotionPlacing
+        from mapper.odometry.local_map.odometry import KeyframeOdometry
+
+        return KeyframeOdometry(self, partial(MotionPlacing, self))
 
 
 OdometryConfig = Annotated[IsvdOdometryConfig | LocalMapConfig, Field(discriminator="kind")]

@@ -18,6 +18,7 @@ Ids = NDArray[np.int32]
 _WEAK_PRIOR = np.diag([1.0] * 3 + [0.01] * 3)
 """1 rad and 10 m: keeps the information positive definite where a few landmarks leave directions open."""
 _BUNDLE_ROUNDS, _BUNDLE_ITERATIONS = 2, 5
+_NEWEST = 3
 
 
 @dataclass(slots=True, eq=False)
@@ -131,6 +132,11 @@ class LandmarkMap:
             len(self.keyframes),
         )
         return counts
+
+    def latest(self, reference: int) -> list[int]:
+        """Return a keyframe and the newest ones, newest first: those that tracking knows to be near."""
+        newest = range(len(self.keyframes) - 1, max(len(self.keyframes) - 1 - _NEWEST, -1), -1)
+        return list(dict.fromkeys([reference, *newest]))
 
     def seen_by(self, index: int) -> Ids:
         """Return the landmarks that a keyframe sees, in feature order."""

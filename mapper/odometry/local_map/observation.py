@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.odometry import LocalMapConfig
+from mapper.config.odometry import KeyframeConfig
 from mapper.errors import FrameError
 from mapper.features.detectors import Detector
 from mapper.features.view import View
@@ -65,7 +65,7 @@ class Observation:
         )
 
 
-def observe(frame: Frame, detector: Detector, config: LocalMapConfig) -> Observation:
+def observe(frame: Frame, detector: Detector, config: KeyframeConfig) -> Observation:
     """Detect features, look their depth up at the raw pixel, and undistort them.
 
     Raises:
@@ -73,14 +73,14 @@ def observe(frame: Frame, detector: Detector, config: LocalMapConfig) -> Observa
     """
     if not isinstance(frame, RgbdFrame):
         raise FrameError(
-            f"frame {frame.stamp_ns}: odometry 'local-map' needs colour and depth images, got a bare scan; "
-            "choose another odometry.kind"
+            f"frame {frame.stamp_ns}: odometry '{config.kind}' needs colour and depth images, "
+            "got a bare scan; choose another odometry.kind"
         )
     camera = frame.camera
     features = detector.detect(frame.gray)
     if features.descriptors.dtype != np.uint8 or features.descriptors.shape[1] != 32:
         raise FrameError(
-            "odometry 'local-map' needs 256-bit descriptors; choose detector 'orb' or 'uniform-orb'"
+            f"odometry '{config.kind}' needs 256-bit descriptors; choose detector 'orb' or 'uniform-orb'"
         )
     pixels = camera.undistort(features.pixels)
     order, grid = sort_into_grid(pixels, width_px=camera.width_px, height_px=camera.height_px)

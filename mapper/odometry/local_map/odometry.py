@@ -1,12 +1,12 @@
 """Frame by frame against a local map of keyframes (after Mur-Artal & Tardós 2017; Zhao et al. 2020)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.odometry import LocalMapConfig
+from mapper.config.odometry import KeyframeConfig
 from mapper.features.detectors import build_detector
 from mapper.features.view import View
 from mapper.frames import Frame
@@ -14,22 +14,28 @@ from mapper.geometry import Transform, inverse
 from mapper.graph.model import BetweenFactor
 from mapper.odometry.base import Diagnostics, Track
 from mapper.odometry.local_map.landmarks import LandmarkMap
+from mapper.odometry.local_map.local_search import LocalSearch
 from mapper.odometry.local_map.observation import Observation, observe
-from mapper.odometry.local_map.placing import Placement, Placer
+from mapper.odometry.local_map.placing import Placement, Placing, unmatched
+from mapper.odometry.local_map.recall import Recall
+
+MakePlacing = Callable[[LandmarkMap, LocalSearch, Recall], Placing]
 
 
-class LocalMapOdometry:
+class KeyframeOdometry:
     """Tracks against keyframes' landmarks and refines both by local bundle adjustment.
 
     Keyframes are the graph's nodes, numbered from 0. Their poses keep improving while they are in the window,
     so all factors are handed out by ``finish``.
     """
 
-    def __init__(self, config: LocalMapConfig) -> None:
+    def __init__(self, config: KeyframeConfig, make_placing: MakePlacing) -> None:
         self._config = config
         self._detector = build_detector(config.detector)
         self._map = LandmarkMap(scale_factor=self._detector.scale_factor)
-        self._placer = Placer(config, self._map, scale_factor=self._detector.scale_factor)
+        search = LocalSearch(config, self._map, scale_factor=self._detector.scale_factor)
+        self._recall = Recall(config, self._map, search)
+        self._placing = make_placing(self._map, search, self._recall)
         self._last: Placement | None = None
         self._before_last: Placement | None = None
         self._most_inliers = 0  # since the last keyframe
@@ -88,27 +94,20 @@ class LocalMapOdometry:
         usable = int((observation.points_camera[:, 2] <= self._config.max_depth_m).sum())
         if usable < self._config.min_start_features:
             return self._lost(observation)
-        nothing = np.full(len(observation), -1, np.int32)
-        origin = Placement(observation, inverse(observation.T_body_camera), nothing, 0, 0, 0.0, "start")
+        T_camera_world = inverse(observation.T_body_camera)
+        origin = Placement(observation, T_camera_world, unmatched(observation), 0, 0, 0.0, "start")
         self._last = self._keep(origin)
         return self._track(self._last, is_keyframe=True)
 
     def _place(self, observation: Observation, last: Placement) -> Placement | None:
-        """Try, in this order: the predicted motion, the latest keyframes, all that look alike."""
+        """Follow the motion; once that fails, look through the keyframes that look alike."""
         if self._lost_frames == 0:
-            predicted = self._placer.by_motion(observation, last, self._before_last)
-            if predicted is not None and predicted.inliers >= self._config.weak_inliers:
-                return predicted
-            # A weak answer may be a wrong one: let a placement that owes nothing to the prediction compete.
-            newest = range(len(self._map.keyframes) - 1, max(len(self._map.keyframes) - 4, -1), -1)
-            latest = list(dict.fromkeys([last.reference, *newest]))
-            matched = self._placer.by_matching(observation, latest, method="fallback")
-            found = [placement for placement in (predicted, matched) if placement is not None]
-            if found:
-                return max(found, key=lambda placement: placement.inliers)
+            placement = self._placing.place(observation, last, self._before_last)
+            if placement is not None:
+                return placement
         here_world = inverse(last.T_camera_world)[:3, 3]
-        lookalikes = self._placer.lookalikes(observation, here_world, turn=self._lost_frames)
-        return self._placer.by_matching(observation, lookalikes, method="relocalised")
+        lookalikes = self._recall.lookalikes(observation, here_world, turn=self._lost_frames)
+        return self._recall.among(lookalikes, observation, method="relocalised")
 
     def _wants_keyframe(self, placement: Placement) -> bool:
         config = self._config

@@ -1,0 +1,127 @@
+"""The second half of placing a frame: what the local map should show is sought near its projection."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.config.odometry import KeyframeConfig
+from mapper.features.windowed import Words, match_windows
+from mapper.geometry import Array, Transform
+from mapper.odometry.local_map.gather import project_visible
+from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
+from mapper.odometry.local_map.observation import Observation
+from mapper.odometry.local_map.placing import MAX_HAMMING, Placement, refined, rms_px
+
+_MAX_RATIO = 0.8
+
+
+class LocalSearch:
+    """Searches the landmarks of the keyframes around a first pose."""
+
+    def __init__(self, config: KeyframeConfig, landmark_map: LandmarkMap, *, scale_factor: float) -> None:
+        self._config = config
+        self._map = landmark_map
+        self._scale_factor = scale_factor
+
+    def placed(
+        self,
+        observation: Observation,
+        T_camera_world: Transform,
+        landmark_of_feature: Ids,
+        *,
+        reference: int,
+        method: str,
+    ) -> Placement | None:
+        """Search the landmarks of the most covisible keyframes and refine the pose with all that match.
+
+        Args:
+            observation: The frame.
+            T_camera_world: (4, 4) first pose, good to a few pixels.
+            landmark_of_feature: (N,) what led to it: the landmark of each feature, −1 for none.
+            reference: Keyframe to search if none of the features shows a landmark.
+            method: What the placement is to say of how it was found.
+
+        Returns:
+            None when too few landmarks agree.
+        """
+        config, landmarks = self._config, self._map.landmarks
+        matched = landmark_of_feature[landmark_of_feature >= 0]
+        counts = self._map.shared(matched)
+        order = np.argsort(-counts, kind="stable")[: config.local_keyframes]
+        local = [int(k) for k in order if counts[k] > 0] or [reference]
+        nearby = self._map.seen_by_any(local, except_for=matched)
+        rows, pixels, octave = project_visible(
+            nearby,
+            landmarks["position"],
+            landmarks["direction"],
+            landmarks["reach_m"],
+            T_camera_world,
+            observation.intrinsics,
+            np.array(observation.size_px),
+            math.log(self._scale_factor),
+            config.detector.levels,
+        )
+        visible = nearby[rows]
+        feature = self.match_near(
+            observation,
+            pixels,
+            octave,
+            landmarks["words"][visible],
+            search_px=config.local_search_px,
+            taken=landmark_of_feature >= 0,
+            max_ratio=_MAX_RATIO,
+        )
+        hits = np.flatnonzero(feature >= 0)
+        landmark_of_feature = landmark_of_feature.copy()
+        landmark_of_feature[feature[hits]] = visible[hits]
+        features = np.flatnonzero(landmark_of_feature >= 0)
+        ids = landmark_of_feature[features]
+        if len(features) < config.min_inliers:
+            return None
+        T_camera_world, agree = refined(T_camera_world, landmarks["position"][ids], observation, features)
+        if agree.sum() < config.min_inliers:
+            return None
+        landmark_of_feature[features[~agree]] = -1
+        landmarks["visible"][visible] += 1
+        landmarks["visible"][matched] += 1
+        landmarks["found"][ids[agree]] += 1
+        return Placement(
+            observation,
+            T_camera_world,
+            landmark_of_feature,
+            local[0],
+            len(features),
+            rms_px(T_camera_world, landmarks["position"][ids[agree]], observation, features[agree]),
+            method,
+        )
+
+    def match_near(
+        self,
+        observation: Observation,
+        pixels: Array,
+        octave: NDArray[np.int32],
+        words: Words,
+        *,
+        search_px: float,
+        taken: NDArray[np.bool_],
+        max_ratio: float,
+    ) -> Ids:
+        """Return, per predicted pixel, the matching feature or −1; coarser octaves search wider."""
+        grid = observation.grid
+        matched: Ids = match_windows(
+            pixels,
+            octave,
+            search_px * self._scale_factor ** octave.astype(np.float64),
+            words,
+            observation.pixels,
+            observation.octave,
+            observation.words,
+            taken,
+            grid.start,
+            grid.columns,
+            grid.rows,
+            MAX_HAMMING,
+            max_ratio,
+        )
+        return matched
