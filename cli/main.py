@@ -17,6 +17,7 @@ from cli.fuse import fuse
 from cli.plan import WithPoints, plan
 from cli.show_config import show_config
 from cli.synth import synth
+from cli.vocabulary import vocabulary
 from mapper import __version__
 from mapper.errors import MapperError
 
@@ -65,6 +66,7 @@ app.command("convert")(convert)
 app.command("synth")(synth)
 app.command("demo")(demo)
 app.command("config")(show_config)
+app.add_typer(vocabulary, name="vocabulary")
 
 
 @app.callback(invoke_without_command=True)

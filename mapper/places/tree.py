@@ -34,8 +34,8 @@ class WordTree:
                 f"word tree: {nodes} nodes with centres {self.centres.shape} of {self.centres.dtype}, "
                 "want (nodes, 4) of uint64"
             )
-        reached = 1 + np.cumsum(self.children, dtype=np.int64)  # node i has children only below this
-        if nodes == 0 or reached[-1] != nodes or (reached[:-1] <= np.arange(nodes - 1)).any():
+        known = 1 + np.cumsum(self.children, dtype=np.int64)  # nodes that have a parent by then, and the root
+        if nodes == 0 or known[-1] != nodes or (known[:-1] <= np.arange(1, nodes)).any():
             raise DataError(f"word tree: the child counts of {nodes} nodes do not make one tree")
 
     @cached_property

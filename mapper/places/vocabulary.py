@@ -5,7 +5,6 @@ each); a JSON header; then columns: child counts (uint8) and centres (4 × uint6
 (float64) of the words.
 """
 
-import json
 import struct
 import zlib
 from dataclasses import dataclass
@@ -13,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import NonNegativeInt, ValidationError
 
 from mapper import atomic
+from mapper.config.base import Config
 from mapper.errors import DataError, VocabularyError
-from mapper.features.detectors import Descriptors
-from mapper.features.windowed import pack
 from mapper.places.kernels import shared_weight
 from mapper.places.tree import Bits, Ids, WordTree
 
@@ -32,6 +31,14 @@ SHIPPED = Path(__file__).with_name("orb.words")
 """Trained on synthetic logs by ``scripts/train_vocabulary.py``."""
 
 _FIXED = struct.Struct("<III")
+
+
+class _Header(Config):
+    descriptor: str
+    descriptor_bytes: NonNegativeInt
+    nodes: NonNegativeInt
+    words: NonNegativeInt
+    trained_on: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,7 +94,7 @@ class Vocabulary:
         return int(self.tree.depth.max())
 
     def words_of(self, bits: Bits) -> Ids:
-        """Return (N,) the word of each of (N, 4) descriptors; see ``bits_of``."""
+        """Return (N,) the word of each of (N, 4) descriptors."""
         return self.tree.words_of(bits)
 
     def nodes_of(self, bits: Bits, *, level: int) -> Ids:
@@ -111,14 +118,14 @@ class Vocabulary:
 
     def save(self, path: Path) -> None:
         """Write it to a file; the same vocabulary gives the same bytes. Atomic."""
-        header = {
-            "descriptor": DESCRIPTOR,
-            "descriptor_bytes": DESCRIPTOR_BYTES,
-            "nodes": len(self.tree.children),
-            "words": self.words,
-            "trained_on": self.trained_on,
-        }
-        head = json.dumps(header, sort_keys=True, separators=(",", ":")).encode()
+        header = _Header(
+            descriptor=DESCRIPTOR,
+            descriptor_bytes=DESCRIPTOR_BYTES,
+            nodes=len(self.tree.children),
+            words=self.words,
+            trained_on=self.trained_on,
+        )
+        head = header.model_dump_json().encode()
         columns = self.tree.children, self.tree.centres.astype("<u8"), self.idf.astype("<f8")
         rest = head + b"".join(column.tobytes() for column in columns)
         atomic.write_bytes(path, _MAGIC + _FIXED.pack(_VERSION, len(head), zlib.crc32(rest)) + rest)
@@ -130,20 +137,6 @@ def similarity(a: WordVector, b: WordVector) -> float:
     Weights are not negative, so that each term is the smaller of the two.
     """
     return float(shared_weight(a.ids, a.weights, b.ids, b.weights))
-
-
-def bits_of(descriptors: Descriptors) -> Bits:
-    """Return an image's (N, 32) uint8 descriptors as (N, 4) uint64.
-
-    Raises:
-        VocabularyError: They are not of 256 bits.
-    """
-    if descriptors.dtype != np.uint8 or descriptors.shape[1:] != (DESCRIPTOR_BYTES,):
-        raise VocabularyError(
-            f"descriptors {descriptors.shape} of {descriptors.dtype} have no visual words, which are of "
-            f"{8 * DESCRIPTOR_BYTES} bits; use the detector orb or uniform-orb"
-        )
-    return pack(descriptors)
 
 
 def load_vocabulary(path: Path | None = None) -> Vocabulary:
@@ -175,16 +168,15 @@ def load_vocabulary(path: Path | None = None) -> Vocabulary:
 
 def _parsed(path: Path, head: bytes, body: memoryview) -> Vocabulary:
     try:
-        header = json.loads(head)
-        descriptor, descriptor_bytes = header["descriptor"], header["descriptor_bytes"]
-        nodes, words, trained_on = header["nodes"], header["words"], header["trained_on"]
-    except (ValueError, KeyError, TypeError):
+        header = _Header.model_validate_json(head)
+    except ValidationError:
         raise VocabularyError(f"{path}: its header does not describe a vocabulary; it is damaged") from None
-    if (descriptor, descriptor_bytes) != (DESCRIPTOR, DESCRIPTOR_BYTES):
+    if (header.descriptor, header.descriptor_bytes) != (DESCRIPTOR, DESCRIPTOR_BYTES):
         raise VocabularyError(
-            f"{path}: has words of {descriptor} descriptors of {descriptor_bytes} bytes; only {DESCRIPTOR}'s "
-            f"of {DESCRIPTOR_BYTES} can be used"
+            f"{path}: has words of {header.descriptor} descriptors of {header.descriptor_bytes} bytes; "
+            f"only {DESCRIPTOR}'s of {DESCRIPTOR_BYTES} can be used"
         )
+    nodes, words = header.nodes, header.words
     if len(body) != nodes * (1 + DESCRIPTOR_BYTES) + 8 * words:
         raise VocabularyError(
             f"{path}: its body does not hold {nodes} nodes and {words} words; it is damaged"
@@ -193,6 +185,6 @@ def _parsed(path: Path, head: bytes, body: memoryview) -> Vocabulary:
     centres = np.frombuffer(body, "<u8", 4 * nodes, nodes).reshape(nodes, 4).astype(np.uint64)
     idf = np.frombuffer(body, "<f8", words, nodes * (1 + DESCRIPTOR_BYTES)).astype(np.float64)
     try:
-        return Vocabulary(WordTree(centres, children), idf, trained_on)
+        return Vocabulary(WordTree(centres, children), idf, header.trained_on)
     except DataError as error:
         raise VocabularyError(f"{path}: {error}; it is damaged") from None

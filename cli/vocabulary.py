@@ -1,0 +1,92 @@
+"""``mapper vocabulary``: visual words made from logs, and what a file of them holds."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cli.console import progress_for
+from cli.environment import prepare_libraries
+from cli.options import Quiet, assignments, merged
+
+_SEED = 0  # of the draws of k-means++: the same logs give the same bytes
+
+vocabulary = typer.Typer(
+    help="Train and inspect the visual words by which places are recognised.",
+    epilog="Example: mapper vocabulary train LOG --out office.words",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+
+@vocabulary.command("train")
+def train(
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG", help="Logs that mapper build can read.")],
+    out: Annotated[Path, typer.Option(help="Vocabulary file to create.")],
+    frames: Annotated[int | None, typer.Option(help="Frames to use of each log.")] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY.PATH=VALUE", help="branching, levels, detector.max_features, …"),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Cluster the ORB descriptors of logs into a vocabulary.
+
+    Example: mapper vocabulary train logs/office logs/lab --out lab.words --set branching=8
+    """
+    import numpy as np
+
+    from mapper.config import overridden
+    from mapper.config.places import VocabularyConfig
+    from mapper.errors import VocabularyError
+    from mapper.places.images import descriptors_of
+    from mapper.places.training import train as train_words
+    from mapper.sources import open_source
+
+    config = overridden(VocabularyConfig(), merged(assignments({"frames_per_log": frames}), set_))
+    if out.exists() and not overwrite:
+        raise VocabularyError(f"{out}: exists already; give --overwrite to replace it")
+    prepare_libraries()
+    progress = progress_for(quiet=quiet)
+    sources = [open_source(log) for log in logs]
+    images = [bits for source in sources for bits in descriptors_of(source, config, progress=progress)]
+    trained = train_words(
+        images,
+        config=config,
+        trained_on=f"{len(images)} images of {', '.join(source.name for source in sources)}",
+        rng=np.random.default_rng(_SEED),
+        progress=progress,
+    )
+    trained.save(out)
+    if not quiet:
+        _print_summary(out)
+
+
+@vocabulary.command("show")
+def show(
+    path: Annotated[
+        Path | None,
+        typer.Argument(metavar="[VOCABULARY]", help="File to show; omit for the one that comes with mapper."),
+    ] = None,
+) -> None:
+    """Print what a vocabulary holds.
+
+    Example: mapper vocabulary show lab.words
+    """
+    from mapper.places.vocabulary import SHIPPED
+
+    _print_summary(path or SHIPPED)
+
+
+def _print_summary(path: Path) -> None:
+    from mapper.places.vocabulary import load_vocabulary
+
+    loaded = load_vocabulary(path)
+    branching = int(loaded.tree.children.max())
+    print(
+        f"{path}: {loaded.words} words, {branching} × {loaded.levels} levels, "
+        f"{path.stat().st_size / 1e3:.0f} kB\n"
+        f"trained on {loaded.trained_on}\n"
+        f"weights ln(N / N_w): {loaded.idf.min():.2f} … {loaded.idf.max():.2f}"
+    )
