@@ -102,3 +102,14 @@ def test_exhaustive_matching_refuses_what_is_not_there():
     b = pack(rng.integers(0, 256, (50, 32), dtype=np.uint8))
     assert (match_everywhere(a, b, 64, 0.85) == -1).all()
     assert match_everywhere(a, b[:0], 64, 0.85).tolist() == [-1] * 50
+
+
+@pytest.mark.parametrize("place", [(-3e4, 100.0), (3e4, 100.0), (100.0, -3e4), (100.0, 3e4), (-1e6, -1e6)])
+def test_what_is_predicted_far_outside_the_image_reads_nothing(scene, place):
+    """Interpreted, as compiled code would read out of bounds without a word."""
+    pixels, octave, words, grid = scene
+    matched = match_windows.py_func(
+        np.array([place]), octave[:1], np.array([30.0]), words[:1], pixels, octave, words,
+        np.zeros(len(pixels), bool), grid.start, grid.columns, grid.rows, 64, 0.9,
+    )  # fmt: skip
+    assert matched.tolist() == [-1]

@@ -107,6 +107,8 @@ def match_windows(
         right = min(int((u + r) // CELL_PX), columns - 1)
         top = max(int((v - r) // CELL_PX), 0)
         bottom = min(int((v + r) // CELL_PX), rows - 1)
+        if right < left or bottom < top:
+            continue  # the window lies wholly outside the image
         best, second, best_octave, second_octave, best_feature = 257, 257, -1, -1, -1
         for row in range(top, bottom + 1):
             for f in range(start[row * columns + left], start[row * columns + right + 1]):
