@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[1]
 OURS = {"mapper", "evaluators", "cli"}
 MAY_IMPORT = {"mapper": {"mapper"}, "evaluators": {"evaluators", "mapper"}, "cli": OURS}
 HOMES = {
-    "gtsam": ("mapper/graph/optimize.py",),
+    "gtsam": ("mapper/graph/",),
     "mcap": ("mapper/export/mcap_log.py", "mapper/sources/mcap_log.py"),
     "foxglove": ("mapper/export/",),
     "mahotas": ("mapper/features/",),

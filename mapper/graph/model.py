@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from operator import mul
 from typing import Literal
 
 import numpy as np
@@ -81,6 +82,11 @@ class PoseGraph:
         self.T_world_node[node] = T_world_node
         self.stamps_ns[node] = stamp_ns
 
+    def moved(self, T_new_world: Transform) -> "PoseGraph":
+        """Return the graph in another world frame; its measurements are the same."""
+        moved = {node: T_new_world @ T for node, T in self.T_world_node.items()}
+        return PoseGraph(moved, self.stamps_ns, self.factors)
+
     def add_factors(self, factors: Iterable[BetweenFactor]) -> None:
         """Add measurements between nodes that exist.
 
@@ -96,18 +102,28 @@ class PoseGraph:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """What the solver made of a graph.
+    """What the solver made of a graph. Factors are told in the graph's order.
 
     Attributes:
         T_world_node: Solved pose of every node.
-        error_before: ½ χ² at the first estimates.
-        error_after: ½ χ² at the solution.
         iterations: Solver iterations.
-        factor_errors: ½ χ² of each factor at the solution, in the graph's order.
+        factor_errors_before: ½ χ² of each factor at the first estimates.
+        factor_errors: ½ χ² of each factor at the solution.
+        weights: How far each factor was believed, 0 … 1; 1 but for loops in doubt.
     """
 
     T_world_node: dict[int, Transform]
-    error_before: float
-    error_after: float
     iterations: int
+    factor_errors_before: tuple[float, ...]
     factor_errors: tuple[float, ...]
+    weights: tuple[float, ...]
+
+    @property
+    def error_before(self) -> float:
+        """Σ weight · ½ χ² at the first estimates."""
+        return float(sum(map(mul, self.weights, self.factor_errors_before)))
+
+    @property
+    def error_after(self) -> float:
+        """Σ weight · ½ χ² at the solution."""
+        return float(sum(map(mul, self.weights, self.factor_errors)))

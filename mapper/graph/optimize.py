@@ -1,34 +1,23 @@
-"""Solve a pose graph with GTSAM, the one module that knows it."""
-
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+"""Solve a pose graph: each connected component on its own, loops as far as they can be believed."""
 
 import numpy as np
 
 from mapper.config.graph import GraphConfig
 from mapper.errors import GraphError
-from mapper.geometry import Array, Transform, is_rigid
-from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas, Solution
-
-if TYPE_CHECKING:
-    import gtsam
-
-# The anchor only removes the freedom to move the whole component, so at the solution it costs nothing
-# whatever its width; a far tighter one would spoil the conditioning for no gain.
-_ANCHOR = PoseSigmas(rotation_rad=1e-3, translation_m=1e-3)
-
-# χ² has no unit: once a step gains less than this, only rounding is left.
-_ABSOLUTE_ERROR = 1e-10
+from mapper.geometry import is_rigid
+from mapper.graph.batch import Effort, solve
+from mapper.graph.model import PoseGraph, Solution
+from mapper.graph.robust import Doubtful, solve_robustly
+from mapper.graph.terms import anchor, between, values_of
 
 
 def optimize(graph: PoseGraph, config: GraphConfig) -> Solution:
     """Return the poses that explain the factors best.
 
-    Levenberg–Marquardt (Marquardt 1963) on ½ Σ ‖log(T_i_j⁻¹ · T_i⁻¹ · T_j)‖², each in its factor's metric.
-    Every connected component is solved on its own and keeps its first node where it was; a node
-    without factors keeps its estimate. With ``config.solve == "none"`` all estimates are returned as
-    they are, and the errors tell how well they fit.
+    Levenberg–Marquardt (Marquardt 1963) on ½ Σ w ‖log(T_i_j⁻¹ · T_i⁻¹ · T_j)‖², each in its factor's metric;
+    w is 1 but for loops, which ``config.robust`` weighs. Every connected component is solved on its own and
+    keeps its first node where it was; a node without factors keeps its estimate. With
+    ``config.solve == "none"`` all estimates are returned as they are, and the errors tell how well they fit.
 
     Args:
         graph: At least one node; it is not changed.
@@ -41,25 +30,34 @@ def optimize(graph: PoseGraph, config: GraphConfig) -> Solution:
         GraphError: The graph has no nodes, an estimate is not a rigid motion, or the solver fails.
     """
     _refuse_unusable(graph)
-    terms = [_between(factor) for factor in graph.factors]
-    start = _values(graph.T_world_node)
-    before = [term.error(start) for term in terms]
+    terms = [between(factor) for factor in graph.factors]
+    start = values_of(graph.T_world_node, graph.T_world_node)
+    before = tuple(term.error(start) for term in terms)
+    weights = [1.0] * len(terms)
     if config.solve == "none":
-        error = float(sum(before))
-        return Solution(dict(graph.T_world_node), error, error, 0, tuple(before))
+        return Solution(dict(graph.T_world_node), 0, before, before, tuple(weights))
 
     T_world_node = dict(graph.T_world_node)
     after = list(before)
     iterations = 0
     for nodes, factors in _tied_components(graph):
-        optimizer = _optimizer([terms[k] for k in factors], start, nodes=nodes, config=config)
-        solved = _run(optimizer, nodes)
-        iterations += optimizer.iterations()
+        loops = [k for k in factors if graph.factors[k].origin == "loop" and config.robust != "none"]
+        known = [k for k in factors if k not in set(loops)]
+        held = [*(terms[k] for k in known), anchor(nodes[0], graph.T_world_node[nodes[0]])]
+        first = values_of(graph.T_world_node, nodes)
+        if loops:
+            part = Doubtful([graph.factors[k] for k in known], [graph.factors[k] for k in loops], held, first)
+            solved, believed, more = solve_robustly(part, config)
+            for k, weight in zip(loops, believed, strict=True):
+                weights[k] = float(weight)
+        else:
+            solved, more = solve(held, (), first, effort=Effort(config.max_iterations, config.relative_error))
+        iterations += more
         for node in nodes:
             T_world_node[node] = solved.atPose3(node).matrix()
         for k in factors:
             after[k] = terms[k].error(solved)
-    return Solution(T_world_node, float(sum(before)), float(sum(after)), iterations, tuple(after))
+    return Solution(T_world_node, iterations, before, tuple(after), tuple(weights))
 
 
 def components(graph: PoseGraph) -> list[list[int]]:
@@ -96,65 +94,3 @@ def _refuse_unusable(graph: PoseGraph) -> None:
     if not is_rigid(np.array(list(graph.T_world_node.values()))):
         bad = next(node for node, T in graph.T_world_node.items() if not is_rigid(T))
         raise GraphError(f"node {bad}: its estimate is not a finite rigid motion; the graph cannot be solved")
-
-
-def _optimizer(
-    terms: list[gtsam.BetweenFactorPose3], start: gtsam.Values, *, nodes: list[int], config: GraphConfig
-) -> gtsam.LevenbergMarquardtOptimizer:
-    import gtsam
-
-    problem, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for term in terms:
-        problem.add(term)
-    for node in nodes:
-        values.insert(node, start.atPose3(node))
-    first = nodes[0]
-    problem.add(gtsam.PriorFactorPose3(first, start.atPose3(first), _noise(_ANCHOR.information)))
-
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(config.max_iterations)
-    parameters.setRelativeErrorTol(config.relative_error)
-    parameters.setAbsoluteErrorTol(_ABSOLUTE_ERROR)
-    return gtsam.LevenbergMarquardtOptimizer(problem, values, parameters)
-
-
-def _run(optimizer: gtsam.LevenbergMarquardtOptimizer, nodes: list[int]) -> gtsam.Values:
-    where = f"the graph of {len(nodes)} nodes from node {nodes[0]}"
-    try:
-        solved = optimizer.optimize()
-    except RuntimeError as error:  # how GTSAM's C++ exceptions arrive, several lines long
-        reason = " ".join(str(error).split())
-        raise GraphError(f"{where} cannot be solved: {reason}") from None
-    cost = optimizer.error()
-    if not np.isfinite(cost):
-        raise GraphError(f"{where} cannot be solved: its error became {cost}; look for absurd information")
-    return solved
-
-
-def _values(T_world_node: dict[int, Transform]) -> gtsam.Values:
-    import gtsam
-
-    values = gtsam.Values()
-    for node, T in T_world_node.items():
-        values.insert(node, _pose3(T))
-    return values
-
-
-def _between(factor: BetweenFactor) -> gtsam.BetweenFactorPose3:
-    import gtsam
-
-    return gtsam.BetweenFactorPose3(factor.i, factor.j, _pose3(factor.T_i_j), _noise(factor.information))
-
-
-def _noise(information: Array) -> gtsam.noiseModel.Gaussian:
-    """GTSAM orders the Pose3 tangent (rotation, translation), as we do; nothing else here relies on it."""
-    import gtsam
-
-    return gtsam.noiseModel.Gaussian.Information(0.5 * (information + information.T))
-
-
-def _pose3(T_a_b: Transform) -> gtsam.Pose3:
-    """GTSAM ends the whole process when a rotation is off SO(3) by rounding, so it is projected first."""
-    import gtsam
-
-    return gtsam.Pose3(gtsam.Rot3.ClosestTo(T_a_b[:3, :3]), T_a_b[:3, 3])
