@@ -12,7 +12,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mapper.errors import DataError
 from mapper.export.jpeg import encode_jpeg, shrunk_camera
-from mapper.export.mcap_log import McapLog, dotted
+from mapper.export.foxglove_parts import dotted
+from mapper.export.mcap_log import McapLog
 from mapper.frames import PinholeCamera
 from mapper.geometry import exp, inverse
 from mapper.graph.model import BetweenFactor, PoseSigmas

@@ -18,6 +18,7 @@ topic                  schema                        Foxglove            Rerun
 /plan                  foxglove.PosesInFrame         line                InstancePoses3D
 /plan/dots             foxglove.PointCloud           points              Points3D
 /diagnostics           mapper/msg/Diagnostics        plots, raw values   plots, raw values
+/loops                 mapper/msg/Loop               plots, raw values   plots, raw values
 =====================  ============================  ==================  ===========================
 
 So lines are logged as dots too, the slice is a ROS message (Rerun ignores foxglove.Grid) and so are the
@@ -51,23 +52,26 @@ from zstandard import ZstdError
 from mapper.atomic import replacing
 from mapper.errors import DataError
 from mapper.export import ros2
+from mapper.export.foxglove_parts import (
+    WORLD,
+    check_stamp,
+    dotted,
+    lines_of,
+    pose_of,
+    quaternion_of,
+    timestamp_of,
+    vector_of,
+)
 from mapper.export.palette import ESTIMATE, FACTORS, PLAN, Rgb
 from mapper.frames import PinholeCamera
 from mapper.geometry import Points, Transform
 from mapper.graph.model import BetweenFactor
 from mapper.octree.slice import OccupancyGrid
-from mapper.rotations import quaternion_from_rotation
-from mapper.timebase import NS_PER_S
 from mapper.trajectory import Trajectory
 
-WORLD = "world"
 PLAN_TOPICS = ("/plan", "/plan/dots")
 
 _LIBRARY = "mapper"
-_LAST_SECOND = 2**31  # builtin_interfaces/Time counts seconds in an int32
-_DOT_SPACING_M = 0.01
-_MOST_DOTS = 100_000
-_LINE_WIDTH_PX = 2.0
 _POINT = np.dtype([("position", "<f4", 3), ("rgba", "u1", 4)])
 
 
@@ -84,7 +88,7 @@ class McapLog:
         self._writer: Writer
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        self._diagnostics_fields = ""
+        self._record_fields: dict[str, str] = {}
 
     def __enter__(self) -> Self:
         self._opened.__enter__()
@@ -111,11 +115,11 @@ class McapLog:
         self._publish(
             "/tf",
             messages.FrameTransform(
-                timestamp=_timestamp(stamp_ns),
+                timestamp=timestamp_of(stamp_ns),
                 parent_frame_id=parent,
                 child_frame_id=child,
-                translation=_vector(T_parent_child),
-                rotation=_quaternion(T_parent_child),
+                translation=vector_of(T_parent_child),
+                rotation=quaternion_of(T_parent_child),
             ),
             stamp_ns,
         )
@@ -125,7 +129,7 @@ class McapLog:
         self._publish(
             "/camera/image",
             messages.CompressedImage(
-                timestamp=_timestamp(stamp_ns), frame_id=frame, data=jpeg, format="jpeg"
+                timestamp=timestamp_of(stamp_ns), frame_id=frame, data=jpeg, format="jpeg"
             ),
             stamp_ns,
         )
@@ -136,7 +140,7 @@ class McapLog:
         self._publish(
             "/camera/calibration",
             messages.CameraCalibration(
-                timestamp=_timestamp(stamp_ns),
+                timestamp=timestamp_of(stamp_ns),
                 frame_id=frame,
                 width=camera.width_px,
                 height=camera.height_px,
@@ -155,9 +159,9 @@ class McapLog:
         self._publish(
             topic,
             messages.PosesInFrame(
-                timestamp=_timestamp(stamp_ns),
+                timestamp=timestamp_of(stamp_ns),
                 frame_id=WORLD,
-                poses=[_pose(T) for T in trajectory.T_world_body],
+                poses=[pose_of(T) for T in trajectory.T_world_body],
             ),
             stamp_ns,
         )
@@ -189,7 +193,7 @@ class McapLog:
             if not pairs:
                 continue
             ends = np.array([[T_world_node[node][:3, 3] for node in pair] for pair in pairs])
-            entities.append(_lines(ends.reshape(-1, 3), color, stamp_ns=stamp_ns, name=origin))
+            entities.append(lines_of(ends.reshape(-1, 3), color, stamp_ns=stamp_ns, name=origin))
             points = dotted(ends[:, 0], ends[:, 1])
             clouds.append(points)
             colors.append(np.broadcast_to(np.array(color, np.uint8), points.shape))
@@ -217,7 +221,7 @@ class McapLog:
         self._publish(
             topic,
             messages.PosesInFrame(
-                timestamp=_timestamp(stamp_ns), frame_id=WORLD, poses=[_pose(T) for T in T_world_waypoint]
+                timestamp=timestamp_of(stamp_ns), frame_id=WORLD, poses=[pose_of(T) for T in T_world_waypoint]
             ),
             stamp_ns,
         )
@@ -268,7 +272,7 @@ class McapLog:
 
     def grid(self, stamp_ns: int, grid: OccupancyGrid, *, name: str = "slice") -> None:
         """Log a 2D grid on /map/NAME, in the world's z = 0 plane."""
-        _check_stamp(stamp_ns)
+        check_stamp(stamp_ns)
         topic = f"/map/{name}"
         if topic not in self._channels:
             self._register(
@@ -280,25 +284,34 @@ class McapLog:
         self._write(topic, ros2.encode_occupancy_grid(grid, stamp_ns=stamp_ns, frame_id=WORLD), stamp_ns)
 
     def diagnostics(self, stamp_ns: int, record: Mapping[str, ros2.Value]) -> None:
-        """Log one frame's numbers and words on /diagnostics.
+        """Log one frame's numbers and words on /diagnostics."""
+        self._record("/diagnostics", "mapper/msg/Diagnostics", stamp_ns, record)
+
+    def loop(self, stamp_ns: int, record: Mapping[str, ros2.Value]) -> None:
+        """Log one loop candidate and its verdict on /loops."""
+        self._record("/loops", "mapper/msg/Loop", stamp_ns, record)
+
+    def _record(self, topic: str, schema: str, stamp_ns: int, record: Mapping[str, ros2.Value]) -> None:
+        """Log numbers and words.
 
         Args:
-            stamp_ns: The frame's stamp.
+            topic: Where to.
+            schema: What its records are called.
+            stamp_ns: Time of what is told.
             record: Name to int, float or str; the same names and types every time.
 
         Raises:
             DataError: Another kind of value, or another record than the first.
         """
-        _check_stamp(stamp_ns)
-        topic = "/diagnostics"
+        check_stamp(stamp_ns)
         fields = ros2.record_schema(record)
         if topic not in self._channels:
-            self._diagnostics_fields = fields
-            self._register(topic, "mapper/msg/Diagnostics", encoding="ros2msg", text=fields.encode())
-        if fields != self._diagnostics_fields:
+            self._record_fields[topic] = fields
+            self._register(topic, schema, encoding="ros2msg", text=fields.encode())
+        if fields != self._record_fields[topic]:
             raise DataError(
                 f"{topic} at {stamp_ns}: fields {fields.split()}, "
-                f"want those of the first record: {self._diagnostics_fields.split()}"
+                f"want those of the first record: {self._record_fields[topic].split()}"
             )
         self._write(topic, ros2.encode_record(record), stamp_ns)
 
@@ -316,9 +329,9 @@ class McapLog:
         self._publish(
             topic,
             messages.PointCloud(
-                timestamp=_timestamp(stamp_ns),
+                timestamp=timestamp_of(stamp_ns),
                 frame_id=WORLD,
-                pose=_pose(np.eye(4)),
+                pose=pose_of(np.eye(4)),
                 point_stride=_POINT.itemsize,
                 fields=[
                     messages.PackedElementField(name=name, offset=offset, type=kind)
@@ -343,53 +356,3 @@ class McapLog:
 
     def _write(self, topic: str, data: bytes, stamp_ns: int) -> None:
         self._writer.add_message(self._channels[topic], log_time=stamp_ns, data=data, publish_time=stamp_ns)
-
-
-def dotted(starts: Points, ends: Points) -> Points:
-    """Return points along (S, 3) segments, ends included: 1 cm apart, or further where that is too many."""
-    lengths_m = np.linalg.norm(ends - starts, axis=1)
-    spacing_m = max(_DOT_SPACING_M, float(lengths_m.sum()) / _MOST_DOTS)
-    counts = np.ceil(lengths_m / spacing_m).astype(np.intp) + 1
-    segment = np.repeat(np.arange(len(starts)), counts)
-    step = np.arange(len(segment)) - np.repeat(np.cumsum(counts) - counts, counts)
-    share = (step / np.maximum(counts[segment] - 1, 1))[:, None]
-    points: Points = starts[segment] * (1.0 - share) + ends[segment] * share
-    return points
-
-
-def _check_stamp(stamp_ns: int) -> None:
-    if not 0 <= stamp_ns < _LAST_SECOND * NS_PER_S:
-        raise DataError(f"stamp {stamp_ns} ns: MCAP messages hold 0 … 2³¹ s (1970 to 2038); shift the log")
-
-
-def _timestamp(stamp_ns: int) -> messages.Timestamp:
-    _check_stamp(stamp_ns)
-    return messages.Timestamp(int(stamp_ns // NS_PER_S), int(stamp_ns % NS_PER_S))
-
-
-def _vector(T: Transform) -> messages.Vector3:
-    x, y, z = T[:3, 3].tolist()
-    return messages.Vector3(x=x, y=y, z=z)
-
-
-def _quaternion(T: Transform) -> messages.Quaternion:
-    x, y, z, w = (float(value) for value in quaternion_from_rotation(T[:3, :3]))
-    return messages.Quaternion(x=x, y=y, z=z, w=w)
-
-
-def _pose(T: Transform) -> messages.Pose:
-    return messages.Pose(position=_vector(T), orientation=_quaternion(T))
-
-
-def _lines(points: Points, color: Rgb, *, stamp_ns: int, name: str) -> messages.SceneEntity:
-    """Return an entity of separate lines: points 2k and 2k + 1 are the ends of line k."""
-    red, green, blue = (channel / 255.0 for channel in color)
-    line = messages.LinePrimitive(
-        type=messages.LinePrimitiveLineType.LineList,
-        pose=_pose(np.eye(4)),
-        thickness=_LINE_WIDTH_PX,
-        scale_invariant=True,
-        points=[messages.Point3(x=x, y=y, z=z) for x, y, z in points.tolist()],
-        color=messages.Color(r=red, g=green, b=blue, a=1.0),
-    )
-    return messages.SceneEntity(timestamp=_timestamp(stamp_ns), frame_id=WORLD, id=name, lines=[line])
