@@ -6,15 +6,16 @@ from pydantic import PositiveFloat, PositiveInt
 
 from mapper.config.base import Config
 
-Robust = Literal["gnc", "cauchy", "huber", "dcs", "none"]
+KernelKind = Literal["cauchy", "huber", "dcs"]
 
 
 class GraphConfig(Config):
     """The back end."""
 
-    solve: Literal["batch", "none"] = "batch"
-    """"batch": Levenberg–Marquardt on every factor; "none": keep the odometry's own estimate (A7)."""
-    robust: Robust = "gnc"
+    solve: Literal["batch", "proportional", "none"] = "batch"
+    """"batch": Levenberg–Marquardt on every factor; "proportional": each loop is spread along the path in
+    turn (A9); "none": keep the odometry's own estimate (A7)."""
+    robust: Literal["gnc", "none"] | KernelKind = "gnc"
     """What keeps false loops from bending the map: "gnc" decides about each (Yang et al. 2020), the kernels
     "cauchy", "huber" and "dcs" (Agarwal et al. 2013) weigh each by its residual, "none" believes all.
     Odometry and wheels are always believed."""

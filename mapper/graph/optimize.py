@@ -1,14 +1,20 @@
 """Solve a pose graph: each connected component on its own, loops as far as they can be believed."""
 
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from mapper.config.graph import GraphConfig
 from mapper.errors import GraphError
-from mapper.geometry import is_rigid
-from mapper.graph.batch import Effort, solve
+from mapper.geometry import Transform, is_rigid
 from mapper.graph.model import PoseGraph, Solution
-from mapper.graph.robust import Doubtful, solve_robustly
-from mapper.graph.terms import anchor, between, values_of
+from mapper.graph.proportional import distribute
+from mapper.graph.robust import Part, solve_part
+from mapper.graph.terms import anchor, between, poses_of, values_of
+
+if TYPE_CHECKING:
+    import gtsam
 
 
 def optimize(graph: PoseGraph, config: GraphConfig) -> Solution:
@@ -16,8 +22,10 @@ def optimize(graph: PoseGraph, config: GraphConfig) -> Solution:
 
     Levenberg–Marquardt (Marquardt 1963) on ½ Σ w ‖log(T_i_j⁻¹ · T_i⁻¹ · T_j)‖², each in its factor's metric;
     w is 1 but for loops, which ``config.robust`` weighs. Every connected component is solved on its own and
-    keeps its first node where it was; a node without factors keeps its estimate. With
-    ``config.solve == "none"`` all estimates are returned as they are, and the errors tell how well they fit.
+    keeps its first node where it was; a node without factors keeps its estimate.
+
+    With ``config.solve == "proportional"`` the loops are spread along the path instead, and with "none"
+    all estimates are returned as they are; the errors tell how well they fit.
 
     Args:
         graph: At least one node; it is not changed.
@@ -31,33 +39,31 @@ def optimize(graph: PoseGraph, config: GraphConfig) -> Solution:
     """
     _refuse_unusable(graph)
     terms = [between(factor) for factor in graph.factors]
-    start = values_of(graph.T_world_node, graph.T_world_node)
-    before = tuple(term.error(start) for term in terms)
+    before = _errors(terms, graph.T_world_node)
     weights = [1.0] * len(terms)
-    if config.solve == "none":
-        return Solution(dict(graph.T_world_node), 0, before, before, tuple(weights))
-
-    T_world_node = dict(graph.T_world_node)
-    after = list(before)
     iterations = 0
-    for nodes, factors in _tied_components(graph):
-        loops = [k for k in factors if graph.factors[k].origin == "loop" and config.robust != "none"]
-        known = [k for k in factors if k not in set(loops)]
-        held = [*(terms[k] for k in known), anchor(nodes[0], graph.T_world_node[nodes[0]])]
-        first = values_of(graph.T_world_node, nodes)
-        if loops:
-            part = Doubtful([graph.factors[k] for k in known], [graph.factors[k] for k in loops], held, first)
-            solved, believed, more = solve_robustly(part, config)
-            for k, weight in zip(loops, believed, strict=True):
-                weights[k] = float(weight)
-        else:
-            solved, more = solve(held, (), first, effort=Effort(config.max_iterations, config.relative_error))
-        iterations += more
-        for node in nodes:
-            T_world_node[node] = solved.atPose3(node).matrix()
-        for k in factors:
-            after[k] = terms[k].error(solved)
-    return Solution(T_world_node, iterations, before, tuple(after), tuple(weights))
+    match config.solve:
+        case "none":
+            T_world_node = dict(graph.T_world_node)
+        case "proportional":
+            T_world_node = distribute(graph)
+        case "batch":
+            T_world_node = dict(graph.T_world_node)
+            for nodes, factors in _tied_components(graph):
+                loops = [k for k in factors if graph.factors[k].origin == "loop"]
+                known = [k for k in factors if graph.factors[k].origin != "loop"]
+                part = Part(
+                    known=[graph.factors[k] for k in known],
+                    loops=[graph.factors[k] for k in loops],
+                    held=[*(terms[k] for k in known), anchor(nodes[0], graph.T_world_node[nodes[0]])],
+                    start=values_of(graph.T_world_node, nodes),
+                )
+                solved, believed, more = solve_part(part, config)
+                T_world_node |= poses_of(solved)
+                iterations += more
+                for k, weight in zip(loops, believed, strict=True):
+                    weights[k] = float(weight)
+    return Solution(T_world_node, iterations, before, _errors(terms, T_world_node), tuple(weights))
 
 
 def components(graph: PoseGraph) -> list[list[int]]:
@@ -76,6 +82,13 @@ def components(graph: PoseGraph) -> list[list[int]]:
     for node in graph.T_world_node:
         members.setdefault(root(node), []).append(node)
     return list(members.values())
+
+
+def _errors(
+    terms: Sequence["gtsam.NonlinearFactor"], T_world_node: Mapping[int, Transform]
+) -> tuple[float, ...]:
+    values = values_of(T_world_node, T_world_node)
+    return tuple(term.error(values) for term in terms)
 
 
 def _tied_components(graph: PoseGraph) -> list[tuple[list[int], list[int]]]:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mapper.config.graph import GraphConfig, Robust
+from mapper.config.graph import GraphConfig
 from mapper.geometry import Array
 from mapper.graph.batch import Effort, solve
 from mapper.graph.drift import innovations
 from mapper.graph.model import BetweenFactor
-from mapper.graph.terms import between
+from mapper.graph.terms import Kernel, between
 
 if TYPE_CHECKING:
     import gtsam
@@ -32,12 +32,12 @@ _DRIFT_SLACK = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Doubtful:
-    """One connected part of a pose graph that has loops.
+class Part:
+    """One connected part of a pose graph.
 
     Attributes:
         known: Its factors that are believed.
-        loops: Its factors in doubt, at least one.
+        loops: Its factors in doubt.
         held: GTSAM's terms of ``known``, and the anchor.
         start: Where the solver begins.
     """
@@ -48,8 +48,8 @@ class Doubtful:
     start: gtsam.Values
 
 
-def solve_robustly(part: Doubtful, config: GraphConfig) -> tuple[gtsam.Values, Array, int]:
-    """Solve a part whose loops are in doubt.
+def solve_part(part: Part, config: GraphConfig) -> tuple[gtsam.Values, Array, int]:
+    """Solve a part with its loops in doubt.
 
     Returns:
         The solution, the weight of each loop in [0, 1], and the iterations.
@@ -58,19 +58,21 @@ def solve_robustly(part: Doubtful, config: GraphConfig) -> tuple[gtsam.Values, A
         GraphError: The solver fails.
     """
     effort = Effort(config.max_iterations, config.relative_error)
-    if config.robust == "gnc":
-        weights, near, prepared = _graduate(part, config.robust_width)
-        solved, iterations = solve(part.held, _weighted(part.loops, weights), near, effort=effort)
-        return solved, weights, prepared + iterations
-    kernel = _kernel(config.robust, config.robust_width)
-    solved, iterations = solve(
-        part.held, [_under_kernel(loop, kernel) for loop in part.loops], part.start, effort=effort
-    )
+    kernel = None
+    match config.robust:
+        case "gnc" if part.loops:
+            weights, near, prepared = _graduate(part, config.robust_width)
+            solved, iterations = solve(part.held, _weighted(part.loops, weights), near, effort=effort)
+            return solved, weights, prepared + iterations
+        case "cauchy" | "huber" | "dcs" as kind:
+            kernel = Kernel(kind, config.robust_width)
+    terms = [between(loop, kernel=kernel) for loop in part.loops]
+    solved, iterations = solve(part.held, terms, part.start, effort=effort)
     chi2 = _chi2([between(loop) for loop in part.loops], solved)
-    return solved, np.array([kernel.weight(norm) for norm in np.sqrt(chi2)]), iterations
+    return solved, kernel.weights(chi2) if kernel else np.ones_like(chi2), iterations
 
 
-def _graduate(part: Doubtful, width: float) -> tuple[Array, gtsam.Values, int]:
+def _graduate(part: Part, width: float) -> tuple[Array, gtsam.Values, int]:
     """Return a weight of 0 or 1 for each loop, and poses that are nearly solved with them.
 
     Graduated Non-Convexity with truncated least squares (Yang et al. 2020). Information that counts
@@ -111,25 +113,3 @@ def _weighted(loops: Sequence[BetweenFactor], weights: Array) -> list[gtsam.Nonl
 
 def _chi2(terms: Sequence[gtsam.NonlinearFactor], poses: gtsam.Values) -> Array:
     return np.array([2.0 * term.error(poses) for term in terms])
-
-
-def _under_kernel(loop: BetweenFactor, kernel: Any) -> gtsam.NonlinearFactor:
-    import gtsam
-
-    plain = between(loop)
-    return plain.cloneWithNewNoiseModel(gtsam.noiseModel.Robust.Create(kernel, plain.noiseModel()))
-
-
-def _kernel(robust: Robust, width: float) -> Any:
-    """Return GTSAM's M-estimator; DCS takes the square of a width (Agarwal et al. 2013)."""
-    from gtsam.noiseModel import mEstimator
-
-    match robust:
-        case "cauchy":
-            return mEstimator.Cauchy.Create(width)
-        case "huber":
-            return mEstimator.Huber.Create(width)
-        case "dcs":
-            return mEstimator.DCS.Create(width**2)
-        case _:
-            raise ValueError(f"{robust} is not a kernel")

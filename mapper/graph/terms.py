@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mapper.config.graph import KernelKind
 from mapper.geometry import Array, Transform
 from mapper.graph.model import BetweenFactor, PoseSigmas
 
@@ -18,19 +20,49 @@ if TYPE_CHECKING:
 _ANCHOR = PoseSigmas(rotation_rad=1e-3, translation_m=1e-3)
 
 
-def between(factor: BetweenFactor, *, weight: float = 1.0) -> gtsam.BetweenFactorPose3:
-    """Return weight · ½ ‖log(T_i_j⁻¹ · T_i⁻¹ · T_j)‖² in the factor's metric."""
+@dataclass(frozen=True, slots=True)
+class Kernel:
+    """What large residuals cost: less than their square.
+
+    Attributes:
+        kind: "huber" (1964), "cauchy" or "dcs", Dynamic Covariance Scaling (Agarwal et al. 2013).
+        width: Norm of the whitened residual, in sigmas, from which the kernel bites.
+    """
+
+    kind: KernelKind
+    width: float
+
+    def estimator(self) -> Any:
+        """Return GTSAM's M-estimator; that of DCS takes the square of a width."""
+        from gtsam.noiseModel import mEstimator
+
+        if self.kind == "dcs":
+            return mEstimator.DCS.Create(self.width**2)
+        return {"cauchy": mEstimator.Cauchy, "huber": mEstimator.Huber}[self.kind].Create(self.width)
+
+    def weights(self, chi2: Array) -> Array:
+        """Return the weights, 0 … 1, of (N,) squared norms of whitened residuals."""
+        estimator = self.estimator()
+        return np.array([estimator.weight(norm) for norm in np.sqrt(chi2)])
+
+
+def between(
+    factor: BetweenFactor, *, weight: float = 1.0, kernel: Kernel | None = None
+) -> gtsam.BetweenFactorPose3:
+    """Return weight · ½ ‖log(T_i_j⁻¹ · T_i⁻¹ · T_j)‖² in the factor's metric, under a kernel if any."""
     import gtsam
 
-    information = weight * factor.information
-    return gtsam.BetweenFactorPose3(factor.i, factor.j, pose3(factor.T_i_j), noise(information))
+    noise: gtsam.noiseModel.Base = _noise(weight * factor.information)
+    if kernel is not None:
+        noise = gtsam.noiseModel.Robust.Create(kernel.estimator(), noise)
+    return gtsam.BetweenFactorPose3(factor.i, factor.j, _pose3(factor.T_i_j), noise)
 
 
 def anchor(node: int, T_world_node: Transform) -> gtsam.PriorFactorPose3:
     """Return the prior that holds a component's first node."""
     import gtsam
 
-    return gtsam.PriorFactorPose3(node, pose3(T_world_node), noise(_ANCHOR.information))
+    return gtsam.PriorFactorPose3(node, _pose3(T_world_node), _noise(_ANCHOR.information))
 
 
 def values_of(T_world_node: Mapping[int, Transform], nodes: Iterable[int]) -> gtsam.Values:
@@ -39,19 +71,29 @@ def values_of(T_world_node: Mapping[int, Transform], nodes: Iterable[int]) -> gt
 
     values = gtsam.Values()
     for node in nodes:
-        values.insert(node, pose3(T_world_node[node]))
+        values.insert(node, _pose3(T_world_node[node]))
     return values
 
 
-def noise(information: Array) -> gtsam.noiseModel.Gaussian:
+def poses_of(values: gtsam.Values) -> dict[int, Transform]:
+    """Return GTSAM's values as poses, by ascending node."""
+    import gtsam
+
+    rows = gtsam.utilities.extractPose3(values)  # R row by row, then t
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = rows[:, :9].reshape(-1, 3, 3), rows[:, 9:]
+    return dict(zip(values.keys(), poses, strict=True))
+
+
+def _noise(information: Array) -> gtsam.noiseModel.Gaussian:
     """Return the noise model of a (6, 6) information matrix; only the symmetric part counts."""
     import gtsam
 
     return gtsam.noiseModel.Gaussian.Information(0.5 * (information + information.T))
 
 
-def pose3(T_a_b: Transform) -> gtsam.Pose3:
+def _pose3(T_a_b: Transform) -> gtsam.Pose3:
     """GTSAM ends the whole process when a rotation is off SO(3) by rounding, so it is projected first."""
     import gtsam
 
-    return gtsam.Pose3(gtsam.Rot3.ClosestTo(T_a_b[:3, :3]), np.ascontiguousarray(T_a_b[:3, 3]))
+    return gtsam.Pose3(gtsam.Rot3.ClosestTo(T_a_b[:3, :3]), T_a_b[:3, 3])

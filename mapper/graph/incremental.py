@@ -1,0 +1,138 @@
+"""A pose graph that stays solved while it grows: iSAM2 (Kaess et al. 2012) by GTSAM."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from mapper.config.graph import GraphConfig
+from mapper.errors import GraphError
+from mapper.geometry import Transform, inverse, is_rigid
+from mapper.graph.model import BetweenFactor
+from mapper.graph.terms import Kernel, anchor, between, poses_of, values_of
+
+_HUBER = Kernel("huber", GraphConfig().robust_width)
+
+
+class IncrementalSolver:
+    """Believed poses of a growing graph. Loops are under Huber's kernel, which never quite lets go of one.
+
+    Nodes and factors wait until ``update``, and a node without factors waits on; a waiting node is where
+    it was put. Every connected component keeps its first node where that was put. When a factor joins
+    two solved components, the younger is moved to the older and both are solved afresh.
+    """
+
+    def __init__(self) -> None:
+        self._T_world_node: dict[int, Transform] = {}
+        self._factors: list[BetweenFactor] = []
+        self._component: dict[int, int] = {}
+        self._members: dict[int, list[int]] = {}
+        self._restart()
+
+    def _restart(self) -> None:
+        """Forget what is solved: everything waits."""
+        import gtsam
+
+        self._isam = gtsam.ISAM2()
+        self._solved: set[int] = set()
+        self._anchored: set[int] = set()
+        self._used = 0
+        self._is_read = True
+
+    def add_node(self, node: int, T_world_node: Transform) -> None:
+        """Add a node with its first estimate.
+
+        Raises:
+            GraphError: The node is there already, or the estimate is not a rigid motion.
+        """
+        if node in self._T_world_node:
+            raise GraphError(f"node {node} is in the graph already")
+        if not is_rigid(T_world_node):
+            raise GraphError(f"node {node}: its pose is not a finite rigid motion")
+        self._T_world_node[node] = T_world_node
+        self._component[node], self._members[node] = node, [node]
+
+    def add_factors(self, factors: Iterable[BetweenFactor]) -> None:
+        """Add measurements between nodes that exist.
+
+        Raises:
+            GraphError: A factor names an unknown node.
+        """
+        for factor in factors:
+            for node in (factor.i, factor.j):
+                if node not in self._T_world_node:
+                    raise GraphError(f"factor {factor.i} → {factor.j}: node {node} is not in the graph")
+            if self._component[factor.i] != self._component[factor.j]:
+                self._join(factor)
+            self._factors.append(factor)
+
+    def update(self) -> None:
+        """Solve with all that waits.
+
+        Raises:
+            GraphError: The factors do not determine the poses; look for absurd information.
+        """
+        import gtsam
+
+        waiting = self._factors[self._used :]
+        if not waiting:
+            return
+        terms = gtsam.NonlinearFactorGraph()
+        tied: dict[int, None] = {}
+        for factor in waiting:
+            terms.add(between(factor, kernel=_HUBER if factor.origin == "loop" else None))
+            tied |= dict.fromkeys((factor.i, factor.j))
+        for first in dict.fromkeys(self._component[node] for node in tied):
+            if first not in self._anchored:
+                terms.add(anchor(first, self._T_world_node[first]))
+                self._anchored.add(first)
+        new = [node for node in tied if node not in self._solved]
+        try:
+            self._isam.update(terms, values_of(self._T_world_node, new))
+            if any(factor.origin == "loop" for factor in waiting):
+                self._isam.update()  # a loop moves poses farther than one linearisation holds
+        except RuntimeError as error:  # how GTSAM's C++ exceptions arrive, several lines long
+            raise GraphError(f"the growing graph cannot be solved: {' '.join(str(error).split())}") from None
+        self._solved |= tied.keys()
+        self._used = len(self._factors)
+        self._is_read = False
+
+    def pose_of(self, node: int) -> Transform:
+        """Return the (4, 4) believed pose of a node.
+
+        Raises:
+            GraphError: The node is unknown.
+        """
+        if node not in self._T_world_node:
+            raise GraphError(f"node {node} is not in the graph")
+        if node in self._solved and not self._is_read:
+            T_world_node: Transform = self._isam.calculateEstimatePose3(node).matrix()
+            return T_world_node
+        return self._T_world_node[node]
+
+    def poses(self) -> dict[int, Transform]:
+        """Return the (4, 4) believed pose of every node, in the order in which they were added."""
+        if not self._is_read:
+            self._T_world_node |= poses_of(self._isam.calculateEstimate())
+            self._is_read = True
+        return dict(self._T_world_node)
+
+    def _join(self, factor: BetweenFactor) -> None:
+        """Make one component of the two that a factor ties."""
+        two = self._component[factor.i], self._component[factor.j]
+        older, younger = (first for first in self._members if first in two)
+        joining = self._members.pop(younger)
+        if older in self._anchored and younger in self._anchored:
+            self._move(joining, factor)
+            self._restart()
+        for node in joining:
+            self._component[node] = older
+        self._members[older] += joining
+
+    def _move(self, joining: list[int], factor: BetweenFactor) -> None:
+        """Move one side of a factor so that the factor fits."""
+        T_world_node = self.poses()
+        if factor.j in joining:
+            T_fitting_world = T_world_node[factor.i] @ factor.T_i_j @ inverse(T_world_node[factor.j])
+        else:
+            T_fitting_world = T_world_node[factor.j] @ inverse(T_world_node[factor.i] @ factor.T_i_j)
+        self._T_world_node |= {node: T_fitting_world @ T_world_node[node] for node in joining}

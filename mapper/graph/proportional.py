@@ -1,0 +1,82 @@
+"""The thesis's loop correction: spread a loop's disagreement along the path (Somlyai, ALGORITHMS.md A9)."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from mapper.errors import GraphError
+from mapper.geometry import Array, Transform, inverse, rotation_log, skew
+from mapper.graph.model import BetweenFactor, PoseGraph
+
+
+def distribute(graph: PoseGraph) -> dict[int, Transform]:
+    """Return the estimates after every loop was spread, in the order in which they closed.
+
+    Args:
+        graph: Nodes in time order; factors of origin "loop" are spread, others are what made the estimates.
+
+    Returns:
+        T_world_node of every node, in the graph's order.
+    """
+    order = {node: place for place, node in enumerate(graph.T_world_node)}
+    loops = [factor for factor in graph.factors if factor.origin == "loop"]
+    T_world_node = dict(graph.T_world_node)
+    for loop in sorted(loops, key=lambda loop: max(order[loop.i], order[loop.j])):
+        T_world_node = spread(T_world_node, loop)
+    return T_world_node
+
+
+def spread(T_world_node: Mapping[int, Transform], loop: BetweenFactor) -> dict[int, Transform]:
+    """Return poses of which the loop's later node fulfils it.
+
+    The later node j takes the pose that the loop gives it, T_world_i · T_i_j: a shift Δt and a turn ΔR.
+    A node between takes f · Δt and exp(f · log ΔR), f being its share of the path's length from i to j.
+    Up to i nothing moves; after j everything moves rigidly with j.
+
+    Args:
+        T_world_node: Poses of the nodes in time order.
+        loop: How two of them lie to each other; either may be the later.
+
+    Raises:
+        GraphError: A node of the loop is not among the poses.
+    """
+    nodes = list(T_world_node)
+    try:
+        i, j = nodes.index(loop.i), nodes.index(loop.j)
+    except ValueError:
+        raise GraphError(
+            f"loop {loop.i} → {loop.j}: not both nodes are among the {len(nodes)} poses"
+        ) from None
+    T_i_j = loop.T_i_j
+    if i > j:
+        i, j, T_i_j = j, i, inverse(T_i_j)
+    poses = np.array([T_world_node[node] for node in nodes])
+    wanted = poses[i] @ T_i_j
+    shift = wanted[:3, 3] - poses[j, :3, 3]
+    turn = rotation_log(wanted[:3, :3] @ poses[j, :3, :3].T)
+    after = wanted @ inverse(poses[j]) @ poses[j + 1 :]
+    share = _shares(poses[i : j + 1, :3, 3])
+    poses[i : j + 1, :3, :3] = _turns(share, turn) @ poses[i : j + 1, :3, :3]
+    poses[i : j + 1, :3, 3] += share[:, np.newaxis] * shift
+    poses[j] = wanted
+    poses[j + 1 :] = after
+    return dict(zip(nodes, poses, strict=True))
+
+
+def _shares(positions: Array) -> Array:
+    """Return the share of the way to the last of (N, 3) positions that each has behind it, 0 … 1.
+
+    Where nothing moved, every step counts the same.
+    """
+    steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    way = np.cumsum(steps_m if steps_m.sum() > 0.0 else np.ones_like(steps_m))
+    return np.concatenate([[0.0], way / way[-1]])
+
+
+def _turns(share: Array, rotation_rad: Array) -> Array:
+    """Return the (N, 3, 3) rotations exp(share · rotation) (Rodrigues 1840)."""
+    angle_rad = float(np.linalg.norm(rotation_rad))
+    K = skew(rotation_rad / angle_rad) if angle_rad > 0.0 else np.zeros((3, 3))
+    angles_rad = share[:, np.newaxis, np.newaxis] * angle_rad
+    turns: Array = np.eye(3) + np.sin(angles_rad) * K + (1.0 - np.cos(angles_rad)) * (K @ K)
+    return turns
