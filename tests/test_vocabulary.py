@@ -11,7 +11,7 @@ from mapper.errors import DataError, VocabularyError
 from mapper.features.windowed import pack
 from mapper.places.training import grow, train
 from mapper.places.tree import WordTree
-from mapper.places.vocabulary import Vocabulary, WordVector, load_vocabulary, similarity
+from mapper.places.vocabulary import ONE, Vocabulary, WordVector, load_vocabulary, similarity
 
 SMALL = VocabularyConfig(branching=4, levels=3)
 
@@ -108,7 +108,8 @@ def test_a_vector_holds_tf_idf_that_sums_to_one(vocabulary):
 
     expected = vocabulary.idf[telling] * [1, 3]
     assert vector.ids.tolist() == telling.tolist()
-    np.testing.assert_allclose(vector.weights, expected / expected.sum(), rtol=1e-6)
+    assert vector.weights.sum() == ONE
+    np.testing.assert_allclose(vector.weights / ONE, expected / expected.sum(), atol=1 / ONE)
 
 
 def test_words_that_all_images_have_tell_nothing(vocabulary):
@@ -123,24 +124,24 @@ def test_similarity_is_equation_10(images, vocabulary):
 
     def dense(vector):
         full = np.zeros(vocabulary.words)
-        full[vector.ids] = vector.weights
+        full[vector.ids] = vector.weights / ONE
         return full
 
     for a in vectors:
-        assert similarity(a, a) == pytest.approx(1.0, abs=1e-6)
+        assert similarity(a, a) == 1.0
         for b in vectors:
             f_a, f_b = dense(a), dense(b)
             expected = 0.5 * (abs(f_a) + abs(f_b) - abs(f_a - f_b)).sum()
-            assert similarity(a, b) == pytest.approx(expected, abs=1e-6)
+            assert similarity(a, b) == pytest.approx(expected, abs=1e-12)
             assert similarity(a, b) == similarity(b, a)
 
 
 def test_nothing_in_common_is_similarity_zero():
     def vector(*ids):
-        return WordVector(np.array(ids, np.int32), np.full(len(ids), 1 / len(ids), np.float32))
+        return WordVector(np.array(ids, np.int32), np.full(len(ids), ONE // len(ids), np.uint16))
 
     assert similarity(vector(0, 4, 9), vector(1, 5)) == 0.0
-    assert similarity(vector(0, 4), WordVector(np.empty(0, np.int32), np.empty(0, np.float32))) == 0.0
+    assert similarity(vector(0, 4), WordVector(np.empty(0, np.int32), np.empty(0, np.uint16))) == 0.0
 
 
 def test_the_same_vocabulary_gives_the_same_bytes(tmp_path, images, vocabulary):

@@ -18,8 +18,8 @@ class VocabularyConfig(Config):
     branching: Annotated[int, Field(ge=2, le=255)] = 13
     """k: parts that a cluster is split into."""
     levels: Annotated[int, Field(ge=1, le=8)] = 3
-    """d: how often. The more words (k^d), the smaller are all similarities: with about 2200, the published 0.32
-    tells the same place from others; with 10 000 it is never reached."""
+    """d: how often. More words (k^d) make all similarities smaller: with about 2200 the published 0.32 tells
+    the same place from others, with 10 000 no two images reach it."""
     max_iterations: PositiveInt = 12
     """Of each split."""
 

@@ -111,7 +111,7 @@ def k_majority(bits, seeds, max_iterations):
 @njit(cache=True, nogil=True)
 def shared_weight(ids_a, weights_a, ids_b, weights_b):
     """Return Σ min(fA, fB) over the words that two vectors with ascending ids share."""
-    total = 0.0
+    total = 0
     i, j = 0, 0
     while i < len(ids_a) and j < len(ids_b):
         if ids_a[i] < ids_b[j]:
@@ -126,68 +126,21 @@ def shared_weight(ids_a, weights_a, ids_b, weights_b):
 
 
 @njit(cache=True, nogil=True)
-def append_postings(ids, weights, row, first, last, following, filled, rows, posted, used):
-    """Append (row, weight) to the posting list of every word, and return how many blocks are used then.
-
-    A word's postings lie in a chain of blocks, in order of rows.
+def shared_weights(ids, weights, weights_of_word, count):
+    """Return (count,) uint16, the ``shared_weight`` of a vector with each of the first vectors of an index.
 
     Args:
-        ids: (M,) int32 words.
-        weights: (M,) float32.
-        row: The row that has these words; larger than every row before.
-        first: (W,) int32 first block of each word, −1 before it has any.
-        last: (W,) int32 last block of each word.
-        following: (B,) int32 next block of the same word, −1 at the end.
-        filled: (B,) int32 how many postings a block holds.
-        rows: (B, block) int32 rows.
-        posted: (B, block) float32 weights.
-        used: How many blocks are in use; at least M more must be there.
+        ids: (M,) int32 words of the vector.
+        weights: (M,) uint16.
+        weights_of_word: (W, R) uint16 weight of every word in every vector.
+        count: How many vectors take part.
     """
+    totals = np.zeros(count, np.uint16)
     for m in range(len(ids)):
-        word = ids[m]
-        block = last[word]
-        if block < 0 or filled[block] == rows.shape[1]:
-            if block < 0:
-                first[word] = used
-            else:
-                following[block] = used
-            last[word] = used
-            block = used
-            following[block] = -1
-            filled[block] = 0
-            used += 1
-        rows[block, filled[block]] = row
-        posted[block, filled[block]] = weights[m]
-        filled[block] += 1
-    return used
-
-
-@njit(cache=True, nogil=True)
-def accumulate(ids, weights, before, first, following, filled, rows, posted):
-    """Return (before,) float64, the similarity (``shared_weight``) of a vector to each of the first rows.
-
-    Args:
-        ids: (M,) int32 ascending words of the vector.
-        weights: (M,) float32.
-        before: How many rows take part.
-        first: As in ``append_postings``, like all that follow.
-        following: Next block.
-        filled: Postings per block.
-        rows: Rows.
-        posted: Weights.
-    """
-    similarity = np.zeros(before)
-    for m in range(len(ids)):
-        weight = weights[m]
-        block = first[ids[m]]
-        while block >= 0 and rows[block, 0] < before:
-            for p in range(filled[block]):
-                row = rows[block, p]
-                if row >= before:
-                    break
-                similarity[row] += min(weight, posted[block, p])
-            block = following[block]
-    return similarity
+        weight, others = weights[m], weights_of_word[ids[m]]
+        for i in range(count):  # a few vector instructions, as there is nothing to skip
+            totals[i] += min(weight, others[i])
+    return totals
 
 
 @njit(cache=True, nogil=True)

@@ -23,6 +23,8 @@ from mapper.places.tree import Bits, Ids, WordTree
 DESCRIPTOR = "orb"
 """What the bits are: detectors "orb" and "uniform-orb" both describe with it."""
 DESCRIPTOR_BYTES = 32
+ONE = 32_768
+"""What the weights of an image add up to."""
 
 _MAGIC = b"\x89mapper-words\r\n"
 """Not text, and damaged by whoever takes it for text."""
@@ -47,11 +49,12 @@ class WordVector:
 
     Attributes:
         ids: (M,) int32 ascending words.
-        weights: (M,) float32 positive; there are none in an image without features.
+        weights: (M,) uint16 positive, in units of 1 / ``ONE``, so that sums are exact in any order. There are
+            none in an image without features.
     """
 
     ids: Ids
-    weights: NDArray[np.float32]
+    weights: NDArray[np.uint16]
 
     def __post_init__(self) -> None:
         if self.ids.ndim != 1 or self.ids.shape != self.weights.shape:
@@ -111,10 +114,12 @@ class Vocabulary:
     def vector(self, words: Ids) -> WordVector:
         """Return the tf·idf weights of (N,) words, normalised to the sum 1."""
         ids, counts = np.unique(words, return_counts=True)
-        weights = counts * self.idf[ids]
-        told = weights > 0.0
-        weights = weights[told]
-        return WordVector(ids[told].astype(np.int32), (weights / weights.sum()).astype(np.float32))
+        reached = np.cumsum(counts * self.idf[ids])
+        total = reached[-1] if len(reached) and reached[-1] > 0.0 else 1.0
+        # Rounding the running sum keeps the total exact.
+        weights = np.diff(np.rint(ONE * (reached / total)), prepend=0.0).astype(np.uint16)
+        told = weights > 0
+        return WordVector(ids[told].astype(np.int32), weights[told])
 
     def save(self, path: Path) -> None:
         """Write it to a file; the same vocabulary gives the same bytes. Atomic."""
@@ -132,11 +137,11 @@ class Vocabulary:
 
 
 def similarity(a: WordVector, b: WordVector) -> float:
-    """Return s = ½ Σ (|fA| + |fB| − |fA − fB|), 0 … 1 up to rounding (B5; Zhao et al. 2020, eq. 10).
+    """Return s = ½ Σ (|fA| + |fB| − |fA − fB|), from 0 to 1 (B5; Zhao et al. 2020, eq. 10).
 
     Weights are not negative, so that each term is the smaller of the two.
     """
-    return float(shared_weight(a.ids, a.weights, b.ids, b.weights))
+    return int(shared_weight(a.ids, a.weights, b.ids, b.weights)) / ONE
 
 
 def load_vocabulary(path: Path | None = None) -> Vocabulary:
