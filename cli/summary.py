@@ -1,11 +1,14 @@
 """The table at the end of a build."""
 
+from collections import Counter
 from collections.abc import Sequence
 from math import degrees
 from pathlib import Path
+from statistics import median
 from textwrap import wrap
 
 from evaluators.metric import Metric
+from mapper.loops.closure import LoopClosure
 from mapper.run import Run
 
 _LINE_WIDTH = 110
@@ -18,6 +21,7 @@ def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
     rows = [
         ("frames", f"{counts.tracked} tracked, {counts.lost} lost, {counts.skipped} skipped"),
         ("keyframes", f"{counts.nodes}, with {counts.factors} factors"),
+        ("loops", _loops_text(run.loops())),
         *((metric.name, _value_text(metric)) for metric in metrics if metric.name.startswith(_SHOWN)),
         ("octree", f"{counts.leaves} leaves of {run.config.octree.resolution_m:g} m"),
     ]
@@ -33,6 +37,22 @@ def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
     ]
     width = max(len(name) for name, _ in rows)
     return "\n".join(_row(name, text, indent=width + 2) for name, text in rows)
+
+
+def _loops_text(loops: Sequence[LoopClosure]) -> str:
+    """Return how many loops hold, how far they moved the path, and why the other candidates do not."""
+    held = [loop for loop in loops if loop.verdict == "accepted"]
+    refused = Counter(loop.reason.split(":")[0] for loop in loops if loop.verdict == "rejected")
+    text = f"{len(held)} of {len(loops)} candidates hold"
+    if refused:
+        text += f"; refused by {', '.join(f'{why} {count}' for why, count in refused.most_common())}"
+    moved = [
+        (loop.before.translation_m, loop.after.translation_m) for loop in held if loop.before and loop.after
+    ]
+    if moved:
+        before_m, after_m = (median(column) for column in zip(*moved, strict=True))
+        text += f"; median residual {before_m:.3f} m before the solve, {after_m:.3f} m after"
+    return text
 
 
 def _row(name: str, text: str, *, indent: int) -> str:

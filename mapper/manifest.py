@@ -53,6 +53,9 @@ class Counts(Config):
     tracked: int = 0
     nodes: int = 0
     factors: int = 0
+    loops: int = 0
+    """Loop closures that hold."""
+    loop_candidates: int = 0
     leaves: int = 0
     """Known leaves of the octree."""
     cloud_points: int = 0
@@ -72,6 +75,8 @@ class Solve(Config):
     """½ χ² of the first estimates."""
     error_after: float
     iterations: int
+    components: int = 1
+    """Parts of the graph that no factor ties to each other; each is solved on its own."""
 
 
 class Levelling(Config):

@@ -1,8 +1,8 @@
 """From a recorded log to a run folder: the whole story."""
 
 import shutil
-from collections.abc import Mapping
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +16,12 @@ from mapper.export.mcap_log import McapLog
 from mapper.export.picture import write_cloud_views, write_summary
 from mapper.export.ply import write_ply
 from mapper.fusion import Maps, fuse_log
-from mapper.geometry import Transform, fit_rigid
+from mapper.geometry import fit_rigid
 from mapper.graph.g2o import write_g2o
 from mapper.graph.model import PoseGraph
-from mapper.graph.optimize import optimize
 from mapper.levelling import Level, find_level
-from mapper.manifest import Counts, Levelling, SkippedFrame, Solve, Status, Timing
+from mapper.loops.closure import write_closures
+from mapper.manifest import Counts, Levelling, SkippedFrame, Status, Timing
 from mapper.measure import peak_memory_mb
 from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.sight_file import SightWriter, open_sights
@@ -29,6 +29,7 @@ from mapper.progress import SILENT, Progress
 from mapper.records import records_of, write_frame_ms, write_records
 from mapper.run import Draft, Run, drafting, first_manifest, load_run, moved_log, refuse_another_log
 from mapper.run_log import Story, log_maps, log_snapshot, log_story
+from mapper.solving import solve
 from mapper.sources.base import FrameSource
 from mapper.timebase import NS_PER_S, nearest
 from mapper.tracking import Tracking, refuse_a_fragment, track_log
@@ -79,20 +80,17 @@ def build(
     with drafting(out, first_manifest(source), config, overwrite=overwrite) as draft:
         with draft.clock.stage("track"):
             tracking = track_log(source, config, progress=progress)
-        _save_tracking(draft, tracking, tracking.graph.T_world_node, source.truth)
+        _save_tracking(draft, tracking, source.truth)
         refuse_a_fragment(tracking, config)
         with draft.clock.stage("solve"):
-            solution = optimize(tracking.graph, config.graph)
+            solved = solve(tracking.graph, tracking.loops, config.graph)
+        tracking = replace(tracking, graph=solved.graph, loops=solved.loops)
         with draft.clock.stage("level"):
-            level = _level(source, tracking.trajectory(solution.T_world_node), config)
-        T_level_node = {node: level.T_level_world @ T for node, T in solution.T_world_node.items()}
-        _save_tracking(draft, tracking, T_level_node, source.truth)
+            level = _level(source, tracking.trajectory(), config)
+        tracking = replace(tracking, graph=solved.graph.moved(level.T_level_world))
+        _save_tracking(draft, tracking, source.truth)
         draft.update(
-            solve=Solve(
-                error_before=solution.error_before,
-                error_after=solution.error_after,
-                iterations=solution.iterations,
-            ),
+            solve=solved.report,
             levelling=Levelling(method=level.method, detail=level.detail),
         )
         _fuse_into(draft, source, config, progress)
@@ -163,17 +161,16 @@ def _keep_the_rest(folder: Path, new: Path) -> None:
             shutil.copy2(child, new / child.name, follow_symlinks=False)
 
 
-def _save_tracking(
-    draft: Draft, tracking: Tracking, T_world_node: Mapping[int, Transform], truth: Trajectory | None
-) -> None:
+def _save_tracking(draft: Draft, tracking: Tracking, truth: Trajectory | None) -> None:
     """Write what the first pass found, with the nodes where they are believed to be by now."""
-    graph = PoseGraph(dict(T_world_node), tracking.graph.stamps_ns, tracking.graph.factors)
+    graph = tracking.graph
     write_records(draft.folder / files.FRAMES, records_of(tracking.tracks, tracking.skipped))
     write_frame_ms(draft.folder / files.FRAME_MS, tracking.frame_ms)
-    write_tum(draft.folder / files.TRAJECTORY, tracking.trajectory(T_world_node))
+    write_tum(draft.folder / files.TRAJECTORY, tracking.trajectory())
+    write_closures(draft.folder / files.LOOPS, tracking.loops)
     if truth is not None:
         write_tum(draft.folder / files.TRUTH, truth)
-    if T_world_node:
+    if graph.T_world_node:
         _write_graph(draft.folder, graph)
     draft.update(
         counts=Counts(
@@ -184,6 +181,8 @@ def _save_tracking(
             tracked=len(tracking.placed),
             nodes=len(graph.T_world_node),
             factors=len(graph.factors),
+            loops=sum(loop.verdict == "accepted" for loop in tracking.loops),
+            loop_candidates=len(tracking.loops),
         ),
         skipped=tuple(SkippedFrame(stamp_ns=s.stamp_ns, reason=s.reason) for s in tracking.skipped),
     )
@@ -223,7 +222,7 @@ def _fuse_into(
     if truth is not None:
         truth = _laid_over(truth, trajectory)
     frame_ms = tracked.frame_ms() if config.mcap.frame_times else {}
-    story = Story(trajectory, tracked.graph(), tracked.records(), frame_ms, truth)
+    story = Story(trajectory, tracked.graph(), tracked.records(), tracked.loops(), frame_ms, truth)
     with McapLog(draft.folder / files.MCAP) as log:
         with (
             draft.clock.stage("fuse"),

@@ -14,6 +14,7 @@ from mapper.errors import MapperError, RunError
 from mapper.fingerprint import fingerprint
 from mapper.graph.g2o import read_g2o
 from mapper.graph.model import PoseGraph
+from mapper.loops.closure import LoopClosure, read_closures
 from mapper.manifest import Input, Manifest, Timing, library_versions, now_text, read_manifest
 from mapper.measure import Stopwatch
 from mapper.records import FrameRecord, read_frame_ms, read_records
@@ -28,6 +29,7 @@ TRAJECTORY = "trajectory.tum"
 KEYFRAMES = "keyframes.tum"
 TRUTH = "truth.tum"
 GRAPH = "graph.g2o"
+LOOPS = "loops.jsonl"
 FRAMES = "frames.csv"
 FRAME_MS = "frame_ms.csv"
 OCTREE_BT = "map.bt"
@@ -69,6 +71,10 @@ class Run:
     def graph(self) -> PoseGraph:
         """Return the pose graph with its nodes at the solution, in the levelled world."""
         return read_g2o(self.path / GRAPH)
+
+    def loops(self) -> list[LoopClosure]:
+        """Return every loop candidate with its verdict."""
+        return read_closures(self.path / LOOPS)
 
     def records(self) -> list[FrameRecord]:
         """Return what became of every frame."""

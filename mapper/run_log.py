@@ -1,12 +1,15 @@
 """What a run tells in its MCAP log."""
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 
-from mapper.export.mcap_log import WORLD, McapLog
+from mapper.export.foxglove_parts import WORLD
+from mapper.export.mcap_log import McapLog
 from mapper.export.palette import TRUTH, height_colors
 from mapper.fusion import Maps, Snapshot
 from mapper.graph.model import PoseGraph
+from mapper.loops.closure import Discrepancy, LoopClosure
 from mapper.records import FrameRecord
 from mapper.trajectory import Trajectory
 
@@ -22,6 +25,7 @@ class Story:
         trajectory: Final body poses in the levelled world; at least one.
         graph: Nodes at the solution, same world.
         records: What became of every frame.
+        loops: Every loop candidate with its verdict.
         frame_ms: Milliseconds that each frame took, by stamp; empty leaves them out.
         truth: Where the body really was, laid over the trajectory, if known.
     """
@@ -29,6 +33,7 @@ class Story:
     trajectory: Trajectory
     graph: PoseGraph
     records: Iterable[FrameRecord]
+    loops: Iterable[LoopClosure]
     frame_ms: Mapping[int, float]
     truth: Trajectory | None
 
@@ -47,6 +52,8 @@ def log_story(log: McapLog, story: Story) -> None:
         log.transform(int(stamp_ns), T_world_body, parent=WORLD, child=BODY)
     for record in story.records:
         log.diagnostics(record.stamp_ns, _fields(record, story.frame_ms))
+    for loop in story.loops:
+        log.loop(loop.stamp_j_ns, _loop_fields(loop))
 
 
 def log_snapshot(log: McapLog, snapshot: Snapshot) -> None:
@@ -64,6 +71,33 @@ def log_maps(log: McapLog, maps: Maps, *, stamp_ns: int) -> None:
     log.cloud(stamp_ns, maps.cloud_points_world, colors=maps.cloud_colors, name="cloud")
     log.grid(stamp_ns, maps.grid)
     log.grid(stamp_ns, maps.traversable, name="traversable")
+
+
+def _loop_fields(loop: LoopClosure) -> dict[str, int | float | str]:
+    """Return numbers and words of a fixed kind: what is not known is NaN."""
+    before = loop.before or Discrepancy(math.nan, math.nan)
+    after = loop.after or Discrepancy(math.nan, math.nan)
+    return {
+        "i": loop.i,
+        "j": loop.j,
+        "verdict": loop.verdict,
+        "reason": loop.reason,
+        "proposed_by": loop.proposed_by,
+        "similarity": _number(loop.similarity),
+        "matches": loop.matches,
+        "inliers": loop.inliers,
+        "rmse_m": _number(loop.rmse_m),
+        "residual_px": _number(loop.residual_px),
+        "weight": _number(loop.weight),
+        "before_m": before.translation_m,
+        "before_rad": before.rotation_rad,
+        "after_m": after.translation_m,
+        "after_rad": after.rotation_rad,
+    }
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
 
 
 def _fields(record: FrameRecord, frame_ms: Mapping[int, float]) -> dict[str, int | float | str]:

@@ -3,12 +3,13 @@
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from mapper.config import BuildConfig
 from mapper.errors import FrameError, TrackingError
-from mapper.geometry import Transform
 from mapper.graph.model import PoseGraph
+from mapper.loops.closure import LoopClosure
 from mapper.odometry.base import Odometry, Track
 from mapper.parallel import ordered_map
 from mapper.progress import Progress
@@ -23,13 +24,15 @@ class Tracking:
     Attributes:
         tracks: One per frame that could be read, in time order.
         skipped: The frames that could not be read.
-        graph: Nodes at the odometry's estimates, with every factor.
+        graph: Nodes at the odometry's estimates, with every factor, those of the loops last.
+        loops: Every loop candidate with its verdict.
         frame_ms: Wall milliseconds that each frame took to read, detect and track, by stamp.
     """
 
     tracks: tuple[Track, ...]
     skipped: tuple[Skipped, ...]
     graph: PoseGraph
+    loops: tuple[LoopClosure, ...]
     frame_ms: Mapping[int, float]
 
     @property
@@ -37,10 +40,10 @@ class Tracking:
         """The tracks of the frames that were not lost."""
         return [track for track in self.tracks if track.node is not None]
 
-    def trajectory(self, T_world_node: Mapping[int, Transform]) -> Trajectory:
+    def trajectory(self) -> Trajectory:
         """Return T_world_body = T_world_node · T_node_body of every frame that was not lost."""
         return trajectory_from(
-            (track.stamp_ns, T_world_node[track.node] @ track.T_node_body)
+            (track.stamp_ns, self.graph.T_world_node[track.node] @ track.T_node_body)
             for track in self.tracks
             if track.node is not None
         )
@@ -52,6 +55,7 @@ def track_log(source: FrameSource, config: BuildConfig, *, progress: Progress) -
     A frame that cannot be read is skipped and reported, not fatal.
     """
     odometry: Odometry[Any] = config.odometry.build()
+    closer = config.loops.build(config.graph.solve)
     graph = PoseGraph()
     tracks: list[Track] = []
     skipped: list[Skipped] = []
@@ -75,13 +79,16 @@ def track_log(source: FrameSource, config: BuildConfig, *, progress: Progress) -
                 continue
             began = time.perf_counter()
             track = odometry.track(observation)
-            frame_ms[track.stamp_ns] = 1e3 * (observed_s + time.perf_counter() - began)
             if track.is_keyframe and track.node is not None:
                 graph.add_node(track.node, track.stamp_ns, track.T_world_body)
+                closer.add(track.node, track, partial(odometry.view, observation))
+            frame_ms[track.stamp_ns] = 1e3 * (observed_s + time.perf_counter() - began)
             graph.add_factors(track.factors)
             tracks.append(track)
     graph.add_factors(odometry.finish())
-    return Tracking(tuple(tracks), tuple(skipped), graph, frame_ms)
+    loops = tuple(closer.closures())
+    graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")
+    return Tracking(tuple(tracks), tuple(skipped), graph, loops, frame_ms)
 
 
 def refuse_a_fragment(tracking: Tracking, config: BuildConfig) -> None:

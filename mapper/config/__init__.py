@@ -11,6 +11,7 @@ from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, Validati
 from mapper.config.base import Config
 from mapper.config.export import MeshConfig
 from mapper.config.graph import GraphConfig
+from mapper.config.loops import LoopsConfig, PlaceLoopsConfig
 from mapper.config.navigation import TraversableConfig
 from mapper.config.octree import LevelConfig, OctreeConfig, SliceConfig
 from mapper.config.odometry import LocalMapConfig, OdometryConfig
@@ -47,6 +48,7 @@ class BuildConfig(Config):
 
     source: SourceConfig = SourceConfig()
     odometry: OdometryConfig = LocalMapConfig()
+    loops: LoopsConfig = PlaceLoopsConfig()
     graph: GraphConfig = GraphConfig()
     octree: OctreeConfig = OctreeConfig()
     level: LevelConfig = LevelConfig()

@@ -1,5 +1,7 @@
 """Pairs of mutually nearest features, and the homography by which thesis alg. 8 filters them."""
 
+from typing import Protocol
+
 import cv2
 import numpy as np
 from numba import njit
@@ -7,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapper.errors import DataError
 from mapper.features.bits import popcount
-from mapper.features.detectors import Features
+from mapper.features.detectors import Descriptors
 
 Pairs = NDArray[np.intp]
 """(M, 2) indices into the first and the second image's features."""
@@ -16,7 +18,16 @@ _HOMOGRAPHY_POINTS = 4
 _CONFIDENCE = 0.995
 
 
-def match_mutual(a: Features, b: Features, *, max_ratio: float) -> Pairs:
+class Described(Protocol):
+    """Whatever has descriptors, one per row: an image's features, a keyframe's view."""
+
+    @property
+    def descriptors(self) -> Descriptors:
+        """(N, D) uint8 bits or float32."""
+        ...
+
+
+def match_mutual(a: Described, b: Described, *, max_ratio: float) -> Pairs:
     """Return the pairs of mutually nearest descriptors that pass Lowe's ratio test (Lowe 2004, §7.1).
 
     Every descriptor is compared with every other: Hamming distance for bits, Euclidean for numbers.
@@ -37,12 +48,14 @@ def match_mutual(a: Features, b: Features, *, max_ratio: float) -> Pairs:
             f"matching: descriptors {a.descriptors.shape} {a.descriptors.dtype} and {b.descriptors.shape} "
             f"{b.descriptors.dtype} are of different kinds; use one detector for both images"
         )
-    if len(a) == 0 or len(b) == 0:
+    if len(a.descriptors) == 0 or len(b.descriptors) == 0:
         return np.empty((0, 2), np.intp)
-    if a.is_binary:
-        pairs: Pairs = _match_bits(_words(a), _words(b), max_ratio)
+    if a.descriptors.dtype == np.uint8:
+        pairs: Pairs = _match_bits(_words(a.descriptors), _words(b.descriptors), max_ratio)
         return pairs
-    nearest: Pairs = _match_numbers(a.descriptors @ b.descriptors.T, _squares(a), _squares(b), max_ratio)
+    nearest: Pairs = _match_numbers(
+        a.descriptors @ b.descriptors.T, _squares(a.descriptors), _squares(b.descriptors), max_ratio
+    )
     return nearest
 
 
@@ -71,17 +84,17 @@ def homography_inliers(
     return none if found is None else mask.ravel().astype(np.bool_)
 
 
-def _words(features: Features) -> NDArray[np.uint64]:
+def _words(descriptors: Descriptors) -> NDArray[np.uint64]:
     """Return the bits as (N, W) whole words, filled up with zeros."""
-    n, width = features.descriptors.shape
+    n, width = descriptors.shape
     padded = np.zeros((n, -(-width // 8) * 8), np.uint8)
-    padded[:, :width] = features.descriptors
+    padded[:, :width] = descriptors
     words: NDArray[np.uint64] = padded.view(np.uint64)
     return words
 
 
-def _squares(features: Features) -> NDArray[np.float32]:
-    squares: NDArray[np.float32] = np.einsum("ij,ij->i", features.descriptors, features.descriptors)
+def _squares(descriptors: Descriptors) -> NDArray[np.float32]:
+    squares: NDArray[np.float32] = np.einsum("ij,ij->i", descriptors, descriptors)
     return squares
 
 

@@ -10,7 +10,7 @@ from mapper.features.detectors import Descriptors
 from mapper.features.windowed import Words, pack
 from mapper.geometry import Array, Points, Transform
 
-_BINARY_BYTES = 32
+_ORB_BYTES = 32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,9 +39,9 @@ class View:
         return len(self.pixels)
 
     @property
-    def is_binary(self) -> bool:
+    def is_orb(self) -> bool:
         """Descriptors are 256 bits each, as ORB's are."""
-        return self.descriptors.dtype == np.uint8 and self.descriptors.shape[1] == _BINARY_BYTES
+        return self.descriptors.dtype == np.uint8 and self.descriptors.shape[1] == _ORB_BYTES
 
     @property
     def bits(self) -> Words:
@@ -50,7 +50,7 @@ class View:
         Raises:
             DataError: They are not 256 bits each.
         """
-        if not self.is_binary:
+        if not self.is_orb:
             raise DataError(
                 f"view {self.stamp_ns}: descriptors are {self.descriptors.shape[1]} × "
                 f"{self.descriptors.dtype}, want 256 bits; choose detector 'orb' or 'uniform-orb'"

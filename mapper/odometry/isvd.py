@@ -14,6 +14,7 @@ from mapper.features.view import View
 from mapper.frames import Frame, PinholeCamera, RgbdFrame
 from mapper.geometry import Array, Points, Transform, apply, inverse, mean_rotation, transform
 from mapper.graph.model import BetweenFactor
+from mapper.graph.noise import with_model_error
 from mapper.odometry.base import Diagnostics, Track
 from mapper.odometry.keyframes import SharpestKeyframes
 from mapper.registration.base import Alignment
@@ -213,7 +214,12 @@ class IsvdOdometry:
         self._keyframes.extend(placed for placed in self._recent if placed.node == keyframe)
         nearest = candidates[0].alignment if candidates else None
         factors = tuple(
-            BetweenFactor(candidate.earlier.node, node, alignment.T_target_source, alignment.information)
+            BetweenFactor(
+                candidate.earlier.node,
+                node,
+                alignment.T_target_source,
+                with_model_error(alignment.information, alignment.T_target_source),
+            )
             for candidate in candidates
             if (alignment := candidate.alignment).information is not None
         )

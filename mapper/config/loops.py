@@ -1,0 +1,124 @@
+"""How loops are proposed, verified and believed."""
+
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+
+from mapper.config.base import Config
+from mapper.config.odometry import IsvdConfig, MatchConfig
+from mapper.config.places import PlacesConfig
+
+if TYPE_CHECKING:
+    from mapper.loops.belief import Correction
+    from mapper.loops.closer import Closer
+
+Ratio = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class VerificationConfig(Config):
+    """What two views must have in common to be two views of one place."""
+
+    match: MatchConfig = MatchConfig(filter="none", max_ratio=0.85)
+    """How descriptors are paired."""
+    min_matches: PositiveInt = 45
+    """Fewer paired features are no loop (B5)."""
+    registration: IsvdConfig = IsvdConfig()
+    """ISVD on the paired points gives the first motion."""
+    max_depth_m: PositiveFloat = 5.0
+    """Depth beyond it is not used."""
+    min_inliers: PositiveInt = 30
+    """Fewer pairs that agree with the motion in the image are no loop."""
+    min_inlier_ratio: Ratio = 0.45
+    """A smaller share of the pairs that agrees is no loop."""
+    virtual_baseline_px_m: PositiveFloat = 40.0
+    """bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017)."""
+    measure: Literal["reprojection", "isvd"] = "reprojection"
+    """Which of the two tests' motions becomes the constraint."""
+
+
+class GateConfig(Config):
+    """How far off a loop may put us: what the odometry may have drifted on the way since."""
+
+    slack_m: PositiveFloat = 0.2
+    slack_rad: PositiveFloat = 0.1
+    drift_ratio: NonNegativeFloat = 0.05
+    """Metres per metre of path."""
+    drift_rad_per_m: NonNegativeFloat = 0.02
+    """Radians per metre of path."""
+    drift_rad_per_rad: NonNegativeFloat = 0.05
+    """Radians per radian turned."""
+
+
+class NoLoopsConfig(Config):
+    """No loop is looked for."""
+
+    kind: Literal["none"] = "none"
+
+    def build(self, _correction: "Correction", /) -> "Closer":
+        """Return a closer that finds nothing."""
+        from mapper.loops.closer import NoLoops
+
+        return NoLoops()
+
+
+class PlaceLoopsConfig(Config):
+    """Every keyframe is compared with those that look like it, however far away they are believed to be."""
+
+    kind: Literal["places"] = "places"
+    propose: Literal["auto", "places", "nearby"] = "auto"
+    """By a bag of words, by believed pose, or "auto": by words where descriptors have 256 bits."""
+    places: PlacesConfig = PlacesConfig()
+    min_gap_s: PositiveFloat = 5.0
+    """What was seen more recently is the odometry's to know."""
+    min_motion_m: NonNegativeFloat = 0.05
+    min_motion_rad: NonNegativeFloat = 0.05
+    """No look is taken before the camera has moved so far or turned so much since the last one."""
+    max_distance_m: PositiveFloat = 1.0
+    """How near is "nearby", before the drift since is added."""
+    max_angle_rad: PositiveFloat = 0.8
+    """Largest angle between the viewing directions of what is nearby."""
+    max_candidates: PositiveInt = 4
+    """Candidates compared per keyframe, the most similar first; the first loop found ends the search."""
+    verification: VerificationConfig = VerificationConfig()
+    gate: GateConfig = GateConfig()
+    min_agreeing: NonNegativeInt = 1
+    """This many loops found from other keyframes nearby must tell the same before one is believed."""
+    agreement_path_m: PositiveFloat = 3.0
+    """How far along the path from each other two loops' ends may lie to tell of one another."""
+
+    def build(self, correction: "Correction", /) -> "Closer":
+        """Return the closer; ``correction`` is how the graph is solved."""
+        from mapper.loops.closer import PlaceLoops
+
+        return PlaceLoops(self, correction=correction)
+
+
+class ThesisLoopsConfig(Config):
+    """The thesis's loop closure (A9): sharp frames against the keyframes near their estimate."""
+
+    kind: Literal["thesis"] = "thesis"
+    keyframe_interval: PositiveInt = 20
+    """One keyframe, the sharpest, in this many frames (A8)."""
+    sharp_ratio: PositiveFloat = 1.2
+    """A frame is tried when it has this many times the median number of features of late."""
+    median_frames: PositiveInt = 20
+    max_distance_m: PositiveFloat = 0.5
+    """How close is close; the thesis leaves it open, as it does the angle."""
+    max_angle_rad: PositiveFloat = 0.5
+    """Largest angle between the two viewing directions."""
+    min_gap_s: PositiveFloat = 2.0
+    """Younger keyframes are not tried."""
+    max_candidates: PositiveInt = 4
+    """Keyframes compared per frame, the nearest first; the first loop found ends the search."""
+    verification: VerificationConfig = VerificationConfig(
+        match=MatchConfig(), min_matches=20, min_inliers=20, min_inlier_ratio=0.0, measure="isvd"
+    )
+
+    def build(self, correction: "Correction", /) -> "Closer":
+        """Return the closer; ``correction`` is how the graph is solved."""
+        from mapper.loops.closer import ThesisLoops
+
+        return ThesisLoops(self, correction=correction)
+
+
+LoopsConfig = Annotated[NoLoopsConfig | PlaceLoopsConfig | ThesisLoopsConfig, Field(discriminator="kind")]

@@ -1,0 +1,84 @@
+"""Where the nodes are believed to be while a log is still being tracked, with the loops found so far."""
+
+from typing import Literal, Protocol
+
+from mapper.geometry import Transform
+from mapper.graph.incremental import IncrementalSolver
+from mapper.graph.proportional import spread
+from mapper.loops.closure import LoopClosure
+from mapper.odometry.base import Track
+
+Correction = Literal["batch", "proportional", "none"]
+"""How the graph is solved in the end (``graph.solve``)."""
+
+
+class Belief(Protocol):
+    """Node poses that loops correct; a new node hangs on the believed pose of the one it was tracked from."""
+
+    def add(self, node: int, track: Track) -> None:
+        """Take in a new node, in time order."""
+        ...
+
+    def close(self, closure: LoopClosure) -> None:
+        """Correct the path by a loop."""
+        ...
+
+    def pose_of(self, node: int) -> Transform:
+        """Return the (4, 4) believed pose of a node."""
+        ...
+
+
+class SolvedBelief:
+    """Belief by incremental smoothing (iSAM2, Kaess et al. 2012); it is solved only when a loop closes."""
+
+    def __init__(self) -> None:
+        self._solver = IncrementalSolver()
+        self._T_world_node: dict[int, Transform] = {}
+
+    def add(self, node: int, track: Track) -> None:
+        """Take in a new node, in time order."""
+        self._T_world_node[node] = _first_estimate(track, self._T_world_node)
+        self._solver.add_node(node, self._T_world_node[node])
+        self._solver.add_factors(track.links)
+
+    def close(self, closure: LoopClosure) -> None:
+        """Correct the path by a loop."""
+        self._solver.add_factors([closure.factor])
+        self._solver.update()
+        self._T_world_node = self._solver.poses()
+
+    def pose_of(self, node: int) -> Transform:
+        """Return the (4, 4) believed pose of a node."""
+        return self._T_world_node[node]
+
+
+class SpreadBelief:
+    """Belief by the thesis's proportional correction (A9)."""
+
+    def __init__(self) -> None:
+        self._T_world_node: dict[int, Transform] = {}
+
+    def add(self, node: int, track: Track) -> None:
+        """Take in a new node, in time order."""
+        self._T_world_node[node] = _first_estimate(track, self._T_world_node)
+
+    def close(self, closure: LoopClosure) -> None:
+        """Correct the path by a loop."""
+        self._T_world_node = spread(self._T_world_node, closure.factor)
+
+    def pose_of(self, node: int) -> Transform:
+        """Return the (4, 4) believed pose of a node."""
+        return self._T_world_node[node]
+
+
+def _first_estimate(track: Track, T_world_node: dict[int, Transform]) -> Transform:
+    if not track.links:
+        return track.T_world_body
+    link = track.links[0]
+    T_world_new: Transform = T_world_node[link.i] @ link.T_i_j
+    return T_world_new
+
+
+def belief_for(correction: Correction) -> Belief:
+    """Return the belief that corrects as the graph will be solved."""
+    return SpreadBelief() if correction == "proportional" else SolvedBelief()

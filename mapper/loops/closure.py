@@ -1,0 +1,211 @@
+"""Loop closures: what was proposed, what came of it, and the file that tells."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from mapper.atomic import write_text
+from mapper.errors import DataError, RunError
+from mapper.geometry import Array, Transform, inverse, rotation_log, transform
+from mapper.graph.model import BetweenFactor, Solution
+from mapper.rotations import quaternion_from_rotation, rotation_from_quaternion
+
+ProposedBy = Literal["places", "nearby", "hand"]
+Verdict = Literal["accepted", "rejected"]
+
+
+@dataclass(frozen=True, slots=True)
+class Discrepancy:
+    """How far two poses lie from where a loop closure wants them to each other."""
+
+    translation_m: float
+    rotation_rad: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopClosure:
+    """One candidate and its verdict.
+
+    Attributes:
+        i: Earlier node.
+        j: Later node, from which the loop was found.
+        stamp_i_ns: Stamp of i's frame.
+        stamp_j_ns: Stamp of j's frame.
+        proposed_by: Who thought of it.
+        similarity: Of the two images' words (eq. 10); None if they were not compared.
+        matches: Features paired by descriptor.
+        inliers: Pairs that agree with the motion in the image.
+        rmse_m: Root mean square distance of the agreeing points; None if none agreed.
+        residual_px: Root mean square image residual of the inliers; None if none agreed.
+        T_i_j: (4, 4) measured pose of j in i; None if there is no measurement.
+        information: (6, 6) of j's tangent (rotation, translation); None if there is no measurement.
+        verdict: Whether it is a constraint of the graph.
+        reason: Why not; empty when accepted.
+        before: Discrepancy before the solve; None unless it was accepted until then.
+        after: Discrepancy after the solve.
+        weight: What the solver let it count, 0 … 1.
+    """
+
+    i: int
+    j: int
+    stamp_i_ns: int
+    stamp_j_ns: int
+    proposed_by: ProposedBy
+    verdict: Verdict
+    reason: str = ""
+    similarity: float | None = None
+    matches: int = 0
+    inliers: int = 0
+    rmse_m: float | None = None
+    residual_px: float | None = None
+    T_i_j: Transform | None = None
+    information: Array | None = None
+    before: Discrepancy | None = None
+    after: Discrepancy | None = None
+    weight: float | None = None
+
+    def __post_init__(self) -> None:
+        if (self.verdict == "accepted") == bool(self.reason):
+            raise DataError(
+                f"loop {self.i} → {self.j}: verdict {self.verdict!r} with reason {self.reason!r}; "
+                "a rejected loop says why, an accepted one has nothing to say"
+            )
+        if self.verdict == "accepted" and (self.T_i_j is None or self.information is None):
+            raise DataError(f"loop {self.i} → {self.j}: accepted without a measurement")
+
+    @property
+    def factor(self) -> BetweenFactor:
+        """The constraint that it is.
+
+        Raises:
+            DataError: Nothing was measured.
+        """
+        if self.T_i_j is None or self.information is None:
+            raise DataError(f"loop {self.i} → {self.j}: nothing was measured, so it is no constraint")
+        return BetweenFactor(self.i, self.j, self.T_i_j, self.information, "loop")
+
+
+def discrepancy(T_i_j: Transform, T_world_i: Transform, T_world_j: Transform) -> Discrepancy:
+    """Return how far node j lies from where a measurement from node i puts it."""
+    miss = inverse(T_i_j) @ inverse(T_world_i) @ T_world_j
+    return Discrepancy(float(np.linalg.norm(miss[:3, 3])), float(np.linalg.norm(rotation_log(miss[:3, :3]))))
+
+
+def settled(
+    loops: Sequence[LoopClosure],
+    T_world_before: Mapping[int, Transform],
+    solution: Solution,
+    *,
+    min_weight: float,
+) -> tuple[LoopClosure, ...]:
+    """Return the loops with what the solver made of them; those that it did not believe are rejected.
+
+    Args:
+        loops: Every candidate; the accepted ones are the solved graph's last factors, in this order.
+        T_world_before: Poses before the solve.
+        solution: Of that graph.
+        min_weight: A loop that weighs less is rejected.
+    """
+    accepted = sum(loop.verdict == "accepted" for loop in loops)
+    weights = iter(solution.weights[len(solution.weights) - accepted :])
+    return tuple(
+        _settled(loop, next(weights), T_world_before, solution.T_world_node, min_weight)
+        if loop.verdict == "accepted" and loop.T_i_j is not None
+        else loop
+        for loop in loops
+    )
+
+
+def _settled(
+    loop: LoopClosure,
+    weight: float,
+    T_world_before: Mapping[int, Transform],
+    T_world_after: Mapping[int, Transform],
+    min_weight: float,
+) -> LoopClosure:
+    assert loop.T_i_j is not None
+    told = replace(
+        loop,
+        before=discrepancy(loop.T_i_j, T_world_before[loop.i], T_world_before[loop.j]),
+        after=discrepancy(loop.T_i_j, T_world_after[loop.i], T_world_after[loop.j]),
+        weight=weight,
+    )
+    if weight >= min_weight:
+        return told
+    return replace(
+        told, verdict="rejected", reason=f"solver: contradicts the rest of the graph, weight {weight:.2f}"
+    )
+
+
+def write_closures(path: Path, closures: Iterable[LoopClosure]) -> None:
+    """Write one JSON object per line; numbers keep every digit."""
+    write_text(path, "".join(json.dumps(_fields(closure)) + "\n" for closure in closures))
+
+
+def read_closures(path: Path) -> list[LoopClosure]:
+    """Return what ``write_closures`` wrote.
+
+    Raises:
+        RunError: The file cannot be read.
+        DataError: A line is not a loop closure; the message names it.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read: {error.strerror}") from None
+    closures = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            closures.append(_closure(json.loads(line)))
+        except (KeyError, TypeError, ValueError, DataError) as error:
+            raise DataError(f"{path}:{number}: not a loop closure: {error!r}") from None
+    return closures
+
+
+def _fields(closure: LoopClosure) -> dict[str, Any]:
+    T_i_j, information = closure.T_i_j, closure.information
+    return {
+        "i": closure.i,
+        "j": closure.j,
+        "stamp_i_ns": closure.stamp_i_ns,
+        "stamp_j_ns": closure.stamp_j_ns,
+        "proposed_by": closure.proposed_by,
+        "verdict": closure.verdict,
+        "reason": closure.reason,
+        "similarity": closure.similarity,
+        "matches": closure.matches,
+        "inliers": closure.inliers,
+        "rmse_m": closure.rmse_m,
+        "residual_px": closure.residual_px,
+        "translation_m": None if T_i_j is None else T_i_j[:3, 3].tolist(),
+        "rotation_xyzw": None if T_i_j is None else quaternion_from_rotation(T_i_j[:3, :3]).tolist(),
+        "information": None if information is None else information.tolist(),
+        "before": None if closure.before is None else _discrepancy_fields(closure.before),
+        "after": None if closure.after is None else _discrepancy_fields(closure.after),
+        "weight": closure.weight,
+    }
+
+
+def _discrepancy_fields(value: Discrepancy) -> dict[str, float]:
+    return {"translation_m": value.translation_m, "rotation_rad": value.rotation_rad}
+
+
+def _closure(fields: dict[str, Any]) -> LoopClosure:
+    rest = dict(fields)
+    translation_m, rotation_xyzw = rest.pop("translation_m"), rest.pop("rotation_xyzw")
+    information = rest.pop("information")
+    before, after = rest.pop("before"), rest.pop("after")
+    T_i_j = None
+    if translation_m is not None:
+        T_i_j = transform(rotation_from_quaternion(np.array(rotation_xyzw)), np.array(translation_m))
+    return LoopClosure(
+        **rest,
+        T_i_j=T_i_j,
+        information=None if information is None else np.array(information),
+        before=None if before is None else Discrepancy(**before),
+        after=None if after is None else Discrepancy(**after),
+    )

@@ -1,0 +1,137 @@
+"""Whether two views are of one place, and how they then lie to each other."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.config.loops import VerificationConfig
+from mapper.features.matching import Pairs, homography_inliers, match_mutual
+from mapper.features.view import View
+from mapper.geometry import Array, Transform, adjoint, apply, inverse
+from mapper.graph.noise import with_model_error
+from mapper.odometry.local_map.pose import normal_matrix, refine_pose
+from mapper.registration.base import Alignment
+from mapper.registration.isvd import Isvd
+
+_LM_ROUNDS, _LM_ITERATIONS = 4, 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verification:
+    """What comparing two views came to.
+
+    Attributes:
+        matches: Features paired by descriptor.
+        reason: Why the views are not of one place; empty if they are.
+        inliers: Pairs that agree with the motion in the image.
+        rmse_m: Root mean square distance of the points that agree in space, metres.
+        residual_px: Root mean square image residual of the inliers, pixels of the finest octave.
+        T_i_j: (4, 4) pose of j's body in i's, None without agreement.
+        information: (6, 6) of j's tangent (rotation, translation), None without agreement.
+    """
+
+    matches: int
+    reason: str
+    inliers: int = 0
+    rmse_m: float | None = None
+    residual_px: float | None = None
+    T_i_j: Transform | None = None
+    information: Array | None = None
+
+
+class Verifier:
+    """Pairs two views' features, fits a motion to their points by ISVD, and asks the image whether it holds.
+
+    The two tests err differently: ISVD (thesis alg. 7) needs depth on both sides and trusts points,
+    reprojection (Mur-Artal & Tardós 2017, §III-C) trusts pixels and would accept a far scene that hardly
+    moves in the image. A loop has to pass both.
+    """
+
+    def __init__(self, config: VerificationConfig) -> None:
+        self._config = config
+        self._isvd = Isvd(config.registration)
+
+    def verify(self, i: View, j: View) -> Verification:
+        """Return how view j lies to view i, or why they do not show one place."""
+        config = self._config
+        pairs = self._pairs(i, j)
+        matches = len(pairs)
+        if matches < config.min_matches:
+            return Verification(matches, f"matching: {matches} pairs, want {config.min_matches}")
+        with_depth = i.has_depth(max_depth_m=config.max_depth_m)[pairs[:, 0]]
+        pairs = pairs[with_depth]
+        both = pairs[j.has_depth(max_depth_m=config.max_depth_m)[pairs[:, 1]]]
+        alignment = self._isvd.fit(i.points_camera[both[:, 0]], j.points_camera[both[:, 1]])
+        if not alignment.converged:
+            return Verification(matches, f"isvd: {alignment.reason}")
+        return self._reproject(i, j, pairs, alignment, matches=matches)
+
+    def _pairs(self, i: View, j: View) -> Pairs:
+        match = self._config.match
+        pairs = match_mutual(i, j, max_ratio=match.max_ratio)
+        if match.filter == "none":
+            return pairs
+        agree = homography_inliers(
+            i.pixels[pairs[:, 0]].astype(np.float32),
+            j.pixels[pairs[:, 1]].astype(np.float32),
+            tolerance_px=match.homography_tolerance_px,
+            iterations=match.homography_iterations,
+        )
+        return pairs[agree]
+
+    def _reproject(
+        self, i: View, j: View, pairs: Pairs, alignment: Alignment, *, matches: int
+    ) -> Verification:
+        """Refine ISVD's motion in j's image, and count who agrees."""
+        config = self._config
+        points = i.points_camera[pairs[:, 0]]
+        measured, weights, intrinsics = _measurements(j, pairs[:, 1], config.virtual_baseline_px_m)
+        T_j_i, agree, _ = refine_pose(
+            inverse(alignment.T_target_source),
+            points,
+            measured,
+            weights,
+            intrinsics,
+            _LM_ROUNDS,
+            _LM_ITERATIONS,
+        )
+        inliers = int(agree.sum())
+        wanted = max(config.min_inliers, config.min_inlier_ratio * len(pairs))
+        if inliers < wanted:
+            reason = f"reprojection: {inliers} of {len(pairs)} pairs agree, want {wanted:.0f}"
+            return Verification(matches, reason, inliers, alignment.inlier_rmse_m)
+        seen = apply(T_j_i, points[agree])
+        miss_px = (seen[:, :2] / seen[:, 2:] * intrinsics[:2] + intrinsics[2:4] - measured[agree, :2]) * (
+            weights[agree, :1] ** 0.5
+        )
+        T_ci_cj, information = alignment.T_target_source, alignment.information
+        if config.measure == "reprojection":
+            T_ci_cj = inverse(T_j_i)
+            # i's points were measured no better than j's pixels, so the information is halved.
+            information = 0.5 * normal_matrix(
+                T_j_i, points[agree], measured[agree], weights[agree], intrinsics
+            )
+        assert information is not None  # ISVD converged
+        to_camera = adjoint(inverse(j.T_body_camera))
+        T_i_j = i.T_body_camera @ T_ci_cj @ inverse(j.T_body_camera)
+        return Verification(
+            matches,
+            "",
+            inliers,
+            alignment.inlier_rmse_m,
+            float(np.sqrt((miss_px**2).sum(axis=1).mean())),
+            T_i_j,
+            with_model_error(to_camera.T @ information @ to_camera, T_i_j),
+        )
+
+
+def _measurements(view: View, features: NDArray[np.intp], bf: float) -> tuple[Array, Array, Array]:
+    """Return (M, 3) u, v, bf/z, their (M, 3) inverse variances, and (5,) intrinsics."""
+    depth_m = view.points_camera[features, 2]
+    sigma_px = np.repeat(view.sigma_px[features, None], 3, axis=1)
+    return (
+        np.column_stack([view.pixels[features], bf / depth_m]),
+        sigma_px**-2.0,
+        np.append(view.intrinsics, bf),
+    )

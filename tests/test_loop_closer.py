@@ -1,0 +1,181 @@
+"""Loops found on a walk round a made-up room: by words, by pose, and as the thesis does."""
+
+from collections.abc import Sequence
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from view_world import Room, track
+
+from mapper.config import load_config
+from mapper.config.loops import GateConfig, NoLoopsConfig, PlaceLoopsConfig, ThesisLoopsConfig
+from mapper.config.places import PlacesConfig
+from mapper.errors import DataError
+from mapper.features.view import View
+from mapper.geometry import Transform, exp, inverse
+from mapper.graph.model import BetweenFactor, PoseSigmas
+from mapper.loops.closer import Closer
+from mapper.loops.closure import LoopClosure, discrepancy
+from mapper.timebase import NS_PER_S
+
+NODES, LAP = 60, 40
+LINK = PoseSigmas(rotation_rad=0.02, translation_m=0.02).information
+# Random bits fall into random words, so views of one place share fewer of them than real images do.
+PLACES = PlacesConfig(min_similarity=0.1)
+
+
+def walked() -> list[Transform]:
+    """One and a half laps on a circle, looking outwards."""
+    poses = []
+    for k in range(NODES):
+        yaw = 2.0 * np.pi * k / LAP
+        T = exp(np.array([0.0, 0.0, yaw]), np.zeros(3))
+        T[:2, 3] = [0.5 * np.cos(yaw), 0.5 * np.sin(yaw)]
+        poses.append(T)
+    return poses
+
+
+def drifting(truth: Sequence[Transform]) -> list[Transform]:
+    """The same walk as an odometry tells it that turns 1 % too far and climbs a little."""
+    poses = [truth[0]]
+    for before, after in pairwise(truth):
+        step = inverse(before) @ after @ exp(np.array([0.0, 0.0, 0.0015]), np.array([0.0, 0.0, 0.004]))
+        poses.append(poses[-1] @ step)
+    return poses
+
+
+def walk(closer: Closer, room: Room, *, told: Sequence[Transform] | None = None, features=None) -> list[View]:
+    """Feed a closer with the walk; ``told`` is what the odometry says of it."""
+    truth = walked()
+    told = drifting(truth) if told is None else told
+    views = [room.view(T, k * NS_PER_S // 2) for k, T in enumerate(truth)]
+    for k, T_world_body in enumerate(told):
+        links = [BetweenFactor(k - 1, k, inverse(told[k - 1]) @ T_world_body, LINK)] if k else []
+        count = 500 if features is None else features[k]
+        closer.add(
+            k, track(k, views[k].stamp_ns, T_world_body, links, features=count), partial(views.__getitem__, k)
+        )
+    return views
+
+
+def accepted(closer: Closer) -> list[LoopClosure]:
+    return [loop for loop in closer.closures() if loop.verdict == "accepted"]
+
+
+def worst_m(loops: Sequence[LoopClosure]) -> float:
+    truth = walked()
+    return max(discrepancy(loop.T_i_j, truth[loop.i], truth[loop.j]).translation_m for loop in loops)
+
+
+@pytest.mark.parametrize("propose", ["places", "nearby"])
+def test_the_second_lap_closes_on_the_first(propose):
+    closer = PlaceLoopsConfig(propose=propose, places=PLACES).build("batch")
+    walk(closer, Room(1))
+    found = accepted(closer)
+    assert len({loop.j for loop in found}) >= 0.8 * (NODES - LAP)
+    assert worst_m(found) < 0.05
+    assert {loop.proposed_by for loop in found} == {propose}
+
+
+def test_loops_correct_what_is_believed():
+    closer = PlaceLoopsConfig(places=PLACES).build("batch")
+    walk(closer, Room(1))
+    truth = walked()
+    drifted = drifting(truth)
+    end = closer.believed(NODES - 1)
+    assert np.linalg.norm(drifted[-1][:3, 3] - truth[-1][:3, 3]) > 0.1
+    assert np.linalg.norm(end[:3, 3] - truth[-1][:3, 3]) < 0.05
+
+
+def test_every_candidate_gets_a_verdict():
+    closer = PlaceLoopsConfig(places=PLACES).build("batch")
+    walk(closer, Room(1))
+    for loop in closer.closures():
+        assert (loop.verdict == "rejected") == bool(loop.reason)
+        assert loop.stamp_j_ns - loop.stamp_i_ns >= 5 * NS_PER_S
+
+
+def test_two_runs_tell_the_same():
+    runs = []
+    for _ in range(2):
+        closer = PlaceLoopsConfig(places=PLACES).build("batch")
+        walk(closer, Room(1))
+        runs.append([(loop.i, loop.j, loop.reason, loop.similarity) for loop in closer.closures()])
+    assert runs[0] == runs[1]
+
+
+def test_the_gate_refuses_what_odometry_rules_out():
+    gate = GateConfig(
+        slack_m=0.01, slack_rad=0.01, drift_ratio=0.0, drift_rad_per_m=0.0, drift_rad_per_rad=0.0
+    )
+    closer = PlaceLoopsConfig(places=PLACES, gate=gate).build("batch")
+    walk(closer, Room(1))
+    assert not accepted(closer)
+    assert any(loop.reason.startswith("gate: ") for loop in closer.closures())
+
+
+def test_a_loop_without_company_is_not_believed():
+    closer = PlaceLoopsConfig(places=PLACES, min_agreeing=NODES).build("batch")
+    walk(closer, Room(1))
+    assert not accepted(closer)
+    assert any(loop.reason.startswith("alone: ") for loop in closer.closures())
+
+
+def test_a_look_needs_motion():
+    closer = PlaceLoopsConfig(places=PLACES, min_motion_m=10.0, min_motion_rad=10.0).build("batch")
+    walk(closer, Room(1))
+    assert not closer.closures()
+
+
+def test_words_need_orb_descriptors():
+    closer = PlaceLoopsConfig(propose="places").build("batch")
+    view = Room(1).view(np.eye(4), 0)
+    numbers = View(
+        0,
+        view.pixels,
+        view.sigma_px,
+        np.zeros((len(view), 64), np.float32),
+        view.points_camera,
+        view.intrinsics,
+        view.T_body_camera,
+    )
+    with pytest.raises(DataError, match="want 256 bits; choose detector 'orb' or 'uniform-orb'"):
+        closer.add(0, track(0, 0, np.eye(4)), lambda: numbers)
+
+
+def test_the_thesis_looks_only_from_sharp_frames():
+    sharp = [800 if k % 10 == 5 else 500 for k in range(NODES)]
+    closer = ThesisLoopsConfig(keyframe_interval=5).build("proportional")
+    walk(closer, Room(1), features=sharp)
+    assert closer.closures()
+    assert {loop.j % 10 for loop in closer.closures()} == {5}
+    assert worst_m(accepted(closer)) < 0.05
+
+
+def test_the_thesis_finds_nothing_when_no_frame_is_sharp():
+    closer = ThesisLoopsConfig().build("proportional")
+    walk(closer, Room(1))
+    assert not closer.closures()
+
+
+def test_proportional_correction_puts_the_newest_node_where_its_loop_wants_it():
+    sharp = [800 if k == 50 else 500 for k in range(NODES)]
+    closer = ThesisLoopsConfig(keyframe_interval=5).build("proportional")
+    walk(closer, Room(1), features=sharp)
+    (closed,) = accepted(closer)
+    assert closed.j == 50
+    miss = discrepancy(closed.T_i_j, closer.believed(closed.i), closer.believed(closed.j))
+    assert miss.translation_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_no_loops_finds_nothing():
+    closer = NoLoopsConfig().build("batch")
+    walk(closer, Room(1))
+    assert closer.closures() == ()
+
+
+def test_the_configuration_names_the_kind():
+    assert isinstance(load_config(None, ["loops.kind=thesis"]).loops, ThesisLoopsConfig)
+    assert isinstance(load_config().loops, PlaceLoopsConfig)
+    assert isinstance(load_config(None, ["loops.kind=none"]).loops, NoLoopsConfig)

@@ -1,0 +1,57 @@
+"""Views of made-up rooms: points with descriptors of their own, seen by a pinhole camera."""
+
+import numpy as np
+
+from mapper.features.view import View
+from mapper.geometry import Transform, apply, inverse
+from mapper.odometry.base import Diagnostics, Track
+
+INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5])
+BODY_CAMERA = np.array(
+    [[0.0, 0.0, 1.0, 0.1], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.2], [0.0, 0.0, 0.0, 1.0]]
+)
+"""T_body_camera: body x forward, camera z forward."""
+
+
+class Room:
+    """Points all around within a few metres, each with 256 random bits."""
+
+    def __init__(self, seed: int, *, points: int = 4000, size_m: float = 6.0) -> None:
+        self._rng = np.random.default_rng(seed)
+        self.points = self._rng.uniform(-0.5, 0.5, (points, 3)) * [size_m, size_m, 3.0]
+        self.bits = self._rng.integers(0, 256, (points, 32), dtype=np.uint8)
+
+    def view(self, T_world_body: Transform, stamp_ns: int, *, noise_px: float = 0.3) -> View:
+        """Return what is seen between 0.5 and 4 m, with a few pixels of noise and some wrong bits."""
+        points_camera = apply(inverse(T_world_body @ BODY_CAMERA), self.points)
+        z = np.maximum(points_camera[:, 2:], 1e-6)
+        pixels = points_camera[:, :2] / z * INTRINSICS[:2] + INTRINSICS[2:]
+        seen = ((pixels > 0.0) & (pixels < [640.0, 480.0])).all(axis=1)
+        seen &= (points_camera[:, 2] > 0.5) & (points_camera[:, 2] < 4.0)
+        n = int(seen.sum())
+        flipped = np.packbits(self._rng.random((n, 256)) < 0.05, axis=1)
+        noisy = pixels[seen] + self._rng.normal(0.0, noise_px, (n, 2))
+        depth_m = points_camera[seen, 2:] * (1.0 + self._rng.normal(0.0, 0.002, (n, 1)))
+        rays = np.column_stack([(noisy - INTRINSICS[2:]) / INTRINSICS[:2], np.ones(n)])
+        return View(
+            stamp_ns=stamp_ns,
+            pixels=noisy,
+            sigma_px=np.ones(n),
+            descriptors=self.bits[seen] ^ flipped,
+            points_camera=rays * depth_m,
+            intrinsics=INTRINSICS,
+            T_body_camera=BODY_CAMERA,
+        )
+
+
+def track(node: int, stamp_ns: int, T_world_body: Transform, links=(), *, features: int = 500) -> Track:
+    """Return the track of a frame that became a node."""
+    return Track(
+        stamp_ns=stamp_ns,
+        node=node,
+        T_node_body=np.eye(4),
+        T_world_body=T_world_body,
+        is_keyframe=True,
+        diagnostics=Diagnostics(features, features, features, 0.5, "px", "map"),
+        links=tuple(links),
+    )
