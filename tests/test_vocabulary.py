@@ -2,6 +2,7 @@
 
 import struct
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ import pytest
 from mapper.config.places import VocabularyConfig
 from mapper.errors import DataError, VocabularyError
 from mapper.features.windowed import pack
+from mapper.frames import Scan
+from mapper.places.images import descriptors_of
 from mapper.places.training import grow, train
 from mapper.places.tree import WordTree
 from mapper.places.vocabulary import ONE, Vocabulary, WordVector, load_vocabulary, similarity
@@ -88,6 +91,26 @@ def test_identical_descriptors_end_the_splitting_early():
 def test_one_image_is_nothing_to_train_on(images):
     with pytest.raises(VocabularyError, match="nothing to train on: 1 images have features, want at least 2"):
         train([images[0], images[0][:0]], config=SMALL, trained_on="", rng=np.random.default_rng(0))
+
+
+class ScanLog:
+    """A log of three scans, which have no images."""
+
+    path = Path("lidar")
+
+    def __len__(self):
+        return 3
+
+    def entries(self):
+        return iter([self] * 3)
+
+    def load(self, *, colour):  # noqa: ARG002
+        return Scan(0, np.zeros((1, 3), np.float32), np.zeros(3))
+
+
+def test_a_log_without_images_is_refused():
+    with pytest.raises(VocabularyError, match="lidar: holds scans without images"):
+        descriptors_of(ScanLog(), SMALL)
 
 
 def test_nodes_are_ancestors_of_words(images, vocabulary):
