@@ -30,5 +30,5 @@ class PlacesConfig(Config):
     path: Path | None = None
     """File of the vocabulary; None is the one trained on synthetic logs that comes with the toolkit."""
     min_similarity: Annotated[float, Field(ge=0.0, le=1.0)] = 0.32
-    """Of two images' words (eq. 10), as published. It suits images of about 1000 features; those of 500 are told
-    apart by 0.22, those of 2000 by 0.45."""
+    """Of two images' words (eq. 10), as published. It suits images of about 1000 features; 0.22 does for 500,
+    0.45 for 2000."""
