@@ -40,19 +40,26 @@ class Agreement:
         self._gate = gate
         self._min_agreeing = min_agreeing
         self._within_m = within_m
-        self._claims: list[_Claim] = []
+        self._claims_from: dict[int, list[_Claim]] = {}
 
     def add(self, closure: LoopClosure) -> list[LoopClosure]:
         """Take a measured loop in; return all that are to be believed now and were not before."""
         new = _Claim(closure)
         near_i = self._ways.around(closure.i, within_m=self._within_m)
         near_j = self._ways.around(closure.j, within_m=self._within_m)
-        for claim in self._claims:
-            if claim.closure.j != closure.j and self._agree(claim.closure, closure, near_i, near_j):
-                claim.supporters += 1
-                new.supporters += 1
-        self._claims.append(new)
-        ripe = [c for c in self._claims if not c.believed and c.supporters >= self._min_agreeing]
+        helped = []
+        for j in sorted(near_j.keys() - {closure.j}):
+            for claim in self._claims_from.get(j, ()):
+                if claim.believed and new.supporters >= self._min_agreeing:
+                    continue  # neither of the two needs the other
+                if self._agree(claim.closure, closure, near_i, near_j):
+                    new.supporters += 1
+                    claim.supporters += 1
+                    helped.append(claim)
+        self._claims_from.setdefault(closure.j, []).append(new)
+        ripe = [
+            claim for claim in (*helped, new) if not claim.believed and claim.supporters >= self._min_agreeing
+        ]
         for claim in ripe:
             claim.believed = True
         return [claim.closure for claim in ripe]
@@ -61,7 +68,7 @@ class Agreement:
         self, other: LoopClosure, new: LoopClosure, near_i: dict[int, Way], near_j: dict[int, Way]
     ) -> bool:
         """Tell whether the other loop, carried over along the path at both its ends, is the new one."""
-        if other.i not in near_i or other.j not in near_j or new.T_i_j is None or other.T_i_j is None:
+        if other.i not in near_i or new.T_i_j is None or other.T_i_j is None:
             return False
         T_i_other = inverse(self._belief.pose_of(new.i)) @ self._belief.pose_of(other.i)
         T_other_j = inverse(self._belief.pose_of(other.j)) @ self._belief.pose_of(new.j)

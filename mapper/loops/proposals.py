@@ -57,6 +57,7 @@ class ByWords:
         self._vocabulary = load_vocabulary(config.path)
         self._index = PlaceIndex(self._vocabulary)
         self._stamps_ns: list[int] = []
+        self._described: tuple[View, WordVector] | None = None
 
     def propose(self, _node: int, view: View, /, *, limit: int) -> list[Proposal]:
         """Return the most similar places, the most similar first."""
@@ -74,7 +75,10 @@ class ByWords:
         self._stamps_ns.append(view.stamp_ns)
 
     def _vector(self, view: View) -> WordVector:
-        return self._vocabulary.vector(self._vocabulary.words_of(view.bits))
+        """Return the view's words; the last view's are kept, for who is compared is then remembered."""
+        if self._described is None or self._described[0] is not view:
+            self._described = view, self._vocabulary.vector(self._vocabulary.words_of(view.bits))
+        return self._described[1]
 
 
 class ByPose:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from mapper.config.loops import VerificationConfig
 from mapper.features.matching import Pairs, homography_inliers, match_mutual
 from mapper.features.view import View
+from mapper.features.windowed import match_everywhere
 from mapper.geometry import Array, Transform, adjoint, apply, inverse
 from mapper.graph.noise import with_model_error
 from mapper.odometry.local_map.pose import normal_matrix, refine_pose
@@ -15,6 +16,7 @@ from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
 
 _LM_ROUNDS, _LM_ITERATIONS = 4, 10
+_MAX_HAMMING = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +71,12 @@ class Verifier:
 
     def _pairs(self, i: View, j: View) -> Pairs:
         match = self._config.match
-        pairs = match_mutual(i, j, max_ratio=match.max_ratio)
+        if i.is_orb and j.is_orb:
+            partner = match_everywhere(i.bits, j.bits, _MAX_HAMMING, match.max_ratio)
+            paired = np.flatnonzero(partner >= 0)
+            pairs: Pairs = np.column_stack([paired, partner[paired]])
+        else:
+            pairs = match_mutual(i, j, max_ratio=match.max_ratio)
         if match.filter == "none":
             return pairs
         agree = homography_inliers(
