@@ -120,6 +120,12 @@ def test_nothing_starts_before_there_is_texture(frames):
     assert tracks[1].is_keyframe
 
 
+def test_a_view_that_is_mostly_new_becomes_a_keyframe(frames):
+    """The more of a view must be known, the more keyframes it takes."""
+    few, many = (track(frames[:20], LocalMapConfig(mapped_ratio=ratio))[0] for ratio in (0.0, 0.9))
+    assert sum(step.is_keyframe for step in few) < sum(step.is_keyframe for step in many)
+
+
 def test_factors_tie_every_keyframe_to_an_earlier_one(frames):
     odometry = LocalMapConfig().build()
     keyframes = sum(odometry.track(odometry.observe(frame)).is_keyframe for frame in frames)

@@ -1,11 +1,11 @@
-"""Compiled pose refinement, RANSAC and bundle adjustment on points whose truth is known."""
+"""Compiled pose refinement and bundle adjustment on points whose truth is known."""
 
 import numpy as np
 import pytest
 
 from mapper.geometry import angle_between, apply, exp, inverse
 from mapper.odometry.local_map.bundle import adjust
-from mapper.odometry.local_map.pose import normal_matrix, ransac_pose, refine_pose, twist_exp
+from mapper.odometry.local_map.pose import normal_matrix, refine_pose, twist_exp
 
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5, 40.0])
 
@@ -67,36 +67,6 @@ def test_normal_matrix_predicts_the_spread_of_estimates():
     exact, _ = measure(truth, points, rng)
     predicted = np.linalg.inv(normal_matrix(truth, points, exact, weights, INTRINSICS))
     assert np.allclose(np.std(errors, axis=0), np.sqrt(np.diag(predicted)[3:]), rtol=0.25)
-
-
-def test_ransac_finds_the_pose_among_mostly_wrong_pairs():
-    rng = np.random.default_rng(2)
-    points = points_ahead(rng, 200)
-    truth = random_pose(rng, translation_m=1.0, rotation_rad=0.5)
-    points_world = apply(inverse(truth), points)
-    measured, points_camera = measure(truth, points_world, rng, noise_px=0.3)
-    points_camera = points_camera + rng.normal(0, 0.005, points_camera.shape)
-    shuffled = rng.permutation(120)
-    measured[:120], points_camera[:120] = measured[shuffled], points_camera[shuffled]
-
-    found, agreeing = ransac_pose(
-        points_world,
-        measured,
-        points_camera,
-        np.full((200, 3), 0.04),
-        INTRINSICS,
-        rng.integers(200, size=(400, 3)),
-    )
-
-    assert agreeing >= 75
-    assert np.linalg.norm((inverse(truth) @ found)[:3, 3]) < 0.1
-
-
-def test_ransac_of_collinear_points_answers_that_nothing_agrees():
-    line = np.outer(np.linspace(1, 2, 30), [0.0, 0.0, 1.0])
-    samples = np.random.default_rng(0).integers(30, size=(50, 3))
-    _, agreeing = ransac_pose(line, line, line, np.ones((30, 3)), INTRINSICS, samples)
-    assert agreeing == 0
 
 
 def bundle(rng, *, cameras=5, points=200, noise_px=0.5):

@@ -1,9 +1,10 @@
 """Odometry methods and the ISVD registration inside the thesis's one."""
 
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from mapper.config.base import Config
 from mapper.config.features import DetectorConfig, OrbConfig, SurfConfig, UniformOrbConfig
@@ -96,20 +97,26 @@ class KeyframeConfig(Config):
     """bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017); a Kinect's is 40 to 43."""
     disparity_sigma_px: PositiveFloat = 1.0
     """Noise of the virtual disparity relative to that of a pixel."""
+    depth_residual: bool = True
+    """Poses and bundles have to explain bf / z too; without it only pixels (Zhao et al. 2020, eq. 5–7)."""
     local_search_px: PositiveFloat = 4.0
     """Search radius around the projected landmarks of the local map in the finest octave."""
-    local_keyframes: PositiveInt = 15
-    """How many covisible keyframes' landmarks are searched."""
+    local_keyframes: NonNegativeInt = 15
+    """How many covisible keyframes' landmarks are searched; 0 leaves it at what matching found."""
     min_start_features: PositiveInt = 100
     """Features with depth that the first frame must have."""
-    min_motion_matches: PositiveInt = 20
+    min_matches: Annotated[int, Field(ge=8)] = 20
     """Fewer matches to the last frame, or to a keyframe, say nothing about the motion."""
     min_inliers: PositiveInt = 30
     """Fewer landmarks that agree with the pose mean that the frame is lost."""
+    max_lost_frames: NonNegativeInt = 30
+    """After so many frames that show enough but nothing known, a new sub-map begins; 0 never begins one."""
     keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.75
     """Keyframe when the inliers fall below this share of the most since the last keyframe."""
     hasty_keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
     """The same share while the last keyframe is younger than ``min_keyframe_gap``: for fast motion."""
+    mapped_ratio: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
+    """Keyframe when the inliers are a smaller share of the near features: much of the view is new."""
     min_keyframe_gap: PositiveInt = 4
     max_keyframe_gap: PositiveInt = 20
     bundle_keyframes: PositiveInt = 10
@@ -119,9 +126,16 @@ class KeyframeConfig(Config):
     min_found_ratio: Annotated[float, Field(ge=0.0, le=1.0)] = 0.25
     """Young landmarks found in a smaller share of the frames that should show them are forgotten."""
     factors_per_keyframe: PositiveInt = 4
-    ransac_iterations: PositiveInt = 300
-    relocalisation_keyframes: PositiveInt = 30
-    """How many of the nearest keyframes, and as many of the others in turn, a lost frame is compared with."""
+    vocabulary: Path | None = None
+    """File of the visual words; None is what comes with the toolkit, trained on synthetic logs."""
+    matching_level: NonNegativeInt = 2
+    """Only descriptors under one node this many steps below the vocabulary's root are compared (B2)."""
+    ransac_iterations: PositiveInt = 100
+    """M: draws of four pairs for P3P, at most (B3)."""
+    ransac_tolerance_px: PositiveFloat = 4.0
+    """β: how far a pair that agrees with P3P may lie off (B3)."""
+    relocalisation_keyframes: PositiveInt = 5
+    """A lost frame is compared with as many keyframes that look like it, and as many of the nearest."""
 
 
 class LocalMapConfig(KeyframeConfig):
@@ -143,4 +157,17 @@ class LocalMapConfig(KeyframeConfig):
         return KeyframeOdometry(self, partial(MotionPlacing, self))
 
 
-OdometryConfig = Annotated[IsvdOdometryConfig | LocalMapConfig, Field(discriminator="kind")]
+class PnpConfig(KeyframeConfig):
+    """The second source's odometry: each frame by P3P and Levenberg–Marquardt on its pixels (B3)."""
+
+    kind: Literal["pnp"] = "pnp"
+
+    def build(self) -> "KeyframeOdometry":
+        """Return the odometry this configures."""
+        from mapper.odometry.local_map.odometry import KeyframeOdometry
+        from mapper.odometry.local_map.pnp import PnpPlacing
+
+        return KeyframeOdometry(self, partial(PnpPlacing, self))
+
+
+OdometryConfig = Annotated[IsvdOdometryConfig | LocalMapConfig | PnpConfig, Field(discriminator="kind")]

@@ -29,11 +29,13 @@ class Keyframe:
         observation: Its features.
         T_camera_world: (4, 4) current estimate.
         landmark_of_feature: (N,) int32 landmark that each feature shows, −1 for none.
+        origin: First keyframe of the sub-map it belongs to; nothing ties sub-maps to each other.
     """
 
     observation: Observation
     T_camera_world: Transform
     landmark_of_feature: Ids
+    origin: int
 
 
 class LandmarkMap:
@@ -48,7 +50,7 @@ class LandmarkMap:
         self.landmarks = Table(
             position=((3,), np.float64),
             direction=((3,), np.float64),
-            words=((4,), np.uint64),
+            bits=((4,), np.uint64),
             reach_m=((), np.float64),
             newest=((), np.int32),
             visible=((), np.int32),
@@ -72,6 +74,7 @@ class LandmarkMap:
         landmark_of_feature: Ids,
         *,
         new: NDArray[np.bool_],
+        beside: int | None,
     ) -> int:
         """Add a keyframe that sees known landmarks, and create landmarks from its ``new`` features.
 
@@ -80,6 +83,7 @@ class LandmarkMap:
             T_camera_world: (4, 4).
             landmark_of_feature: (N,) known landmark of each feature, −1 for none.
             new: (N,) features with depth that become landmarks.
+            beside: A keyframe of the same sub-map; None begins a new one.
 
         Returns:
             The keyframe's index.
@@ -93,7 +97,7 @@ class LandmarkMap:
             len(features),
             position=points_world,
             direction=0.0,
-            words=observation.words[features],
+            bits=observation.bits[features],
             reach_m=np.linalg.norm(observation.points_camera[features], axis=1)
             * self._scale_factor ** observation.octave[features],
             newest=-1,
@@ -101,7 +105,8 @@ class LandmarkMap:
             found=1,
             observers=0,
         )
-        self.keyframes.append(Keyframe(observation, T_camera_world, landmark_of_feature))
+        origin = index if beside is None else self.keyframes[beside].origin
+        self.keyframes.append(Keyframe(observation, T_camera_world, landmark_of_feature, origin))
         self._link(index)
         return index
 
@@ -138,6 +143,11 @@ class LandmarkMap:
         newest = range(len(self.keyframes) - 1, max(len(self.keyframes) - 1 - _NEWEST, -1), -1)
         return list(dict.fromkeys([reference, *newest]))
 
+    def before(self, index: int) -> int:
+        """Return the keyframe of the same sub-map that came last before one that is not its first."""
+        origin = self.keyframes[index].origin
+        return max(k for k in range(index) if self.keyframes[k].origin == origin)
+
     def seen_by(self, index: int) -> Ids:
         """Return the landmarks that a keyframe sees, in feature order."""
         ids = self.keyframes[index].landmark_of_feature
@@ -163,10 +173,11 @@ class LandmarkMap:
     def refine(self, index: int, *, window: int, min_shared: int) -> None:
         """Adjust a keyframe, its most covisible ones and all they see; drop observations that then disagree.
 
-        Keyframes outside the window that see the same landmarks hold them in place; the first never moves.
+        Keyframes outside the window that see the same landmarks hold them in place; a sub-map's first never
+        moves.
         """
         members = [index, *(k for k, _ in self.covisible(index, min_shared=min_shared)[: window - 1])]
-        movable = sorted(set(members) - {0})
+        movable = sorted(k for k in members if k != self.keyframes[k].origin)
         if not movable:
             return
         landmarks = self.seen_by_any(members, except_for=np.empty(0, np.int32))

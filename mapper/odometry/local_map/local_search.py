@@ -48,9 +48,8 @@ class LocalSearch:
         config, landmarks = self._config, self._map.landmarks
         matched = landmark_of_feature[landmark_of_feature >= 0]
         counts = self._map.shared(matched)
-        order = np.argsort(-counts, kind="stable")[: config.local_keyframes]
-        local = [int(k) for k in order if counts[k] > 0] or [reference]
-        nearby = self._map.seen_by_any(local, except_for=matched)
+        order = [int(k) for k in np.argsort(-counts, kind="stable") if counts[k] > 0] or [reference]
+        nearby = self._map.seen_by_any(order[: config.local_keyframes], except_for=matched)
         rows, pixels, octave = project_visible(
             nearby,
             landmarks["position"],
@@ -67,7 +66,7 @@ class LocalSearch:
             observation,
             pixels,
             octave,
-            landmarks["words"][visible],
+            landmarks["bits"][visible],
             search_px=config.local_search_px,
             taken=landmark_of_feature >= 0,
             max_ratio=_MAX_RATIO,
@@ -90,7 +89,7 @@ class LocalSearch:
             observation,
             T_camera_world,
             landmark_of_feature,
-            local[0],
+            order[0],
             len(features),
             rms_px(T_camera_world, landmarks["position"][ids[agree]], observation, features[agree]),
             method,
@@ -101,7 +100,7 @@ class LocalSearch:
         observation: Observation,
         pixels: Array,
         octave: NDArray[np.int32],
-        words: Words,
+        bits: Words,
         *,
         search_px: float,
         taken: NDArray[np.bool_],
@@ -113,10 +112,10 @@ class LocalSearch:
             pixels,
             octave,
             search_px * self._scale_factor ** octave.astype(np.float64),
-            words,
+            bits,
             observation.pixels,
             observation.octave,
-            observation.words,
+            observation.bits,
             taken,
             grid.start,
             grid.columns,

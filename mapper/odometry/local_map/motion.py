@@ -49,18 +49,18 @@ class MotionPlacing:
                 observation,
                 pixels,
                 last.observation.octave[seen],
-                last.observation.words[seen],
+                last.observation.bits[seen],
                 search_px=search_px,
                 taken=np.zeros(len(observation), np.bool_),
                 max_ratio=_MAX_RATIO,
             )
             hits = np.flatnonzero(feature >= 0)
-            if len(hits) >= self._config.min_motion_matches:
+            if len(hits) >= self._config.min_matches:
                 break
         else:
             return None
         T_camera_world, agree = refined(T_camera_world, points_world[hits], observation, feature[hits])
-        if agree.sum() < self._config.min_motion_matches // 2:
+        if agree.sum() < self._config.min_matches // 2:
             return None
         landmark_of_feature = unmatched(observation)
         landmark_of_feature[feature[hits[agree]]] = landmark[hits[agree]]

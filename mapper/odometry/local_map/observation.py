@@ -12,6 +12,7 @@ from mapper.features.view import View
 from mapper.features.windowed import FeatureGrid, Words, pack, sort_into_grid
 from mapper.frames import Frame, RgbdFrame
 from mapper.geometry import Array, Points, Transform
+from mapper.places.vocabulary import Vocabulary
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,8 +23,10 @@ class Observation:
         stamp_ns: The frame's stamp.
         pixels: (N, 2) undistorted pixels.
         octave: (N,) int32 pyramid level.
-        words: (N, 4) uint64 descriptors.
-        measured: (N, 3) u, v and virtual disparity bf / z in pixels; NaN in the third place without depth.
+        bits: (N, 4) uint64 descriptors.
+        words: (N,) int32 visual word of each.
+        measured: (N, 3) u, v and virtual disparity bf / z in pixels; NaN in the third place without depth, or
+            where it is not to count.
         weights: (N, 3) inverse variances of the three, px⁻².
         points_camera: (N, 3) metres; NaN without depth.
         grid: Which of the features, sorted by cell, lie where.
@@ -35,7 +38,8 @@ class Observation:
     stamp_ns: int
     pixels: Array
     octave: NDArray[np.int32]
-    words: Words
+    bits: Words
+    words: NDArray[np.int32]
     measured: Array
     weights: Array
     points_camera: Points
@@ -50,7 +54,7 @@ class Observation:
     @property
     def has_depth(self) -> NDArray[np.bool_]:
         """(N,) which features have depth."""
-        return ~np.isnan(self.measured[:, 2])
+        return ~np.isnan(self.points_camera[:, 2])
 
     def view(self) -> View:
         """Return what a place is recognised by."""
@@ -58,14 +62,14 @@ class Observation:
             stamp_ns=self.stamp_ns,
             pixels=self.pixels,
             sigma_px=self.weights[:, 0] ** -0.5,
-            descriptors=self.words.view(np.uint8).reshape(len(self), -1),
+            descriptors=self.bits.view(np.uint8).reshape(len(self), -1),
             points_camera=self.points_camera,
             intrinsics=self.intrinsics[:4],
             T_body_camera=self.T_body_camera,
         )
 
 
-def observe(frame: Frame, detector: Detector, config: KeyframeConfig) -> Observation:
+def observe(frame: Frame, detector: Detector, vocabulary: Vocabulary, config: KeyframeConfig) -> Observation:
     """Detect features, look their depth up at the raw pixel, and undistort them.
 
     Raises:
@@ -92,14 +96,19 @@ def observe(frame: Frame, detector: Detector, config: KeyframeConfig) -> Observa
     intrinsics = np.array(
         [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, config.virtual_baseline_px_m]
     )
+    disparity_px = config.virtual_baseline_px_m / depth_m
+    if not config.depth_residual:
+        disparity_px[:] = np.nan
+    bits = pack(features.descriptors[order])
     sigma_px = detector.scale_factor ** octave.astype(np.float64)
     rays = (pixels - intrinsics[2:4]) / intrinsics[:2]
     return Observation(
         stamp_ns=frame.stamp_ns,
         pixels=pixels,
         octave=octave,
-        words=pack(features.descriptors[order]),
-        measured=np.column_stack([pixels, config.virtual_baseline_px_m / depth_m]),
+        bits=bits,
+        words=vocabulary.words_of(bits),
+        measured=np.column_stack([pixels, disparity_px]),
         weights=np.column_stack([sigma_px, sigma_px, sigma_px * config.disparity_sigma_px]) ** -2.0,
         points_camera=np.column_stack([rays * depth_m[:, None], depth_m]),
         grid=grid,

@@ -12,12 +12,14 @@ from mapper.features.view import View
 from mapper.frames import Frame
 from mapper.geometry import Transform, inverse
 from mapper.graph.model import BetweenFactor
+from mapper.graph.noise import with_model_error
 from mapper.odometry.base import Diagnostics, Track
 from mapper.odometry.local_map.landmarks import LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
 from mapper.odometry.local_map.observation import Observation, observe
 from mapper.odometry.local_map.placing import Placement, Placing, unmatched
 from mapper.odometry.local_map.recall import Recall
+from mapper.places.vocabulary import load_vocabulary
 
 MakePlacing = Callable[[LandmarkMap, LocalSearch, Recall], Placing]
 
@@ -33,14 +35,16 @@ class KeyframeOdometry:
         self._config = config
         self._detector = build_detector(config.detector)
         self._map = LandmarkMap(scale_factor=self._detector.scale_factor)
+        self._vocabulary = load_vocabulary(config.vocabulary)
         search = LocalSearch(config, self._map, scale_factor=self._detector.scale_factor)
-        self._recall = Recall(config, self._map, search)
+        self._recall = Recall(config, self._map, search, self._vocabulary)
         self._placing = make_placing(self._map, search, self._recall)
         self._last: Placement | None = None
         self._before_last: Placement | None = None
         self._most_inliers = 0  # since the last keyframe
         self._frames_since_keyframe = 0
-        self._lost_frames = 0
+        self._lost_frames = 0  # since the last one that was placed
+        self._stray_frames = 0  # those of them that show enough to begin with
 
     def observe(self, frame: Frame) -> Observation:
         """Detect features and look up their depth. Pure; safe in any thread.
@@ -48,22 +52,22 @@ class KeyframeOdometry:
         Raises:
             FrameError: The frame is a bare scan.
         """
-        return observe(frame, self._detector, self._config)
+        return observe(frame, self._detector, self._vocabulary, self._config)
 
     def track(self, observation: Observation) -> Track:
         """Place the next frame, in time order."""
-        if self._last is None:
-            return self._start(observation)
-        placement = self._place(observation, self._last)
+        placement = None if self._last is None else self._place(observation, self._last)
         if placement is None:
-            return self._lost(observation)
-        self._lost_frames = 0
+            return self._not_found(observation)
+        # What came before a gap says nothing about the motion after it.
+        before_last = None if self._lost_frames else self._last
+        self._lost_frames = self._stray_frames = 0
         self._frames_since_keyframe += 1
         self._most_inliers = max(self._most_inliers, placement.inliers)
         is_keyframe, seen_from = self._wants_keyframe(placement), placement.reference
         if is_keyframe:
-            placement = self._keep(placement)
-        self._before_last, self._last = self._last, placement
+            placement = self._keep(placement, beside=seen_from)
+        self._before_last, self._last = before_last, placement
         links = [self._factor(seen_from, placement.reference)] if is_keyframe else []
         return self._track(placement, is_keyframe=is_keyframe, links=links)
 
@@ -72,12 +76,17 @@ class KeyframeOdometry:
         return observation.view()
 
     def finish(self) -> Sequence[BetweenFactor]:
-        """Return a factor from every keyframe to those earlier ones that share most landmarks with it."""
+        """Return a factor from every keyframe to those earlier ones that share most landmarks with it.
+
+        A sub-map's first keyframe has none: nothing says where it lies.
+        """
         factors = []
-        for j in range(1, len(self._map.keyframes)):
+        for j, keyframe in enumerate(self._map.keyframes):
+            if j == keyframe.origin:
+                continue
             earlier = [(k, shared) for k, shared in self._map.covisible(j, min_shared=1) if k < j]
             strong = [k for k, shared in earlier if shared >= self._config.min_shared_landmarks]
-            weak = [k for k, _ in earlier[:1]] or [j - 1]
+            weak = [k for k, _ in earlier[:1]] or [self._map.before(j)]
             factors += [self._factor(i, j) for i in strong[: self._config.factors_per_keyframe] or weak]
         return factors
 
@@ -87,16 +96,24 @@ class KeyframeOdometry:
             _body_pose(keyframe.observation, keyframe.T_camera_world)
             for keyframe in (self._map.keyframes[i], self._map.keyframes[j])
         )
-        return BetweenFactor(i, j, inverse(T_world_i) @ T_world_j, self._map.information(i, j))
+        T_i_j = inverse(T_world_i) @ T_world_j
+        return BetweenFactor(i, j, T_i_j, with_model_error(self._map.information(i, j), T_i_j))
 
-    def _start(self, observation: Observation) -> Track:
-        """Make the first frame with enough depth the world's origin."""
-        usable = int((observation.points_camera[:, 2] <= self._config.max_depth_m).sum())
-        if usable < self._config.min_start_features:
-            return self._lost(observation)
-        T_camera_world = inverse(observation.T_body_camera)
-        origin = Placement(observation, T_camera_world, unmatched(observation), 0, 0, 0.0, "start")
-        self._last = self._keep(origin)
+    def _not_found(self, observation: Observation) -> Track:
+        """Give the frame up, or begin a new sub-map with it once enough frames showed nothing known."""
+        if self._near(observation) >= self._config.min_start_features:
+            self._stray_frames += 1
+            if self._last is None or 0 < self._config.max_lost_frames < self._stray_frames:
+                return self._begin(observation)
+        return self._lost(observation)
+
+    def _begin(self, observation: Observation) -> Track:
+        """Make the frame a sub-map's first keyframe: the world's origin, or where the camera was last."""
+        last = self._last
+        T_camera_world = inverse(observation.T_body_camera) if last is None else last.T_camera_world
+        start = Placement(observation, T_camera_world, unmatched(observation), 0, 0, 0.0, "start")
+        self._lost_frames = self._stray_frames = 0
+        self._before_last, self._last = None, self._keep(start, beside=None)
         return self._track(self._last, is_keyframe=True)
 
     def _place(self, observation: Observation, last: Placement) -> Placement | None:
@@ -106,7 +123,7 @@ class KeyframeOdometry:
             if placement is not None:
                 return placement
         here_world = inverse(last.T_camera_world)[:3, 3]
-        lookalikes = self._recall.lookalikes(observation, here_world, turn=self._lost_frames)
+        lookalikes = self._recall.lookalikes(observation, here_world)
         return self._recall.among(lookalikes, observation, method="relocalised")
 
     def _wants_keyframe(self, placement: Placement) -> bool:
@@ -114,18 +131,30 @@ class KeyframeOdometry:
         if self._frames_since_keyframe >= config.max_keyframe_gap:
             return True
         kept_ratio = placement.inliers / self._most_inliers
-        settled = self._frames_since_keyframe >= config.min_keyframe_gap
-        return kept_ratio < (config.keyframe_ratio if settled else config.hasty_keyframe_ratio)
+        if self._frames_since_keyframe < config.min_keyframe_gap:
+            return kept_ratio < config.hasty_keyframe_ratio
+        # Landmarks left behind at one edge of a view hold its pose badly, however many they are.
+        mapped = placement.inliers / max(self._near(placement.observation), 1)
+        return kept_ratio < config.keyframe_ratio or mapped < config.mapped_ratio
 
-    def _keep(self, placement: Placement) -> Placement:
-        """Turn a placed frame into a keyframe, refine the map around it, and return it as refined."""
+    def _near(self, observation: Observation) -> int:
+        """Return how many features are near enough to become landmarks."""
+        return int((observation.points_camera[:, 2] <= self._config.max_depth_m).sum())
+
+    def _keep(self, placement: Placement, *, beside: int | None) -> Placement:
+        """Turn a placed frame into a keyframe, refine the map around it, and return it as refined.
+
+        ``beside`` is a keyframe of the sub-map it was placed in; None begins a new one.
+        """
         config, observation = self._config, placement.observation
         index = self._map.add_keyframe(
             observation,
             placement.T_camera_world,
             placement.landmark_of_feature,
             new=self._worth_mapping(placement),
+            beside=beside,
         )
+        self._recall.remember(index)
         self._map.refine(index, window=config.bundle_keyframes, min_shared=config.min_shared_landmarks)
         self._map.cull(min_found_ratio=config.min_found_ratio)
         self._most_inliers, self._frames_since_keyframe = 0, 0

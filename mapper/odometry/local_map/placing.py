@@ -50,7 +50,7 @@ class Placing(Protocol):
     """How a frame is placed while tracking has not lost its thread."""
 
     def place(
-        self, observation: Observation, last: Placement, before_last: Placement | None
+        self, observation: Observation, last: Placement, before_last: Placement | None, /
     ) -> Placement | None:
         """Return where the frame was found, given the two placed before it; None means "not found"."""
         ...

@@ -1,4 +1,4 @@
-"""Pose from map points and their images: compiled Levenberg–Marquardt, and the RANSAC that starts it."""
+"""Pose from map points and their images: compiled Levenberg–Marquardt."""
 
 import numpy as np
 from numba import njit
@@ -205,54 +205,3 @@ def refine_pose(T_camera_world, points, measured, weights, intrinsics, rounds, i
         if classify(T, points, measured, weights, intrinsics, inlier) < 6:
             break
     return T, inlier, H
-
-
-@njit(cache=True, nogil=True)
-def _rigid3(world, camera):
-    """Return T_camera_world of three pairs by aligning their triads (Horn 1987, §2)."""
-    frames = np.empty((2, 3, 3))
-    for s in range(2):
-        p = world if s == 0 else camera
-        e1 = p[1] - p[0]
-        n1 = np.sqrt((e1 * e1).sum())
-        e2 = p[2] - p[0]
-        e3 = np.cross(e1, e2)
-        n3 = np.sqrt((e3 * e3).sum())
-        if n1 < 1e-6 or n3 < 1e-8:
-            return np.zeros((4, 4))
-        e1 = e1 / n1
-        e3 = e3 / n3
-        frames[s, :, 0] = e1
-        frames[s, :, 1] = np.cross(e3, e1)
-        frames[s, :, 2] = e3
-    T = np.eye(4)
-    R = product(frames[1], frames[0].T)
-    T[:3, :3] = R
-    T[:3, 3] = (camera[0] + camera[1] + camera[2] - turned(R, world[0] + world[1] + world[2])) / 3.0
-    return T
-
-
-@njit(cache=True, nogil=True)
-def ransac_pose(points, measured, points_camera, weights, intrinsics, samples):
-    """Return the T_camera_world of the three pairs that most agree with, and how many do.
-
-    RANSAC (Fischler & Bolles 1981).
-
-    Args:
-        points: (N, 3) metres, world.
-        measured: (N, 3) u, v, bf/z in pixels, all with depth.
-        points_camera: (N, 3) the same measurements back-projected, metres, camera frame.
-        weights: (N, 3) inverse variances, px⁻².
-        intrinsics: (5,) fx, fy, cx, cy, bf.
-        samples: (S, 3) int64 rows of three pairs to try.
-    """
-    best, best_T = 0, np.eye(4)
-    inlier = np.empty(len(points), np.bool_)
-    for picks in samples:
-        T = _rigid3(points[picks], points_camera[picks])
-        if T[3, 3] == 0.0:
-            continue
-        count = classify(T, points, measured, weights, intrinsics, inlier)
-        if count > best:
-            best, best_T = count, T
-    return best_T, best

@@ -1,57 +1,64 @@
 """Placing a frame by descriptors alone: nothing is predicted, so it works after a jump and after a loss."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
 from mapper.config.odometry import KeyframeConfig
-from mapper.features.windowed import match_everywhere
 from mapper.geometry import Array, inverse
-from mapper.odometry.local_map.landmarks import LandmarkMap
+from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
 from mapper.odometry.local_map.observation import Observation
+from mapper.odometry.local_map.p3p import ransac_p3p
 from mapper.odometry.local_map.placing import MAX_HAMMING, Placement, refined, unmatched
-from mapper.odometry.local_map.pose import ransac_pose
+from mapper.places.guided import match_by_word
+from mapper.places.index import PlaceIndex
+from mapper.places.vocabulary import Vocabulary
 
 _MAX_RATIO = 0.85
-_SIMILARITY_FEATURES = 200
-_BEST_LOOKALIKES = 5
 
 
 class Recall:
     """Finds a frame among the keyframes; None is the answer "not found"."""
 
-    def __init__(self, config: KeyframeConfig, landmark_map: LandmarkMap, search: LocalSearch) -> None:
+    def __init__(
+        self, config: KeyframeConfig, landmark_map: LandmarkMap, search: LocalSearch, vocabulary: Vocabulary
+    ) -> None:
         self._config = config
         self._map = landmark_map
         self._search = search
+        self._vocabulary = vocabulary
+        self._index = PlaceIndex(vocabulary)
 
-    def among(self, keyframes: Sequence[int], observation: Observation, *, method: str) -> Placement | None:
-        """Return the first placement that matching a keyframe and three-point RANSAC lead to."""
+    def remember(self, keyframe: int) -> None:
+        """Learn what a keyframe looks like."""
+        words = self._map.keyframes[keyframe].observation.words
+        self._index.add(keyframe, self._vocabulary.vector(words))
+
+    def among(self, keyframes: Iterable[int], observation: Observation, *, method: str) -> Placement | None:
+        """Return the first placement that matching a keyframe and P3P lead to.
+
+        Only descriptors under the same node of the vocabulary are compared (B2); Levenberg–Marquardt then
+        refines the pose over the inliers of RANSAC (B3).
+        """
+        config = self._config
         for k in keyframes:
-            keyframe = self._map.keyframes[k]
-            seen = np.flatnonzero(keyframe.landmark_of_feature >= 0)
-            pairs = match_everywhere(
-                keyframe.observation.words[seen], observation.words, MAX_HAMMING, _MAX_RATIO
-            )
-            hits = np.flatnonzero(pairs >= 0)
-            hits = hits[observation.has_depth[pairs[hits]]]
-            if len(hits) < self._config.min_motion_matches:
+            features, ids = self._matches(k, observation)
+            if len(features) < config.min_matches:
                 continue
-            ids, features = keyframe.landmark_of_feature[seen[hits]], pairs[hits]
             points_world = self._map.landmarks["position"][ids]
-            rng = np.random.default_rng([observation.stamp_ns % (1 << 32), k])
-            T_camera_world, agreeing = ransac_pose(
+            found = ransac_p3p(
                 points_world,
-                observation.measured[features],
-                observation.points_camera[features],
-                observation.weights[features],
+                observation.pixels[features],
                 observation.intrinsics,
-                rng.integers(len(hits), size=(self._config.ransac_iterations, 3)),
+                tolerance_px=config.ransac_tolerance_px,
+                iterations=config.ransac_iterations,
             )
-            if agreeing < self._config.min_motion_matches // 2:
+            if found is None or len(found[1]) < config.min_matches // 2:
                 continue
-            T_camera_world, agree = refined(T_camera_world, points_world, observation, features)
+            T_camera_world, agreeing = found
+            features, ids = features[agreeing], ids[agreeing]
+            T_camera_world, agree = refined(T_camera_world, points_world[agreeing], observation, features)
             landmark_of_feature = unmatched(observation)
             landmark_of_feature[features[agree]] = ids[agree]
             placement = self._search.placed(
@@ -61,23 +68,34 @@ class Recall:
                 return placement
         return None
 
-    def lookalikes(self, observation: Observation, here_world: Array, *, turn: int) -> list[int]:
-        """Return the keyframes most like a frame, best first.
+    def lookalikes(self, observation: Observation, here_world: Array) -> list[int]:
+        """Return keyframes that a frame may show: those most like it, best first, then the nearest.
 
         Args:
             observation: The frame.
-            here_world: (3,) metres; the keyframes nearest to it are always compared.
-            turn: Which share of the remaining keyframes is compared too; count it up while lost.
+            here_world: (3,) metres: where the camera was last.
         """
-        keyframes, budget = self._map.keyframes, self._config.relocalisation_keyframes
-        centres = np.array([inverse(k.T_camera_world)[:3, 3] for k in keyframes])
-        ranked = np.argsort(np.linalg.norm(centres - here_world, axis=1), kind="stable")
-        near, rest = ranked[:budget], np.roll(ranked[budget:], -turn * budget)[:budget]
-        finest = np.argsort(observation.octave, kind="stable")
-        sample = observation.words[finest[:: max(len(finest) // _SIMILARITY_FEATURES, 1)]]
-        scored = []
-        for k in map(int, (*near, *rest)):
-            words = keyframes[k].observation.words[keyframes[k].landmark_of_feature >= 0]
-            pairs = match_everywhere(sample, words, MAX_HAMMING, _MAX_RATIO)
-            scored.append((-int((pairs >= 0).sum()), k))
-        return [k for _, k in sorted(scored)[:_BEST_LOOKALIKES]]
+        budget, keyframes = self._config.relocalisation_keyframes, self._map.keyframes
+        seen = self._vocabulary.vector(observation.words)
+        alike = [k for k, _ in self._index.query(seen, min_similarity=0.0, limit=budget)]
+        centres = np.array([inverse(keyframe.T_camera_world)[:3, 3] for keyframe in keyframes])
+        nearest = np.argsort(np.linalg.norm(centres - here_world, axis=1), kind="stable")[:budget]
+        return list(dict.fromkeys([*alike, *map(int, nearest)]))
+
+    def _matches(self, k: int, observation: Observation) -> tuple[Ids, Ids]:
+        """Return the features of a frame that match a keyframe's, and the landmarks that they then show."""
+        keyframe = self._map.keyframes[k]
+        seen = np.flatnonzero(keyframe.landmark_of_feature >= 0)
+        pairs = match_by_word(
+            keyframe.observation.bits[seen],
+            self._nodes(keyframe.observation.words[seen]),
+            observation.bits,
+            self._nodes(observation.words),
+            max_hamming=MAX_HAMMING,
+            max_ratio=_MAX_RATIO,
+        )
+        hits = np.flatnonzero(pairs >= 0)
+        return pairs[hits], keyframe.landmark_of_feature[seen[hits]]
+
+    def _nodes(self, words: Ids) -> Ids:
+        return self._vocabulary.ancestors_of(words, level=self._config.matching_level)

@@ -1,0 +1,119 @@
+"""After a loss: a known place is found by what it looks like, an unknown one begins a map of its own."""
+
+import numpy as np
+import pytest
+
+from mapper.config.odometry import LocalMapConfig, PnpConfig
+from mapper.config.synthetic import SynthConfig
+from mapper.frames import RgbdFrame
+from mapper.geometry import angle_between, inverse
+from mapper.graph.model import PoseGraph
+from mapper.graph.optimize import components
+from mapper.sources.synthetic.source import SyntheticSource
+
+RATE_HZ = 15.0
+BOTH = pytest.mark.parametrize("config", [LocalMapConfig(), PnpConfig()], ids=lambda config: config.kind)
+
+
+@pytest.fixture(scope="module")
+def source():
+    """One and a half turns on the spot."""
+    return SyntheticSource(
+        SynthConfig(
+            path="spin",
+            duration_s=7.0,
+            frame_rate_hz=RATE_HZ,
+            max_yaw_rate_rad_s=1.9,
+            width_px=320,
+            height_px=240,
+            texture_px_per_m=96,
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def frames(source):
+    return [entry.load(colour=False) for entry in source.entries()]
+
+
+def seconds(start_s, end_s):
+    return slice(round(start_s * RATE_HZ), round(end_s * RATE_HZ))
+
+
+def covered(frame):
+    return RgbdFrame(frame.stamp_ns, np.zeros_like(frame.image), np.zeros_like(frame.depth_m), frame.camera)
+
+
+def tracked(frames, odometry):
+    return [odometry.track(odometry.observe(frame)) for frame in frames]
+
+
+def graph_of(tracks, odometry):
+    graph = PoseGraph()
+    for track in tracks:
+        if track.is_keyframe:
+            graph.add_node(track.node, track.stamp_ns, track.T_world_body)
+    graph.add_factors(odometry.finish())
+    return graph
+
+
+@BOTH
+def test_a_known_place_is_found_in_the_first_frame_that_shows_it(source, frames, config):
+    dark = seconds(4.5, 5.5)
+    log = [*frames[: dark.start], *map(covered, frames[dark]), *frames[dark.stop :]]
+
+    tracks = tracked(log, config.build())
+
+    assert [i for i, t in enumerate(tracks) if t.node is None] == list(range(dark.start, dark.stop))
+    back = tracks[dark.stop]
+    assert back.diagnostics.method == "relocalised"
+    found_by = back.links[0].i if back.is_keyframe else back.node
+    assert found_by < tracks[dark.start - 1].node // 2  # a keyframe of the turn before
+    T_truth = inverse(source.truth.T_world_body[0]) @ source.truth.T_world_body[dark.stop]
+    miss = inverse(T_truth) @ back.T_world_body
+    assert np.linalg.norm(miss[:3, 3]) < 0.08
+    assert angle_between(miss[:3, :3], np.eye(3)) < 0.04
+
+
+@BOTH
+def test_an_unknown_place_begins_a_map_of_its_own(frames, config):
+    before, elsewhere = frames[seconds(0.0, 1.0)], frames[seconds(2.3, 3.3)]
+    odometry = config.model_copy(update={"max_lost_frames": 4}).build()
+
+    tracks = tracked([*before, *elsewhere], odometry)
+
+    last, after = tracks[len(before) - 1], tracks[len(before) :]
+    assert [t.node is None for t in after] == [True] * 4 + [False] * (len(after) - 4)
+    first = after[4]
+    assert first.is_keyframe
+    assert first.diagnostics.method == "start"
+    assert not first.links
+    assert not first.factors
+    assert np.allclose(first.T_world_body, last.T_world_body)
+    assert all(t.node >= first.node for t in after[4:])
+    parts = components(graph_of(tracks, odometry))
+    assert [part[0] for part in parts] == [0, first.node]
+
+
+def test_whoever_wants_no_second_map_stays_lost(frames):
+    odometry = LocalMapConfig(max_lost_frames=0).build()
+    before, elsewhere = frames[seconds(0.0, 1.0)], frames[seconds(2.3, 3.3)]
+    assert all(t.node is None for t in tracked([*before, *elsewhere], odometry)[len(before) :])
+
+
+def test_darkness_is_no_place(frames):
+    """Frames without features never begin a map, however many they are."""
+    odometry = LocalMapConfig(max_lost_frames=2).build()
+    tracks = tracked([*frames[:5], *map(covered, frames[5:9]), *frames[9:12]], odometry)
+    assert all(t.node is None for t in tracks[5:9])
+    assert tracks[9].diagnostics.method == "relocalised"
+
+
+def test_one_second_turn_joins_the_first_ones_landmarks(frames):
+    """After relocalisation keyframes share landmarks with those from before the loss: one component."""
+    dark = seconds(4.5, 5.5)
+    odometry = LocalMapConfig().build()
+    tracks = tracked([*frames[: dark.start], *map(covered, frames[dark]), *frames[dark.stop :]], odometry)
+    graph = graph_of(tracks, odometry)
+    assert len(components(graph)) == 1
+    assert any(factor.j - factor.i > 10 for factor in graph.factors)
