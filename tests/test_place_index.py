@@ -68,6 +68,20 @@ def test_every_node_finds_itself_first(index, vectors):
         assert index.query(vector, min_similarity=0.9, limit=1) == [(1000 + number, 1.0)]
 
 
+def test_what_stands_out_is_found_however_unlike(vocabulary, index, vectors):
+    rng = np.random.default_rng(3)
+    known = np.repeat(vectors[7].ids, 1)
+    half = vocabulary.vector(np.concatenate([known[:8], rng.integers(0, vocabulary.words, 22)]))
+    assert index.query(half, min_similarity=0.9, limit=3) == []
+    assert index.query(half, min_similarity=0.9, limit=1, min_deviations=3.0)[0][0] == 1007
+    assert index.query(half, min_similarity=0.9, limit=1, min_deviations=50.0) == []
+
+
+def test_nothing_stands_out_from_a_few(index, vectors):
+    assert index.query(vectors[5], min_similarity=1.1, limit=1, min_deviations=0.0, before=29) == []
+    assert index.query(vectors[5], min_similarity=1.1, limit=1, min_deviations=0.0, before=30)
+
+
 def test_of_equals_the_earlier_comes_first(vocabulary, vectors):
     index = PlaceIndex(vocabulary)
     for node in (7, 3, 5):

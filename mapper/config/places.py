@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field, PositiveInt
+from pydantic import Field, PositiveFloat, PositiveInt
 
 from mapper.config.base import Config
 from mapper.config.features import OrbConfig, UniformOrbConfig
@@ -30,5 +30,8 @@ class PlacesConfig(Config):
     path: Path | None = None
     """File of the vocabulary; None is the one trained on synthetic logs that comes with the toolkit."""
     min_similarity: Annotated[float, Field(ge=0.0, le=1.0)] = 0.32
-    """Of two images' words (eq. 10), as published. It suits images of about 1000 features; 0.22 does for 500,
-    0.45 for 2000."""
+    """Of two images' words (eq. 10), as published. It suits images of about 1000 features; 0.22 would do for
+    500, 0.45 for 2000."""
+    min_deviations: PositiveFloat = 3.0
+    """Whatever its similarity, a place is proposed that stands out from all others by this many standard
+    deviations: so images with few features find theirs as well."""

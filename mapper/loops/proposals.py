@@ -52,7 +52,7 @@ class ByWords:
         Raises:
             VocabularyError: The vocabulary cannot be read, or is of another kind.
         """
-        self._min_similarity = config.min_similarity
+        self._config = config
         self._min_gap_ns = round(min_gap_s * NS_PER_S)
         self._vocabulary = load_vocabulary(config.path)
         self._index = PlaceIndex(self._vocabulary)
@@ -63,7 +63,8 @@ class ByWords:
         """Return the most similar places, the most similar first."""
         found = self._index.query(
             self._vector(view),
-            min_similarity=self._min_similarity,
+            min_similarity=self._config.min_similarity,
+            min_deviations=self._config.min_deviations,
             limit=limit,
             before=bisect_right(self._stamps_ns, view.stamp_ns - self._min_gap_ns),
         )

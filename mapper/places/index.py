@@ -8,6 +8,8 @@ from mapper.places.kernels import shared_weights
 from mapper.places.vocabulary import ONE, Vocabulary, WordVector
 
 _FIRST_CAPACITY = 256
+_ENOUGH_TO_COMPARE = 30
+_SIGMA_PER_MAD = 1.4826
 
 
 class PlaceIndex:
@@ -42,15 +44,23 @@ class PlaceIndex:
         self._known.add(node)
 
     def query(
-        self, vector: WordVector, *, min_similarity: float, limit: int, before: int | None = None
+        self,
+        vector: WordVector,
+        *,
+        min_similarity: float,
+        limit: int,
+        before: int | None = None,
+        min_deviations: float = np.inf,
     ) -> list[tuple[int, float]]:
         """Return the most similar nodes with their similarity, best first; of equals, the earlier.
 
         Args:
             vector: What is seen now.
-            min_similarity: Less is not returned; nor is ever a node that shares no word.
+            min_similarity: Less is not returned, unless it stands out; nor is ever a node that shares no word.
             limit: How many nodes are returned at most.
             before: Only the first so many nodes take part, for the latest look alike anyway; None is all.
+            min_deviations: A node stands out when it is this many standard deviations more similar than the
+                median node. Both are told robustly, so a few true revisits do not hide each other.
 
         Raises:
             DataError: The vector is of a larger vocabulary.
@@ -59,7 +69,8 @@ class PlaceIndex:
         rows = len(self._nodes) if before is None else min(max(before, 0), len(self._nodes))
         shared: NDArray[np.uint16] = shared_weights(vector.ids, vector.weights, self._weights, rows)
         similarity = shared / ONE
-        found = np.flatnonzero((similarity >= min_similarity) & (similarity > 0.0))
+        least = min(min_similarity, _outstanding(similarity, min_deviations))
+        found = np.flatnonzero((similarity >= least) & (similarity > 0.0))
         best = found[np.argsort(-similarity[found], kind="stable")[:limit]]
         return [(self._nodes[row], float(similarity[row])) for row in best.tolist()]
 
@@ -67,3 +78,11 @@ class PlaceIndex:
         words = len(self._weights)
         if len(vector.ids) and vector.ids[-1] >= words:
             raise DataError(f"place index: word {vector.ids[-1]} of another vocabulary; this one has {words}")
+
+
+def _outstanding(similarity: NDArray[np.float64], deviations: float) -> float:
+    """Return from which similarity on a node stands out; never where there are few to stand out from."""
+    if len(similarity) < _ENOUGH_TO_COMPARE or not np.isfinite(deviations):
+        return np.inf
+    median = float(np.median(similarity))
+    return median + deviations * _SIGMA_PER_MAD * float(np.median(np.abs(similarity - median)))
