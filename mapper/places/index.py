@@ -56,7 +56,7 @@ class PlaceIndex:
 
         Args:
             vector: What is seen now.
-            min_similarity: Less is not returned, unless it stands out; nor is ever a node that shares no word.
+            min_similarity: Less is not returned, unless it stands out; nor ever a node that shares no word.
             limit: How many nodes are returned at most.
             before: Only the first so many nodes take part, for the latest look alike anyway; None is all.
             min_deviations: A node stands out when it is this many standard deviations more similar than the
