@@ -169,11 +169,29 @@ def fit_rigid(target: Points, source: Points, *, with_scale: bool = False) -> tu
 def is_rigid(T: NDArray[np.float64], *, tolerance: float = 1e-5) -> bool:
     """Tell whether a (4, 4) or (N, 4, 4) array holds rigid motions only."""
     T = np.asarray(T)
+    if T.shape == (4, 4):
+        return _is_rigid_rows(T.tolist(), tolerance)
     if T.shape[-2:] != (4, 4) or not np.isfinite(T).all():
         return False
     R = T[..., :3, :3]
-    # Plain comparisons: np.allclose takes ten times as long on one pose, and every pose passes here.
     orthogonal = (np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)) <= tolerance).all()
     proper = (np.linalg.det(R) > 0.0).all()
     affine = (np.abs(T[..., 3, :] - [0.0, 0.0, 0.0, 1.0]) <= tolerance).all()
     return bool(orthogonal and proper and affine)
+
+
+def _is_rigid_rows(rows: list[list[float]], tolerance: float) -> bool:
+    """Tell it of one motion: arrays would take ten times as long, and every pose and factor passes here."""
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), (p, q, r, s) = rows
+    products = (
+        a * a + b * b + c * c - 1.0,
+        d * d + e * e + f * f - 1.0,
+        g * g + h * h + i * i - 1.0,
+        a * d + b * e + c * f,
+        a * g + b * h + c * i,
+        d * g + e * h + f * i,
+    )
+    orthogonal = all(abs(product) <= tolerance for product in products)
+    proper = a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g) > 0.0
+    affine = all(abs(value) <= tolerance for value in (p, q, r, s - 1.0))
+    return orthogonal and proper and affine and math.isfinite(x + y + z)

@@ -1,7 +1,7 @@
 """Pose graphs as g2o text (Kümmerle et al. 2011), as GTSAM, g2o and SE-Sync read it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import get_args
 
@@ -10,16 +10,15 @@ from numpy.typing import NDArray
 
 from mapper.atomic import write_text
 from mapper.errors import GraphError, MapperError
-from mapper.geometry import Array, Transform, transform
+from mapper.geometry import Array
+from mapper.graph.information import as_gtsam_takes, lifted, swapped, symmetric
 from mapper.graph.model import BetweenFactor, Origin, PoseGraph
-from mapper.rotations import quaternion_from_rotation, rotation_from_euler, rotation_from_quaternion
+from mapper.progress import SILENT, Progress
+from mapper.rotations import quaternion_from_rotation, rotation_from_quaternion
 
-# g2o orders a pose's tangent (translation, rotation); ours is (rotation, translation).
-_SWAPPED = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])
-_UPPER_3D = np.triu_indices(6)
-_UPPER_2D = np.triu_indices(3)
-_PLANAR = np.array([3, 4, 2])
-"""Where x, y and yaw stand in our tangent."""
+_ORIGINS: tuple[Origin, ...] = get_args(Origin)
+_SHORTEST = 1e-9
+"""A quaternion shorter than this has no direction."""
 
 
 def write_g2o(path: Path, graph: PoseGraph) -> None:
@@ -34,122 +33,191 @@ def write_g2o(path: Path, graph: PoseGraph) -> None:
     """
     if not graph.T_world_node:
         raise GraphError(f"{path}: a graph without nodes is not written; was any frame tracked?")
+    poses = _pose_texts(np.array(list(graph.T_world_node.values())))
     lines = [
-        f"VERTEX_SE3:QUAT {node} {_pose_text(T)} # stamp_ns {graph.stamps_ns[node]}"
-        for node, T in graph.T_world_node.items()
+        f"VERTEX_SE3:QUAT {node} {pose} # stamp_ns {graph.stamps_ns[node]}"
+        for node, pose in zip(graph.T_world_node, poses, strict=True)
     ]
     lines.append(f"FIX {next(iter(graph.T_world_node))}")
-    for factor in graph.factors:
-        information = (0.5 * (factor.information + factor.information.T))[_SWAPPED]
-        lines.append(
-            f"EDGE_SE3:QUAT {factor.i} {factor.j} {_pose_text(factor.T_i_j)} "
-            f"{_numbers_text(information[_UPPER_3D])} # origin {factor.origin}"
-        )
+    if graph.factors:
+        information = np.array([factor.information for factor in graph.factors])
+        information = 0.5 * (information + np.swapaxes(information, 1, 2))
+        upper = swapped(information)[:, *np.triu_indices(6)]
+        motions = _pose_texts(np.array([factor.T_i_j for factor in graph.factors]))
+        lines += [
+            f"EDGE_SE3:QUAT {factor.i} {factor.j} {motion} {_numbers_text(row)} # origin {factor.origin}"
+            for factor, motion, row in zip(graph.factors, motions, upper, strict=True)
+        ]
     write_text(path, "\n".join(lines) + "\n")
 
 
-def read_g2o(path: Path) -> PoseGraph:
+def read_g2o(path: Path, *, guess_loops: bool = False, progress: Progress = SILENT) -> PoseGraph:
     """Read a 3D graph, or a 2D one lifted into the plane z = 0.
 
     A vertex without a stamp gets its id as nanoseconds, which only orders it. A 2D edge holds the
-    three motions out of its plane with its own largest information.
+    three motions out of its plane with its own largest information. Information with a negative
+    eigenvalue, as in the published cubicle graph, is what GTSAM's Cholesky factor makes of it.
+
+    Args:
+        path: The file.
+        guess_loops: An edge that does not say its origin is a loop if its ids do not follow each other;
+            otherwise it counts as odometry.
+        progress: Told how many edges have such information.
 
     Raises:
         GraphError: The file cannot be read, has no vertices, or a line has an unknown tag, a wrong
             number of columns, a number that is not finite, an id that is unknown or taken, or
-            information that is not positive definite; the message names file and line.
+            information whose diagonal is not positive; the message names file and line.
     """
+    tables = _tables(path)
     graph = PoseGraph()
-    edges: list[tuple[int, BetweenFactor]] = []
-    for number, line in enumerate(_text(path).splitlines(), start=1):
-        body, _, note = line.partition("#")
-        tag, *words = body.split() or [""]
-        if tag in ("", "FIX"):
-            continue
+    for line, (node,), note, T_world_node in _in_order(path, tables, _VERTICES):
         try:
-            if tag in _VERTICES:
-                node, T_world_node = _vertex(words, _VERTICES[tag])
-                graph.add_node(node, int(_noted(note, "stamp_ns", str(node))), T_world_node)
-            elif tag in _EDGES:
-                edges.append((number, _edge(words, _EDGES[tag], _noted(note, "origin", "odometry"))))
-            else:
-                known = ", ".join((*_VERTICES, *_EDGES, "FIX"))
-                raise GraphError(f"unknown tag {tag!r}; want one of {known}")
+            graph.add_node(node, int(_noted(note, "stamp_ns", str(node))), T_world_node)
         except (MapperError, ValueError) as error:
-            raise GraphError(f"{path}:{number}: {error}") from None
+            raise GraphError(f"{path}:{line}: {error}") from None
     if not graph.T_world_node:
         raise GraphError(f"{path}: no vertices; want g2o text with {' or '.join(_VERTICES)} lines")
-    for number, factor in edges:
+    informations = _informations(path, tables, progress)
+    for line, (i, j), note, T_i_j in _in_order(path, tables, _EDGES):
+        unnamed: Origin = "loop" if guess_loops and abs(i - j) != 1 else "odometry"
         try:
-            graph.add_factors([factor])
-        except GraphError as error:
-            raise GraphError(f"{path}:{number}: {error}") from None
+            graph.add_factors([BetweenFactor(i, j, T_i_j, informations[line], _origin(note, unnamed))])
+        except MapperError as error:
+            raise GraphError(f"{path}:{line}: {error}") from None
     return graph
 
 
 @dataclass(frozen=True, slots=True)
-class _Kind:
-    """How many numbers a pose and its information take, and what they mean."""
+class _Form:
+    """What the numbers of a line mean.
 
+    Attributes:
+        ids: How many there are.
+        pose_numbers: How many a pose takes.
+        poses: Makes (N, 4, 4) of (N, pose_numbers).
+        information_rows: Rows of the information matrix whose upper triangle follows; 0 for none.
+    """
+
+    ids: int
     pose_numbers: int
-    information_numbers: int
-    pose: Callable[[Array], Transform]
-    information: Callable[[Array], Array]
+    poses: Callable[[Array], Array]
+    information_rows: int = 0
+
+    @property
+    def columns(self) -> int:
+        return self.ids + self.pose_numbers + self.information_rows * (self.information_rows + 1) // 2
 
 
-def _vertex(words: list[str], kind: _Kind) -> tuple[int, Transform]:
-    _refuse_columns(words, 1 + kind.pose_numbers)
-    return int(words[0]), kind.pose(_finite(words[1:]))
+@dataclass(slots=True)
+class _Table:
+    """All lines of one tag: where they stand, their ids, numbers and notes."""
+
+    lines: list[int] = field(default_factory=list)
+    ids: list[list[int]] = field(default_factory=list)
+    numbers: list[list[float]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def refuse(self, path: Path, bad: NDArray[np.bool_], why: str) -> None:
+        """Blame the first line that has anything bad, if any has."""
+        lines = bad.reshape(len(self.lines), -1).any(axis=1)
+        if lines.any():
+            raise GraphError(f"{path}:{self.lines[int(np.argmax(lines))]}: {why}")
 
 
-def _edge(words: list[str], kind: _Kind, origin: str) -> BetweenFactor:
-    _refuse_columns(words, 2 + kind.pose_numbers + kind.information_numbers)
-    for known in get_args(Origin):
-        if origin == known:
-            numbers = _finite(words[2:])
-            T_i_j = kind.pose(numbers[: kind.pose_numbers])
-            information = kind.information(numbers[kind.pose_numbers :])
-            return BetweenFactor(int(words[0]), int(words[1]), T_i_j, information, known)
-    raise GraphError(f"origin {origin!r}: want one of {', '.join(get_args(Origin))}")
+def _poses_3d(numbers: Array) -> Array:
+    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = rotation_from_quaternion(numbers[:, 3:]), numbers[:, :3]
+    return poses
 
 
-def _pose_3d(numbers: Array) -> Transform:
-    return transform(rotation_from_quaternion(numbers[3:]), numbers[:3])
+def _poses_2d(numbers: Array) -> Array:
+    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
+    cosine, sine = np.cos(numbers[:, 2]), np.sin(numbers[:, 2])
+    poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = cosine, -sine, sine, cosine
+    poses[:, :2, 3] = numbers[:, :2]
+    return poses
 
 
-def _pose_2d(numbers: Array) -> Transform:
-    x_m, y_m, yaw_rad = numbers
-    return transform(rotation_from_euler(0.0, 0.0, float(yaw_rad)), np.array([x_m, y_m, 0.0]))
+_VERTICES = {"VERTEX_SE3:QUAT": _Form(1, 7, _poses_3d), "VERTEX_SE2": _Form(1, 3, _poses_2d)}
+_EDGES = {"EDGE_SE3:QUAT": _Form(2, 7, _poses_3d, 6), "EDGE_SE2": _Form(2, 3, _poses_2d, 3)}
+_FORMS = _VERTICES | _EDGES
 
 
-def _information_3d(upper: Array) -> Array:
-    information: Array = _symmetric(upper, _UPPER_3D)[_SWAPPED]
-    return information
+def _tables(path: Path) -> dict[str, _Table]:
+    """Sort the lines by their tags; numbers are checked in bulk afterwards."""
+    tables: dict[str, _Table] = {}
+    for line, text in enumerate(_text(path).splitlines(), start=1):
+        body, _, note = text.partition("#")
+        tag, *words = body.split() or [""]
+        if tag in ("", "FIX"):
+            continue
+        form = _FORMS.get(tag)
+        if form is None:
+            known = ", ".join((*_FORMS, "FIX"))
+            raise GraphError(f"{path}:{line}: unknown tag {tag!r}; want one of {known}")
+        if len(words) != form.columns:
+            raise GraphError(f"{path}:{line}: {len(words)} columns after the tag, want {form.columns}")
+        table = tables.setdefault(tag, _Table())
+        try:
+            table.ids.append([int(word) for word in words[: form.ids]])
+            table.numbers.append([float(word) for word in words[form.ids :]])
+        except ValueError as error:
+            raise GraphError(f"{path}:{line}: {error}") from None
+        table.lines.append(line)
+        table.notes.append(note)
+    for table in tables.values():
+        table.refuse(path, np.array(table.ids) < 0, "an id is negative")
+    return tables
 
 
-def _information_2d(upper: Array) -> Array:
-    planar = _symmetric(upper, _UPPER_2D)
-    information: Array = np.eye(6) * planar.diagonal().max()
-    information[np.ix_(_PLANAR, _PLANAR)] = planar
-    return information
+def _in_order(
+    path: Path, tables: dict[str, _Table], forms: dict[str, _Form]
+) -> list[tuple[int, list[int], str, Array]]:
+    """Return (line, ids, note, pose) of some tags' lines in the file's order."""
+    rows: list[tuple[int, list[int], str, Array]] = []
+    for tag, table in tables.items():
+        if tag not in forms:
+            continue
+        form = forms[tag]
+        numbers = np.array(table.numbers)
+        table.refuse(path, ~np.isfinite(numbers), "a number is not finite")
+        pose = numbers[:, : form.pose_numbers]
+        if form.poses is _poses_3d:
+            lengths = np.linalg.norm(pose[:, 3:], axis=1)
+            table.refuse(path, lengths < _SHORTEST, "its quaternion is zero and has no direction")
+        rows += zip(table.lines, table.ids, table.notes, form.poses(pose), strict=True)
+    return sorted(rows, key=lambda row: row[0])
 
 
-def _symmetric(upper: Array, where: tuple[NDArray[np.intp], ...]) -> Array:
-    size = int(where[0][-1]) + 1
-    matrix = np.zeros((size, size))
-    matrix[where] = upper
-    matrix.T[where] = upper
-    return matrix
-
-
-_VERTICES = {
-    "VERTEX_SE3:QUAT": _Kind(7, 0, _pose_3d, _information_3d),
-    "VERTEX_SE2": _Kind(3, 0, _pose_2d, _information_2d),
-}
-_EDGES = {
-    "EDGE_SE3:QUAT": _Kind(7, 21, _pose_3d, _information_3d),
-    "EDGE_SE2": _Kind(3, 6, _pose_2d, _information_2d),
-}
+def _informations(path: Path, tables: dict[str, _Table], progress: Progress) -> dict[int, Array]:
+    """Return the (6, 6) information of every edge, in our tangent, by its line."""
+    informations: dict[int, Array] = {}
+    indefinite = 0
+    for tag, table in tables.items():
+        if tag not in _EDGES:
+            continue
+        form = _EDGES[tag]
+        given = symmetric(np.array(table.numbers)[:, form.pose_numbers :], form.information_rows)
+        is_planar = form.information_rows == 3
+        if not is_planar:
+            given = swapped(given)
+        table.refuse(path, ~np.isfinite(given), "a number is not finite")
+        diagonal = given.diagonal(axis1=1, axis2=2)
+        table.refuse(
+            path,
+            diagonal <= 0.0,
+            "its information is not positive definite: a diagonal value is not positive",
+        )
+        taken, mended = as_gtsam_takes(given)
+        indefinite += int(mended.sum())
+        informations |= zip(table.lines, lifted(taken) if is_planar else taken, strict=True)
+    if indefinite:
+        progress.note(
+            f"{path}: {indefinite} of {len(informations)} edges have indefinite information, "
+            "taken as GTSAM takes it: by its Cholesky factor as far as that goes"
+        )
+    return informations
 
 
 def _text(path: Path) -> str:
@@ -161,27 +229,25 @@ def _text(path: Path) -> str:
         raise GraphError(f"{path}: byte {error.start} is not ASCII; is this really a g2o file?") from None
 
 
-def _refuse_columns(words: list[str], wanted: int) -> None:
-    if len(words) != wanted:
-        raise GraphError(f"{len(words)} columns after the tag, want {wanted}")
-
-
-def _finite(words: list[str]) -> Array:
-    numbers = np.array([float(word) for word in words])
-    if not np.isfinite(numbers).all():
-        raise GraphError("a number is not finite")
-    return numbers
-
-
 def _noted(note: str, name: str, missing: str) -> str:
     """Return the word after ``name`` in the note behind ``#``."""
     words = note.split()
     return words[1] if len(words) == 2 and words[0] == name else missing
 
 
-def _pose_text(T: Transform) -> str:
-    return _numbers_text(np.concatenate([T[:3, 3], quaternion_from_rotation(T[:3, :3])]))
+def _origin(note: str, missing: Origin) -> Origin:
+    named = _noted(note, "origin", missing)
+    for origin in _ORIGINS:
+        if named == origin:
+            return origin
+    raise GraphError(f"origin {named!r}: want one of {', '.join(_ORIGINS)}")
+
+
+def _pose_texts(poses: Array) -> list[str]:
+    """Return (N, 4, 4) poses as ``x y z qx qy qz qw``."""
+    numbers = np.concatenate([poses[:, :3, 3], quaternion_from_rotation(poses[:, :3, :3])], axis=1)
+    return [_numbers_text(row) for row in numbers]
 
 
 def _numbers_text(numbers: Array) -> str:
-    return " ".join(repr(float(number)) for number in numbers)
+    return " ".join(map(repr, numbers.tolist()))

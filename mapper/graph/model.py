@@ -57,8 +57,10 @@ class BetweenFactor:
             raise GraphError(f"factor {self.i} → {self.j}: T_i_j is not a finite rigid motion")
         if self.information.shape != (6, 6) or not np.isfinite(self.information).all():
             raise GraphError(f"factor {self.i} → {self.j}: information must be a finite (6, 6) matrix")
-        if np.linalg.eigvalsh(0.5 * (self.information + self.information.T))[0] <= 0.0:
-            raise GraphError(f"factor {self.i} → {self.j}: information is not positive definite")
+        try:
+            np.linalg.cholesky(0.5 * (self.information + self.information.T))
+        except np.linalg.LinAlgError:
+            raise GraphError(f"factor {self.i} → {self.j}: information is not positive definite") from None
 
 
 @dataclass(slots=True)
