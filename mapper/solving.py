@@ -8,6 +8,7 @@ from mapper.graph.model import PoseGraph, Solution
 from mapper.graph.optimize import components, optimize
 from mapper.loops.closure import LoopClosure, settled
 from mapper.manifest import Solve
+from mapper.parts import laid_together
 
 MIN_WEIGHT = 0.5
 """A loop that the solver lets count for less is rejected, and is no factor of the solved graph."""
@@ -39,6 +40,7 @@ def solve(graph: PoseGraph, loops: Sequence[LoopClosure], config: GraphConfig) -
     Raises:
         GraphError: The graph cannot be solved.
     """
+    graph = laid_together(graph)
     solution = optimize(graph, config)
     loops = settled(loops, graph.T_world_node, solution, min_weight=MIN_WEIGHT)
     others = [factor for factor in graph.factors if factor.origin != "loop"]

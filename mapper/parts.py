@@ -1,0 +1,90 @@
+"""Parts of a path that the odometry left untied: laid together where loops tie them, left out where none does."""
+
+from collections import Counter
+from collections.abc import Set
+from dataclasses import replace
+
+import numpy as np
+
+from mapper.geometry import Transform, inverse
+from mapper.graph.model import PoseGraph
+from mapper.graph.optimize import components
+from mapper.loops.closure import LoopClosure
+from mapper.odometry.base import Diagnostics, Track
+from mapper.tracking import Tracking
+
+UNTIED = "untied"
+"""``Diagnostics.method`` of a frame that was placed, but in a part of the path that is left out."""
+
+
+def largest_part(tracking: Tracking) -> Tracking:
+    """Return what was tracked without the parts that nothing ties to the one with most frames.
+
+    After a loss the odometry may begin anew where nothing is known. Until a loop joins the two parts, nobody
+    knows how they lie to each other, and a map of both would be a guess: the frames left out count as lost.
+    """
+    parts = components(tracking.graph)
+    if len(parts) <= 1:
+        return tracking
+    frames = Counter(track.node for track in tracking.placed)
+    kept = frozenset(max(parts, key=lambda nodes: sum(frames[node] for node in nodes)))
+    graph = tracking.graph
+    return replace(
+        tracking,
+        tracks=tuple(_lost_unless(track, kept) for track in tracking.tracks),
+        graph=PoseGraph(
+            {node: T for node, T in graph.T_world_node.items() if node in kept},
+            {node: stamp_ns for node, stamp_ns in graph.stamps_ns.items() if node in kept},
+            [factor for factor in graph.factors if factor.i in kept],
+        ),
+        loops=tuple(_refused_unless(loop, kept) for loop in tracking.loops),
+    )
+
+
+def _lost_unless(track: Track, kept: Set[int]) -> Track:
+    if track.node is None or track.node in kept:
+        return track
+    nothing = Diagnostics(track.diagnostics.features, 0, 0, 0.0, track.diagnostics.residual_unit, UNTIED)
+    return replace(track, node=None, T_node_body=np.eye(4), is_keyframe=False, diagnostics=nothing)
+
+
+def _refused_unless(loop: LoopClosure, kept: Set[int]) -> LoopClosure:
+    if loop.verdict == "rejected" or loop.i in kept:
+        return loop
+    return replace(loop, verdict="rejected", reason="untied: in a part of the path that is left out")
+
+
+def laid_together(graph: PoseGraph) -> PoseGraph:
+    """Return the graph with every part that only loops tie to earlier ones moved to where the first one says.
+
+    A part begun after a loss stands where the camera was last seen, which may be rooms away from where it was:
+    no place for a solver to start from.
+    """
+    known = PoseGraph(graph.T_world_node, graph.stamps_ns, [f for f in graph.factors if f.origin != "loop"])
+    waiting = components(known)
+    if len(waiting) <= 1:
+        return graph
+    T_world_node = {node: graph.T_world_node[node] for node in waiting.pop(0)}
+    while waiting:
+        ties = ((part, _tie(graph, set(part), T_world_node)) for part in waiting)
+        part, T_new_old = next(
+            ((part, tie) for part, tie in ties if tie is not None), (waiting[0], np.eye(4))
+        )
+        T_world_node |= {node: T_new_old @ graph.T_world_node[node] for node in part}
+        waiting.remove(part)
+    in_order = {node: T_world_node[node] for node in graph.T_world_node}
+    return PoseGraph(in_order, graph.stamps_ns, graph.factors)
+
+
+def _tie(graph: PoseGraph, part: Set[int], T_world_laid: dict[int, Transform]) -> Transform | None:
+    """Return the motion that puts a part where the first loop from what is laid wants it."""
+    for factor in graph.factors:
+        if factor.i in T_world_laid and factor.j in part:
+            wanted, node = T_world_laid[factor.i] @ factor.T_i_j, factor.j
+        elif factor.j in T_world_laid and factor.i in part:
+            wanted, node = T_world_laid[factor.j] @ inverse(factor.T_i_j), factor.i
+        else:
+            continue
+        T_new_old: Transform = wanted @ inverse(graph.T_world_node[node])
+        return T_new_old
+    return None
