@@ -1,4 +1,4 @@
-"""Parts of a path that the odometry left untied: laid together where loops tie them, left out where none does."""
+"""Parts of a path that the odometry left untied: loops lay them together, and what none ties is left out."""
 
 from collections import Counter
 from collections.abc import Set
@@ -11,14 +11,15 @@ from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import components
 from mapper.loops.closure import LoopClosure
 from mapper.odometry.base import Diagnostics, Track
+from mapper.progress import Progress
 from mapper.tracking import Tracking
 
 UNTIED = "untied"
 """``Diagnostics.method`` of a frame that was placed, but in a part of the path that is left out."""
 
 
-def largest_part(tracking: Tracking) -> Tracking:
-    """Return what was tracked without the parts that nothing ties to the one with most frames.
+def largest_part(tracking: Tracking, *, progress: Progress) -> Tracking:
+    """Return what was tracked without the parts that nothing ties to the one with most frames, and say so.
 
     After a loss the odometry may begin anew where nothing is known. Until a loop joins the two parts, nobody
     knows how they lie to each other, and a map of both would be a guess: the frames left out count as lost.
@@ -28,6 +29,11 @@ def largest_part(tracking: Tracking) -> Tracking:
         return tracking
     frames = Counter(track.node for track in tracking.placed)
     kept = frozenset(max(parts, key=lambda nodes: sum(frames[node] for node in nodes)))
+    left_out = sum(frames[node] for nodes in parts for node in nodes if node not in kept)
+    progress.note(
+        f"{left_out} of {len(tracking.placed)} frames lie in {len(parts) - 1} parts of the path that no loop "
+        "ties to the rest; they are left out"
+    )
     graph = tracking.graph
     return replace(
         tracking,
@@ -57,8 +63,8 @@ def _refused_unless(loop: LoopClosure, kept: Set[int]) -> LoopClosure:
 def laid_together(graph: PoseGraph) -> PoseGraph:
     """Return the graph with every part that only loops tie to earlier ones moved to where the first one says.
 
-    A part begun after a loss stands where the camera was last seen, which may be rooms away from where it was:
-    no place for a solver to start from.
+    A part begun after a loss stands where the camera was last seen, which may be rooms away from where it
+    was: no place for a solver to start from.
     """
     known = PoseGraph(graph.T_world_node, graph.stamps_ns, [f for f in graph.factors if f.origin != "loop"])
     waiting = components(known)
@@ -66,10 +72,8 @@ def laid_together(graph: PoseGraph) -> PoseGraph:
         return graph
     T_world_node = {node: graph.T_world_node[node] for node in waiting.pop(0)}
     while waiting:
-        ties = ((part, _tie(graph, set(part), T_world_node)) for part in waiting)
-        part, T_new_old = next(
-            ((part, tie) for part, tie in ties if tie is not None), (waiting[0], np.eye(4))
-        )
+        ties = [(part, _tie(graph, set(part), T_world_node)) for part in waiting]
+        part, T_new_old = next((p, T) for p, T in [*ties, (waiting[0], np.eye(4))] if T is not None)
         T_world_node |= {node: T_new_old @ graph.T_world_node[node] for node in part}
         waiting.remove(part)
     in_order = {node: T_world_node[node] for node in graph.T_world_node}
