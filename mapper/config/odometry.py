@@ -106,9 +106,11 @@ class KeyframeConfig(Config):
     min_start_features: PositiveInt = 100
     """Features with depth that the first frame must have."""
     min_matches: Annotated[int, Field(ge=8)] = 20
-    """Fewer matches to the last frame, or to a keyframe, say nothing about the motion."""
+    """Fewer matches to the last frame, or to a keyframe and with P3P, say nothing about the motion."""
     min_inliers: PositiveInt = 30
     """Fewer landmarks that agree with the pose mean that the frame is lost."""
+    weak_inliers: PositiveInt = 150
+    """With fewer, a placement has to compete with what other ways and other keyframes lead to."""
     max_lost_frames: NonNegativeInt = 30
     """After so many frames that show enough but nothing known, a new sub-map begins; 0 never begins one."""
     keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.75
@@ -146,8 +148,6 @@ class LocalMapConfig(KeyframeConfig):
     """Search radius around the predicted pixel in the finest octave; doubled once when too little matches."""
     max_predicted_steps: PositiveFloat = 10.0
     """Longer gaps, in frame intervals, are not extrapolated over."""
-    weak_inliers: PositiveInt = 150
-    """With fewer, what the prediction found has to compete with what matching without it finds."""
 
     def build(self) -> "KeyframeOdometry":
         """Return the odometry this configures."""

@@ -1,6 +1,9 @@
 """Placing a frame by its pixels alone, against the latest keyframes (Zhao et al. 2020, §1.2)."""
 
+from collections.abc import Iterator
+
 from mapper.config.odometry import PnpConfig
+from mapper.geometry import inverse
 from mapper.odometry.local_map.landmarks import LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
 from mapper.odometry.local_map.observation import Observation
@@ -20,5 +23,11 @@ class PnpPlacing:
     def place(
         self, observation: Observation, last: Placement, _before_last: Placement | None, /
     ) -> Placement | None:
-        """Try the keyframe that the last frame saw most of, then the newest ones."""
-        return self._recall.among(self._map.latest(last.reference), observation, method="pnp")
+        """Try the latest keyframes, and those that look like the frame while the answer is weak."""
+        return self._recall.among(self._candidates(observation, last), observation, method="pnp")
+
+    def _candidates(self, observation: Observation, last: Placement) -> Iterator[int]:
+        latest = self._map.latest(last.reference)
+        yield from latest
+        here_world = inverse(last.T_camera_world)[:3, 3]
+        yield from (k for k in self._recall.lookalikes(observation, here_world) if k not in latest)

@@ -36,37 +36,18 @@ class Recall:
         self._index.add(keyframe, self._vocabulary.vector(words))
 
     def among(self, keyframes: Iterable[int], observation: Observation, *, method: str) -> Placement | None:
-        """Return the first placement that matching a keyframe and P3P lead to.
+        """Return the first placement that many landmarks agree with; failing that, the best of the weak ones.
 
-        Only descriptors under the same node of the vocabulary are compared (B2); Levenberg–Marquardt then
-        refines the pose over the inliers of RANSAC (B3).
+        A weak one may be wrong: things that repeat have led to a hundred inliers metres away.
         """
-        config = self._config
+        best: Placement | None = None
         for k in keyframes:
-            features, ids = self._matches(k, observation)
-            if len(features) < config.min_matches:
-                continue
-            points_world = self._map.landmarks["position"][ids]
-            found = ransac_p3p(
-                points_world,
-                observation.pixels[features],
-                observation.intrinsics,
-                tolerance_px=config.ransac_tolerance_px,
-                iterations=config.ransac_iterations,
-            )
-            if found is None or len(found[1]) < config.min_matches // 2:
-                continue
-            T_camera_world, agreeing = found
-            features, ids = features[agreeing], ids[agreeing]
-            T_camera_world, agree = refined(T_camera_world, points_world[agreeing], observation, features)
-            landmark_of_feature = unmatched(observation)
-            landmark_of_feature[features[agree]] = ids[agree]
-            placement = self._search.placed(
-                observation, T_camera_world, landmark_of_feature, reference=k, method=method
-            )
-            if placement is not None:
-                return placement
-        return None
+            placement = self._beside(k, observation, method=method)
+            if placement is not None and (best is None or placement.inliers > best.inliers):
+                best = placement
+                if best.inliers >= self._config.weak_inliers:
+                    break
+        return best
 
     def lookalikes(self, observation: Observation, here_world: Array) -> list[int]:
         """Return keyframes that a frame may show: those most like it, best first, then the nearest.
@@ -81,6 +62,34 @@ class Recall:
         centres = np.array([inverse(keyframe.T_camera_world)[:3, 3] for keyframe in keyframes])
         nearest = np.argsort(np.linalg.norm(centres - here_world, axis=1), kind="stable")[:budget]
         return list(dict.fromkeys([*alike, *map(int, nearest)]))
+
+    def _beside(self, k: int, observation: Observation, *, method: str) -> Placement | None:
+        """Match one keyframe and place the frame by P3P.
+
+        Only descriptors under the same node of the vocabulary are compared (B2); Levenberg–Marquardt then
+        refines the pose over the inliers of RANSAC (B3).
+        """
+        features, ids = self._matches(k, observation)
+        if len(features) < self._config.min_matches:
+            return None
+        points_world = self._map.landmarks["position"][ids]
+        found = ransac_p3p(
+            points_world,
+            observation.pixels[features],
+            observation.intrinsics,
+            tolerance_px=self._config.ransac_tolerance_px,
+            iterations=self._config.ransac_iterations,
+        )
+        if found is None or len(found[1]) < self._config.min_matches:
+            return None
+        T_camera_world, agreeing = found
+        features, ids = features[agreeing], ids[agreeing]
+        T_camera_world, agree = refined(T_camera_world, points_world[agreeing], observation, features)
+        landmark_of_feature = unmatched(observation)
+        landmark_of_feature[features[agree]] = ids[agree]
+        return self._search.placed(
+            observation, T_camera_world, landmark_of_feature, reference=k, method=method
+        )
 
     def _matches(self, k: int, observation: Observation) -> tuple[Ids, Ids]:
         """Return the features of a frame that match a keyframe's, and the landmarks that they then show."""
