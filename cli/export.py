@@ -7,7 +7,7 @@ import typer
 
 from cli.console import progress_for
 from cli.environment import prepare_libraries
-from cli.options import MovedLog, Overrides, Quiet
+from cli.options import MovedLogs, Overrides, Quiet
 from mapper.export.exporters import EXPORTERS
 
 _KINDS = "; ".join(f"{kind}: {exporter.summary}" for kind, exporter in EXPORTERS.items())
@@ -21,7 +21,7 @@ def export(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
     set_: Overrides = None,
-    log: MovedLog = None,
+    log: MovedLogs = None,
     quiet: Quiet = False,
 ) -> None:
     """Write a run's map, cloud, surface, slice, trajectory or graph for other programs, and tell where it is.
@@ -34,8 +34,8 @@ def export(
 
     prepare_libraries()
     built = load_run(run)
-    if log is not None:
-        built = moved_log(built, log)
+    if log:
+        built = moved_log(built, *log)
     config = overridden(built.config, set_) if set_ else None
     progress = progress_for(quiet=quiet)
     path = export_run(built, as_, out, config=config, overwrite=overwrite, progress=progress)

@@ -7,13 +7,13 @@ import typer
 
 from cli.console import progress_for
 from cli.environment import prepare_libraries
-from cli.options import MovedLog, Overrides, Quiet
+from cli.options import MovedLogs, Overrides, Quiet
 
 
 def fuse(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder that a build left.")],
     set_: Overrides = None,
-    log: MovedLog = None,
+    log: MovedLogs = None,
     trajectory: Annotated[
         Path | None, typer.Option(help="TUM file of better poses; only frames that moved are fused again.")
     ] = None,
@@ -34,8 +34,8 @@ def fuse(
 
     prepare_libraries()
     built = load_run(run)
-    if log is not None:
-        built = moved_log(built, log)
+    if log:
+        built = moved_log(built, *log)
     config = overridden(built.config, set_ or ())
     fused = fuse_run(
         open_log(built),

@@ -15,8 +15,11 @@ Overrides = Annotated[
     typer.Option("--set", metavar="KEY.PATH=VALUE", help="Turn one knob; mapper config lists them all."),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print errors only.")]
-MovedLog = Annotated[
-    Path | None, typer.Option("--log", help="Where the log lies now, if it has moved since the build.")
+MovedLogs = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--log", help="Where the log lies now, if it has moved since the build; of several, each in its turn."
+    ),
 ]
 First = Annotated[int | None, typer.Option("--first", help="Index of the first frame to use.")]
 Last = Annotated[int | None, typer.Option("--last", help="Index of the last frame to use.")]

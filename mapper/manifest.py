@@ -12,6 +12,7 @@ from pydantic import Field, ValidationError
 import mapper
 from mapper.atomic import write_text
 from mapper.config.base import Config
+from mapper.config.sources import SourceConfig
 from mapper.errors import RunError
 
 Status = Literal["building", "complete", "failed", "interrupted"]
@@ -29,8 +30,8 @@ _LIBRARIES = (
 )
 
 
-class Input(Config):
-    """The log that was read."""
+class Log(Config):
+    """A log that was read."""
 
     path: str
     """Absolute."""
@@ -38,6 +39,28 @@ class Input(Config):
     fingerprint: str
     notes: tuple[str, ...] = ()
     """What opening the log had to leave out or assume."""
+
+
+class AppendedLog(Log):
+    """A later session of the same place."""
+
+    source: SourceConfig
+    """What of it was used; ``config.json`` tells that of the first log."""
+    shift_ns: int
+    """Nanoseconds added to its stamps."""
+    begins_ns: int
+    """Its first frame, on the run's clock."""
+
+
+class Input(Log):
+    """The log that was read, and those that were appended since."""
+
+    appended: tuple[AppendedLog, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """The logs' names."""
+        return " + ".join(Path(log.path).name for log in (self, *self.appended))
 
 
 class Counts(Config):

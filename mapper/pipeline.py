@@ -1,6 +1,7 @@
 """From a recorded log to a run folder: the whole story."""
 
 import shutil
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -17,23 +18,31 @@ from mapper.export.picture import write_cloud_views, write_summary
 from mapper.export.ply import write_ply
 from mapper.fusion import Maps, fuse_log
 from mapper.geometry import fit_rigid
-from mapper.graph.g2o import write_g2o
 from mapper.graph.model import PoseGraph
 from mapper.levelling import Level, find_level
-from mapper.loops.closure import write_closures
-from mapper.manifest import Counts, Levelling, SkippedFrame, Status, Timing
+from mapper.manifest import Levelling, Solve, Status, Timing
 from mapper.measure import peak_memory_mb
 from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.sight_file import SightWriter, open_sights
+from mapper.parts import largest_part
 from mapper.progress import SILENT, Progress
-from mapper.records import records_of, write_frame_ms, write_records
-from mapper.run import Draft, Run, drafting, first_manifest, load_run, moved_log, refuse_another_log
+from mapper.run import (
+    Draft,
+    Run,
+    drafting,
+    first_manifest,
+    load_run,
+    moved_log,
+    paths_of,
+    refuse_another_log,
+)
 from mapper.run_log import Story, log_maps, log_snapshot, log_story
 from mapper.solving import solve
 from mapper.sources.base import FrameSource
 from mapper.timebase import NS_PER_S, nearest
-from mapper.tracking import Tracking, refuse_a_fragment, track_log
-from mapper.trajectory import Trajectory, trajectory_from, write_tum
+from mapper.tracked import Tracked, save_tracked, tracked_before, tracked_now
+from mapper.tracking import refuse_a_fragment, track_log
+from mapper.trajectory import Trajectory
 
 _FUSE_CONFIGS = frozenset({"octree", "slice", "traversable", "cloud", "mcap", "mesh", "workers"})
 _TRACKING_STAGES = ("track", "solve", "level")
@@ -79,21 +88,22 @@ def build(
     """
     with drafting(out, first_manifest(source), config, overwrite=overwrite) as draft:
         with draft.clock.stage("track"):
-            tracking = track_log(source, config, progress=progress)
-        _save_tracking(draft, tracking, source.truth)
+            tracking = largest_part(track_log(source, config, progress=progress), progress=progress)
+        save_tracked(draft, tracked_now(tracking, source.truth))
         refuse_a_fragment(tracking, config)
         with draft.clock.stage("solve"):
             solved = solve(tracking.graph, tracking.loops, config.graph)
         tracking = replace(tracking, graph=solved.graph, loops=solved.loops)
+        tracking = largest_part(tracking, progress=progress)
         with draft.clock.stage("level"):
             level = _level(source, tracking.trajectory(), config)
-        tracking = replace(tracking, graph=solved.graph.moved(level.T_level_world))
-        _save_tracking(draft, tracking, source.truth)
+        tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
+        save_tracked(draft, tracked_now(tracking, source.truth))
         draft.update(
             solve=solved.report,
             levelling=Levelling(method=level.method, detail=level.detail),
         )
-        _fuse_into(draft, source, config, progress)
+        fuse_into(draft, source, config, progress)
     return load_run(out)
 
 
@@ -125,29 +135,60 @@ def fuse(
     for name in sorted(set(BuildConfig.model_fields) - _FUSE_CONFIGS):
         if getattr(config, name) != getattr(run.config, name):
             raise ConfigError(f"{name}: fuse keeps what was tracked and cannot change it; run mapper build")
-    refuse_another_log(run, source.path)
+    changed = None if trajectory is None else _led_along(run, trajectory)
+    return fuse_changed(source, replace(run, config=config), changed, progress=progress)
+
+
+def fuse_changed(
+    source: FrameSource,
+    run: Run,
+    changed: Tracked | None = None,
+    *,
+    solve: Solve | None = None,
+    progress: Progress = SILENT,
+) -> Run:
+    """Make a run's maps again after its graph or its poses have changed; see ``fuse``.
+
+    Args:
+        source: The log that the run was built from.
+        run: A finished run, with the configuration to fuse by.
+        changed: What replaces the run's own; None keeps that.
+        solve: What the manifest says of the solve that changed it; None keeps what it says.
+        progress: Who watches.
+
+    Raises:
+        RunError: The log is not the one that the run was built from.
+    """
+    refuse_another_log(run, source)
     status: Status = "building"
-    manifest = moved_log(run, source.path).manifest.model_copy(update={"status": status})
-    with drafting(run.path, manifest, config, overwrite=True) as draft:
-        for stage in _TRACKING_STAGES:
-            draft.clock.seconds[stage] = manifest.timing.stage_s[stage]
+    manifest = moved_log(run, *paths_of(source)).manifest.model_copy(update={"status": status})
+    with drafting(run.path, manifest, run.config, overwrite=True) as draft:
+        carry_times(draft, manifest.timing)
         _keep_the_rest(run.path, draft.folder)
-        if trajectory is not None:
-            _move(draft.folder, run, trajectory)
-        _fuse_into(draft, source, config, progress, before=run.path / files.SIGHTS)
+        if changed is not None:
+            save_tracked(draft, changed)
+            (draft.folder / EXPORTERS["mesh"].file_name).unlink(missing_ok=True)
+        if solve is not None:
+            draft.update(solve=solve)
+        fuse_into(draft, source, run.config, progress, before=run.path / files.SIGHTS)
     return load_run(run.path)
 
 
-def _move(folder: Path, run: Run, trajectory: Trajectory) -> None:
-    """Replace a run's trajectory, and move the nodes of its graph along with it."""
+def carry_times(draft: Draft, timing: Timing) -> None:
+    """Count the time that tracking took in an earlier run as this one's."""
+    for stage in _TRACKING_STAGES:
+        draft.clock.seconds[stage] = timing.stage_s[stage]
+
+
+def _led_along(run: Run, trajectory: Trajectory) -> Tracked:
+    """Return what a run keeps, with its trajectory replaced and the nodes of its graph moved along."""
+    tracked = tracked_before(run)
     T_world_body = dict(zip(trajectory.stamps_ns.tolist(), trajectory.T_world_body, strict=True))
-    if T_world_body.keys().isdisjoint(run.trajectory().stamps_ns.tolist()):
+    if T_world_body.keys().isdisjoint(tracked.trajectory.stamps_ns.tolist()):
         raise RunError(f"{run.path}: none of the trajectory's {len(trajectory)} stamps is one of the run's")
-    write_tum(folder / files.TRAJECTORY, trajectory)
-    graph = run.graph()
+    graph = tracked.graph
     moved = {node: T_world_body.get(graph.stamps_ns[node], T) for node, T in graph.T_world_node.items()}
-    _write_graph(folder, PoseGraph(moved, graph.stamps_ns, graph.factors))
-    (folder / EXPORTERS["mesh"].file_name).unlink(missing_ok=True)
+    return replace(tracked, trajectory=trajectory, graph=PoseGraph(moved, graph.stamps_ns, graph.factors))
 
 
 def _keep_the_rest(folder: Path, new: Path) -> None:
@@ -159,39 +200,6 @@ def _keep_the_rest(folder: Path, new: Path) -> None:
             shutil.copytree(child, new / child.name, symlinks=True)
         else:
             shutil.copy2(child, new / child.name, follow_symlinks=False)
-
-
-def _save_tracking(draft: Draft, tracking: Tracking, truth: Trajectory | None) -> None:
-    """Write what the first pass found, with the nodes where they are believed to be by now."""
-    graph = tracking.graph
-    write_records(draft.folder / files.FRAMES, records_of(tracking.tracks, tracking.skipped))
-    write_frame_ms(draft.folder / files.FRAME_MS, tracking.frame_ms)
-    write_tum(draft.folder / files.TRAJECTORY, tracking.trajectory())
-    write_closures(draft.folder / files.LOOPS, tracking.loops)
-    if truth is not None:
-        write_tum(draft.folder / files.TRUTH, truth)
-    if graph.T_world_node:
-        _write_graph(draft.folder, graph)
-    draft.update(
-        counts=Counts(
-            listed=len(tracking.tracks) + len(tracking.skipped),
-            read=len(tracking.tracks),
-            skipped=len(tracking.skipped),
-            lost=len(tracking.tracks) - len(tracking.placed),
-            tracked=len(tracking.placed),
-            nodes=len(graph.T_world_node),
-            factors=len(graph.factors),
-            loops=sum(loop.verdict == "accepted" for loop in tracking.loops),
-            loop_candidates=len(tracking.loops),
-        ),
-        skipped=tuple(SkippedFrame(stamp_ns=s.stamp_ns, reason=s.reason) for s in tracking.skipped),
-    )
-
-
-def _write_graph(folder: Path, graph: PoseGraph) -> None:
-    write_g2o(folder / files.GRAPH, graph)
-    keyframes = trajectory_from((graph.stamps_ns[node], T) for node, T in graph.T_world_node.items())
-    write_tum(folder / files.KEYFRAMES, keyframes)
 
 
 def _level(source: FrameSource, trajectory: Trajectory, config: BuildConfig) -> Level:
@@ -208,7 +216,7 @@ def _level(source: FrameSource, trajectory: Trajectory, config: BuildConfig) -> 
     return find_level(scans, trajectory=trajectory, accelerations=source.accelerations, config=config.level)
 
 
-def _fuse_into(
+def fuse_into(
     draft: Draft,
     source: FrameSource,
     config: BuildConfig,
@@ -267,7 +275,7 @@ def _write_pictures(draft: Draft, maps: Maps, trajectory: Trajectory, truth: Tra
         grid=maps.grid,
         trajectory=trajectory,
         truth=truth,
-        title=Path(draft.manifest.input.path).name,
+        title=draft.manifest.input.title,
         lines=lines,
     )
     if len(maps.cloud_points_world):
@@ -286,10 +294,16 @@ def _laid_over(truth: Trajectory, trajectory: Trajectory) -> Trajectory | None:
     return truth.moved(T_level_truth)
 
 
+def _duration_s(trajectory: Trajectory, begins_ns: Sequence[int]) -> float:
+    """Return the seconds from first to last frame, without the pauses before logs that begin later."""
+    sessions = np.split(trajectory.stamps_ns, np.searchsorted(trajectory.stamps_ns, begins_ns))
+    return float(sum(stamps[-1] - stamps[0] for stamps in sessions if len(stamps))) / NS_PER_S
+
+
 def _timing(draft: Draft, trajectory: Trajectory, frames: int) -> Timing:
     seconds = {stage: round(value, 3) for stage, value in draft.clock.seconds.items()}
     total_s = sum(seconds.values())
-    log_s = float(trajectory.stamps_ns[-1] - trajectory.stamps_ns[0]) / NS_PER_S
+    log_s = _duration_s(trajectory, [log.begins_ns for log in draft.manifest.input.appended])
     return draft.manifest.timing.model_copy(
         update={
             "stage_s": seconds,

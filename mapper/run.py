@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +11,27 @@ from pydantic import ValidationError
 
 from mapper.atomic import write_text
 from mapper.config import BuildConfig
+from mapper.config.sources import SourceConfig
 from mapper.errors import MapperError, RunError
 from mapper.fingerprint import fingerprint
 from mapper.graph.g2o import read_g2o
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure, read_closures
-from mapper.manifest import Input, Manifest, Timing, library_versions, now_text, read_manifest
+from mapper.manifest import (
+    AppendedLog,
+    Input,
+    Log,
+    Manifest,
+    Timing,
+    library_versions,
+    now_text,
+    read_manifest,
+)
 from mapper.measure import Stopwatch
 from mapper.records import FrameRecord, read_frame_ms, read_records
 from mapper.sources import open_source
 from mapper.sources.base import FrameSource
+from mapper.sources.chained import Session, chained, sessions_of
 from mapper.staging import MARK, partial_of, staged
 from mapper.trajectory import Trajectory, read_tum
 
@@ -106,35 +118,66 @@ def load_run(path: Path) -> Run:
     return Run(path, _read_config(path / CONFIG), manifest)
 
 
-def moved_log(run: Run, log: Path) -> Run:
-    """Return the run, knowing that its log lies elsewhere by now."""
-    known = run.manifest.input.model_copy(update={"path": str(log.resolve())})
-    return replace(run, manifest=run.manifest.model_copy(update={"input": known}))
+def moved_log(run: Run, *logs: Path) -> Run:
+    """Return the run, knowing that its logs lie elsewhere by now.
+
+    Raises:
+        RunError: It was made from another number of logs.
+    """
+    known = run.manifest.input
+    if len(logs) != 1 + len(known.appended):
+        raise RunError(
+            f"{run.path}: made from {1 + len(known.appended)} logs, {known.title}; "
+            f"{len(logs)} given, want all of them in this order"
+        )
+    first, *others = (str(log.resolve()) for log in logs)
+    appended = tuple(
+        log.model_copy(update={"path": path}) for log, path in zip(known.appended, others, strict=True)
+    )
+    moved = known.model_copy(update={"path": first, "appended": appended})
+    return replace(run, manifest=run.manifest.model_copy(update={"input": moved}))
 
 
 def open_log(run: Run) -> FrameSource:
-    """Return the log that a run was built from, with the same frames selected.
+    """Return the log that a run was built from, with the same frames selected and all that was appended.
 
     Raises:
         RunError: It is no longer there, or is not what it was.
         SourceError: It cannot be opened.
     """
-    path = Path(run.manifest.input.path)
-    if not path.exists():
-        raise RunError(f"{path}: the log of {run.path} is no longer there; tell its new place with --log")
-    source = open_source(path, run.config.source)
-    refuse_another_log(run, source.path)
+    source = _open(run, run.manifest.input, run.config.source)
+    for log in run.manifest.input.appended:
+        source = chained(source, _open(run, log, log.source), shift_ns=log.shift_ns)
+    refuse_another_log(run, source)
     return source
 
 
-def refuse_another_log(run: Run, log: Path) -> None:
+def _open(run: Run, log: Log, config: SourceConfig) -> FrameSource:
+    path = Path(log.path)
+    if not path.exists():
+        raise RunError(f"{path}: the log of {run.path} is no longer there; tell its new place with --log")
+    return open_source(path, config)
+
+
+def refuse_another_log(run: Run, source: FrameSource) -> None:
     """Refuse a log that is not the one that a run was built from.
 
     Raises:
-        RunError: Its fingerprint differs.
+        RunError: Its fingerprint differs, or that of a log that was appended.
     """
-    if fingerprint(log) != run.manifest.input.fingerprint:
-        raise RunError(f"{log}: changed since {run.path} was built from it; build it again")
+    logs = (run.manifest.input, *run.manifest.input.appended)
+    for path, log in zip_longest(paths_of(source), logs):
+        if path is None or log is None:
+            raise RunError(
+                f"{source.path}: {run.path} was made from {len(logs)} logs; open them with open_log"
+            )
+        if fingerprint(path) != log.fingerprint:
+            raise RunError(f"{path}: changed since {run.path} was built from it; build it again")
+
+
+def paths_of(source: FrameSource) -> list[Path]:
+    """Return where the logs are that a source is made of."""
+    return [session.log.path for session in sessions_of(source)]
 
 
 class Draft:
@@ -191,14 +234,28 @@ def first_manifest(source: FrameSource) -> Manifest:
     return Manifest(
         status="building",
         libraries=library_versions(),
-        input=Input(
-            path=str(source.path.resolve()),
-            kind=source.kind,
-            fingerprint=fingerprint(source.path),
-            notes=tuple(source.notes),
-        ),
+        input=Input(**_facts(source)),
         timing=Timing(started=now_text()),
     )
+
+
+def appended_log(session: Session, config: SourceConfig) -> AppendedLog:
+    """Return what the manifest says of a log that was appended."""
+    return AppendedLog(
+        **_facts(session.log),
+        source=config,
+        shift_ns=session.shift_ns,
+        begins_ns=int(session.stamps_ns[0]),
+    )
+
+
+def _facts(source: FrameSource) -> dict[str, Any]:
+    return {
+        "path": str(source.path.resolve()),
+        "kind": source.kind,
+        "fingerprint": fingerprint(source.path),
+        "notes": tuple(source.notes),
+    }
 
 
 def _ending(folder: Path) -> str:

@@ -1,0 +1,150 @@
+"""Several logs as one, in the order in which they were mapped: sessions of one place."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from mapper.frames import Frame, Scan
+from mapper.sources.base import Accelerations, Entry, FrameSource, ImageFiles
+from mapper.timebase import NS_PER_S, Stamps
+from mapper.trajectory import Trajectory
+
+_PAUSE_NS = NS_PER_S
+"""Between one log and the next, where their own stamps do not tell which came first."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Session:
+    """A log and where it lies on the common clock.
+
+    Attributes:
+        log: The log, on its own clock.
+        shift_ns: What its stamps are raised by.
+        stamps_ns: (N,) its frames on the common clock.
+    """
+
+    log: FrameSource
+    shift_ns: int
+    stamps_ns: Stamps
+
+    def entries(self) -> Iterator[Entry]:
+        """Yield every frame's entry on the common clock."""
+        if not self.shift_ns:
+            return self.log.entries()
+        return (_Shifted(entry, self.shift_ns) for entry in self.log.entries())
+
+
+@dataclass(slots=True, eq=False)
+class ChainedLog:
+    """Sessions one after the other; see :class:`mapper.sources.base.FrameSource`.
+
+    There are no accelerations: two logs' readings may be in different axes.
+    """
+
+    sessions: Sequence[Session]
+    path: Path
+    name: str
+    kind: str
+    truth: Trajectory | None
+    notes: Sequence[str]
+    accelerations: Accelerations | None = None
+
+    def __len__(self) -> int:
+        return sum(len(session.stamps_ns) for session in self.sessions)
+
+    def entries(self) -> Iterator[Entry]:
+        """Yield every frame's entry, session by session."""
+        for session in self.sessions:
+            yield from session.entries()
+
+
+@dataclass(frozen=True, slots=True)
+class _Shifted:
+    """An entry on another clock."""
+
+    entry: Entry
+    shift_ns: int
+
+    @property
+    def stamp_ns(self) -> int:
+        return self.entry.stamp_ns + self.shift_ns
+
+    @property
+    def files(self) -> ImageFiles | None:
+        files = self.entry.files
+        return files and replace(files, depth_stamp_ns=files.depth_stamp_ns + self.shift_ns)
+
+    def load(self, *, colour: bool = True) -> Frame:
+        return replace(self.entry.load(colour=colour), stamp_ns=self.stamp_ns)
+
+    def scan(self) -> Scan:
+        return replace(self.entry.scan(), stamp_ns=self.stamp_ns)
+
+
+def chained(first: FrameSource, second: FrameSource, *, shift_ns: int | None = None) -> ChainedLog:
+    """Return a log followed by another.
+
+    Args:
+        first: A log, or several chained ones.
+        second: The log that comes after.
+        shift_ns: What its stamps are raised by. None leaves them as they are if they come after the first
+            log's, and otherwise lets it begin one second after the first log's end.
+    """
+    before = sessions_of(first)
+    end_ns, stamps_ns = int(before[-1].stamps_ns[-1]), _stamps(second)
+    begin_ns = int(stamps_ns[0])
+    if shift_ns is None:
+        shift_ns = 0 if begin_ns > end_ns else end_ns + _PAUSE_NS - begin_ns
+    sessions = [*before, Session(second, shift_ns, stamps_ns + shift_ns)]
+    truth, told = _truth(sessions)
+    notes = [f"{session.log.name}: {note}" for session in sessions for note in session.log.notes]
+    if shift_ns:
+        notes.append(
+            f"{second.name}: {shift_ns / NS_PER_S:+.3f} s on every stamp, so that it follows {first.name}"
+        )
+    return ChainedLog(
+        sessions=sessions,
+        path=first.path,
+        name=" + ".join(session.log.name for session in sessions),
+        kind=" + ".join(dict.fromkeys(session.log.kind for session in sessions)),
+        truth=truth,
+        notes=[*notes, *told],
+    )
+
+
+def sessions_of(source: FrameSource) -> Sequence[Session]:
+    """Return the logs that a source is made of: itself, unless it is chained."""
+    if isinstance(source, ChainedLog):
+        return source.sessions
+    return [Session(source, 0, _stamps(source))]
+
+
+def _stamps(source: FrameSource) -> Stamps:
+    return np.array([entry.stamp_ns for entry in source.entries()], dtype=np.int64)
+
+
+def _truth(sessions: Sequence[Session]) -> tuple[Trajectory | None, list[str]]:
+    """Return the truths one after the other, each until half way to the next session's first frame."""
+    ends_ns = [
+        (int(before.stamps_ns[-1]) + int(after.stamps_ns[0])) // 2 for before, after in pairwise(sessions)
+    ]
+    limits_ns = [np.iinfo(np.int64).min, *ends_ns, np.iinfo(np.int64).max]
+    told, untold, parts = [], [], []
+    for session, (begin_ns, end_ns) in zip(sessions, pairwise(limits_ns), strict=True):
+        truth = session.log.truth
+        if truth is None:
+            untold.append(session.log.name)
+            continue
+        told.append(session.log.name)
+        stamps_ns = truth.stamps_ns + session.shift_ns
+        inside = (stamps_ns > begin_ns) & (stamps_ns <= end_ns)
+        parts.append((stamps_ns[inside], truth.T_world_body[inside]))
+    if not told:
+        return None, []
+    joined = Trajectory(*map(np.concatenate, zip(*parts, strict=True)))
+    if untold:
+        return joined, [f"ground truth of {' and '.join(told)} only"]
+    return joined, [f"the ground truths of {' and '.join(told)} are taken to be in one world"]
