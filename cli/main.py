@@ -14,6 +14,7 @@ from cli.environment import prepare_environment
 from cli.evaluate import evaluate
 from cli.export import export
 from cli.fuse import fuse
+from cli.loops import WithPairs, loops
 from cli.plan import WithPoints, plan
 from cli.show_config import show_config
 from cli.synth import synth
@@ -59,6 +60,7 @@ app = typer.Typer(
 )
 app.command("build")(build)
 app.command("fuse")(fuse)
+app.command("loops", cls=WithPairs)(loops)
 app.command("eval")(evaluate)
 app.command("export")(export)
 app.command("plan", cls=WithPoints)(plan)

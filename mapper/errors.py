@@ -32,6 +32,10 @@ class GraphError(MapperError):
     """A pose graph that is inconsistent or cannot be solved."""
 
 
+class LoopError(MapperError):
+    """A loop that cannot be added or removed, or two sessions that no loop ties."""
+
+
 class MapSizeError(MapperError):
     """A map or a scan that would not fit into memory, refused before it is allocated."""
 

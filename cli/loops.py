@@ -1,0 +1,114 @@
+"""``mapper loops``: a run's loop closures listed, added and removed by hand."""
+
+from collections.abc import Sequence
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperCommand
+
+from cli.console import progress_for
+from cli.environment import prepare_libraries
+from cli.options import MovedLogs, Quiet
+
+if TYPE_CHECKING:
+    from mapper.loops.closure import Discrepancy, LoopClosure
+
+_COLUMNS = ("i", "j", "by", "similar", "matches", "inliers", "before", "after", "weight", "verdict")
+_PAIR_OPTIONS = ("--add", "--remove")
+
+
+class WithPairs(TyperCommand):
+    """Lets ``--add`` and ``--remove`` take two numbers each, as often as they are given."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Join the two words that follow each of these options to one."""
+        words = iter(args)
+        joined = [f"{word}={' '.join(islice(words, 2))}" if word in _PAIR_OPTIONS else word for word in words]
+        return list(super().parse_args(ctx, joined))
+
+
+def loops(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder that a build left.")],
+    list_: Annotated[
+        bool, typer.Option("--list", help="Print every candidate; done when nothing else is asked.")
+    ] = False,
+    accepted: Annotated[bool, typer.Option("--accepted", help="Print only those that hold.")] = False,
+    add: Annotated[
+        list[str] | None, typer.Option(metavar="I J", help="Tie two nodes that show one place.")
+    ] = None,
+    remove: Annotated[list[str] | None, typer.Option(metavar="I J", help="Take a loop back.")] = None,
+    log: MovedLogs = None,
+    quiet: Quiet = False,
+) -> None:
+    """List a run's loop candidates, or add and remove loops by hand: solved and fused again, not tracked.
+
+    Example: mapper loops runs/xyz, or: mapper loops runs/xyz --add 3 71 --remove 17 40
+    """
+    from mapper.run import load_run, moved_log, open_log
+
+    built = load_run(run)
+    if add or remove:
+        from cli.summary import summary_text
+        from evaluators.evaluate import evaluate
+        from mapper.loops_by_hand import edit_loops
+
+        prepare_libraries()
+        if log:
+            built = moved_log(built, *log)
+        built = edit_loops(
+            open_log(built),
+            built,
+            add=[_pair("--add", text) for text in add or ()],
+            remove=[_pair("--remove", text) for text in remove or ()],
+            progress=progress_for(quiet=quiet),
+        )
+        if not quiet:
+            print(summary_text(built, evaluate(built.trajectory(), built.truth())))
+    if list_ or accepted or not (add or remove):
+        shown = [loop for loop in built.loops() if loop.verdict == "accepted" or not accepted]
+        print(loops_text(shown))
+
+
+def loops_text(closures: "Sequence[LoopClosure]") -> str:
+    """Return a table, a line per candidate; a rejected one says why."""
+    rows = [_COLUMNS, *(_cells(closure) for closure in closures)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_COLUMNS) - 1)]
+    lines = [
+        "  ".join([*(f"{cell:>{width}}" for cell, width in zip(row[:-1], widths, strict=True)), row[-1]])
+        for row in rows
+    ]
+    held = sum(closure.verdict == "accepted" for closure in closures)
+    return "\n".join([*lines, f"{held} of {len(closures)} hold"])
+
+
+def _cells(closure: "LoopClosure") -> tuple[str, ...]:
+    return (
+        str(closure.i),
+        str(closure.j),
+        closure.proposed_by,
+        "" if closure.similarity is None else f"{closure.similarity:.2f}",
+        str(closure.matches),
+        str(closure.inliers),
+        _miss_text(closure.before),
+        _miss_text(closure.after),
+        "" if closure.weight is None else f"{closure.weight:.2f}",
+        closure.reason or closure.verdict,
+    )
+
+
+def _miss_text(miss: "Discrepancy | None") -> str:
+    from math import degrees
+
+    return "" if miss is None else f"{miss.translation_m:.3f} m {degrees(miss.rotation_rad):.2f}°"
+
+
+def _pair(option: str, text: str) -> tuple[int, int]:
+    from mapper.errors import ConfigError
+
+    try:
+        i, j = (int(word) for word in text.split())
+    except ValueError:
+        raise ConfigError(f"{option} {text}: want two nodes' numbers; mapper loops RUN lists them") from None
+    return i, j

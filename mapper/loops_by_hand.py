@@ -1,0 +1,122 @@
+"""Loops that a user adds to a finished run or takes from it: solved and fused again, but not tracked."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from mapper.config import BuildConfig
+from mapper.config.loops import NoLoopsConfig, VerificationConfig
+from mapper.errors import ConfigError, LoopError
+from mapper.graph.chain import by_odometry
+from mapper.graph.model import PoseGraph
+from mapper.loops.closer import measured
+from mapper.loops.closure import LoopClosure
+from mapper.loops.proposals import Proposal
+from mapper.loops.verification import Verifier
+from mapper.pipeline import fuse_changed
+from mapper.progress import SILENT, Progress
+from mapper.run import Run
+from mapper.solving import solve
+from mapper.sources.base import FrameSource
+from mapper.tracked import tracked_before
+from mapper.views_again import views_again
+
+Pair = tuple[int, int]
+"""Two nodes."""
+
+_REMOVED = "hand: removed"
+
+
+def edit_loops(
+    source: FrameSource,
+    run: Run,
+    *,
+    add: Sequence[Pair] = (),
+    remove: Sequence[Pair] = (),
+    progress: Progress = SILENT,
+) -> Run:
+    """Add and remove loops, solve once, fuse what has moved; the run stays as it is unless all of it works.
+
+    A hand's word replaces the proposal, the gate and the agreement of others, but not the measurement: the
+    two frames are compared as every candidate is. The solve starts from odometry alone, so the outcome does
+    not depend on the order of edits.
+
+    Args:
+        source: The log that the run was built from.
+        run: A finished run.
+        add: Pairs of nodes that show one place.
+        remove: Loops that do not.
+        progress: Who watches.
+
+    Raises:
+        ConfigError: The run's configuration does not solve its graph.
+        LoopError: A node is unknown, a loop is there already or is not, two frames do not show one place, or
+            the solver does not believe a loop that was added.
+    """
+    if run.config.graph.solve == "none":
+        raise ConfigError(f"{run.path}: built with graph.solve=none, so loops change nothing; build it again")
+    tracked = tracked_before(run)
+    graph, loops = tracked.graph, list(tracked.loops)
+    for pair in remove:
+        place = _held(loops, pair)
+        if place is None:
+            raise LoopError(f"loop {_text(pair)}: no loop of {run.path} to remove; mapper loops lists them")
+        loops[place] = replace(loops[place], verdict="rejected", reason=_REMOVED)
+    pairs = [_in_time_order(graph, pair) for pair in add]
+    for pair in pairs:
+        if _held(loops, pair) is not None or pairs.count(pair) > 1:
+            raise LoopError(f"loop {_text(pair)}: there already")
+    if pairs:
+        found = _measured(source, graph, pairs, run.config)
+        loops = [loop for loop in loops if (loop.i, loop.j) not in pairs] + found
+    known = [factor for factor in graph.factors if factor.origin != "loop"]
+    held = [loop.factor for loop in loops if loop.verdict == "accepted"]
+    edited = PoseGraph(by_odometry(graph), graph.stamps_ns, [*known, *held])
+    solved = solve(edited, loops, run.config.graph)
+    for loop in solved.loops[len(loops) - len(pairs) :]:
+        _refuse_rejected(loop)
+    return fuse_changed(source, run, tracked.solved(solved), solve=solved.report, progress=progress)
+
+
+def _held(loops: Sequence[LoopClosure], pair: Pair) -> int | None:
+    """Return where the accepted loop between two nodes stands, either way round."""
+    for place, loop in enumerate(loops):
+        if loop.verdict == "accepted" and {loop.i, loop.j} == set(pair):
+            return place
+    return None
+
+
+def _in_time_order(graph: PoseGraph, pair: Pair) -> Pair:
+    for node in pair:
+        if node not in graph.T_world_node:
+            last = max(graph.T_world_node)
+            raise LoopError(f"loop {_text(pair)}: no node {node}; the graph's nodes are 0 … {last}")
+    if pair[0] == pair[1]:
+        raise LoopError(f"loop {_text(pair)}: a node cannot be tied to itself")
+    i, j = sorted(pair, key=graph.stamps_ns.__getitem__)
+    return i, j
+
+
+def _measured(
+    source: FrameSource, graph: PoseGraph, pairs: Sequence[Pair], config: BuildConfig
+) -> list[LoopClosure]:
+    verifier = Verifier(_verification(config))
+    views = views_again(source, {graph.stamps_ns[node] for pair in pairs for node in pair}, config)
+    loops = []
+    for i, j in pairs:
+        view_i, view_j = (views[graph.stamps_ns[node]] for node in (i, j))
+        loops.append(measured(Proposal(i, "hand"), j, view_i, view_j, verifier))
+        _refuse_rejected(loops[-1])
+    return loops
+
+
+def _verification(config: BuildConfig) -> VerificationConfig:
+    return VerificationConfig() if isinstance(config.loops, NoLoopsConfig) else config.loops.verification
+
+
+def _refuse_rejected(loop: LoopClosure) -> None:
+    if loop.verdict == "rejected":
+        raise LoopError(f"loop {_text((loop.i, loop.j))}: not added; {loop.reason}")
+
+
+def _text(pair: Pair) -> str:
+    return f"{pair[0]} → {pair[1]}"
