@@ -54,7 +54,7 @@ def test_recovers_a_perturbed_loop():
         np.testing.assert_allclose(solution.T_world_node[node], T, atol=1e-7)
     assert solution.error_before > 10.0
     assert solution.error_after < 1e-9
-    assert solution.iterations >= 2
+    assert solution.iterations >= 1
     assert len(solution.factor_errors) == len(graph.factors)
 
 

@@ -22,6 +22,9 @@ class GraphConfig(Config):
     robust_width: PositiveFloat = 4.1
     """Residual, in sigmas of all six directions together, from which a loop counts less ("gnc": not at
     all). 99 % of honest measurements lie within 4.1."""
+    initial: Literal["auto", "given", "chordal"] = "auto"
+    """Where the batch solve begins: at the "given" estimates, at a "chordal" relaxation that needs none, or
+    "auto": at the relaxation where the estimates fit badly, nothing is in doubt, and it serves better."""
     max_iterations: PositiveInt = 100
     relative_error: PositiveFloat = 1e-8
     """Stop when an iteration improves the error by less than this share."""

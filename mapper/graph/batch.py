@@ -1,15 +1,17 @@
-"""A least-squares problem in GTSAM's words, and the Levenberg–Marquardt run that solves it."""
+"""A least-squares problem in GTSAM's words, and the descent that solves it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mapper.errors import GraphError
+from mapper.graph.model import BetweenFactor
+from mapper.progress import Report
 
 if TYPE_CHECKING:
     import gtsam
@@ -20,10 +22,32 @@ _ABSOLUTE_ERROR = 1e-10
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """When to stop: after so many iterations, or when one improves the error by less than this share."""
+    """When to stop: after so many iterations, or when one improves the error by less than this share.
+
+    Attributes:
+        report: Told the iterations done, and how many there may be.
+    """
 
     max_iterations: int
     relative_error: float
+    report: Report = lambda _done, _total: None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """One connected part of a pose graph.
+
+    Attributes:
+        known: Its factors that are believed.
+        loops: Its factors in doubt.
+        held: GTSAM's terms of ``known``, and the anchor.
+        start: Where the solver begins.
+    """
+
+    known: Sequence[BetweenFactor]
+    loops: Sequence[BetweenFactor]
+    held: Sequence[gtsam.NonlinearFactor]
+    start: gtsam.Values
 
 
 def solve(
@@ -33,7 +57,10 @@ def solve(
     *,
     effort: Effort,
 ) -> tuple[gtsam.Values, int]:
-    """Minimise the sum of all terms by Levenberg–Marquardt (Marquardt 1963).
+    """Minimise the sum of all terms.
+
+    Gauss–Newton as long as every step improves, for its steps take half the time; where one does not,
+    Levenberg–Marquardt (Marquardt 1963) from there.
 
     Returns:
         The solution and the iterations it took.
@@ -46,18 +73,45 @@ def solve(
     problem = gtsam.NonlinearFactorGraph()
     for term in chain(terms, more_terms):
         problem.add(term)
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(effort.max_iterations)
-    parameters.setRelativeErrorTol(effort.relative_error)
-    parameters.setAbsoluteErrorTol(_ABSOLUTE_ERROR)
     where = f"the graph of {start.size()} nodes from node {min(start.keys())}"
     try:
-        optimizer = gtsam.LevenbergMarquardtOptimizer(problem, start, parameters)
-        solved = optimizer.optimize()
+        try:
+            quick = _descend(gtsam.GaussNewtonOptimizer(problem, start), effort)
+        except RuntimeError:  # some step is not determined without damping
+            quick = _Descent(start, 0, rose=True)
+        if not quick.rose:
+            return quick.values, quick.iterations
+        parameters = gtsam.LevenbergMarquardtParams()
+        damped = _descend(gtsam.LevenbergMarquardtOptimizer(problem, quick.values, parameters), effort)
     except RuntimeError as error:  # how GTSAM's C++ exceptions arrive, several lines long
         reason = " ".join(str(error).split())
         raise GraphError(f"{where} cannot be solved: {reason}") from None
-    cost = optimizer.error()
-    if not np.isfinite(cost):
-        raise GraphError(f"{where} cannot be solved: its error became {cost}; look for absurd information")
-    return solved, optimizer.iterations()
+    if damped.rose:
+        raise GraphError(f"{where} cannot be solved: its error is not finite; look for absurd information")
+    return damped.values, quick.iterations + damped.iterations
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Descent:
+    """Where steps led; ``rose`` if the last one, not taken, led up or to infinity."""
+
+    values: gtsam.Values
+    iterations: int
+    rose: bool
+
+
+def _descend(optimizer: Any, effort: Effort) -> _Descent:
+    import gtsam
+
+    # The optimizer lends out its values, and replaces them with its next step.
+    values, error = gtsam.Values(optimizer.values()), optimizer.error()
+    for iteration in range(1, effort.max_iterations + 1):
+        optimizer.iterate()
+        improved = optimizer.error()
+        effort.report(iteration, effort.max_iterations)
+        if not improved <= error * (1.0 + effort.relative_error) + _ABSOLUTE_ERROR:
+            return _Descent(values, iteration, rose=True)
+        values, gain, error = gtsam.Values(optimizer.values()), error - improved, improved
+        if gain <= max(_ABSOLUTE_ERROR, effort.relative_error * (error + gain)):
+            return _Descent(values, iteration, rose=not np.isfinite(error))
+    return _Descent(values, effort.max_iterations, rose=False)

@@ -1,6 +1,7 @@
 """Solve a pose graph: each connected component on its own, loops as far as they can be believed."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -8,16 +9,19 @@ import numpy as np
 from mapper.config.graph import GraphConfig
 from mapper.errors import GraphError
 from mapper.geometry import Transform, is_rigid
+from mapper.graph.batch import Part
+from mapper.graph.chordal import start_of
 from mapper.graph.model import PoseGraph, Solution
 from mapper.graph.proportional import distribute
-from mapper.graph.robust import Part, solve_part
+from mapper.graph.robust import solve_part
 from mapper.graph.terms import anchor, between, poses_of, values_of
+from mapper.progress import SILENT, Progress
 
 if TYPE_CHECKING:
     import gtsam
 
 
-def optimize(graph: PoseGraph, config: GraphConfig) -> Solution:
+def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILENT) -> Solution:
     """Return the poses that explain the factors best.
 
     Levenberg–Marquardt (Marquardt 1963) on ½ Σ w ‖log(T_i_j⁻¹ · T_i⁻¹ · T_j)‖², each in its factor's metric;
@@ -30,6 +34,7 @@ def optimize(graph: PoseGraph, config: GraphConfig) -> Solution:
     Args:
         graph: At least one node; it is not changed.
         config: Which solve, and when to stop.
+        progress: Told the iterations of each component, and how many there may be.
 
     Returns:
         The poses of every node in the graph's order; ``iterations`` sums over the components.
@@ -58,7 +63,9 @@ def optimize(graph: PoseGraph, config: GraphConfig) -> Solution:
                     held=[*(terms[k] for k in known), anchor(nodes[0], graph.T_world_node[nodes[0]])],
                     start=values_of(graph.T_world_node, nodes),
                 )
-                solved, believed, more = solve_part(part, config)
+                part = replace(part, start=start_of(part, config))
+                with progress.stage("solve") as report:
+                    solved, believed, more = solve_part(part, config, report=report)
                 T_world_node |= poses_of(solved)
                 iterations += more
                 for k, weight in zip(loops, believed, strict=True):

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mapper.config.graph import GraphConfig
 from mapper.geometry import Array
-from mapper.graph.batch import Effort, solve
+from mapper.graph.batch import Effort, Part, solve
 from mapper.graph.drift import innovations
 from mapper.graph.model import BetweenFactor
 from mapper.graph.terms import Kernel, between
+from mapper.progress import Report
 
 if TYPE_CHECKING:
     import gtsam
@@ -31,25 +31,13 @@ _DRIFT_SLACK = 3.0
 """Systematic drift grows with the way, not with its root, so long loops disagree more than short ones."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Part:
-    """One connected part of a pose graph.
-
-    Attributes:
-        known: Its factors that are believed.
-        loops: Its factors in doubt.
-        held: GTSAM's terms of ``known``, and the anchor.
-        start: Where the solver begins.
-    """
-
-    known: Sequence[BetweenFactor]
-    loops: Sequence[BetweenFactor]
-    held: Sequence[gtsam.NonlinearFactor]
-    start: gtsam.Values
-
-
-def solve_part(part: Part, config: GraphConfig) -> tuple[gtsam.Values, Array, int]:
+def solve_part(part: Part, config: GraphConfig, *, report: Report) -> tuple[gtsam.Values, Array, int]:
     """Solve a part with its loops in doubt.
+
+    Args:
+        part: What to solve.
+        config: Which kernel, and when to stop.
+        report: Told how far the last descent is.
 
     Returns:
         The solution, the weight of each loop in [0, 1], and the iterations.
@@ -57,7 +45,7 @@ def solve_part(part: Part, config: GraphConfig) -> tuple[gtsam.Values, Array, in
     Raises:
         GraphError: The solver fails.
     """
-    effort = Effort(config.max_iterations, config.relative_error)
+    effort = Effort(config.max_iterations, config.relative_error, report)
     kernel = None
     match config.robust:
         case "gnc" if part.loops:
