@@ -70,9 +70,7 @@ def solve(
     """
     import gtsam
 
-    problem = gtsam.NonlinearFactorGraph()
-    for term in chain(terms, more_terms):
-        problem.add(term)
+    problem = problem_of(chain(terms, more_terms))
     where = f"the graph of {start.size()} nodes from node {min(start.keys())}"
     try:
         try:
@@ -89,6 +87,16 @@ def solve(
     if damped.rose:
         raise GraphError(f"{where} cannot be solved: its error is not finite; look for absurd information")
     return damped.values, quick.iterations + damped.iterations
+
+
+def problem_of(terms: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
+    """Return the sum of some terms."""
+    import gtsam
+
+    problem = gtsam.NonlinearFactorGraph()
+    for term in terms:
+        problem.add(term)
+    return problem
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,7 +10,7 @@ import numpy as np
 from mapper.config.graph import GraphConfig
 from mapper.errors import GraphError
 from mapper.geometry import transform
-from mapper.graph.batch import Effort, Part, solve
+from mapper.graph.batch import Part, problem_of
 from mapper.graph.model import BetweenFactor
 from mapper.graph.terms import between, values_of
 
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 _BAD_FIT = 100.0
 """Mean χ² of a factor beyond which estimates may be a poor start: 4 σ in each of six directions."""
-_ONE_STEP = Effort(max_iterations=1, relative_error=0.0)
 
 
 def start_of(part: Part, config: GraphConfig) -> gtsam.Values:
@@ -39,14 +38,14 @@ def start_of(part: Part, config: GraphConfig) -> gtsam.Values:
     if part.loops and config.robust != "none":
         return part.start
     terms = [*part.held, *(between(loop) for loop in part.loops)]
-    if 2.0 * _error(terms, part.start) <= _BAD_FIT * len(terms):
+    if 2.0 * sum(term.error(part.start) for term in terms) <= _BAD_FIT * len(terms):
         return part.start
     try:
         relaxed = chordal_start([*part.known, *part.loops], part.start)
     except GraphError:
         return part.start
-    steps = [solve(terms, (), near, effort=_ONE_STEP)[0] for near in (part.start, relaxed)]
-    return min(steps, key=lambda values: _error(terms, values))
+    problem = problem_of(terms)
+    return min((_step(problem, near) for near in (part.start, relaxed)), key=lambda step: step[0])[1]
 
 
 def chordal_start(factors: Sequence[BetweenFactor], given: gtsam.Values) -> gtsam.Values:
@@ -67,10 +66,8 @@ def chordal_start(factors: Sequence[BetweenFactor], given: gtsam.Values) -> gtsa
 
     nodes = given.keys()
     first = given.atPose3(nodes[0])
-    problem = gtsam.NonlinearFactorGraph()
-    for factor in factors:
-        problem.add(between(factor))
-    problem.add(gtsam.PriorFactorPose3(nodes[0], first, gtsam.noiseModel.Unit.Create(6)))
+    held = gtsam.PriorFactorPose3(nodes[0], first, gtsam.noiseModel.Unit.Create(6))
+    problem = problem_of((held, *(between(factor) for factor in factors)))
     try:
         rotations = gtsam.InitializePose3.computeOrientationsChordal(
             gtsam.InitializePose3.buildPose3graph(problem)
@@ -89,5 +86,13 @@ def chordal_start(factors: Sequence[BetweenFactor], given: gtsam.Values) -> gtsa
     return values_of(poses, nodes)
 
 
-def _error(terms: Sequence[gtsam.NonlinearFactor], values: gtsam.Values) -> float:
-    return sum(term.error(values) for term in terms)
+def _step(problem: gtsam.NonlinearFactorGraph, near: gtsam.Values) -> tuple[float, gtsam.Values]:
+    """Return the error after one Gauss–Newton step, infinite where there is none, and where it led."""
+    import gtsam
+
+    optimizer = gtsam.GaussNewtonOptimizer(problem, near)
+    try:
+        optimizer.iterate()
+    except RuntimeError:
+        return np.inf, near
+    return optimizer.error(), gtsam.Values(optimizer.values())
