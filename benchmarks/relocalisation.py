@@ -4,8 +4,8 @@
 
 A log turns on the spot at 1.7 to 2.1 rad/s for 12 s, with motion blur, 5 to 10 % of the frames missing and 1
 to 2 s of darkness after the first turn. "frames" counts those from the first after the darkness whose true
-pose shows a place seen before (nearer than 0.3 m and 20 degrees) to the one that is placed, 0 being that frame
-itself; "lost" leaves out the dark ones. ATE RMSE of the solved graph after SE(3) alignment.
+pose shows a place seen before (nearer than 0.3 m and 20 degrees) to the one that is placed, 0 being that one;
+"lost" leaves out the dark ones. ATE RMSE of the solved graph after SE(3) alignment.
 """
 
 import argparse
@@ -39,6 +39,7 @@ class RenderedEntry:
     """A frame that lies in memory; tracking needs no colour, so it has none."""
 
     frame: RgbdFrame
+    files: None = None
 
     @property
     def stamp_ns(self) -> int:
@@ -64,7 +65,7 @@ class RenderedSource:
         self.truth: Trajectory | None = source.truth
         self.accelerations: Accelerations | None = None
         self.notes: Sequence[str] = ()
-        self.rendered = [RenderedEntry(entry.load(colour=False)) for entry in source.entries()]
+        self.rendered: list[Entry] = [RenderedEntry(entry.load(colour=False)) for entry in source.entries()]
 
     def __len__(self) -> int:
         return len(self.rendered)
