@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from evaluators.metric import Metric
     from mapper.trajectory import Trajectory
 
 
@@ -26,7 +27,7 @@ def evaluate(
     align: Annotated[Align, typer.Option(help="How the estimate is laid over the truth.")] = Align.SE3,
     json: Annotated[bool, typer.Option("--json", help="Print JSON, every digit, angles in radians.")] = False,
 ) -> None:
-    """Print ATE and RPE as the TUM benchmark defines them, and how far a trajectory ends from its start.
+    """Print ATE and RPE as the TUM benchmark defines them, the loops that are right, and the end-to-start offset.
 
     Example: mapper eval runs/xyz --align sim3, or: mapper eval estimate.tum --truth groundtruth.txt
     """
@@ -36,7 +37,18 @@ def evaluate(
     trajectory, known = _trajectories(estimate, truth)
     names = (str(estimate), str(truth) if truth else "its truth")
     metrics = evaluate_trajectory(trajectory, known, alignment=align.value, names=names)
+    if estimate.is_dir() and known is not None:
+        metrics += _loops_of(estimate, known)
     print(json_text(metrics) if json else text_table(metrics))
+
+
+def _loops_of(path: Path, truth: "Trajectory") -> "list[Metric]":
+    from evaluators.loops import loop_metrics
+    from mapper.run import KEYFRAMES, load_run
+    from mapper.trajectory import read_tum
+
+    run = load_run(path)
+    return loop_metrics(run.loops(), read_tum(path / KEYFRAMES).stamps_ns, truth)
 
 
 def _trajectories(estimate: Path, truth: Path | None) -> "tuple[Trajectory, Trajectory | None]":

@@ -114,3 +114,12 @@ def test_any_configuration_can_be_overridden():
 )
 def test_every_shipped_configuration_is_valid(path):
     assert load_config(path) != BuildConfig()
+
+
+def test_turning_one_knob_leaves_the_others_of_its_part():
+    """Parts may default to something else than their class does, as the loops' matching does."""
+    default = load_config().loops.verification.match
+    turned = load_config(None, ["loops.verification.match.max_ratio=0.7"]).loops.verification.match
+    assert turned == default.model_copy(update={"max_ratio": 0.7})
+    fallback = load_config(None, ["odometry.kind=isvd", "odometry.fallback.homography_iterations=7"]).odometry
+    assert (fallback.fallback.filter, fallback.fallback.max_ratio) == ("none", 0.95)

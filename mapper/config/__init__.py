@@ -113,7 +113,11 @@ def _put(tree: dict[str, Any], override: str) -> None:
 
 
 def _with_kinds(tree: dict[str, Any], default: Config) -> dict[str, Any]:
-    """Return the tree with every ``kind`` it leaves out, so that a knob turns without repeating it."""
+    """Return the tree with what it leaves out and the classes' own defaults would not restore.
+
+    That is every ``kind``, and whatever a part's default says beyond its class: turning one knob of a part
+    must not turn back the others.
+    """
     filled = dict(tree)
     for name, value in tree.items():
         member = getattr(default, name, None)
@@ -123,7 +127,7 @@ def _with_kinds(tree: dict[str, Any], default: Config) -> dict[str, Any]:
             value = {"kind": _kind(type(member)), **value}
             members = get_args(type(default).model_fields[name].annotation)
             member = next((m() for m in members if _kind(m) == value["kind"]), member)
-        filled[name] = _with_kinds(value, member)
+        filled[name] = member.model_dump(include=member.model_fields_set) | _with_kinds(value, member)
     return filled
 
 

@@ -32,6 +32,8 @@ class VerificationConfig(Config):
     """A smaller share of the pairs that agrees is no loop."""
     virtual_baseline_px_m: PositiveFloat = 40.0
     """bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017)."""
+    max_sigma_m: PositiveFloat = 0.05
+    """A motion whose translation is less certain in any direction is no loop: far scenes hold it loosely."""
     measure: Literal["reprojection", "isvd"] = "reprojection"
     """Which of the two tests' motions becomes the constraint."""
 
@@ -66,12 +68,13 @@ class PlaceLoopsConfig(Config):
 
     kind: Literal["places"] = "places"
     propose: Literal["auto", "places", "nearby"] = "auto"
-    """By a bag of words, by believed pose, or "auto": by words where descriptors have 256 bits."""
+    """By a bag of words, by believed pose, or "auto": by both, or by pose alone where descriptors have no
+    words."""
     places: PlacesConfig = PlacesConfig()
     min_gap_s: PositiveFloat = 5.0
     """What was seen more recently is the odometry's to know."""
-    min_motion_m: NonNegativeFloat = 0.05
-    min_motion_rad: NonNegativeFloat = 0.05
+    min_motion_m: NonNegativeFloat = 0.02
+    min_motion_rad: NonNegativeFloat = 0.02
     """No look is taken before the camera has moved so far or turned so much since the last one."""
     max_distance_m: PositiveFloat = 1.0
     """How near is "nearby", before the drift since is added."""

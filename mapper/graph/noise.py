@@ -4,9 +4,9 @@ import numpy as np
 
 from mapper.geometry import Array, Transform, rotation_log
 
-_SHARE = 0.01
+_SHARE = 0.02
 """Of distance and angle: what calibration and depth distortion leave wrong, however many pixels agree."""
-_LEAST_M, _LEAST_RAD = 5e-4, 5e-4
+_LEAST_M, _LEAST_RAD = 1e-3, 1e-3
 
 
 def with_model_error(information: Array, T_i_j: Transform) -> Array:

@@ -4,6 +4,7 @@ from typing import Literal, Protocol
 
 from mapper.geometry import Transform
 from mapper.graph.incremental import IncrementalSolver
+from mapper.graph.model import PoseGraph
 from mapper.graph.proportional import spread
 from mapper.loops.closure import LoopClosure
 from mapper.odometry.base import Track
@@ -17,6 +18,10 @@ class Belief(Protocol):
 
     def add(self, node: int, track: Track) -> None:
         """Take in a new node, in time order."""
+        ...
+
+    def know(self, graph: PoseGraph) -> None:
+        """Take in an earlier session, solved, before anything else."""
         ...
 
     def close(self, closure: LoopClosure) -> None:
@@ -34,6 +39,14 @@ class SolvedBelief:
     def __init__(self) -> None:
         self._solver = IncrementalSolver()
         self._T_world_node: dict[int, Transform] = {}
+
+    def know(self, graph: PoseGraph) -> None:
+        """Take in an earlier session, solved, before anything else."""
+        for node, T_world_node in graph.T_world_node.items():
+            self._solver.add_node(node, T_world_node)
+        self._solver.add_factors(graph.factors)
+        self._solver.update()
+        self._T_world_node = self._solver.poses()
 
     def add(self, node: int, track: Track) -> None:
         """Take in a new node, in time order."""
@@ -57,6 +70,10 @@ class SpreadBelief:
 
     def __init__(self) -> None:
         self._T_world_node: dict[int, Transform] = {}
+
+    def know(self, graph: PoseGraph) -> None:
+        """Take in an earlier session, solved, before anything else."""
+        self._T_world_node |= graph.T_world_node
 
     def add(self, node: int, track: Track) -> None:
         """Take in a new node, in time order."""

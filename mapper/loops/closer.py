@@ -1,7 +1,7 @@
 """Looks for loops while a log is tracked, and gives every candidate its verdict."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import replace
 from statistics import median
 from typing import Protocol
@@ -9,16 +9,19 @@ from typing import Protocol
 import numpy as np
 
 from mapper.config.loops import PlaceLoopsConfig, ThesisLoopsConfig
+from mapper.errors import ConfigError
 from mapper.features.view import View
 from mapper.geometry import Transform
+from mapper.graph.model import PoseGraph
 from mapper.loops.agreement import Agreement
 from mapper.loops.belief import Correction, belief_for
 from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy
 from mapper.loops.drift import Ways, allowed, exceeds
-from mapper.loops.proposals import ByPose, ByWords, Proposal, Proposer
+from mapper.loops.proposals import ByBoth, ByPose, ByWords, Proposal, Proposer
 from mapper.loops.verification import Verifier
 from mapper.odometry.base import Track
 from mapper.odometry.keyframes import SharpestKeyframes
+from mapper.timebase import NS_PER_S
 
 ViewOf = Callable[[], View]
 
@@ -83,6 +86,36 @@ class PlaceLoops:
         self._views: dict[int, View] = {}
         self._last_looked: Transform | None = None
         self._closures: dict[tuple[int, int], LoopClosure] = {}
+        self._elsewhere: Set[int] = frozenset()
+
+    def know(self, graph: PoseGraph, views: Mapping[int, View]) -> None:
+        """Take in the places of an earlier session, before anything is added.
+
+        Where they lie from here nobody knows until a loop ties the two sessions: until then they are
+        proposed by what they look like only, and no gate holds.
+
+        Args:
+            graph: Of that session, solved.
+            views: Of its nodes, in time order.
+
+        Raises:
+            ConfigError: Places are not recognised by what they look like.
+        """
+        self._belief.know(graph)
+        self._ways.add(graph.factors)
+        self._elsewhere = graph.T_world_node.keys()
+        min_gap_ns = round(self._config.min_gap_s * NS_PER_S)
+        for node, seen in views.items():
+            if self._proposer is None:
+                self._proposer = self._proposer_for(seen)
+            if isinstance(self._proposer, ByPose):
+                raise ConfigError(
+                    "places of another session are recognised by visual words alone; "
+                    "want loops.propose=auto or places, and an ORB detector"
+                )
+            # What odometry cannot know may be proposed at once, however little time lies between.
+            self._proposer.remember(node, replace(seen, stamp_ns=seen.stamp_ns - min_gap_ns))
+            self._views[node] = seen
 
     def add(self, node: int, track: Track, view: ViewOf, /) -> None:
         """Look for loops from a new node, and remember it as a place."""
@@ -94,6 +127,8 @@ class PlaceLoops:
         if self._proposer is None:
             self._proposer = self._proposer_for(seen)
         for proposal in self._proposer.propose(node, seen, limit=self._config.max_candidates):
+            if proposal.proposed_by == "nearby" and proposal.node in self._elsewhere:
+                continue
             closure = self._judged(measured(proposal, node, self._views[proposal.node], seen, self._verifier))
             self._closures[closure.i, closure.j] = closure
             if closure.verdict == "accepted":
@@ -121,15 +156,17 @@ class PlaceLoops:
 
     def _proposer_for(self, view: View) -> Proposer:
         config = self._config
-        if config.propose == "places" or (config.propose == "auto" and view.is_orb):
-            return ByWords(config.places, min_gap_s=config.min_gap_s)
-        return ByPose(
+        by_pose = ByPose(
             self._belief,
             max_distance_m=config.max_distance_m,
             max_angle_rad=config.max_angle_rad,
             drift_ratio=config.gate.drift_ratio,
             min_gap_s=config.min_gap_s,
         )
+        if config.propose == "nearby" or (config.propose == "auto" and not view.is_orb):
+            return by_pose
+        by_words = ByWords(config.places, min_gap_s=config.min_gap_s)
+        return by_words if config.propose == "places" else ByBoth(by_words, by_pose)
 
     def _judged(self, closure: LoopClosure) -> LoopClosure:
         """Reject a measurement that the odometry cannot have drifted by."""
@@ -153,6 +190,8 @@ class PlaceLoops:
             self._closures[ripe.i, ripe.j] = ripe
             self._belief.close(ripe)
             self._ways.add([ripe.factor])
+            if ripe.i in self._elsewhere:
+                self._elsewhere = frozenset()
 
 
 class ThesisLoops:

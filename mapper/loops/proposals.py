@@ -105,34 +105,58 @@ class ByPose:
         """
         self._belief = belief
         self._max_distance_m = max_distance_m
-        self._min_cosine = float(np.cos(max_angle_rad))
+        self._max_angle_rad = max_angle_rad
         self._drift_ratio = drift_ratio
         self._min_gap_ns = round(min_gap_s * NS_PER_S)
-        self._places: list[tuple[int, Transform]] = []
+        self._nodes: list[int] = []
+        self._T_body_camera: list[Transform] = []
         self._stamps_ns: list[int] = []
         self._travelled_m: list[float] = []
 
     def propose(self, node: int, view: View, /, *, limit: int) -> list[Proposal]:
-        """Return the nearest places, the nearest first."""
+        """Return the nearest places, the nearest first: metres and radians count alike."""
         old = bisect_right(self._stamps_ns, view.stamp_ns - self._min_gap_ns)
         if old == 0:
             return []
         T_world_here = self._belief.pose_of(node) @ view.T_body_camera
-        T_world_place = np.array([self._belief.pose_of(n) @ T for n, T in self._places[:old]])
+        T_world_body = np.array([self._belief.pose_of(place) for place in self._nodes[:old]])
+        T_world_place = T_world_body @ np.array(self._T_body_camera[:old])
         distance_m = np.linalg.norm(T_world_place[:, :3, 3] - T_world_here[:3, 3], axis=1)
         since_m = self._travelled_m[-1] - np.array(self._travelled_m[:old])
         near = distance_m <= self._max_distance_m + self._drift_ratio * since_m
-        same_way = T_world_place[:, :3, 2] @ T_world_here[:3, 2] >= self._min_cosine
-        candidates = np.flatnonzero(near & same_way)
-        nearest = candidates[np.argsort(distance_m[candidates], kind="stable")[:limit]]
-        return [Proposal(self._places[k][0], "nearby") for k in nearest.tolist()]
+        angle_rad = np.arccos(np.clip(T_world_place[:, :3, 2] @ T_world_here[:3, 2], -1.0, 1.0))
+        candidates = np.flatnonzero(near & (angle_rad <= self._max_angle_rad))
+        apart = distance_m[candidates] + angle_rad[candidates]
+        nearest = candidates[np.argsort(apart, kind="stable")[:limit]]
+        return [Proposal(self._nodes[k], "nearby") for k in nearest.tolist()]
 
     def remember(self, node: int, view: View) -> None:
         """Take a place in."""
         travelled_m = 0.0
-        if self._places:
-            step = self._belief.pose_of(node)[:3, 3] - self._belief.pose_of(self._places[-1][0])[:3, 3]
+        if self._nodes:
+            step = self._belief.pose_of(node)[:3, 3] - self._belief.pose_of(self._nodes[-1])[:3, 3]
             travelled_m = self._travelled_m[-1] + float(np.linalg.norm(step))
-        self._places.append((node, view.T_body_camera))
+        self._nodes.append(node)
+        self._T_body_camera.append(view.T_body_camera)
         self._stamps_ns.append(view.stamp_ns)
         self._travelled_m.append(travelled_m)
+
+
+class ByBoth:
+    """Proposes by words and, where those leave room, by pose."""
+
+    def __init__(self, words: ByWords, pose: ByPose) -> None:
+        self._proposers = (words, pose)
+
+    def propose(self, node: int, view: View, /, *, limit: int) -> list[Proposal]:
+        """Return what looks alike, then what is believed to be near."""
+        proposals: dict[int, Proposal] = {}
+        for proposer in self._proposers:
+            for proposal in proposer.propose(node, view, limit=limit):
+                proposals.setdefault(proposal.node, proposal)
+        return list(proposals.values())[:limit]
+
+    def remember(self, node: int, view: View) -> None:
+        """Take a place in."""
+        for proposer in self._proposers:
+            proposer.remember(node, view)

@@ -11,12 +11,14 @@ from mapper.features.view import View
 from mapper.features.windowed import match_everywhere
 from mapper.geometry import Array, Transform, adjoint, apply, inverse
 from mapper.graph.noise import with_model_error
+from mapper.odometry.local_map.p3p import ransac_p3p
 from mapper.odometry.local_map.pose import normal_matrix, refine_pose
 from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
 
 _LM_ROUNDS, _LM_ITERATIONS = 4, 10
 _MAX_HAMMING = 64
+_P3P_PAIRS, _P3P_TOLERANCE_PX, _P3P_ITERATIONS = 4, 4.0, 300
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,13 +63,30 @@ class Verifier:
         matches = len(pairs)
         if matches < config.min_matches:
             return Verification(matches, f"matching: {matches} pairs, want {config.min_matches}")
-        with_depth = i.has_depth(max_depth_m=config.max_depth_m)[pairs[:, 0]]
-        pairs = pairs[with_depth]
-        both = pairs[j.has_depth(max_depth_m=config.max_depth_m)[pairs[:, 1]]]
-        alignment = self._isvd.fit(i.points_camera[both[:, 0]], j.points_camera[both[:, 1]])
+        pairs = pairs[i.has_depth(max_depth_m=config.max_depth_m)[pairs[:, 0]]]
+        alignment = self._align(i, j, pairs)
+        if not alignment.converged:
+            alignment = self._align(i, j, self._consensus(i, j, pairs))
         if not alignment.converged:
             return Verification(matches, f"isvd: {alignment.reason}")
         return self._reproject(i, j, pairs, alignment, matches=matches)
+
+    def _align(self, i: View, j: View, pairs: Pairs) -> Alignment:
+        both = pairs[j.has_depth(max_depth_m=self._config.max_depth_m)[pairs[:, 1]]]
+        return self._isvd.fit(i.points_camera[both[:, 0]], j.points_camera[both[:, 1]])
+
+    def _consensus(self, i: View, j: View, pairs: Pairs) -> Pairs:
+        """Return the pairs that P3P finds to agree: ISVD begins with all, and drowns when most are wrong."""
+        if len(pairs) < _P3P_PAIRS:
+            return pairs[:0]
+        found = ransac_p3p(
+            i.points_camera[pairs[:, 0]],
+            j.pixels[pairs[:, 1]],
+            j.intrinsics,
+            tolerance_px=_P3P_TOLERANCE_PX,
+            iterations=_P3P_ITERATIONS,
+        )
+        return pairs[:0] if found is None else pairs[found[1]]
 
     def _pairs(self, i: View, j: View) -> Pairs:
         match = self._config.match
@@ -122,15 +141,13 @@ class Verifier:
         assert information is not None  # ISVD converged
         to_camera = adjoint(inverse(j.T_body_camera))
         T_i_j = i.T_body_camera @ T_ci_cj @ inverse(j.T_body_camera)
-        return Verification(
-            matches,
-            "",
-            inliers,
-            alignment.inlier_rmse_m,
-            float(np.sqrt((miss_px**2).sum(axis=1).mean())),
-            T_i_j,
-            with_model_error(to_camera.T @ information @ to_camera, T_i_j),
-        )
+        information = with_model_error(to_camera.T @ information @ to_camera, T_i_j)
+        residual_px = float(np.sqrt((miss_px**2).sum(axis=1).mean()))
+        sigma_m = float(np.linalg.eigvalsh(np.linalg.inv(information)[3:, 3:])[-1] ** 0.5)
+        if sigma_m > config.max_sigma_m:
+            reason = f"loose: translation known to {sigma_m:.2f} m, want {config.max_sigma_m} m"
+            return Verification(matches, reason, inliers, alignment.inlier_rmse_m, residual_px)
+        return Verification(matches, "", inliers, alignment.inlier_rmse_m, residual_px, T_i_j, information)
 
 
 def _measurements(view: View, features: NDArray[np.intp], bf: float) -> tuple[Array, Array, Array]:

@@ -1,0 +1,80 @@
+"""Precision and recall of loop closures against the truth."""
+
+import numpy as np
+import pytest
+
+from evaluators.loops import loop_metrics, revisits_of
+from mapper.geometry import exp
+from mapper.loops.closure import LoopClosure
+from mapper.timebase import NS_PER_S
+from mapper.trajectory import Trajectory
+
+
+def pose(x: float, yaw: float = 0.0) -> np.ndarray:
+    T = exp(np.array([0.0, 0.0, yaw]), np.zeros(3))
+    T[0, 3] = x
+    return T
+
+
+@pytest.fixture
+def truth() -> Trajectory:
+    """Ten seconds out along x at 0.5 m/s and ten seconds back, a pose a second."""
+    x = [0.5 * (k if k <= 10 else 20 - k) for k in range(21)]
+    stamps_ns = np.arange(21) * NS_PER_S
+    return Trajectory(stamps_ns, np.array([pose(value) for value in x]))
+
+
+def closure(i: int, j: int, x: float, *, verdict: str = "accepted") -> LoopClosure:
+    return LoopClosure(
+        i=i,
+        j=j,
+        stamp_i_ns=i * NS_PER_S,
+        stamp_j_ns=j * NS_PER_S,
+        proposed_by="places",
+        verdict=verdict,
+        reason="" if verdict == "accepted" else "isvd: no",
+        T_i_j=pose(x),
+        information=np.eye(6),
+    )
+
+
+def values(metrics) -> dict[str, float]:
+    return {metric.name: metric.value for metric in metrics}
+
+
+def test_revisits_are_near_alike_and_long_ago(truth):
+    revisit = revisits_of(truth.stamps_ns, truth)
+    assert revisit.nonzero()[0].tolist() == list(range(12, 21))  # at 12 s as at 7 s, half a metre away
+
+
+def test_looking_the_other_way_is_no_revisit(truth):
+    T = truth.T_world_body.copy()
+    T[11:, :3, :3] = pose(0.0, np.pi)[:3, :3]
+    assert not revisits_of(truth.stamps_ns, Trajectory(truth.stamps_ns, T)).any()
+
+
+def test_a_loop_off_the_truth_is_wrong(truth):
+    told = values(loop_metrics([closure(2, 18, 0.05), closure(3, 17, 0.5)], truth.stamps_ns, truth))
+    assert told["loops"] == 2
+    assert told["loops wrongly accepted"] == 1
+
+
+def test_rejected_candidates_count_neither_way(truth):
+    told = values(loop_metrics([closure(3, 17, 0.5, verdict="rejected")], truth.stamps_ns, truth))
+    assert (told["loops"], told["loops wrongly accepted"], told["loop recall"]) == (0, 0, 0.0)
+
+
+def test_recall_is_the_share_of_revisits_with_a_loop(truth):
+    told = values(loop_metrics([closure(2, 18, 0.0), closure(1, 18, 0.5)], truth.stamps_ns, truth))
+    assert told["loop recall"] == pytest.approx(1 / told["true revisits"])
+
+
+def test_without_revisits_there_is_no_recall(truth):
+    told = values(loop_metrics([], truth.stamps_ns[:10], truth))
+    assert "loop recall" not in told
+    assert told["loops"] == 0
+
+
+def test_what_the_truth_does_not_cover_is_not_judged(truth):
+    late = truth.stamps_ns + 1000 * NS_PER_S
+    assert not revisits_of(late, truth).any()
