@@ -17,6 +17,7 @@ from cli.fuse import fuse
 from cli.loops import WithPairs, loops
 from cli.plan import WithPoints, plan
 from cli.show_config import show_config
+from cli.solve import solve
 from cli.synth import synth
 from cli.vocabulary import vocabulary
 from mapper import __version__
@@ -64,6 +65,7 @@ app.command("loops", cls=WithPairs)(loops)
 app.command("eval")(evaluate)
 app.command("export")(export)
 app.command("plan", cls=WithPoints)(plan)
+app.command("solve")(solve)
 app.command("convert")(convert)
 app.command("synth")(synth)
 app.command("demo")(demo)

@@ -1,4 +1,4 @@
-"""Pictures of a finished run: the trajectory or a path over the slice, and the cloud from two sides.
+"""Pictures of a run: the trajectory or a path over the slice, the cloud from two sides, a pose graph.
 
 Matplotlib is driven through its objects: pyplot would keep global state and pick a GUI backend.
 """
@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from mapper.atomic import replacing
 from mapper.export.grid import grid_image
-from mapper.export.palette import END, ESTIMATE, PLAN, START, TRUTH, UNKNOWN_CELL, Rgb
+from mapper.export.palette import END, ESTIMATE, FACTORS, PLAN, START, TRUTH, UNKNOWN_CELL, Rgb
 from mapper.frames import Points32
 from mapper.geometry import Array
+from mapper.graph.model import PoseGraph, Solution
 from mapper.octree.slice import FREE, OCCUPIED, OccupancyGrid
 from mapper.trajectory import Trajectory
 
@@ -30,6 +31,7 @@ _LINE = "#c3c8d0"
 _MARGIN_M = 0.3
 _HEADROOM_M = 0.3  # above the highest camera position; what lies higher would hide the rooms from above
 _VIEW_PX = 900
+_BELIEVED = 0.5  # weight from which a factor counts as held
 _TILT_RAD = np.deg2rad(32.0)
 _TURN_RAD = np.deg2rad(-35.0)
 _SWEPT_PX = 4  # pixels per cell
@@ -168,6 +170,44 @@ def _draw_view(
     axes.plot(*path[:, :2].T, color=_hex(ESTIMATE), linewidth=1.3)
     _scale_bar(axes, low, high, color="white")
     axes.set_axis_off()
+
+
+def write_graph_views(path: Path, graph: PoseGraph, solution: Solution, *, title: str) -> None:
+    """Draw a pose graph before and after it was solved, from the side on which it is widest.
+
+    Args:
+        path: PNG file to write.
+        graph: Nodes at their first estimates.
+        solution: Of that graph; factors that weigh less than half are drawn dotted.
+        title: Headline.
+    """
+    from matplotlib.collections import LineCollection
+
+    place = {node: k for k, node in enumerate(graph.T_world_node)}
+    ends = np.array([(place[factor.i], place[factor.j]) for factor in graph.factors], np.int64).reshape(-1, 2)
+    solved = np.array(list(solution.T_world_node.values()))[:, :3, 3]
+    *_, axes_world = np.linalg.svd(solved - solved.mean(axis=0), full_matrices=False)
+    figure = _figure(13.0, 6.9)
+    figure.text(0.03, 0.955, title, fontsize=14, fontweight="bold", color=_INK)
+    costs = {"before": solution.error_before, "after": solution.error_after}
+    for column, (name, cost) in enumerate(costs.items()):
+        T_world_node = graph.T_world_node if name == "before" else solution.T_world_node
+        seen = np.array(list(T_world_node.values()))[:, :3, 3] @ axes_world[:2].T
+        axes = figure.add_axes((0.02 + 0.49 * column, 0.02, 0.47, 0.86))
+        for origin, color in FACTORS.items():
+            for believed, style in ((True, "solid"), (False, "dotted")):
+                drawn = [
+                    factor.origin == origin and (weight >= _BELIEVED) == believed
+                    for factor, weight in zip(graph.factors, solution.weights, strict=True)
+                ]
+                axes.add_collection(
+                    LineCollection(seen[ends[drawn]], colors=_hex(color), linewidths=0.8, linestyles=style)
+                )
+        axes.plot(*seen.T, ".", color=_hex(ESTIMATE), markersize=1.5)
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_title(f"{name}: cost {cost:.6g}", color=_FAINT, fontsize=11)
+        axes.set_axis_off()
+    _save(figure, path)
 
 
 def splat(

@@ -25,7 +25,7 @@ class Effort:
     """When to stop: after so many iterations, or when one improves the error by less than this share.
 
     Attributes:
-        report: Told the iterations done, and how many there may be.
+        report: Told the iterations done, and how many there may be; in the end, how many there were.
     """
 
     max_iterations: int
@@ -121,5 +121,6 @@ def _descend(optimizer: Any, effort: Effort) -> _Descent:
             return _Descent(values, iteration, rose=True)
         values, gain, error = gtsam.Values(optimizer.values()), error - improved, improved
         if gain <= max(_ABSOLUTE_ERROR, effort.relative_error * (error + gain)):
+            effort.report(iteration, iteration)
             return _Descent(values, iteration, rose=not np.isfinite(error))
     return _Descent(values, effort.max_iterations, rose=False)

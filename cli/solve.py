@@ -1,0 +1,96 @@
+"""``mapper solve``: a pose graph from g2o text, solved."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli.console import progress_for
+from cli.options import Overrides, Quiet, assignments, merged
+
+if TYPE_CHECKING:
+    from mapper.export.solved_graph import SolvedGraph
+
+_MOST_SIZES = 8
+
+
+class RobustKernel(StrEnum):
+    """What is done about false loops."""
+
+    GNC = "gnc"
+    CAUCHY = "cauchy"
+    HUBER = "huber"
+    DCS = "dcs"
+    NONE = "none"
+
+
+class Initial(StrEnum):
+    """Where the solver begins."""
+
+    AUTO = "auto"
+    GIVEN = "given"
+    CHORDAL = "chordal"
+
+
+def solve(
+    graph: Annotated[Path, typer.Argument(metavar="GRAPH.g2o", help="Pose graph in 3D or 2D.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.g2o|FOLDER", help="File to write, or folder to create.")],
+    robust: Annotated[
+        RobustKernel | None,
+        typer.Option(help="Doubt the loops; in files of others, edges between ids that are not neighbours."),
+    ] = None,
+    initial: Annotated[Initial | None, typer.Option(help="Where the solver begins.  [default: auto]")] = None,
+    set_: Overrides = None,
+    quiet: Quiet = False,
+) -> None:
+    """Solve a pose graph, each connected component on its own, and say what it cost before and after.
+
+    Example: mapper solve sphere2500.g2o --out solved, or: mapper solve city.g2o --out city2.g2o --robust dcs
+    """
+    import time
+
+    from mapper.config import overridden
+    from mapper.config.graph import GraphConfig
+    from mapper.export.solved_graph import SolvedGraph, write_solved_graph
+    from mapper.graph.g2o import read_g2o
+    from mapper.graph.optimize import optimize
+
+    overrides = merged(assignments({"robust": robust, "initial": initial}), set_)
+    overrides = [override.removeprefix("graph.") for override in overrides]
+    config = overridden(GraphConfig(), overrides)
+    doubts = config.robust != "none" and any(override.startswith("robust=") for override in overrides)
+    progress = progress_for(quiet=quiet)
+    began = time.perf_counter()
+    given = read_g2o(graph, guess_loops=doubts, progress=progress)
+    read = time.perf_counter()
+    solution = optimize(given, config, progress=progress)
+    seconds = {"read": read - began, "solve": time.perf_counter() - read}
+    solved = SolvedGraph(graph, given, solution, config, seconds)
+    write_solved_graph(out, solved)
+    if not quiet:
+        print(_table(solved))
+        print(out)
+
+
+def _table(solved: "SolvedGraph") -> str:
+    solution = solved.solution
+    rows = [
+        ("nodes", str(len(solved.graph.T_world_node))),
+        ("edges", str(len(solved.graph.factors))),
+        ("components", _sizes_text(solved.component_sizes)),
+        ("cost", f"{solution.error_before:.8g} → {solution.error_after:.8g}"),
+        ("iterations", str(solution.iterations)),
+        ("seconds", ", ".join(f"{name} {seconds:.1f}" for name, seconds in solved.seconds.items())),
+    ]
+    if solved.loops:
+        rows.insert(2, ("loops", f"{solved.loops - len(solved.rejected)} of {solved.loops} believed"))
+    return "\n".join(f"{name:<12}{text}" for name, text in rows)
+
+
+def _sizes_text(sizes: list[int]) -> str:
+    if len(sizes) == 1:
+        return "1"
+    more = ", …" if len(sizes) > _MOST_SIZES else ""
+    shown = ", ".join(map(str, sizes[:_MOST_SIZES]))
+    return f"{len(sizes)}, each solved on its own: {shown}{more} nodes"

@@ -1,0 +1,95 @@
+"""What ``mapper solve`` leaves: the solved graph alone, or a folder with its path, a picture and a report."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from mapper.atomic import write_text
+from mapper.config.graph import GraphConfig
+from mapper.errors import RunError
+from mapper.export.picture import write_graph_views
+from mapper.graph.g2o import write_g2o
+from mapper.graph.model import PoseGraph, Solution
+from mapper.graph.optimize import components
+from mapper.staging import staged
+from mapper.trajectory import trajectory_from, write_tum
+
+GRAPH, KEYFRAMES, PICTURE, REPORT = "graph.g2o", "keyframes.tum", "graph.png", "solve.json"
+BELIEVED = 0.5
+"""A factor that weighs less is rejected."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolvedGraph:
+    """A graph, what the solver made of it, and how.
+
+    Attributes:
+        path: The file that the graph came from.
+        graph: Nodes at their first estimates.
+        solution: Of that graph.
+        config: What it was solved with.
+        seconds: What reading and solving took, by name.
+    """
+
+    path: Path
+    graph: PoseGraph
+    solution: Solution
+    config: GraphConfig
+    seconds: dict[str, float]
+
+    @property
+    def solved(self) -> PoseGraph:
+        """The graph with its nodes at the solution; rejected loops are still in it."""
+        return PoseGraph(self.solution.T_world_node, self.graph.stamps_ns, self.graph.factors)
+
+    @property
+    def component_sizes(self) -> list[int]:
+        """Nodes of every connected component, in the graph's order."""
+        return [len(nodes) for nodes in components(self.graph)]
+
+    @property
+    def loops(self) -> int:
+        """How many factors are loops."""
+        return sum(factor.origin == "loop" for factor in self.graph.factors)
+
+    @property
+    def rejected(self) -> list[tuple[int, int]]:
+        """Nodes i, j of every loop that the solver did not believe."""
+        pairs = zip(self.graph.factors, self.solution.weights, strict=True)
+        return [(factor.i, factor.j) for factor, weight in pairs if weight < BELIEVED]
+
+
+def write_solved_graph(out: Path, solved: SolvedGraph) -> None:
+    """Write the solved graph to a ``.g2o`` file, or to a new folder with everything beside it.
+
+    Raises:
+        RunError: The folder exists already, or cannot be made.
+    """
+    if out.suffix == ".g2o":
+        write_g2o(out, solved.solved)
+        return
+    if out.exists():
+        raise RunError(f"{out}: exists already; choose another --out, or a file that ends in .g2o")
+    with staged(out) as folder:
+        write_g2o(folder / GRAPH, solved.solved)
+        by_time = sorted((stamp, node) for node, stamp in solved.graph.stamps_ns.items())
+        poses = ((stamp, solved.solution.T_world_node[node]) for stamp, node in by_time)
+        write_tum(folder / KEYFRAMES, trajectory_from(poses))
+        write_graph_views(folder / PICTURE, solved.graph, solved.solution, title=solved.path.name)
+        write_text(folder / REPORT, json.dumps(_report(solved), indent=2) + "\n")
+
+
+def _report(solved: SolvedGraph) -> dict[str, object]:
+    return {
+        "graph": str(solved.path.resolve()),
+        "config": solved.config.model_dump(),
+        "nodes": len(solved.graph.T_world_node),
+        "edges": len(solved.graph.factors),
+        "loops": solved.loops,
+        "rejected": solved.rejected,
+        "component_sizes": solved.component_sizes,
+        "error_before": solved.solution.error_before,
+        "error_after": solved.solution.error_after,
+        "iterations": solved.solution.iterations,
+        "seconds": {name: round(seconds, 3) for name, seconds in solved.seconds.items()},
+    }
