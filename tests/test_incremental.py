@@ -122,6 +122,23 @@ def test_components_are_anchored_apart_until_a_loop_joins_them():
     assert gap_m(solver.poses(), dict(enumerate(truth))) < 0.3
 
 
+def test_a_loop_takes_along_a_component_that_still_waits():
+    """A later session, none of whose factors was ever solved, begins where its first loop wants it."""
+    rng = np.random.default_rng(4)
+    truth = ring(30)
+    T_wrong_world = exp(np.array([0.1, 0.2, 3.0]), np.array([5.0, -3.0, 1.0]))
+    solver = IncrementalSolver()
+    for k in range(30):
+        solver.add_node(k, truth[k] if k < 15 else T_wrong_world @ truth[k])
+    solver.add_factors(measured(truth, k - 1, k, rng) for k in range(1, 15))
+    solver.update()
+    solver.add_factors(measured(truth, k - 1, k, rng) for k in range(16, 30))
+    solver.add_factors([measured(truth, 4, 20, rng, "loop")])
+    assert gap_m(solver.poses(), dict(enumerate(truth))) < 0.3
+    solver.update()
+    assert gap_m(solver.poses(), dict(enumerate(truth))) < 0.3
+
+
 def test_joining_from_either_end_is_the_same():
     rng = np.random.default_rng(3)
     T_0_2 = exp(rng.normal(0, 1, 3), rng.normal(0, 1, 3))

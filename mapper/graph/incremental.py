@@ -17,8 +17,8 @@ class IncrementalSolver:
     """Believed poses of a growing graph. Loops are under Huber's kernel, which never quite lets go of one.
 
     Nodes and factors wait until ``update``, and a node without factors waits on; a waiting node is where
-    it was put. Every connected component keeps its first node where that was put. When a factor joins
-    two solved components, the younger is moved to the older and both are solved afresh.
+    it was put. Every connected component keeps its first node where that was put. When a loop joins two
+    components, the younger is moved to the older; if both are solved, they are solved afresh.
     """
 
     def __init__(self) -> None:
@@ -121,8 +121,10 @@ class IncrementalSolver:
         two = self._component[factor.i], self._component[factor.j]
         older, younger = (first for first in self._members if first in two)
         joining = self._members.pop(younger)
-        if older in self._anchored and younger in self._anchored:
+        both_solved = older in self._anchored and younger in self._anchored
+        if both_solved or factor.origin == "loop":  # new nodes hang where their first factor wants them
             self._move(joining, factor)
+        if both_solved:
             self._restart()
         for node in joining:
             self._component[node] = older
