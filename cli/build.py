@@ -1,5 +1,6 @@
 """``mapper build``: a log becomes a run."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -36,6 +37,13 @@ def build(
     last: Last = None,
     stride: Stride = None,
     require_truth: RequireTruth = None,
+    onto: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN",
+            help="Append the log to this run of the same place; OUT then holds both, by RUN's own settings.",
+        ),
+    ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace OUT, once the new run is whole.")
     ] = False,
@@ -48,7 +56,11 @@ def build(
     from mapper.config import load_config
 
     overrides = merged(selection(first, last, stride, require_truth), set_)
-    run, metrics = built(log, load_config(config, overrides), out, overwrite=overwrite, quiet=quiet)
+    if onto is None:
+        run, metrics = built(log, load_config(config, overrides), out, overwrite=overwrite, quiet=quiet)
+    else:
+        _refuse_both(config, onto)
+        run, metrics = appended(log, onto, overrides, out, overwrite=overwrite, quiet=quiet)
     if not quiet:
         from cli.summary import summary_text
 
@@ -72,3 +84,31 @@ def built(
         progress.note(note)
     run = build_run(source, config, out, progress=progress, overwrite=overwrite)
     return run, evaluate(run.trajectory(), run.truth())
+
+
+def appended(
+    log: Path, onto: Path, overrides: "Sequence[str]", out: Path, *, overwrite: bool, quiet: bool
+) -> "tuple[Run, list[Metric]]":
+    """Build a run from a run and a later log of the same place, by the run's configuration."""
+    from evaluators.evaluate import evaluate
+    from mapper.appending import append
+    from mapper.config import overridden
+    from mapper.config.sources import SourceConfig
+    from mapper.run import load_run
+    from mapper.sources import open_source
+
+    prepare_libraries()
+    first = load_run(onto)
+    config = overridden(first.config.model_copy(update={"source": SourceConfig()}), overrides)
+    source = open_source(log, config.source)
+    run = append(source, first, config, out, progress=progress_for(quiet=quiet), overwrite=overwrite)
+    return run, evaluate(run.trajectory(), run.truth())
+
+
+def _refuse_both(config: Path | None, onto: Path) -> None:
+    from mapper.errors import ConfigError
+
+    if config is not None:
+        raise ConfigError(
+            f"--config {config}: with --onto the settings of {onto} hold; turn single ones by --set"
+        )

@@ -8,6 +8,7 @@ from mapper.config.loops import NoLoopsConfig, VerificationConfig
 from mapper.errors import ConfigError, LoopError
 from mapper.graph.chain import by_odometry
 from mapper.graph.model import PoseGraph
+from mapper.graph.optimize import components
 from mapper.loops.closer import measured
 from mapper.loops.closure import LoopClosure
 from mapper.loops.proposals import Proposal
@@ -74,6 +75,8 @@ def edit_loops(
     solved = solve(edited, loops, run.config.graph)
     for loop in solved.loops[len(loops) - len(pairs) :]:
         _refuse_rejected(loop)
+    if len(components(solved.graph)) > len(components(graph)):
+        raise LoopError(f"{run.path}: without these loops nothing ties the graph together; nothing removed")
     return fuse_changed(source, run, tracked.solved(solved), solve=solved.report, progress=progress)
 
 

@@ -24,11 +24,19 @@ def largest_part(tracking: Tracking, *, progress: Progress) -> Tracking:
     After a loss the odometry may begin anew where nothing is known. Until a loop joins the two parts, nobody
     knows how they lie to each other, and a map of both would be a guess: the frames left out count as lost.
     """
+    frames = Counter(track.node for track in tracking.placed)
+    parts = components(tracking.graph)
+    largest = max(parts, key=lambda nodes: sum(frames[node] for node in nodes), default=[])
+    return part_of(tracking, largest[0], progress=progress) if largest else tracking
+
+
+def part_of(tracking: Tracking, node: int, *, progress: Progress) -> Tracking:
+    """Return what was tracked without the parts that nothing ties to a node's own, and say so."""
     parts = components(tracking.graph)
     if len(parts) <= 1:
         return tracking
     frames = Counter(track.node for track in tracking.placed)
-    kept = frozenset(max(parts, key=lambda nodes: sum(frames[node] for node in nodes)))
+    kept = frozenset(next(nodes for nodes in parts if node in nodes))
     left_out = sum(frames[node] for nodes in parts for node in nodes if node not in kept)
     progress.note(
         f"{left_out} of {len(tracking.placed)} frames lie in {len(parts) - 1} parts of the path that no loop "

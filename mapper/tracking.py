@@ -1,7 +1,7 @@
 """The first pass over a log: every frame tracked in order, and the pose graph that grows from it."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -9,6 +9,7 @@ from typing import Any
 from mapper.config import BuildConfig
 from mapper.errors import FrameError, TrackingError
 from mapper.graph.model import PoseGraph
+from mapper.loops.closer import Closer
 from mapper.loops.closure import LoopClosure
 from mapper.odometry.base import Odometry, Track
 from mapper.parallel import ordered_map
@@ -49,14 +50,39 @@ class Tracking:
         )
 
 
-def track_log(source: FrameSource, config: BuildConfig, *, progress: Progress) -> Tracking:
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """What tracking begins with.
+
+    Attributes:
+        odometry: Before its first frame.
+        closer: Knows the places of earlier sessions.
+        graph: Of earlier sessions, without loops.
+        loops: The candidates of earlier sessions.
+    """
+
+    odometry: Odometry[Any]
+    closer: Closer
+    graph: PoseGraph
+    loops: Sequence[LoopClosure] = ()
+
+
+def from_nothing(config: BuildConfig) -> Start:
+    """Return the start of a log that is the first of its place."""
+    return Start(config.odometry.build(), config.loops.build(config.graph.solve), PoseGraph())
+
+
+def track_log(
+    source: FrameSource, config: BuildConfig, *, progress: Progress, start: Start | None = None
+) -> Tracking:
     """Track every frame of a log, in time order; reading and detecting run ahead in threads.
 
-    A frame that cannot be read is skipped and reported, not fatal.
+    A frame that cannot be read is skipped and reported, not fatal. With a ``start`` the graph and the loops
+    returned are those of all sessions, the tracks those of this log.
     """
-    odometry: Odometry[Any] = config.odometry.build()
-    closer = config.loops.build(config.graph.solve)
-    graph = PoseGraph()
+    start = start or from_nothing(config)
+    odometry, closer, before = start.odometry, start.closer, start.graph
+    graph = PoseGraph(dict(before.T_world_node), dict(before.stamps_ns), list(before.factors))
     tracks: list[Track] = []
     skipped: list[Skipped] = []
     frame_ms: dict[int, float] = {}
@@ -86,7 +112,7 @@ def track_log(source: FrameSource, config: BuildConfig, *, progress: Progress) -
             graph.add_factors(track.factors)
             tracks.append(track)
     graph.add_factors(odometry.finish())
-    loops = tuple(closer.closures())
+    loops = (*start.loops, *closer.closures())
     graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")
     return Tracking(tuple(tracks), tuple(skipped), graph, loops, frame_ms)
 

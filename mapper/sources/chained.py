@@ -98,21 +98,12 @@ def chained(first: FrameSource, second: FrameSource, *, shift_ns: int | None = N
     begin_ns = int(stamps_ns[0])
     if shift_ns is None:
         shift_ns = 0 if begin_ns > end_ns else end_ns + _PAUSE_NS - begin_ns
-    sessions = [*before, Session(second, shift_ns, stamps_ns + shift_ns)]
-    truth, told = _truth(sessions)
-    notes = [f"{session.log.name}: {note}" for session in sessions for note in session.log.notes]
-    if shift_ns:
-        notes.append(
-            f"{second.name}: {shift_ns / NS_PER_S:+.3f} s on every stamp, so that it follows {first.name}"
-        )
-    return ChainedLog(
-        sessions=sessions,
-        path=first.path,
-        name=" + ".join(session.log.name for session in sessions),
-        kind=" + ".join(dict.fromkeys(session.log.kind for session in sessions)),
-        truth=truth,
-        notes=[*notes, *told],
-    )
+    return _chain([*before, Session(second, shift_ns, stamps_ns + shift_ns)])
+
+
+def last_session(source: ChainedLog) -> ChainedLog:
+    """Return the last of the logs alone, on the common clock."""
+    return _chain(source.sessions[-1:])
 
 
 def sessions_of(source: FrameSource) -> Sequence[Session]:
@@ -122,29 +113,51 @@ def sessions_of(source: FrameSource) -> Sequence[Session]:
     return [Session(source, 0, _stamps(source))]
 
 
+def _chain(sessions: Sequence[Session]) -> ChainedLog:
+    logs = [session.log for session in sessions]
+    truth, notes = _truth(sessions)
+    notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
+    notes += [
+        f"{session.log.name}: stamps raised by {session.shift_ns / NS_PER_S:.3f} s, to follow the log before"
+        for session in sessions
+        if session.shift_ns
+    ]
+    return ChainedLog(
+        sessions=sessions,
+        path=logs[0].path,
+        name=" + ".join(log.name for log in logs),
+        kind=" + ".join(dict.fromkeys(log.kind for log in logs)),
+        truth=truth,
+        notes=notes,
+    )
+
+
 def _stamps(source: FrameSource) -> Stamps:
     return np.array([entry.stamp_ns for entry in source.entries()], dtype=np.int64)
 
 
 def _truth(sessions: Sequence[Session]) -> tuple[Trajectory | None, list[str]]:
     """Return the truths one after the other, each until half way to the next session's first frame."""
-    ends_ns = [
-        (int(before.stamps_ns[-1]) + int(after.stamps_ns[0])) // 2 for before, after in pairwise(sessions)
+    bounds_ns = [
+        np.iinfo(np.int64).min,
+        *((int(a.stamps_ns[-1]) + int(b.stamps_ns[0])) // 2 for a, b in pairwise(sessions)),
+        np.iinfo(np.int64).max,
     ]
-    limits_ns = [np.iinfo(np.int64).min, *ends_ns, np.iinfo(np.int64).max]
-    told, untold, parts = [], [], []
-    for session, (begin_ns, end_ns) in zip(sessions, pairwise(limits_ns), strict=True):
+    told, parts = [], []
+    for session, (begin_ns, end_ns) in zip(sessions, pairwise(bounds_ns), strict=True):
         truth = session.log.truth
         if truth is None:
-            untold.append(session.log.name)
             continue
-        told.append(session.log.name)
         stamps_ns = truth.stamps_ns + session.shift_ns
         inside = (stamps_ns > begin_ns) & (stamps_ns <= end_ns)
-        parts.append((stamps_ns[inside], truth.T_world_body[inside]))
+        if inside.any():
+            told.append(session.log.name)
+            parts.append((stamps_ns[inside], truth.T_world_body[inside]))
     if not told:
         return None, []
-    joined = Trajectory(*map(np.concatenate, zip(*parts, strict=True)))
-    if untold:
-        return joined, [f"ground truth of {' and '.join(told)} only"]
-    return joined, [f"the ground truths of {' and '.join(told)} are taken to be in one world"]
+    notes = []
+    if len(told) < len(sessions):
+        notes.append(f"ground truth of {' and '.join(told)} only")
+    if len(told) > 1:
+        notes.append(f"the ground truths of {' and '.join(told)} are taken to be in one world")
+    return Trajectory(*map(np.concatenate, zip(*parts, strict=True))), notes

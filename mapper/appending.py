@@ -1,0 +1,137 @@
+"""A second session of the same place: tracked on its own, tied to the first by loops, mapped with it."""
+
+from collections import Counter
+from collections.abc import Sequence, Set
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from mapper import run as files
+from mapper.config import BuildConfig
+from mapper.config.loops import PlaceLoopsConfig
+from mapper.config.sources import SourceConfig
+from mapper.errors import ConfigError, LoopError
+from mapper.graph.model import PoseGraph
+from mapper.loops.closer import PlaceLoops
+from mapper.loops.closure import LoopClosure
+from mapper.manifest import Manifest, Timing, library_versions, now_text
+from mapper.odometry.base import Odometry
+from mapper.odometry.renumbered import Renumbered
+from mapper.parts import part_of
+from mapper.pipeline import carry_times, fuse_into
+from mapper.progress import SILENT, Progress
+from mapper.run import Run, appended_log, drafting, load_run, open_log
+from mapper.solving import solve
+from mapper.sources.base import FrameSource
+from mapper.sources.chained import ChainedLog, chained, last_session
+from mapper.tracked import Tracked, save_tracked, tracked_before, tracked_now
+from mapper.tracking import Start, refuse_a_fragment, track_log
+from mapper.views_again import views_again
+
+_SETTLED = ("odometry", "level")
+
+
+def append(
+    second: FrameSource,
+    run: Run,
+    config: BuildConfig,
+    out: Path,
+    *,
+    progress: Progress = SILENT,
+    overwrite: bool = False,
+) -> Run:
+    """Track a log as a later session of a run's place, solve both as one graph, and map them together.
+
+    The run stays as it is, and the new one has its world: the first node of the first session does not move.
+    No gate holds between the sessions until loops tie them, but two tests and another loop that agrees do.
+
+    Args:
+        second: The later log.
+        run: A finished run; its log must be there still, for its keyframes are looked at again.
+        config: The run's own but for what may differ: ``source`` is the second log's, and loops, solver and
+            map may have other settings.
+        out: Run folder to create.
+        progress: Who watches.
+        overwrite: Replace a run that is there, once the new one is whole.
+
+    Raises:
+        ConfigError: The configuration cannot join sessions, or differs in what the first one has settled.
+        TrackingError: Too few frames could be tracked.
+        LoopError: No loop ties the two sessions.
+        RunError: OUT is there already, or the run's log is not what it was.
+    """
+    _refuse_unfit(config, run)
+    first = open_log(run)
+    source = chained(first, second)
+    for note in source.notes:
+        progress.note(note)
+    joined = config.model_copy(update={"source": run.config.source})
+    with drafting(out, _manifest(run, source, config.source), joined, overwrite=overwrite) as draft:
+        carry_times(draft, run.manifest.timing)
+        before = tracked_before(run)
+        known = before.graph.T_world_node.keys()
+        with draft.clock.stage("track"):
+            start = _after(before, first, config, progress)
+            tracking = track_log(last_session(source), config, progress=progress, start=start)
+        refuse_a_fragment(tracking, config)
+        _refuse_untied(second, run, tracking.loops, known)
+        with draft.clock.stage("solve"):
+            tracking = part_of(tracking, next(iter(known)), progress=progress)
+            solved = solve(tracking.graph, tracking.loops, config.graph)
+        _refuse_untied(second, run, solved.loops, known)
+        later = tracked_now(replace(tracking, graph=solved.graph, loops=solved.loops), None)
+        save_tracked(draft, before.solved(solved).then(later, truth=source.truth))
+        draft.update(solve=solved.report)
+        fuse_into(draft, source, joined, progress, before=run.path / files.SIGHTS)
+    return load_run(out)
+
+
+def _refuse_unfit(config: BuildConfig, run: Run) -> None:
+    for name in _SETTLED:
+        if getattr(config, name) != getattr(run.config, name):
+            raise ConfigError(
+                f"{name}: {run.path} has settled it; a session is appended by the same settings"
+            )
+    if not isinstance(config.loops, PlaceLoopsConfig):
+        raise ConfigError(f"loops.kind={config.loops.kind}: cannot tie two sessions; want places")
+    if config.graph.solve != "batch":
+        raise ConfigError(f"graph.solve={config.graph.solve}: cannot join two sessions; want batch")
+
+
+def _manifest(run: Run, source: ChainedLog, config: SourceConfig) -> Manifest:
+    """Return the manifest to begin with: what is not said again of both sessions holds from the first."""
+    known = run.manifest.input
+    appended = (*known.appended, appended_log(source.sessions[-1], config))
+    return Manifest(
+        status="building",
+        libraries=library_versions(),
+        input=known.model_copy(update={"appended": appended}),
+        levelling=run.manifest.levelling,
+        timing=Timing(started=now_text()),
+    )
+
+
+def _after(before: Tracked, first: FrameSource, config: BuildConfig, progress: Progress) -> Start:
+    """Return the start of a session that knows the places of the one before."""
+    assert isinstance(config.loops, PlaceLoopsConfig)
+    graph = before.graph
+    closer = PlaceLoops(config.loops, correction=config.graph.solve)
+    views = views_again(first, set(graph.stamps_ns.values()), config, progress=progress)
+    closer.know(graph, {node: views[stamp_ns] for node, stamp_ns in graph.stamps_ns.items()})
+    odometry: Odometry[Any] = config.odometry.build()
+    renumbered = Renumbered(odometry, first_node=max(graph.T_world_node) + 1)
+    known = [factor for factor in graph.factors if factor.origin != "loop"]
+    return Start(renumbered, closer, PoseGraph(graph.T_world_node, graph.stamps_ns, known), before.loops)
+
+
+def _refuse_untied(second: FrameSource, run: Run, loops: Sequence[LoopClosure], known: Set[int]) -> None:
+    """Refuse a session of which no loop leads to the known nodes."""
+    between = [loop for loop in loops if loop.i in known and loop.j not in known]
+    if any(loop.verdict == "accepted" for loop in between):
+        return
+    if not between:
+        why = "nothing in it looks like a known place (loops.places.min_similarity)"
+    else:
+        refused = Counter(loop.reason.split(":")[0] for loop in between).most_common()
+        why = f"{len(between)} candidates compared, none held: {', '.join(f'{by} {n}' for by, n in refused)}"
+    raise LoopError(f"{second.path}: no loop ties it to {run.path}; {why}; is it the same place?")

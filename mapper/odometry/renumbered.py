@@ -1,0 +1,46 @@
+"""An odometry whose nodes follow those of earlier sessions."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import Generic
+
+from mapper.features.view import View
+from mapper.frames import Frame
+from mapper.graph.model import BetweenFactor
+from mapper.odometry.base import Observation, Odometry, Track
+
+
+class Renumbered(Generic[Observation]):
+    """Raises the node numbers of an odometry; see :class:`mapper.odometry.base.Odometry`."""
+
+    def __init__(self, odometry: Odometry[Observation], *, first_node: int) -> None:
+        self._odometry = odometry
+        self._first_node = first_node
+
+    def observe(self, frame: Frame) -> Observation:
+        """Reduce a frame to what tracking needs. Pure."""
+        return self._odometry.observe(frame)
+
+    def track(self, observation: Observation) -> Track:
+        """Place the next observation, in time order."""
+        track = self._odometry.track(observation)
+        return replace(
+            track,
+            node=None if track.node is None else track.node + self._first_node,
+            factors=self._raised(track.factors),
+            links=self._raised(track.links),
+        )
+
+    def view(self, observation: Observation) -> View:
+        """Return what a place is recognised by. Pure."""
+        return self._odometry.view(observation)
+
+    def finish(self) -> Sequence[BetweenFactor]:
+        """Return the measurements that were still being refined when the log ended."""
+        return self._raised(self._odometry.finish())
+
+    def _raised(self, factors: Iterable[BetweenFactor]) -> tuple[BetweenFactor, ...]:
+        return tuple(
+            replace(factor, i=factor.i + self._first_node, j=factor.j + self._first_node)
+            for factor in factors
+        )
