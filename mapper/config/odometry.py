@@ -111,7 +111,7 @@ class KeyframeConfig(Config):
     """Fewer landmarks that agree with the pose mean that the frame is lost."""
     weak_inliers: PositiveInt = 150
     """With fewer, a placement has to compete with what other ways and other keyframes lead to."""
-    max_lost_frames: NonNegativeInt = 30
+    max_lost_frames: NonNegativeInt = 15
     """After so many frames that show enough but nothing known, a new sub-map begins; 0 never begins one."""
     keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.75
     """Keyframe when the inliers fall below this share of the most since the last keyframe."""
