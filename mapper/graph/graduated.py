@@ -1,0 +1,152 @@
+"""Graduated Non-Convexity: decide for each loop whether it is believed (Yang et al. 2020)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.geometry import Array
+from mapper.graph.batch import Effort, Part, solve
+from mapper.graph.drift import innovations
+from mapper.graph.model import BetweenFactor
+from mapper.graph.terms import between
+
+if TYPE_CHECKING:
+    import gtsam
+
+_GROWTH = 1.4
+"""Of μ in each round (Yang et al. 2020, remark 5)."""
+_MAX_ROUNDS = 100
+_ROUND = Effort(max_iterations=3, relative_error=1e-4)
+"""A round only prepares the next."""
+_DECIDED = 1e-3
+"""A weight this close to 0 or 1 has arrived."""
+_MEDIAN_CHI2 = 5.348
+"""Median of χ² with six degrees of freedom."""
+_DRIFT_SLACK = 3.0
+"""Systematic drift grows with the way, not with its root, so long loops disagree more than short ones."""
+_BESIDE = 10
+"""Loops whose ends are at most so many nodes apart stand and fall together."""
+_MOST_SUSPECTS = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Graduated:
+    """Where a round ended.
+
+    Attributes:
+        poses: Nearly solved with the loops that were believed in it.
+        chi2: (L,) squared residual of every loop there, in sigmas.
+        iterations: Taken so far.
+    """
+
+    poses: gtsam.Values
+    chi2: Array
+    iterations: int
+
+
+def graduate(part: Part, width: float) -> tuple[Array, Graduated]:
+    """Return a weight of 0 or 1 for each loop of a part, and where that leaves it.
+
+    Truncated least squares. Information that counts features as independent is over-confident, so the
+    limit is scaled by how far the median loop lies from what odometry predicts, where that is farther than
+    honest. Loops that odometry rules out even so sit out the first round, in which a cluster of
+    false ones could fold the path beyond recovery.
+
+    Args:
+        part: With at least one loop.
+        width: Residual in sigmas beyond which a loop with honest information is false.
+
+    Raises:
+        GraphError: The solver fails.
+    """
+    apart = innovations(part.known, part.loops)
+    limit = width**2 * max(1.0, float(np.median(apart)) / _MEDIAN_CHI2)
+    terms = [between(loop) for loop in part.loops]
+    weights = (apart <= _DRIFT_SLACK**2 * limit).astype(np.float64)
+    now = _round(part, terms, weights, Graduated(part.start, apart, 0))
+    worst = now.chi2[weights > 0.0].max(initial=0.0)
+    if worst > limit:
+        mu = limit / (2.0 * worst - limit)
+        for _ in range(_MAX_ROUNDS):
+            weights = _truncated(now.chi2, limit, mu)
+            now = _round(part, terms, weights, now)
+            if (np.minimum(weights, 1.0 - weights) < _DECIDED).all():
+                break
+            mu *= _GROWTH
+    now = _without_clusters(part, terms, now, apart=apart, limit=limit)
+    return (now.chi2 <= limit).astype(np.float64), now
+
+
+def weighted(loops: Sequence[BetweenFactor], weights: Array) -> list[gtsam.NonlinearFactor]:
+    """Return the terms of the loops that have any weight."""
+    pairs = zip(loops, weights, strict=True)
+    return [between(loop, weight=float(weight)) for loop, weight in pairs if weight > 0.0]
+
+
+def chi2_of(terms: Sequence[gtsam.NonlinearFactor], poses: gtsam.Values) -> Array:
+    """Return the squared residual of each term, in sigmas."""
+    return np.array([2.0 * term.error(poses) for term in terms])
+
+
+def _round(
+    part: Part, terms: Sequence[gtsam.NonlinearFactor], weights: Array, before: Graduated
+) -> Graduated:
+    poses, more = solve(part.held, weighted(part.loops, weights), before.poses, effort=_ROUND)
+    return Graduated(poses, chi2_of(terms, poses), before.iterations + more)
+
+
+def _truncated(chi2: Array, limit: float, mu: float) -> Array:
+    """Return the weights of truncated least squares at one μ (Yang et al. 2020, eq. 14)."""
+    ramp: Array = np.sqrt(limit * mu * (mu + 1.0) / np.maximum(chi2, 1e-12)) - mu
+    return np.clip(ramp, 0.0, 1.0)
+
+
+def _without_clusters(
+    part: Part, terms: Sequence[gtsam.NonlinearFactor], now: Graduated, *, apart: Array, limit: float
+) -> Graduated:
+    """Drop clusters of loops without which the truncated cost is lower.
+
+    Weights change one loop at a time, so false loops that agree with each other can hold out against the
+    fewer true ones beside them. Tried while any loop is rejected, from what odometry believes least.
+    """
+    clusters = sorted(_clusters(part.loops), key=lambda cluster: -float(apart[cluster].max()))
+    for cluster in clusters[:_MOST_SUSPECTS]:
+        believed = now.chi2 <= limit
+        if believed.all():
+            break
+        if not believed[cluster].any():
+            continue
+        without = _round(part, terms, (believed & ~cluster).astype(np.float64), now)
+        then = _round(part, terms, (without.chi2 <= limit).astype(np.float64), without)
+        if _cost(part, then, limit) < _cost(part, now, limit):
+            now = then
+    return now
+
+
+def _cost(part: Part, now: Graduated, limit: float) -> float:
+    """Return what truncated least squares minimises."""
+    return 2.0 * sum(term.error(now.poses) for term in part.held) + float(np.minimum(now.chi2, limit).sum())
+
+
+def _clusters(loops: Sequence[BetweenFactor]) -> list[NDArray[np.bool_]]:
+    """Return which loops belong together, as masks: connected by both ends being close."""
+    ends = np.sort([(loop.i, loop.j) for loop in loops], axis=1)
+    left = np.ones(len(loops), dtype=np.bool_)
+    clusters = []
+    while left.any():
+        cluster = np.zeros_like(left)
+        rim = [int(np.argmax(left))]
+        while rim:
+            k = rim.pop()
+            if not left[k]:
+                continue
+            left[k], cluster[k] = False, True
+            beside = left & (np.abs(ends - ends[k]) <= _BESIDE).all(axis=1)
+            rim += np.flatnonzero(beside).tolist()
+        clusters.append(cluster)
+    return clusters
