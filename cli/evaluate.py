@@ -27,7 +27,7 @@ def evaluate(
     align: Annotated[Align, typer.Option(help="How the estimate is laid over the truth.")] = Align.SE3,
     json: Annotated[bool, typer.Option("--json", help="Print JSON, every digit, angles in radians.")] = False,
 ) -> None:
-    """Print ATE and RPE as the TUM benchmark defines them, the loops that are right, and the end-to-start offset.
+    """Print ATE and RPE as the TUM benchmark defines them, which loops are right, and the end's offset.
 
     Example: mapper eval runs/xyz --align sim3, or: mapper eval estimate.tum --truth groundtruth.txt
     """

@@ -5,7 +5,7 @@ import pytest
 
 from mapper.config.graph import GraphConfig
 from mapper.errors import GraphError
-from mapper.geometry import exp, inverse, rotation_exp, rotation_log, transform
+from mapper.geometry import exp, inverse, is_rigid, rotation_exp, rotation_log, transform
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.graph.optimize import optimize
 from mapper.graph.proportional import distribute, spread
@@ -123,3 +123,14 @@ def test_the_proportional_solve_believes_every_loop_and_says_how_well_it_fits():
 def test_a_loop_to_an_unknown_node_is_refused():
     with pytest.raises(GraphError, match="loop 0 → 9: not both nodes are among the 3 poses"):
         spread(walk([1.0, 1.0]), loop(0, 9, np.eye(4)))
+
+
+def test_many_loops_leave_rotations_rotations():
+    """Products of poses drift off SO(3); without a projection sixty loops make the path burst."""
+    rng = np.random.default_rng(2)
+    T_world_node = {k: exp(rng.normal(0, 0.3, 3), rng.normal(0, 1, 3)) for k in range(70)}
+    for j in range(5, 65):
+        i = int(rng.integers(0, j - 4))
+        T_world_node = spread(T_world_node, loop(i, j, exp(rng.normal(0, 0.5, 3), rng.normal(0, 1, 3))))
+
+    assert is_rigid(np.array(list(T_world_node.values())), tolerance=1e-12)

@@ -30,7 +30,8 @@ def test_thesis_settings_load_and_only_override(path):
     assert isinstance(config.odometry, IsvdOdometryConfig)
     assert config.odometry.detector.kind == "surf"
     assert config.odometry.match.filter == "homography"
-    assert config.graph.solve == "none"
+    loops = ("thesis", "proportional") if "LC" in path.stem else ("none", "none")
+    assert (config.loops.kind, config.graph.solve) == loops
     odometry = tomllib.loads(path.read_text())["odometry"]
     defaults = IsvdOdometryConfig()
     named_by_file_name = {"kind", "previous_frames"}
@@ -40,7 +41,8 @@ def test_thesis_settings_load_and_only_override(path):
 
 
 def test_thesis_names_are_all_there():
-    assert {path.stem for path in THESIS} >= {"ISVD", "ISVD+DIF", "MP1", "MP2", "MP3", "MP4", "MP6"}
+    names = {"ISVD", "ISVD+DIF", "ISVD+LC", "ISVD+LC+DIF", "MP1", "MP2", "MP3", "MP4", "MP6"}
+    assert {path.stem for path in THESIS} >= names
     assert load_config(ROOT / "configs/thesis/MP6.toml").odometry.previous_frames == 6
     assert load_config(ROOT / "configs/thesis/ISVD+DIF.toml").odometry.depth_filter
 
