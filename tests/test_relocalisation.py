@@ -117,3 +117,19 @@ def test_one_second_turn_joins_the_first_ones_landmarks(frames):
     graph = graph_of(tracks, odometry)
     assert len(components(graph)) == 1
     assert any(factor.j - factor.i > 10 for factor in graph.factors)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_better_of_two_weak_placements_wins(frames, order):
+    """Nothing is strong here, so each keyframe is asked, in whatever order."""
+    config = LocalMapConfig(weak_inliers=10_000)
+    odometry = config.build()
+    tracked(frames[:12], odometry)
+    recall, observation = odometry._recall, odometry.observe(frames[12])
+    keyframes = range(len(odometry._map.keyframes))[::order]
+    alone = [recall.among([k], observation, method="alone") for k in keyframes]
+
+    best = recall.among(keyframes, observation, method="all")
+
+    assert sum(placement is not None for placement in alone) > 1
+    assert best.inliers == max(placement.inliers for placement in alone if placement is not None)
