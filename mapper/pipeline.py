@@ -250,7 +250,7 @@ def fuse_into(
             log_story(log, story)
             log_maps(log, maps, stamp_ns=int(trajectory.stamps_ns[0]))
             _write_maps(draft.folder, maps)
-            _write_pictures(draft, maps, trajectory, truth)
+            _write_pictures(draft, maps, story)
     counts = draft.manifest.counts.model_copy(
         update={"leaves": len(maps.octree), "cloud_points": len(maps.cloud_points_world)}
     )
@@ -265,8 +265,9 @@ def _write_maps(folder: Path, maps: Maps) -> None:
     write_grid(folder, files.TRAVERSABLE, maps.traversable)
 
 
-def _write_pictures(draft: Draft, maps: Maps, trajectory: Trajectory, truth: Trajectory | None) -> None:
+def _write_pictures(draft: Draft, maps: Maps, story: Story) -> None:
     counts, levelling = draft.manifest.counts, draft.manifest.levelling
+    trajectory, graph = story.trajectory, story.graph
     lines = [f"{len(trajectory)} frames, {counts.nodes} keyframes, {trajectory.path_length_m:.2f} m of path"]
     if levelling is not None:
         lines.append(f"levelled by {levelling.method}")
@@ -274,7 +275,14 @@ def _write_pictures(draft: Draft, maps: Maps, trajectory: Trajectory, truth: Tra
         draft.folder / files.SUMMARY,
         grid=maps.grid,
         trajectory=trajectory,
-        truth=truth,
+        truth=story.truth,
+        loops_world=np.array(
+            [
+                [graph.T_world_node[node][:3, 3] for node in (factor.i, factor.j)]
+                for factor in graph.factors
+                if factor.origin == "loop"
+            ]
+        ).reshape(-1, 2, 3),
         title=draft.manifest.input.title,
         lines=lines,
     )

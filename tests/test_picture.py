@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mapper.export.palette import ESTIMATE, TRUTH, height_colors
+from mapper.export.palette import ESTIMATE, FACTORS, TRUTH, height_colors
 from mapper.export.picture import splat, write_cloud_views, write_summary
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.trajectory import Trajectory
@@ -16,6 +16,9 @@ def room():
     cells[:, [0, -1]] = OCCUPIED
     cells[40:50, 20:30] = UNKNOWN
     return OccupancyGrid(cells, np.array([-2.5, -1.5]), 0.05)
+
+
+NO_LOOPS = np.empty((0, 2, 3))
 
 
 def loop(*, radius_m=1.0):
@@ -31,7 +34,13 @@ def pixels_like(picture, rgb):
 
 def test_summary_shows_estimate_and_truth(tmp_path):
     path = tmp_path / "summary.png"
-    drawing = {"grid": room(), "trajectory": loop(), "title": "a room", "lines": ["200 frames"]}
+    drawing = {
+        "grid": room(),
+        "trajectory": loop(),
+        "loops_world": NO_LOOPS,
+        "title": "a room",
+        "lines": ["200 frames"],
+    }
     write_summary(path, truth=loop(radius_m=1.4), **drawing)
     both = cv2.imread(str(path))
     write_summary(path, truth=None, **drawing)
@@ -45,10 +54,22 @@ def test_summary_shows_estimate_and_truth(tmp_path):
     assert pixels_like(alone, with_alpha) == 0
 
 
+def test_summary_shows_what_loops_tie(tmp_path):
+    ends = np.array([[[-0.8, 0.0, 1.2], [0.8, 0.1, 1.2]], [[0.0, -0.8, 1.2], [0.1, 0.8, 1.2]]])
+    drawing = {"grid": room(), "trajectory": loop(), "truth": None, "title": "a room"}
+    path = tmp_path / "summary.png"
+    write_summary(path, loops_world=NO_LOOPS, **drawing)
+    without = pixels_like(cv2.imread(str(path)), FACTORS["loop"])
+    write_summary(path, loops_world=ends, **drawing)
+    assert pixels_like(cv2.imread(str(path)), FACTORS["loop"]) > without + 100
+
+
 @pytest.mark.parametrize("shape", [(10, 400), (400, 10), (1, 1)])
 def test_summary_fits_maps_of_any_shape(tmp_path, shape):
     grid = OccupancyGrid(np.zeros(shape, np.int8), np.array([0.0, 0.0]), 0.05)
-    write_summary(tmp_path / "s.png", grid=grid, trajectory=loop(), truth=None, title="odd")
+    write_summary(
+        tmp_path / "s.png", grid=grid, trajectory=loop(), truth=None, loops_world=NO_LOOPS, title="odd"
+    )
     height, width = cv2.imread(str(tmp_path / "s.png")).shape[:2]
     assert width == 1040
     assert 400 < height < 1500
@@ -59,7 +80,14 @@ def test_pictures_are_the_same_bytes_again_and_leave_no_pyplot(tmp_path):
     cloud = np.random.default_rng(0).normal(size=(2000, 3)).astype(np.float32)
     colors = height_colors(cloud[:, 2])
     for name in ("a.png", "b.png"):
-        write_summary(tmp_path / name, grid=room(), trajectory=loop(), truth=loop(), title="a room")
+        write_summary(
+            tmp_path / name,
+            grid=room(),
+            trajectory=loop(),
+            truth=loop(),
+            loops_world=NO_LOOPS,
+            title="a room",
+        )
         write_cloud_views(tmp_path / f"views_{name}", cloud, colors, loop())
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert (tmp_path / "views_a.png").read_bytes() == (tmp_path / "views_b.png").read_bytes()

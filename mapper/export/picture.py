@@ -45,16 +45,18 @@ def write_summary(
     grid: OccupancyGrid,
     trajectory: Trajectory,
     truth: Trajectory | None,
+    loops_world: Array,
     title: str,
     lines: Sequence[str] = (),
 ) -> None:
-    """Draw the trajectory over the slice.
+    """Draw the trajectory over the slice, and what its loops tie together.
 
     Args:
         path: PNG file to write.
         grid: The slice, world frame.
         trajectory: The estimate, world frame.
         truth: Where the body really was, already aligned to the world frame, or None.
+        loops_world: (L, 2, 3) ends of the loop closures, metres, world frame.
         title: Headline.
         lines: Figures worth knowing, shown below the headline.
     """
@@ -67,10 +69,19 @@ def write_summary(
         reference = truth.positions_world
         axes.plot(*reference[:, :2].T, color=_hex(TRUTH), linewidth=2.6, alpha=0.65, label="truth")
     axes.plot(*positions[:, :2].T, color=_hex(ESTIMATE), linewidth=1.3, label="estimate")
+    _tie(axes, loops_world)
     _mark(axes, positions[0], color=START, marker="o", label="start")
     _mark(axes, positions[-1], color=END, marker="s", label="end")
     _finish_map(axes, low, high)
     _save(figure, path)
+
+
+def _tie(axes: "Axes", loops_world: Array) -> None:
+    """Draw loops as lines between dots: most are so short that a line alone would not be seen."""
+    label = f"{len(loops_world)} loops"
+    for ends in loops_world[:, :, :2]:
+        axes.plot(*ends.T, ".-", color=_hex(FACTORS["loop"]), linewidth=0.6, markersize=2.0, label=label)
+        label = ""
 
 
 def write_path(
