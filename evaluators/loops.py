@@ -19,7 +19,7 @@ _MAX_TRUTH_GAP_NS = 20_000_000
 
 
 def loop_metrics(loops: Sequence[LoopClosure], keyframes_ns: Stamps, truth: Trajectory) -> list[Metric]:
-    """Return how many loops hold, how many of them are wrong, and the share of revisits with a loop.
+    """Return how many loops hold, how many of them are wrong, and how many true revisits have one.
 
     Args:
         loops: Every candidate with its verdict.
@@ -27,18 +27,14 @@ def loop_metrics(loops: Sequence[LoopClosure], keyframes_ns: Stamps, truth: Traj
         truth: Where the body really was; what it does not cover is not judged.
     """
     held = [loop for loop in loops if loop.verdict == "accepted"]
-    metrics = [
+    revisits = revisits_of(keyframes_ns, truth)
+    found = np.isin(keyframes_ns, [loop.stamp_j_ns for loop in held])
+    return [
         Metric("loops", len(held), "loops"),
         Metric("loops wrongly accepted", sum(_wrong(held, truth)), "loops"),
+        Metric("true revisits", int(revisits.sum()), "keyframes"),
+        Metric("true revisits with a loop", int((found & revisits).sum()), "keyframes"),
     ]
-    revisits = revisits_of(keyframes_ns, truth)
-    if revisits.any():
-        found = np.isin(keyframes_ns, [loop.stamp_j_ns for loop in held])
-        metrics += [
-            Metric("true revisits", int(revisits.sum()), "keyframes"),
-            Metric("loop recall", float((found & revisits).sum() / revisits.sum()), "of true revisits"),
-        ]
-    return metrics
 
 
 def revisits_of(keyframes_ns: Stamps, truth: Trajectory) -> NDArray[np.bool_]:
