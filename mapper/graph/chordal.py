@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mapper.config.graph import GraphConfig
 from mapper.errors import GraphError
-from mapper.geometry import transform
+from mapper.geometry import Array
 from mapper.graph.batch import Part, problem_of
-from mapper.graph.model import BetweenFactor
-from mapper.graph.terms import between, values_of
+from mapper.graph.terms import between
 
 if TYPE_CHECKING:
     import gtsam
@@ -25,8 +23,8 @@ def start_of(part: Part, config: GraphConfig) -> gtsam.Values:
     """Return where the solver shall begin, as ``config.initial`` says.
 
     "auto" stays with the estimates if they fit, or if loops are in doubt, which would spoil the relaxation.
-    Otherwise it takes a step from both and goes on from the better: before that step, a start with all
-    rotations right can look worse than one with none.
+    Otherwise it takes the relaxation if that costs less. If it costs more, both are let take a step first:
+    before it, a start with all rotations right can look worse than one with none.
 
     Raises:
         GraphError: A chordal start is asked for, and there is none.
@@ -34,56 +32,73 @@ def start_of(part: Part, config: GraphConfig) -> gtsam.Values:
     if config.initial == "given":
         return part.start
     if config.initial == "chordal":
-        return chordal_start([*part.known, *part.loops], part.start)
+        return chordal_start(part)
     if part.loops and config.robust != "none":
         return part.start
-    terms = [*part.held, *(between(loop) for loop in part.loops)]
-    if 2.0 * sum(term.error(part.start) for term in terms) <= _BAD_FIT * len(terms):
+    problem = problem_of((*part.held, *(between(loop) for loop in part.loops)))
+    cost = problem.error(part.start)
+    if 2.0 * cost <= _BAD_FIT * problem.size():
         return part.start
     try:
-        relaxed = chordal_start([*part.known, *part.loops], part.start)
+        relaxed = chordal_start(part)
     except GraphError:
         return part.start
-    problem = problem_of(terms)
+    if problem.error(relaxed) < cost:
+        return relaxed
     return min((_step(problem, near) for near in (part.start, relaxed)), key=lambda step: step[0])[1]
 
 
-def chordal_start(factors: Sequence[BetweenFactor], given: gtsam.Values) -> gtsam.Values:
-    """Return poses of one connected component from its factors, in two linear problems.
+def chordal_start(part: Part) -> gtsam.Values:
+    """Return poses of one connected component from its factors and its first node's estimate.
 
-    Rotations are relaxed to any (3, 3) matrices, fitted to the measured ones and projected back. With them
-    fixed, positions are fitted to the measured translations, all of which weigh the same: some
-    published information is too ill-conditioned for a linear solver.
-
-    Args:
-        factors: Of the component.
-        given: Its estimates; only that of the first node counts.
+    Rotations are relaxed to any (3, 3) matrices that fit R_j = R_i · R_i_j best, which binds every row of
+    them alike, and projected back. With them fixed, positions are fitted to the measured translations.
+    All factors weigh the same: some published information is too ill-conditioned for a linear solver.
 
     Raises:
         GraphError: A linear problem is singular.
     """
     import gtsam
 
-    nodes = given.keys()
-    first = given.atPose3(nodes[0])
-    held = gtsam.PriorFactorPose3(nodes[0], first, gtsam.noiseModel.Unit.Create(6))
-    problem = problem_of((held, *(between(factor) for factor in factors)))
+    factors = (*part.known, *part.loops)
+    nodes = part.start.keys()
+    place = {node: k for k, node in enumerate(nodes)}
+    first = part.start.atPose3(nodes[0])
+    turns, steps = gtsam.GaussianFactorGraph(), gtsam.GaussianFactorGraph()
+    one, zero = np.eye(3), np.zeros(3)
+    for factor in factors:
+        turns.add(factor.i, -factor.T_i_j[:3, :3].T, factor.j, one, zero)
     try:
-        rotations = gtsam.InitializePose3.computeOrientationsChordal(
-            gtsam.InitializePose3.buildPose3graph(problem)
-        )
-        R_world_node = {node: rotations.atRot3(node).matrix() for node in nodes}
-        steps = gtsam.GaussianFactorGraph()
-        identity = np.eye(3)
-        steps.add(nodes[0], identity, first.translation())
+        rows = [_solved(turns, nodes, row) for row in first.rotation().matrix()]
+        R_world_node = _nearest_rotations(np.stack(rows, axis=1))
         for factor in factors:
-            step_world = R_world_node[factor.i] @ factor.T_i_j[:3, 3]
-            steps.add(factor.i, -identity, factor.j, identity, step_world)
-        positions = steps.optimize()
+            steps.add(factor.i, -one, factor.j, one, R_world_node[place[factor.i]] @ factor.T_i_j[:3, 3])
+        positions = _solved(steps, nodes, first.translation())
     except RuntimeError as error:  # how GTSAM's C++ exceptions arrive, several lines long
         raise GraphError(f"no chordal start from node {nodes[0]}: {' '.join(str(error).split())}") from None
-    poses = {node: transform(R_world_node[node], positions.at(node)) for node in nodes}
-    return values_of(poses, nodes)
+    values = gtsam.Values()
+    for node, R, position in zip(nodes, R_world_node, positions, strict=True):
+        values.insert(node, gtsam.Pose3(gtsam.Rot3(R), position))
+    return values
+
+
+def _solved(problem: gtsam.GaussianFactorGraph, nodes: list[int], first: Array) -> Array:
+    """Return the (N, 3) vectors that solve a linear problem in which the first node's is known."""
+    import gtsam
+
+    held = gtsam.GaussianFactorGraph()
+    held.push_back(problem)
+    held.add(nodes[0], np.eye(3), first)
+    solution = held.optimize()
+    return np.array([solution.at(node) for node in nodes])
+
+
+def _nearest_rotations(matrices: Array) -> Array:
+    """Return the rotations closest to (N, 3, 3) matrices in the Frobenius norm (Umeyama 1991, lemma)."""
+    U, _, Vt = np.linalg.svd(matrices)
+    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, np.newaxis]
+    rotations: Array = U @ Vt
+    return rotations
 
 
 def _step(problem: gtsam.NonlinearFactorGraph, near: gtsam.Values) -> tuple[float, gtsam.Values]:

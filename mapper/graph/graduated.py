@@ -29,6 +29,8 @@ _MEDIAN_CHI2 = 5.348
 """Median of χ² with six degrees of freedom."""
 _DRIFT_SLACK = 3.0
 """Systematic drift grows with the way, not with its root, so long loops disagree more than short ones."""
+_NEARLY = 4.0
+"""Of the limit: what an unused loop may exceed it by, for the path was never pulled to it."""
 _BESIDE = 10
 """Loops whose ends are at most so many nodes apart stand and fall together."""
 _MOST_SUSPECTS = 8
@@ -78,7 +80,7 @@ def graduate(part: Part, width: float) -> tuple[Array, Graduated]:
             if (np.minimum(weights, 1.0 - weights) < _DECIDED).all():
                 break
             mu *= _GROWTH
-    now = _without_clusters(part, terms, now, apart=apart, limit=limit)
+    now = _reconsidered(part, terms, now, apart=apart, limit=limit)
     return (now.chi2 <= limit).astype(np.float64), now
 
 
@@ -106,25 +108,26 @@ def _truncated(chi2: Array, limit: float, mu: float) -> Array:
     return np.clip(ramp, 0.0, 1.0)
 
 
-def _without_clusters(
+def _reconsidered(
     part: Part, terms: Sequence[gtsam.NonlinearFactor], now: Graduated, *, apart: Array, limit: float
 ) -> Graduated:
-    """Drop clusters of loops without which the truncated cost is lower.
+    """Change what is believed where that lowers the truncated cost, while any loop is rejected.
 
-    Weights change one loop at a time, so false loops that agree with each other can hold out against the
-    fewer true ones beside them. Tried while any loop is rejected, from what odometry believes least.
+    Weights change one loop at a time. So a true loop may stay out because nothing has pulled the path to it:
+    those nearly good enough are let in. And false loops that agree with each other can hold out against
+    the fewer true ones beside them: clusters are left out, first those that odometry believes least.
     """
     clusters = sorted(_clusters(part.loops), key=lambda cluster: -float(apart[cluster].max()))
-    for cluster in clusters[:_MOST_SUSPECTS]:
+    cost = _cost(part, now, limit)
+    for cluster in (None, *clusters[:_MOST_SUSPECTS]):
         believed = now.chi2 <= limit
-        if believed.all():
-            break
-        if not believed[cluster].any():
+        tried = now.chi2 <= _NEARLY * limit if cluster is None else believed & ~cluster
+        if believed.all() or (tried == believed).all():
             continue
-        without = _round(part, terms, (believed & ~cluster).astype(np.float64), now)
-        then = _round(part, terms, (without.chi2 <= limit).astype(np.float64), without)
-        if _cost(part, then, limit) < _cost(part, now, limit):
-            now = then
+        then = _round(part, terms, tried.astype(np.float64), now)
+        then = _round(part, terms, (then.chi2 <= limit).astype(np.float64), then)
+        if (lower := _cost(part, then, limit)) < cost:
+            now, cost = then, lower
     return now
 
 

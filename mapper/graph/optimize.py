@@ -1,6 +1,6 @@
 """Solve a pose graph: each connected component on its own, loops as far as they can be believed."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.config.graph import GraphConfig
 from mapper.errors import GraphError
-from mapper.geometry import Transform, is_rigid
+from mapper.geometry import is_rigid
 from mapper.graph.batch import Part
 from mapper.graph.chordal import start_of
 from mapper.graph.model import PoseGraph, Solution
@@ -44,7 +44,8 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
     """
     _refuse_unusable(graph)
     terms = [between(factor) for factor in graph.factors]
-    before = _errors(terms, graph.T_world_node)
+    given = values_of(graph.T_world_node, graph.T_world_node)
+    before = _errors(terms, given)
     weights = [1.0] * len(terms)
     iterations = 0
     match config.solve:
@@ -61,7 +62,7 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
                     known=[graph.factors[k] for k in known],
                     loops=[graph.factors[k] for k in loops],
                     held=[*(terms[k] for k in known), anchor(nodes[0], graph.T_world_node[nodes[0]])],
-                    start=values_of(graph.T_world_node, nodes),
+                    start=given if len(nodes) == given.size() else values_of(graph.T_world_node, nodes),
                 )
                 part = replace(part, start=start_of(part, config))
                 with progress.stage("solve") as report:
@@ -70,7 +71,8 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
                 iterations += more
                 for k, weight in zip(loops, believed, strict=True):
                     weights[k] = float(weight)
-    return Solution(T_world_node, iterations, before, _errors(terms, T_world_node), tuple(weights))
+    after = _errors(terms, values_of(T_world_node, T_world_node))
+    return Solution(T_world_node, iterations, before, after, tuple(weights))
 
 
 def components(graph: PoseGraph) -> list[list[int]]:
@@ -91,10 +93,7 @@ def components(graph: PoseGraph) -> list[list[int]]:
     return list(members.values())
 
 
-def _errors(
-    terms: Sequence["gtsam.NonlinearFactor"], T_world_node: Mapping[int, Transform]
-) -> tuple[float, ...]:
-    values = values_of(T_world_node, T_world_node)
+def _errors(terms: Sequence["gtsam.NonlinearFactor"], values: "gtsam.Values") -> tuple[float, ...]:
     return tuple(term.error(values) for term in terms)
 
 
