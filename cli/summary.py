@@ -25,6 +25,8 @@ def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
         *((metric.name, _value_text(metric)) for metric in metrics if metric.name.startswith(_SHOWN)),
         ("octree", f"{counts.leaves} leaves of {run.config.octree.resolution_m:g} m"),
     ]
+    if run.manifest.input.appended:
+        rows.insert(0, ("logs", run.manifest.input.title))
     if run.manifest.levelling is not None:
         rows.append(("levelled by", f"{run.manifest.levelling.method}: {run.manifest.levelling.detail}"))
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in timing.stage_s.items())

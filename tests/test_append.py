@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from test_cli_loops import mapper
 
+from cli.summary import summary_text
 from evaluators.trajectory import align, associate, ate
 from mapper.appending import append
 from mapper.config import load_config, overridden
@@ -102,6 +103,11 @@ def test_the_manifest_remembers_both_logs(joined, desk_log):
     assert [entry.stamp_ns for entry in source.entries()] == [
         entry.stamp_ns for entry in open_source(desk_log).entries()
     ]
+
+
+def test_the_table_names_both_logs(first, joined):
+    assert summary_text(joined, []).splitlines()[0].split() == ["logs", "desk", "+", "desk"]
+    assert summary_text(first, []).startswith("frames")
 
 
 def test_the_maps_are_those_of_fusing_from_scratch(joined, tmp_path):
