@@ -1,3 +1,4 @@
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -142,11 +143,153 @@ def test_what_cannot_be_solved_is_said_in_one_line():
         optimize(graph, GraphConfig())
 
 
+def laps(lap=80, *, seed=0, false=0, too_confident=1.0):
+    """Three rounds with drift and loops to the first; then false ones: clusters of four, each consistent."""
+    rng = np.random.default_rng(seed)
+    sigmas, loop_sigmas = PoseSigmas(0.002, 0.005), PoseSigmas(0.005, 0.01)
+    truth = 3 * on_a_circle(lap)
+    n = len(truth)
+
+    def measured(i, j, noise):
+        rotation, translation = too_confident * noise.rotation_rad, too_confident * noise.translation_m
+        error = exp(rng.normal(0, rotation, 3), rng.normal(0, translation, 3))
+        return inverse(truth[i]) @ truth[j] @ error
+
+    graph = PoseGraph()
+    graph.add_node(0, 0, truth[0])
+    for k in range(1, n):
+        step = measured(k - 1, k, sigmas)
+        graph.add_node(k, k, graph.T_world_node[k - 1] @ step)
+        graph.add_factors([BetweenFactor(k - 1, k, step, sigmas.information)])
+    ends = [(j % lap, j) for j in range(lap, n, 10)]
+    T_i_js = [measured(i, j, loop_sigmas) for i, j in ends]
+    for start in range(0, false, 4):
+        i, j = np.sort(rng.choice(n - 4, 2, replace=False)).tolist()
+        wrong = exp(rng.normal(0, 0.3, 3), rng.normal(0, 1, 3))
+        for k in range(min(4, false - start)):
+            ends.append((i + k, j + k))
+            T_i_js.append(inverse(truth[i + k]) @ truth[i] @ wrong @ inverse(truth[j]) @ truth[j + k])
+    graph.add_factors(
+        BetweenFactor(i, j, T, loop_sigmas.information, "loop")
+        for (i, j), T in zip(ends, T_i_js, strict=True)
+    )
+    return graph, truth, len(ends) - false
+
+
+def worst_m(solution, truth):
+    return max(np.linalg.norm(solution.T_world_node[k][:3, 3] - T[:3, 3]) for k, T in enumerate(truth))
+
+
+@pytest.mark.parametrize("false", [1, 3, 8])
+@pytest.mark.parametrize("seed", range(3))
+def test_false_loops_are_found_out_and_change_nothing(false, seed):
+    graph, truth, true = laps(seed=seed, false=false)
+    without = optimize(laps(seed=seed)[0], GraphConfig())
+    solution = optimize(graph, GraphConfig())
+    weights = np.array(solution.weights)
+    loops = weights[239:]
+    assert (weights[:239] == 1.0).all()
+    assert (loops[true:] == 0.0).all()
+    assert loops[:true].mean() > 0.95
+    assert worst_m(solution, truth) < 1.1 * worst_m(without, truth)
+
+
+def test_without_doubt_a_false_loop_bends_the_map():
+    graph, truth, _ = laps(false=1)
+    doubting, plain = (
+        optimize(graph, GraphConfig(robust=robust, initial="given", max_iterations=20))
+        for robust in ("gnc", "none")
+    )
+    assert worst_m(plain, truth) > 2.0 * worst_m(doubting, truth)
+
+
+def test_over_confident_information_does_not_cost_the_true_loops():
+    """Features that count as independent make sigmas five times too small: a fixed limit refuses all."""
+    graph, _, true = laps(seed=1, false=5, too_confident=5.0)
+    loops = np.array(optimize(graph, GraphConfig()).weights)[239:]
+    assert loops[:true].mean() > 0.9
+    assert (loops[true:] < 0.5).all()
+
+
+@pytest.mark.parametrize("kernel", ["cauchy", "huber", "dcs"])
+def test_kernels_weigh_a_false_loop_down_and_leave_odometry_alone(kernel):
+    graph, _, true = laps(seed=2, false=1)
+    solution = optimize(graph, GraphConfig(robust=kernel))
+    weights = np.array(solution.weights)
+    assert (weights[:239] == 1.0).all()
+    assert weights[-1] < 0.5
+    assert weights[239 : 239 + true].mean() > 0.6
+    assert solution.error_after == pytest.approx(np.dot(solution.weights, solution.factor_errors))
+
+
+def test_a_wider_kernel_lets_more_count():
+    graph, _, _ = laps(seed=2, false=1)
+    narrow, wide = (
+        optimize(graph, GraphConfig(robust="cauchy", robust_width=w)).weights[-1] for w in (1, 50)
+    )
+    assert narrow < wide
+
+
+def test_a_loop_between_parts_that_odometry_does_not_tie_is_believed():
+    a, truth = loop(8)
+    both = merged(a, loop(6, first=100)[0])
+    T_0_100 = inverse(truth[0]) @ both.T_world_node[100]
+    both.add_factors([BetweenFactor(0, 100, T_0_100, INFORMATION, "loop")])
+    assert optimize(both, GraphConfig()).weights[-1] == 1.0
+
+
+@pytest.mark.parametrize("initial", ["auto", "chordal"])
+def test_a_start_without_estimates_is_found(initial):
+    graph, truth = loop(40)
+    lost = PoseGraph()
+    rng = np.random.default_rng(6)
+    for node, T in graph.T_world_node.items():
+        lost.add_node(node, node, exp(rng.normal(0, 2, 3), rng.normal(0, 9, 3)) if node else T)
+    lost.add_factors(graph.factors)
+    solution = optimize(lost, GraphConfig(initial=initial))
+    assert solution.error_after < 1e-9
+    for node, T in enumerate(truth):
+        np.testing.assert_allclose(solution.T_world_node[node], T, atol=1e-7)
+
+
+def test_auto_keeps_estimates_that_fit():
+    graph, _ = loop(rng=np.random.default_rng(7))
+    near = optimize(graph, GraphConfig()).T_world_node
+    good = PoseGraph(near, graph.stamps_ns, graph.factors)
+    auto, given = (optimize(good, GraphConfig(initial=initial)) for initial in ("auto", "given"))
+    assert all((auto.T_world_node[node] == given.T_world_node[node]).all() for node in near)
+
+
+def test_the_iterations_are_reported():
+    seen = []
+
+    class Watching:
+        @contextmanager
+        def stage(self, name):
+            yield lambda done, total: seen.append((name, done, total))
+
+        def note(self, message):
+            raise AssertionError(message)
+
+    graph, _ = loop(rng=np.random.default_rng(8))
+    solution = optimize(graph, GraphConfig(initial="given"), progress=Watching())
+    assert seen[-1] == ("solve", solution.iterations, solution.iterations)
+
+
 @needs_posegraphs
 @pytest.mark.parametrize(
-    ("name", "best"), [("tinyGrid3D", 9.3139094), ("smallGrid3D", 517.92533), ("sphere2500", 675.70096)]
+    ("name", "best"),
+    [
+        ("tinyGrid3D", 9.3139094),
+        ("smallGrid3D", 517.92533),
+        ("intel", 22.502117),
+        ("parking-garage", 0.6341924),
+        ("sphere2500", 675.70096),
+        ("torus3D", 12117.637),
+        ("cubicle", 1372.7779),
+    ],
 )
 def test_reaches_the_published_cost_from_file_initialisation(name, best):
     solution = optimize(read_g2o(POSEGRAPHS / f"{name}.g2o"), GraphConfig())
-    assert solution.error_after == pytest.approx(best, rel=1e-7)
-    assert sum(solution.factor_errors) == pytest.approx(best, rel=1e-7)
+    assert solution.error_after == pytest.approx(best, rel=1e-6)
+    assert sum(solution.factor_errors) == pytest.approx(best, rel=1e-6)
