@@ -106,7 +106,7 @@ class KeyframeConfig(Config):
     min_start_features: PositiveInt = 100
     """Features with depth that the first frame must have."""
     min_matches: Annotated[int, Field(ge=8)] = 20
-    """Fewer matches to the last frame, or to a keyframe and with P3P, say nothing about the motion."""
+    """Fewer matches to the last frame, or to a keyframe, say nothing about the motion."""
     min_inliers: PositiveInt = 30
     """Fewer landmarks that agree with the pose mean that the frame is lost."""
     weak_inliers: PositiveInt = 150
@@ -116,10 +116,11 @@ class KeyframeConfig(Config):
     keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.75
     """Keyframe when the inliers fall below this share of the most since the last keyframe."""
     hasty_keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
-    """The same share while the last keyframe is younger than ``min_keyframe_gap``: for fast motion."""
+    """The same share while the last keyframe is young and the inliers are not weak: for fast motion."""
     mapped_ratio: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
     """Keyframe when the inliers are a smaller share of the near features: much of the view is new."""
     min_keyframe_gap: PositiveInt = 4
+    """Frames for which a keyframe is young."""
     max_keyframe_gap: PositiveInt = 20
     bundle_keyframes: PositiveInt = 10
     """Window of the local bundle adjustment."""
@@ -136,6 +137,8 @@ class KeyframeConfig(Config):
     """M: draws of four pairs for P3P, at most (B3)."""
     ransac_tolerance_px: PositiveFloat = 4.0
     """β: how far a pair that agrees with P3P may lie off (B3)."""
+    min_agreement_ratio: Annotated[float, Field(ge=0.0, le=1.0)] = 0.3
+    """A pose that a smaller share of the matches agrees with is refused: what repeats gave 0.28."""
     relocalisation_keyframes: PositiveInt = 5
     """A lost frame is compared with as many keyframes that look like it, and as many of the nearest."""
 

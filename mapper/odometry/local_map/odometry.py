@@ -131,7 +131,8 @@ class KeyframeOdometry:
         if self._frames_since_keyframe >= config.max_keyframe_gap:
             return True
         kept_ratio = placement.inliers / self._most_inliers
-        if self._frames_since_keyframe < config.min_keyframe_gap:
+        weak = placement.inliers < config.weak_inliers
+        if self._frames_since_keyframe < config.min_keyframe_gap and not weak:
             return kept_ratio < config.hasty_keyframe_ratio
         # Landmarks left behind at one edge of a view hold its pose badly, however many they are.
         mapped = placement.inliers / max(self._near(placement.observation), 1)

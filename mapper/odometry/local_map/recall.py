@@ -80,9 +80,12 @@ class Recall:
             tolerance_px=self._config.ransac_tolerance_px,
             iterations=self._config.ransac_iterations,
         )
-        if found is None or len(found[1]) < self._config.min_matches:
+        if found is None:
             return None
         T_camera_world, agreeing = found
+        fewest = max(self._config.min_agreement_ratio * len(features), self._config.min_matches // 2)
+        if len(agreeing) < fewest:
+            return None
         features, ids = features[agreeing], ids[agreeing]
         T_camera_world, agree = refined(T_camera_world, points_world[agreeing], observation, features)
         landmark_of_feature = unmatched(observation)
