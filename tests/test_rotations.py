@@ -84,3 +84,18 @@ def test_at_the_gimbal_roll_is_zero():
         roll, found, _ = euler_from_rotation(rotation_from_euler(0.4, pitch, 0.9))
         assert roll == 0.0
         assert found == pytest.approx(pitch)
+
+
+def test_many_turns_are_converted_as_one_would_be():
+    rng = np.random.default_rng(5)
+    q = rng.normal(0, 1, (50, 4))
+    rotations = rotation_from_quaternion(q)
+    assert rotations.shape == (50, 3, 3)
+    for one, R in zip(q, rotations, strict=True):
+        np.testing.assert_array_equal(rotation_from_quaternion(one), R)
+    back = quaternion_from_rotation(rotations)
+    for R, one in zip(rotations, back, strict=True):
+        np.testing.assert_allclose(quaternion_from_rotation(R), one, atol=1e-15)
+    q[7] = 0.0
+    with pytest.raises(DataError, match=r"\(0.0, 0.0, 0.0, 0.0\) has no direction"):
+        rotation_from_quaternion(q)
