@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILENT) -> Solution:
     """Return the poses that explain the factors best.
 
-    Levenberg–Marquardt (Marquardt 1963) on ½ Σ w ‖log(T_i_j⁻¹ · T_i⁻¹ · T_j)‖², each in its factor's metric;
-    w is 1 but for loops, which ``config.robust`` weighs. Every connected component is solved on its own and
+    Least squares on ½ Σ w ‖log(T_i_j⁻¹ · T_i⁻¹ · T_j)‖², each in its factor's metric; w is 1 but for loops,
+    which ``config.robust`` weighs. Every connected component is solved on its own and
     keeps its first node where it was; a node without factors keeps its estimate.
 
     With ``config.solve == "proportional"`` the loops are spread along the path instead, and with "none"
