@@ -11,22 +11,31 @@ import numpy as np
 from mapper.geometry import Array, Transform, adjoint, inverse, log
 from mapper.graph.model import BetweenFactor
 
+_MOST_TRIED = 5
+"""Loops between the same two parts that are tried as their tie."""
+
 
 def innovations(known: Sequence[BetweenFactor], loops: Sequence[BetweenFactor]) -> Array:
     """Return how well each loop fits what odometry alone says: its squared Mahalanobis distance.
 
     Along the spanning tree of the surest known factors, poses are chained and first-order covariances add
     up in the world's tangent space (Barfoot & Furgale 2014, eq. 55 without the fourth-order terms). It is
-    as wide as odometry claims to have drifted: over a long way a large disagreement says little.
+    as wide as odometry claims to have drifted: over a long way a large disagreement says little. Parts that
+    only loops tie are tied by the one that the others between them fit best.
 
     Args:
         known: Factors that are believed.
         loops: Factors in doubt.
 
     Returns:
-        (len(loops),) χ² of six degrees of freedom; 0 where no known factors lead from i to j.
+        (len(loops),) χ² of six degrees of freedom; 0 of a tie, and of a loop to a node without known factors.
     """
     tree = _spanning_tree(known)
+    while between := tree.between_first_parts(loops):
+        tried = between[:: -(-len(between) // _MOST_TRIED)]
+        trees = [_spanning_tree([*known, tie]) for tie in tried]
+        best = min(range(len(tried)), key=lambda k: float(np.median([*map(trees[k].innovation, between)])))
+        known, tree = [*known, tried[best]], trees[best]
     return np.array([tree.innovation(loop) for loop in loops])
 
 
@@ -52,6 +61,16 @@ class _Place:
 @dataclass(frozen=True, slots=True)
 class _Tree:
     places: dict[int, _Place]
+
+    def between_first_parts(self, loops: Sequence[BetweenFactor]) -> list[BetweenFactor]:
+        """Return the loops between the same two trees as the first one that lies between any two."""
+        by_parts: dict[frozenset[int], list[BetweenFactor]] = {}
+        for loop in loops:
+            if loop.i in self.places and loop.j in self.places:
+                parts = frozenset((self.places[loop.i].root, self.places[loop.j].root))
+                if len(parts) == 2:
+                    by_parts.setdefault(parts, []).append(loop)
+        return next(iter(by_parts.values()), [])
 
     def innovation(self, loop: BetweenFactor) -> float:
         i, j = self.places.get(loop.i), self.places.get(loop.j)
