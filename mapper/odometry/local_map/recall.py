@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from mapper.config.odometry import KeyframeConfig
-from mapper.geometry import Array, inverse
+from mapper.geometry import Array
 from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
 from mapper.odometry.local_map.observation import Observation
@@ -56,11 +56,12 @@ class Recall:
             observation: The frame.
             here_world: (3,) metres: where the camera was last.
         """
-        budget, keyframes = self._config.relocalisation_keyframes, self._map.keyframes
+        budget = self._config.relocalisation_keyframes
         seen = self._vocabulary.vector(observation.words)
         alike = [k for k, _ in self._index.query(seen, min_similarity=0.0, limit=budget)]
-        centres = np.array([inverse(keyframe.T_camera_world)[:3, 3] for keyframe in keyframes])
-        nearest = np.argsort(np.linalg.norm(centres - here_world, axis=1), kind="stable")[:budget]
+        T_camera_world = np.array([keyframe.T_camera_world for keyframe in self._map.keyframes])
+        here_camera = T_camera_world[:, :3, :3] @ here_world + T_camera_world[:, :3, 3]
+        nearest = np.argsort(np.linalg.norm(here_camera, axis=1), kind="stable")[:budget]
         return list(dict.fromkeys([*alike, *map(int, nearest)]))
 
     def _beside(self, k: int, observation: Observation, *, method: str) -> Placement | None:
