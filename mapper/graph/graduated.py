@@ -125,7 +125,8 @@ def _reconsidered(
         if believed.all() or (tried == believed).all():
             continue
         then = _round(part, terms, tried.astype(np.float64), now)
-        then = _round(part, terms, (then.chi2 <= limit).astype(np.float64), then)
+        for share in (_NEARLY, 1.0):
+            then = _round(part, terms, (then.chi2 <= share * limit).astype(np.float64), then)
         if (lower := _cost(part, then, limit)) < cost:
             now, cost = then, lower
     return now
