@@ -114,8 +114,9 @@ class ThesisLoopsConfig(Config):
     max_candidates: PositiveInt = 4
     """Keyframes compared per frame, the nearest first; the first loop found ends the search."""
     verification: VerificationConfig = VerificationConfig(
-        match=MatchConfig(), min_matches=20, min_inliers=20, min_inlier_ratio=0.0, measure="isvd"
+        match=MatchConfig(filter="none"), min_matches=20, min_inliers=20, min_inlier_ratio=0.0, measure="isvd"
     )
+    """A9 matches descriptors and leaves the rest to ISVD; alg. 8's homography is for frames in a row."""
 
     def build(self, correction: "Correction", /) -> "Closer":
         """Return the closer; ``correction`` is how the graph is solved."""

@@ -2,7 +2,7 @@
 
 from typing import Literal, Protocol
 
-from mapper.geometry import Transform
+from mapper.geometry import Transform, inverse
 from mapper.graph.incremental import IncrementalSolver
 from mapper.graph.model import PoseGraph
 from mapper.graph.proportional import spread
@@ -66,18 +66,23 @@ class SolvedBelief:
 
 
 class SpreadBelief:
-    """Belief by the thesis's proportional correction (A9)."""
+    """Belief by the thesis's proportional correction (A9) of the path as the odometry averaged it (A7)."""
 
     def __init__(self) -> None:
         self._T_world_node: dict[int, Transform] = {}
+        self._told: tuple[int, Transform] | None = None
 
     def know(self, graph: PoseGraph) -> None:
         """Take in an earlier session, solved, before anything else."""
         self._T_world_node |= graph.T_world_node
 
     def add(self, node: int, track: Track) -> None:
-        """Take in a new node, in time order."""
-        self._T_world_node[node] = _first_estimate(track, self._T_world_node)
+        """Take in a new node, in time order; the motion since the last one is what the odometry tells."""
+        self._T_world_node[node] = track.T_world_body
+        if self._told is not None:
+            last, T_told = self._told
+            self._T_world_node[node] = self._T_world_node[last] @ inverse(T_told) @ track.T_world_body
+        self._told = node, track.T_world_body
 
     def close(self, closure: LoopClosure) -> None:
         """Correct the path by a loop."""
