@@ -152,7 +152,15 @@ def test_eval_states_the_alignment_and_agrees_with_the_library(run_folder, desk_
 
     values = {metric["name"]: metric["value"] for metric in of_files}
     assert values == {m.name: m.value for m in evaluate(read_tum(estimate), read_tum(truth))}
-    assert {metric["name"]: metric["value"] for metric in of_run} == pytest.approx(values)
+    told = {metric["name"]: metric["value"] for metric in of_run}
+    assert {name: told[name] for name in values} == pytest.approx(values)
+    assert told.keys() - values.keys() == {
+        "loops",
+        "loops wrongly accepted",
+        "true revisits",
+        "true revisits with a loop",
+    }
+    assert told["loops wrongly accepted"] == 0
     assert "ATE RMSE, SE(3)-aligned" in mapper("eval", run_folder).stdout
     assert "ATE RMSE, Sim(3)-aligned" in mapper("eval", run_folder, "--align", "sim3").stdout
     assert "ATE RMSE, not aligned" in mapper("eval", run_folder, "--align", "none").stdout
