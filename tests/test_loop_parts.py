@@ -17,11 +17,12 @@ from mapper.loops.closure import (
     Discrepancy,
     LoopClosure,
     discrepancy,
+    exceeds,
     read_closures,
     settled,
     write_closures,
 )
-from mapper.loops.drift import Ways, allowed, exceeds
+from mapper.loops.drift import Ways, allowed
 from mapper.loops.verification import Verifier
 
 SURE = PoseSigmas(rotation_rad=0.01, translation_m=0.01).information

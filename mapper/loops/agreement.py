@@ -7,8 +7,8 @@ import numpy as np
 from mapper.config.loops import GateConfig
 from mapper.geometry import inverse
 from mapper.loops.belief import Belief
-from mapper.loops.closure import LoopClosure, discrepancy
-from mapper.loops.drift import Way, Ways, allowed, exceeds
+from mapper.loops.closure import LoopClosure, discrepancy, exceeds
+from mapper.loops.drift import Way, Ways, allowed
 
 
 @dataclass(slots=True)

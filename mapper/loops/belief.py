@@ -6,7 +6,7 @@ from mapper.geometry import Transform, inverse
 from mapper.graph.incremental import IncrementalSolver
 from mapper.graph.model import PoseGraph
 from mapper.graph.proportional import spread
-from mapper.loops.closure import LoopClosure
+from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy, exceeds
 from mapper.odometry.base import Track
 
 Correction = Literal["batch", "proportional", "none"]
@@ -33,8 +33,12 @@ class Belief(Protocol):
         ...
 
 
+_NEWS = Discrepancy(translation_m=0.02, rotation_rad=0.01)
+"""A loop that moves nothing farther is no news; it waits to be solved with the next that is."""
+
+
 class SolvedBelief:
-    """Belief by incremental smoothing (iSAM2, Kaess et al. 2012); it is solved only when a loop closes."""
+    """Belief by incremental smoothing (iSAM2, Kaess et al. 2012); it is solved when a loop brings news."""
 
     def __init__(self) -> None:
         self._solver = IncrementalSolver()
@@ -56,9 +60,12 @@ class SolvedBelief:
 
     def close(self, closure: LoopClosure) -> None:
         """Correct the path by a loop."""
-        self._solver.add_factors([closure.factor])
-        self._solver.update()
-        self._T_world_node = self._solver.poses()
+        factor = closure.factor
+        self._solver.add_factors([factor])
+        miss = discrepancy(factor.T_i_j, self._T_world_node[factor.i], self._T_world_node[factor.j])
+        if exceeds(miss, _NEWS):
+            self._solver.update()
+            self._T_world_node = self._solver.poses()
 
     def pose_of(self, node: int) -> Transform:
         """Return the (4, 4) believed pose of a node."""

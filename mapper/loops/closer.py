@@ -15,8 +15,8 @@ from mapper.geometry import Transform
 from mapper.graph.model import PoseGraph
 from mapper.loops.agreement import Agreement
 from mapper.loops.belief import Correction, belief_for
-from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy
-from mapper.loops.drift import Ways, allowed, exceeds
+from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy, exceeds
+from mapper.loops.drift import Ways, allowed
 from mapper.loops.proposals import ByBoth, ByPose, ByWords, Proposal, Proposer
 from mapper.loops.verification import Verifier
 from mapper.odometry.base import Track

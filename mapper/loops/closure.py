@@ -95,6 +95,11 @@ def discrepancy(T_i_j: Transform, T_world_i: Transform, T_world_j: Transform) ->
     return Discrepancy(float(np.linalg.norm(miss[:3, 3])), float(np.linalg.norm(rotation_log(miss[:3, :3]))))
 
 
+def exceeds(miss: Discrepancy, limit: Discrepancy) -> bool:
+    """Tell whether a discrepancy is larger than a limit in either part."""
+    return miss.translation_m > limit.translation_m or miss.rotation_rad > limit.rotation_rad
+
+
 def settled(
     loops: Sequence[LoopClosure],
     T_world_before: Mapping[int, Transform],

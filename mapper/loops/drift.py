@@ -72,8 +72,3 @@ def allowed(config: GateConfig, way: Way) -> Discrepancy:
         + config.drift_rad_per_m * way.path_m
         + config.drift_rad_per_rad * way.turned_rad,
     )
-
-
-def exceeds(miss: Discrepancy, limit: Discrepancy) -> bool:
-    """Tell whether a discrepancy is larger than a limit in either part."""
-    return miss.translation_m > limit.translation_m or miss.rotation_rad > limit.rotation_rad
