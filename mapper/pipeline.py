@@ -22,6 +22,7 @@ from mapper.graph.model import PoseGraph
 from mapper.levelling import Level, find_level
 from mapper.manifest import Levelling, Solve, Status, Timing
 from mapper.measure import peak_memory_mb
+from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.sight_file import SightWriter, open_sights
 from mapper.parts import largest_part
@@ -44,7 +45,7 @@ from mapper.tracked import Tracked, save_tracked, tracked_before, tracked_now
 from mapper.tracking import refuse_a_fragment, track_log
 from mapper.trajectory import Trajectory
 
-_FUSE_CONFIGS = frozenset({"octree", "slice", "traversable", "cloud", "mcap", "mesh", "workers"})
+_FUSE_CONFIGS = frozenset({"octree", "slice", "traversable", "cloud", "mcap", "mesh", "costmap", "workers"})
 _TRACKING_STAGES = ("track", "solve", "level")
 _REMADE_BY_FUSE = frozenset(
     {
@@ -52,6 +53,7 @@ _REMADE_BY_FUSE = frozenset(
         files.MANIFEST,
         files.OCTREE_BT,
         files.OCTREE_OT,
+        files.OCTREE_MAP,
         files.SIGHTS,
         files.CLOUD,
         files.CLOUD_VIEWS,
@@ -60,7 +62,12 @@ _REMADE_BY_FUSE = frozenset(
     }
 )
 _OUTDATED_BY_FUSE = frozenset(
-    {EXPORTERS["voxels"].file_name, EXPORTERS["voxel-mesh"].file_name, files.PLAN, files.PLAN_VIEW}
+    {
+        *(EXPORTERS[kind].file_name for kind in ("voxels", "voxel-mesh", "costmap")),
+        *(f"{files.COSTMAP}{ending}" for ending in EXPORTERS["costmap"].beside),
+        files.PLAN,
+        files.PLAN_VIEW,
+    }
 )
 _MAX_TRUTH_GAP_NS = 20_000_000
 
@@ -260,6 +267,7 @@ def fuse_into(
 def _write_maps(folder: Path, maps: Maps) -> None:
     write_bt(folder / files.OCTREE_BT, maps.octree)
     write_ot(folder / files.OCTREE_OT, maps.octree)
+    write_map(folder / files.OCTREE_MAP, maps.octree)
     write_ply(folder / files.CLOUD, maps.cloud_points_world, maps.cloud_colors)
     write_grid(folder, files.SLICE, maps.grid)
     write_grid(folder, files.TRAVERSABLE, maps.traversable)

@@ -14,6 +14,7 @@ from mapper.export.exporters import EXPORTERS, export
 from mapper.export.grid import read_grid
 from mapper.graph.g2o import read_g2o
 from mapper.octree.octomap_file import read_map
+from mapper.octree.slice import OCCUPIED, UNKNOWN
 from mapper.pipeline import build
 from mapper.run import load_run, moved_log
 from mapper.sources import open_source
@@ -107,6 +108,25 @@ def check_grid(run, path):
     assert path.with_suffix(".png").is_file()
 
 
+def check_native(run, path):
+    ours, theirs = read_map(path), read_map(run.path / "map.ot", run.config.octree)
+    assert ours.config == run.config.octree
+    np.testing.assert_array_equal(ours.leaves().keys, theirs.leaves().keys)
+    np.testing.assert_array_equal(ours.leaves().log_odds, theirs.leaves().log_odds)
+
+
+def check_costmap(run, path):
+    grid = read_grid(run.path / "slice.yaml")
+    magic, _, size, _, pixels = path.with_suffix(".pgm").read_bytes().split(b"\n", 4)
+    assert (magic, size) == (b"P5", b"%d %d" % grid.cells.shape[::-1])
+    values = np.frombuffer(pixels, np.uint8).reshape(grid.cells.shape)[::-1]
+    np.testing.assert_array_equal(values == 100, grid.cells == OCCUPIED)
+    assert set(np.unique(values)) <= {*range(101), 255}
+    assert (values[grid.cells == UNKNOWN] >= 99).all()  # unknown, or too near to an obstacle anyway
+    assert "mode: raw" in path.read_text()
+    assert path.with_suffix(".png").is_file()
+
+
 def check_tum(run, path):
     np.testing.assert_array_equal(read_tum(path).T_world_body, run.trajectory().T_world_body)
 
@@ -126,6 +146,8 @@ CHECKS = {
     "voxel-mesh": check_voxel_mesh,
     "mesh": check_mesh,
     "grid": check_grid,
+    "native": check_native,
+    "costmap": check_costmap,
     "tum": check_tum,
     "kitti": check_kitti,
     "g2o": check_g2o,
@@ -199,7 +221,7 @@ def test_a_folder_is_not_a_file(untouched, kind, tmp_path):
 
 
 def test_an_unknown_kind_names_the_known():
-    with pytest.raises(ConfigError, match="no exporter 'jpeg'; want one of octomap, ply, voxels"):
+    with pytest.raises(ConfigError, match="no exporter 'jpeg'; want one of octomap, native, ply, voxels"):
         export(None, "jpeg")
 
 

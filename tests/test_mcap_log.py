@@ -11,8 +11,8 @@ from mcap_protobuf.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mapper.errors import DataError
-from mapper.export.jpeg import encode_jpeg, shrunk_camera
 from mapper.export.foxglove_parts import dotted
+from mapper.export.jpeg import encode_jpeg, shrunk_camera
 from mapper.export.mcap_log import McapLog
 from mapper.frames import PinholeCamera
 from mapper.geometry import exp, inverse

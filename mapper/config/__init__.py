@@ -12,7 +12,7 @@ from mapper.config.base import Config
 from mapper.config.export import MeshConfig
 from mapper.config.graph import GraphConfig
 from mapper.config.loops import LoopsConfig, PlaceLoopsConfig
-from mapper.config.navigation import TraversableConfig
+from mapper.config.navigation import CostmapConfig, TraversableConfig
 from mapper.config.octree import LevelConfig, OctreeConfig, SliceConfig
 from mapper.config.odometry import LocalMapConfig, OdometryConfig
 from mapper.config.sources import SourceConfig
@@ -57,6 +57,7 @@ class BuildConfig(Config):
     cloud: CloudConfig = CloudConfig()
     mcap: McapConfig = McapConfig()
     mesh: MeshConfig = MeshConfig()
+    costmap: CostmapConfig = CostmapConfig()
     min_tracked_frames: PositiveInt = 10
     """With fewer frames tracked there is no map worth the name, and the build ends in an error."""
     min_tracked_ratio: Annotated[float, Field(ge=0.0, le=1.0)] = 0.2

@@ -24,6 +24,17 @@ class TraversableConfig(Config):
     """Floor goes on over unseen columns up to this wide, which rays along the floor leave."""
 
 
+class CostmapConfig(Config):
+    """The slice inflated as nav2's costmap does; its defaults but the radius."""
+
+    robot_radius_m: NonNegativeFloat = 0.2
+    """Inscribed radius: nearer to an obstacle the robot's centre cannot be."""
+    inflation_radius_m: NonNegativeFloat = 0.55
+    """How far from obstacles there is a cost at all."""
+    cost_scaling: NonNegativeFloat = 10.0
+    """Per metre: how fast the cost falls with the distance."""
+
+
 class PlanConfig(Config):
     """A path for a disc on a grid or a ball in the octree."""
 

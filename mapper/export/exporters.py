@@ -49,12 +49,21 @@ _MESH_ENDINGS = (".ply", ".obj", ".glb")
 
 EXPORTERS = {
     "octomap": Exporter("octree for OctoMap and ROS", "run_files:octomap", "map.bt", (".bt", ".ot")),
+    "native": Exporter("octree with all that it knows", "run_files:native", "map.octree", (".octree",)),
     "ply": Exporter("coloured cloud", "run_files:cloud", "cloud.ply", (".ply",)),
     "voxels": Exporter("occupied voxels' centres", "voxels:centres", "voxels.ply", (".ply",)),
     "voxel-mesh": Exporter("occupied voxels as cubes", "voxels:cubes", "voxel_mesh.ply", _MESH_ENDINGS),
     "mesh": Exporter("coloured surface", "mesh:surface", "mesh.ply", _MESH_ENDINGS, settings="mesh"),
     "grid": Exporter(
         "slice for nav2", "run_files:grid", "slice.yaml", (".yaml", ".yml"), beside=(".pgm", ".png")
+    ),
+    "costmap": Exporter(
+        "slice inflated for nav2",
+        "costmap:costmap",
+        "costmap.yaml",
+        (".yaml", ".yml"),
+        beside=(".pgm", ".png"),
+        settings="costmap",
     ),
     "tum": Exporter("trajectory as TUM text", "run_files:tum", "trajectory.tum", (".tum", ".txt")),
     "kitti": Exporter("trajectory as KITTI text", "run_files:kitti", "trajectory.kitti", (".kitti", ".txt")),

@@ -17,6 +17,11 @@ def octomap(run: Run, path: Path, _progress: Progress) -> None:
     _copy(run, files.OCTREE_OT if path.suffix.lower() == ".ot" else files.OCTREE_BT, path)
 
 
+def native(run: Run, path: Path, _progress: Progress) -> None:
+    """Copy the octree with everything that it knows, compressed."""
+    _copy(run, files.OCTREE_MAP, path)
+
+
 def cloud(run: Run, path: Path, _progress: Progress) -> None:
     """Copy the coloured cloud, binary PLY."""
     _copy(run, files.CLOUD, path)

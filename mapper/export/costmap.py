@@ -1,0 +1,66 @@
+"""The slice, inflated, as nav2's map_server loads costs."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper import run as files
+from mapper.atomic import write_bytes, write_text
+from mapper.export.grid import read_grid
+from mapper.export.palette import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
+from mapper.navigation.costmap import INSCRIBED, LETHAL, NO_INFORMATION, Costmap, inflate
+from mapper.progress import Progress
+from mapper.run import Run
+
+_MOST_INFLATED = 98
+_INSCRIBED, _LETHAL, _UNKNOWN = 99, 100, 255
+_PICTURE_PX_PER_CELL = 4
+
+
+def costmap(run: Run, path: Path, _progress: Progress) -> None:
+    """Write YAML in map_server's mode "raw" with PGM and PNG beside it.
+
+    Raises:
+        DataError: The configured radii do not fit together.
+    """
+    config = run.config.costmap
+    inflated = inflate(
+        read_grid(run.path / f"{files.SLICE}.yaml"),
+        robot_radius_m=config.robot_radius_m,
+        inflation_radius_m=config.inflation_radius_m,
+        cost_scaling=config.cost_scaling,
+    )
+    values = occupancy_values(inflated)
+    height, width = values.shape
+    header = f"P5\n# CREATOR: mapper {inflated.resolution_m:.3f} m/pix\n{width} {height}\n255\n"
+    write_bytes(path.with_suffix(".pgm"), header.encode("ascii") + values[::-1].tobytes())
+    write_bytes(path.with_suffix(".png"), _picture(values))
+    x, y = (float(value) for value in inflated.origin_world_m)
+    write_text(
+        path,
+        f"image: {path.stem}.pgm\nmode: raw\nresolution: {float(inflated.resolution_m)!r}\n"
+        f"origin: [{x!r}, {y!r}, 0.0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n",
+    )
+
+
+def occupancy_values(costmap: Costmap) -> NDArray[np.uint8]:
+    """Return (H, W) values as nav2 publishes costs: 0 free, 1 … 98, 99 inscribed, 100 lethal, 255 unknown."""
+    table = np.zeros(256, np.uint8)
+    inflated = np.arange(1, INSCRIBED)
+    table[1:INSCRIBED] = 1 + (_MOST_INFLATED - 1) * (inflated - 1) // (INSCRIBED - 2)
+    table[[INSCRIBED, LETHAL, NO_INFORMATION]] = _INSCRIBED, _LETHAL, _UNKNOWN
+    values: NDArray[np.uint8] = table[costmap.costs]
+    return values
+
+
+def _picture(values: NDArray[np.uint8]) -> bytes:
+    """Return a PNG: the dearer, the redder; obstacles dark, unknown grey."""
+    share = np.clip(values, 0, _INSCRIBED).astype(np.float32)[..., None] / _INSCRIBED
+    bgr = (1.0 - share) * FREE_CELL[::-1] + share * (40.0, 60.0, 225.0)
+    bgr[values == _LETHAL] = OCCUPIED_CELL[::-1]
+    bgr[values == _UNKNOWN] = UNKNOWN_CELL[::-1]
+    enlarged = np.kron(bgr[::-1].astype(np.uint8), np.ones((_PICTURE_PX_PER_CELL,) * 2 + (1,), np.uint8))
+    _, encoded = cv2.imencode(".png", enlarged)
+    return encoded.tobytes()
