@@ -80,7 +80,10 @@ def test_spelled_out_overrides_win(desk_log, tmp_path):
         (["fuse", "RUN", "--set", "graph.solve=none"], "mapper: graph: fuse keeps what was tracked"),
         (["fuse", "RUN", "--log", "gone"], "gone: the log of RUN is no longer there; tell its new place"),
         (["export", "nowhere", "--as", "ply"], "mapper: nowhere: no such run folder"),
-        (["export", "RUN", "--as", "jpeg"], "mapper: no exporter 'jpeg'; want one of octomap, native, ply, voxels"),
+        (
+            ["export", "RUN", "--as", "jpeg"],
+            "mapper: no exporter 'jpeg'; want one of octomap, native, ply, voxels",
+        ),
         (["export", "RUN", "--as", "ply", "--out", "a.obj"], "mapper: a.obj: ply files end with .ply"),
         (["export", "RUN", "--as", "tum", "--set", "a.b=1"], "mapper: overrides: a: Extra inputs"),
         (["eval", "nowhere"], "mapper: nowhere: no such run folder"),
