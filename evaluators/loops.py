@@ -8,14 +8,13 @@ from numpy.typing import NDArray
 from evaluators.metric import Metric
 from mapper.geometry import Array
 from mapper.loops.closure import LoopClosure, discrepancy
-from mapper.timebase import NS_PER_S, Stamps, nearest
+from mapper.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
 from mapper.trajectory import Trajectory
 
 MAX_ERROR_M, MAX_ERROR_RAD = 0.2, 0.1
 """A loop that is farther from the truth is wrong."""
 REVISIT_M, REVISIT_RAD, REVISIT_S = 0.5, np.deg2rad(20.0), 5.0
 """A keyframe revisits what an earlier one saw from so near, in so nearly the same direction, so long ago."""
-_MAX_TRUTH_GAP_NS = 20_000_000
 
 
 def loop_metrics(loops: Sequence[LoopClosure], keyframes_ns: Stamps, truth: Trajectory) -> list[Metric]:
@@ -40,7 +39,7 @@ def loop_metrics(loops: Sequence[LoopClosure], keyframes_ns: Stamps, truth: Traj
 def revisits_of(keyframes_ns: Stamps, truth: Trajectory) -> NDArray[np.bool_]:
     """Return (N,) which keyframes see again, by the truth, what an earlier one saw."""
     index, gap_ns = nearest(truth.stamps_ns, keyframes_ns)
-    known = gap_ns <= _MAX_TRUTH_GAP_NS
+    known = gap_ns <= MAX_TRUTH_GAP_NS
     T_truth_body: Array = truth.T_world_body[index]
     revisit = np.zeros(len(keyframes_ns), np.bool_)
     for j in np.flatnonzero(known):
@@ -57,7 +56,7 @@ def _wrong(held: Sequence[LoopClosure], truth: Trajectory) -> list[bool]:
     stamps_ns = np.array([(loop.stamp_i_ns, loop.stamp_j_ns) for loop in held], np.int64).reshape(-1, 2)
     index, gap_ns = nearest(truth.stamps_ns, stamps_ns.ravel())
     ends = index.reshape(-1, 2)
-    known = (gap_ns <= _MAX_TRUTH_GAP_NS).reshape(-1, 2)
+    known = (gap_ns <= MAX_TRUTH_GAP_NS).reshape(-1, 2)
     wrong = []
     for loop, (i, j), covered in zip(held, ends, known, strict=True):
         if covered.all() and loop.T_i_j is not None:

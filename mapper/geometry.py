@@ -117,10 +117,10 @@ def angle_between(R_a: Array, R_b: Array) -> float:
 
 
 def nearest_rotation(M: Array) -> Array:
-    """Return the rotation closest to a (3, 3) matrix in the Frobenius norm (Umeyama 1991, lemma)."""
+    """Return the rotations closest to (…, 3, 3) matrices in the Frobenius norm (Umeyama 1991, lemma)."""
     U, _, Vt = np.linalg.svd(M)
-    S = np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt)) or 1.0])
-    R: Array = U @ S @ Vt
+    U[..., 2] *= np.where(np.linalg.det(U) * np.linalg.det(Vt) < 0.0, -1.0, 1.0)[..., np.newaxis]
+    R: Array = U @ Vt
     return R
 
 

@@ -40,7 +40,7 @@ from mapper.run import (
 from mapper.run_log import Story, log_maps, log_snapshot, log_story
 from mapper.solving import solve
 from mapper.sources.base import FrameSource
-from mapper.timebase import NS_PER_S, nearest
+from mapper.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, nearest
 from mapper.tracked import Tracked, save_tracked, tracked_before, tracked_now
 from mapper.tracking import refuse_a_fragment, track_log
 from mapper.trajectory import Trajectory
@@ -69,7 +69,6 @@ _OUTDATED_BY_FUSE = frozenset(
         files.PLAN_VIEW,
     }
 )
-_MAX_TRUTH_GAP_NS = 20_000_000
 
 
 def build(
@@ -303,7 +302,7 @@ def _write_pictures(draft: Draft, maps: Maps, story: Story) -> None:
 def _laid_over(truth: Trajectory, trajectory: Trajectory) -> Trajectory | None:
     """Return the truth moved to where it fits the trajectory best; None if they share no three stamps."""
     index, gap_ns = nearest(truth.stamps_ns, trajectory.stamps_ns)
-    near = gap_ns <= _MAX_TRUTH_GAP_NS
+    near = gap_ns <= MAX_TRUTH_GAP_NS
     if near.sum() < 3:
         return None
     T_level_truth, _ = fit_rigid(trajectory.positions_world[near], truth.positions_world[index[near]])

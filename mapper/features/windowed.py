@@ -134,6 +134,40 @@ def match_windows(
 
 
 @njit(cache=True, nogil=True)
+def nearest_among(a, i, b, first, end, best_of_b, owner):
+    """Return the two smallest distances from row i of a to rows of b, and the nearest of these.
+
+    Args:
+        a: (M, 4) uint64 descriptors.
+        i: The row.
+        b: (N, 4) uint64 descriptors.
+        first: First row of b to compare.
+        end: The row after the last.
+        best_of_b: (N,) int32 smallest distance that each row of b has met so far; kept up to date.
+        owner: (N,) int32 row of a that it met it in; kept up to date.
+    """
+    best, second, best_j = 257, 257, -1
+    for j in range(first, end):
+        d = hamming(a, i, b, j)
+        if d < best_of_b[j]:
+            best_of_b[j] = d
+            owner[j] = i
+        if d < best:
+            second, best, best_j = best, d, j
+        elif d < second:
+            second = d
+    return best, second, best_j
+
+
+@njit(cache=True, nogil=True)
+def drop_unrequited(matched, owner):
+    """Undo the matches (M,) whose partner is nearer to another row, its ``owner`` (N,)."""
+    for i in range(len(matched)):
+        if matched[i] >= 0 and owner[matched[i]] != i:
+            matched[i] = -1
+
+
+@njit(cache=True, nogil=True)
 def match_everywhere(a, b, max_hamming, max_ratio):
     """Return, per row of a, its mutually nearest row of b or −1; for when there is no prediction.
 
@@ -143,23 +177,12 @@ def match_everywhere(a, b, max_hamming, max_ratio):
         max_hamming: Largest distance in bits.
         max_ratio: Largest ratio of best to second-best distance.
     """
-    best_of_b = np.full(len(b), 257, np.int32)
     owner = np.full(len(b), -1, np.int32)
+    best_of_b = np.full(len(b), 257, np.int32)
     matched = np.full(len(a), -1, np.int32)
     for i in range(len(a)):
-        best, second, best_j = 257, 257, -1
-        for j in range(len(b)):
-            d = hamming(a, i, b, j)
-            if d < best_of_b[j]:
-                best_of_b[j] = d
-                owner[j] = i
-            if d < best:
-                second, best, best_j = best, d, j
-            elif d < second:
-                second = d
+        best, second, best_j = nearest_among(a, i, b, 0, len(b), best_of_b, owner)
         if best <= max_hamming and best <= max_ratio * second:
             matched[i] = best_j
-    for i in range(len(a)):
-        if matched[i] >= 0 and owner[matched[i]] != i:
-            matched[i] = -1
+    drop_unrequited(matched, owner)
     return matched

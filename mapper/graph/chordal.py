@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.config.graph import GraphConfig
 from mapper.errors import GraphError
-from mapper.geometry import Array
+from mapper.geometry import Array, nearest_rotation
 from mapper.graph.batch import Part, problem_of
 from mapper.graph.terms import between
 
@@ -70,7 +70,7 @@ def chordal_start(part: Part) -> gtsam.Values:
         turns.add(factor.i, -factor.T_i_j[:3, :3].T, factor.j, one, zero)
     try:
         rows = [_solved(turns, nodes, row) for row in first.rotation().matrix()]
-        R_world_node = _nearest_rotations(np.stack(rows, axis=1))
+        R_world_node = nearest_rotation(np.stack(rows, axis=1))
         for factor in factors:
             steps.add(factor.i, -one, factor.j, one, R_world_node[place[factor.i]] @ factor.T_i_j[:3, 3])
         positions = _solved(steps, nodes, first.translation())
@@ -91,14 +91,6 @@ def _solved(problem: gtsam.GaussianFactorGraph, nodes: list[int], first: Array) 
     held.add(nodes[0], np.eye(3), first)
     solution = held.optimize()
     return np.array([solution.at(node) for node in nodes])
-
-
-def _nearest_rotations(matrices: Array) -> Array:
-    """Return the rotations closest to (N, 3, 3) matrices in the Frobenius norm (Umeyama 1991, lemma)."""
-    U, _, Vt = np.linalg.svd(matrices)
-    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, np.newaxis]
-    rotations: Array = U @ Vt
-    return rotations
 
 
 def _step(problem: gtsam.NonlinearFactorGraph, near: gtsam.Values) -> tuple[float, gtsam.Values]:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from mapper.errors import GraphError
-from mapper.geometry import Array, Transform, inverse, rotation_log, skew
+from mapper.geometry import Array, Transform, inverse, nearest_rotation, rotation_log, skew
 from mapper.graph.model import BetweenFactor, PoseGraph
 
 
@@ -60,19 +60,10 @@ def spread(T_world_node: Mapping[int, Transform], loop: BetweenFactor) -> dict[i
     poses[i : j + 1, :3, 3] += share[:, np.newaxis] * shift
     poses[j] = wanted
     poses[j + 1 :] = after
-    poses[i:, :3, :3] = _nearest_rotations(poses[i:, :3, :3])
+    # Every loop multiplies the rounding that the last ones left, and a transpose is no inverse off SO(3):
+    # after fifty loops in a row the path would burst.
+    poses[i:, :3, :3] = nearest_rotation(poses[i:, :3, :3])
     return dict(zip(nodes, poses, strict=True))
-
-
-def _nearest_rotations(R: Array) -> Array:
-    """Return (N, 3, 3) matrices projected to SO(3).
-
-    Every loop multiplies what the last ones left of rounding, and a transpose is no inverse off SO(3): after
-    fifty loops in a row the path would burst.
-    """
-    U, _, Vt = np.linalg.svd(R)
-    nearest: Array = U @ Vt
-    return nearest
 
 
 def _shares(positions: Array) -> Array:

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from mapper.features.windowed import hamming
+from mapper.features.windowed import drop_unrequited, hamming, nearest_among
 
 _BITS = 256
 _FARTHER = _BITS + 1
@@ -162,21 +162,11 @@ def match_sorted(bits_a, nodes_a, bits_b, nodes_b, max_hamming, max_ratio):
     for i in range(len(nodes_a)):
         while start < len(nodes_b) and nodes_b[start] < nodes_a[i]:
             start += 1
-        best, second, best_j = _FARTHER, _FARTHER, -1
-        j = start
-        while j < len(nodes_b) and nodes_b[j] == nodes_a[i]:
-            distance = hamming(bits_a, i, bits_b, j)
-            if distance < best_of_b[j]:
-                best_of_b[j] = distance
-                owner[j] = i
-            if distance < best:
-                second, best, best_j = best, distance, j
-            elif distance < second:
-                second = distance
-            j += 1
+        end = start
+        while end < len(nodes_b) and nodes_b[end] == nodes_a[i]:
+            end += 1
+        best, second, best_j = nearest_among(bits_a, i, bits_b, start, end, best_of_b, owner)
         if best <= max_hamming and best <= max_ratio * second:
             matched[i] = best_j
-    for i in range(len(nodes_a)):
-        if matched[i] >= 0 and owner[matched[i]] != i:
-            matched[i] = -1
+    drop_unrequited(matched, owner)
     return matched

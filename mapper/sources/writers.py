@@ -16,7 +16,7 @@ from mapper.sources.base import Accelerations, Entry, FrameSource, ImageFiles, S
 from mapper.sources.calibration_file import calibration_text
 from mapper.sources.images import SATURATED
 from mapper.sources.mbag import HEADER
-from mapper.timebase import nearest, seconds_text_from_ns
+from mapper.timebase import MAX_TRUTH_GAP_NS, nearest, seconds_text_from_ns
 from mapper.trajectory import Trajectory, write_tum
 
 LogKind = Literal["tum", "mbag"]
@@ -24,7 +24,6 @@ LogKind = Literal["tum", "mbag"]
 DEPTH_UNITS_PER_M = 5000.0
 """Depth units of images that are encoded here; copied images keep their own."""
 
-_MAX_TRUTH_GAP_NS = 20_000_000
 _NO_POSE = ["nan"] * 7
 
 
@@ -157,5 +156,5 @@ def _pose_words(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> list[
     for i, gap in zip(index, gap_ns, strict=True):
         T = truth.T_world_body[i]
         numbers = [*T[:3, 3], *quaternion_from_rotation(T[:3, :3])]
-        words.append([repr(float(n)) for n in numbers] if gap <= _MAX_TRUTH_GAP_NS else _NO_POSE)
+        words.append([repr(float(n)) for n in numbers] if gap <= MAX_TRUTH_GAP_NS else _NO_POSE)
     return words
