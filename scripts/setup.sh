@@ -1,8 +1,7 @@
 #!/usr/bin/env bash
 # Makes .venv and installs the project into it; does nothing the second time.
-# usage: bash scripts/setup.sh [--dev] [--mesh]
+# usage: bash scripts/setup.sh [--dev]
 #   --dev   adds what the tests need
-#   --mesh  adds Open3D and the system libraries it needs, for mapper export --as mesh
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -13,12 +12,11 @@ fail() {
 }
 
 extra=""
-wheels="numpy cv2 numba gtsam mahotas matplotlib foxglove mcap"
+wheels="numpy cv2 numba gtsam mahotas matplotlib foxglove mcap open3d small_gicp kiss_icp kiss_matcher rerun"
 for option in "$@"; do
   case "$option" in
-    --dev) extra="${extra:+$extra,}dev" ;;
-    --mesh) extra="${extra:+$extra,}mesh" wheels="$wheels open3d" ;;
-    *) fail "unknown option $option; want --dev or --mesh" ;;
+    --dev) extra=dev ;;
+    *) fail "unknown option $option; want --dev" ;;
   esac
 done
 extra="${extra:+[$extra]}"

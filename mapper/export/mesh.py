@@ -210,7 +210,7 @@ def _open3d() -> Any:
         import open3d
     except ModuleNotFoundError as error:
         raise DependencyError(
-            f"mesh needs an extra ({error.name} is missing): pip install 'mapper[mesh]'"
+            f"mesh needs {error.name}, which is missing: pip install open3d"
         ) from None
     except (ImportError, OSError) as error:
         found = re.search(r"lib[\w.+-]+\.so[.\d]*", str(error))

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
+from mapper.features.scan_view import ScanView
 from mapper.features.view import View
 from mapper.frames import Frame
 from mapper.geometry import Transform
@@ -59,6 +60,9 @@ class Track:
 
 Observation = TypeVar("Observation")
 
+Seen = View | ScanView
+"""What a place is recognised by, of one sensor or the other."""
+
 
 class Odometry(Protocol[Observation]):
     """Frame-by-frame tracking, split so that the costly, stateless half can run ahead in threads."""
@@ -75,7 +79,7 @@ class Odometry(Protocol[Observation]):
         """Place the next observation, in time order."""
         ...
 
-    def view(self, observation: Observation) -> View:
+    def view(self, observation: Observation) -> Seen:
         """Return what a place is recognised by. Pure."""
         ...
 

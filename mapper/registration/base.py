@@ -1,10 +1,12 @@
-"""What every registration answers."""
+"""The seam of registration: two scans and a guess in, a motion and its trust out."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from mapper.errors import DataError
+from mapper.frames import Scan
 from mapper.geometry import Array, Transform, is_rigid
 
 
@@ -40,3 +42,24 @@ class Alignment:
 def failed(reason: str) -> Alignment:
     """Return the answer "I don't know": identity, not converged, with the reason."""
     return Alignment(np.eye(4), converged=False, inlier_ratio=0.0, inlier_rmse_m=float("inf"), reason=reason)
+
+
+class Aligner(Protocol):
+    """A method bound to one target, so that its search index is built once."""
+
+    def align(self, source: Scan, T_target_source: Transform) -> Alignment:
+        """Return the motion refined from a guess. Pure: the same inputs give the same answer.
+
+        Args:
+            source: Its points are aligned to the target's.
+            T_target_source: (4, 4) guess. A global method needs none and does not look at it.
+        """
+        ...
+
+
+class Registration(Protocol):
+    """A method of registering scans."""
+
+    def prepare(self, target: Scan) -> Aligner:
+        """Return the method bound to a target."""
+        ...

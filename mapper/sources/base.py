@@ -3,12 +3,15 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 from mapper.frames import Frame, Scan
 from mapper.geometry import Array
 from mapper.timebase import Stamps
 from mapper.trajectory import Trajectory
+
+Sensor = Literal["rgbd", "lidar"]
+"""What took a log's frames: RGB-D frames whose body is an optical frame, or scans with z roughly up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +84,7 @@ class FrameSource(Protocol):
         path: What was opened.
         name: What the log calls itself; the folder's name where it does not say.
         kind: Which format it was recognised as, e.g. "tum".
+        sensor: What its frames are.
         truth: Where the body really was, if the log tells.
         accelerations: Accelerometer readings, if the log has them.
         notes: What opening it had to leave out or assume, a sentence each.
@@ -89,6 +93,7 @@ class FrameSource(Protocol):
     path: Path
     name: str
     kind: str
+    sensor: Sensor
     truth: Trajectory | None
     accelerations: Accelerations | None
     notes: Sequence[str]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mapper.frames import Frame, Scan
-from mapper.sources.base import Accelerations, Entry, FrameSource, ImageFiles
+from mapper.sources.base import Accelerations, Entry, FrameSource, ImageFiles, Sensor
 from mapper.timebase import NS_PER_S, Stamps
 from mapper.trajectory import Trajectory
 
@@ -50,6 +50,7 @@ class ChainedLog:
     kind: str
     truth: Trajectory | None
     notes: Sequence[str]
+    sensor: Sensor
     accelerations: Accelerations | None = None
 
     def __len__(self) -> int:
@@ -129,6 +130,7 @@ def _chain(sessions: Sequence[Session]) -> ChainedLog:
         kind=" + ".join(dict.fromkeys(log.kind for log in logs)),
         truth=truth,
         notes=notes,
+        sensor=logs[0].sensor,
     )
 
 

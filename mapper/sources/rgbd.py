@@ -9,7 +9,7 @@ import numpy as np
 from mapper.config.sources import CameraConfig
 from mapper.errors import FrameError, SourceError
 from mapper.frames import DepthImage, PinholeCamera, RgbdFrame, Scan
-from mapper.sources.base import Accelerations, Entry, ImageFiles
+from mapper.sources.base import Accelerations, Entry, ImageFiles, Sensor
 from mapper.sources.calibration import Calibration
 from mapper.sources.calibration_file import FILE_NAMES, read_calibration
 from mapper.sources.images import read_colour, read_depth_m, read_grey
@@ -67,6 +67,7 @@ class RgbdLog:
     accelerations: Accelerations | None
     notes: Sequence[str]
     images: Sequence[RgbdEntry]
+    sensor: Sensor = "rgbd"
 
     def __len__(self) -> int:
         return len(self.images)

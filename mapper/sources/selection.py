@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapper.config.sources import SourceConfig
 from mapper.errors import SourceError
-from mapper.sources.base import Accelerations, Entry, FrameSource
+from mapper.sources.base import Accelerations, Entry, FrameSource, Sensor
 from mapper.timebase import NS_PER_S, nearest
 from mapper.trajectory import Trajectory
 
@@ -22,6 +22,7 @@ class Selection:
     path: Path
     name: str
     kind: str
+    sensor: Sensor
     truth: Trajectory | None
     accelerations: Accelerations | None
     notes: Sequence[str]
@@ -69,6 +70,7 @@ def select(source: FrameSource, config: SourceConfig) -> FrameSource:
         path=source.path,
         name=source.name,
         kind=source.kind,
+        sensor=source.sensor,
         truth=source.truth,
         accelerations=source.accelerations,
         notes=notes,

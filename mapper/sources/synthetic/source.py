@@ -11,7 +11,7 @@ import numpy as np
 from mapper.config.synthetic import SynthConfig
 from mapper.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
 from mapper.geometry import angle_between
-from mapper.sources.base import Accelerations
+from mapper.sources.base import Accelerations, Sensor
 from mapper.sources.synthetic.movers import Movers, make_movers
 from mapper.sources.synthetic.path import Motion, frame_stamps, make_motion, seconds_of
 from mapper.sources.synthetic.raycast import Rendering, render
@@ -67,6 +67,7 @@ class SyntheticSource:
         stamps_ns: (N,) stamps of all frames, also of those that the log drops.
         path: A name for messages.
         kind: "synthetic".
+        sensor: "rgbd".
         truth: The exact pose of every frame, also of dropped ones.
         accelerations: None; there is no accelerometer.
         notes: Empty.
@@ -81,6 +82,7 @@ class SyntheticSource:
         self.stamps_ns: Stamps = frame_stamps(config, self.motion)
         self.path = Path(f"synthetic-{config.path}-{config.seed}")
         self.kind = "synthetic"
+        self.sensor: Sensor = "rgbd"
         self.accelerations: Accelerations | None = None
         self.notes: Sequence[str] = ()
 
