@@ -1,0 +1,76 @@
+"""When each point of a sweep was measured, whatever unit and clock its sensor's driver wrote."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.geometry import Array
+from mapper.timebase import NS_PER_S
+
+TIME_FIELDS = (
+    "t",  # Ouster: uint32 nanoseconds after the stamp
+    "time",  # Velodyne: float32 seconds after or before the stamp
+    "timestamp",  # Hesai, RoboSense: float64 seconds of the epoch; Livox: float64 nanoseconds of the epoch
+    "timestamps",
+    "time_stamp",  # Autoware: uint32 nanoseconds after the stamp
+    "offset_time",  # Livox: uint32 nanoseconds after the stamp
+    "time_offset",
+    "time_offset_ns",
+    "point_time",
+    "gps_time",  # LAS: float64 seconds, of the GPS week or of the GPS epoch less 10⁹
+)
+"""Names that drivers give a point's time."""
+
+MAX_SWEEP_S = 2.0
+"""No sensor turns slower; points farther apart in time were put together from several sweeps."""
+
+_UNITS_PER_S = (1, 1_000, 1_000_000, NS_PER_S)
+
+
+def time_field(names: Iterable[str]) -> str | None:
+    """Return the first name, in the case it is written in, that drivers give a point's time."""
+    return next((name for name in names if name.lower() in TIME_FIELDS), None)
+
+
+def relative_times_s(values: NDArray[np.number], stamp_ns: int) -> NDArray[np.float32] | None:
+    """Return the times of a sweep's points, seconds after its stamp.
+
+    The unit is the coarsest of s, ms, µs and ns in which the sweep lasts at most ``MAX_SWEEP_S``: each is
+    a thousand of the next, so it is the right one of every sweep longer than 2 ms. Values within
+    ``MAX_SWEEP_S`` of zero are offsets from the stamp already; others within as much of the stamp are times
+    on its clock; all others are on a clock of the sensor's own, and the first point is taken at the stamp.
+
+    Args:
+        values: (N,) of any integer or floating type, of the points that measured something.
+        stamp_ns: Time of the scan, nanoseconds.
+
+    Returns:
+        (N,) float32 seconds, negative before the stamp; None where the values tell nothing: none, all the
+        same, not finite, or further apart than a sweep lasts.
+    """
+    if len(values) == 0 or not np.isfinite(values).all():
+        return None
+    first = values.min()
+    since_first = _less(values, first)
+    span = float(since_first.max())
+    units_per_s = next((unit for unit in _UNITS_PER_S if span <= MAX_SWEEP_S * unit), None)
+    if span == 0.0 or units_per_s is None:
+        return None
+    first_ns = round(first.item() * (NS_PER_S // units_per_s))
+    limit_ns = MAX_SWEEP_S * NS_PER_S
+    if abs(first_ns) <= limit_ns:
+        first_after_stamp_ns = first_ns
+    elif abs(first_ns - stamp_ns) <= limit_ns:
+        first_after_stamp_ns = first_ns - stamp_ns
+    else:
+        first_after_stamp_ns = 0
+    after_stamp_s = since_first / units_per_s + first_after_stamp_ns / NS_PER_S
+    times_s: NDArray[np.float32] = after_stamp_s.astype(np.float32)
+    return times_s
+
+
+def _less(values: NDArray[np.number], first: np.number) -> Array:
+    """Subtract before rounding: nanoseconds of the epoch do not fit into a float64."""
+    wide = values if values.dtype == np.uint64 else values.astype(np.result_type(values, np.int64))
+    return np.subtract(wide, first, dtype=wide.dtype).astype(np.float64)

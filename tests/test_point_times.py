@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+
+from mapper.sources.point_times import relative_times_s, time_field
+
+STAMP_NS = 1_567_410_201_745_204_700
+SWEEP_S = np.linspace(0.0, 0.0999, 1000)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        pytest.param(np.round(SWEEP_S * 1e9).astype(np.uint32), id="ouster: ns after the stamp"),
+        pytest.param(SWEEP_S.astype(np.float32), id="velodyne: s after the stamp"),
+        pytest.param(np.round(SWEEP_S * 1e6).astype(np.uint32), id="µs after the stamp"),
+        pytest.param((SWEEP_S * 1e3).astype(np.float32), id="ms after the stamp"),
+        pytest.param(STAMP_NS / 1e9 + SWEEP_S, id="hesai: s of the epoch"),
+        pytest.param(STAMP_NS + SWEEP_S * 1e9, id="livox: float ns of the epoch"),
+        pytest.param(STAMP_NS + np.round(SWEEP_S * 1e9).astype(np.uint64), id="ns of the epoch"),
+        pytest.param(345_678.9 + SWEEP_S, id="s of the GPS week"),
+    ],
+)
+def test_every_unit_and_clock_becomes_seconds_after_the_stamp(values):
+    times_s = relative_times_s(values, STAMP_NS)
+    assert times_s.dtype == np.float32
+    np.testing.assert_allclose(times_s, SWEEP_S, atol=1e-6)
+
+
+def test_a_stamp_at_the_end_of_the_sweep_gives_negative_times():
+    before_s = SWEEP_S - SWEEP_S[-1]
+    np.testing.assert_allclose(relative_times_s(before_s.astype(np.float32), STAMP_NS), before_s, atol=1e-6)
+    absolute_s = STAMP_NS / 1e9 + before_s
+    np.testing.assert_allclose(relative_times_s(absolute_s, STAMP_NS), before_s, atol=1e-6)
+
+
+def test_nanoseconds_of_the_epoch_stay_exact():
+    values = np.array([STAMP_NS + 7, STAMP_NS + 100_000_007], dtype=np.uint64)
+    np.testing.assert_array_equal(relative_times_s(values, STAMP_NS), np.float32([7e-9, 0.100000007]))
+
+
+def test_part_of_a_sweep_keeps_its_place_in_it():
+    part = np.array([70_000_000, 100_000_000], dtype=np.uint32)
+    np.testing.assert_allclose(relative_times_s(part, STAMP_NS), [0.07, 0.1])
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        pytest.param(np.zeros(0, dtype=np.uint32), id="none"),
+        pytest.param(np.zeros(5), id="all the same"),
+        pytest.param(np.array([0.0, np.nan, 0.1]), id="not finite"),
+        pytest.param(np.array([0.0, 1.6e18]), id="years apart"),
+        pytest.param(np.array([0, 10_000_000_000], dtype=np.int64), id="ten seconds apart"),
+    ],
+)
+def test_values_that_tell_nothing_give_no_times(values):
+    assert relative_times_s(values, STAMP_NS) is None
+
+
+def test_the_field_is_found_in_any_case():
+    assert time_field(["x", "y", "z", "GPS_Time", "t"]) == "GPS_Time"
+    assert time_field(["x", "y", "z", "intensity"]) is None
