@@ -8,11 +8,10 @@ from typing import Any
 
 from mapper import run as files
 from mapper.config import BuildConfig
-from mapper.config.loops import PlaceLoopsConfig
+from mapper.config.loops import KeyframeLoopsConfig
 from mapper.config.sources import SourceConfig
 from mapper.errors import ConfigError, LoopError
 from mapper.graph.model import PoseGraph
-from mapper.loops.closer import PlaceLoops
 from mapper.loops.closure import LoopClosure
 from mapper.manifest import Manifest, Timing, library_versions, now_text
 from mapper.odometry.base import Odometry
@@ -92,8 +91,8 @@ def _refuse_unfit(config: BuildConfig, run: Run) -> None:
             raise ConfigError(
                 f"{name}: {run.path} has settled it; a session is appended by the same settings"
             )
-    if not isinstance(config.loops, PlaceLoopsConfig):
-        raise ConfigError(f"loops.kind={config.loops.kind}: cannot tie two sessions; want places")
+    if not isinstance(config.loops, KeyframeLoopsConfig):
+        raise ConfigError(f"loops.kind={config.loops.kind}: cannot tie two sessions; want places or scans")
     if config.graph.solve != "batch":
         raise ConfigError(f"graph.solve={config.graph.solve}: cannot join two sessions; want batch")
 
@@ -113,9 +112,9 @@ def _manifest(run: Run, source: ChainedLog, config: SourceConfig) -> Manifest:
 
 def _after(before: Tracked, first: FrameSource, config: BuildConfig, progress: Progress) -> Start:
     """Return the start of a session that knows the places of the one before."""
-    assert isinstance(config.loops, PlaceLoopsConfig)
+    assert isinstance(config.loops, KeyframeLoopsConfig)
     graph = before.graph
-    closer = PlaceLoops(config.loops, correction=config.graph.solve)
+    closer = config.loops.build(config.graph.solve)
     views = views_again(first, set(graph.stamps_ns.values()), config, progress=progress)
     closer.know(graph, {node: views[stamp_ns] for node, stamp_ns in graph.stamps_ns.items()})
     odometry: Odometry[Any] = config.odometry.build()
@@ -130,7 +129,7 @@ def _refuse_untied(second: FrameSource, run: Run, loops: Sequence[LoopClosure], 
     if any(loop.verdict == "accepted" for loop in between):
         return
     if not between:
-        why = "nothing in it looks like a known place (loops.places.min_similarity)"
+        why = "nothing in it looks like a known place"
     else:
         refused = Counter(loop.reason.split(":")[0] for loop in between).most_common()
         why = f"{len(between)} candidates compared, none held: {', '.join(f'{by} {n}' for by, n in refused)}"

@@ -2,17 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from mapper.config import BuildConfig
-from mapper.config.loops import NoLoopsConfig, VerificationConfig
+from mapper.config.loops import NoLoopsConfig, PlaceLoopsConfig
 from mapper.errors import ConfigError, LoopError
 from mapper.graph.chain import by_odometry
 from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import components
-from mapper.loops.closer import measured
+from mapper.loops.base import Proposal, Verifier, measured
 from mapper.loops.closure import LoopClosure
-from mapper.loops.proposals import Proposal
-from mapper.loops.verification import Verifier
 from mapper.pipeline import fuse_changed
 from mapper.progress import SILENT, Progress
 from mapper.run import Run
@@ -102,18 +101,21 @@ def _in_time_order(graph: PoseGraph, pair: Pair) -> Pair:
 def _measured(
     source: FrameSource, graph: PoseGraph, pairs: Sequence[Pair], config: BuildConfig
 ) -> list[LoopClosure]:
-    verifier = Verifier(_verification(config))
+    verifier = _verifier(config)
     views = views_again(source, {graph.stamps_ns[node] for pair in pairs for node in pair}, config)
+    places = {stamp_ns: verifier.digest(seen) for stamp_ns, seen in views.items()}
     loops = []
     for i, j in pairs:
-        view_i, view_j = (views[graph.stamps_ns[node]] for node in (i, j))
-        loops.append(measured(Proposal(i, "hand"), j, view_i, view_j, verifier))
+        place_i, place_j = (places[graph.stamps_ns[node]] for node in (i, j))
+        loops.append(measured(Proposal(i, "hand"), j, place_i, place_j, verifier))
         _refuse_rejected(loops[-1])
     return loops
 
 
-def _verification(config: BuildConfig) -> VerificationConfig:
-    return VerificationConfig() if isinstance(config.loops, NoLoopsConfig) else config.loops.verification
+def _verifier(config: BuildConfig) -> Verifier[Any]:
+    """Return what compares two frames; a run that looked for no loops has that of the default."""
+    loops = PlaceLoopsConfig() if isinstance(config.loops, NoLoopsConfig) else config.loops
+    return loops.verification.build()
 
 
 def _refuse_rejected(loop: LoopClosure) -> None:

@@ -4,8 +4,7 @@ from collections.abc import Collection
 from typing import Any
 
 from mapper.config import BuildConfig
-from mapper.features.view import View
-from mapper.odometry.base import Odometry
+from mapper.odometry.base import Odometry, Seen
 from mapper.parallel import ordered_map
 from mapper.progress import SILENT, Progress
 from mapper.sources.base import Entry, FrameSource
@@ -13,7 +12,7 @@ from mapper.sources.base import Entry, FrameSource
 
 def views_again(
     source: FrameSource, stamps_ns: Collection[int], config: BuildConfig, *, progress: Progress = SILENT
-) -> dict[int, View]:
+) -> dict[int, Seen]:
     """Return what the odometry of a configuration sees in some frames of a log, by stamp.
 
     Raises:
@@ -21,7 +20,7 @@ def views_again(
     """
     odometry: Odometry[Any] = config.odometry.build()
 
-    def view(entry: Entry) -> tuple[int, View]:
+    def view(entry: Entry) -> tuple[int, Seen]:
         return entry.stamp_ns, odometry.view(odometry.observe(entry.load(colour=False)))
 
     entries = [entry for entry in source.entries() if entry.stamp_ns in stamps_ns]

@@ -11,7 +11,6 @@ from mapper.config.loops import PlaceLoopsConfig
 from mapper.errors import ConfigError
 from mapper.geometry import exp, inverse
 from mapper.graph.model import BetweenFactor, PoseGraph
-from mapper.loops.closer import PlaceLoops
 from mapper.loops.closure import discrepancy
 from mapper.timebase import NS_PER_S
 
@@ -28,7 +27,7 @@ def knowing(config, room):
     truth = walked()[:LAP]
     graph = PoseGraph(dict(enumerate(truth)), {k: k * CLOSE_IN_TIME_NS for k in range(LAP)})
     graph.add_factors(link(k, k + 1, truth[k], truth[k + 1]) for k in range(LAP - 1))
-    closer = PlaceLoops(config, correction="batch")
+    closer = config.build("batch")
     closer.know(graph, {k: room.view(T, graph.stamps_ns[k]) for k, T in graph.T_world_node.items()})
     return closer
 

@@ -1,5 +1,6 @@
 """How loops are proposed, verified and believed."""
 
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -9,8 +10,10 @@ from mapper.config.odometry import IsvdConfig, MatchConfig
 from mapper.config.places import PlacesConfig
 
 if TYPE_CHECKING:
+    from mapper.features.view import View
     from mapper.loops.belief import Correction
-    from mapper.loops.closer import Closer
+    from mapper.loops.closer import Closer, KeyframeLoops
+    from mapper.loops.verification import ImageVerifier
 
 Ratio = Annotated[float, Field(ge=0.0, le=1.0)]
 
@@ -36,6 +39,12 @@ class VerificationConfig(Config):
     """A motion whose translation is less certain in any direction is no loop: far scenes hold it loosely."""
     measure: Literal["reprojection", "isvd"] = "reprojection"
     """Which of the two tests' motions becomes the constraint."""
+
+    def build(self) -> "ImageVerifier":
+        """Return the verifier this configures."""
+        from mapper.loops.verification import ImageVerifier
+
+        return ImageVerifier(self)
 
 
 class GateConfig(Config):
@@ -63,37 +72,48 @@ class NoLoopsConfig(Config):
         return NoLoops()
 
 
-class PlaceLoopsConfig(Config):
-    """Every keyframe is compared with those that look like it, however far away they are believed to be."""
+class KeyframeLoopsConfig(Config):
+    """What the closers share that compare keyframes with known places."""
 
-    kind: Literal["places"] = "places"
-    propose: Literal["auto", "places", "nearby"] = "auto"
-    """By a bag of words, by believed pose, or "auto": by both, or by pose alone where descriptors have no
-    words."""
-    places: PlacesConfig = PlacesConfig()
+    kind: str
     min_gap_s: PositiveFloat = 5.0
     """What was seen more recently is the odometry's to know."""
+    min_gap_m: NonNegativeFloat = 0.0
+    """What lies less far back along the path is, too."""
     min_motion_m: NonNegativeFloat = 0.02
     min_motion_rad: NonNegativeFloat = 0.02
-    """No look is taken before the camera has moved so far or turned so much since the last one."""
+    """No look is taken before the sensor has moved so far or turned so much since the last one."""
     max_distance_m: PositiveFloat = 1.0
     """How near is "nearby", before the drift since is added."""
-    max_angle_rad: PositiveFloat = 0.8
-    """Largest angle between the viewing directions of what is nearby."""
     max_candidates: PositiveInt = 4
     """Candidates compared per keyframe, the most similar first; the first loop found ends the search."""
-    verification: VerificationConfig = VerificationConfig()
     gate: GateConfig = GateConfig()
     min_agreeing: NonNegativeInt = 1
     """This many loops found from other keyframes nearby must tell the same before one is believed."""
     agreement_path_m: PositiveFloat = 3.0
     """How far along the path from each other two loops' ends may lie to tell of one another."""
 
-    def build(self, correction: "Correction", /) -> "Closer":
-        """Return the closer; ``correction`` is how the graph is solved."""
-        from mapper.loops.closer import PlaceLoops
 
-        return PlaceLoops(self, correction=correction)
+class PlaceLoopsConfig(KeyframeLoopsConfig):
+    """Every image is compared with those that look like it, however far away they are believed to be."""
+
+    kind: Literal["places"] = "places"
+    propose: Literal["auto", "places", "nearby"] = "auto"
+    """By a bag of words, by believed pose, or "auto": by both, or by pose alone where descriptors have no
+    words."""
+    places: PlacesConfig = PlacesConfig()
+    max_angle_rad: PositiveFloat = 0.8
+    """Largest angle between the viewing directions of what is nearby."""
+    verification: VerificationConfig = VerificationConfig()
+
+    def build(self, correction: "Correction", /) -> "KeyframeLoops[View]":
+        """Return the closer; ``correction`` is how the graph is solved."""
+        from mapper.loops.closer import KeyframeLoops
+        from mapper.loops.words import image_proposer
+
+        return KeyframeLoops(
+            self, self.verification.build(), partial(image_proposer, self), correction=correction
+        )
 
 
 class ThesisLoopsConfig(Config):
@@ -120,7 +140,7 @@ class ThesisLoopsConfig(Config):
 
     def build(self, correction: "Correction", /) -> "Closer":
         """Return the closer; ``correction`` is how the graph is solved."""
-        from mapper.loops.closer import ThesisLoops
+        from mapper.loops.thesis import ThesisLoops
 
         return ThesisLoops(self, correction=correction)
 

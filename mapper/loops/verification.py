@@ -1,16 +1,17 @@
-"""Whether two views are of one place, and how they then lie to each other."""
-
-from dataclasses import dataclass
+"""Whether two images' views are of one place, and how they then lie to each other."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.config.loops import VerificationConfig
+from mapper.errors import ConfigError
 from mapper.features.matching import Pairs, homography_inliers, match_mutual
 from mapper.features.view import View
 from mapper.features.windowed import match_everywhere
-from mapper.geometry import Array, Transform, adjoint, apply, inverse
+from mapper.geometry import Array, adjoint, apply, inverse
 from mapper.graph.noise import with_model_error
+from mapper.loops.base import Verification
+from mapper.odometry.base import Seen
 from mapper.odometry.local_map.p3p import ransac_p3p
 from mapper.odometry.local_map.pose import normal_matrix, refine_pose
 from mapper.registration.base import Alignment
@@ -21,30 +22,7 @@ _MAX_HAMMING = 64
 _P3P_PAIRS, _P3P_TOLERANCE_PX, _P3P_ITERATIONS = 4, 4.0, 300
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Verification:
-    """What comparing two views came to.
-
-    Attributes:
-        matches: Features paired by descriptor.
-        reason: Why the views are not of one place; empty if they are.
-        inliers: Pairs that agree with the motion in the image.
-        rmse_m: Root mean square distance of the points that agree in space, metres.
-        residual_px: Root mean square image residual of the inliers, pixels of the finest octave.
-        T_i_j: (4, 4) pose of j's body in i's, None without agreement.
-        information: (6, 6) of j's tangent (rotation, translation), None without agreement.
-    """
-
-    matches: int
-    reason: str
-    inliers: int = 0
-    rmse_m: float | None = None
-    residual_px: float | None = None
-    T_i_j: Transform | None = None
-    information: Array | None = None
-
-
-class Verifier:
+class ImageVerifier:
     """Pairs two views' features, fits a motion to their points by ISVD, and asks the image whether it holds.
 
     The two tests err differently: ISVD (thesis alg. 7) needs depth on both sides and trusts points,
@@ -55,6 +33,16 @@ class Verifier:
     def __init__(self, config: VerificationConfig) -> None:
         self._config = config
         self._isvd = Isvd(config.registration)
+
+    def digest(self, seen: Seen, /) -> View:
+        """Return the view as it is.
+
+        Raises:
+            ConfigError: It is a scan's.
+        """
+        if not isinstance(seen, View):
+            raise ConfigError("loops.kind=places and thesis compare images, and these are scans; want scans")
+        return seen
 
     def verify(self, i: View, j: View) -> Verification:
         """Return how view j lies to view i, or why they do not show one place."""

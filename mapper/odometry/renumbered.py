@@ -4,10 +4,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Generic
 
-from mapper.features.view import View
 from mapper.frames import Frame
 from mapper.graph.model import BetweenFactor
-from mapper.odometry.base import Observation, Odometry, Track
+from mapper.odometry.base import Observation, Odometry, Seen, Track
 
 
 class Renumbered(Generic[Observation]):
@@ -31,7 +30,7 @@ class Renumbered(Generic[Observation]):
             links=self._raised(track.links),
         )
 
-    def view(self, observation: Observation) -> View:
+    def view(self, observation: Observation) -> Seen:
         """Return what a place is recognised by. Pure."""
         return self._odometry.view(observation)
 
