@@ -10,6 +10,7 @@ from typer.core import TyperGroup
 from cli.build import build
 from cli.convert import convert
 from cli.demo import demo
+from cli.doctor import doctor
 from cli.environment import prepare_environment
 from cli.evaluate import evaluate
 from cli.export import export
@@ -70,6 +71,7 @@ app.command("convert")(convert)
 app.command("synth")(synth)
 app.command("demo")(demo)
 app.command("config")(show_config)
+app.command("doctor")(doctor)
 app.add_typer(vocabulary, name="vocabulary")
 
 

@@ -1,0 +1,50 @@
+"""``mapper doctor``: is this machine fit for the job, and what to do if not."""
+
+import json
+import sys
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from mapper.doctor.finding import Finding
+
+_MARKS = {"well": "ok  ", "warning": "warn", "failed": "FAIL"}
+
+
+def doctor(
+    json_: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+) -> None:
+    """Look at the machine, try every library in a process of its own, and tell what to do.
+
+    The exit status is 1 if anything failed.
+
+    Example: mapper doctor
+    """
+    from cli.console import progress_for
+    from mapper.doctor.examination import examine
+
+    findings = examine(progress=progress_for(quiet=json_ or not sys.stderr.isatty()))
+    if json_:
+        print(json.dumps([asdict(finding) for finding in findings], indent=2))
+    else:
+        print(_table(findings))
+    failed = [finding.name for finding in findings if finding.verdict == "failed"]
+    if failed:
+        print(
+            f"mapper: doctor: {len(failed)} of {len(findings)} failed: {', '.join(failed)}", file=sys.stderr
+        )
+        raise typer.Exit(1)
+
+
+def _table(findings: "Sequence[Finding]") -> str:
+    width = max(len(finding.name) for finding in findings)
+    lines = []
+    for finding in findings:
+        lines.append(f"{_MARKS[finding.verdict]}  {finding.name:<{width}}  {finding.detail}")
+        if finding.remedy:
+            lines.append(f"{'':<{width + 8}}do: {finding.remedy}")
+    return "\n".join(lines)

@@ -1,0 +1,38 @@
+"""Every look the doctor takes, in the order in which they are told."""
+
+import os
+from collections.abc import Callable
+
+from mapper.doctor import machine
+from mapper.doctor.finding import Finding
+from mapper.doctor.libraries import look_at_library, requirements
+from mapper.doctor.self_tests import SELF_TESTS
+from mapper.doctor.system_libraries import look_at_system_libraries
+from mapper.parallel import ordered_map
+from mapper.progress import SILENT, Progress
+
+_MACHINE: tuple[Callable[[], Finding], ...] = (
+    machine.look_at_python,
+    machine.look_at_glibc,
+    machine.look_at_threads,
+    machine.look_at_memory,
+    machine.look_at_disk,
+    machine.look_at_kernels,
+    look_at_system_libraries,
+)
+
+
+def examine(*, progress: Progress = SILENT) -> list[Finding]:
+    """Look at the machine, then try every library in a process of its own, one per processor at a time."""
+    least = requirements()
+    findings = [look() for look in _MACHINE]
+    with progress.stage("try") as report:
+        tried = ordered_map(
+            lambda name: look_at_library(name, least.get(name, "0")),
+            SELF_TESTS,
+            workers=len(os.sched_getaffinity(0)),
+        )
+        for done, finding in enumerate(tried, start=1):
+            findings.append(finding)
+            report(done, len(SELF_TESTS))
+    return findings

@@ -1,0 +1,29 @@
+"""What an examination finds."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from mapper.errors import DataError
+
+Verdict = Literal["well", "warning", "failed"]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing looked at.
+
+    Attributes:
+        name: What was looked at.
+        verdict: "warning" is worth knowing; "failed" keeps some verb from working.
+        detail: What was seen, in one line.
+        remedy: What to do about it; empty when all is well.
+    """
+
+    name: str
+    verdict: Verdict
+    detail: str
+    remedy: str = ""
+
+    def __post_init__(self) -> None:
+        if (self.verdict == "well") == bool(self.remedy):
+            raise DataError(f"{self.name}: verdict {self.verdict!r} with remedy {self.remedy!r}")

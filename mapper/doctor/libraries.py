@@ -1,0 +1,88 @@
+"""Whether each library is there, new enough, and right about a tiny job."""
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from importlib import metadata
+
+from mapper.doctor.finding import Finding
+from mapper.doctor.system_libraries import apt_line
+
+_PATIENCE_S = 60.0
+_REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(\[[\w,]*\])?(>=(?P<least>[\d.]+))?")
+_MISSING_OBJECT = re.compile(r"(?P<object>lib[\w.+-]+\.so[\w.]*): cannot open shared object file")
+
+
+def requirements() -> dict[str, str]:
+    """Return the least version of every library that we need, by the name under which pip knows it."""
+    found = {}
+    for line in metadata.requires("mapper") or ():
+        match = _REQUIREMENT.match(line)
+        if match is not None and "extra ==" not in line:
+            found[match["name"]] = match["least"] or "0"
+    return found
+
+
+def look_at_library(name: str, least: str = "0") -> Finding:
+    """Return whether a library is installed, of at least a version, and passes its self-test."""
+    mend = f"pip install '{name}>={least}'"
+    try:
+        version = metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return Finding(name, "failed", "not installed", mend)
+    if _numbers(version) < _numbers(least):
+        return Finding(name, "failed", f"{version}, want at least {least}", mend)
+    return tried(
+        name,
+        version,
+        [sys.executable, "-m", "mapper.doctor.self_tests", name],
+        again=f"pip install --force-reinstall --no-cache-dir '{name}=={version}'",
+    )
+
+
+def tried(
+    name: str, version: str, command: Sequence[str], *, again: str, patience_s: float = _PATIENCE_S
+) -> Finding:
+    """Run a self-test in a process of its own, and tell how that ended.
+
+    Args:
+        name: Of the library.
+        version: Of the library.
+        command: Ends with status 0 if the library works.
+        again: How to install the library afresh.
+        patience_s: Longer is a failure.
+    """
+    began = time.monotonic()
+    try:
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=patience_s, check=False)
+    except subprocess.TimeoutExpired:
+        return Finding(
+            name,
+            "failed",
+            f"{version}, self-test still busy after {patience_s:.0f} s",
+            f"try again; then {again}",
+        )
+    if ended.returncode == 0:
+        return Finding(name, "well", f"{version}, self-test passed in {time.monotonic() - began:.1f} s")
+    if ended.returncode < 0:
+        killer = signal.Signals(-ended.returncode)
+        return Finding(name, "failed", f"{version}, self-test died of {killer.name}", _after(killer, again))
+    said = (ended.stderr.strip().splitlines() or [f"exit status {ended.returncode}"])[-1]
+    missing = _MISSING_OBJECT.search(said)
+    remedy = again if missing is None else apt_line([missing["object"]])
+    return Finding(name, "failed", f"{version}, {said}", remedy)
+
+
+def _after(killer: signal.Signals, again: str) -> str:
+    if killer is signal.SIGILL:
+        return "this processor lacks instructions that the wheel uses: build the library from source"
+    if killer is signal.SIGKILL:
+        return "was there memory enough? see dmesg; then try again"
+    return again
+
+
+def _numbers(version: str) -> list[int]:
+    return [int(number) for number in re.findall(r"\d+", version)[:3]]
