@@ -15,6 +15,8 @@ HOMES = {
     "mcap": ("mapper/export/mcap_log.py", "mapper/sources/mcap_log.py"),
     "foxglove": ("mapper/export/",),
     "mahotas": ("mapper/features/",),
+    "laspy": ("mapper/sources/cloud_files/las.py",),
+    "pypcd4": ("mapper/sources/cloud_files/pcd.py",),
     "typer": ("cli/",),
     "rich": ("cli/",),
     "open3d": ("mapper/export/mesh.py",),

@@ -1,0 +1,47 @@
+"""Files with one cloud each, in the formats that people record and exchange them in."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from mapper.errors import FrameError
+from mapper.sources.cloud_files.bare import read_bin, read_npy, read_text
+from mapper.sources.cloud_files.las import read_las
+from mapper.sources.cloud_files.pcd import read_pcd
+from mapper.sources.cloud_files.ply import read_ply
+from mapper.sources.cloud_files.raw import Columns, RawCloud, cloud_from
+
+__all__ = ["ENDINGS", "RawCloud", "read_cloud"]
+
+_READERS: Mapping[str, Callable[[Path], Columns]] = {
+    ".bin": read_bin,
+    ".pcd": read_pcd,
+    ".ply": read_ply,
+    ".xyz": read_text,
+    ".txt": read_text,
+    ".csv": read_text,
+    ".npy": read_npy,
+    ".las": read_las,
+    ".laz": read_las,
+}
+ENDINGS = tuple(_READERS)
+
+
+def read_cloud(path: Path, *, scale: float | None = None) -> RawCloud:
+    """Return what a cloud's file says, without missing returns.
+
+    Args:
+        path: A file; its ending tells the format.
+        scale: Metres per unit of the file. None is 1, and refuses what looks like millimetres.
+
+    Raises:
+        FrameError: The file cannot be read or is damaged, holds too few points, or its points are not in
+            metres around the sensor.
+    """
+    reader = _READERS.get(path.suffix.lower())
+    if reader is None:
+        raise FrameError(f"{path}: not the ending of a cloud; want one of {' '.join(ENDINGS)}")
+    try:
+        columns = reader(path)
+    except OSError as error:
+        raise FrameError(f"{path}: cannot be read: {error.strerror or error}") from None
+    return cloud_from(columns, path=path, scale=scale)

@@ -1,0 +1,90 @@
+"""Clouds in files that hold little else: KITTI's records, numpy arrays and columns of text."""
+
+import re
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+
+from mapper.errors import FrameError
+from mapper.sources.cloud_files.raw import Column, Columns
+
+RECORD_BYTES = 16
+
+_HEADER_LINES = 100
+_SEPARATORS = re.compile(r"[\s,;]+")
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?|nan|inf)", re.IGNORECASE)
+
+
+def read_bin(path: Path) -> Columns:
+    """Read KITTI's records of float32 x y z intensity (Geiger et al. 2013).
+
+    Raises:
+        FrameError: The file is not a whole number of records.
+    """
+    size = path.stat().st_size
+    if size % RECORD_BYTES:
+        raise FrameError(
+            f"{path}: {size} bytes, want a multiple of {RECORD_BYTES}, KITTI's float32 x y z intensity; "
+            "copy it again if it was cut, else save it as .npy or .pcd"
+        )
+    records = np.fromfile(path, dtype="<f4").reshape(-1, RECORD_BYTES // 4)
+    return _xyz(records)
+
+
+def read_npy(path: Path) -> Columns:
+    """Read a numpy array: structured with fields x, y, z, or (…, ≥ 3) numbers that begin with them.
+
+    Raises:
+        FrameError: It is neither, or not an array's file.
+    """
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise FrameError(f"{path}: not an array of numbers: {error}") from None
+    if array.dtype.names:
+        return {name: array[name].ravel() for name in array.dtype.names if array[name].shape == array.shape}
+    if array.ndim < 2 or array.shape[-1] < 3 or array.dtype.kind not in "fiu":
+        raise FrameError(f"{path}: {array.dtype} of shape {array.shape}, want numbers, (N, 3) or wider")
+    return _xyz(array.reshape(-1, array.shape[-1]))
+
+
+def read_text(path: Path) -> Columns:
+    """Read lines of x y z …, separated by blanks, commas or semicolons.
+
+    A header that names as many columns as there are tells which ones are x, y and z.
+
+    Raises:
+        FrameError: It is not text, or its lines are not as many numbers each, three or more.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise FrameError(f"{path}: not a text file") from None
+    names, skipped = _header(text)
+    if skipped is None:
+        raise FrameError(f"{path}: none of the first {_HEADER_LINES} lines is three or more numbers: x y z")
+    blanks = text.replace(",", " ").replace(";", " ")
+    try:
+        values = np.loadtxt(StringIO(blanks), skiprows=skipped, ndmin=2)
+    except ValueError as error:
+        raise FrameError(f"{path}: after {skipped} lines of header: {error}") from None
+    if len(names) == values.shape[1] and {"x", "y", "z"} <= set(names):
+        return {name: values[:, column] for column, name in enumerate(names)}
+    return _xyz(values)
+
+
+def _header(text: str) -> tuple[list[str], int | None]:
+    """Return the words of the last line before the first point, and its number; None without a point."""
+    names: list[str] = []
+    for number, line in enumerate(text.split("\n", _HEADER_LINES)):
+        words = _SEPARATORS.sub(" ", line).split()
+        if len(words) >= 3 and all(_NUMBER.fullmatch(word) for word in words):
+            return names, number
+        if words:
+            names = [word.strip('"').lower() for word in words if word.strip("#/")]
+    return names, None
+
+
+def _xyz(table: Column) -> Columns:
+    return {name: table[:, column] for column, name in enumerate("xyz")}

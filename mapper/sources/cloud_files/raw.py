@@ -1,0 +1,120 @@
+"""From a cloud file's columns to points that were measured, in metres around the sensor."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.errors import FrameError
+from mapper.frames import Points32
+from mapper.sources.point_times import time_field
+
+Column = NDArray[np.number[Any]]
+Columns = Mapping[str, Column]
+"""(N,) values of each field of a cloud, by its name in the file."""
+
+MIN_POINTS = 10
+"""Fewer points show no surface that anything could be aligned to."""
+
+_MAX_RANGE_M = 1000.0  # the longest automotive sensors see 0.5 km; a room in millimetres is beyond it
+_AWAY_RATIO = 10.0  # times the cloud's own size, and it cannot be a sweep around its origin
+_SAMPLES = 4096
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawCloud:
+    """The points of a cloud's file that measured something.
+
+    Attributes:
+        points: (N, 3) float32, metres, sensor frame.
+        times: (N,) each point's time as the file has it; ``relative_times_s`` finds unit and clock.
+        colors: (N, 3) uint8 RGB.
+    """
+
+    points: Points32
+    times: Column | None
+    colors: NDArray[np.uint8] | None
+
+
+def cloud_from(columns: Columns, *, path: Path, scale: float | None) -> RawCloud:
+    """Return the cloud of a file's columns; not a number, infinity and 0 0 0 are missing returns.
+
+    Args:
+        columns: What was read; x, y and z are needed.
+        path: The file, for messages.
+        scale: Metres per unit; None is 1, and checked.
+
+    Raises:
+        FrameError: No coordinates, too few measured points, or points not in metres around the sensor.
+    """
+    columns = {name.lower(): values for name, values in columns.items()}
+    if not {"x", "y", "z"} <= columns.keys():
+        raise FrameError(f"{path}: fields {' '.join(columns) or 'none'}; want x y z among them")
+    points = np.empty((len(columns["x"]), 3), dtype=np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for axis, name in enumerate("xyz"):
+            points[:, axis] = columns[name] if scale is None else columns[name] * scale
+    is_measured = _measured(points)
+    total, measured = len(points), int(is_measured.sum())
+    if measured < MIN_POINTS:
+        raise FrameError(f"{path}: {measured} of {total} points measured anything; want {MIN_POINTS} or more")
+    field = time_field(columns)
+    times = None if field is None else columns[field]
+    colors = _colors(columns)
+    if measured < total:
+        points = points[is_measured]
+        times = None if times is None else times[is_measured]
+        colors = None if colors is None else colors[is_measured]
+    _check_range(points, path=path, is_scaled=scale is not None)
+    return RawCloud(points, times, colors)
+
+
+def _measured(points: Points32) -> NDArray[np.bool_]:
+    x, y, z = points.T
+    with np.errstate(over="ignore", invalid="ignore"):  # infinities of both signs
+        finite = np.isfinite(x + y + z)
+    measured: NDArray[np.bool_] = finite & ((x != 0.0) | (y != 0.0) | (z != 0.0))
+    return measured
+
+
+def _check_range(points: Points32, *, path: Path, is_scaled: bool) -> None:
+    sample = points[:: 1 + len(points) // _SAMPLES].astype(np.float64)
+    range_m = np.percentile(np.linalg.norm(sample, axis=1), 95)
+    if range_m <= _MAX_RANGE_M:
+        return
+    size_m = np.percentile(np.linalg.norm(sample - np.median(sample, axis=0), axis=1), 95)
+    if range_m > _AWAY_RATIO * size_m:
+        raise FrameError(
+            f"{path}: points {size_m:.3g} m around a place {range_m:.3g} m away from the origin; "
+            "want them around the sensor: subtract a common offset before single precision rounds them"
+        )
+    if not is_scaled:
+        raise FrameError(
+            f"{path}: 5 % of the points are farther than {range_m:.3g} m, which looks like millimetres; "
+            "--set source.cloud_scale=0.001, or 1 if these are metres"
+        )
+
+
+def _colors(columns: Columns) -> NDArray[np.uint8] | None:
+    packed = columns.get("rgb", columns.get("rgba"))
+    if packed is not None and packed.dtype.itemsize == 4:
+        bits = packed.view(np.uint32)
+        return np.stack([bits >> 16, bits >> 8, bits], axis=1).astype(np.uint8)
+    if not {"red", "green", "blue"} <= columns.keys():
+        return None
+    channels = np.stack([columns["red"], columns["green"], columns["blue"]], axis=1)
+    return _as_bytes(channels)
+
+
+def _as_bytes(channels: NDArray[np.number[Any]]) -> NDArray[np.uint8]:
+    """Return colours of 8 bits: LAS has 16, unless its writer left the upper ones empty; floats end at 1."""
+    top = channels.max(initial=0)
+    if np.issubdtype(channels.dtype, np.floating) and top <= 1.0:
+        channels = channels * 255.0
+    elif top > 255:
+        channels = channels / 257.0
+    colors: NDArray[np.uint8] = np.nan_to_num(channels).clip(0, 255).astype(np.uint8)
+    return colors
