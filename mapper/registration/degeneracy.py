@@ -1,0 +1,131 @@
+"""Which motions a registration could not see: along a corridor, over a plain, about a tunnel's axis."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.errors import DataError
+from mapper.geometry import Array, Points, adjoint, transform
+
+_MIN_SHARE = 0.01
+_MIN_ARM_M = 1e-3  # a pole's turning about itself must stay a number
+_PART = 0.5  # a motion is named for its rotation, its translation, or both when mixed
+_SAME_DIRECTION = 0.97  # squared cosine: 10°
+_AXES = "xyz"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Degeneracy:
+    """What the surfaces told about six independent motions, and which of them they left open.
+
+    Attributes:
+        shares: (6,) ascending, 0 … 1: how much of a motion's displacements goes along the normals.
+        motions: (6, 6) tangents (rotation, translation) of the source as rows, in the same order; each
+            displaces the cloud by 1 m root mean square.
+        extent_m: Root mean square distance of the points from their centroid.
+        open_motions: How many of them, from the first, were not seen.
+        text: Their names, as in "translation along x"; empty when all were seen.
+    """
+
+    shares: Array
+    motions: Array
+    extent_m: float
+    open_motions: int
+    text: str
+
+    @property
+    def is_degenerate(self) -> bool:
+        """Whether any motion was left open."""
+        return self.open_motions > 0
+
+    @property
+    def unseen(self) -> Array:
+        """(K, 6) tangents (rotation, translation) that were not seen, as ``motions`` has them."""
+        return self.motions[: self.open_motions]
+
+
+def degeneracy_of(information: Array, *, points: Points, min_share: float = _MIN_SHARE) -> Degeneracy:
+    """Return which motions an information matrix leaves open.
+
+    Zhang, Kaess & Singh (2016, §III) hold the eigenvalues of JᵀJ against a threshold. Radians and metres
+    make those depend on units and on where the origin lies, so here they are relative to what the same
+    points would tell if every surface faced the motion (the point-to-point JᵀJ): Σ(n·δ)² / Σ|δ|² over the
+    displacements δ. A cube seen from within has a third for each translation, a corridor 0 along itself.
+
+    Args:
+        information: (6, 6) of the source's tangent (rotation, translation), from point-to-plane distances.
+        points: (N, 3) source points, metres, source frame.
+        min_share: A motion of which less is seen counts as not seen. Noise in the normals alone can make
+            it 0.004; street scans have 0.15 and more.
+
+    Raises:
+        DataError: The information is not finite or there is none, or there are no points.
+    """
+    total = float(np.trace(information[3:, 3:]))
+    if not np.isfinite(information).all() or total <= 0.0 or len(points) == 0:
+        raise DataError(f"degeneracy: information {total:g} from {len(points)} points; want some of both")
+    centroid = points.mean(axis=0)
+    centred = points - centroid
+    squares = np.einsum("ni,nj->ij", centred, centred) / len(points)
+    arms, axes = np.linalg.eigh(np.trace(squares) * np.eye(3) - squares)
+    metre = np.eye(6)  # motions about the centroid that displace the points by 1 m root mean square
+    metre[:3, :3] = (axes / np.sqrt(np.maximum(arms, _MIN_ARM_M**2))) @ axes.T
+    tangents = adjoint(transform(np.eye(3), centroid)) @ metre
+    shares, vectors = np.linalg.eigh(tangents.T @ information @ tangents / total)
+    open_motions = int((shares < min_share).sum())
+    return Degeneracy(
+        shares,
+        (tangents @ vectors).T,
+        float(np.sqrt(np.trace(squares))),
+        open_motions,
+        _text(vectors[:, :open_motions]),
+    )
+
+
+def loosened(information: Array, degeneracy: Degeneracy) -> Array:
+    """Return the information with the unseen motions left open: unknown to within the cloud's extent.
+
+    What noise pretends to know of them is dropped; the motions that were seen keep theirs.
+
+    Args:
+        information: (6, 6) that the degeneracy was found in.
+        degeneracy: Its answer.
+
+    Returns:
+        (6, 6) positive definite information.
+    """
+    motions, count = degeneracy.motions, degeneracy.open_motions
+    eigenvalues = np.einsum("ki,ij,kj->k", motions, information, motions)
+    eigenvalues[:count] = np.minimum(eigenvalues[:count], degeneracy.extent_m**-2)
+    eigenvalues = np.maximum(eigenvalues, np.finfo(float).eps * eigenvalues.max())
+    columns = np.linalg.inv(motions)
+    result: Array = (columns * eigenvalues) @ columns.T
+    return 0.5 * (result + result.T)
+
+
+def _text(open_: Array) -> str:
+    """Name the (6, K) open motions about the centroid; any basis of the same space gets the same names."""
+    names = []
+    for name, block in (("translation along", open_[3:]), ("rotation about", open_[:3])):
+        if block.size:
+            lines, weights, _ = np.linalg.svd(block, full_matrices=False)
+            lines = lines[:, weights**2 >= _PART]
+            if lines.size:
+                names.append(f"{name} {_lines(lines)}")
+    return ", ".join(names)
+
+
+def _lines(lines: Array) -> str:
+    """Name the space that (3, K) orthonormal columns span, by axes where it holds them."""
+    held = (lines**2).sum(axis=1)
+    axes = [axis for axis, part in zip(_AXES, held, strict=True) if part >= _SAME_DIRECTION]
+    if len(axes) == lines.shape[1]:
+        return " and ".join(axes)
+    if lines.shape[1] == 2:
+        return f"all normal to {_vector(np.cross(lines[:, 0], lines[:, 1]))}"
+    return _vector(lines[:, 0])
+
+
+def _vector(v: Array) -> str:
+    v = v * np.sign(v[np.argmax(np.abs(v))])
+    return "({:.2f}, {:.2f}, {:.2f})".format(*(np.round(v, 2) + 0.0))
