@@ -22,7 +22,7 @@ def doctor(
 
     The exit status is 1 if anything failed.
 
-    Example: mapper doctor
+    Example: mapper doctor --json, or just: mapper doctor
     """
     from cli.console import progress_for
     from mapper.doctor.examination import examine
