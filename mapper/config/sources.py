@@ -1,4 +1,6 @@
-"""Which part of a log is used, and with which camera."""
+"""Which part of a log is used, and what the log does not tell by itself."""
+
+from pathlib import Path
 
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
@@ -33,5 +35,13 @@ class SourceConfig(Config):
     max_pair_gap_s: NonNegativeFloat = 0.02
     """Largest time between a colour image and its depth image."""
     rate_hz: PositiveFloat | None = None
-    """Frames per second of numbered images without stamps; None is the format's own (30, Poznań 10)."""
+    """Frames per second of numbered files without stamps; None is the format's own (30, Poznań, scans 10)."""
     camera: CameraConfig | None = None
+    pattern: str | None = None
+    """Glob of the names of a LiDAR log's clouds, e.g. ``os1_*.bin``; None is all with the usual ending."""
+    stamps_file: Path | None = None
+    """A cloud's stamp a line, seconds or nanoseconds; None looks for stamps in names, then for times.txt."""
+    truth_file: Path | None = None
+    """Poses of a LiDAR log, in TUM's or KITTI's text; None looks for groundtruth.txt and poses.txt."""
+    cloud_scale: PositiveFloat | None = None
+    """Metres per unit of a LiDAR log's files; None is 1, and refuses what looks like millimetres."""

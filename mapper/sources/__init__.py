@@ -4,14 +4,15 @@ from pathlib import Path
 
 from mapper.config.sources import SourceConfig
 from mapper.errors import SourceError
-from mapper.sources import mbag, numbered, poznan, tum
+from mapper.sources import clouds, kitti, mbag, numbered, poznan, tum
 from mapper.sources.base import FrameSource
 from mapper.sources.selection import select
 
 __all__ = ["open_source"]
 
-# The first that recognises a path opens it. Poznań's images are numbered too, so it is asked before.
-_FORMATS = (tum, mbag, poznan, numbered)
+# The first that recognises a path opens it. Poznań's images are numbered too, so it is asked before;
+# any log may have clouds lying about, so they are asked last.
+_FORMATS = (tum, mbag, poznan, numbered, kitti, clouds)
 _DEFAULTS = SourceConfig()
 
 
@@ -19,8 +20,9 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> FrameSource:
     """Return a recorded log, recognised by its files, with the configured selection of its frames.
 
     Args:
-        path: Folder of a TUM, Poznań, 7-Scenes or Redwood log, or an mbag file or its folder.
-        config: Selection, pairing and camera.
+        path: Folder of a TUM, Poznań, 7-Scenes, Redwood or KITTI log or of clouds, or an mbag file or its
+            folder.
+        config: Selection, pairing, camera, and what a folder of clouds does not tell by itself.
 
     Raises:
         SourceError: Nothing is there, no format fits, the log is malformed or nothing of it is selected.

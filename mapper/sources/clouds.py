@@ -1,9 +1,52 @@
-"""Single clouds, and folders of them."""
+"""Single clouds, and folders of them in any format: .bin .pcd .ply .xyz .txt .csv .npy .las .laz."""
 
 from pathlib import Path
 
+from mapper.config.sources import SourceConfig
+from mapper.errors import SourceError
 from mapper.frames import Scan
-from mapper.sources.scans import ScanEntry
+from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, is_cloud_name, scan_log
+from mapper.sources.scans import ScanEntry, ScanLog
+
+LOOKED_FOR = "two or more clouds, .bin .pcd .ply .xyz .npy .las .laz, or .txt .csv with a number in the name"
+TRUTH_FILES = ("groundtruth.txt", "poses.txt")
+
+
+def recognise(path: Path) -> bool:
+    """Tell whether a path is a cloud, a folder with two clouds or more, or holds such folders."""
+    return (path.is_file() and is_cloud_name(path)) or bool(_folders(path))
+
+
+def open_log(path: Path, config: SourceConfig) -> ScanLog:
+    """Open a folder of clouds, or the only such folder in a folder.
+
+    Raises:
+        SourceError: It is a single cloud, there are several folders, no cloud matches the pattern, or a text
+            file is malformed.
+        DataError: A line of poses is malformed.
+    """
+    if path.is_file():
+        raise SourceError(
+            f"{path}: one cloud is no log; open the folder of its scans, "
+            "or align it to another: mapper register SOURCE TARGET"
+        )
+    folders = _folders(path)
+    if len(folders) != 1:
+        names = ", ".join(folder.name for folder in folders)
+        raise SourceError(f"{path}: holds {len(folders)} folders of clouds; open one of {names}")
+    folder = folders[0]
+    files, notes = clouds_in(folder, config.pattern)
+    if not files:
+        raise SourceError(f"{folder}: no cloud matches source.pattern={config.pattern}")
+    return scan_log(
+        path,
+        files,
+        kind="clouds",
+        stamps_file=first_of((folder, path), STAMP_FILES),
+        truth_file=first_of((folder, path), TRUTH_FILES),
+        config=config,
+        notes=notes,
+    )
 
 
 def read_scan(path: Path, *, scale: float | None = None) -> Scan:
@@ -14,6 +57,16 @@ def read_scan(path: Path, *, scale: float | None = None) -> Scan:
         scale: Metres per unit of the file; None is 1, and refuses what looks like millimetres.
 
     Raises:
-        FrameError: The file is missing, damaged, empty or not in metres around the sensor.
+        FrameError: The file is missing, damaged, empty or not in metres (folder, path) the sensor.
     """
     return ScanEntry(0, path, scale).load()
+
+
+def _folders(path: Path) -> list[Path]:
+    if _has_two(path):
+        return [path]
+    return sorted(folder for folder in path.glob("*") if folder.is_dir() and _has_two(folder))
+
+
+def _has_two(folder: Path) -> bool:
+    return len(clouds_in(folder)[0]) >= 2

@@ -15,6 +15,7 @@ class Stream(IntEnum):
     SENSOR = 4
     DROPS = 5
     MOVERS = 6
+    GROUND = 7
 
 
 def rng_of(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:

@@ -1,0 +1,82 @@
+"""KITTI odometry: velodyne/*.bin with calib.txt, poses.txt and times.txt (Geiger et al. 2012).
+
+The benchmark keeps ``sequences/00/velodyne`` and ``poses/00.txt``; SemanticKITTI and converters of other
+logs put ``poses.txt`` beside ``velodyne``. Where ``calib.txt`` tells where the LiDAR is in the camera, poses
+are the camera's; else they are the LiDAR's own.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from mapper.config.sources import SourceConfig
+from mapper.errors import SourceError
+from mapper.geometry import Transform, nearest_rotation, transform
+from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, scan_log
+from mapper.sources.scans import ScanLog
+from mapper.sources.text import parse_numbers, rows
+
+LOOKED_FOR = "velodyne/000000.bin or sequences/00/velodyne/000000.bin (KITTI)"
+
+_ROUGHLY_RIGID = 1e-3  # calib.txt has 12 digits; anything further off is no rotation
+
+
+def recognise(path: Path) -> bool:
+    """Tell whether a path is a sequence with ``velodyne`` in it, or holds such sequences."""
+    return bool(_sequences(path))
+
+
+def open_log(path: Path, config: SourceConfig) -> ScanLog:
+    """Open a sequence, or the only one of a dataset's folder.
+
+    Raises:
+        SourceError: There are several sequences, no scan matches the pattern, or a text file is malformed.
+        DataError: A line of poses is malformed.
+    """
+    sequences = _sequences(path)
+    if len(sequences) != 1:
+        names = ", ".join(str(folder.relative_to(path)) for folder in sequences)
+        raise SourceError(f"{path}: holds {len(sequences)} sequences; open one of {names}")
+    sequence = sequences[0]
+    files, notes = clouds_in(sequence / "velodyne", config.pattern)
+    if not files:
+        raise SourceError(f"{sequence}: no scan matches source.pattern={config.pattern}")
+    at = sequence.resolve()
+    benchmark = at.parent.parent / "poses" / f"{at.name}.txt"
+    return scan_log(
+        sequence,
+        files,
+        kind="kitti",
+        stamps_file=first_of([sequence], STAMP_FILES),
+        truth_file=first_of([sequence], ["poses.txt"]) or (benchmark if benchmark.is_file() else None),
+        config=config,
+        T_posed_lidar=_read_calibration(sequence / "calib.txt"),
+        notes=notes,
+    )
+
+
+def _sequences(path: Path) -> list[Path]:
+    if clouds_in(path / "velodyne")[0]:
+        return [path]
+    folders = [*path.glob("sequences/*"), *path.glob("*")]
+    return sorted(folder for folder in folders if clouds_in(folder / "velodyne")[0])
+
+
+def _read_calibration(path: Path) -> Transform | None:
+    """Return T_camera_lidar of the line ``Tr: …``; None without the file or the line."""
+    if not path.is_file():
+        return None
+    for number, words in rows(path):
+        if words[0] not in ("Tr:", "Tr"):
+            continue
+        where = f"{path}:{number}"
+        if len(words) != 13:
+            raise SourceError(
+                f"{where}: {len(words) - 1} numbers, want 12: the LiDAR's 3×4 pose in the camera"
+            )
+        T = parse_numbers(words[1:], where=where).reshape(3, 4)
+        R = nearest_rotation(T[:, :3]) if np.isfinite(T).all() else np.full((3, 3), np.nan)
+        if not np.abs(R - T[:, :3]).max() < _ROUGHLY_RIGID:
+            raise SourceError(f"{where}: not a rigid motion; want the LiDAR's 3×4 pose in the camera")
+        return transform(R, T[:, 3])
+    return None

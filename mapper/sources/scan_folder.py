@@ -1,0 +1,140 @@
+"""Folders of clouds: which of the files, and where the LiDAR was when it took them."""
+
+import os
+from collections.abc import Iterable, Sequence
+from fnmatch import fnmatch
+from pathlib import Path
+
+from mapper.config.sources import SourceConfig
+from mapper.errors import SourceError
+from mapper.geometry import Transform, inverse
+from mapper.sources.cloud_files import ENDINGS
+from mapper.sources.scan_stamps import in_order, line_of_each, scan_stamps
+from mapper.sources.scans import ScanEntry, ScanLog
+from mapper.sources.text import rows, time_order, truth_from
+from mapper.sources.tum import read_truth
+from mapper.timebase import Stamps
+from mapper.trajectory import Trajectory, read_kitti
+
+STAMP_FILES = ("times.txt", "stamps.txt", "timestamps.txt")
+
+_TEXT_ENDINGS = (".txt", ".csv")
+
+
+def is_cloud_name(path: Path) -> bool:
+    """Tell whether a path is called as a cloud is: by its ending, and a text file also by a number."""
+    ending = path.suffix.lower()
+    return ending in ENDINGS and (ending not in _TEXT_ENDINGS or path.stem[-1:].isdecimal())
+
+
+def clouds_in(folder: Path, pattern: str | None = None) -> tuple[list[Path], list[str]]:
+    """Return a folder's clouds in order, and notes on what is left out.
+
+    Args:
+        folder: Its own files count, not those of its folders; it need not exist.
+        pattern: Glob of the names; None takes the ending that most of the clouds have.
+    """
+    paths = _files(folder)
+    if pattern is not None:
+        matching = (path for path in paths if fnmatch(path.name, pattern))
+        return in_order(path for path in matching if path.suffix.lower() in ENDINGS), []
+    by_ending: dict[str, list[Path]] = {ending: [] for ending in ENDINGS}
+    for path in filter(is_cloud_name, paths):
+        by_ending[path.suffix.lower()].append(path)
+    most = max(by_ending.values(), key=len)
+    notes = [
+        f"{len(paths)} {ending} files left out; source.pattern chooses others"
+        for ending, paths in by_ending.items()
+        if paths and paths is not most
+    ]
+    return in_order(most), notes
+
+
+def first_of(folders: Iterable[Path], names: Sequence[str]) -> Path | None:
+    """Return the first file in these folders that has one of the names."""
+    return next((path for folder in folders for name in names if (path := folder / name).is_file()), None)
+
+
+def scan_log(
+    path: Path,
+    files: Sequence[Path],
+    *,
+    kind: str,
+    stamps_file: Path | None,
+    truth_file: Path | None,
+    config: SourceConfig,
+    T_posed_lidar: Transform | None = None,
+    notes: Iterable[str] = (),
+) -> ScanLog:
+    """Return the log of some clouds, in time order.
+
+    Args:
+        path: What was opened.
+        files: The clouds, one or more, in the order of the lines of the two text files.
+        kind: What it was recognised as.
+        stamps_file: A stamp a line, for names that carry none.
+        truth_file: TUM's lines with stamps, or KITTI's, one a cloud.
+        config: Rate, scale, and the text files that the user names instead.
+        T_posed_lidar: Pose of the LiDAR in what KITTI's lines are the poses of; None is the LiDAR itself.
+        notes: What finding the clouds had to leave out or assume.
+
+    Raises:
+        SourceError: A text file is missing or malformed, or has not one stamp for every cloud.
+        DataError: A line of KITTI's poses is malformed.
+    """
+    stamps_ns, stamp_notes = scan_stamps(
+        files, chosen=_chosen(path, config.stamps_file), beside=stamps_file, rate_hz=config.rate_hz
+    )
+    truth, truth_notes = _read_truth(
+        _chosen(path, config.truth_file) or truth_file, files, stamps_ns, T_posed_lidar
+    )
+    order, order_notes = time_order(stamps_ns, what="scans")
+    return ScanLog(
+        path=path,
+        name=path.resolve().name,
+        kind=kind,
+        truth=truth,
+        notes=[*notes, *stamp_notes, *order_notes, *truth_notes],
+        scans=[ScanEntry(int(stamps_ns[i]), files[i], config.cloud_scale) for i in order],
+    )
+
+
+def _files(folder: Path) -> list[Path]:
+    try:
+        with os.scandir(folder) as found:  # tells files from folders without a stat of each
+            return [folder / entry.name for entry in found if entry.is_file()]
+    except (FileNotFoundError, NotADirectoryError, PermissionError):
+        return []
+
+
+def _chosen(folder: Path, file: Path | None) -> Path | None:
+    if file is None:
+        return None
+    path = folder / file
+    if not path.is_file():
+        raise SourceError(
+            f"{path}: no such file; source.stamps_file and truth_file start at the log's folder"
+        )
+    return path
+
+
+def _read_truth(
+    path: Path | None, files: Sequence[Path], stamps_ns: Stamps, T_posed_lidar: Transform | None
+) -> tuple[Trajectory | None, list[str]]:
+    if path is None:
+        return None, []
+    if len(next(rows(path), (0, []))[1]) == 8:
+        return read_truth(path)
+    T_world_posed = read_kitti(path).T_world_body
+    lines = line_of_each(files, len(T_world_posed))
+    told = [] if lines is None else [(i, line) for i, line in enumerate(lines) if line < len(T_world_posed)]
+    notes = []
+    if len(told) < len(files):
+        notes.append(f"{path.name}: {len(T_world_posed)} poses tell of {len(told)} of {len(files)} scans")
+    if not told:
+        return None, notes
+    T_world_lidar = T_world_posed
+    if T_posed_lidar is not None:  # the world is where the LiDAR began, as it is for KITTI's camera
+        T_world_lidar = inverse(T_posed_lidar) @ T_world_posed @ T_posed_lidar
+    truth, more = truth_from([(int(stamps_ns[i]), T_world_lidar[line]) for i, line in told], what=path.name)
+    return truth, [*notes, *more]

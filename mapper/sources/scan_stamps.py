@@ -1,0 +1,117 @@
+"""When each cloud of a folder was taken: by its name, by a list beside it, or by its number and a rate."""
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.errors import SourceError
+from mapper.sources.numbered import stamp_at
+from mapper.sources.text import parse_stamp, rows
+from mapper.timebase import NS_PER_S, Stamps, ns_from_seconds_text
+
+RATE_HZ = 10.0
+
+_DECIMAL = re.compile(r"(?<!\d)\d{1,10}\.\d+$")
+_TWO_PARTS = re.compile(r"(?<!\d)(\d{10})_(\d{1,9})$")
+_WHOLE = re.compile(r"(?<!\d)\d+$")
+_NUMBER = re.compile(r"\d+(?=\D*$)")
+_EPOCH_S = range(10**9, 10**10)  # the years 2001 to 2286
+_UNITS_PER_S = (1, 1_000, 1_000_000, NS_PER_S)
+
+
+def in_order(paths: Iterable[Path]) -> list[Path]:
+    """Return clouds by the stamps in their names, or else by the names, whose numbers count as numbers."""
+    by_name = sorted(paths, key=lambda path: [int(s) if s.isdecimal() else s for s in _split(path.name)])
+    stamps_ns = _stamps_in(by_name)
+    if stamps_ns is None:
+        return by_name
+    return [by_name[i] for i in np.argsort(stamps_ns, kind="stable")]
+
+
+def scan_stamps(
+    files: Sequence[Path], *, chosen: Path | None, beside: Path | None, rate_hz: float | None
+) -> tuple[Stamps, list[str]]:
+    """Return when each cloud was taken, nanoseconds, and a note where that is assumed.
+
+    Args:
+        files: The clouds, in the order of a list's lines.
+        chosen: List of stamps that the user named; it goes before the stamps in names.
+        beside: List of stamps found by its own name; it comes after them.
+        rate_hz: Scans a second without any stamps; None is 10.
+
+    Raises:
+        SourceError: The list is malformed, or has not one stamp for every cloud.
+    """
+    named = None if chosen else _stamps_in(files)
+    if named is not None:
+        return named, []
+    if listed := chosen or beside:
+        return _listed(listed, files), []
+    rate_hz = rate_hz or RATE_HZ
+    numbers = numbers_of(files)
+    counts = range(len(files)) if numbers is None else numbers.tolist()
+    note = f"neither names nor a times.txt tell stamps; {rate_hz:g} scans a second assumed (source.rate_hz)"
+    return np.array([stamp_at(count, rate_hz=rate_hz) for count in counts], dtype=np.int64), [note]
+
+
+def numbers_of(files: Sequence[Path]) -> NDArray[np.int64] | None:
+    """Return the last whole number in each name; None where one has none or two have the same."""
+    found = [_NUMBER.search(path.stem) for path in files]
+    numbers = [int(number[0]) for number in found if number]
+    if len(set(numbers)) < len(files) or max(numbers) >= 2**31:
+        return None
+    return np.array(numbers, dtype=np.int64)
+
+
+def line_of_each(files: Sequence[Path], total: int) -> NDArray[np.int64] | None:
+    """Return which of ``total`` lines, from 0, tells of each cloud: as many lines, else the names' numbers.
+
+    A number may lie beyond the last line. None where neither pairs them.
+    """
+    return np.arange(total) if total == len(files) else numbers_of(files)
+
+
+def _listed(path: Path, files: Sequence[Path]) -> Stamps:
+    stamps_ns = []
+    for number, words in rows(path):
+        where = f"{path}:{number}"
+        if len(words) != 1:
+            raise SourceError(f"{where}: {len(words)} columns, want 1: a stamp")
+        stamps_ns.append(_epoch_ns(words[0]) or parse_stamp(words[0], where=where))
+    lines = line_of_each(files, len(stamps_ns))
+    if lines is None or lines.max() >= len(stamps_ns):
+        raise SourceError(
+            f"{path}: {len(stamps_ns)} stamps for {len(files)} scans; want a line for each, "
+            "or for each number in their names from 0 on (source.stamps_file names another list)"
+        )
+    return np.array(stamps_ns, dtype=np.int64)[lines]
+
+
+def _stamps_in(files: Sequence[Path]) -> Stamps | None:
+    stamps_ns = [_stamp_in(path.stem) for path in files]
+    if any(stamp_ns is None for stamp_ns in stamps_ns):
+        return None
+    return np.array(stamps_ns, dtype=np.int64)
+
+
+def _stamp_in(stem: str) -> int | None:
+    if found := _DECIMAL.search(stem):
+        return ns_from_seconds_text(found[0])
+    if found := _TWO_PARTS.search(stem):
+        return int(found[1]) * NS_PER_S + int(found[2])
+    found = _WHOLE.search(stem)
+    return _epoch_ns(found[0]) if found else None
+
+
+def _epoch_ns(text: str) -> int | None:
+    """Return a whole number of s, ms, µs or ns since the epoch as nanoseconds: its size tells the unit."""
+    value = int(text) if text.isdecimal() and len(text) < 20 else 0
+    units = (unit for unit in _UNITS_PER_S if value // unit in _EPOCH_S)
+    return next((value * (NS_PER_S // unit) for unit in units), None)
+
+
+def _split(name: str) -> list[str]:
+    return re.split(r"(\d+)", name)
