@@ -1,0 +1,94 @@
+"""What is ground and what stands on it, by a grid (Nagy, Gálai & Benedek 2016, §3.1)."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.config.hough import ConstellationConfig, GroundConfig
+from mapper.frames import Points32
+from mapper.geometry import Transform
+from mapper.registration.kernels import column_heights, thin_obstacles
+from mapper.registration.levelling import Levelling, level
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """The ground around a scan, in its level frame.
+
+    Attributes:
+        heights_level: (E, E) float32 z of the ground in each column of a grid centred on the origin, rows
+            along y; where no ground is near it is 0.
+        seen: (E, E) bool: points of the ground fell into the column.
+        cell_m: Edge of a column.
+    """
+
+    heights_level: NDArray[np.float32]
+    seen: NDArray[np.bool_]
+    cell_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surroundings:
+    """What is around a sensor, seen from above.
+
+    Attributes:
+        levelling: How the scan stands; its level frame is that of the rest.
+        ground: The ground.
+        obstacles: (M, 3) float32, metres, one point per voxel: x, y in the level frame and height
+            above the ground.
+    """
+
+    levelling: Levelling
+    ground: Ground
+    obstacles: Points32
+
+
+def surroundings(points_body: Points32, config: ConstellationConfig) -> Surroundings:
+    """Return what is around a sensor.
+
+    Args:
+        points_body: (N, 3) metres, body frame, z less than ``levelling.max_tilt_deg`` from up.
+        config: Its knobs.
+    """
+    levelling = level(points_body, config.levelling)
+    T_level_body = levelling.T_level_body
+    ground = find_ground(points_body, T_level_body, config.ground)
+    return Surroundings(levelling, ground, find_obstacles(points_body, T_level_body, ground, config.ground))
+
+
+def find_ground(points_body: Points32, T_level_body: Transform, config: GroundConfig) -> Ground:
+    """Return the ground of a scan.
+
+    A column is ground when it has enough points, is thin, and its mean is not much above the lowest thin
+    column nearby (C1). Between ground columns, the ground is at the mean of those within the window.
+    """
+    edge = 2 * int(np.ceil(config.radius_m / config.cell_m))
+    count, low, high, mean = column_heights(points_body, T_level_body, config.cell_m, edge)
+    thin = (count >= config.min_points) & (high - low < config.max_thickness_m)
+    size = 2 * int(0.5 * config.window_m / config.cell_m) + 1
+    lowest = cv2.erode(np.where(thin, mean, np.float32(np.inf)), np.ones((size, size), np.uint8))
+    seen = thin & (mean - lowest <= config.max_rise_m)
+    total = cv2.boxFilter(np.where(seen, mean, np.float32(0.0)), -1, (size, size), normalize=False)
+    weight = cv2.boxFilter(seen.astype(np.float32), -1, (size, size), normalize=False)
+    smooth = np.where(weight > 0.5, total / np.maximum(weight, 1.0), np.float32(0.0))
+    return Ground(np.where(seen, mean, smooth), seen, config.cell_m)
+
+
+def find_obstacles(
+    points_body: Points32, T_level_body: Transform, ground: Ground, config: GroundConfig
+) -> Points32:
+    """Return (M, 3) float32: x, y in the level frame and height above the ground, one point per voxel."""
+    voxels_across = 2 * int(np.ceil(config.radius_m / config.voxel_m))
+    obstacles: Points32 = thin_obstacles(
+        points_body,
+        T_level_body,
+        ground.heights_level,
+        ground.cell_m,
+        config.min_obstacle_m,
+        config.max_obstacle_m,
+        config.voxel_m,
+        voxels_across,
+    )
+    return obstacles

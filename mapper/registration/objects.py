@@ -1,0 +1,91 @@
+"""The constellation of a scan: the few points on the plane by which it is recognised (C2)."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.config.hough import CellsConfig, ConstellationConfig, ObjectsConfig
+from mapper.frames import Points32
+from mapper.geometry import Array, Transform
+from mapper.registration.ground import surroundings
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Constellation:
+    """What stands around a sensor, seen from above.
+
+    Attributes:
+        centres_level: (N, 2) metres, level frame: x, y of objects or of occupied cells.
+        T_level_body: (4, 4) the frame they are told in.
+    """
+
+    centres_level: Array
+    T_level_body: Transform
+
+    def __len__(self) -> int:
+        return len(self.centres_level)
+
+
+def constellation(points_body: Points32, config: ConstellationConfig) -> Constellation:
+    """Return the constellation of a scan; an empty field or an empty scan has one without centres.
+
+    Args:
+        points_body: (N, 3) metres, body frame, z roughly up.
+        config: Its knobs.
+    """
+    around = surroundings(points_body, config)
+    return Constellation(centres_of(around.obstacles, config.centres), around.levelling.T_level_body)
+
+
+def centres_of(obstacles: Points32, config: CellsConfig | ObjectsConfig) -> Array:
+    """Return the (N, 2) centres, metres, of what stands on the ground.
+
+    Args:
+        obstacles: (M, 3) one point per voxel, as ``find_obstacles`` gives them.
+        config: Cells or objects.
+    """
+    if len(obstacles) == 0:
+        return np.empty((0, 2))
+    flat = obstacles[:, :2].astype(np.float64)
+    if isinstance(config, ObjectsConfig):
+        part_of = _objects(flat, config)
+    else:
+        _, part_of = np.unique(_cells(flat, config.cell_m), axis=0, return_inverse=True)
+    sizes = np.bincount(part_of)
+    sums = np.column_stack([np.bincount(part_of, weights=flat[:, axis]) for axis in range(2)])
+    large = sizes >= _least(flat, config)
+    centres: Array = sums[large] / sizes[large, np.newaxis]
+    return centres
+
+
+def _least(flat: Array, config: CellsConfig | ObjectsConfig) -> float:
+    """Return how many voxels make an object or an occupied cell, in a cloud of this density."""
+    cell_m = config.coarse_m if isinstance(config, ObjectsConfig) else config.cell_m
+    _, counts = np.unique(_cells(flat, cell_m), axis=0, return_counts=True)
+    return max(1.0, config.min_voxels_ratio * float(np.median(counts)))
+
+
+def _objects(flat: Array, config: ObjectsConfig) -> NDArray[np.intp]:
+    """Return each voxel's object: a part of its group by fine cells, or the group where no part is large."""
+    group_of, part_of = _connected(flat, config.coarse_m), _connected(flat, config.fine_m)
+    large = np.bincount(part_of) >= _least(flat, config)
+    divided = np.zeros(group_of.max() + 1, np.bool_)
+    divided[group_of[large[part_of]]] = True
+    objects: NDArray[np.intp] = np.where(divided[group_of], part_of, len(large) + group_of)
+    return objects
+
+
+def _connected(flat: Array, cell_m: float) -> NDArray[np.intp]:
+    """Return for each point the component, of cells that touch at a side or a corner, it lies in."""
+    cells = _cells(flat, cell_m)
+    cells -= cells.min(axis=0)
+    image = np.zeros(cells.max(axis=0) + 1, np.uint8)
+    image[cells[:, 0], cells[:, 1]] = 1
+    labels: NDArray[np.int32] = cv2.connectedComponents(image, connectivity=8)[1]
+    return labels[cells[:, 0], cells[:, 1]].astype(np.intp) - 1
+
+
+def _cells(flat: Array, cell_m: float) -> NDArray[np.int64]:
+    return np.floor(flat / cell_m).astype(np.int64)

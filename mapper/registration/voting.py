@@ -1,0 +1,74 @@
+"""Hough voting over (dx, dy, α): the planar motion that most pairs of centres agree on (C3)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.config.hough import VotingConfig
+from mapper.geometry import Array, Transform, transform
+from mapper.registration.kernels import distinct, vote_slices
+
+_PER_ANGLE = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Peak:
+    """A maximum of the accumulator: o_target = Rot(α)·o_source + (dx, dy).
+
+    Attributes:
+        dx_m: Offset along the target's level x.
+        dy_m: Offset along its y.
+        alpha_rad: Turn about up, counter-clockwise, −π … π.
+        votes: Pairs of centres in the peak's bin and the eight around it.
+        score: votes / √(n_target · n_source); like scenes have some tenths, whatever their size.
+    """
+
+    dx_m: float
+    dy_m: float
+    alpha_rad: float
+    votes: int
+    score: float
+
+    @property
+    def motion(self) -> Transform:
+        """(4, 4) T_target_source between the two level frames."""
+        cosine, sine = np.cos(self.alpha_rad), np.sin(self.alpha_rad)
+        R = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        return transform(R, np.array([self.dx_m, self.dy_m, 0.0]))
+
+
+def vote(target: Array, source: Array, config: VotingConfig) -> list[Peak]:
+    """Return the distinct peaks of the accumulator, the highest first.
+
+    Args:
+        target: (N, 2) centres in the target's level frame, metres.
+        source: (M, 2) centres in the source's.
+        config: Range and resolution of the accumulator.
+    """
+    if len(target) == 0 or len(source) == 0:
+        return []
+    alphas = (np.arange(config.angles) - config.angles // 2) * (2.0 * np.pi / config.angles)
+    half_bins = int(np.ceil((config.max_offset_m + config.margin_m) / config.bin_m))
+    votes, offsets = vote_slices(
+        np.ascontiguousarray(target),
+        np.ascontiguousarray(source),
+        np.cos(alphas),
+        np.sin(alphas),
+        half_bins,
+        config.bin_m,
+        _PER_ANGLE,
+    )
+    order = np.argsort(-votes, axis=None, kind="stable")[: np.count_nonzero(votes)]
+    offsets_m, turns = config.bin_m * offsets.reshape(-1, 2)[order], alphas[order // _PER_ANGLE]
+    heights = votes.ravel()[order]
+    norm = np.sqrt(len(target) * len(source))
+    return [
+        Peak(
+            dx_m=float(offsets_m[i, 0]),
+            dy_m=float(offsets_m[i, 1]),
+            alpha_rad=float(turns[i]),
+            votes=int(heights[i]),
+            score=float(heights[i] / norm),
+        )
+        for i in distinct(offsets_m, turns, config.peaks, config.distinct_m, np.radians(config.distinct_deg))
+    ]
