@@ -1,18 +1,15 @@
-"""Pictures of a run: the trajectory or a path over the slice, the cloud from two sides, a pose graph.
-
-Matplotlib is driven through its objects: pyplot would keep global state and pick a GUI backend.
-"""
+"""Pictures of a run: the trajectory or a path over the slice, the cloud from two sides, a pose graph."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.atomic import replacing
 from mapper.export.grid import grid_image
+from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure, save
 from mapper.export.palette import END, ESTIMATE, FACTORS, PLAN, START, TRUTH, UNKNOWN_CELL, Rgb
 from mapper.frames import Points32
 from mapper.geometry import Array
@@ -24,10 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_DPI = 130
-_INK = "#1e2129"
-_FAINT = "#6c7280"
-_LINE = "#c3c8d0"
 _MARGIN_M = 0.3
 _HEADROOM_M = 0.3  # above the highest camera position; what lies higher would hide the rooms from above
 _VIEW_PX = 900
@@ -67,20 +60,20 @@ def write_summary(
     _draw_over(axes, grid_image(grid), grid)
     if truth is not None:
         reference = truth.positions_world
-        axes.plot(*reference[:, :2].T, color=_hex(TRUTH), linewidth=2.6, alpha=0.65, label="truth")
-    axes.plot(*positions[:, :2].T, color=_hex(ESTIMATE), linewidth=1.3, label="estimate")
+        axes.plot(*reference[:, :2].T, color=hex_of(TRUTH), linewidth=2.6, alpha=0.65, label="truth")
+    axes.plot(*positions[:, :2].T, color=hex_of(ESTIMATE), linewidth=1.3, label="estimate")
     _tie(axes, loops_world)
     _mark(axes, positions[0], color=START, marker="o", label="start")
     _mark(axes, positions[-1], color=END, marker="s", label="end")
     _finish_map(axes, low, high)
-    _save(figure, path)
+    save(figure, path)
 
 
 def _tie(axes: "Axes", loops_world: Array) -> None:
     """Draw loops as lines between dots: most are so short that a line alone would not be seen."""
     label = f"{len(loops_world)} loops"
     for ends in loops_world[:, :, :2]:
-        axes.plot(*ends.T, ".-", color=_hex(FACTORS["loop"]), linewidth=0.6, markersize=2.0, label=label)
+        axes.plot(*ends.T, ".-", color=hex_of(FACTORS["loop"]), linewidth=0.6, markersize=2.0, label=label)
         label = ""
 
 
@@ -108,12 +101,12 @@ def write_path(
     figure, axes = _map_page(title, lines, aspect=float(np.divide(*(high - low)[::-1])))
     _draw_over(axes, grid_image(grid), grid)
     _draw_over(axes, _swept(grid, ends, radius_m), grid)
-    axes.plot(*ends.T, color=_hex(PLAN), linewidth=1.6, label=f"path, {2 * radius_m:g} m wide")
-    axes.plot(*ends[1:-1].T, ".", color=_hex(PLAN), markersize=5)
+    axes.plot(*ends.T, color=hex_of(PLAN), linewidth=1.6, label=f"path, {2 * radius_m:g} m wide")
+    axes.plot(*ends[1:-1].T, ".", color=hex_of(PLAN), markersize=5)
     _mark(axes, ends[0], color=START, marker="o", label="start")
     _mark(axes, ends[-1], color=END, marker="s", label="goal")
     _finish_map(axes, low, high)
-    _save(figure, path)
+    save(figure, path)
 
 
 def _swept(grid: OccupancyGrid, ends: Array, radius_m: float) -> NDArray[np.uint8]:
@@ -136,8 +129,8 @@ def _finish_map(axes: "Axes", low: Array, high: Array) -> None:
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal", adjustable="datalim")
-    _scale_bar(axes, low, high, color=_INK)
-    axes.legend(loc="best", fontsize=8, framealpha=0.92, edgecolor=_LINE)
+    _scale_bar(axes, low, high, color=INK)
+    axes.legend(loc="best", fontsize=8, framealpha=0.92, edgecolor=LINE)
 
 
 def write_cloud_views(
@@ -157,13 +150,13 @@ def write_cloud_views(
     below = points[:, 2] <= positions[:, 2].max() + _HEADROOM_M
     if below.any():
         points, colors = points[below], colors[below]
-    figure = _figure(13.0, 6.6, background=_BACKDROP)
+    figure = new_figure(13.0, 6.6, background=_BACKDROP)
     views = {"from above": _view(0.0, np.pi / 2), "from the side": _view(_TURN_RAD, _TILT_RAD)}
     for column, (name, R_view_world) in enumerate(views.items()):
         axes = figure.add_axes((0.01 + 0.5 * column, 0.02, 0.48, 0.9))
         _draw_view(axes, R_view_world, points, colors=colors, positions=positions)
-        axes.set_title(name, color=_LINE, fontsize=11)
-    _save(figure, path)
+        axes.set_title(name, color=LINE, fontsize=11)
+    save(figure, path)
 
 
 def _draw_view(
@@ -178,7 +171,7 @@ def _draw_view(
     image = splat(cloud, colors, low=low, pixel_m=pixel_m, shape=np.ceil((high - low)[::-1] / pixel_m))
     axes.imshow(image, origin="lower", interpolation="antialiased", extent=(low[0], high[0], low[1], high[1]))
     axes.plot(*path[:, :2].T, color="white", linewidth=2.4, alpha=0.75)
-    axes.plot(*path[:, :2].T, color=_hex(ESTIMATE), linewidth=1.3)
+    axes.plot(*path[:, :2].T, color=hex_of(ESTIMATE), linewidth=1.3)
     _scale_bar(axes, low, high, color="white")
     axes.set_axis_off()
 
@@ -198,8 +191,8 @@ def write_graph_views(path: Path, graph: PoseGraph, solution: Solution, *, title
     ends = np.array([(place[factor.i], place[factor.j]) for factor in graph.factors], np.int64).reshape(-1, 2)
     solved = np.array(list(solution.T_world_node.values()))[:, :3, 3]
     *_, axes_world = np.linalg.svd(solved - solved.mean(axis=0), full_matrices=False)
-    figure = _figure(13.0, 6.9)
-    figure.text(0.03, 0.955, title, fontsize=14, fontweight="bold", color=_INK)
+    figure = new_figure(13.0, 6.9)
+    figure.text(0.03, 0.955, title, fontsize=14, fontweight="bold", color=INK)
     costs = {"before": solution.error_before, "after": solution.error_after}
     for column, (name, cost) in enumerate(costs.items()):
         T_world_node = graph.T_world_node if name == "before" else solution.T_world_node
@@ -212,13 +205,13 @@ def write_graph_views(path: Path, graph: PoseGraph, solution: Solution, *, title
                     for factor, weight in zip(graph.factors, solution.weights, strict=True)
                 ]
                 axes.add_collection(
-                    LineCollection(seen[ends[drawn]], colors=_hex(color), linewidths=0.8, linestyles=style)
+                    LineCollection(seen[ends[drawn]], colors=hex_of(color), linewidths=0.8, linestyles=style)
                 )
-        axes.plot(*seen.T, ".", color=_hex(ESTIMATE), markersize=1.5)
+        axes.plot(*seen.T, ".", color=hex_of(ESTIMATE), markersize=1.5)
         axes.set_aspect("equal", adjustable="datalim")
-        axes.set_title(f"{name}: cost {cost:.6g}", color=_FAINT, fontsize=11)
+        axes.set_title(f"{name}: cost {cost:.6g}", color=FAINT, fontsize=11)
         axes.set_axis_off()
-    _save(figure, path)
+    save(figure, path)
 
 
 def splat(
@@ -289,7 +282,7 @@ def _mark(axes: "Axes", position: Array, *, color: Rgb, marker: str, label: str)
         position[0],
         position[1],
         marker,
-        color=_hex(color),
+        color=hex_of(color),
         markersize=8,
         markeredgecolor="white",
         markeredgewidth=1.4,
@@ -304,34 +297,15 @@ def _map_page(title: str, lines: Sequence[str], *, aspect: float) -> tuple["Figu
     map_height_in = map_width_in * min(max(aspect, 0.4), 1.3)
     top_in = 0.65 + 0.19 * len(lines)
     height_in = bottom_in + map_height_in + top_in
-    figure = _figure(width_in, height_in)
+    figure = new_figure(width_in, height_in)
     left, bottom = left_in / width_in, bottom_in / height_in
-    figure.text(left, 1 - 0.2 / height_in, title, fontsize=14, fontweight="bold", color=_INK, va="top")
-    figure.text(left, 1 - 0.52 / height_in, "\n".join(lines), fontsize=9, color=_FAINT, va="top")
+    figure.text(left, 1 - 0.2 / height_in, title, fontsize=14, fontweight="bold", color=INK, va="top")
+    figure.text(left, 1 - 0.52 / height_in, "\n".join(lines), fontsize=9, color=FAINT, va="top")
     axes = figure.add_axes((left, bottom, map_width_in / width_in, map_height_in / height_in))
-    axes.set_facecolor(_hex(UNKNOWN_CELL))
-    axes.set_xlabel("x (m)", color=_FAINT, fontsize=9)
-    axes.set_ylabel("y (m)", color=_FAINT, fontsize=9)
-    axes.tick_params(colors=_FAINT, labelsize=8)
+    axes.set_facecolor(hex_of(UNKNOWN_CELL))
+    axes.set_xlabel("x (m)", color=FAINT, fontsize=9)
+    axes.set_ylabel("y (m)", color=FAINT, fontsize=9)
+    axes.tick_params(colors=FAINT, labelsize=8)
     for spine in axes.spines.values():
-        spine.set_color(_LINE)
+        spine.set_color(LINE)
     return figure, axes
-
-
-def _figure(width_in: float, height_in: float, *, background: Rgb = (255, 255, 255)) -> "Figure":
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second
-    from matplotlib.figure import Figure
-
-    figure = Figure((width_in, height_in), dpi=_DPI, facecolor=_hex(background))
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _save(figure: Any, path: Path) -> None:
-    with replacing(path) as part:
-        # Matplotlib would sign with its version: the same run must give the same bytes.
-        figure.savefig(part, format="png", metadata={"Software": None})
-
-
-def _hex(color: Rgb) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*color)
