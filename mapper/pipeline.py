@@ -17,7 +17,6 @@ from mapper.export.mcap_log import McapLog
 from mapper.export.picture import write_cloud_views, write_summary
 from mapper.export.ply import write_ply
 from mapper.fusion import Maps, fuse_log
-from mapper.geometry import fit_rigid
 from mapper.graph.model import PoseGraph
 from mapper.levelling import Level, find_level
 from mapper.manifest import Levelling, Solve, Status, Timing
@@ -37,10 +36,11 @@ from mapper.run import (
     paths_of,
     refuse_another_log,
 )
-from mapper.run_log import Story, log_maps, log_snapshot, log_story
+from mapper.run_log import log_maps, log_snapshot, log_story
 from mapper.solving import solve
 from mapper.sources.base import FrameSource
-from mapper.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, nearest
+from mapper.story import Story, story_of
+from mapper.timebase import NS_PER_S
 from mapper.tracked import Tracked, save_tracked, tracked_before, tracked_now
 from mapper.tracking import refuse_a_fragment, track_log
 from mapper.trajectory import Trajectory
@@ -231,12 +231,10 @@ def fuse_into(
     before: Path | None = None,
 ) -> None:
     """Fuse a draft's trajectory and write everything that is made from the maps."""
-    tracked = Run(draft.folder, config, draft.manifest)
-    trajectory, truth = tracked.trajectory(), tracked.truth()
-    if truth is not None:
-        truth = _laid_over(truth, trajectory)
-    frame_ms = tracked.frame_ms() if config.mcap.frame_times else {}
-    story = Story(trajectory, tracked.graph(), tracked.records(), tracked.loops(), frame_ms, truth)
+    story = story_of(Run(draft.folder, config, draft.manifest))
+    if not config.mcap.frame_times:
+        story = replace(story, frame_ms={})
+    trajectory = story.trajectory
     with McapLog(draft.folder / files.MCAP) as log:
         with (
             draft.clock.stage("fuse"),
@@ -297,16 +295,6 @@ def _write_pictures(draft: Draft, maps: Maps, story: Story) -> None:
         write_cloud_views(
             draft.folder / files.CLOUD_VIEWS, maps.cloud_points_world, maps.cloud_colors, trajectory
         )
-
-
-def _laid_over(truth: Trajectory, trajectory: Trajectory) -> Trajectory | None:
-    """Return the truth moved to where it fits the trajectory best; None if they share no three stamps."""
-    index, gap_ns = nearest(truth.stamps_ns, trajectory.stamps_ns)
-    near = gap_ns <= MAX_TRUTH_GAP_NS
-    if near.sum() < 3:
-        return None
-    T_level_truth, _ = fit_rigid(trajectory.positions_world[near], truth.positions_world[index[near]])
-    return truth.moved(T_level_truth)
 
 
 def _duration_s(trajectory: Trajectory, begins_ns: Sequence[int]) -> float:

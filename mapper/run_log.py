@@ -1,41 +1,19 @@
 """What a run tells in its MCAP log."""
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict
 
 from mapper.export.foxglove_parts import WORLD
 from mapper.export.mcap_log import McapLog
 from mapper.export.palette import TRUTH, height_colors
 from mapper.fusion import Maps, Snapshot
-from mapper.graph.model import PoseGraph
 from mapper.loops.closure import Discrepancy, LoopClosure
 from mapper.records import FrameRecord
-from mapper.trajectory import Trajectory
+from mapper.story import Story
 
 BODY = "body"
 CAMERA = "camera"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Story:
-    """A tracked log, ready to be told.
-
-    Attributes:
-        trajectory: Final body poses in the levelled world; at least one.
-        graph: Nodes at the solution, same world.
-        records: What became of every frame.
-        loops: Every loop candidate with its verdict.
-        frame_ms: Milliseconds that each frame took, by stamp; empty leaves them out.
-        truth: Where the body really was, laid over the trajectory, if known.
-    """
-
-    trajectory: Trajectory
-    graph: PoseGraph
-    records: Iterable[FrameRecord]
-    loops: Iterable[LoopClosure]
-    frame_ms: Mapping[int, float]
-    truth: Trajectory | None
 
 
 def log_story(log: McapLog, story: Story) -> None:

@@ -1,0 +1,51 @@
+"""A tracked log, ready to be told: to an MCAP file, to a viewer, or in a report."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from mapper.geometry import fit_rigid
+from mapper.graph.model import PoseGraph
+from mapper.loops.closure import LoopClosure
+from mapper.records import FrameRecord
+from mapper.run import Run
+from mapper.timebase import MAX_TRUTH_GAP_NS, nearest
+from mapper.trajectory import Trajectory
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Story:
+    """A tracked log.
+
+    Attributes:
+        trajectory: Final body poses in the levelled world; at least one.
+        graph: Nodes at the solution, same world.
+        records: What became of every frame.
+        loops: Every loop candidate with its verdict.
+        frame_ms: Milliseconds that each frame took, by stamp; empty leaves them out.
+        truth: Where the body really was, laid over the trajectory, if known.
+    """
+
+    trajectory: Trajectory
+    graph: PoseGraph
+    records: Sequence[FrameRecord]
+    loops: Sequence[LoopClosure]
+    frame_ms: Mapping[int, float]
+    truth: Trajectory | None
+
+
+def story_of(run: Run) -> Story:
+    """Return what a run has to tell; its maps may still be missing."""
+    trajectory, truth = run.trajectory(), run.truth()
+    if truth is not None:
+        truth = laid_over(truth, trajectory)
+    return Story(trajectory, run.graph(), run.records(), run.loops(), run.frame_ms(), truth)
+
+
+def laid_over(truth: Trajectory, trajectory: Trajectory) -> Trajectory | None:
+    """Return the truth moved to where it fits the trajectory best; None if they share no three stamps."""
+    index, gap_ns = nearest(truth.stamps_ns, trajectory.stamps_ns)
+    near = gap_ns <= MAX_TRUTH_GAP_NS
+    if near.sum() < 3:
+        return None
+    T_level_truth, _ = fit_rigid(trajectory.positions_world[near], truth.positions_world[index[near]])
+    return truth.moved(T_level_truth)
