@@ -25,6 +25,7 @@ _COLUMNS = (
     "inliers",
     "residual",
     "residual_unit",
+    "unseen",
 )
 _NOTHING = Diagnostics(features=0, matches=0, inliers=0, residual=0.0, residual_unit="", method="")
 
@@ -83,6 +84,7 @@ def write_records(path: Path, records: Iterable[FrameRecord]) -> None:
                 how.inliers,
                 repr(float(how.residual)),
                 how.residual_unit,
+                how.unseen,
             ]
         )
     write_text(path, text.getvalue())
@@ -141,5 +143,6 @@ def _record(row: dict[str, str]) -> FrameRecord:
             residual=float(row["residual"]),
             residual_unit=row["residual_unit"],
             method=row["method"],
+            unseen=row["unseen"],
         ),
     )

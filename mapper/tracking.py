@@ -107,7 +107,7 @@ def track_log(
             track = odometry.track(observation)
             if track.is_keyframe and track.node is not None:
                 graph.add_node(track.node, track.stamp_ns, track.T_world_body)
-                closer.add(track.node, track, partial(odometry.view, observation))
+                closer.add(track.node, track, partial(odometry.view, observation, track.twist))
             frame_ms[track.stamp_ns] = 1e3 * (observed_s + time.perf_counter() - began)
             graph.add_factors(track.factors)
             tracks.append(track)

@@ -8,6 +8,11 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 
 from mapper.config.base import Config
 from mapper.config.features import DetectorConfig, OrbConfig, SurfConfig, UniformOrbConfig
+from mapper.config.scan_odometry import (
+    GicpOdometryConfig,
+    IcpOdometryConfig,
+    KissOdometryConfig,
+)
 
 if TYPE_CHECKING:
     from mapper.odometry.isvd import IsvdOdometry
@@ -173,4 +178,12 @@ class PnpConfig(KeyframeConfig):
         return KeyframeOdometry(self, partial(PnpPlacing, self))
 
 
-OdometryConfig = Annotated[IsvdOdometryConfig | LocalMapConfig | PnpConfig, Field(discriminator="kind")]
+OdometryConfig = Annotated[
+    IsvdOdometryConfig
+    | LocalMapConfig
+    | PnpConfig
+    | GicpOdometryConfig
+    | IcpOdometryConfig
+    | KissOdometryConfig,
+    Field(discriminator="kind"),
+]

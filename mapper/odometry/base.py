@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
+from mapper.deskew import Twist
 from mapper.features.scan_view import ScanView
 from mapper.features.view import View
 from mapper.frames import Frame
@@ -22,6 +23,7 @@ class Diagnostics:
         residual: Root mean square residual of the inliers.
         residual_unit: "m" or "px".
         method: What placed the frame, e.g. "map", "fallback", "relocalised", "lost".
+        unseen: Motions that the surfaces left open, e.g. "translation along x"; empty when none.
     """
 
     features: int
@@ -30,6 +32,7 @@ class Diagnostics:
     residual: float
     residual_unit: str
     method: str
+    unseen: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +49,7 @@ class Track:
         diagnostics: How it went.
         links: Where the new node lies from earlier ones, as far as is known now; ``factors`` may come later
             and better, but until then this is what ties the node to the path.
+        twist: How the body is taken to have moved while a scan was swept; None where nothing was deskewed.
     """
 
     stamp_ns: int
@@ -56,6 +60,7 @@ class Track:
     diagnostics: Diagnostics
     factors: Sequence[BetweenFactor] = field(default_factory=tuple)
     links: Sequence[BetweenFactor] = field(default_factory=tuple)
+    twist: Twist | None = None
 
 
 Observation = TypeVar("Observation")
@@ -79,8 +84,13 @@ class Odometry(Protocol[Observation]):
         """Place the next observation, in time order."""
         ...
 
-    def view(self, observation: Observation) -> Seen:
-        """Return what a place is recognised by. Pure."""
+    def view(self, observation: Observation, twist: Twist | None = None, /) -> Seen:
+        """Return what a place is recognised by. Pure.
+
+        Args:
+            observation: Of the frame.
+            twist: How the body moved while a scan was swept; images do not look at it.
+        """
         ...
 
     def finish(self) -> Sequence[BetweenFactor]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.config.odometry import IsvdOdometryConfig, MatchConfig
+from mapper.deskew import Twist
 from mapper.errors import FrameError
 from mapper.features.detectors import Features, build_detector
 from mapper.features.matching import homography_inliers, match_mutual
@@ -125,7 +126,7 @@ class IsvdOdometry:
         diagnostics = Diagnostics(len(observation.features), 0, 0, 0.0, "m", "lost")
         return Track(observation.stamp_ns, None, np.eye(4), self._recent[-1].T_world_body, False, diagnostics)
 
-    def view(self, observation: IsvdObservation) -> View:
+    def view(self, observation: IsvdObservation, _twist: Twist | None = None, /) -> View:
         """Return what a place is recognised by. Pure."""
         features, camera = observation.features, observation.camera
         pixels: Array = features.pixels.astype(np.float64)

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Generic
 
+from mapper.deskew import Twist
 from mapper.frames import Frame
 from mapper.graph.model import BetweenFactor
 from mapper.odometry.base import Observation, Odometry, Seen, Track
@@ -30,9 +31,9 @@ class Renumbered(Generic[Observation]):
             links=self._raised(track.links),
         )
 
-    def view(self, observation: Observation) -> Seen:
+    def view(self, observation: Observation, twist: Twist | None = None, /) -> Seen:
         """Return what a place is recognised by. Pure."""
-        return self._odometry.view(observation)
+        return self._odometry.view(observation, twist)
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return the measurements that were still being refined when the log ended."""

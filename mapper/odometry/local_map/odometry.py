@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.config.odometry import KeyframeConfig
+from mapper.deskew import Twist
 from mapper.features.detectors import build_detector
 from mapper.features.view import View
 from mapper.frames import Frame
@@ -71,7 +72,7 @@ class KeyframeOdometry:
         links = [self._factor(seen_from, placement.reference)] if is_keyframe else []
         return self._track(placement, is_keyframe=is_keyframe, links=links)
 
-    def view(self, observation: Observation) -> View:
+    def view(self, observation: Observation, _twist: Twist | None = None, /) -> View:
         """Return what a place is recognised by. Pure."""
         return observation.view()
 

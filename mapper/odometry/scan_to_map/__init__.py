@@ -1,0 +1,1 @@
+"""Odometry for scans: each is placed in a map of those before it."""

@@ -1,0 +1,49 @@
+"""Scan to the last keyframes by point-to-point ICP (Besl & McKay 1992)."""
+
+from collections import deque
+
+import numpy as np
+
+from mapper.config.scan_odometry import IcpOdometryConfig
+from mapper.geometry import Points, Transform, apply
+from mapper.odometry.scan_to_map.matching import Reach, Sweep
+from mapper.registration.gicp import Prepared, prepared, refine
+
+
+class IcpMatcher:
+    """A cloud of the last keyframes, in their world."""
+
+    def __init__(self, config: IcpOdometryConfig) -> None:
+        self._config = config
+        self._keyframes: deque[Points] = deque(maxlen=config.map_keyframes)
+        self._map: Prepared | None = None
+
+    def match(self, sweep: Sweep, T_world_body: Transform, *, reach: Reach) -> Transform | None:
+        """Return the T_world_body of a scan from a guess; None if the method cannot say."""
+        if self._map is None:
+            return None
+        distances_m = self._config.pair_distances_m
+        for distance_m in distances_m if reach == "far" else distances_m[-2:]:
+            found = refine(
+                self._map,
+                sweep.prepared,
+                T_world_body,
+                kind="icp",
+                max_pair_distance_m=distance_m,
+                max_iterations=self._config.max_iterations,
+            )
+            if not found.converged:
+                return None
+            T_world_body = found.T_target_source
+        return T_world_body
+
+    def add(self, sweep: Sweep, T_world_body: Transform, *, is_keyframe: bool) -> None:
+        """Take a keyframe into the map."""
+        if is_keyframe:
+            self._keyframes.append(apply(T_world_body, sweep.prepared.points))
+            self._map = prepared(np.concatenate(self._keyframes), voxel_m=sweep.prepared.voxel_m)
+
+    def clear(self) -> None:
+        """Forget the map."""
+        self._keyframes.clear()
+        self._map = None

@@ -1,0 +1,68 @@
+"""KISS-ICP (Vizzo et al. 2023) by its authors' library, one scan at a time."""
+
+import numpy as np
+
+from mapper.config.scan_odometry import KissOdometryConfig
+from mapper.geometry import Array, Points, Transform, inverse, is_rigid
+from mapper.odometry.scan_to_map.matching import Reach, Sweep
+
+
+class KissMatcher:
+    """The library's map, registration and adaptive threshold; deskewing and prediction are the odometry's."""
+
+    def __init__(self, config: KissOdometryConfig) -> None:
+        from kiss_icp.config import KISSConfig
+        from kiss_icp.registration import get_registration
+
+        self._settings = KISSConfig()
+        self._settings.data.max_range = config.max_range_m
+        self._settings.mapping.voxel_size = config.map_voxel_m
+        self._settings.mapping.max_points_per_voxel = config.max_points_per_voxel
+        self._settings.registration.max_num_iterations = config.max_iterations
+        self._settings.registration.convergence_criterion = config.convergence
+        self._settings.registration.max_num_threads = 1  # sums are added up in the order of the points
+        self._settings.adaptive_threshold.initial_threshold = config.initial_threshold_m
+        self._settings.adaptive_threshold.min_motion_th = config.min_motion_m
+        self._registration = get_registration(self._settings)
+        self._T_world_guess: Transform | None = None
+        self.clear()
+
+    def match(self, sweep: Sweep, T_world_body: Transform, *, reach: Reach) -> Transform | None:
+        """Return the T_world_body of a scan from a guess; None if the method cannot say."""
+        source = self._thinned(self._thinned(sweep.scan.points_body.astype(np.float64), 0.5), 1.5)
+        sigma_m = self._settings.adaptive_threshold.initial_threshold
+        if reach == "near":
+            sigma_m = self._threshold.get_threshold()
+        T_found: Array = self._registration.align_points_to_map(
+            points=source,
+            voxel_map=self._map,
+            initial_guess=T_world_body,
+            max_correspondance_distance=3.0 * sigma_m,
+            kernel=sigma_m,
+        )
+        if not is_rigid(T_found):
+            return None
+        self._T_world_guess = T_world_body
+        return T_found
+
+    def add(self, sweep: Sweep, T_world_body: Transform, *, is_keyframe: bool) -> None:  # noqa: ARG002
+        """Take any placed scan into the map, and learn from how far it lay from where it was expected."""
+        if self._T_world_guess is not None:
+            self._threshold.update_model_deviation(inverse(self._T_world_guess) @ T_world_body)
+            self._T_world_guess = None
+        self._map.update(self._thinned(sweep.scan.points_body.astype(np.float64), 0.5), T_world_body)
+
+    def clear(self) -> None:
+        """Forget the map."""
+        from kiss_icp.mapping import get_voxel_hash_map
+        from kiss_icp.threshold import get_threshold_estimator
+
+        self._map = get_voxel_hash_map(self._settings)
+        self._threshold = get_threshold_estimator(self._settings)
+        self._T_world_guess = None
+
+    def _thinned(self, points: Points, ratio: float) -> Points:
+        from kiss_icp.voxelization import voxel_down_sample
+
+        thinned: Points = voxel_down_sample(points, ratio * self._settings.mapping.voxel_size)
+        return thinned

@@ -1,0 +1,61 @@
+"""What a scan is reduced to before it is placed."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mapper.config.scan_odometry import ScanOdometryConfig
+from mapper.deskew import Twist, deskewed
+from mapper.errors import FrameError
+from mapper.frames import Frame, Scan
+from mapper.odometry.scan_to_map.matching import Sweep
+from mapper.registration.gicp import prepared
+from mapper.thinning import thin
+
+_FINER = 0.5  # a prepared point is the mean of those thinned to this part of its voxel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanObservation:
+    """A thinned scan.
+
+    Attributes:
+        scan: Points in range, body frame, with their times where the log has them.
+        sweep: The scan as taken all at once; None while that waits for the motion during the sweep.
+        voxel_m: Voxels that a sweep is prepared with.
+    """
+
+    scan: Scan
+    sweep: Sweep | None
+    voxel_m: float
+
+    def as_swept(self, twist: Twist) -> Sweep:
+        """Return the scan as taken all at once, when the body moved like this during the sweep."""
+        return self.sweep or _sweep(deskewed(self.scan, twist), self.voxel_m)
+
+
+def observe_scan(frame: Frame, config: ScanOdometryConfig) -> ScanObservation:
+    """Return a frame's points in range, thinned; prepared for registration unless they are to be deskewed.
+
+    Raises:
+        FrameError: Too few points are in range.
+    """
+    scan = frame.scan()
+    range_m = np.linalg.norm(scan.points_body - scan.origin_body.astype(np.float32), axis=1)
+    in_range = np.flatnonzero((range_m >= config.min_range_m) & (range_m <= config.max_range_m))
+    points_body = scan.points_body[in_range]
+    kept = thin(points_body, _FINER * config.voxel_m)
+    if len(kept) < config.min_points:
+        raise FrameError(
+            f"scan {scan.stamp_ns}: {len(scan.points_body)} points, of which {len(kept)} are left between "
+            f"{config.min_range_m:g} m and {config.max_range_m:g} m and {_FINER * config.voxel_m:g} m apart; "
+            f"want {config.min_points} (odometry.min_points, min_range_m, max_range_m, voxel_m)"
+        )
+    times_s = scan.times_s[in_range][kept] if scan.times_s is not None and config.deskew else None
+    thinned = replace(scan, points_body=points_body[kept], colors=None, times_s=times_s)
+    sweep = _sweep(thinned, config.voxel_m) if times_s is None else None
+    return ScanObservation(thinned, sweep, config.voxel_m)
+
+
+def _sweep(scan: Scan, voxel_m: float) -> Sweep:
+    return Sweep(scan, prepared(scan.points_body, voxel_m=voxel_m))
