@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from mapper.errors import FrameError
-from mapper.sources.cloud_files.raw import Column, Columns
+from mapper.sources.cloud_files.raw import Column, Columns, refusing_damage
 
 RECORD_BYTES = 16
 
 _HEADER_LINES = 100
-_SEPARATORS = re.compile(r"[\s,;]+")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?|nan|inf)", re.IGNORECASE)
 
 
@@ -38,10 +37,8 @@ def read_npy(path: Path) -> Columns:
     Raises:
         FrameError: It is neither, or not an array's file.
     """
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise FrameError(f"{path}: not an array of numbers: {error}") from None
+    with path.open("rb") as stream, refusing_damage(path, what="npy"):
+        array = np.lib.format.read_array(stream, allow_pickle=False)
     if array.dtype.names:
         return {name: array[name].ravel() for name in array.dtype.names if array[name].shape == array.shape}
     if array.ndim < 2 or array.shape[-1] < 3 or array.dtype.kind not in "fiu":
@@ -52,37 +49,35 @@ def read_npy(path: Path) -> Columns:
 def read_text(path: Path) -> Columns:
     """Read lines of x y z …, separated by blanks, commas or semicolons.
 
-    A header that names as many columns as there are tells which ones are x, y and z.
+    A header with as many names as there are columns tells which are x, y and z; else they are the first.
 
     Raises:
         FrameError: It is not text, or its lines are not as many numbers each, three or more.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig").replace(",", " ").replace(";", " ")
     except UnicodeDecodeError:
         raise FrameError(f"{path}: not a text file") from None
     names, skipped = _header(text)
     if skipped is None:
         raise FrameError(f"{path}: none of the first {_HEADER_LINES} lines is three or more numbers: x y z")
-    blanks = text.replace(",", " ").replace(";", " ")
-    try:
-        values = np.loadtxt(StringIO(blanks), skiprows=skipped, ndmin=2)
-    except ValueError as error:
-        raise FrameError(f"{path}: after {skipped} lines of header: {error}") from None
-    if len(names) == values.shape[1] and {"x", "y", "z"} <= set(names):
+    with refusing_damage(path, what="text"):
+        values = np.loadtxt(StringIO(text), skiprows=skipped, ndmin=2)
+    if len(names) == values.shape[1]:
         return {name: values[:, column] for column, name in enumerate(names)}
     return _xyz(values)
 
 
 def _header(text: str) -> tuple[list[str], int | None]:
-    """Return the words of the last line before the first point, and its number; None without a point."""
+    """Return the names of the columns, if a header tells, and how many lines come before the first point."""
     names: list[str] = []
-    for number, line in enumerate(text.split("\n", _HEADER_LINES)):
-        words = _SEPARATORS.sub(" ", line).split()
+    for number, line in enumerate(text.split("\n", _HEADER_LINES)[:_HEADER_LINES]):
+        words = line.split()
         if len(words) >= 3 and all(_NUMBER.fullmatch(word) for word in words):
             return names, number
-        if words:
-            names = [word.strip('"').lower() for word in words if word.strip("#/")]
+        bare = [word.strip('"#/').lower() for word in words if word.strip('"#/')]
+        if {"x", "y", "z"} <= set(bare) or not line.startswith(("#", "//")):
+            names = bare
     return names, None
 
 

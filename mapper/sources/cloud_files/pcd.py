@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from mapper.errors import FrameError
-from mapper.sources.cloud_files.raw import Columns
+from mapper.sources.cloud_files.raw import Columns, refusing_damage
 
 
 def read_pcd(path: Path) -> Columns:
@@ -16,12 +16,8 @@ def read_pcd(path: Path) -> Columns:
     """
     from pypcd4 import PointCloud
 
-    with path.open("rb") as stream:
-        try:
-            cloud = PointCloud.from_fileobj(stream)
-        except Exception as error:  # damaged bytes raise whatever the line that met them raises
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise FrameError(f"{path}: not a sound PCD file: {reason}") from None
+    with path.open("rb") as stream, refusing_damage(path, what="PCD"):
+        cloud = PointCloud.from_fileobj(stream)
     fields = np.atleast_1d(cloud.pc_data)
     if len(fields) != cloud.metadata.points:
         raise FrameError(

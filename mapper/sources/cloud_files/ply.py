@@ -10,8 +10,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import FrameError
-from mapper.sources.cloud_files.raw import Columns
+from mapper.sources.cloud_files.raw import Columns, refusing_damage
 
 _NAMES = {
     "i1": ("char", "int8"),
@@ -49,12 +48,9 @@ def read_ply(path: Path) -> Columns:
     Raises:
         FrameError: It is malformed or cut, or its vertices have lists or come after an element that has.
     """
-    with path.open("rb") as stream:
-        try:
-            encoding, elements = _read_header(stream)
-            vertices = _read_vertices(stream, encoding, elements)
-        except ValueError as error:
-            raise FrameError(f"{path}: not a sound PLY file: {error}") from None
+    with path.open("rb") as stream, refusing_damage(path, what="PLY"):
+        encoding, elements = _read_header(stream)
+        vertices = _read_vertices(stream, encoding, elements)
     return {name: vertices[name] for name in vertices.dtype.names or ()}
 
 
@@ -95,9 +91,9 @@ def _read_vertices(stream: BinaryIO, encoding: str, elements: Sequence[_Element]
     dtype = vertex.dtype(byte_order)
     if encoding == "ascii":
         skipped = sum(element.count for element in before)
-        lines = list(islice(stream, skipped, skipped + vertex.count))
+        lines = [line for line in islice(stream, skipped, skipped + vertex.count) if line.strip()]
         _refuse_fewer(vertex.count, len(lines))
-        return np.loadtxt(lines, dtype, ndmin=1) if lines else np.empty(0, dtype)
+        return np.loadtxt(lines, dtype, comments=None, ndmin=1) if lines else np.empty(0, dtype)
     stream.seek(sum(element.count * element.dtype(byte_order).itemsize for element in before), os.SEEK_CUR)
     left = os.fstat(stream.fileno()).st_size - stream.tell()
     _refuse_fewer(vertex.count, max(left, 0) // max(dtype.itemsize, 1))

@@ -1,6 +1,7 @@
 """From a cloud file's columns to points that were measured, in metres around the sensor."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,11 +66,27 @@ def cloud_from(columns: Columns, *, path: Path, scale: float | None) -> RawCloud
     times = None if field is None else columns[field]
     colors = _colors(columns)
     if measured < total:
-        points = points[is_measured]
+        points = points.compress(is_measured, axis=0)  # three times as fast as an index
         times = None if times is None else times[is_measured]
-        colors = None if colors is None else colors[is_measured]
+        colors = None if colors is None else colors.compress(is_measured, axis=0)
     _check_range(points, path=path, is_scaled=scale is not None)
     return RawCloud(points, times, colors)
+
+
+@contextmanager
+def refusing_damage(path: Path, *, what: str) -> Iterator[None]:
+    """Turn whatever a parser raises on a damaged file into one line about it.
+
+    Raises:
+        FrameError: The parser gave up; what the system refuses stays an OSError.
+    """
+    try:
+        yield
+    except (OSError, FrameError):
+        raise
+    except Exception as error:  # parsers of foreign bytes raise whatever the line that met them raises
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise FrameError(f"{path}: not a sound {what} file: {reason}") from None
 
 
 def _measured(points: Points32) -> NDArray[np.bool_]:
