@@ -1,8 +1,8 @@
-"""The synthetic flat, the walk through it, and the camera that records it."""
+"""Synthetic worlds, the way through them, and the camera or LiDAR that records it."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from mapper.config.base import Config
 
@@ -90,3 +90,83 @@ IDEAL_SENSOR = SensorConfig(
     image_noise_levels=0.0,
 )
 """Exact depth and noise-free images."""
+
+
+class LidarSensorConfig(Config):
+    """A spinning multi-beam LiDAR; by default the rings of a Velodyne HDL-64E."""
+
+    rings: PositiveInt = 64
+    lowest_ring_rad: Annotated[float, Field(gt=-1.5, lt=1.5)] = -0.4346
+    highest_ring_rad: Annotated[float, Field(gt=-1.5, lt=1.5)] = 0.0349
+    """Elevation of the outermost rings; the others lie evenly between."""
+    azimuth_steps: PositiveInt = 900
+    sweep_s: PositiveFloat = 0.1
+    """Time of one turn, whatever the log's scan rate."""
+    min_range_m: NonNegativeFloat = 1.0
+    max_range_m: PositiveFloat = 80.0
+    range_noise_m: NonNegativeFloat = 0.02
+    """Standard deviation along the ray."""
+    dropout_ratio: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.02
+    """Share of returns that are lost at random."""
+    motion_distortion: bool = True
+    """Whether the sensor moves while it turns; the points then have times. False freezes it at the stamp."""
+
+    @model_validator(mode="after")
+    def _rings_rise(self) -> Self:
+        if self.highest_ring_rad < self.lowest_ring_rad:
+            raise ValueError(
+                f"highest_ring_rad = {self.highest_ring_rad} lies below "
+                f"lowest_ring_rad = {self.lowest_ring_rad}; swap them"
+            )
+        return self
+
+
+class LidarSynthConfig(Config):
+    """One synthetic LiDAR log: the same configuration gives the same points."""
+
+    seed: NonNegativeInt = 0
+
+    scene: Literal["street", "courtyard"] = "street"
+    """"street": round a block between facades; "courtyard": a yard with few things in it."""
+    loop_m: Annotated[float, Field(ge=30.0)] = 300.0
+    """Length of the way round, which the scene is laid out along."""
+    slope_rad: Annotated[float, Field(ge=0.0, lt=0.3)] = 0.01
+    """Mean slope of the ground."""
+    undulation_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
+    """Largest height of the ground's waves above its mean slope."""
+
+    laps: PositiveFloat = 1.0
+    overlap_m: NonNegativeFloat = 15.0
+    """How far the way goes on past its start, so that its ends see the same."""
+    duration_s: PositiveFloat | None = None
+    """Length of the log; None is as long as the laps take."""
+    rate_hz: PositiveFloat = 10.0
+    """Scans recorded per second."""
+    speed_mps: PositiveFloat = 5.0
+    mount_height_m: PositiveFloat = 1.7
+    """Height of the sensor above the ground."""
+    tilt_rad: Annotated[float, Field(ge=0.0, le=0.6)] = 0.0
+    """The sensor's up swings this far from the ground's normal, in changing directions."""
+    yaw_swing_rad: Annotated[float, Field(ge=0.0, le=1.6)] = 0.0
+    """The sensor turns this far to either side of the direction of travel."""
+
+    sensor: LidarSensorConfig = LidarSensorConfig()
+
+
+STREET = LidarSynthConfig()
+"""A car's LiDAR on its way round a block."""
+
+COURTYARD = LidarSynthConfig(
+    scene="courtyard",
+    loop_m=60.0,
+    overlap_m=5.0,
+    rate_hz=2.0,
+    speed_mps=1.2,
+    tilt_rad=0.52,
+    yaw_swing_rad=0.8,
+    sensor=LidarSensorConfig(rings=32, lowest_ring_rad=-0.5236, highest_ring_rad=0.2618),
+)
+"""A LiDAR carried by hand, strongly tilting and turning, past few things."""
+
+IDEAL_LIDAR = LidarSensorConfig(range_noise_m=0.0, dropout_ratio=0.0, min_range_m=0.0)
+"""Exact ranges."""
