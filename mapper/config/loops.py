@@ -6,13 +6,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from mapper.config.base import Config
+from mapper.config.hough import ConstellationConfig, GroundConfig, VotingConfig
 from mapper.config.odometry import IsvdConfig, MatchConfig
-from mapper.config.places import PlacesConfig
+from mapper.config.places import PlacesConfig, ScanContextConfig
 
 if TYPE_CHECKING:
     from mapper.features.view import View
     from mapper.loops.belief import Correction
     from mapper.loops.closer import Closer, KeyframeLoops
+    from mapper.loops.overlap import OverlapVerifier
+    from mapper.loops.scans import ScanPlace
     from mapper.loops.verification import ImageVerifier
 
 Ratio = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -116,6 +119,64 @@ class PlaceLoopsConfig(KeyframeLoopsConfig):
         )
 
 
+class OverlapConfig(Config):
+    """What two scans must have in common to be two scans of one place."""
+
+    voxel_m: PositiveFloat = 0.75
+    """One point is kept per voxel; upright points this near are counterparts."""
+    reach_m: PositiveFloat = 48.0
+    """Farther points are dropped."""
+    constellation: ConstellationConfig = ConstellationConfig(ground=GroundConfig(cell_m=1.0, voxel_m=0.75))
+    """What stands around, from thin points: a cell of the ground has to be the larger."""
+    voting: VotingConfig = VotingConfig(angles=120)
+    pair_distances_m: tuple[PositiveFloat, ...] = (2.0, 1.0)
+    """Largest distance between the points of a pair, from coarse to fine."""
+    max_iterations: PositiveInt = 20
+    min_upright: PositiveInt = 100
+    """Fewer points on upright surfaces say nothing."""
+    min_overlap: Ratio = 0.5
+    """A smaller share of upright points with a counterpart, in either direction, is no loop."""
+    sigma_rad: NonNegativeFloat = 0.002
+    sigma_m: NonNegativeFloat = 0.03
+    """Errors that all points share: of deskewing, calibration and voxels."""
+    remembered: PositiveInt = 16
+    """Places whose search trees are kept."""
+
+    def build(self) -> "OverlapVerifier":
+        """Return the verifier this configures."""
+        from mapper.loops.overlap import OverlapVerifier
+
+        return OverlapVerifier(self)
+
+
+class ScanLoopsConfig(KeyframeLoopsConfig):
+    """Every scan is compared with those that look like it and those that may be near."""
+
+    kind: Literal["scans"] = "scans"
+    min_gap_m: NonNegativeFloat = 20.0
+    min_motion_m: NonNegativeFloat = 2.5
+    min_motion_rad: NonNegativeFloat = 1.0
+    max_distance_m: PositiveFloat = 10.0
+    max_tilt_rad: PositiveFloat = 0.8
+    """Largest angle between the upright axes of what is nearby."""
+    max_lookalikes: PositiveInt = 2
+    """So many of the candidates, at most, are proposed by looks; the others because they are near."""
+    max_candidates: PositiveInt = 3
+    context: ScanContextConfig = ScanContextConfig()
+    verification: OverlapConfig = OverlapConfig()
+    gate: GateConfig = GateConfig(slack_m=1.0)
+    agreement_path_m: PositiveFloat = 15.0
+
+    def build(self, correction: "Correction", /) -> "KeyframeLoops[ScanPlace]":
+        """Return the closer; ``correction`` is how the graph is solved."""
+        from mapper.loops.closer import KeyframeLoops
+        from mapper.loops.scans import scan_proposer
+
+        return KeyframeLoops(
+            self, self.verification.build(), partial(scan_proposer, self), correction=correction
+        )
+
+
 class ThesisLoopsConfig(Config):
     """The thesis's loop closure (A9): sharp frames against the keyframes near their estimate."""
 
@@ -145,4 +206,6 @@ class ThesisLoopsConfig(Config):
         return ThesisLoops(self, correction=correction)
 
 
-LoopsConfig = Annotated[NoLoopsConfig | PlaceLoopsConfig | ThesisLoopsConfig, Field(discriminator="kind")]
+LoopsConfig = Annotated[
+    NoLoopsConfig | PlaceLoopsConfig | ScanLoopsConfig | ThesisLoopsConfig, Field(discriminator="kind")
+]

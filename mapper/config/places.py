@@ -1,4 +1,4 @@
-"""Place recognition by visual words."""
+"""Place recognition: by visual words, and by the heights around a scanner."""
 
 from pathlib import Path
 from typing import Annotated
@@ -35,3 +35,18 @@ class PlacesConfig(Config):
     min_deviations: PositiveFloat = 3.0
     """Whatever its similarity, a place is proposed that stands out from all others by this many standard
     deviations: so images with few features find theirs as well."""
+
+
+class ScanContextConfig(Config):
+    """When two scans are taken to show the same place (Kim & Kim 2018)."""
+
+    rings: PositiveInt = 20
+    sectors: PositiveInt = 60
+    reach_m: PositiveFloat = 50.0
+    """Radius of the outermost ring; the published 80 m suits sparser surroundings."""
+    max_height_m: PositiveFloat = 15.0
+    """What is higher counts as this high."""
+    shortlist: PositiveInt = 50
+    """So many places with the nearest ring keys are turned to where they fit best."""
+    min_similarity: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
+    """Mean cosine between the sectors of two places, from which on one is proposed."""

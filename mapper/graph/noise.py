@@ -22,8 +22,16 @@ def with_model_error(information: Array, T_i_j: Transform) -> Array:
     """
     angle_rad = float(np.linalg.norm(rotation_log(T_i_j[:3, :3])))
     distance_m = float(np.linalg.norm(T_i_j[:3, 3]))
-    sigmas = [_LEAST_RAD + _SHARE * angle_rad] * 3 + [_LEAST_M + _SHARE * distance_m] * 3
-    covariance = np.linalg.inv(information) + np.diag(np.square(sigmas))
-    softened = np.linalg.inv(covariance)
-    symmetric: Array = 0.5 * (softened + softened.T)
+    return softened(
+        information,
+        sigma_rad=_LEAST_RAD + _SHARE * angle_rad,
+        sigma_m=_LEAST_M + _SHARE * distance_m,
+    )
+
+
+def softened(information: Array, *, sigma_rad: float, sigma_m: float) -> Array:
+    """Return the (6, 6) information of a relative pose with another error on top, the same each way."""
+    variances = np.square([sigma_rad] * 3 + [sigma_m] * 3)
+    known = np.linalg.inv(np.linalg.inv(information) + np.diag(variances))
+    symmetric: Array = 0.5 * (known + known.T)
     return symmetric

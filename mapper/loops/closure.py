@@ -14,7 +14,7 @@ from mapper.geometry import Array, Transform, inverse, rotation_log, transform
 from mapper.graph.model import BetweenFactor, Solution
 from mapper.rotations import quaternion_from_rotation, rotation_from_quaternion
 
-ProposedBy = Literal["places", "nearby", "hand"]
+ProposedBy = Literal["places", "scans", "nearby", "hand"]
 Verdict = Literal["accepted", "rejected"]
 
 
@@ -36,9 +36,9 @@ class LoopClosure:
         stamp_i_ns: Stamp of i's frame.
         stamp_j_ns: Stamp of j's frame.
         proposed_by: Who thought of it.
-        similarity: Of the two images' words (eq. 10); None if they were not compared.
-        matches: Features paired by descriptor.
-        inliers: Pairs that agree with the motion in the image.
+        similarity: Of two images' words (eq. 10) or of two scans' heights; None if they were not compared.
+        matches: Features paired by descriptor, or upright points compared.
+        inliers: Pairs that agree with the motion, in the image or in space.
         rmse_m: Root mean square distance of the agreeing points; None if none agreed.
         residual_px: Root mean square image residual of the inliers; None if none agreed.
         T_i_j: (4, 4) measured pose of j in i; None if there is no measurement.

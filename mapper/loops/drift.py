@@ -29,6 +29,7 @@ class Ways:
 
     def __init__(self) -> None:
         self._ties: dict[int, list[tuple[int, float, float]]] = {}
+        self._parent: dict[int, int] = {}
 
     def add(self, factors: Iterable[BetweenFactor]) -> None:
         """Add ties between nodes."""
@@ -37,6 +38,16 @@ class Ways:
             turned_rad = float(np.linalg.norm(rotation_log(factor.T_i_j[:3, :3])))
             for a, b in ((factor.i, factor.j), (factor.j, factor.i)):
                 self._ties.setdefault(a, []).append((b, path_m, turned_rad))
+            self._parent[self.part_of(factor.j)] = self.part_of(factor.i)
+
+    def part_of(self, node: int) -> int:
+        """Return the name of a node's part: two nodes have the same while ties lead from one to the other."""
+        root = node
+        while (parent := self._parent.get(root, root)) != root:
+            root = parent
+        while node != root:
+            self._parent[node], node = root, self._parent[node]
+        return root
 
     def between(self, a: int, b: int) -> Way | None:
         """Return the shortest way between two nodes (Dijkstra 1959), None if nothing ties them."""

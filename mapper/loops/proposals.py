@@ -4,8 +4,9 @@ from collections.abc import Callable
 from typing import Generic
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mapper.geometry import Transform
+from mapper.geometry import Array, Transform
 from mapper.loops.base import Place, Proposal, Proposer
 from mapper.loops.belief import Belief
 
@@ -40,17 +41,15 @@ class ByPose(Generic[Place]):
         self._T_body_sensor: list[Transform] = []
         self._travelled_m: list[float] = []
 
+    def within_reach(self, node: int, seen: Place, /, *, before: int) -> NDArray[np.bool_]:
+        """Return which of the first ``before`` places may be nearby, however they look."""
+        distance_m, _ = self._apart(node, seen, before)
+        return distance_m <= self._reach_m(before)
+
     def propose(self, node: int, seen: Place, /, *, before: int, limit: int) -> list[Proposal]:
         """Return the nearest places, the nearest first: metres and radians count alike."""
-        if before == 0:
-            return []
-        T_world_here = self._belief.pose_of(node) @ self._pose_of_sensor(seen)
-        T_world_body = np.array([self._belief.pose_of(place) for place in self._nodes[:before]])
-        T_world_place = T_world_body @ np.array(self._T_body_sensor[:before])
-        distance_m = np.linalg.norm(T_world_place[:, :3, 3] - T_world_here[:3, 3], axis=1)
-        since_m = self._travelled_m[-1] - np.array(self._travelled_m[:before])
-        near = distance_m <= self._max_distance_m + self._drift_ratio * since_m
-        angle_rad = np.arccos(np.clip(T_world_place[:, :3, 2] @ T_world_here[:3, 2], -1.0, 1.0))
+        distance_m, angle_rad = self._apart(node, seen, before)
+        near = distance_m <= self._reach_m(before)
         candidates = np.flatnonzero(near & (angle_rad <= self._max_angle_rad))
         apart = distance_m[candidates] + angle_rad[candidates]
         nearest = candidates[np.argsort(apart, kind="stable")[:limit]]
@@ -65,6 +64,22 @@ class ByPose(Generic[Place]):
         self._nodes.append(node)
         self._T_body_sensor.append(self._pose_of_sensor(seen))
         self._travelled_m.append(travelled_m)
+
+    def _apart(self, node: int, seen: Place, before: int) -> tuple[Array, Array]:
+        """Return how far the places are believed to lie from a node's, and the angles between their views."""
+        if before == 0:
+            return np.empty(0), np.empty(0)
+        T_world_here = self._belief.pose_of(node) @ self._pose_of_sensor(seen)
+        T_world_body = np.array([self._belief.pose_of(place) for place in self._nodes[:before]])
+        T_world_place = T_world_body @ np.array(self._T_body_sensor[:before])
+        distance_m = np.linalg.norm(T_world_place[:, :3, 3] - T_world_here[:3, 3], axis=1)
+        angle_rad = np.arccos(np.clip(T_world_place[:, :3, 2] @ T_world_here[:3, 2], -1.0, 1.0))
+        return distance_m, angle_rad
+
+    def _reach_m(self, before: int) -> Array:
+        """Return how far away each place may be believed to be and still be nearby."""
+        since_m = np.array([self._travelled_m[-1] - path_m for path_m in self._travelled_m[:before]])
+        return self._max_distance_m + self._drift_ratio * since_m
 
 
 class ByBoth(Generic[Place]):
