@@ -28,7 +28,10 @@ if TYPE_CHECKING:
 
 def build(
     log: Annotated[
-        Path, typer.Argument(metavar="LOG", help="Recorded log: a TUM, Poznań or numbered folder, or .mbag.")
+        Path,
+        typer.Argument(
+            metavar="LOG", help="Recorded log: a TUM, Poznań, KITTI or numbered folder, .mcap, .bag or .mbag."
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Run folder to create.")],
     config: ConfigFile = None,
@@ -53,11 +56,9 @@ def build(
 
     Example: mapper build rgbd_dataset_freiburg1_xyz --out runs/xyz --set octree.resolution_m=0.1
     """
-    from mapper.config import load_config
-
     overrides = merged(selection(first, last, stride, require_truth), set_)
     if onto is None:
-        run, metrics = built(log, load_config(config, overrides), out, overwrite=overwrite, quiet=quiet)
+        run, metrics = built(log, config, overrides, out, overwrite=overwrite, quiet=quiet)
     else:
         _refuse_both(config, onto)
         run, metrics = appended(log, onto, overrides, out, overwrite=overwrite, quiet=quiet)
@@ -68,15 +69,23 @@ def build(
 
 
 def built(
-    log: Path, config: "BuildConfig", out: Path, *, overwrite: bool, quiet: bool
+    log: Path,
+    config_file: Path | None,
+    overrides: "Sequence[str]",
+    out: Path,
+    *,
+    overwrite: bool,
+    quiet: bool,
 ) -> "tuple[Run, list[Metric]]":
     """Build a run and judge its trajectory by the truth, if the log has any."""
     from evaluators.evaluate import evaluate
+    from mapper.config import load_config, load_source_config
     from mapper.pipeline import build as build_run
     from mapper.sources import open_source
 
     prepare_libraries()
-    source = open_source(log, config.source)
+    source = open_source(log, load_source_config(config_file, overrides))
+    config = load_config(config_file, overrides, sensor=source.sensor)
     progress = progress_for(quiet=quiet)
     if not has_compiled_code():
         progress.note("first run here: the kernels are compiled once, which takes about a minute")

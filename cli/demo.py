@@ -35,13 +35,13 @@ def demo(
     from mapper.sources.synthetic import write_tum_log
 
     prepare_libraries()
-    config = load_config(None, set_ or ())
+    load_config(None, set_ or ())  # what is wrong with it is better known before the log is made
     log = out / "log"
     scene = overridden(SynthConfig(), [*DEMO_LOG, *assignments({"duration_s": seconds})])
     if not _is_made(log, scene):
         with progress_for(quiet=quiet).stage("render") as report:
             write_tum_log(log, scene, on_progress=report)
-    run, metrics = built(log, config, out / "run", overwrite=True, quiet=quiet)
+    run, metrics = built(log, None, set_ or (), out / "run", overwrite=True, quiet=quiet)
     if not quiet:
         print(summary_text(run, metrics))
     for picture in (files.SUMMARY, files.CLOUD_VIEWS, f"{files.SLICE}.png"):

@@ -9,6 +9,7 @@ import numpy as np
 from mapper.cloud import CloudBuilder, Colors
 from mapper.config import BuildConfig, McapConfig
 from mapper.config.octree import OctreeConfig
+from mapper.deskew import Twist, deskewed, twist_at
 from mapper.errors import FrameError
 from mapper.export.jpeg import encode_jpeg, shrunk_camera
 from mapper.frames import Frame, PinholeCamera, Points32, RgbdFrame, Scan
@@ -69,6 +70,7 @@ class _Job:
 
     entry: Entry
     T_world_body: Transform
+    twist: Twist
     known: Remembered | None
     feeds_cloud: bool
     feeds_log: bool
@@ -156,15 +158,27 @@ def _jobs(
         index = index_of.get(entry.stamp_ns)
         if index is not None:
             T_world_body, known = trajectory.T_world_body[index], None
-            if before is not None:
+            if before is not None and (
+                source.sensor == "rgbd" or _beside_hold(before, trajectory, index, config.octree)
+            ):
                 known = before.recall(entry.stamp_ns, T_world_body, config=config.octree)
             yield _Job(
                 entry,
                 T_world_body,
+                twist_at(trajectory, index),
                 known,
                 feeds_cloud=index % config.cloud.frame_stride == 0,
                 feeds_log=image_stride > 0 and index % image_stride == 0,
             )
+
+
+def _beside_hold(before: SightFile, trajectory: Trajectory, index: int, config: OctreeConfig) -> bool:
+    """Tell whether the poses before and after one are what they were: a scan is deskewed between them."""
+    return all(
+        before.holds(int(trajectory.stamps_ns[beside]), trajectory.T_world_body[beside], config=config)
+        for beside in (index - 1, index + 1)
+        if 0 <= beside < len(trajectory)
+    )
 
 
 def _prepared(job: _Job, config: BuildConfig, caster: Caster) -> _Fused:
@@ -173,10 +187,10 @@ def _prepared(job: _Job, config: BuildConfig, caster: Caster) -> _Fused:
     try:
         if job.feeds_cloud or job.feeds_log or config.octree.attributes:
             frame = job.entry.load()
-            scan = frame.scan()
+            scan = deskewed(frame.scan(), job.twist)
             snapshot = _snapshot(frame, config.mcap) if job.feeds_log else None
         elif job.known is None:
-            scan = job.entry.scan()
+            scan = deskewed(job.entry.scan(), job.twist)
     except FrameError as error:  # it was readable in the first pass, so the log changed under us
         return _Fused(job, reason=str(error))
     if job.known is not None:

@@ -1,12 +1,13 @@
 """Which way is up, and where the floor is: the frame that maps are sliced in."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
 
 from mapper.config.octree import LevelConfig
+from mapper.config.sensors import Sensor
 from mapper.errors import DataError
 from mapper.frames import Scan
 from mapper.geometry import Array, Points, Transform, apply, transform
@@ -15,8 +16,25 @@ from mapper.sources.base import Accelerations
 from mapper.timebase import nearest
 from mapper.trajectory import Trajectory
 
-OPTICAL_UP = np.array([0.0, -1.0, 0.0])
-OPTICAL_FORWARD = np.array([0.0, 0.0, 1.0])
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyAxes:
+    """How a body is roughly held.
+
+    Attributes:
+        up: (3,) unit vector that roughly points up, body frame.
+        forward: (3,) unit vector that the body looks along, body frame.
+    """
+
+    up: Array
+    forward: Array
+
+
+AXES: Mapping[Sensor, BodyAxes] = {
+    "rgbd": BodyAxes(up=np.array([0.0, -1.0, 0.0]), forward=np.array([0.0, 0.0, 1.0])),
+    "lidar": BodyAxes(up=np.array([0.0, 0.0, 1.0]), forward=np.array([1.0, 0.0, 0.0])),
+}
+
 
 _MAX_READING_GAP_NS = 50_000_000
 _MIN_READINGS = 50
@@ -56,8 +74,7 @@ def find_level(
     trajectory: Trajectory,
     accelerations: Accelerations | None,
     config: LevelConfig,
-    up_body: Array = OPTICAL_UP,
-    forward_body: Array = OPTICAL_FORWARD,
+    axes: BodyAxes = AXES["rgbd"],
 ) -> Level:
     """Return the level frame of a log.
 
@@ -70,22 +87,21 @@ def find_level(
         trajectory: Where the body was; at least one pose.
         accelerations: Readings in the accelerometer's own axes, which may be a permutation of the body's.
         config: How much is looked at.
-        up_body: (3,) unit vector that roughly points up, body frame.
-        forward_body: (3,) unit vector that the body looks along, body frame.
+        axes: How the sensor's body is held.
 
     Raises:
         DataError: The trajectory has no poses.
     """
     if not len(trajectory):
         raise DataError("levelling: the trajectory has no poses")
-    up_guess = _mean_up(trajectory, up_body)
+    up_guess = _mean_up(trajectory, axes.up)
     patches = patches_of(scans, points_per_scan=config.points_per_frame, tolerance_m=config.plane_tolerance_m)
     up_world, method, told = _up(
         patches, trajectory, accelerations, up_guess=up_guess, tolerance_m=config.plane_tolerance_m
     )
     heights_m = _heights(scans, up_world, config)
     floor_m, found = _floor(patches, heights_m, up_world=up_world, tolerance_m=config.plane_tolerance_m)
-    T_level_world = _frame(trajectory.T_world_body[0], up_world, floor_m, forward_body, up_body)
+    T_level_world = _frame(trajectory.T_world_body[0], up_world, floor_m, axes)
     return Level(T_level_world, method, f"{told}; {found}")
 
 
@@ -220,17 +236,15 @@ def _floor(
     return lowest_m, f"no floor seen: z = 0 is where the lowest {_LOWEST_PERCENT} % of the points end"
 
 
-def _frame(
-    T_world_first: Transform, up_world: Array, floor_m: float | None, forward_body: Array, up_body: Array
-) -> Transform:
+def _frame(T_world_first: Transform, up_world: Array, floor_m: float | None, axes: BodyAxes) -> Transform:
     """Return T_level_world: z up, floor at 0, the first pose at x = y = 0, looking along +x.
 
     A body that looks straight down or up has no heading; its own up direction then gives +x.
     """
     R_world_first, first_world = T_world_first[:3, :3], T_world_first[:3, 3]
-    heading = _flattened(R_world_first @ forward_body, up_world)
+    heading = _flattened(R_world_first @ axes.forward, up_world)
     if np.linalg.norm(heading) < np.sin(np.radians(10.0)):
-        heading = _flattened(R_world_first @ up_body, up_world)
+        heading = _flattened(R_world_first @ axes.up, up_world)
     x_world = heading / np.linalg.norm(heading)
     R_level_world = np.array([x_world, np.cross(up_world, x_world), up_world])
     first_level = R_level_world @ first_world

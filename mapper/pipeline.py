@@ -10,6 +10,7 @@ import numpy as np
 
 from mapper import run as files
 from mapper.config import BuildConfig
+from mapper.deskew import deskewed, twist_at
 from mapper.errors import ConfigError, FrameError, RunError
 from mapper.export.exporters import EXPORTERS
 from mapper.export.grid import write_grid
@@ -18,7 +19,7 @@ from mapper.export.picture import write_cloud_views, write_summary
 from mapper.export.ply import write_ply
 from mapper.fusion import Maps, fuse_log
 from mapper.graph.model import PoseGraph
-from mapper.levelling import Level, find_level
+from mapper.levelling import AXES, Level, find_level
 from mapper.manifest import Levelling, Solve, Status, Timing
 from mapper.measure import peak_memory_mb
 from mapper.octree.map_file import write_map
@@ -67,6 +68,7 @@ _OUTDATED_BY_FUSE = frozenset(
         *(f"{files.COSTMAP}{ending}" for ending in EXPORTERS["costmap"].beside),
         files.PLAN,
         files.PLAN_VIEW,
+        files.RERUN,
     }
 )
 
@@ -211,15 +213,23 @@ def _keep_the_rest(folder: Path, new: Path) -> None:
 def _level(source: FrameSource, trajectory: Trajectory, config: BuildConfig) -> Level:
     """Find the level frame from a few frames, spread over the trajectory."""
     spread = np.unique(np.linspace(0, len(trajectory) - 1, config.level.frames).round().astype(int))
-    T_world_body = {int(trajectory.stamps_ns[i]): trajectory.T_world_body[i] for i in spread}
+    index_of = {int(trajectory.stamps_ns[index]): int(index) for index in spread}
     scans = []
     for entry in source.entries():
-        if entry.stamp_ns in T_world_body:
+        if entry.stamp_ns in index_of:
+            index = index_of[entry.stamp_ns]
             try:
-                scans.append((entry.scan(), T_world_body[entry.stamp_ns]))
+                scan = deskewed(entry.scan(), twist_at(trajectory, index))
             except FrameError:
                 continue  # it was readable a moment ago; the second pass will tell
-    return find_level(scans, trajectory=trajectory, accelerations=source.accelerations, config=config.level)
+            scans.append((scan, trajectory.T_world_body[index]))
+    return find_level(
+        scans,
+        trajectory=trajectory,
+        accelerations=source.accelerations,
+        config=config.level,
+        axes=AXES[source.sensor],
+    )
 
 
 def fuse_into(

@@ -9,7 +9,7 @@ from mapper.config.octree import LevelConfig
 from mapper.errors import DataError
 from mapper.frames import PinholeCamera, RgbdFrame, Scan, ray_table
 from mapper.geometry import apply, exp, inverse, rotation_exp, transform
-from mapper.levelling import OPTICAL_FORWARD, OPTICAL_UP, find_level
+from mapper.levelling import AXES, find_level
 from mapper.sources.base import Accelerations
 from mapper.timebase import nearest, ns_from_seconds_text
 from mapper.trajectory import Trajectory, read_tum
@@ -115,10 +115,10 @@ def test_the_first_pose_stands_at_the_origin_and_looks_along_x():
     scans, trajectory, _ = log_of(ROOM, around())
     T_level_first = level_of(scans, trajectory).T_level_world @ trajectory.T_world_body[0]
     np.testing.assert_allclose(T_level_first[:3, 3], [0.0, 0.0, 1.4], atol=0.02)
-    heading = T_level_first[:3, :3] @ OPTICAL_FORWARD
+    heading = T_level_first[:3, :3] @ AXES["rgbd"].forward
     assert heading[0] > 0.8
     assert abs(heading[1]) < 1e-12
-    assert (T_level_first[:3, :3] @ OPTICAL_UP)[2] > 0.8
+    assert (T_level_first[:3, :3] @ AXES["rgbd"].up)[2] > 0.8
 
 
 def test_a_camera_that_looks_straight_down_takes_its_heading_from_its_own_up():
@@ -127,7 +127,7 @@ def test_a_camera_that_looks_straight_down_takes_its_heading_from_its_own_up():
     ]
     scans, trajectory, _ = log_of(ROOM, poses)
     T_level_first = level_of(scans, trajectory).T_level_world @ trajectory.T_world_body[0]
-    np.testing.assert_allclose(T_level_first[:3, :3] @ OPTICAL_UP, [1.0, 0.0, 0.0], atol=0.02)
+    np.testing.assert_allclose(T_level_first[:3, :3] @ AXES["rgbd"].up, [1.0, 0.0, 0.0], atol=0.02)
 
 
 def test_a_big_desk_is_not_taken_for_the_floor():
@@ -194,7 +194,7 @@ def test_without_any_plane_the_camera_says_what_is_up():
         level = level_of(scans, trajectory)
         assert level.method == "camera"
         np.testing.assert_allclose(
-            level.T_level_world[2, :3], trajectory.T_world_body[0, :3, :3] @ OPTICAL_UP, atol=1e-12
+            level.T_level_world[2, :3], trajectory.T_world_body[0, :3, :3] @ AXES["rgbd"].up, atol=1e-12
         )
     assert "no points seen" in level.detail
 
@@ -260,9 +260,7 @@ def test_a_body_with_other_axes_can_say_so():
         for s, T in scans
     ]
     moved = Trajectory(trajectory.stamps_ns, trajectory.T_world_body @ T_camera_lidar)
-    level = level_of(
-        as_lidar, moved, up_body=np.array([0.0, 0.0, 1.0]), forward_body=np.array([1.0, 0.0, 0.0])
-    )
+    level = level_of(as_lidar, moved, axes=AXES["lidar"])
     assert tilt_deg(level, T_world_room) < 0.3
     assert (level.T_level_world @ moved.T_world_body[0])[0, 0] > 0.8
 

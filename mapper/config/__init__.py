@@ -2,7 +2,7 @@
 
 import json
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
@@ -15,6 +15,7 @@ from mapper.config.loops import LoopsConfig, PlaceLoopsConfig
 from mapper.config.navigation import CostmapConfig, TraversableConfig
 from mapper.config.octree import LevelConfig, OctreeConfig, SliceConfig
 from mapper.config.odometry import LocalMapConfig, OdometryConfig
+from mapper.config.sensors import DEFAULTS, Sensor
 from mapper.config.sources import SourceConfig
 from mapper.errors import ConfigError
 
@@ -66,25 +67,61 @@ class BuildConfig(Config):
     """Threads that decode and detect ahead; the result does not depend on it."""
 
 
-def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> BuildConfig:
+def load_config(
+    path: Path | None = None, overrides: Sequence[str] = (), *, sensor: Sensor = "rgbd"
+) -> BuildConfig:
     """Return the configuration of a TOML file, or a run's JSON, with ``key.path=value`` overrides on top.
+
+    Args:
+        path: The file; None begins with the defaults.
+        overrides: Text, parsed by the model.
+        sensor: Whose defaults hold where neither says anything.
 
     Raises:
         ConfigError: The file cannot be read or parsed, or the model refuses a name or a value.
     """
-    tree: dict[str, Any] = {}
+    tree = {} if path is None else _read(path)
     if path is not None:
-        try:
-            text = path.read_text(encoding="utf-8")
-            tree = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-        except OSError as error:
-            raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-        except ValueError as error:  # what either parser raises, and text that is not UTF-8
-            raise ConfigError(f"{path}: not valid {path.suffix.upper()[1:] or 'TOML'}: {error}") from None
-        _validated(BuildConfig, tree, str(path))
+        _validated(BuildConfig, _over(DEFAULTS[sensor], tree), str(path))
     for override in overrides:
         _put(tree, override)
-    return _validated(BuildConfig, tree, "overrides" if overrides else str(path))
+    return _validated(
+        BuildConfig, _over(DEFAULTS[sensor], tree), "overrides" if overrides or path is None else str(path)
+    )
+
+
+def load_source_config(path: Path | None = None, overrides: Sequence[str] = ()) -> SourceConfig:
+    """Return the part of a configuration that opens a log, before it is known which sensor took it.
+
+    Raises:
+        ConfigError: As ``load_config``, of that part alone.
+    """
+    tree = {} if path is None else _read(path)
+    for override in overrides:
+        if override.startswith("source."):
+            _put(tree, override)
+    return _validated(BuildConfig, {"source": tree.get("source", {})}, str(path or "overrides")).source
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+        tree: dict[str, Any] = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:  # what either parser raises, and text that is not UTF-8
+        raise ConfigError(f"{path}: not valid {path.suffix.upper()[1:] or 'TOML'}: {error}") from None
+    return tree
+
+
+def _over(defaults: Mapping[str, Any], tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tree with what it leaves out taken from the defaults, part by part."""
+    filled: dict[str, Any] = {**defaults, **tree}
+    for name, value in tree.items():
+        default = defaults.get(name)
+        if isinstance(value, dict) and isinstance(default, dict):
+            filled[name] = {**default, **value}
+    return filled
 
 
 def overridden(config: AnyConfig, overrides: Sequence[str]) -> AnyConfig:

@@ -111,14 +111,20 @@ class SightFile:
             T_world_body: (4, 4) where it is believed to have been by now.
             config: Says how long rays are and how far they may stray.
         """
-        if stamp_ns not in self._heads:
+        if not self.holds(stamp_ns, T_world_body, config=config):
             return None
         head, start = self._heads[stamp_ns]
-        moved_m = displacement_m(head["T_world_body"], T_world_body, range_m=config.max_range_m)
-        if moved_m > config.stays_within_m:
-            return None
         data = os.pread(self._descriptor, int(head["size"]), start)
         return Remembered(stamp_ns, head["T_world_body"], int(head["blocks"]), data)
+
+    def holds(self, stamp_ns: int, T_world_body: Transform, *, config: OctreeConfig) -> bool:
+        """Tell whether a frame is known, and still where it was; see ``recall``."""
+        if stamp_ns not in self._heads:
+            return False
+        head, _ = self._heads[stamp_ns]
+        return displacement_m(head["T_world_body"], T_world_body, range_m=config.max_range_m) <= (
+            config.stays_within_m
+        )
 
 
 def displacement_m(T_a_body: Transform, T_b_body: Transform, *, range_m: float) -> float:

@@ -3,20 +3,36 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Protocol
 
+from mapper.config.sensors import Sensor
 from mapper.frames import Frame, Scan
 from mapper.geometry import Array
 from mapper.timebase import Stamps
 from mapper.trajectory import Trajectory
 
-Sensor = Literal["rgbd", "lidar"]
-"""What took a log's frames: RGB-D frames whose body is an optical frame, or scans with z roughly up."""
+
+class ImageFile(Protocol):
+    """An encoded image: a ``Path``, or a message that has one."""
+
+    @property
+    def suffix(self) -> str:
+        """Return which format it is in, as a file's ending: ".png"."""
+        ...
+
+    def read_bytes(self) -> bytes:
+        """Return the file's bytes.
+
+        Raises:
+            OSError: It cannot be read; so says a ``Path``.
+            FrameError: It cannot be read; so says a message.
+        """
+        ...
 
 
 @dataclass(frozen=True, slots=True)
 class ImageFiles:
-    """The files behind an RGB-D frame, so that a log can be converted without decoding its images.
+    """The encoded images of an RGB-D frame, so that a log can be converted without decoding them.
 
     Attributes:
         colour: Colour image.
@@ -25,8 +41,8 @@ class ImageFiles:
         depth_units_per_m: Depth image units per metre.
     """
 
-    colour: Path
-    depth: Path
+    colour: ImageFile
+    depth: ImageFile
     depth_stamp_ns: int
     depth_units_per_m: float
 
@@ -41,7 +57,7 @@ class Entry(Protocol):
 
     @property
     def files(self) -> ImageFiles | None:
-        """The frame's own image files, where it has any."""
+        """The frame's encoded images, where the log has them."""
         ...
 
     def load(self, *, colour: bool = True) -> Frame:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from mapper.config.sensors import Sensor
 from mapper.frames import Frame, Scan
-from mapper.sources.base import Accelerations, Entry, FrameSource, ImageFiles, Sensor
+from mapper.sources.base import Accelerations, Entry, FrameSource, ImageFiles
 from mapper.timebase import NS_PER_S, Stamps
 from mapper.trajectory import Trajectory
 

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from mapper.config.sensors import Sensor
 from mapper.config.sources import CameraConfig
 from mapper.errors import FrameError, SourceError
 from mapper.frames import DepthImage, PinholeCamera, RgbdFrame, Scan
-from mapper.sources.base import Accelerations, Entry, ImageFiles, Sensor
+from mapper.sources.base import Accelerations, Entry, ImageFile, ImageFiles
 from mapper.sources.calibration import Calibration
 from mapper.sources.calibration_file import FILE_NAMES, read_calibration
 from mapper.sources.images import read_colour, read_depth_m, read_grey
@@ -50,7 +51,7 @@ class RgbdEntry:
         self._check_size(self.files.depth, depth_m.shape)
         return depth_m
 
-    def _check_size(self, path: Path, shape: tuple[int, ...]) -> None:
+    def _check_size(self, path: ImageFile, shape: tuple[int, ...]) -> None:
         want = (self.camera.height_px, self.camera.width_px)
         if shape != want:
             raise FrameError(f"{path}: {shape[1]}×{shape[0]} px, but the log has {want[1]}×{want[0]}")

@@ -4,8 +4,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from mapper.config.sensors import Sensor
 from mapper.frames import Scan
-from mapper.sources.base import Accelerations, Entry, ImageFiles, Sensor
+from mapper.sources.base import Accelerations, Entry, ImageFiles
 from mapper.sources.cloud_files import read_cloud
 from mapper.sources.point_times import relative_times_s
 from mapper.trajectory import Trajectory

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.config.sensors import Sensor
 from mapper.config.sources import SourceConfig
 from mapper.errors import SourceError
-from mapper.sources.base import Accelerations, Entry, FrameSource, Sensor
+from mapper.sources.base import Accelerations, Entry, FrameSource
 from mapper.timebase import NS_PER_S, nearest
 from mapper.trajectory import Trajectory
 

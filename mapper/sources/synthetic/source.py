@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from mapper.config.sensors import Sensor
 from mapper.config.synthetic import SynthConfig
 from mapper.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
 from mapper.geometry import angle_between
-from mapper.sources.base import Accelerations, Sensor
+from mapper.sources.base import Accelerations
 from mapper.sources.synthetic.movers import Movers, make_movers
 from mapper.sources.synthetic.path import Motion, frame_stamps, make_motion, seconds_of
 from mapper.sources.synthetic.raycast import Rendering, render

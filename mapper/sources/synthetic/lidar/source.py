@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from mapper.config.sensors import Sensor
 from mapper.config.synthetic import LidarSynthConfig
 from mapper.frames import Scan
-from mapper.sources.base import Accelerations, ImageFiles, Sensor
+from mapper.sources.base import Accelerations, ImageFiles
 from mapper.sources.synthetic.lidar.route import Drive, make_drive, scan_stamps
 from mapper.sources.synthetic.lidar.scene import OutdoorScene, make_outdoor_scene
 from mapper.sources.synthetic.lidar.sensor import firing_times_s, render_scan, render_sweep
