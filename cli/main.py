@@ -20,6 +20,7 @@ from cli.plan import WithPoints, plan
 from cli.show_config import show_config
 from cli.solve import solve
 from cli.synth import synth
+from cli.view import view
 from cli.vocabulary import vocabulary
 from mapper import __version__
 from mapper.errors import MapperError
@@ -71,6 +72,7 @@ app.command("convert")(convert)
 app.command("synth")(synth)
 app.command("demo")(demo)
 app.command("config")(show_config)
+app.command("view")(view)
 app.command("doctor")(doctor)
 app.add_typer(vocabulary, name="vocabulary")
 

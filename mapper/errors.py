@@ -56,5 +56,9 @@ class DependencyError(MapperError):
     """A library that an optional part needs, and that is not installed or cannot be loaded."""
 
 
+class ViewerError(MapperError):
+    """A viewer that cannot be started or reached."""
+
+
 class RunError(MapperError):
     """A run folder that is missing, unfinished or already there."""

@@ -57,6 +57,7 @@ SUMMARY = "summary.png"
 CLOUD_VIEWS = "cloud.png"
 PLAN = "plan.json"
 PLAN_VIEW = "plan.png"
+RERUN = "run.rrd"
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from mapper.geometry import fit_rigid
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure
@@ -42,10 +44,17 @@ def story_of(run: Run) -> Story:
 
 
 def laid_over(truth: Trajectory, trajectory: Trajectory) -> Trajectory | None:
-    """Return the truth moved to where it fits the trajectory best; None if they share no three stamps."""
+    """Return the truth of the trajectory's time, moved to where it fits best.
+
+    None if they share no three stamps.
+    """
     index, gap_ns = nearest(truth.stamps_ns, trajectory.stamps_ns)
     near = gap_ns <= MAX_TRUTH_GAP_NS
     if near.sum() < 3:
         return None
     T_level_truth, _ = fit_rigid(trajectory.positions_world[near], truth.positions_world[index[near]])
-    return truth.moved(T_level_truth)
+    first_ns, last_ns = trajectory.stamps_ns[[0, -1]]
+    meanwhile = slice(
+        *np.searchsorted(truth.stamps_ns, [first_ns - MAX_TRUTH_GAP_NS, last_ns + MAX_TRUTH_GAP_NS])
+    )
+    return Trajectory(truth.stamps_ns[meanwhile], truth.T_world_body[meanwhile]).moved(T_level_truth)

@@ -23,7 +23,7 @@ HOMES = {
     "small_gicp": ("mapper/registration/gicp.py",),
     "pyoctomap": (),
     "evo": (),
-    "rerun": (),
+    "rerun": ("mapper/export/rerun/",),
 }
 
 

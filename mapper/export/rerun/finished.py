@@ -1,0 +1,72 @@
+"""A finished run, told to a recording."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from mapper.export.rerun.recording import RerunLog, recorded
+from mapper.export.run_maps import maps_of, snapshots_of
+from mapper.fusion import Maps
+from mapper.geometry import Array
+from mapper.run import Run
+from mapper.story import Story, story_of
+
+
+def show_run(run: Run, target: str) -> None:
+    """Tell a finished run to a target: FILE.rrd, "spawn", "connect" or "connect:URL".
+
+    Raises:
+        ConfigError: The target is none.
+        ViewerError: No viewer can be started or reached.
+        MapperError: A file of the run cannot be read.
+    """
+    story, maps = story_of(run), maps_of(run)
+    with recorded(target, name=run.path.name, looking_at=extent(story, maps)) as log:
+        log.images(list(snapshots_of(run)))
+        tell(log, story, maps)
+        log.about(in_words(run))
+
+
+def tell(log: RerunLog, story: Story, maps: Maps) -> None:
+    """Log what is known once the maps are made."""
+    paths = {"estimate": story.trajectory}
+    if story.truth is not None:
+        paths["truth"] = story.truth
+    for name, trajectory in paths.items():
+        log.path(name, trajectory)
+    log.body(story.trajectory)
+    log.graph(story.graph)
+    log.loops(story.loops, story.graph.T_world_node)
+    log.diagnostics(story.records, story.frame_ms)
+    log.voxels(maps.octree)
+    log.cloud(maps.cloud_points_world, maps.cloud_colors)
+    log.grid("slice", maps.grid)
+    log.grid("traversable", maps.traversable)
+    log.plan(maps.grid, paths)
+
+
+def extent(story: Story, maps: Maps) -> Array:
+    """Return the (2, 3) lower and upper corner around the path and all but a few stray points, metres."""
+    seen = [story.trajectory.positions_world]
+    if len(maps.cloud_points_world):
+        seen.append(np.percentile(maps.cloud_points_world, [2.0, 98.0], axis=0))
+    points_world = np.concatenate(seen)
+    return np.array([points_world.min(axis=0), points_world.max(axis=0)])
+
+
+def in_words(run: Run) -> str:
+    """Return a run as Markdown: its counts, its settings that matter, its times."""
+    manifest = run.manifest
+    counts, timing = manifest.counts, manifest.timing
+    rows: Iterable[tuple[str, str]] = (
+        ("log", f"{manifest.input.title} ({manifest.input.kind})"),
+        ("frames", f"{counts.tracked} tracked, {counts.lost} lost, {counts.skipped} skipped"),
+        ("graph", f"{counts.nodes} nodes, {counts.factors} factors"),
+        ("loops", f"{counts.loops} of {counts.loop_candidates} candidates hold"),
+        ("octree", f"{counts.leaves} leaves of {run.config.octree.resolution_m:g} m"),
+        ("odometry", run.config.odometry.kind),
+        ("seconds", f"{timing.total_s:.1f}, {timing.real_time_factor:.2f} × real time"),
+        ("mapper", manifest.mapper_version),
+    )
+    table = "\n".join(f"| {name} | {text.replace('|', '∣')} |" for name, text in rows)
+    return f"# {run.path.name}\n\n| | |\n| --- | --- |\n{table}\n"

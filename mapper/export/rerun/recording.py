@@ -1,0 +1,243 @@
+"""What a recording can be told: the entities of a run, by name, and what each is drawn as.
+
+==========================  =======================  ====================================================
+entity                      archetype                what it is
+==========================  =======================  ====================================================
+/world/body                 Transform3D              pose of every frame
+/world/body/camera          Pinhole, EncodedImage    images, and where they were taken
+/world/path/NAME            LineStrips3D             a trajectory: estimate, truth
+/world/graph/nodes          Points3D                 the solved keyframes
+/world/graph/ORIGIN         LineStrips3D             factors by origin
+/world/loops/VERDICT        LineStrips3D             loop candidates, accepted or rejected
+/world/map/voxels           VoxelGridMap             occupied voxels by height
+/world/map/cloud            Points3D                 coloured cloud
+/world/map/NAME             GridMap                  slice and traversable floor, at z = 0
+/slice                      Image                    the slice as a plan, y up; cells are pixels
+/slice/NAME                 LineStrips2D             trajectories over it
+/diagnostics/NAME           Scalars                  features, matches, inliers, residual, ms of each frame
+/log/loops                  TextLog                  loop candidates with their verdicts
+/about                      TextDocument             the run in words
+==========================  =======================  ====================================================
+
+All that changes has its place on one timeline, "stamp", the log's own clock in exact nanoseconds; what
+belongs to the whole log is static. Two recordings of a run are alike but not equal in bytes: Rerun numbers
+its chunks by time and chance.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from mapper.export.grid import grid_image
+from mapper.export.palette import ACCEPTED, ESTIMATE, FACTORS, REJECTED, TRUTH, Rgb, height_colors
+from mapper.export.rerun.blueprint import blueprint_for
+from mapper.export.rerun.target import streaming
+from mapper.frames import PinholeCamera
+from mapper.fusion import Snapshot
+from mapper.geometry import Array, Transform
+from mapper.graph.model import PoseGraph
+from mapper.loops.closure import LoopClosure, Verdict
+from mapper.octree.keys import KEY_ZERO
+from mapper.octree.map import OctreeMap
+from mapper.octree.slice import OccupancyGrid
+from mapper.records import FrameRecord
+from mapper.timebase import Stamps
+from mapper.trajectory import Trajectory
+
+APPLICATION = "mapper"
+CAMERA = "world/body/camera"
+TIMELINE = "stamp"
+_PATHS: dict[str, Rgb] = {"estimate": ESTIMATE, "truth": TRUTH}
+_VERDICTS: dict[Verdict, Rgb] = {"accepted": ACCEPTED, "rejected": REJECTED}
+_SERIES: dict[str, Rgb] = {
+    "features": (140, 146, 158),
+    "matches": (45, 108, 178),
+    "inliers": (38, 145, 87),
+    "residual": (124, 58, 196),
+    "ms": (214, 69, 37),
+}
+_LINE_PX = rr.Radius.ui_points(1.5)
+_THIN_PX = rr.Radius.ui_points(0.7)
+_DOT_PX = rr.Radius.ui_points(2.5)
+
+
+class RerunLog:
+    """One open recording; made by :func:`recorded`."""
+
+    def __init__(self, stream: rr.RecordingStream) -> None:
+        self._stream = stream
+        self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        for name, color in _SERIES.items():
+            self._log(f"diagnostics/{name}", rr.SeriesLines(names=name, colors=[color]))
+
+    def body(self, trajectory: Trajectory) -> None:
+        """Log where the body was at every stamp."""
+        self._columns(
+            "world/body",
+            trajectory.stamps_ns,
+            rr.Transform3D.columns(
+                translation=trajectory.positions_world, mat3x3=trajectory.T_world_body[:, :3, :3]
+            ),
+        )
+        self._log("world/body", rr.TransformAxes3D(0.2))
+
+    def images(self, snapshots: Sequence[Snapshot]) -> None:
+        """Log images with the camera that took them, which sits still on the body."""
+        if not snapshots:
+            return
+        self.camera(snapshots[0].camera, snapshots[0].T_body_camera)
+        blobs = [np.frombuffer(snapshot.jpeg, np.uint8) for snapshot in snapshots]
+        self._columns(
+            CAMERA,
+            np.array([snapshot.stamp_ns for snapshot in snapshots]),
+            rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs)),
+        )
+
+    def camera(self, camera: PinholeCamera, T_body_camera: Transform) -> None:
+        """Log a camera and where it sits on the body; Rerun knows no lens distortion."""
+        self._log(CAMERA, _transform(T_body_camera))
+        self._log(
+            CAMERA,
+            rr.Pinhole(
+                image_from_camera=camera.matrix,
+                resolution=[camera.width_px, camera.height_px],
+                image_plane_distance=0.3,
+            ),
+        )
+
+    def path(self, name: str, trajectory: Trajectory) -> None:
+        """Log a whole trajectory, "estimate" or "truth"."""
+        strip = trajectory.positions_world.astype(np.float32)
+        self._log(f"world/path/{name}", rr.LineStrips3D([strip], colors=[_PATHS[name]], radii=_LINE_PX))
+
+    def graph(self, graph: PoseGraph) -> None:
+        """Log the nodes, and the factors that are no loops, as lines by origin."""
+        positions = {node: T[:3, 3] for node, T in graph.T_world_node.items()}
+        self._log(
+            "world/graph/nodes",
+            rr.Points3D(np.array(list(positions.values())), colors=[ESTIMATE], radii=_DOT_PX),
+        )
+        for origin, color in FACTORS.items():
+            ends = [(positions[f.i], positions[f.j]) for f in graph.factors if f.origin == origin]
+            if ends and origin != "loop":
+                self._log(
+                    f"world/graph/{origin}", rr.LineStrips3D(np.array(ends), colors=[color], radii=_THIN_PX)
+                )
+
+    def loops(self, loops: Iterable[LoopClosure], T_world_node: Mapping[int, Transform]) -> None:
+        """Log loop candidates as lines between their nodes, and in words where they were found."""
+        loops = [loop for loop in loops if loop.i in T_world_node and loop.j in T_world_node]
+        for verdict, color in _VERDICTS.items():
+            ends = [
+                (T_world_node[loop.i][:3, 3], T_world_node[loop.j][:3, 3])
+                for loop in loops
+                if loop.verdict == verdict
+            ]
+            if ends:
+                self._log(
+                    f"world/loops/{verdict}", rr.LineStrips3D(np.array(ends), colors=[color], radii=_LINE_PX)
+                )
+        if loops:
+            self._columns(
+                "log/loops",
+                np.array([loop.stamp_j_ns for loop in loops]),
+                rr.TextLog.columns(
+                    text=[_told(loop) for loop in loops],
+                    level=["INFO" if loop.verdict == "accepted" else "DEBUG" for loop in loops],
+                ),
+            )
+
+    def voxels(self, octree: OctreeMap) -> None:
+        """Log the occupied voxels, coloured by height."""
+        leaves = octree.leaves()
+        occupied = leaves.log_odds >= octree.occupied_log_odds
+        if occupied.any():
+            colors = height_colors(leaves.centres_world[occupied, 2])
+            indices = leaves.keys[occupied].astype(np.int32) - KEY_ZERO
+            self._log("world/map/voxels", rr.VoxelGridMap(indices, [leaves.edge_m] * 3, colors=colors))
+
+    def cloud(self, points_world: NDArray[np.floating], colors: NDArray[np.uint8]) -> None:
+        """Log (N, 3) points in metres with (N, 3) RGB bytes."""
+        self._log("world/map/cloud", rr.Points3D(points_world, colors=colors, radii=rr.Radius.ui_points(1.2)))
+
+    def grid(self, name: str, grid: OccupancyGrid) -> None:
+        """Log a 2D grid in the world's z = 0 plane."""
+        height, width = grid.cells.shape
+        self._log(
+            f"world/map/{name}",
+            rr.GridMap(
+                data=grid.cells[::-1].tobytes(),
+                format=rr.components.ImageFormat(
+                    width=width, height=height, color_model="L", channel_datatype="U8"
+                ),
+                cell_size=grid.resolution_m,
+                translation=[*grid.origin_world_m, 0.0],
+                colormap=rr.components.Colormap.RvizMap,
+            ),
+        )
+
+    def plan(self, grid: OccupancyGrid, paths: Mapping[str, Trajectory]) -> None:
+        """Log the slice as an image seen from above, with trajectories over it."""
+        self._log("slice", rr.Image(np.ascontiguousarray(grid_image(grid)[::-1])))
+        height = grid.cells.shape[0]
+        for name, trajectory in paths.items():
+            cells = (trajectory.positions_world[:, :2] - grid.origin_world_m) / grid.resolution_m
+            strip = np.column_stack([cells[:, 0], height - cells[:, 1]])
+            self._log(f"slice/{name}", rr.LineStrips2D([strip], colors=[_PATHS[name]], radii=_LINE_PX))
+
+    def diagnostics(self, records: Sequence[FrameRecord], frame_ms: Mapping[int, float]) -> None:
+        """Log how every frame went, as curves."""
+        if not records:
+            return
+        stamps_ns = np.array([record.stamp_ns for record in records])
+        for name in ("features", "matches", "inliers", "residual"):
+            values = np.array([getattr(record.diagnostics, name) for record in records], np.float64)
+            self._columns(f"diagnostics/{name}", stamps_ns, rr.Scalars.columns(scalars=values))
+        if frame_ms:
+            self._columns(
+                "diagnostics/ms",
+                np.array(list(frame_ms)),
+                rr.Scalars.columns(scalars=np.array(list(frame_ms.values()))),
+            )
+
+    def about(self, markdown: str) -> None:
+        """Log the run in words."""
+        self._log("about", rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))
+
+    def _log(self, entity: str, what: Any, *, stamp_ns: int | None = None) -> None:
+        """Log something at a stamp, or for the whole recording."""
+        if stamp_ns is not None:
+            self._stream.set_time(TIMELINE, timestamp=np.datetime64(stamp_ns, "ns"))
+        self._stream.log(entity, what, static=stamp_ns is None, strict=True)
+
+    def _columns(self, entity: str, stamps_ns: Stamps, columns: Any) -> None:
+        index = rr.TimeColumn(TIMELINE, timestamp=np.asarray(stamps_ns).astype("datetime64[ns]"))
+        self._stream.send_columns(entity, [index], columns, strict=True)
+
+
+@contextmanager
+def recorded(target: str, *, name: str, looking_at: Array | None = None) -> Iterator[RerunLog]:
+    """Yield a recording that goes to a target, see :func:`mapper.export.rerun.target.streaming`.
+
+    Args:
+        target: FILE.rrd, "spawn", "connect" or "connect:URL".
+        name: What the viewer calls it.
+        looking_at: (2, 3) lower and upper corner of what to look at first, metres; None leaves it to Rerun.
+    """
+    stream = rr.RecordingStream(APPLICATION)
+    with streaming(stream, target, blueprint_for(looking_at)):
+        stream.send_recording_name(name)
+        yield RerunLog(stream)
+
+
+def _transform(T_parent_child: Transform) -> rr.Transform3D:
+    return rr.Transform3D(translation=T_parent_child[:3, 3], mat3x3=T_parent_child[:3, :3])
+
+
+def _told(loop: LoopClosure) -> str:
+    why = f": {loop.reason}" if loop.reason else ""
+    return f"{loop.i} → {loop.j} ({loop.proposed_by}, {loop.inliers} inliers) {loop.verdict}{why}"

@@ -1,0 +1,73 @@
+"""A finished run's maps and pictures, read back from its files."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from mapper import run as files
+from mapper.errors import DataError
+from mapper.export.grid import read_grid
+from mapper.frames import PinholeCamera
+from mapper.fusion import Maps, Snapshot
+from mapper.octree.octomap_file import read_map
+from mapper.run import Run
+from mapper.run_log import CAMERA
+from mapper.sources.cloud_files.ply import read_ply
+from mapper.sources.mcap_log import open_mcap
+from mapper.sources.ros.messages import CameraMessage, FileMessage, decode
+
+
+def maps_of(run: Run) -> Maps:
+    """Return what fusing made of a run.
+
+    Raises:
+        MapFileError: The octree cannot be read.
+        FrameError: The cloud cannot be read.
+        DataError: A grid cannot be read.
+    """
+    cloud = read_ply(run.path / files.CLOUD)
+    return Maps(
+        octree=read_map(run.path / files.OCTREE_MAP),
+        cloud_points_world=np.column_stack([cloud[axis] for axis in ("x", "y", "z")]),
+        cloud_colors=np.column_stack([cloud[channel] for channel in ("red", "green", "blue")]),
+        grid=read_grid(run.path / f"{files.SLICE}.yaml"),
+        traversable=read_grid(run.path / f"{files.TRAVERSABLE}.yaml"),
+    )
+
+
+def snapshots_of(run: Run) -> Iterator[Snapshot]:
+    """Yield the images of a run's MCAP log, in time order.
+
+    Raises:
+        DataError: The log cannot be read.
+    """
+    yield from read_snapshots(run.path / files.MCAP)
+
+
+def read_snapshots(path: Path) -> Iterator[Snapshot]:
+    """Yield the images of an MCAP log that :mod:`mapper.run_log` wrote, each with its own camera.
+
+    Raises:
+        DataError: The log cannot be read, or an image comes without a camera.
+    """
+    camera, T_body_camera = None, np.eye(4)
+    for topic, _, _, data in open_mcap(path).messages():
+        if topic.name not in ("/tf", "/camera/calibration", "/camera/image"):
+            continue
+        message = decode(topic, data)
+        if isinstance(message, list):
+            poses = [pose.T_parent_child for pose in message if pose.child == CAMERA]
+            T_body_camera = next((T for T in poses if T is not None), T_body_camera)
+        elif isinstance(message, CameraMessage):
+            camera = _camera(message)
+        elif isinstance(message, FileMessage):
+            if camera is None:
+                raise DataError(f"{path}: image {message.stamp_ns} comes before any calibration")
+            yield Snapshot(message.stamp_ns, bytes(message.data), camera, T_body_camera)
+
+
+def _camera(message: CameraMessage) -> PinholeCamera:
+    fx, _, cx, _, fy, cy, *_ = message.K.tolist()
+    k1, k2, p1, p2, k3 = message.D.tolist()
+    return PinholeCamera(message.width_px, message.height_px, fx, fy, cx, cy, (k1, k2, p1, p2, k3))

@@ -1,0 +1,193 @@
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from typer.testing import CliRunner
+
+from cli.main import app
+from mapper.config import BuildConfig
+from mapper.errors import ConfigError, DataError, ViewerError
+from mapper.export.rerun.finished import show_run
+from mapper.export.rerun.recording import recorded
+from mapper.export.rerun.target import check_target
+from mapper.export.run_maps import maps_of, snapshots_of
+from mapper.pipeline import build
+from mapper.sources import open_source
+
+RERUN = Path(sys.executable).with_name("rerun")
+
+
+class Told:
+    """A recording read back: its chunks by entity."""
+
+    def __init__(self, path):
+        self.reader = rr.chunk.RrdReader(path)
+        self.chunks = {}
+        for chunk in self.reader.stream():
+            self.chunks.setdefault(chunk.entity_path, []).append(chunk)
+
+    def values(self, entity, component):
+        """All values of a component, in order of their stamps."""
+        rows = []
+        for chunk in self.chunks[entity]:
+            batch = chunk.to_record_batch()
+            if component in batch.schema.names:
+                values = batch.column(component).to_pylist()
+                stamps = (
+                    batch.column("stamp").cast("int64").to_pylist()
+                    if "stamp" in chunk.timeline_names
+                    else [0]
+                )
+                rows += [
+                    (stamp, value) for stamp, value in zip(stamps, values, strict=True) if value is not None
+                ]
+        return sorted(rows, key=lambda row: row[0])
+
+    def one(self, entity, component):
+        [(_, value)] = self.values(entity, component)
+        return np.array(value)
+
+
+@pytest.fixture(scope="module")
+def run(desk_log, tmp_path_factory):
+    return build(open_source(desk_log), BuildConfig(), tmp_path_factory.mktemp("rerun") / "desk")
+
+
+@pytest.fixture(scope="module")
+def told(run):
+    path = run.path / "told.rrd"
+    show_run(run, str(path))
+    return Told(path)
+
+
+def test_the_paths_are_the_run_s(run, told):
+    estimate = told.one("/world/path/estimate", "LineStrips3D:strips")[0]
+    np.testing.assert_allclose(estimate, run.trajectory().positions_world, atol=1e-6)
+    truth = told.one("/world/path/truth", "LineStrips3D:strips")[0]
+    assert np.linalg.norm(truth[0] - estimate[0]) < 0.05  # laid over the estimate, in its own world
+
+
+def test_the_body_has_a_pose_at_every_exact_stamp(run, told):
+    trajectory = run.trajectory()
+    rows = told.values("/world/body", "Transform3D:translation")
+    assert [stamp for stamp, _ in rows] == trajectory.stamps_ns.tolist()
+    np.testing.assert_allclose([value[0] for _, value in rows], trajectory.positions_world, atol=1e-6)
+
+
+def test_the_graph_is_nodes_and_lines_between_them(run, told):
+    graph = run.graph()
+    nodes = told.one("/world/graph/nodes", "Points3D:positions")
+    np.testing.assert_allclose(nodes, [T[:3, 3] for T in graph.T_world_node.values()], atol=1e-6)
+    lines = told.one("/world/graph/odometry", "LineStrips3D:strips")
+    assert len(lines) == sum(factor.origin == "odometry" for factor in graph.factors)
+
+
+def test_every_loop_is_a_line_by_verdict_and_a_line_of_text(run, told):
+    loops = run.loops()
+    for verdict in ("accepted", "rejected"):
+        count = sum(loop.verdict == verdict for loop in loops)
+        entity = f"/world/loops/{verdict}"
+        assert (len(told.one(entity, "LineStrips3D:strips")) if entity in told.chunks else 0) == count
+    said = told.values("/log/loops", "TextLog:text") if "/log/loops" in told.chunks else []
+    assert [stamp for stamp, _ in said] == sorted(loop.stamp_j_ns for loop in loops)
+
+
+def test_the_voxels_are_the_occupied_ones(run, told):
+    octree = maps_of(run).octree
+    leaves = octree.leaves()
+    occupied = leaves.centres_world[leaves.log_odds >= octree.occupied_log_odds]
+    indices = told.one("/world/map/voxels", "VoxelGridMap:voxel_indices")
+    edge_m = told.one("/world/map/voxels", "VoxelGridMap:voxel_size")[0]
+    np.testing.assert_allclose((indices + 0.5) * edge_m, occupied, atol=1e-5)
+    assert len(told.one("/world/map/voxels", "VoxelGridMap:colors")) == len(occupied)
+
+
+def test_the_slice_lies_as_rerun_s_own_importer_lays_the_one_in_the_mcap(run, told):
+    ours = told.one("/world/map/slice", "GridMap:data")[0]
+    imported = [
+        chunk.to_record_batch()
+        for chunk in rr.chunk.McapReader(run.path / "run.mcap").stream()
+        if chunk.entity_path == "/map/slice" and chunk.timeline_names
+    ]
+    assert ours.tolist() == imported[0].column("GridMap:data")[0].as_py()[0]
+    placed = imported[0].column("GridMap:translation")[0].as_py()[0]
+    np.testing.assert_allclose(told.one("/world/map/slice", "GridMap:translation")[0], placed, atol=1e-6)
+
+
+def test_images_come_from_the_run_s_own_log(run, told):
+    snapshots = list(snapshots_of(run))
+    rows = told.values("/world/body/camera", "EncodedImage:blob")
+    assert len(rows) == len(snapshots) == -(-len(run.trajectory()) // run.config.mcap.image_stride)
+    assert [stamp for stamp, _ in rows] == [snapshot.stamp_ns for snapshot in snapshots]
+    assert bytes(rows[0][1][0]) == snapshots[0].jpeg
+    matrix = told.one("/world/body/camera", "Pinhole:image_from_camera")[0]
+    np.testing.assert_allclose(matrix.reshape(3, 3).T, snapshots[0].camera.matrix, rtol=1e-6)
+
+
+def test_diagnostics_are_curves(run, told):
+    for name in ("features", "matches", "inliers", "residual"):
+        rows = told.values(f"/diagnostics/{name}", "Scalars:scalars")
+        wanted = [(record.stamp_ns, getattr(record.diagnostics, name)) for record in run.records()]
+        assert [(stamp, value[0]) for stamp, value in rows] == wanted
+    assert len(told.values("/diagnostics/ms", "Scalars:scalars")) == len(run.records())
+
+
+def test_a_run_without_images_loops_and_truth_can_be_told(desk_log, tmp_path):
+    config = BuildConfig.model_validate({"mcap": {"image_stride": 0}, "loops": {"kind": "none"}})
+    source = open_source(desk_log)
+    source.truth = None
+    run = build(source, config, tmp_path / "bare")
+    show_run(run, str(tmp_path / "bare.rrd"))
+    entities = Told(tmp_path / "bare.rrd").chunks
+    assert not {"/world/path/truth", "/world/body/camera", "/log/loops"} & entities.keys()
+
+
+def test_the_recording_verifies_and_brings_its_blueprint(run):
+    path = run.path / "told.rrd"
+    subprocess.run([str(RERUN), "rrd", "verify", str(path)], check=True, capture_output=True)
+    assert len(rr.chunk.RrdReader(path).blueprints()) == 1
+
+
+def test_a_recording_that_fails_leaves_no_file(tmp_path):
+    with pytest.raises(DataError), recorded(str(tmp_path / "x.rrd"), name="x"):
+        raise DataError("stop")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("target", ["run.mcap", "spam", "connect:nonsense", ""])
+def test_a_target_is_refused_at_once(target):
+    with pytest.raises(ConfigError, match=r"want FILE\.rrd, spawn, connect or connect:rerun\+http"):
+        check_target(target)
+
+
+def test_a_viewer_that_does_not_answer_is_one_line(run):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with pytest.raises(ViewerError, match=f"no viewer answers at rerun.http://127.0.0.1:{port}/proxy"):
+        show_run(run, f"connect:rerun+http://127.0.0.1:{port}/proxy")
+
+
+def test_no_screen_is_one_line(run, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    with pytest.raises(ViewerError, match="there is no screen"):
+        show_run(run, "spawn")
+
+
+def test_the_verb_keeps_the_recording_in_the_run(run, tmp_path):
+    result = CliRunner().invoke(app, ["view", str(run.path)])
+    assert result.stdout == f"{run.path / 'run.rrd'}\n"
+    assert "/world/path/estimate" in Told(run.path / "run.rrd").chunks
+
+    other = tmp_path / "other.rrd"
+    assert CliRunner().invoke(app, ["view", str(run.path), "--rrd", str(other), "--quiet"]).output == ""
+    again = CliRunner().invoke(app, ["view", str(run.path), "--rrd", str(other)])
+    assert (again.exit_code, "pass --overwrite" in again.stderr) == (1, True)
+    both = CliRunner().invoke(app, ["view", str(run.path), "--rrd", str(other), "--spawn"])
+    assert both.stderr == "mapper: --rrd, --spawn and --connect: choose one\n"
