@@ -12,6 +12,7 @@ from mapper.config.octree import OctreeConfig
 from mapper.deskew import Twist, deskewed, twist_at
 from mapper.errors import FrameError
 from mapper.export.jpeg import encode_jpeg, shrunk_camera
+from mapper.export.palette import height_colors
 from mapper.frames import Frame, PinholeCamera, Points32, RgbdFrame, Scan
 from mapper.geometry import Transform
 from mapper.navigation.traversable import traversable
@@ -25,7 +26,7 @@ from mapper.progress import Progress
 from mapper.sources.base import Entry, FrameSource
 from mapper.trajectory import Trajectory
 
-_NO_COLOUR = 128  # mid grey: for the points of a sensor that sees no colour
+_COLOURED_HEIGHTS_M = -1.0, 8.0  # the same in every scan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,6 +216,6 @@ def _add_to_cloud(cloud: CloudBuilder, scan: Scan, T_world_body: Transform) -> N
     R, t = T_world_body[:3, :3].astype(np.float32), T_world_body[:3, 3].astype(np.float32)
     points_world = scan.points_body @ R.T + t
     colors = scan.colors
-    if colors is None:
-        colors = np.full(points_world.shape, _NO_COLOUR, np.uint8)
+    if colors is None:  # the sensor sees no colour, but people see heights in it
+        colors = height_colors(points_world[:, 2], between_m=_COLOURED_HEIGHTS_M)
     cloud.add(points_world, colors)

@@ -24,15 +24,18 @@ class BodyAxes:
     Attributes:
         up: (3,) unit vector that roughly points up, body frame.
         forward: (3,) unit vector that the body looks along, body frame.
+        stands_on_floor: The floor is what lies below the sensor, not the lowest of what is around: a street
+            may fall away within sight, and reflections lie below it.
     """
 
     up: Array
     forward: Array
+    stands_on_floor: bool = False
 
 
 AXES: Mapping[Sensor, BodyAxes] = {
     "rgbd": BodyAxes(up=np.array([0.0, -1.0, 0.0]), forward=np.array([0.0, 0.0, 1.0])),
-    "lidar": BodyAxes(up=np.array([0.0, 0.0, 1.0]), forward=np.array([1.0, 0.0, 0.0])),
+    "lidar": BodyAxes(up=np.array([0.0, 0.0, 1.0]), forward=np.array([1.0, 0.0, 0.0]), stands_on_floor=True),
 }
 
 
@@ -50,6 +53,9 @@ _FLAT_COSINE = np.cos(np.radians(10.0))
 _NEAR_FLOOR_M = 0.15
 _MAX_BELOW_FLOOR_RATIO = 0.01
 _LOWEST_PERCENT = 0.5
+_NEAR_SENSOR_M = 12.0
+_MIN_SENSOR_HEIGHT_M = 0.15
+_MIN_FLOOR_POINTS = 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,8 +105,11 @@ def find_level(
     up_world, method, told = _up(
         patches, trajectory, accelerations, up_guess=up_guess, tolerance_m=config.plane_tolerance_m
     )
-    heights_m = _heights(scans, up_world, config)
-    floor_m, found = _floor(patches, heights_m, up_world=up_world, tolerance_m=config.plane_tolerance_m)
+    if axes.stands_on_floor:
+        floor_m, found = _floor_below(scans, up_world, tolerance_m=config.plane_tolerance_m)
+    else:
+        heights_m = _heights(scans, up_world, config)
+        floor_m, found = _floor(patches, heights_m, up_world=up_world, tolerance_m=config.plane_tolerance_m)
     T_level_world = _frame(trajectory.T_world_body[0], up_world, floor_m, axes)
     return Level(T_level_world, method, f"{told}; {found}")
 
@@ -234,6 +243,27 @@ def _floor(
             return floor_m, f"floor seen in {len(surfaces[chosen])} of {len(patches)} patches"
     lowest_m = float(np.percentile(heights_m, _LOWEST_PERCENT))
     return lowest_m, f"no floor seen: z = 0 is where the lowest {_LOWEST_PERCENT} % of the points end"
+
+
+def _floor_below(
+    scans: Sequence[tuple[Scan, Transform]], up_world: Array, *, tolerance_m: float
+) -> tuple[float | None, str]:
+    """Return the floor's height along up below the first scan that shows one, and how it was found.
+
+    That is the best supported height below the sensor among the points around it.
+    """
+    for scan, T_world_body in scans:
+        sensor_world = apply(T_world_body, scan.origin_body[np.newaxis])[0]
+        points_world = apply(T_world_body, scan.points_body.astype(np.float64)) - sensor_world
+        heights_m = points_world @ up_world
+        across_m = np.linalg.norm(points_world - heights_m[:, np.newaxis] * up_world, axis=1)
+        below_m = heights_m[(across_m <= _NEAR_SENSOR_M) & (heights_m < -_MIN_SENSOR_HEIGHT_M)]
+        least = max(_MIN_FLOOR_POINTS, len(below_m) // 4)
+        levels = levels_of(below_m, tolerance_m=tolerance_m, least=least)
+        if levels:
+            floor_m = float(np.median(below_m[levels[0]]))
+            return floor_m + float(sensor_world @ up_world), f"floor {-floor_m:.2f} m below the sensor"
+    return None, "no floor seen below the sensor: the floor is put at the first pose"
 
 
 def _frame(T_world_first: Transform, up_world: Array, floor_m: float | None, axes: BodyAxes) -> Transform:
