@@ -19,6 +19,8 @@ topic                  schema                        Foxglove            Rerun
 /plan/dots             foxglove.PointCloud           points              Points3D
 /diagnostics           mapper/msg/Diagnostics        plots, raw values   plots, raw values
 /loops                 mapper/msg/Loop               plots, raw values   plots, raw values
+/errors/NAME           mapper/msg/PathError          plots, raw values   plots, raw values
+/trials/NAME           mapper/msg/Trial              raw values          plots, raw values
 =====================  ============================  ==================  ===========================
 
 So lines are logged as dots too, the slice is a ROS message (Rerun ignores foxglove.Grid) and so are the
@@ -285,13 +287,13 @@ class McapLog:
 
     def diagnostics(self, stamp_ns: int, record: Mapping[str, ros2.Value]) -> None:
         """Log one frame's numbers and words on /diagnostics."""
-        self._record("/diagnostics", "mapper/msg/Diagnostics", stamp_ns, record)
+        self.record("/diagnostics", "mapper/msg/Diagnostics", stamp_ns, record)
 
     def loop(self, stamp_ns: int, record: Mapping[str, ros2.Value]) -> None:
         """Log one loop candidate and its verdict on /loops."""
-        self._record("/loops", "mapper/msg/Loop", stamp_ns, record)
+        self.record("/loops", "mapper/msg/Loop", stamp_ns, record)
 
-    def _record(self, topic: str, schema: str, stamp_ns: int, record: Mapping[str, ros2.Value]) -> None:
+    def record(self, topic: str, schema: str, stamp_ns: int, record: Mapping[str, ros2.Value]) -> None:
         """Log numbers and words.
 
         Args:
