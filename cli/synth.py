@@ -1,5 +1,6 @@
 """``mapper synth``: a synthetic log with exact truth."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -10,44 +11,82 @@ from cli.environment import prepare_libraries
 from cli.options import Quiet, assignments, merged
 
 
+class SensorKind(StrEnum):
+    """What takes the log."""
+
+    RGBD = "rgbd"
+    LIDAR = "lidar"
+
+
+class LidarScene(StrEnum):
+    """Where a LiDAR is."""
+
+    STREET = "street"
+    COURTYARD = "courtyard"
+
+
 def synth(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="TUM folder to create.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Log folder to create.")],
+    sensor: Annotated[
+        SensorKind, typer.Option(help="A camera in a flat, or a LiDAR outdoors.")
+    ] = SensorKind.RGBD,
     seconds: Annotated[float | None, typer.Option(help="Length of the log.")] = None,
-    path: Annotated[str | None, typer.Option(help="loop, desk or spin.")] = None,
-    rooms: Annotated[int | None, typer.Option(help="Rooms of the flat, an even number from 4.")] = None,
-    noise: Annotated[float | None, typer.Option(help="Times a Kinect's noise; 0 is exact.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Another flat, another walk.")] = None,
+    path: Annotated[str | None, typer.Option(help="rgbd: loop, desk or spin.")] = None,
+    rooms: Annotated[int | None, typer.Option(help="rgbd: rooms of the flat, an even number from 4.")] = None,
+    scene: Annotated[
+        LidarScene | None, typer.Option(help="lidar: a car round a block, or a yard crossed by hand.")
+    ] = None,
+    rings: Annotated[int | None, typer.Option(help="lidar: beams, one above the other.")] = None,
+    noise: Annotated[float | None, typer.Option(help="Times the sensor's noise; 0 is exact.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Another scene, another way through it.")] = None,
     set_: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY.PATH=VALUE", help="Turn any other knob of the scene or sensor."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Ray-cast a walk through a furnished flat and write it as a TUM log with exact truth.
+    """Ray-cast a walk through a furnished flat, or a drive through streets, as a log with exact truth.
 
     Example: mapper synth logs/spin --path spin --seconds 10 --set sensor.exposure_s=0.01
+    Example: mapper synth logs/yard --sensor lidar --scene courtyard --rings 16
     """
     from mapper.config import overridden
-    from mapper.config.synthetic import SynthConfig
-    from mapper.sources.synthetic import write_tum_log
+    from mapper.config.synthetic import SCENES, SynthConfig
 
-    given = {
-        "duration_s": seconds,
-        "path": path,
-        "rooms": rooms,
-        "seed": seed,
-        **_noise_knobs(noise),
-    }
-    config = overridden(SynthConfig(), merged(assignments(given), set_))
-    prepare_libraries()
-    with progress_for(quiet=quiet).stage("render") as report:
-        write_tum_log(out, config, on_progress=report)
+    common = {"duration_s": seconds, "seed": seed}
+    if sensor is SensorKind.RGBD:
+        from mapper.sources.synthetic import write_tum_log
+
+        _refuse({"--scene": scene, "--rings": rings}, sensor)
+        given = common | {"path": path, "rooms": rooms} | _camera_noise(noise)
+        flat = overridden(SynthConfig(), merged(assignments(given), set_))
+        prepare_libraries()
+        with progress_for(quiet=quiet).stage("render") as report:
+            write_tum_log(out, flat, on_progress=report)
+    else:
+        from mapper.sources.synthetic.lidar import write_lidar_log
+
+        _refuse({"--path": path, "--rooms": rooms}, sensor)
+        given = common | {"sensor.rings": rings} | _lidar_noise(noise)
+        outdoors = overridden(SCENES[scene or LidarScene.STREET], merged(assignments(given), set_))
+        prepare_libraries()
+        with progress_for(quiet=quiet).stage("scan") as report:
+            write_lidar_log(out, outdoors, on_progress=report)
     if not quiet:
-        print(f"{out}: a TUM log; map it with mapper build {out} --out RUN")
+        kind = "TUM" if sensor is SensorKind.RGBD else "KITTI"
+        print(f"{out}: a {kind} log; map it with mapper build {out} --out RUN")
 
 
-def _noise_knobs(noise: float | None) -> dict[str, float]:
-    """Return every knob of the sensor's noise, scaled from its default."""
+def _refuse(options: dict[str, object], sensor: SensorKind) -> None:
+    from mapper.errors import ConfigError
+
+    for name, value in options.items():
+        if value is not None:
+            raise ConfigError(f"{name} {value}: has no meaning with --sensor {sensor}; leave it out")
+
+
+def _camera_noise(noise: float | None) -> dict[str, object]:
+    """Return every knob of the camera's noise, scaled from its default."""
     from mapper.config.synthetic import SensorConfig
 
     if noise is None:
@@ -59,4 +98,17 @@ def _noise_knobs(noise: float | None) -> dict[str, float]:
         "sensor.disparity_step_px": noise * usual.disparity_step_px,
         "sensor.image_noise_levels": noise * usual.image_noise_levels,
         "sensor.dropout_ratio": min(noise * usual.dropout_ratio, 1.0),
+    }
+
+
+def _lidar_noise(noise: float | None) -> dict[str, object]:
+    """Return every knob of the LiDAR's noise, scaled from its default."""
+    from mapper.config.synthetic import LidarSensorConfig
+
+    if noise is None:
+        return {}
+    usual = LidarSensorConfig()
+    return {
+        "sensor.range_noise_m": noise * usual.range_noise_m,
+        "sensor.dropout_ratio": min(noise * usual.dropout_ratio, 0.99),
     }

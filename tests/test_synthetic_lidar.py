@@ -1,17 +1,21 @@
 """Synthetic LiDAR logs: every point lies where its scene, its sensor and its path say."""
 
+import json
+
 import numpy as np
 import pytest
 
-from mapper.config.synthetic import COURTYARD, IDEAL_LIDAR, STREET, LidarSensorConfig
-from mapper.errors import DataError
+from mapper.config.synthetic import COURTYARD, IDEAL_LIDAR, STREET, LidarSensorConfig, LidarSynthConfig
+from mapper.errors import DataError, SourceError
 from mapper.geometry import angle_between, apply, inverse
+from mapper.sources import open_source
 from mapper.sources.synthetic.lidar import (
     SyntheticLidarSource,
     make_outdoor_scene,
     render_scan,
     render_sweep,
     sample_map,
+    write_lidar_log,
 )
 from mapper.sources.synthetic.lidar.solids import Shape
 from mapper.sources.synthetic.path import seconds_of
@@ -196,3 +200,42 @@ def test_a_dense_map_is_exact_even_and_where_it_was_asked_for():
 def test_rings_in_the_wrong_order_are_refused():
     with pytest.raises(ValueError, match="swap them"):
         LidarSensorConfig(lowest_ring_rad=0.2, highest_ring_rad=-0.2)
+
+
+@pytest.mark.parametrize("motion_distortion", [False, True])
+def test_a_written_log_reads_back_as_it_was(tmp_path, motion_distortion):
+    sensor = LidarSensorConfig(**SMALL, motion_distortion=motion_distortion)
+    config = COURTYARD.model_copy(update={"sensor": sensor, "duration_s": 2.0, "rate_hz": 3.0})
+    told = []
+    write_lidar_log(tmp_path / "log", config, on_progress=lambda done, total: told.append((done, total)))
+
+    source, log = SyntheticLidarSource(config), open_source(tmp_path / "log")
+    assert (log.kind, log.sensor, list(log.notes)) == ("kitti", "lidar", [])
+    assert told == [(done, 7) for done in range(1, 8)]
+    np.testing.assert_array_equal(log.truth.stamps_ns, source.truth.stamps_ns)
+    np.testing.assert_allclose(log.truth.T_world_body, source.truth.T_world_body, atol=1e-15)
+    for entry, made in zip(log.entries(), source.entries(), strict=True):
+        read, scan = entry.load(), made.load()
+        assert read.stamp_ns == scan.stamp_ns
+        np.testing.assert_array_equal(read.points_body, scan.points_body)
+        if motion_distortion:
+            np.testing.assert_allclose(read.times_s, scan.times_s, atol=1e-9)
+        else:
+            assert read.times_s is scan.times_s is None
+    scene = json.loads((tmp_path / "log/scene.json").read_text())
+    assert LidarSynthConfig(**scene["config"]) == config
+    assert len(scene["solids"]) == len(source.scene.solids)
+    assert {row["shape"] for row in scene["solids"]} == {"box", "cylinder", "ellipsoid"}
+
+
+def test_a_log_is_not_written_over_another_and_leaves_nothing_half_done(tmp_path):
+    (tmp_path / "log").mkdir()
+    with pytest.raises(SourceError, match="exists already"):
+        write_lidar_log(tmp_path / "log", COURTYARD)
+
+    def give_up(*_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_lidar_log(tmp_path / "other", exact(COURTYARD), on_progress=give_up)
+    assert [path.name for path in tmp_path.iterdir()] == ["log"]

@@ -1,5 +1,6 @@
 """Synthetic worlds, the way through them, and the camera or LiDAR that records it."""
 
+from collections.abc import Mapping
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
@@ -167,6 +168,9 @@ COURTYARD = LidarSynthConfig(
     sensor=LidarSensorConfig(rings=32, lowest_ring_rad=-0.5236, highest_ring_rad=0.2618),
 )
 """A LiDAR carried by hand, strongly tilting and turning, past few things."""
+
+SCENES: Mapping[str, LidarSynthConfig] = {"street": STREET, "courtyard": COURTYARD}
+"""Where ``mapper synth`` begins."""
 
 IDEAL_LIDAR = LidarSensorConfig(range_noise_m=0.0, dropout_ratio=0.0, min_range_m=0.0)
 """Exact ranges."""

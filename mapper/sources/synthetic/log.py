@@ -2,7 +2,8 @@
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -48,13 +49,25 @@ def write_tum_log(
     Raises:
         SourceError: ``out`` exists, or cannot be written.
     """
+    with appearing(out) as folder:
+        for name in ("rgb", "depth"):
+            (folder / name).mkdir()
+        _write(folder, SyntheticSource(config), on_progress or (lambda _done, _total: None))
+
+
+@contextmanager
+def appearing(out: Path) -> Iterator[Path]:
+    """Yield a folder to fill; it takes ``out``'s place when it is complete, and is gone if it never is.
+
+    Raises:
+        SourceError: ``out`` exists, or cannot be written.
+    """
     if out.exists():
         raise SourceError(f"{out}: exists already; give a folder that does not, or remove it")
     partial = out.with_name(f"{out.name}.{os.getpid()}.partial")
     try:
-        for folder in ("rgb", "depth"):
-            (partial / folder).mkdir(parents=True, exist_ok=True)
-        _write(partial, SyntheticSource(config), on_progress or (lambda _done, _total: None))
+        partial.mkdir(parents=True, exist_ok=True)
+        yield partial
         partial.rename(out)
     except OSError as error:
         raise SourceError(

@@ -1,7 +1,7 @@
 """What each of many rays meets first, among solids sorted into square cells of the ground plan.
 
-A ray visits the cells under it in order (Amanatides & Woo 1987), skips those whose solids it passes
-above, and ends where a solid is met before the cell is left. In units of a solid's half sizes the three
+A ray visits the cells under it in order (Amanatides & Woo 1987), skips what it passes above or below
+there, and ends where a solid is met before the cell is left. In units of a solid's half sizes the three
 shapes are the unit cube, cylinder and sphere, each the part of the ray between two roots.
 """
 
@@ -24,7 +24,8 @@ class World(NamedTuple):
     """Solids and their cells, as plain arrays for compiled code.
 
     Attributes:
-        solids: (N, 9): centre, half sizes, cosine and sine of the yaw, ``Shape``.
+        solids: (N, 11): centre, inverse half sizes, cosine and sine of the yaw, ``Shape``, lowest and
+            highest z.
         corner: (2,) lowest x and y of the cells, metres.
         starts: (X, Y + 1) where each cell's members begin; a column's last entry ends its last cell.
         members: (M,) solids, cell after cell.
@@ -62,7 +63,9 @@ def sort_into_cells(solids: Solids, ground: Ground) -> World:
     members = np.array([solid for column in cells for cell in column for solid in cell], dtype=np.int64)
     hulls = solids.hulls
     turns = np.column_stack([np.cos(hulls.yaws_rad), np.sin(hulls.yaws_rad)])
-    table = np.column_stack([hulls.centers_world, hulls.half_sizes_m, turns, solids.shapes])
+    table = np.column_stack(
+        [hulls.centers_world, 1.0 / hulls.half_sizes_m, turns, solids.shapes, low[:, 2], high[:, 2]]
+    )
     return World(table, corner, starts, members, tops, ground.slope, ground.waves)
 
 
@@ -141,10 +144,11 @@ def _solid_range_m(
     while True:
         leave = min(next_column, next_row, end)
         lowest = origin[2] + dz * (enter if dz > 0.0 else leave)
+        highest = origin[2] + dz * (leave if dz > 0.0 else enter)
         if lowest <= tops[i, j]:
             for k in range(starts[i, j], starts[i, j + 1]):
                 solid = members[k]
-                if tested[solid] != ray:
+                if tested[solid] != ray and solids[solid, 9] <= highest and lowest <= solids[solid, 10]:
                     tested[solid] = ray
                     nearest = min(nearest, _one_range_m(solids, solid, origin, direction))
         if nearest <= leave or leave >= end:
@@ -164,14 +168,14 @@ def _solid_range_m(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _one_range_m(solids: Array, solid: int, origin: Vector, direction: Vector) -> float:
     """Return where a ray enters a solid, metres; inf if it does not."""
-    hx, hy, hz = solids[solid, 3], solids[solid, 4], solids[solid, 5]
     cosine, sine = solids[solid, 6], solids[solid, 7]
     x, y = origin[0] - solids[solid, 0], origin[1] - solids[solid, 1]
-    ox, oy = (cosine * x + sine * y) / hx, (cosine * y - sine * x) / hy
-    oz = (origin[2] - solids[solid, 2]) / hz
-    vx = (cosine * direction[0] + sine * direction[1]) / hx
-    vy = (cosine * direction[1] - sine * direction[0]) / hy
-    vz = direction[2] / hz
+    ox = (cosine * x + sine * y) * solids[solid, 3]
+    oy = (cosine * y - sine * x) * solids[solid, 4]
+    oz = (origin[2] - solids[solid, 2]) * solids[solid, 5]
+    vx = (cosine * direction[0] + sine * direction[1]) * solids[solid, 3]
+    vy = (cosine * direction[1] - sine * direction[0]) * solids[solid, 4]
+    vz = direction[2] * solids[solid, 5]
     if solids[solid, 8] == _ELLIPSOID:
         across = ox * vx + oy * vy + oz * vz
         enter, leave = _between_roots(vx**2 + vy**2 + vz**2, across, ox**2 + oy**2 + oz**2 - 1.0)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -41,6 +42,10 @@ class Ground:
         unit: Array = normals / np.linalg.norm(normals, axis=1, keepdims=True)
         return unit
 
+    def as_json(self) -> dict[str, list[Any]]:
+        """Return both attributes, with every digit."""
+        return {"slope": self.slope.tolist(), "waves": self.waves.tolist()}
+
     def _angles(self, points_xy: Array) -> Array:
         angles: Array = points_xy @ self.waves[:, 1:3].T + self.waves[:, 3]
         return angles
@@ -64,25 +69,27 @@ def make_ground(rng: np.random.Generator, *, slope_rad: float, undulation_m: flo
 def ground_range_m(slope: Array, waves: Array, origin: Vector, direction: Vector, limit_m: float) -> float:
     """Return how far along a ray the ground is, metres; inf where it is not within the limit.
 
-    Sphere tracing (Hart 1996): no step is longer than the steepest possible ground allows, so none
-    passes through. A ray that has not arrived after 100 steps grazes, and nothing comes back from it.
+    No step is longer than where the ray could be at the soonest if the ground rose towards it as fast as
+    the waves' curvature lets it: the root of gap + rate·s − bend·s²/2. So none passes through, as in sphere
+    tracing (Hart 1996), and the last steps converge like Newton's.
     """
     dx, dy, dz = direction
-    steepest = math.hypot(slope[0], slope[1])
+    bend = 1e-12
     for k in range(len(waves)):
-        steepest += waves[k, 0] * math.hypot(waves[k, 1], waves[k, 2])
-    sink = steepest * math.hypot(dx, dy) - dz
-    if sink <= 0.0:
-        return np.inf
+        bend += abs(waves[k, 0]) * (waves[k, 1] * dx + waves[k, 2] * dy) ** 2
     t = 0.0
     for _ in range(_STEPS):
         x, y = origin[0] + t * dx, origin[1] + t * dy
         gap = origin[2] + t * dz - slope[0] * x - slope[1] * y
+        rate = dz - slope[0] * dx - slope[1] * dy
         for k in range(len(waves)):
-            gap -= waves[k, 0] * math.sin(waves[k, 1] * x + waves[k, 2] * y + waves[k, 3])
+            angle = waves[k, 1] * x + waves[k, 2] * y + waves[k, 3]
+            gap -= waves[k, 0] * math.sin(angle)
+            rate -= waves[k, 0] * math.cos(angle) * (waves[k, 1] * dx + waves[k, 2] * dy)
         if gap < _TOUCH_M:
             return t
-        t += gap / sink
+        root = math.sqrt(rate * rate + 2.0 * bend * gap)
+        t += (rate + root) / bend if rate > 0.0 else 2.0 * gap / (root - rate)
         if t > limit_m:
             return np.inf
     return np.inf

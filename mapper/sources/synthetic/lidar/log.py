@@ -1,0 +1,69 @@
+"""A synthetic LiDAR log on disk: a KITTI folder with exact truth beside it."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from mapper.config.synthetic import LidarSynthConfig
+from mapper.frames import Scan
+from mapper.parallel import ordered_map
+from mapper.sources.synthetic.lidar.source import SyntheticLidarEntry, SyntheticLidarSource
+from mapper.sources.synthetic.log import appearing
+from mapper.timebase import seconds_text_from_ns
+from mapper.trajectory import write_kitti
+
+_TIMED = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<f4")])
+_WORKERS = 2
+
+
+def write_lidar_log(
+    out: Path, config: LidarSynthConfig, *, on_progress: Callable[[int, int], None] | None = None
+) -> None:
+    """Write a synthetic log as KITTI's ``velodyne``, ``times.txt`` and ``poses.txt``, and the scene itself.
+
+    There is no ``calib.txt``: the poses are the LiDAR's own. KITTI's records have no room for times, so
+    scans with motion in them are numpy arrays with fields x, y, z and t, seconds after the stamp. The folder
+    appears when it is complete.
+
+    Args:
+        out: Folder to make; it must not exist.
+        config: What to record.
+        on_progress: Called with (scans written, scans in all) after every scan.
+
+    Raises:
+        SourceError: ``out`` exists, or cannot be written.
+    """
+    source = SyntheticLidarSource(config)
+
+    def save(entry: SyntheticLidarEntry) -> None:
+        _save_scan(clouds / f"{entry.index:06d}", entry.load())
+
+    with appearing(out) as folder:
+        clouds = folder / "velodyne"
+        clouds.mkdir()
+        for done, _ in enumerate(ordered_map(save, source.entries(), workers=_WORKERS), start=1):
+            if on_progress is not None:
+                on_progress(done, len(source))
+        times = [seconds_text_from_ns(int(stamp_ns)) for stamp_ns in source.stamps_ns]
+        (folder / "times.txt").write_text("\n".join(times) + "\n", encoding="utf-8")
+        write_kitti(folder / "poses.txt", source.truth)
+        scene = {
+            "config": config.model_dump(mode="json"),
+            "ground": source.scene.ground.as_json(),
+            "solids": source.scene.solids.as_json(),
+        }
+        (folder / "scene.json").write_text(json.dumps(scene, indent=1) + "\n", encoding="utf-8")
+
+
+def _save_scan(stem: Path, scan: Scan) -> None:
+    if scan.times_s is None:
+        records = np.zeros((len(scan.points_body), 4), dtype="<f4")  # the last is the intensity
+        records[:, :3] = scan.points_body
+        records.tofile(stem.with_suffix(".bin"))
+        return
+    timed = np.empty(len(scan.points_body), dtype=_TIMED)
+    timed["x"], timed["y"], timed["z"] = scan.points_body.T
+    timed["t"] = scan.times_s
+    np.save(stem.with_suffix(".npy"), timed)
