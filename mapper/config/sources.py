@@ -20,6 +20,23 @@ class CameraConfig(Config):
     """Depth image units per metre; None keeps the log's own (5000 for TUM)."""
 
 
+class TopicsConfig(Config):
+    """Which topics of an MCAP file or a ROS bag are read; None is guessed, and told."""
+
+    color: str | None = None
+    """Colour or grey images."""
+    depth: str | None = None
+    """Depth images, registered to the colour images."""
+    camera_info: str | None = None
+    """Calibration of the colour camera."""
+    points: str | None = None
+    """Point clouds; set, they are mapped even where there are RGB-D images too."""
+    imu: str | None = None
+    """Inertial readings, of which the accelerations tell which way is up."""
+    truth: str | None = None
+    """True poses (Odometry, PoseStamped, TransformStamped); None is /ground_truth, if there is one."""
+
+
 class SourceConfig(Config):
     """The selection every kind of log understands."""
 
@@ -37,6 +54,9 @@ class SourceConfig(Config):
     rate_hz: PositiveFloat | None = None
     """Frames per second of numbered files without stamps; None is the format's own (30, Poznań, scans 10)."""
     camera: CameraConfig | None = None
+    topics: TopicsConfig = TopicsConfig()
+    body_frame: str | None = None
+    """Frame in a bag's tf that is a LiDAR's body, e.g. base_link; None is the cloud's own frame."""
     pattern: str | None = None
     """Glob of the names of a LiDAR log's clouds, e.g. ``os1_*.bin``; None is all with the usual ending."""
     stamps_file: Path | None = None

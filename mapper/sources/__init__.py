@@ -6,13 +6,14 @@ from mapper.config.sources import SourceConfig
 from mapper.errors import SourceError
 from mapper.sources import clouds, kitti, mbag, numbered, poznan, tum
 from mapper.sources.base import FrameSource
+from mapper.sources.ros import files as recordings
 from mapper.sources.selection import select
 
 __all__ = ["open_source"]
 
 # The first that recognises a path opens it. Poznań's images are numbered too, so it is asked before;
 # any log may have clouds lying about, so they are asked last.
-_FORMATS = (tum, mbag, poznan, numbered, kitti, clouds)
+_FORMATS = (tum, mbag, poznan, numbered, kitti, recordings, clouds)
 _DEFAULTS = SourceConfig()
 
 

@@ -1,6 +1,5 @@
 """Image files as arrays: whole and of the right kind, or an error that names the file."""
 
-from pathlib import Path
 from typing import cast
 
 import cv2
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from mapper.errors import DataError, FrameError
 from mapper.frames import DepthImage, Image
 from mapper.sources import png
+from mapper.sources.base import ImageFile
 
 SATURATED = 65535
 """The largest 16-bit depth is a sensor's way to say "nothing" (7-Scenes) or "too far": no measurement."""
@@ -22,28 +22,46 @@ _JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 _PNG_END = b"IEND\xae\x42\x60\x82"
 
 
-def read_colour(path: Path) -> Image:
+def read_colour(path: ImageFile) -> Image:
     """Return the (H, W, 3) uint8 RGB image of a file.
 
     Raises:
         FrameError: The file is missing, empty, cut short, damaged or not an image.
     """
-    return _eight_bit(path, _read(path, _RGB))
+    return decode_colour(bytes_of(path), f"{path}")
 
 
-def read_grey(path: Path) -> Image:
+def decode_colour(data: bytes, where: str) -> Image:
+    """Return the (H, W, 3) uint8 RGB image of a file's bytes; ``where`` is what an error names.
+
+    Raises:
+        FrameError: As :func:`read_colour`.
+    """
+    return _eight_bit(_decoded(data, _RGB, where), where)
+
+
+def read_grey(path: ImageFile) -> Image:
     """Return the (H, W) uint8 luminance of a file; cheaper than colour for a JPEG.
 
     Raises:
         FrameError: As :func:`read_colour`.
     """
-    image = _eight_bit(path, _read(path, _GREY))
+    return decode_grey(bytes_of(path), f"{path}")
+
+
+def decode_grey(data: bytes, where: str) -> Image:
+    """Return the (H, W) uint8 luminance of a file's bytes; ``where`` is what an error names.
+
+    Raises:
+        FrameError: As :func:`read_colour`.
+    """
+    image = _eight_bit(_decoded(data, _GREY, where), where)
     if image.ndim == 3:
         image = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return image
 
 
-def read_depth_m(path: Path, units_per_m: float) -> DepthImage:
+def read_depth_m(path: ImageFile, units_per_m: float) -> DepthImage:
     """Return the (H, W) float32 depth in metres of a 16-bit image; 0 is no measurement.
 
     Args:
@@ -53,36 +71,58 @@ def read_depth_m(path: Path, units_per_m: float) -> DepthImage:
     Raises:
         FrameError: As :func:`read_colour`, or the image is not one channel of 16 bits.
     """
-    units = _read(path, cv2.IMREAD_UNCHANGED)
+    return depth_m_from(decode_depth_units(bytes_of(path), f"{path}"), units_per_m)
+
+
+def decode_depth_units(data: bytes, where: str) -> NDArray[np.uint16]:
+    """Return the (H, W) units of a 16-bit depth image's bytes; ``where`` is what an error names.
+
+    Raises:
+        FrameError: As :func:`read_depth_m`.
+    """
+    units = _decoded(data, cv2.IMREAD_UNCHANGED, where)
     if units.dtype != np.uint16 or units.ndim != 2:
-        raise FrameError(f"{path}: depth image of {units.dtype} {units.shape}, want one channel of 16 bits")
+        raise FrameError(f"{where}: depth image of {units.dtype} {units.shape}, want one channel of 16 bits")
+    return cast(NDArray[np.uint16], units)
+
+
+def depth_m_from(units: NDArray[np.uint16], units_per_m: float) -> DepthImage:
+    """Return (H, W) float32 metres of 16-bit units; 0, and what is saturated, is no measurement."""
     depth_m: DepthImage = _metres(units, np.float32(units_per_m))
     return depth_m
 
 
-def _eight_bit(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> Image:
+def bytes_of(path: ImageFile) -> bytes:
+    """Return an image file's bytes.
+
+    Raises:
+        FrameError: The file is missing or cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise FrameError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _eight_bit(image: NDArray[np.uint8] | NDArray[np.uint16], where: str) -> Image:
     if image.dtype != np.uint8:
-        raise FrameError(f"{path}: colour image of {image.dtype} {image.shape}, want 8 bits a channel")
+        raise FrameError(f"{where}: colour image of {image.dtype} {image.shape}, want 8 bits a channel")
     return cast(Image, image)
 
 
-def _read(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
+def _decoded(data: bytes, flags: int, where: str) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Decode a file; plain PNGs come as they are stored, everything else as OpenCV's flags say."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise FrameError(f"{path}: cannot be read: {error.strerror}") from None
     if not data:
-        raise FrameError(f"{path}: empty file")
+        raise FrameError(f"{where}: empty file")
     try:
         if png.is_plain(data):
             return png.decode(data)
         _check_whole(data)
         image: NDArray[np.uint8] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except (DataError, cv2.error) as error:
-        raise FrameError(f"{path}: {error}") from None
+        raise FrameError(f"{where}: {error}") from None
     if image is None:
-        raise FrameError(f"{path}: not an image that OpenCV can decode ({len(data)} bytes)")
+        raise FrameError(f"{where}: not an image that OpenCV can decode ({len(data)} bytes)")
     return image
 
 

@@ -1,6 +1,7 @@
 """Logs written as TUM folders or in the thesis's mbag format (A12)."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -12,9 +13,9 @@ from mapper.atomic import write_bytes, write_text
 from mapper.errors import FrameError, SourceError
 from mapper.frames import PinholeCamera, RgbdFrame
 from mapper.rotations import quaternion_from_rotation
-from mapper.sources.base import Accelerations, Entry, FrameSource, ImageFiles, Skipped
+from mapper.sources.base import Accelerations, Entry, FrameSource, Skipped
 from mapper.sources.calibration_file import calibration_text
-from mapper.sources.images import SATURATED
+from mapper.sources.images import SATURATED, bytes_of
 from mapper.sources.mbag import HEADER
 from mapper.timebase import MAX_TRUTH_GAP_NS, nearest, seconds_text_from_ns
 from mapper.trajectory import Trajectory, write_tum
@@ -25,6 +26,17 @@ DEPTH_UNITS_PER_M = 5000.0
 """Depth units of images that are encoded here; copied images keep their own."""
 
 _NO_POSE = ["nan"] * 7
+
+
+@dataclass(frozen=True, slots=True)
+class _Written:
+    """A frame's image files, relative to the log's folder."""
+
+    stamp_ns: int
+    colour: Path
+    depth: Path
+    depth_stamp_ns: int
+    depth_units_per_m: float
 
 
 def write_log(
@@ -49,16 +61,16 @@ def write_log(
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise SourceError(f"{out}: already there; give a folder that does not exist yet")
     camera = _camera_of(source)
-    written: list[tuple[int, ImageFiles]] = []
+    written: list[_Written] = []
     skipped: list[Skipped] = []
     for done, entry in enumerate(source.entries(), start=1):
         try:
-            written.append((entry.stamp_ns, _write_images(entry, out)))
+            written.append(_write_images(entry, out))
         except FrameError as error:
             skipped.append(Skipped(entry.stamp_ns, str(error)))
         if on_progress is not None:
             on_progress(done)
-    units_per_m = written[0][1].depth_units_per_m
+    units_per_m = written[0].depth_units_per_m
     write_text(out / "calibration.toml", calibration_text(camera, depth_units_per_m=units_per_m))
     if source.accelerations is not None:
         write_text(out / "accelerometer.txt", _accelerations_text(source.accelerations, source.name))
@@ -67,8 +79,8 @@ def write_log(
     else:
         if source.truth is not None:
             write_tum(out / "groundtruth.txt", source.truth)
-        depth_files = {files.depth_stamp_ns: files.depth for _, files in written}
-        colour_files = {stamp_ns: files.colour for stamp_ns, files in written}
+        depth_files = {frame.depth_stamp_ns: frame.depth for frame in written}
+        colour_files = {frame.stamp_ns: frame.colour for frame in written}
         write_text(out / "depth.txt", _list_text("depth maps", source.name, depth_files))
         write_text(out / "rgb.txt", _list_text("color images", source.name, colour_files))
     return skipped
@@ -92,29 +104,22 @@ def _load(entry: Entry) -> RgbdFrame:
     return frame
 
 
-def _write_images(entry: Entry, out: Path) -> ImageFiles:
+def _write_images(entry: Entry, out: Path) -> _Written:
     """Copy or encode both images; return their paths relative to ``out``."""
     stamp = seconds_text_from_ns(entry.stamp_ns)
     if (files := entry.files) is not None:
         depth_stamp = seconds_text_from_ns(files.depth_stamp_ns)
         colour = Path("rgb", stamp + files.colour.suffix)
         depth = Path("depth", depth_stamp + files.depth.suffix)
-        write_bytes(out / colour, _bytes_of(files.colour))
-        write_bytes(out / depth, _bytes_of(files.depth))
-        return ImageFiles(colour, depth, files.depth_stamp_ns, files.depth_units_per_m)
+        write_bytes(out / colour, bytes_of(files.colour))
+        write_bytes(out / depth, bytes_of(files.depth))
+        return _Written(entry.stamp_ns, colour, depth, files.depth_stamp_ns, files.depth_units_per_m)
     frame = _load(entry)
     colour, depth = Path("rgb", f"{stamp}.png"), Path("depth", f"{stamp}.png")
     units = np.rint(frame.depth_m * DEPTH_UNITS_PER_M)
     write_bytes(out / colour, _png(np.ascontiguousarray(frame.rgb[:, :, ::-1])))
     write_bytes(out / depth, _png(np.where(units < SATURATED, units, 0).astype(np.uint16)))
-    return ImageFiles(colour, depth, entry.stamp_ns, DEPTH_UNITS_PER_M)
-
-
-def _bytes_of(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise FrameError(f"{path}: cannot be read: {error.strerror}") from None
+    return _Written(entry.stamp_ns, colour, depth, entry.stamp_ns, DEPTH_UNITS_PER_M)
 
 
 def _png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
@@ -138,12 +143,12 @@ def _accelerations_text(accelerations: Accelerations, name: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _mbag_text(written: list[tuple[int, ImageFiles]], source: FrameSource) -> str:
+def _mbag_text(written: list[_Written], source: FrameSource) -> str:
     lines = [HEADER, f"!dbName: {source.name}"]
-    poses = _pose_words(np.array([stamp_ns for stamp_ns, _ in written], dtype=np.int64), source.truth)
-    for (stamp_ns, files), pose in zip(written, poses, strict=True):
-        paths = [files.colour.as_posix(), files.depth.as_posix()]
-        lines.append("; ".join([seconds_text_from_ns(stamp_ns), *paths, *pose]))
+    poses = _pose_words(np.array([frame.stamp_ns for frame in written], dtype=np.int64), source.truth)
+    for frame, pose in zip(written, poses, strict=True):
+        paths = [frame.colour.as_posix(), frame.depth.as_posix()]
+        lines.append("; ".join([seconds_text_from_ns(frame.stamp_ns), *paths, *pose]))
     return "\n".join(lines) + "\n"
 
 

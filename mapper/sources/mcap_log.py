@@ -1,0 +1,233 @@
+"""MCAP files as recordings, and messages written to them; the home of the mcap library for reading.
+
+A whole file's summary tells where its chunks lie; where there is none (the recorder was killed, the file was
+cut), the records are walked from the start as far as they go. Either way a damaged chunk costs itself only.
+"""
+
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+import lz4.frame
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Channel, Schema
+from mcap.writer import CompressionType, Writer
+
+from mapper.atomic import replacing
+from mapper.errors import DataError, SourceError
+from mapper.sources.ros.recording import BlockRecording, Part, Span, Topic
+from mapper.sources.ros.writing import Written
+
+_MAGIC = b"\x89MCAP0\r\n"
+_RECORD = struct.Struct("<BQ")  # opcode, length of what follows
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_CHUNK = struct.Struct(
+    "<QQQII"
+)  # first and last time, unpacked size and CRC, length of the compression's name
+
+
+def is_mcap(path: Path) -> bool:
+    """Tell whether a file begins as MCAP files do."""
+    with path.open("rb") as file:
+        return file.read(len(_MAGIC)) == _MAGIC
+
+
+def open_mcap(path: Path) -> BlockRecording:
+    """Return an MCAP file as a recording.
+
+    Raises:
+        SourceError: The file is no MCAP file, or cannot be read.
+    """
+    try:
+        if not is_mcap(path):
+            raise SourceError(f"{path}: does not begin as MCAP files do; is it damaged, or another format?")
+        with path.open("rb") as file:
+            contents = _summarised(file) or _walked(file, path)
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
+    return BlockRecording(
+        path,
+        kind="mcap",
+        blocks=contents.blocks,
+        unpack=_unpacked,
+        split=contents.split,
+        expected=contents.expected,
+        notes=contents.notes,
+    )
+
+
+class McapWriter:
+    """Writes ROS 2 messages; see :class:`mapper.sources.ros.writing.MessageWriter`."""
+
+    def __init__(self, writer: Writer) -> None:
+        """Write to an open file."""
+        self._writer = writer
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+
+    def write(self, message: Written) -> None:
+        """Append a message; its log time is its stamp."""
+        if message.topic not in self._channels:
+            self._channels[message.topic] = self._registered(message.topic, message.type)
+        self._writer.add_message(
+            self._channels[message.topic],
+            log_time=message.stamp_ns,
+            data=message.cdr,
+            publish_time=message.stamp_ns,
+        )
+
+    def _registered(self, topic: str, type_: str) -> int:
+        if type_ not in self._schemas:
+            from mapper.sources.rosbag_writing import definition  # rosbags is not needed to read
+
+            text = definition(type_).encode()
+            self._schemas[type_] = self._writer.register_schema(type_, "ros2msg", text)
+        return int(self._writer.register_channel(topic, "cdr", self._schemas[type_]))
+
+
+@contextmanager
+def mcap_writer(path: Path) -> Iterator[McapWriter]:
+    """Yield a writer of an MCAP file that appears whole or not at all."""
+    with replacing(path) as part, part.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.LZ4, enable_data_crcs=True)
+        writer.start(profile="ros2", library="mapper")
+        yield McapWriter(writer)
+        writer.finish()
+
+
+class _Contents:
+    """What is known of a file: its blocks, and its channels as far as they have been seen."""
+
+    def __init__(self) -> None:
+        self.blocks: list[Span] = []
+        self.expected: int | None = None
+        self.notes: list[str] = []
+        self._schemas: dict[int, str] = {}
+        self._topics: dict[int, Topic] = {}
+
+    def add_schema(self, schema: Schema) -> None:
+        self._schemas[schema.id] = schema.name
+
+    def add_channel(self, channel: Channel) -> None:
+        type_ = self._schemas.get(channel.schema_id, "")
+        self._topics[channel.id] = Topic(channel.topic, type_, channel.message_encoding)
+
+    def split(self, data: bytes) -> Iterator[Part]:
+        """Yield the messages of a chunk, or of a lone record outside of any."""
+        for opcode, start, length in _records(data):
+            if opcode == Opcode.MESSAGE:
+                if length < _MESSAGE.size:
+                    raise DataError(f"a message record of {length} bytes, want {_MESSAGE.size} or more")
+                channel, _, log_ns, _ = _MESSAGE.unpack_from(data, start)
+                if channel in self._topics:  # else the chunk that names it is lost
+                    yield Part(self._topics[channel], log_ns, start + _MESSAGE.size, length - _MESSAGE.size)
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self.describe(opcode, data[start : start + length])
+
+    def describe(self, opcode: int, record: bytes) -> None:
+        """Learn of a schema or a channel."""
+        stream = ReadDataStream(BytesIO(record))
+        try:
+            if opcode == Opcode.SCHEMA:
+                self.add_schema(Schema.read(stream))
+            else:
+                self.add_channel(Channel.read(stream))
+        except (McapError, struct.error, UnicodeDecodeError) as error:
+            raise DataError(f"a damaged schema or channel: {error}") from None
+
+
+def _summarised(file: BinaryIO) -> _Contents | None:
+    """Return what the summary at the end of a whole file tells; None without one."""
+    try:
+        summary = make_reader(file).get_summary()
+    except (McapError, OSError, ValueError, struct.error):
+        return None
+    if summary is None or summary.statistics is None:
+        return None
+    if summary.statistics.chunk_count != len(summary.chunk_indexes) or not summary.chunk_indexes:
+        return None
+    contents = _Contents()
+    for schema in summary.schemas.values():
+        contents.add_schema(schema)
+    for channel in summary.channels.values():
+        contents.add_channel(channel)
+    contents.blocks = sorted(
+        Span(index.chunk_start_offset, index.chunk_length) for index in summary.chunk_indexes
+    )
+    contents.expected = summary.statistics.message_count
+    return contents
+
+
+def _walked(file: BinaryIO, path: Path) -> _Contents:
+    """Return what the records tell from the start of a file to where they end or make no sense."""
+    contents = _Contents()
+    size = file.seek(0, os.SEEK_END)
+    at = file.seek(len(_MAGIC))
+    is_whole = False
+    while at + _RECORD.size <= size:
+        opcode, length = _RECORD.unpack(file.read(_RECORD.size))
+        if at + _RECORD.size + length > size:
+            break
+        if opcode == Opcode.DATA_END:
+            is_whole = True
+            break
+        if opcode in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
+            contents.blocks.append(Span(at, _RECORD.size + length))
+        at = file.seek(at + _RECORD.size + length)
+    if not is_whole:
+        contents.notes.append(
+            f"{path.name}: the recording was cut off: no index, and {size - at} of {size} bytes at its end "
+            "are no whole record; read as far as it goes"
+        )
+    return contents
+
+
+def _unpacked(stored: bytes) -> bytes:
+    """Return the records of a chunk; any other record is its own content."""
+    opcode, length = _RECORD.unpack_from(stored)
+    if opcode != Opcode.CHUNK:
+        return stored
+    at = _RECORD.size
+    if length < _CHUNK.size:
+        raise DataError(f"a chunk of {length} bytes, want {_CHUNK.size} or more")
+    _, _, size, crc, name_length = _CHUNK.unpack_from(stored, at)
+    at += _CHUNK.size
+    compression = stored[at : at + name_length]
+    at += name_length + 8  # the length of what follows: all of it
+    try:
+        if compression == b"":
+            data = stored[at:]
+        elif compression == b"zstd":
+            data = zstandard.decompress(stored[at:], max_output_size=size)
+        elif compression == b"lz4":
+            data = lz4.frame.decompress(stored[at:])
+        else:
+            raise DataError(f"a chunk compressed as {compression!r}; known are zstd and lz4")
+    except (zstandard.ZstdError, RuntimeError, MemoryError) as error:  # RuntimeError is lz4's
+        raise DataError(f"a chunk that cannot be decompressed: {error}") from None
+    if crc and zlib.crc32(data) != crc:
+        raise DataError("a chunk whose checksum is wrong")
+    return data
+
+
+def _records(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode, start and length of every record's body."""
+    at = 0
+    while at < len(data):
+        if at + _RECORD.size > len(data):
+            raise DataError("a chunk that ends within a record")
+        opcode, length = _RECORD.unpack_from(data, at)
+        at += _RECORD.size
+        if at + length > len(data):
+            raise DataError("a chunk that ends within a record")
+        yield opcode, at, length
+        at += length

@@ -1,0 +1,186 @@
+"""ROS 1 bags as recordings: the bag format 2.0 (https://wiki.ros.org/Bags/Format/2.0), whole or cut off.
+
+A bag's index tells where its chunks lie; a bag that was never closed has none, and its records are walked
+from the start as far as they go.
+"""
+
+import bz2
+import os
+import struct
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO
+
+import lz4.frame
+
+from mapper.errors import DataError, SourceError
+from mapper.sources.ros.recording import BlockRecording, Part, Span, Topic
+from mapper.timebase import NS_PER_S
+
+_MAGIC = b"#ROSBAG V2.0\n"
+_LENGTH = struct.Struct("<I")
+_MESSAGE, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 5, 6, 7  # the values of a header's op
+_Fields = Mapping[bytes, bytes]
+
+
+def is_bag(path: Path) -> bool:
+    """Tell whether a file begins as ROS 1 bags do."""
+    with path.open("rb") as file:
+        return file.read(len(_MAGIC)) == _MAGIC
+
+
+def open_bag(path: Path) -> BlockRecording:
+    """Return a ROS 1 bag as a recording.
+
+    Raises:
+        SourceError: The file is no bag of format 2.0, or cannot be read.
+    """
+    try:
+        if not is_bag(path):
+            raise SourceError(f"{path}: does not begin as ROS 1 bags of format 2.0 do; is it damaged?")
+        with path.open("rb") as file:
+            contents = _indexed(file) or _walked(file, path)
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
+    return BlockRecording(
+        path,
+        kind="rosbag",
+        blocks=contents.blocks,
+        unpack=_unpacked,
+        split=contents.split,
+        expected=contents.expected,
+        notes=contents.notes,
+    )
+
+
+class _Contents:
+    """What is known of a bag: its chunks, and its connections as far as they have been seen."""
+
+    def __init__(self) -> None:
+        self.blocks: list[Span] = []
+        self.expected: int | None = None
+        self.notes: list[str] = []
+        self._topics: dict[bytes, Topic] = {}
+
+    def add_connection(self, fields: _Fields, data: bytes) -> None:
+        told = _fields(data)
+        package, _, name = told[b"type"].decode().partition("/")
+        self._topics[fields[b"conn"]] = Topic(fields[b"topic"].decode(), f"{package}/msg/{name}", "ros1")
+
+    def split(self, data: bytes) -> Iterator[Part]:
+        """Yield the messages of a chunk."""
+        at = 0
+        while at < len(data):
+            fields, start, length = _record(data, at)
+            at = start + length
+            try:
+                if fields[b"op"][0] == _CONNECTION:
+                    self.add_connection(fields, data[start:at])
+                elif fields[b"op"][0] == _MESSAGE and fields[b"conn"] in self._topics:
+                    sec, nsec = struct.unpack("<II", fields[b"time"])
+                    yield Part(self._topics[fields[b"conn"]], sec * NS_PER_S + nsec, start, length)
+            except (KeyError, struct.error, UnicodeDecodeError) as error:
+                raise DataError(f"a damaged record: {error}") from None
+
+
+def _indexed(file: BinaryIO) -> _Contents | None:
+    """Return what the index of a closed bag tells; None without a whole one."""
+    contents = _Contents()
+    try:
+        size = file.seek(0, os.SEEK_END)
+        fields, _, _ = _record_at(file, len(_MAGIC), size)
+        (at,) = struct.unpack("<Q", fields[b"index_pos"])
+        starts: list[int] = []
+        contents.expected = 0
+        while len(_MAGIC) < at < size:
+            fields, start, length = _record_at(file, at, size)
+            at = start + length
+            file.seek(start)
+            if fields[b"op"][0] == _CONNECTION:
+                contents.add_connection(fields, file.read(length))
+            elif fields[b"op"][0] == _CHUNK_INFO:
+                starts += struct.unpack("<Q", fields[b"chunk_pos"])
+                contents.expected += sum(count for _, count in struct.iter_unpack("<II", file.read(length)))
+        for at in sorted(starts):
+            _, start, length = _record_at(file, at, size)
+            contents.blocks.append(Span(at, start + length - at))
+    except (DataError, KeyError, IndexError, struct.error, UnicodeDecodeError):
+        return None
+    return contents if contents.blocks else None
+
+
+def _walked(file: BinaryIO, path: Path) -> _Contents:
+    """Return what the records tell from the start of a bag to where they end or make no sense."""
+    contents = _Contents()
+    size = file.seek(0, os.SEEK_END)
+    at = len(_MAGIC)
+    with suppress(DataError):
+        while at < size:
+            fields, start, length = _record_at(file, at, size)
+            if fields.get(b"op") == bytes([_CHUNK]):
+                contents.blocks.append(Span(at, start + length - at))
+            at = start + length
+    contents.notes.append(
+        f"{path.name}: the recording was cut off: no index, and {size - at} of {size} bytes at its end "
+        "are no whole record; read as far as it goes"
+    )
+    return contents
+
+
+def _unpacked(stored: bytes) -> bytes:
+    """Return the records of a chunk."""
+    fields, start, length = _record(stored, 0)
+    data = stored[start : start + length]
+    compression = fields.get(b"compression")
+    try:
+        if compression == b"none":
+            return data
+        if compression == b"lz4":
+            return bytes(lz4.frame.decompress(data))
+        if compression == b"bz2":
+            return bz2.decompress(data)
+    except (OSError, ValueError, RuntimeError, MemoryError) as error:  # RuntimeError is lz4's
+        raise DataError(f"a chunk that cannot be decompressed: {error}") from None
+    raise DataError(f"a chunk compressed as {compression!r}; known are none, lz4 and bz2")
+
+
+def _record_at(file: BinaryIO, at: int, size: int) -> tuple[_Fields, int, int]:
+    """Return a record's header, and where its data start in the file and how long they are."""
+    file.seek(at)
+    (header_length,) = _LENGTH.unpack(file.read(_LENGTH.size).ljust(_LENGTH.size, b"\xff"))
+    start = at + _LENGTH.size + header_length + _LENGTH.size
+    if start > size:
+        raise DataError("a record that ends after the file")
+    fields = _fields(file.read(header_length))
+    (length,) = _LENGTH.unpack(file.read(_LENGTH.size))
+    if start + length > size:
+        raise DataError("a record that ends after the file")
+    return fields, start, length
+
+
+def _record(data: bytes, at: int) -> tuple[_Fields, int, int]:
+    """Return a record's header, and where its data start in these bytes and how long they are."""
+    try:
+        (header_length,) = _LENGTH.unpack_from(data, at)
+        start = at + 2 * _LENGTH.size + header_length
+        (length,) = _LENGTH.unpack_from(data, start - _LENGTH.size)
+    except struct.error:
+        raise DataError("a chunk that ends within a record") from None
+    if start + length > len(data):
+        raise DataError("a chunk that ends within a record")
+    return _fields(data[at + _LENGTH.size : start - _LENGTH.size]), start, length
+
+
+def _fields(header: bytes) -> _Fields:
+    """Return the ``name=value`` fields of a record's header."""
+    fields, at = {}, 0
+    while at < len(header):
+        (length,) = _LENGTH.unpack(header[at : at + _LENGTH.size].ljust(_LENGTH.size, b"\xff"))
+        at += _LENGTH.size
+        name, equals, value = header[at : at + length].partition(b"=")
+        if not equals or at + length > len(header):
+            raise DataError("a record whose header is damaged")
+        fields[name] = value
+        at += length
+    return fields

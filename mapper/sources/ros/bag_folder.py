@@ -1,0 +1,117 @@
+"""ROS 2 bags as recordings: .db3 files (SQLite) alone, and folders of .db3 or .mcap files in sequence."""
+
+import re
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+
+from mapper.errors import FrameError, SourceError
+from mapper.sources.ros.recording import Place, Recorded, Recording, Topic
+
+_MAGIC = b"SQLite format 3\x00"
+
+
+class DatabaseRecording:
+    """A .db3 file: a message's place is its row. See :class:`Recording`."""
+
+    kind = "rosbag2"
+
+    def __init__(self, path: Path) -> None:
+        """Read which topics there are.
+
+        Raises:
+            SourceError: The file is no SQLite database of rosbag2, or cannot be read.
+        """
+        self.path = path
+        self.notes: list[str] = []
+        try:
+            with closing(self._connect()) as database:
+                rows = database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
+        except sqlite3.Error as error:
+            raise SourceError(f"{path}: not a .db3 file that rosbag2 wrote: {error}") from None
+        self._topics = {number: Topic(name, type_, encoding) for number, name, type_, encoding in rows}
+
+    def messages(self) -> Iterator[Recorded]:
+        """Yield every message that can be read, in the order of the file."""
+        count = 0
+        with closing(self._connect()) as database:
+            try:
+                for row, topic, log_ns, data in database.execute(
+                    "SELECT id, topic_id, timestamp, data FROM messages ORDER BY id"
+                ):
+                    count += 1
+                    if topic in self._topics:
+                        place = Place(0, row, len(data))
+                        yield Recorded(self._topics[topic], log_ns, place, memoryview(data))
+            except sqlite3.Error as error:
+                self.notes.append(
+                    f"{self.path.name}: damaged after {count} messages ({error}); read as far as it goes"
+                )
+
+    def read(self, place: Place) -> memoryview:
+        """Return a message's bytes; safe in any thread.
+
+        Raises:
+            FrameError: The file has changed or cannot be read any more.
+        """
+        try:
+            with closing(self._connect()) as database:
+                row = database.execute("SELECT data FROM messages WHERE id = ?", [place.offset]).fetchone()
+        except sqlite3.Error as error:
+            raise FrameError(f"{self.path}: message {place.offset} cannot be read: {error}") from None
+        if row is None:
+            raise FrameError(f"{self.path}: message {place.offset} is not there any more")
+        return memoryview(row[0])
+
+    def _connect(self) -> sqlite3.Connection:
+        # Immutable: neither a lock nor a journal is made beside somebody's log.
+        return sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
+
+
+class JoinedRecording:
+    """Recordings of one session that was split into files. See :class:`Recording`."""
+
+    kind = "rosbag2"
+
+    def __init__(self, path: Path, parts: Sequence[Recording]) -> None:
+        """Join the files of a folder.
+
+        Args:
+            path: The folder.
+            parts: Its files in the order in which they were recorded.
+        """
+        self.path = path
+        self._parts = parts
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """What was lost, a sentence each."""
+        return [note for part in self._parts for note in part.notes]
+
+    def messages(self) -> Iterator[Recorded]:
+        """Yield every message that can be read, file by file."""
+        for number, part in enumerate(self._parts):
+            for message in part.messages():
+                block = message.place.block * len(self._parts) + number
+                yield message._replace(place=message.place._replace(block=block))
+
+    def read(self, place: Place) -> memoryview:
+        """Return a message's bytes; safe in any thread.
+
+        Raises:
+            FrameError: As of the file that it lies in.
+        """
+        block, number = divmod(place.block, len(self._parts))
+        return self._parts[number].read(place._replace(block=block))
+
+
+def is_database(path: Path) -> bool:
+    """Tell whether a file begins as SQLite's do."""
+    with path.open("rb") as file:
+        return file.read(len(_MAGIC)) == _MAGIC
+
+
+def in_sequence(paths: Sequence[Path]) -> list[Path]:
+    """Return files in the order of the numbers in their names: log_2.db3 before log_10.db3."""
+    return sorted(paths, key=lambda path: [int(word) for word in re.findall(r"\d+", path.stem)])

@@ -1,0 +1,109 @@
+"""Point clouds in messages as scans: structured views of the payload, and what of it was measured."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.errors import DataError, FrameError
+from mapper.frames import Scan
+from mapper.geometry import Transform, apply
+from mapper.sources.point_times import relative_times_s, time_field
+from mapper.sources.ros.messages import CloudMessage
+
+Field = tuple[str, int, str, int]
+"""Name, offset in a point, numpy's name of its type with the byte order, and how many there are."""
+
+_SEPARATE_COLOURS = (("r", "g", "b"), ("red", "green", "blue"))
+_PACKED_COLOURS = ("rgb", "rgba")
+
+
+def structured(
+    data: memoryview,
+    fields: Sequence[Field],
+    *,
+    point_bytes: int,
+    shape: tuple[int, int],
+    row_bytes: int | None = None,
+) -> NDArray[np.void]:
+    """Return a view of a cloud's bytes as (N,) records; rows are copied only where they are padded.
+
+    Args:
+        data: The payload.
+        fields: What a point is made of.
+        point_bytes: From one point to the next.
+        shape: Rows and points of a row.
+        row_bytes: From one row to the next; None where they follow each other.
+
+    Raises:
+        DataError: The payload is shorter than the numbers say, or they contradict each other.
+    """
+    rows, columns = shape
+    names, offsets, formats = [], [], []
+    for name, offset, kind, count in fields:
+        if name and name not in names:
+            names.append(name)
+            offsets.append(offset)
+            formats.append(kind if count <= 1 else f"{count}{kind}")
+    try:
+        point = np.dtype({"names": names, "offsets": offsets, "formats": formats, "itemsize": point_bytes})
+        strides = (row_bytes or columns * point_bytes, point_bytes)
+        return np.ndarray(shape, point, buffer=data, strides=strides).reshape(-1)
+    except (TypeError, ValueError) as error:
+        raise DataError(
+            f"a cloud of {rows}×{columns} points of {point_bytes} bytes in {len(data)} bytes: {error}"
+        ) from None
+
+
+def scan_from(message: CloudMessage, *, T_body_frame: Transform, with_colours: bool, where: str) -> Scan:
+    """Return what was measured of a cloud, in the body frame.
+
+    Points that are not finite, or at the sensor itself, are what drivers write for missing returns.
+
+    Args:
+        message: The cloud.
+        T_body_frame: Pose of the cloud's frame in the body's.
+        with_colours: Take the points' colours too, if there are any.
+        where: What to name in an error.
+
+    Raises:
+        FrameError: The points have no x, y and z.
+    """
+    points = message.points
+    names = points.dtype.names or ()
+    if not {"x", "y", "z"} <= set(names):
+        raise FrameError(f"{where}: points of {', '.join(names)}; want x, y and z")
+    points_body = np.empty((len(points), 3), np.float32)
+    for axis, name in enumerate("xyz"):
+        points_body[:, axis] = points[name]
+    with np.errstate(over="ignore", invalid="ignore"):
+        squared_m2 = np.einsum("ij,ij->i", points_body, points_body)
+    is_measured: NDArray[np.bool_] = np.isfinite(squared_m2) & (squared_m2 > 0.0)
+    kept = slice(None) if is_measured.all() else np.flatnonzero(is_measured)
+    points_body = points_body[kept]
+    T_body_points = T_body_frame @ message.T_frame_points
+    if not np.array_equal(T_body_points, np.eye(4)):
+        points_body = apply(T_body_points, points_body.astype(np.float64)).astype(np.float32)
+    times = time_field(names)
+    return Scan(
+        message.stamp_ns,
+        points_body,
+        origin_body=T_body_points[:3, 3],
+        colors=_colours(points, names, kept) if with_colours else None,
+        times_s=None if times is None else relative_times_s(points[times][kept], message.stamp_ns),
+    )
+
+
+def _colours(
+    points: NDArray[np.void], names: Sequence[str], kept: slice | NDArray[np.intp]
+) -> NDArray[np.uint8] | None:
+    """Return (N, 3) RGB of separate bytes, or of 0x00RRGGBB in four bytes that are called a float."""
+    for separate in _SEPARATE_COLOURS:
+        if set(separate) <= set(names) and all(points[name].dtype == np.uint8 for name in separate):
+            return np.column_stack([points[name][kept] for name in separate])
+    for packed in _PACKED_COLOURS:
+        if packed in names and points[packed].dtype.itemsize == 4:
+            bytes_of_four = np.ascontiguousarray(points[packed][kept])
+            value = bytes_of_four.view(bytes_of_four.dtype.str[0] + "u4")
+            return np.column_stack([value >> 16, value >> 8, value]).astype(np.uint8)
+    return None

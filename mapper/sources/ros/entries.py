@@ -1,0 +1,177 @@
+"""Frames of a recording that have not been read yet; see :class:`mapper.sources.base.Entry`."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.errors import FrameError
+from mapper.frames import DepthImage, PinholeCamera, RgbdFrame, Scan
+from mapper.geometry import Transform
+from mapper.sources.base import ImageFiles
+from mapper.sources.images import SATURATED
+from mapper.sources.ros.clouds import scan_from
+from mapper.sources.ros.images import depth_file_of, depth_m_of, image_of
+from mapper.sources.ros.messages import CloudMessage, FileMessage, ImageMessage, Message, decode
+from mapper.sources.ros.recording import Place, Recording, Topic
+
+
+@dataclass(frozen=True, slots=True)
+class Located:
+    """A message that has not been read yet."""
+
+    recording: Recording
+    topic: Topic
+    stamp_ns: int
+    place: Place
+
+    def __str__(self) -> str:
+        return f"{self.recording.path}: {self.topic.name} at {self.stamp_ns}"
+
+    def read(self) -> Message:
+        """Read and decode it.
+
+        Raises:
+            FrameError: It is damaged.
+        """
+        return decode(self.topic, self.recording.read(self.place))
+
+    def image(self) -> ImageMessage:
+        """Read and decode an image message, not its image.
+
+        Raises:
+            FrameError: It is damaged.
+        """
+        message = self.read()
+        if not isinstance(message, ImageMessage):
+            raise FrameError(f"{self}: {self.topic.type} is no image")
+        return message
+
+
+@dataclass(frozen=True, slots=True)
+class RgbdMessages:
+    """A colour and a depth message; the body is the camera."""
+
+    colour: Located
+    depth: Located
+    camera: PinholeCamera
+    units_per_m: float
+    colour_suffix: str
+
+    @property
+    def stamp_ns(self) -> int:
+        """Return the colour image's time."""
+        return self.colour.stamp_ns
+
+    @property
+    def files(self) -> ImageFiles:
+        """Return the images as files: as they are where they are files, else encoded as PNG."""
+        return ImageFiles(
+            _ColourFile(self.colour, self.colour_suffix),
+            _DepthFile(self.depth, self.units_per_m),
+            self.depth.stamp_ns,
+            self.units_per_m,
+        )
+
+    def load(self, *, colour: bool = True) -> RgbdFrame:
+        """Read and decode both images.
+
+        Raises:
+            FrameError: A message is damaged, in an encoding that is not read, or of another size.
+        """
+        image = image_of(self.colour.image(), colour=colour, where=f"{self.colour}")
+        self._check_size(self.colour, image.shape[:2])
+        return RgbdFrame(self.stamp_ns, image, self._depth_m(), self.camera)
+
+    def scan(self) -> Scan:
+        """Read and decode the depth image alone.
+
+        Raises:
+            FrameError: As ``load``.
+        """
+        depth_m = self._depth_m()
+        no_image = np.broadcast_to(np.uint8(0), depth_m.shape)
+        return RgbdFrame(self.stamp_ns, no_image, depth_m, self.camera).scan()
+
+    def _depth_m(self) -> DepthImage:
+        depth_m = depth_m_of(self.depth.image(), units_per_m=self.units_per_m, where=f"{self.depth}")
+        self._check_size(self.depth, depth_m.shape)
+        return depth_m
+
+    def _check_size(self, message: Located, shape: tuple[int, ...]) -> None:
+        want = (self.camera.height_px, self.camera.width_px)
+        if shape != want:
+            raise FrameError(f"{message}: {shape[1]}×{shape[0]} px, but the log has {want[1]}×{want[0]}")
+
+
+@dataclass(frozen=True, slots=True)
+class CloudEntry:
+    """A cloud message."""
+
+    cloud: Located
+    T_body_frame: Transform
+    files: ImageFiles | None = None
+
+    @property
+    def stamp_ns(self) -> int:
+        """Return the cloud's time."""
+        return self.cloud.stamp_ns
+
+    def load(self, *, colour: bool = True) -> Scan:
+        """Read the cloud, with the time of each point where the message has it.
+
+        Raises:
+            FrameError: The message is damaged, or its points have no x, y and z.
+        """
+        message = self.cloud.read()
+        if not isinstance(message, CloudMessage):
+            raise FrameError(f"{self.cloud}: {self.cloud.topic.type} is no point cloud")
+        return scan_from(message, T_body_frame=self.T_body_frame, with_colours=colour, where=f"{self.cloud}")
+
+    def scan(self) -> Scan:
+        """Read the cloud without its colours.
+
+        Raises:
+            FrameError: As ``load``.
+        """
+        return self.load(colour=False)
+
+
+@dataclass(frozen=True, slots=True)
+class _ColourFile:
+    """A colour image as a file; see :class:`mapper.sources.base.ImageFile`."""
+
+    message: Located
+    suffix: str
+
+    def read_bytes(self) -> bytes:
+        message = self.message.image()
+        if isinstance(message, FileMessage):
+            return bytes(message.data)
+        image = image_of(message, colour=True, where=f"{self.message}")
+        return _png(image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1]))
+
+
+@dataclass(frozen=True, slots=True)
+class _DepthFile:
+    """A depth image as a PNG of 16 bits; see :class:`mapper.sources.base.ImageFile`."""
+
+    message: Located
+    units_per_m: float
+    suffix: str = ".png"
+
+    def read_bytes(self) -> bytes:
+        message = self.message.image()
+        file = depth_file_of(message)
+        if file is not None:
+            return file
+        depth_m = depth_m_of(message, units_per_m=self.units_per_m, where=f"{self.message}")
+        units = np.rint(depth_m * self.units_per_m)
+        return _png(np.where(units < SATURATED, units, 0).astype(np.uint16))
+
+
+def _png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
+    _, encoded = cv2.imencode(".png", pixels)
+    data: bytes = encoded.tobytes()
+    return data

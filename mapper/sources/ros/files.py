@@ -1,0 +1,69 @@
+"""Which files are recordings, and which of their readers opens them."""
+
+from pathlib import Path
+
+from mapper.config.sources import SourceConfig
+from mapper.errors import SourceError
+from mapper.sources.ros.recording import Recording
+from mapper.sources.ros.source import MessageLog, log_of
+
+LOOKED_FOR = ".mcap, .bag (ROS 1), .db3 or a folder of them (ROS 2)"
+
+_ENDINGS = (".mcap", ".bag", ".db3")
+_IN_FOLDERS = (".mcap", ".db3")
+
+
+def recognise(path: Path) -> bool:
+    """Tell whether a path is named as a recording, or a folder as ROS 2 records it."""
+    if path.is_dir():
+        return bool(_parts(path))
+    return path.suffix in _ENDINGS
+
+
+def open_log(path: Path, config: SourceConfig) -> MessageLog:
+    """Open a recording as a log.
+
+    Raises:
+        SourceError: It is damaged beyond reading, or nothing in it can be mapped.
+    """
+    return log_of(open_recording(path), config)
+
+
+def open_recording(path: Path) -> Recording:
+    """Open a file, or the files of a folder one after the other.
+
+    Raises:
+        SourceError: A file is not what its name says, or cannot be read.
+    """
+    if path.is_dir():
+        from mapper.sources.ros.bag_folder import JoinedRecording
+
+        return JoinedRecording(path, [_opened(part) for part in _parts(path)])
+    return _opened(path)
+
+
+def _opened(path: Path) -> Recording:
+    # Each reader loads a library that the others do not need.
+    if path.suffix == ".mcap":
+        from mapper.sources.mcap_log import open_mcap
+
+        return open_mcap(path)
+    if path.suffix == ".bag":
+        from mapper.sources.ros.bag_file import open_bag
+
+        return open_bag(path)
+    if path.suffix == ".db3":
+        from mapper.sources.ros.bag_folder import DatabaseRecording
+
+        return DatabaseRecording(path)
+    raise SourceError(f"{path}: not a recording; known are {', '.join(_ENDINGS)}")
+
+
+def _parts(folder: Path) -> list[Path]:
+    """Return a folder's recordings in sequence, of the first kind that ROS 2 records and that is there."""
+    from mapper.sources.ros.bag_folder import in_sequence
+
+    for ending in _IN_FOLDERS:
+        if parts := [path for path in folder.glob(f"*{ending}") if path.is_file()]:
+            return in_sequence(parts)
+    return []

@@ -1,0 +1,162 @@
+"""Images in messages as arrays of ours: RGB, grey and depth in metres."""
+
+import struct
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.errors import FrameError
+from mapper.frames import DepthImage, Image
+from mapper.sources.images import decode_colour, decode_depth_units, decode_grey, depth_m_from
+from mapper.sources.ros.messages import FileMessage, ImageMessage, PixelsMessage
+
+MILLIMETRES_PER_M = 1000.0
+"""Units of 16-bit depth images in ROS (REP 118)."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Encoding:
+    """How colour pixels are stored, and OpenCV's way to RGB and to grey; None is how they are."""
+
+    channels: int
+    to_rgb: int | None
+    to_grey: int | None
+
+
+_COLOUR = {
+    "rgb8": _Encoding(3, None, cv2.COLOR_RGB2GRAY),
+    "bgr8": _Encoding(3, cv2.COLOR_BGR2RGB, cv2.COLOR_BGR2GRAY),
+    "8UC3": _Encoding(3, cv2.COLOR_BGR2RGB, cv2.COLOR_BGR2GRAY),
+    "rgba8": _Encoding(4, cv2.COLOR_RGBA2RGB, cv2.COLOR_RGBA2GRAY),
+    "bgra8": _Encoding(4, cv2.COLOR_BGRA2RGB, cv2.COLOR_BGRA2GRAY),
+    "8UC4": _Encoding(4, cv2.COLOR_BGRA2RGB, cv2.COLOR_BGRA2GRAY),
+    "mono8": _Encoding(1, None, None),
+    "8UC1": _Encoding(1, None, None),
+    "yuv422": _Encoding(2, cv2.COLOR_YUV2RGB_UYVY, cv2.COLOR_YUV2GRAY_UYVY),
+    "yuv422_yuy2": _Encoding(2, cv2.COLOR_YUV2RGB_YUY2, cv2.COLOR_YUV2GRAY_YUY2),
+    # ROS names a Bayer pattern by its first two pixels, OpenCV by those of the second row and column.
+    "bayer_rggb8": _Encoding(1, cv2.COLOR_BayerBG2RGB, cv2.COLOR_BayerBG2GRAY),
+    "bayer_bggr8": _Encoding(1, cv2.COLOR_BayerRG2RGB, cv2.COLOR_BayerRG2GRAY),
+    "bayer_gbrg8": _Encoding(1, cv2.COLOR_BayerGR2RGB, cv2.COLOR_BayerGR2GRAY),
+    "bayer_grbg8": _Encoding(1, cv2.COLOR_BayerGB2RGB, cv2.COLOR_BayerGB2GRAY),
+}
+_DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+_DEPTH_HEADER = struct.Struct("<iff")  # compressedDepth's: how it is stored, and two parameters of that
+
+
+def is_depth(message: ImageMessage) -> bool:
+    """Tell whether an image is of depth, by its encoding."""
+    if isinstance(message, PixelsMessage):
+        return message.encoding in _DEPTH
+    return "compressedDepth" in message.format or message.format.startswith(tuple(_DEPTH))
+
+
+def size_of(message: ImageMessage, *, where: str) -> tuple[int, int]:
+    """Return an image's width and height in pixels.
+
+    Raises:
+        FrameError: It is an image file that cannot be decoded.
+    """
+    if isinstance(message, PixelsMessage):
+        return message.width_px, message.height_px
+    if is_depth(message):
+        height_px, width_px = depth_m_of(message, units_per_m=MILLIMETRES_PER_M, where=where).shape
+    else:
+        height_px, width_px = decode_grey(bytes(message.data), where).shape
+    return width_px, height_px
+
+
+def image_of(message: ImageMessage, *, colour: bool, where: str) -> Image:
+    """Return an image as (H, W, 3) RGB, or as (H, W) grey if it is or shall be.
+
+    Raises:
+        FrameError: The image is damaged, or in an encoding that is not read; ``where`` is what it names.
+    """
+    if isinstance(message, FileMessage):
+        data = bytes(message.data)
+        return decode_colour(data, where) if colour else decode_grey(data, where)
+    encoding = _COLOUR.get(message.encoding)
+    if encoding is None:
+        raise FrameError(f"{where}: colour encoded as {message.encoding}; known are {', '.join(_COLOUR)}")
+    pixels = _pixels(message, "u1", encoding.channels, where=where)
+    code = encoding.to_rgb if colour else encoding.to_grey
+    if code is None:
+        return np.ascontiguousarray(pixels)
+    image: Image = cv2.cvtColor(np.ascontiguousarray(pixels), code)
+    return image
+
+
+def depth_m_of(message: ImageMessage, *, units_per_m: float, where: str) -> DepthImage:
+    """Return (H, W) float32 depth in metres; 0 is no measurement.
+
+    Args:
+        message: 16-bit units, 32-bit metres, or a file of 16-bit units.
+        units_per_m: 16-bit units of a metre; ROS says 1000.
+        where: What to name in an error.
+
+    Raises:
+        FrameError: The image is damaged, or in an encoding that is not read.
+    """
+    if isinstance(message, FileMessage):
+        return _depth_m_of_file(message, units_per_m=units_per_m, where=where)
+    kind = _DEPTH.get(message.encoding)
+    if kind is None:
+        raise FrameError(f"{where}: depth encoded as {message.encoding}; known are {', '.join(_DEPTH)}")
+    order = ">" if message.is_big_endian else "<"
+    pixels = _pixels(message, order + kind, 1, where=where)
+    if kind == "f4":
+        return _measured(pixels.astype(np.float32))
+    return depth_m_from(np.ascontiguousarray(pixels, dtype=np.uint16), units_per_m)
+
+
+def depth_file_of(message: ImageMessage) -> bytes | None:
+    """Return the PNG of 16-bit units in a message; None where depth is stored in another way."""
+    if isinstance(message, PixelsMessage) or "rvl" in message.format or message.format.startswith("32FC1"):
+        return None
+    data = bytes(message.data)
+    return data[_DEPTH_HEADER.size :] if "compressedDepth" in message.format else data
+
+
+def _depth_m_of_file(message: FileMessage, *, units_per_m: float, where: str) -> DepthImage:
+    """Read a PNG, behind a header if it is compressedDepth's.
+
+    Its 32-bit depth is stored as A / depth + B in 16 bits, with A and B in the header.
+    """
+    data = bytes(message.data)
+    if "compressedDepth" not in message.format:
+        return depth_m_from(decode_depth_units(data, where), units_per_m)
+    if "rvl" in message.format:
+        raise FrameError(f"{where}: depth compressed as RVL is not read; record it as PNG or raw")
+    if len(data) < _DEPTH_HEADER.size:
+        raise FrameError(f"{where}: compressedDepth of {len(data)} bytes")
+    _, a, b = _DEPTH_HEADER.unpack_from(data)
+    units = decode_depth_units(data[_DEPTH_HEADER.size :], where)
+    if not message.format.startswith("32FC1"):
+        return depth_m_from(units, units_per_m)
+    with np.errstate(divide="ignore"):
+        depth_m = np.float32(a) / (units.astype(np.float32) - np.float32(b))
+    return _measured(np.where(units > 0, depth_m, np.float32(0.0)))
+
+
+def _measured(depth_m: DepthImage) -> DepthImage:
+    """Return depth with 0 where it is not finite or not in front of the camera."""
+    measured: DepthImage = np.where(np.isfinite(depth_m) & (depth_m > 0.0), depth_m, np.float32(0.0))
+    return measured
+
+
+def _pixels(message: PixelsMessage, kind: str, channels: int, *, where: str) -> NDArray[np.generic]:
+    """Return a view of an image's rows as (H, W) or (H, W, channels), whatever their padding."""
+    pixel = np.dtype(kind)
+    shape = (message.height_px, message.width_px, channels)
+    row_bytes = message.row_bytes or message.width_px * channels * pixel.itemsize
+    strides = (row_bytes, channels * pixel.itemsize, pixel.itemsize)
+    try:
+        pixels = np.ndarray(shape, pixel, buffer=message.data, strides=strides)
+    except (TypeError, ValueError):
+        raise FrameError(
+            f"{where}: an image of {message.width_px}×{message.height_px} px {message.encoding} in rows of "
+            f"{message.row_bytes} bytes, but {len(message.data)} bytes are there"
+        ) from None
+    return pixels[:, :, 0] if channels == 1 else pixels

@@ -1,0 +1,115 @@
+"""When and where every message of a recording is, from one pass over it; nothing but headers is decoded."""
+
+import struct
+from array import array
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.errors import DataError, FrameError
+from mapper.sources.ros import foxglove
+from mapper.sources.ros.messages import READ, WITH_HEADER, Message, decode
+from mapper.sources.ros.recording import Place, Recording, Topic
+from mapper.timebase import NS_PER_S, Stamps
+
+_NO_STAMP = 1 << 62  # in the year 2116; differences of smaller ones fit into 64 bits
+_TRIED = 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Series:
+    """The messages of one topic, in the order of the recording.
+
+    Attributes:
+        topic: What they are.
+        stamps_ns: (N,) when they were measured, by their headers; ``log_ns`` where their type has none.
+        log_ns: (N,) when they were recorded.
+        places: (N, 3) block, offset and length of each.
+        undated: How many more have no header that can be read; they are left out.
+    """
+
+    topic: Topic
+    stamps_ns: Stamps
+    log_ns: Stamps
+    places: NDArray[np.int64]
+    undated: int
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def place(self, i: int) -> Place:
+        """Return where message ``i`` lies."""
+        return Place(*self.places[i].tolist())
+
+
+@dataclass(slots=True)
+class _Growing:
+    """A topic's messages so far: 40 bytes each."""
+
+    stamps_ns: "array[int]" = field(default_factory=lambda: array("q"))
+    log_ns: "array[int]" = field(default_factory=lambda: array("q"))
+    places: "array[int]" = field(default_factory=lambda: array("q"))
+    undated: int = 0
+
+
+def index_of(recording: Recording) -> Mapping[str, Series]:
+    """Return the series of every topic that has messages, by its name."""
+    growing: dict[Topic, _Growing] = {}
+    for topic, log_ns, place, data in recording.messages():
+        series = growing.get(topic)
+        if series is None:
+            series = growing[topic] = _Growing()
+        try:
+            stamp_ns = stamp_of(topic, data) if topic.type in WITH_HEADER else log_ns
+        except DataError:
+            stamp_ns = _NO_STAMP
+        if not 0 <= stamp_ns < _NO_STAMP:
+            series.undated += 1
+            continue
+        series.stamps_ns.append(stamp_ns)
+        series.log_ns.append(log_ns)
+        series.places.extend(place)
+    return {
+        topic.name: Series(
+            topic,
+            stamps_ns=np.array(series.stamps_ns, np.int64),
+            log_ns=np.array(series.log_ns, np.int64),
+            places=np.array(series.places, np.int64).reshape(-1, 3),
+            undated=series.undated,
+        )
+        for topic, series in sorted(growing.items(), key=lambda item: item[0].name)
+        if series.stamps_ns
+    }
+
+
+def first_messages(recording: Recording, series: Iterable[Series]) -> dict[str, Message]:
+    """Return each topic's first message that is whole, by the topic's name; only of types that are read."""
+    firsts: dict[str, Message] = {}
+    for one in series:
+        if one.topic.type not in READ:
+            continue
+        for i in range(min(_TRIED, len(one))):
+            with suppress(FrameError):
+                firsts[one.topic.name] = decode(one.topic, recording.read(one.place(i)))
+                break
+    return firsts
+
+
+def stamp_of(topic: Topic, data: memoryview) -> int:
+    """Return the stamp with which a message with a header begins, nanoseconds.
+
+    Raises:
+        DataError: The message is too short to have one, or is written in an encoding that is not read.
+    """
+    if topic.encoding not in ("cdr", "ros1"):
+        return foxglove.stamp_of(topic.encoding, data)
+    if len(data) < 12:
+        raise DataError(f"{topic.name}: a message of {len(data)} bytes has no header")
+    if topic.encoding == "ros1":  # a sequence number, then seconds and nanoseconds
+        sec, nanosec = struct.unpack_from("<II", data, 4)
+    else:  # CDR's own header of four bytes, whose second tells the byte order
+        sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
+    return int(sec * NS_PER_S + nanosec)

@@ -1,0 +1,167 @@
+"""What the messages that a map is made from say, in our own terms; ``decode`` reads every encoding."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.errors import DataError, FrameError
+from mapper.geometry import Array, Transform
+from mapper.sources.ros.recording import Topic
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PixelsMessage:
+    """An image as rows of pixels (sensor_msgs/Image, foxglove.RawImage).
+
+    Attributes:
+        stamp_ns: Time of the image.
+        frame: Coordinate frame of its camera.
+        encoding: E.g. "rgb8", "16UC1".
+        width_px: Pixels of a row.
+        height_px: Rows.
+        row_bytes: Bytes of a row, padding included.
+        is_big_endian: How pixels of several bytes are stored.
+        data: The rows.
+    """
+
+    stamp_ns: int
+    frame: str
+    encoding: str
+    width_px: int
+    height_px: int
+    row_bytes: int
+    is_big_endian: bool
+    data: memoryview
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FileMessage:
+    """An image as the bytes of an image file (CompressedImage), maybe behind compressedDepth's own header.
+
+    Attributes:
+        stamp_ns: Time of the image.
+        frame: Coordinate frame of its camera.
+        format: As the message has it, e.g. "jpeg" or "16UC1; compressedDepth png".
+        data: The file.
+    """
+
+    stamp_ns: int
+    frame: str
+    format: str
+    data: memoryview
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraMessage:
+    """A camera's calibration (sensor_msgs/CameraInfo, foxglove.CameraCalibration).
+
+    Attributes:
+        frame: Coordinate frame of the camera.
+        width_px: Image width.
+        height_px: Image height.
+        model: Distortion model, e.g. "plumb_bob".
+        D: Its coefficients.
+        K: (9,) intrinsics of the raw image, row by row.
+        P: (12,) intrinsics of the rectified image, row by row.
+    """
+
+    frame: str
+    width_px: int
+    height_px: int
+    model: str
+    D: Array
+    K: Array
+    P: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CloudMessage:
+    """A point cloud (sensor_msgs/PointCloud2, foxglove.PointCloud).
+
+    Attributes:
+        stamp_ns: Time of the cloud.
+        frame: Coordinate frame of the points.
+        points: (N,) structured view of the message's own bytes; organised rows follow each other.
+        T_frame_points: Pose of the points in ``frame``; only Foxglove's clouds tell one.
+    """
+
+    stamp_ns: int
+    frame: str
+    points: NDArray[np.void]
+    T_frame_points: Transform = field(default_factory=lambda: np.eye(4))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseMessage:
+    """Where a frame is in another (TransformStamped, PoseStamped, Odometry and Foxglove's).
+
+    Attributes:
+        stamp_ns: When.
+        parent: The frame that it is told in.
+        child: The frame that it is told of; "" where the message does not name it.
+        T_parent_child: (4, 4); None where the numbers are no pose.
+    """
+
+    stamp_ns: int
+    parent: str
+    child: str
+    T_parent_child: Transform | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuMessage:
+    """A reading of an inertial unit.
+
+    Attributes:
+        stamp_ns: When.
+        frame: The unit's frame.
+        acceleration_mps2: (3,) specific force: it points up at rest.
+    """
+
+    stamp_ns: int
+    frame: str
+    acceleration_mps2: Array
+
+
+ImageMessage = PixelsMessage | FileMessage
+Message = ImageMessage | CameraMessage | CloudMessage | ImuMessage | list[PoseMessage]
+
+PIXELS = frozenset({"sensor_msgs/msg/Image", "foxglove.RawImage"})
+FILES = frozenset({"sensor_msgs/msg/CompressedImage", "foxglove.CompressedImage"})
+IMAGES = PIXELS | FILES
+CAMERAS = frozenset({"sensor_msgs/msg/CameraInfo", "foxglove.CameraCalibration"})
+CLOUDS = frozenset({"sensor_msgs/msg/PointCloud2", "foxglove.PointCloud"})
+IMUS = frozenset({"sensor_msgs/msg/Imu"})
+POSES = frozenset(
+    {
+        "geometry_msgs/msg/PoseStamped",
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "geometry_msgs/msg/TransformStamped",
+        "nav_msgs/msg/Odometry",
+        "foxglove.PoseInFrame",
+    }
+)
+TRANSFORMS = frozenset(
+    {"tf2_msgs/msg/TFMessage", "tf/msg/tfMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms"}
+)
+WITH_HEADER = IMAGES | CAMERAS | CLOUDS | IMUS | POSES | {"foxglove.FrameTransform"}
+READ = WITH_HEADER | TRANSFORMS
+
+
+def decode(topic: Topic, data: memoryview) -> Message:
+    """Return what a message says; large payloads are views of ``data``.
+
+    Raises:
+        FrameError: The message is damaged, or of a type or in an encoding that is not read.
+    """
+    try:
+        if topic.encoding in ("cdr", "ros1"):
+            from mapper.sources.rosbag import decode_ros  # loads rosbags, which only ROS logs need
+
+            return decode_ros(topic, data)
+        from mapper.sources.ros.foxglove import decode_foxglove
+
+        return decode_foxglove(topic, data)
+    except (DataError, ValueError, KeyError, TypeError, OverflowError) as error:
+        raise FrameError(f"{topic.name}: a damaged message: {error}") from None

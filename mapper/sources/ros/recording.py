@@ -1,0 +1,180 @@
+"""The seam between recorded files and what their messages mean: raw messages, and where each lies."""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from mapper.errors import DataError, FrameError
+
+_CACHE_BYTES = 64 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A stream of messages.
+
+    Attributes:
+        name: E.g. "/camera/color/image_raw".
+        type: What a message is, as ROS 2 or Foxglove call it, e.g. "sensor_msgs/msg/Image".
+        encoding: How a message is written: "cdr", "ros1", "protobuf", "json" or another that is not read.
+    """
+
+    name: str
+    type: str
+    encoding: str
+
+
+class Place(NamedTuple):
+    """Where a message's bytes lie: in which block of the recording, and where in it."""
+
+    block: int
+    offset: int
+    length: int
+
+
+class Recorded(NamedTuple):
+    """A raw message, as the recorder wrote it at ``log_ns``."""
+
+    topic: Topic
+    log_ns: int
+    place: Place
+    data: memoryview
+
+
+class Recording(Protocol):
+    """A file of messages, read once from end to end, and then a message at a time."""
+
+    @property
+    def path(self) -> Path:
+        """Return what was opened."""
+        ...
+
+    @property
+    def kind(self) -> str:
+        """Return "mcap", "rosbag" or "rosbag2"."""
+        ...
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """Return what was lost, a sentence each; complete once ``messages`` has ended."""
+        ...
+
+    def messages(self) -> Iterator[Recorded]:
+        """Yield every message that can be read, in the order of the file."""
+        ...
+
+    def read(self, place: Place) -> memoryview:
+        """Return a message's bytes; safe in any thread.
+
+        Raises:
+            FrameError: The file has changed or cannot be read any more.
+        """
+        ...
+
+
+class Span(NamedTuple):
+    """Bytes of a file."""
+
+    start: int
+    length: int
+
+
+class Part(NamedTuple):
+    """A message within a block's unpacked bytes."""
+
+    topic: Topic
+    log_ns: int
+    offset: int
+    length: int
+
+
+class BlockRecording:
+    """A recording made of blocks that are each stored, compressed and checked on their own."""
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        kind: str,
+        blocks: Sequence[Span],
+        unpack: Callable[[bytes], bytes],
+        split: Callable[[bytes], Iterator[Part]],
+        expected: int | None,
+        notes: Sequence[str],
+    ) -> None:
+        """Keep what a format's module has found in a file.
+
+        Args:
+            path: The file.
+            kind: As of :class:`Recording`.
+            blocks: Where the blocks lie, in the order of the file.
+            unpack: Returns the bytes of a stored block; DataError if they are damaged.
+            split: Yields the messages of an unpacked block; DataError where it cannot go on.
+            expected: How many messages the file says that it holds, if it says so.
+            notes: What was lost already.
+        """
+        self.path = path
+        self.kind = kind
+        self.notes = list(notes)
+        self._blocks = blocks
+        self._unpack = unpack
+        self._split = split
+        self._expected = expected
+        self._unpacked: OrderedDict[int, bytes] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def messages(self) -> Iterator[Recorded]:
+        """Yield every message that can be read, in the order of the file."""
+        count = damaged = damaged_bytes = 0
+        for number, span in enumerate(self._blocks):
+            try:
+                data = self._load(number)
+                view = memoryview(data)
+                for topic, log_ns, offset, length in self._split(data):
+                    count += 1
+                    place = Place(number, offset, length)
+                    yield Recorded(topic, log_ns, place, view[offset : offset + length])
+            except DataError:
+                damaged += 1
+                damaged_bytes += span.length
+        if damaged:
+            lost = f"{damaged} of {len(self._blocks)} chunks are damaged: {damaged_bytes} bytes"
+            if self._expected is not None:
+                lost += f" with {self._expected - count} of {self._expected} messages"
+            self.notes.append(f"{self.path.name}: {lost} lost")
+
+    def read(self, place: Place) -> memoryview:
+        """Return a message's bytes; safe in any thread.
+
+        The blocks read last are kept unpacked, as many as fit into 64 MiB.
+
+        Raises:
+            FrameError: The block is damaged or cannot be read any more.
+        """
+        try:
+            with self._lock:  # else two threads would unpack the same block
+                block = self._block(place.block)
+        except DataError as error:
+            raise FrameError(f"{self.path}: {error}") from None
+        return memoryview(block)[place.offset : place.offset + place.length]
+
+    def _block(self, number: int) -> bytes:
+        if number not in self._unpacked:
+            self._unpacked[number] = self._load(number)
+            while len(self._unpacked) > 1 and sum(map(len, self._unpacked.values())) > _CACHE_BYTES:
+                self._unpacked.popitem(last=False)
+        self._unpacked.move_to_end(number)
+        return self._unpacked[number]
+
+    def _load(self, number: int) -> bytes:
+        start, length = self._blocks[number]
+        try:
+            with self.path.open("rb") as file:
+                file.seek(start)
+                stored = file.read(length)
+        except OSError as error:
+            raise DataError(f"cannot be read: {error.strerror}") from None
+        return self._unpack(stored)

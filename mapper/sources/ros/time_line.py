@@ -1,0 +1,134 @@
+"""Messages in time order even where stamps are damaged or a clock was set, and colour paired with depth."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from mapper.errors import SourceError
+from mapper.sources.ros.index import Series
+from mapper.sources.text import time_order
+from mapper.timebase import NS_PER_S, Stamps, nearest
+
+_Indices = NDArray[np.intp]
+
+_MAX_SWAP_NS = NS_PER_S
+"""Messages overtake each other by less; what falls further back was taken after a clock was set back."""
+_NEIGHBOURS = 5
+
+
+def ordered(series: Series) -> tuple[_Indices, list[str]]:
+    """Return a topic's messages in strictly increasing time, and notes on those left out."""
+    name = series.topic.name
+    sound, notes = _sound(series)
+    stamps_ns = series.stamps_ns[sound]
+    kept = _without_overlap(stamps_ns, _epochs(stamps_ns))
+    notes += _overlap_note(name, int((~kept).sum()), len(kept))
+    sound = sound[kept]
+    order, order_notes = time_order(series.stamps_ns[sound], what=name)
+    return sound[order], [*notes, *order_notes]
+
+
+def paired(
+    color: Series, depth: Series, *, max_gap_s: float, where: str
+) -> tuple[_Indices, _Indices, list[str]]:
+    """Return each colour image with its nearest depth image, in strictly increasing time, and notes.
+
+    A clock that was set back lets two images bear the same stamp and show different places; images are
+    paired only if the clock had been set back equally often before them.
+
+    Raises:
+        SourceError: Nothing pairs.
+    """
+    max_gap_ns = round(max_gap_s * NS_PER_S)
+    sound_color, notes = _sound(color)
+    sound_depth, depth_notes = _sound(depth)
+    notes += depth_notes
+    epochs_color, epochs_depth = (
+        _epochs(one.stamps_ns[sound]) for one, sound in ((color, sound_color), (depth, sound_depth))
+    )
+    pairs_color, pairs_depth, closest_ns = [], [], []
+    for epoch in np.intersect1d(epochs_color, epochs_depth):
+        of_color = sound_color[epochs_color == epoch]
+        of_depth = sound_depth[epochs_depth == epoch]
+        of_depth = of_depth[np.argsort(depth.stamps_ns[of_depth], kind="stable")]
+        partner, gap_ns = nearest(depth.stamps_ns[of_depth], color.stamps_ns[of_color])
+        is_near = gap_ns <= max_gap_ns
+        pairs_color.append(of_color[is_near])
+        pairs_depth.append(of_depth[partner[is_near]])
+        closest_ns.append(int(gap_ns.min()))
+    i, j = np.concatenate(pairs_color), np.concatenate(pairs_depth)
+    if len(i) == 0:
+        raise SourceError(
+            f"{where}: no image of {color.topic.name} has one of {depth.topic.name} within "
+            f"{max_gap_s * 1e3:g} ms; the closest are {min(closest_ns) / NS_PER_S:g} s apart "
+            "(source.max_pair_gap_s)"
+        )
+    if alone := len(sound_color) - len(i):
+        notes.append(
+            f"{alone} of {len(sound_color)} colour images have no depth image within "
+            f"{max_gap_s * 1e3:g} ms; left out{_whose_end(color, depth)}"
+        )
+    kept = _without_overlap(color.stamps_ns[i], _epochs(color.stamps_ns[i]))
+    notes += _overlap_note(color.topic.name, int((~kept).sum()), len(kept))
+    i, j = i[kept], j[kept]
+    order, order_notes = time_order(color.stamps_ns[i], what=color.topic.name)
+    return i[order], j[order], [*notes, *order_notes]
+
+
+def _sound(series: Series) -> tuple[_Indices, list[str]]:
+    """Return the messages whose stamps go with their neighbours', and a note on the others."""
+    stamps_ns = series.stamps_ns
+    is_sound = np.ones(len(stamps_ns), dtype=bool)
+    if len(stamps_ns) >= _NEIGHBOURS:
+        windows = np.sort(sliding_window_view(stamps_ns, _NEIGHBOURS), axis=1)
+        inner = slice(_NEIGHBOURS // 2, len(stamps_ns) - _NEIGHBOURS // 2)
+        off_ns = np.abs(stamps_ns[inner].astype(np.float64) - windows[:, _NEIGHBOURS // 2])
+        is_sound[inner] = off_ns <= _MAX_SWAP_NS
+    notes = []
+    if wrong := series.undated + int((~is_sound).sum()):
+        notes.append(
+            f"{series.topic.name}: {wrong} of {len(stamps_ns) + series.undated} messages have stamps that "
+            "cannot be right; left out"
+        )
+    return np.flatnonzero(is_sound), notes
+
+
+def _epochs(stamps_ns: Stamps) -> NDArray[np.int64]:
+    """Return how often the clock had been set back before each message, in the order of recording."""
+    return np.concatenate([[0], np.cumsum(np.diff(stamps_ns) < -_MAX_SWAP_NS)])
+
+
+def _without_overlap(stamps_ns: Stamps, epochs: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Tell which messages to keep: the largest epoch, and of the others what lies before or after it."""
+    sizes = np.bincount(epochs)
+    main = int(sizes.argmax())
+    kept: NDArray[np.bool_] = epochs == main
+    low_ns, high_ns = stamps_ns[kept].min(), stamps_ns[kept].max()
+    for epoch in range(main + 1, len(sizes)):
+        later = (epochs == epoch) & (stamps_ns > high_ns)
+        kept |= later
+        high_ns = stamps_ns[later].max(initial=high_ns)
+    for epoch in reversed(range(main)):
+        earlier = (epochs == epoch) & (stamps_ns < low_ns)
+        kept |= earlier
+        low_ns = stamps_ns[earlier].min(initial=low_ns)
+    return kept
+
+
+def _overlap_note(name: str, dropped: int, total: int) -> Sequence[str]:
+    if not dropped:
+        return []
+    return [
+        f"{name}: the clock was set back while recording; {dropped} of {total} frames bear times that other "
+        "frames have too; left out"
+    ]
+
+
+def _whose_end(color: Series, depth: Series) -> str:
+    """Say which topic stopped before the other, if that is why images are alone."""
+    ahead_s = (int(color.stamps_ns[-1]) - int(depth.stamps_ns[-1])) / NS_PER_S
+    if ahead_s > 1.0:
+        return f"; {depth.topic.name} stops {ahead_s:.1f} s before {color.topic.name}"
+    return ""

@@ -1,0 +1,217 @@
+"""Which topics of a recording a map is made from: the user's choice, or a guess that is told."""
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mapper.config.sources import TopicsConfig
+from mapper.errors import SourceError
+from mapper.sources.ros.images import is_depth
+from mapper.sources.ros.index import Series
+from mapper.sources.ros.messages import (
+    CAMERAS,
+    CLOUDS,
+    IMAGES,
+    IMUS,
+    POSES,
+    ImageMessage,
+    ImuMessage,
+    Message,
+)
+
+TRUTH = "/ground_truth"
+
+_TRANSPORTS = ("/compressedDepth", "/compressed")  # what image_transport appends to an image's own topic
+_OWN_TYPES = "mapper/msg/"
+_GRAVITY_MPS2 = (5.0, 20.0)  # an accelerometer feels it, a gyroscope's empty accelerations do not
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraTopics:
+    """The topics of an RGB-D camera.
+
+    Attributes:
+        color: Colour or grey images.
+        depth: Depth images.
+        info: The colour camera's calibration, if there is any.
+        depth_info: The depth camera's own, if there is any.
+    """
+
+    color: Series
+    depth: Series
+    info: Series | None
+    depth_info: Series | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Choice:
+    """The topics that are read.
+
+    Attributes:
+        frames: What is mapped: images, or clouds.
+        imu: Inertial readings, if there are any.
+        truth: True poses, if there are any.
+        notes: What was guessed, a sentence each.
+    """
+
+    frames: CameraTopics | Series
+    imu: Series | None
+    truth: Series | None
+    notes: Sequence[str]
+
+
+def choose(
+    series: Mapping[str, Series], firsts: Mapping[str, Message], config: TopicsConfig, *, path: Path
+) -> Choice:
+    """Return the topics to read: images where colour has depth, else clouds.
+
+    Args:
+        series: Every topic.
+        firsts: The first message of those that can be read.
+        config: What the user set.
+        path: What to name in an error.
+
+    Raises:
+        SourceError: A chosen topic is not there or of another type, or nothing can be mapped.
+    """
+    pick = _Picker(series, path)
+    depths = {name for name, first in firsts.items() if isinstance(first, ImageMessage) and is_depth(first)}
+    color = pick.one("color", config.color, IMAGES, _color_rank, where=lambda name: name not in depths)
+    depth = pick.one("depth", config.depth, IMAGES, _depth_rank, where=depths.__contains__)
+    points = pick.one("points", config.points, CLOUDS, _cloud_rank, where=lambda name: len(series[name]) > 1)
+    imu = pick.one("imu", config.imu, IMUS, _plain_rank, where=lambda name: _feels_gravity(firsts.get(name)))
+    truth = pick.one("truth", config.truth, POSES, _plain_rank, where=lambda name: name == TRUTH)
+    pick.refuse_own_runs()
+    frames: CameraTopics | Series
+    if color is not None and depth is not None and config.points is None:
+        infos = pick.all(CAMERAS)
+        info = pick.one("camera_info", config.camera_info, CAMERAS, _plain_rank, where=set().__contains__)
+        frames = CameraTopics(
+            color,
+            depth,
+            info or _info_of(color, infos, firsts, default=True),
+            _info_of(depth, infos, firsts, default=False),
+        )
+        told = f"colour {color.topic.name}, depth {depth.topic.name}"
+        notes = [_choice_note(told, config.color and config.depth, "color=… and source.topics.depth")]
+        if points is not None:
+            notes.append(
+                f"there are point clouds too: to map those, source.topics.points={points.topic.name}"
+            )
+    elif points is not None:
+        frames = points
+        notes = [_choice_note(f"point clouds {points.topic.name}", config.points, "points")]
+    else:
+        raise SourceError(f"{path}: nothing to map: {_what_there_is(color, depth, series.values())}")
+    return Choice(frames, imu, truth, notes)
+
+
+class _Picker:
+    """Finds topics by what the user set, or else by rank."""
+
+    def __init__(self, series: Mapping[str, Series], path: Path) -> None:
+        self._series = series
+        self._path = path
+
+    def all(self, types: Collection[str]) -> list[Series]:
+        """Return every topic of some types."""
+        return [one for one in self._series.values() if one.topic.type in types]
+
+    def one(
+        self,
+        role: str,
+        wanted: str | None,
+        types: Collection[str],
+        rank: Callable[[str], tuple[int, ...]],
+        *,
+        where: Callable[[str], bool],
+    ) -> Series | None:
+        """Return the topic that is wanted, else the one of the lowest rank, else None."""
+        there = self.all(types)
+        if wanted is None:
+            candidates = [one for one in there if where(one.topic.name)]
+            return min(
+                candidates, key=lambda one: (*rank(one.topic.name), -len(one), one.topic.name), default=None
+            )
+        names = [one.topic.name for one in there]
+        if wanted not in names:
+            what = f"of type {self._series[wanted].topic.type}" if wanted in self._series else "not there"
+            raise SourceError(
+                f"{self._path}: source.topics.{role}={wanted} is {what}; "
+                f"topics for that: {', '.join(names) or 'none'}"
+            )
+        return self._series[wanted]
+
+    def refuse_own_runs(self) -> None:
+        """A run's log has clouds and images too, but they are results."""
+        if any(one.topic.type.startswith(_OWN_TYPES) for one in self._series.values()):
+            raise SourceError(
+                f"{self._path}: a run that mapper wrote: its trajectory, its map and images without depth; "
+                "build from the log that it was made from, or look at it: mapper inspect"
+            )
+
+
+def _choice_note(told: str, chosen: str | None, option: str) -> str:
+    return told if chosen else f"{told}; choose others with source.topics.{option}=…"
+
+
+def _color_rank(name: str) -> tuple[int, ...]:
+    lower = name.lower()
+    is_infrared = any(word in lower for word in ("infra", "/ir", "fisheye"))
+    return int(is_infrared), int("color" not in lower and "rgb" not in lower), int(_is_packed(name))
+
+
+def _depth_rank(name: str) -> tuple[int, ...]:
+    lower = name.lower()
+    return int("aligned" not in lower and "registered" not in lower), int(_is_packed(name))
+
+
+def _cloud_rank(name: str) -> tuple[int, ...]:
+    """Prefer what a driver publishes to what was made of it."""
+    lower = name.lower()
+    is_made = any(word in lower for word in ("map", "filter", "ground", "cluster", "registered", "depth"))
+    return int(is_made), int(not any(word in lower for word in ("lidar", "velodyne", "ouster", "points")))
+
+
+def _plain_rank(name: str) -> tuple[int, ...]:
+    return (name.count("/"),)
+
+
+def _is_packed(name: str) -> bool:
+    return name.endswith(_TRANSPORTS)
+
+
+def _info_of(
+    image: Series, infos: Sequence[Series], firsts: Mapping[str, Message], *, default: bool
+) -> Series | None:
+    """Return the calibration beside an image topic, else of its frame, else (by ``default``) the only one."""
+    name = image.topic.name
+    for transport in _TRANSPORTS:
+        name = name.removesuffix(transport)
+    folder = name.rpartition("/")[0]
+    beside = [one for one in infos if one.topic.name.rpartition("/")[0] == folder]
+    frame = frame_of(firsts.get(image.topic.name))
+    of_frame = [one for one in infos if frame and frame_of(firsts.get(one.topic.name)) == frame]
+    only = infos if default and len(infos) == 1 else []
+    return next(iter([*beside, *of_frame, *only]), None)
+
+
+def frame_of(message: Message | None) -> str:
+    """Return the coordinate frame that a message names, without the slash that ROS 1 once put before it."""
+    return "" if message is None or isinstance(message, list) else message.frame.lstrip("/")
+
+
+def _feels_gravity(message: Message | None) -> bool:
+    low, high = _GRAVITY_MPS2
+    return isinstance(message, ImuMessage) and low < float(np.linalg.norm(message.acceleration_mps2)) < high
+
+
+def _what_there_is(color: Series | None, depth: Series | None, series: Iterable[Series]) -> str:
+    if color is not None:
+        return f"colour images {color.topic.name}, but neither depth images nor point clouds"
+    if depth is not None:
+        return f"depth images {depth.topic.name}, but neither colour images nor point clouds"
+    names = ", ".join(f"{one.topic.name} ({one.topic.type})" for one in series)
+    return f"no images with depth and no point clouds, only {names or 'no messages that can be read'}"

@@ -1,0 +1,130 @@
+"""ROS messages read and written; the home of rosbags, which knows their types and encodings."""
+
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import Any
+
+import numpy as np
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_typestore
+
+from mapper.errors import DataError
+from mapper.sources.ros.clouds import Field, structured
+from mapper.sources.ros.messages import (
+    CameraMessage,
+    CloudMessage,
+    FileMessage,
+    ImuMessage,
+    Message,
+    PixelsMessage,
+    PoseMessage,
+)
+from mapper.sources.ros.recording import Topic
+from mapper.sources.text import pose_from_numbers
+from mapper.timebase import NS_PER_S
+
+_POINT_TYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")  # PointField's constants
+
+
+def decode_ros(topic: Topic, data: memoryview) -> Message:
+    """Return what a ROS message says, in CDR (ROS 2) or in ROS 1's serialisation.
+
+    Raises:
+        DataError: The message is damaged, or of a type that is not read.
+    """
+    read = _READERS.get(topic.type)
+    if read is None:
+        raise DataError(f"messages of type {topic.type} are not read")
+    store = _store(topic.encoding)
+    deserialize = store.deserialize_ros1 if topic.encoding == "ros1" else store.deserialize_cdr
+    try:
+        message = deserialize(data, topic.type)
+    except (SerdeError, AssertionError, IndexError, ValueError) as error:  # what damaged lengths lead to
+        raise DataError(f"{topic.type} cannot be read: {error}") from None
+    return read(message)
+
+
+@cache
+def _store(encoding: str) -> Any:
+    """Return the standard messages; what a map is made from has not changed since Humble and Noetic."""
+    return get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
+
+
+def _pixels(m: Any) -> PixelsMessage:
+    return PixelsMessage(
+        stamp_ns=_ns(m.header.stamp),
+        frame=m.header.frame_id,
+        encoding=m.encoding,
+        width_px=m.width,
+        height_px=m.height,
+        row_bytes=m.step,
+        is_big_endian=bool(m.is_bigendian),
+        data=memoryview(m.data),
+    )
+
+
+def _file(m: Any) -> FileMessage:
+    return FileMessage(_ns(m.header.stamp), m.header.frame_id, m.format, memoryview(m.data))
+
+
+def _camera(m: Any) -> CameraMessage:
+    D, K, P = (
+        np.asarray(getattr(m, name.lower(), getattr(m, name, None)), dtype=np.float64) for name in "DKP"
+    )
+    return CameraMessage(m.header.frame_id, m.width, m.height, m.distortion_model, D, K, P)
+
+
+def _cloud(m: Any) -> CloudMessage:
+    order = ">" if m.is_bigendian else "<"
+    fields: list[Field] = [
+        (f.name, f.offset, order + _POINT_TYPES[f.datatype], max(f.count, 1)) for f in m.fields
+    ]
+    points = structured(
+        memoryview(m.data),
+        fields,
+        point_bytes=m.point_step,
+        shape=(m.height, m.width),
+        row_bytes=m.row_step,
+    )
+    return CloudMessage(_ns(m.header.stamp), m.header.frame_id, points)
+
+
+def _imu(m: Any) -> ImuMessage:
+    a = m.linear_acceleration
+    return ImuMessage(_ns(m.header.stamp), m.header.frame_id, np.array([a.x, a.y, a.z]))
+
+
+def _pose_stamped(m: Any) -> list[PoseMessage]:
+    pose = getattr(m.pose, "pose", m.pose)  # with or without covariance
+    return [_placed(m.header, getattr(m, "child_frame_id", ""), pose.position, pose.orientation)]
+
+
+def _transform_stamped(m: Any) -> list[PoseMessage]:
+    return [_placed(m.header, m.child_frame_id, m.transform.translation, m.transform.rotation)]
+
+
+def _transforms(m: Any) -> list[PoseMessage]:
+    return [pose for transform in m.transforms for pose in _transform_stamped(transform)]
+
+
+_READERS: Mapping[str, Callable[[Any], Message]] = {
+    "sensor_msgs/msg/Image": _pixels,
+    "sensor_msgs/msg/CompressedImage": _file,
+    "sensor_msgs/msg/CameraInfo": _camera,
+    "sensor_msgs/msg/PointCloud2": _cloud,
+    "sensor_msgs/msg/Imu": _imu,
+    "geometry_msgs/msg/PoseStamped": _pose_stamped,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_stamped,
+    "nav_msgs/msg/Odometry": _pose_stamped,
+    "geometry_msgs/msg/TransformStamped": _transform_stamped,
+    "tf2_msgs/msg/TFMessage": _transforms,
+}
+
+
+def _placed(header: Any, child: str, p: Any, q: Any) -> PoseMessage:
+    T_parent_child = pose_from_numbers(np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w]))
+    return PoseMessage(_ns(header.stamp), header.frame_id, child, T_parent_child)
+
+
+def _ns(stamp: Any) -> int:
+    return int(stamp.sec * NS_PER_S + stamp.nanosec)
