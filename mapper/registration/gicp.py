@@ -135,38 +135,48 @@ def refine(
 
 
 def measured(
-    target: Prepared, source: Prepared, T_target_source: Transform, *, max_pair_distance_m: float
+    target: Prepared,
+    source: Prepared,
+    T_target_source: Transform,
+    *,
+    max_pair_distance_m: float,
+    max_surface_distance_m: float = np.inf,
 ) -> Alignment:
     """Return what a motion is worth, by whatever method it was found.
 
-    A pair is a source point and the target point nearest to it; it agrees when they lie within
-    ``max_pair_distance_m``. The information is that of point-to-plane distances, Σ JᵀJ / σ² with
-    J = [(s × m)ᵀ, mᵀ] and m = Rᵀn (the source's tangent, multiplied on the right): what the surfaces can
-    fix, by whichever residual the motion was found. (Point-to-point residuals would claim to see the
-    motion along a wall.) σ is what the residuals show. Points that share a normal are not independent, so
-    as many count once as went into each normal.
+    A pair is a source point and the target point nearest to it. The information is that of point-to-plane
+    distances, Σ JᵀJ / σ² with J = [(s × m)ᵀ, mᵀ] and m = Rᵀn (the source's tangent, multiplied on the
+    right): what the surfaces can fix, by whichever residual the motion was found. (Point-to-point residuals
+    would claim to see the motion along a wall.) σ is what the residuals show. Points that share a normal are
+    not independent, so as many count once as went into each normal.
 
     Args:
         target: Cloud that stays.
         source: Cloud that moves.
         T_target_source: (4, 4) motion in question.
-        max_pair_distance_m: How near the points of a pair must be.
+        max_pair_distance_m: How near the points of a pair must be to agree.
+        max_surface_distance_m: How near the source point must be to the target's surface. Finite, it tells
+            wrong motions from right ones better than the distance between points, which is mostly that
+            between samples; points with no surface about them then do not agree.
     """
     indices, distances_m = target.nearest(apply(T_target_source, source.points))
     near = distances_m <= max_pair_distance_m
-    pairs = int(near.sum())
-    if pairs < _MIN_PAIRS:
+    if near.sum() < _MIN_PAIRS:
         return failed(
-            f"{pairs} of {len(source.points)} points have a partner within {max_pair_distance_m:g} m, "
+            f"{near.sum()} of {len(source.points)} points have a partner within {max_pair_distance_m:g} m, "
             f"fewer than {_MIN_PAIRS}: the clouds do not overlap"
         )
     jacobian, residuals_m = _plane_rows(target, source, T_target_source, indices[near], near)
-    sigma_m = max(float(np.sqrt((residuals_m**2).mean())), _MIN_SIGMA_VOXELS * source.voxel_m)
+    known = jacobian.any(axis=1)
+    rms_m = float(np.sqrt((residuals_m**2).sum() / max(known.sum(), 1)))
+    sigma_m = max(rms_m, _MIN_SIGMA_VOXELS * source.voxel_m)
+    agree = np.where(known, np.abs(residuals_m), np.inf) <= max_surface_distance_m
+    pairs = int(agree.sum())
     return Alignment(
         T_target_source,
         converged=True,
         inlier_ratio=pairs / len(near),
-        inlier_rmse_m=float(np.sqrt((distances_m[near] ** 2).mean())),
+        inlier_rmse_m=float(np.sqrt((distances_m[near][agree] ** 2).sum() / max(pairs, 1))),
         pairs=pairs,
         information=_gram(jacobian) / (target.neighbours * sigma_m**2),
     )
@@ -201,11 +211,9 @@ def _plane_rows(
     partners: NDArray[np.intp],
     paired: NDArray[np.bool_],
 ) -> tuple[Array, Array]:
-    """Return (M, 6) Jacobian rows and (M,) distances along the target's normals, of pairs that have one."""
-    normals = target.normals[partners]
-    known = np.abs(normals).any(axis=1)
-    normals, points_source = normals[known], source.points[paired][known]
-    differences = apply(T_target_source, points_source) - target.points[partners[known]]
+    """Return (M, 6) Jacobian rows and (M,) distances along the target's normals; 0 where there is none."""
+    normals, points_source = target.normals[partners], source.points[paired]
+    differences = apply(T_target_source, points_source) - target.points[partners]
     normals_source = normals @ T_target_source[:3, :3]
     jacobian = np.hstack([np.cross(points_source, normals_source), normals_source])
     return jacobian, np.einsum("ni,ni->n", normals, differences)

@@ -1,0 +1,56 @@
+"""ICP, point-to-plane ICP and GICP behind the seam: from coarse pairs to fine ones, then judged."""
+
+from mapper.config.registration import IterativeConfig, RefinedConfig
+from mapper.frames import Scan
+from mapper.geometry import Transform
+from mapper.registration.base import Alignment
+from mapper.registration.gicp import Prepared, Refiner, prepared, refine
+from mapper.registration.trust import judged
+
+
+class Iterative:
+    """Registers scans by their nearest pairs."""
+
+    def __init__(self, config: IterativeConfig) -> None:
+        self._config = config
+
+    def prepare(self, target: Scan) -> "IterativeAligner":
+        """Return the method bound to a target."""
+        return IterativeAligner(cloud_of(target, self._config), self._config)
+
+
+class IterativeAligner:
+    """A target's cloud and how sources are brought onto it."""
+
+    def __init__(self, target: Prepared, config: IterativeConfig) -> None:
+        self._target = target
+        self._config = config
+
+    def align(self, source: Scan, T_target_source: Transform) -> Alignment:
+        """Return the motion refined from a guess, judged."""
+        cloud = cloud_of(source, self._config)
+        return refined(self._target, cloud, T_target_source, self._config, kind=self._config.kind)
+
+
+def cloud_of(scan: Scan, config: RefinedConfig) -> Prepared:
+    """Return a scan's cloud, as a configuration wants it."""
+    return prepared(scan.points_body, voxel_m=config.voxel_m, neighbours=config.neighbours)
+
+
+def refined(
+    target: Prepared, source: Prepared, T_target_source: Transform, config: RefinedConfig, *, kind: Refiner
+) -> Alignment:
+    """Return the motion refined at one pair distance after another, judged."""
+    for distance_voxels in config.pair_distances_voxels:
+        alignment = refine(
+            target,
+            source,
+            T_target_source,
+            kind=kind,
+            max_pair_distance_m=distance_voxels * config.voxel_m,
+            max_iterations=config.max_iterations,
+        )
+        if not alignment.converged:
+            return alignment
+        T_target_source = alignment.T_target_source
+    return judged(target, source, T_target_source, config.trust)

@@ -1,0 +1,108 @@
+"""KISS-Matcher (Lim et al. 2025): a motion from matched features without any guess; GICP refines it."""
+
+import os
+import sys
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from mapper.config.registration import KissMatcherConfig
+from mapper.frames import Scan
+from mapper.geometry import Transform, is_rigid, transform
+from mapper.registration.base import Alignment, failed
+from mapper.registration.gicp import Prepared, prepared
+from mapper.registration.iterative import cloud_of, refined
+
+_CROWD = 5  # points this near together, in feature voxels, surely have a normal and a feature
+_CROWD_VOXELS = 1.5
+_MIN_FEATURES = 20
+_MAX_MATCHES = 5000  # of more the library draws so many, unseeded
+_GROWTH = 1.25
+_MAX_NOISE_M = 1.0  # the library takes no more, and prints that
+
+
+class KissMatcher:
+    """Registers scans by their features."""
+
+    def __init__(self, config: KissMatcherConfig) -> None:
+        self._config = config
+
+    def prepare(self, target: Scan) -> "KissMatcherAligner":
+        """Return the method bound to a target. The library computes the target's features in every call."""
+        return KissMatcherAligner(cloud_of(target, self._config), self._config)
+
+
+class KissMatcherAligner:
+    """A target's cloud, for the features and for the refinement."""
+
+    def __init__(self, target: Prepared, config: KissMatcherConfig) -> None:
+        self._target = target
+        self._config = config
+
+    def align(self, source: Scan, T_target_source: Transform) -> Alignment:  # noqa: ARG002 - needs no guess
+        """Return the motion that most matches agree on, refined and judged."""
+        config = self._config
+        cloud = cloud_of(source, config)
+        thinned = _thinned(self._target, cloud, config.feature_voxels * config.voxel_m)
+        for name, side in zip(("target", "source"), thinned, strict=True):
+            if _crowded(side) < _MIN_FEATURES:
+                return failed(f"too few points of the {name} lie close enough together to have features")
+        found = _matched(*thinned)
+        if found is None:
+            return failed("the features of the two clouds agree on no motion")
+        return refined(self._target, cloud, found, config, kind="gicp")
+
+
+def _thinned(target: Prepared, source: Prepared, voxel_m: float) -> tuple[Prepared, Prepared]:
+    """Return both with one point in each voxel, which grows until one of them has few enough."""
+    while True:
+        thinned = (prepared(target.points, voxel_m=voxel_m), prepared(source.points, voxel_m=voxel_m))
+        if min(len(side.points) for side in thinned) <= _MAX_MATCHES:
+            return thinned
+        voxel_m *= _GROWTH
+
+
+def _crowded(cloud: Prepared) -> int:
+    """Return how many points have neighbours enough. The library crashes on clouds where none has."""
+    if len(cloud.points) < _CROWD:
+        return 0
+    _, squared = cloud.tree.batch_knn_search(cloud.points, _CROWD)
+    return int((squared[:, -1] <= (_CROWD_VOXELS * cloud.voxel_m) ** 2).sum())
+
+
+def _matched(target: Prepared, source: Prepared) -> Transform | None:
+    """Return the motion that the matches agree on, or None."""
+    kiss_matcher = _library()
+    noise_gain = min(1.0, _MAX_NOISE_M / target.voxel_m)
+    config = kiss_matcher.KISSMatcherConfig(
+        target.voxel_m,
+        False,
+        num_max_corr=_MAX_MATCHES,
+        robin_noise_bound_gain=noise_gain,
+        solver_noise_bound_gain=0.75 * noise_gain,
+    )
+    solution = kiss_matcher.KISSMatcher(config).estimate(
+        source.points.astype(np.float32), target.points.astype(np.float32)
+    )
+    T_target_source = transform(np.array(solution.rotation), np.array(solution.translation))
+    return T_target_source if solution.valid and is_rigid(T_target_source) else None
+
+
+@cache
+def _library() -> Any:
+    """Return the library, held to one thread: with more, the order of its points and so its answer vary.
+
+    Its thread pool is sized when first used, by the cores that it may run on then.
+    """
+    import kiss_matcher
+
+    few = np.random.default_rng(0).uniform(size=(300, 3)).astype(np.float32)
+    if sys.platform == "linux":
+        cores = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, {min(cores)})
+        try:
+            kiss_matcher.KISSMatcher(0.2).estimate(few, few)
+        finally:
+            os.sched_setaffinity(0, cores)
+    return kiss_matcher

@@ -1,0 +1,105 @@
+"""The normal distributions transform (Magnusson 2009, as Open3D has it), judged by the surfaces."""
+
+from typing import Any
+
+import numpy as np
+
+from mapper.config.registration import NdtConfig
+from mapper.frames import Scan
+from mapper.geometry import Points, Transform, is_rigid, nearest_rotation, transform
+from mapper.registration.base import Alignment, failed
+from mapper.registration.gicp import Prepared, prepared
+from mapper.registration.trust import judged
+
+
+class Ndt:
+    """Registers scans by the Gaussians of the target's cells."""
+
+    def __init__(self, config: NdtConfig) -> None:
+        self._config = config
+
+    def prepare(self, target: Scan) -> "NdtAligner":
+        """Return the method bound to a target. Open3D builds its cells in every call anew."""
+        config = self._config
+        cloud = prepared(target.points_body, voxel_m=config.voxel_m, neighbours=config.neighbours)
+        return NdtAligner(target.points_body.astype(np.float64), cloud, config)
+
+
+class NdtAligner:
+    """A target's points, and its surfaces for the judgement."""
+
+    def __init__(self, points_target: Points, target: Prepared, config: NdtConfig) -> None:
+        self._points_target = points_target
+        self._target = target
+        self._config = config
+
+    def align(self, source: Scan, T_target_source: Transform) -> Alignment:
+        """Return the motion refined from a guess at one cell size after another, judged."""
+        config = self._config
+        cloud = prepared(source.points_body, voxel_m=config.voxel_m, neighbours=config.neighbours)
+        for cell_voxels in config.cells_voxels:
+            found = refine_by_cells(
+                self._points_target,
+                cloud.points,
+                T_target_source,
+                cell_m=cell_voxels * config.voxel_m,
+                min_points=config.min_points,
+                max_iterations=config.max_iterations,
+            )
+            if isinstance(found, str):
+                return failed(found)
+            T_target_source = found
+        return judged(self._target, cloud, T_target_source, config.trust)
+
+
+def refine_by_cells(
+    target: Points,
+    source: Points,
+    T_target_source: Transform,
+    *,
+    cell_m: float,
+    min_points: int = 6,
+    max_iterations: int = 30,
+) -> Transform | str:
+    """Return the motion refined from a guess, or why there is none.
+
+    Open3D gives up with a warning, returns the motion it had by then and calls the fitness of that motion
+    what it is; only a fitness of zero tells for certain that it did nothing. So whatever this returns is
+    to be judged by other means.
+
+    Args:
+        target: (N, 3) points that make the Gaussians, metres.
+        source: (M, 3) points that are placed in them, metres.
+        T_target_source: (4, 4) guess.
+        cell_m: Edge of the cells.
+        min_points: Cells with fewer points have no Gaussian.
+        max_iterations: At most so many.
+    """
+    import open3d
+
+    registration = open3d.pipelines.registration
+    if len(source) == 0:
+        return "no points in the source"
+    option = registration.NormalDistributionsTransformOption(
+        voxel_size=cell_m, min_points_per_voxel=min_points, max_iteration=max_iterations
+    )
+    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+        try:
+            result = registration.registration_ndt(
+                _open3d_cloud(source), _open3d_cloud(target), option, T_target_source
+            )
+        except RuntimeError:
+            return f"no cell of {cell_m:g} m has {min_points} points of the target in it"
+    if result.fitness == 0.0:
+        return f"no point of the source lies in a cell of {cell_m:g} m that has a Gaussian: no overlap"
+    # Open3D sums in the order its threads finish, so the last digits vary from run to run.
+    T_refined = np.round(result.transformation, 9)
+    if not is_rigid(T_refined):
+        return "NDT diverged"
+    return transform(nearest_rotation(T_refined[:3, :3]), T_refined[:3, 3])
+
+
+def _open3d_cloud(points: Points) -> Any:
+    import open3d
+
+    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
