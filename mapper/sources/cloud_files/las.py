@@ -8,6 +8,8 @@ from mapper.errors import FrameError
 from mapper.sources.cloud_files.raw import Columns, refusing_damage
 
 _EXTRAS = ("gps_time", "red", "green", "blue")
+_RECORDS_AT = 100  # a uint32: how many records of variable length follow the header (LAS 1.0 to 1.4)
+_RECORD_BYTES = 54  # of each one's own header
 
 
 def read_las(path: Path) -> Columns:
@@ -18,11 +20,18 @@ def read_las(path: Path) -> Columns:
     """
     import laspy
 
+    size = path.stat().st_size
     with path.open("rb") as stream, refusing_damage(path, what="LAS"):
-        reader = laspy.open(stream, closefd=False)
+        records = int.from_bytes(stream.read(_RECORDS_AT + 4)[_RECORDS_AT:], "little")
+        if records * _RECORD_BYTES > size:  # laspy would make as many empty ones
+            raise FrameError(
+                f"{path}: {size} bytes, but the header says {records} VLR records; is it damaged?"
+            )
+        stream.seek(0)
+        reader = laspy.open(stream, closefd=False, read_evlrs=False)
         header = reader.header
         end = header.offset_to_point_data + header.point_count * header.point_format.size
-        if not header.are_points_compressed and (size := path.stat().st_size) < end:
+        if size < end and not header.are_points_compressed:
             raise FrameError(f"{path}: {size} bytes, but the header says {end} or more; was the file cut?")
         cloud = reader.read()
         columns = {"x": cloud.x, "y": cloud.y, "z": cloud.z}
