@@ -50,6 +50,8 @@ class SliceConfig(Config):
     """Lower edge of the band above the floor."""
     max_height_m: float = 1.2
     """Upper edge of the band above the floor: the robot's height."""
+    above: Literal["floor", "ground"] = "floor"
+    """"floor": the band is level; "ground": it follows streets that rise and fall."""
     min_cluster_cells: PositiveInt = 1
     """Smaller 8-connected groups of occupied cells are taken for noise; 1 keeps all."""
 

@@ -10,6 +10,7 @@ from mapper.config.base import Config
 from mapper.config.features import DetectorConfig, OrbConfig, SurfConfig, UniformOrbConfig
 from mapper.config.scan_odometry import (
     GicpOdometryConfig,
+    HoughOdometryConfig,
     IcpOdometryConfig,
     KissOdometryConfig,
 )
@@ -184,6 +185,7 @@ OdometryConfig = Annotated[
     | PnpConfig
     | GicpOdometryConfig
     | IcpOdometryConfig
-    | KissOdometryConfig,
+    | KissOdometryConfig
+    | HoughOdometryConfig,
     Field(discriminator="kind"),
 ]

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 
 from mapper.config.base import Config
+from mapper.config.hough import HoughGicpConfig, HoughNdtConfig
 
 if TYPE_CHECKING:
     from mapper.odometry.scan_to_map.matching import Matcher
@@ -23,8 +24,6 @@ class ScanOdometryConfig(Config):
     """Farther returns are too sparse to say anything."""
     voxel_m: PositiveFloat = 0.4
     """Scans are reduced to one point, the mean of at most eight, in each such voxel."""
-    deskew: bool = True
-    """Undo the motion during the sweep, where points have times of their own."""
     keyframe_distance_m: PositiveFloat = 1.0
     keyframe_angle_rad: PositiveFloat = 0.2
     """A scan this far, or turned this much, from the last keyframe is one itself."""
@@ -36,7 +35,7 @@ class ScanOdometryConfig(Config):
     """One that still overlaps by less than this share of what is usual is lost."""
     max_lost_scans: NonNegativeInt = 10
     """After so many lost scans in a row a new sub-map begins; 0 never begins one."""
-    rescue: None = None
+    rescue: HoughGicpConfig | None = HoughGicpConfig()
     """How a scan that the map does not explain is compared with the last keyframe: without a guess."""
     max_pair_distance_m: PositiveFloat = 0.5
     """A point this near to one of the last keyframe's overlaps with it."""
@@ -107,3 +106,17 @@ class KissOdometryConfig(ScanOdometryConfig):
         from mapper.odometry.scan_to_map.kiss import KissMatcher
 
         return KissMatcher(self)
+
+
+class HoughOdometryConfig(ScanOdometryConfig):
+    """Each scan against the one before it, without a guess, by Hough and NDT (C6)."""
+
+    kind: Literal["hough-ndt"] = "hough-ndt"
+    registration: HoughNdtConfig = HoughNdtConfig()
+    rescue: HoughGicpConfig | None = None
+
+    def matcher(self) -> "Matcher":
+        """Return what places each scan by the last one, before the first."""
+        from mapper.odometry.scan_to_map.consecutive import ConsecutiveMatcher
+
+        return ConsecutiveMatcher(self)

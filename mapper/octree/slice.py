@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mapper.config.octree import SliceConfig
 from mapper.errors import DataError
 from mapper.geometry import Array
+from mapper.octree.ground import ground_heights
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap
 
@@ -66,13 +67,23 @@ def cut_slice(octree: OctreeMap, config: SliceConfig, *, floor_z_m: float = 0.0)
     slots = octree.blocks.sorted_slots()
     codes = octree.blocks.codes[slots]
     keys = block_keys(codes)
-    inside = (keys[:, 2] + (1 << BLOCK_BITS) > lowest) & (keys[:, 2] <= highest)
-    codes, slots, keys = codes[inside], slots[inside], keys[inside]
+    if config.above == "floor":
+        inside = (keys[:, 2] + (1 << BLOCK_BITS) > lowest) & (keys[:, 2] <= highest)
+        codes, slots, keys = codes[inside], slots[inside], keys[inside]
     if len(codes):
         first, last = keys.min(axis=0), keys.max(axis=0) + (1 << BLOCK_BITS)
         seen = np.zeros((last[1] - first[1], last[0] - first[0]), dtype=np.uint8)
+        bases = _bases(octree, config, first=first[:2], shape=seen.shape, floor_z_m=floor_z_m)
         _flatten(
-            codes, slots, octree.blocks.table.values, octree.occupied_log_odds, first, lowest, highest, seen
+            codes,
+            slots,
+            octree.blocks.table.values,
+            octree.occupied_log_odds,
+            first,
+            lowest,
+            highest,
+            bases,
+            seen,
         )
     if not len(codes) or not seen.any():
         raise DataError(
@@ -104,8 +115,24 @@ def _band(octree: OctreeMap, config: SliceConfig, floor_z_m: float) -> tuple[int
     return lowest, highest
 
 
+def _bases(
+    octree: OctreeMap,
+    config: SliceConfig,
+    *,
+    first: NDArray[np.int64],
+    shape: tuple[int, ...],
+    floor_z_m: float,
+) -> NDArray[np.int64]:
+    """Return (H, W) by how many voxels the band is raised in each column."""
+    bases = np.zeros(shape, dtype=np.int64)
+    if config.above == "ground":
+        ground_m = ground_heights(octree, first=first, shape=(shape[0], shape[1]), floor_z_m=floor_z_m)
+        bases += np.rint((ground_m - floor_z_m) / octree.resolution_m).astype(np.int64)
+    return bases
+
+
 @njit(cache=True, nogil=True)
-def _flatten(codes, slots, values, threshold, first, lowest, highest, seen):
+def _flatten(codes, slots, values, threshold, first, lowest, highest, bases, seen):
     """Or what every voxel of the band says into its column of ``seen`` (H, W) uint8."""
     for b in range(len(codes)):
         for voxel in range(BLOCK_VOXELS):
@@ -113,9 +140,9 @@ def _flatten(codes, slots, values, threshold, first, lowest, highest, seen):
             if value != value:
                 continue
             code = (codes[b] << (3 * BLOCK_BITS)) | voxel
-            z = gather(code >> 2)
+            row, column = gather(code >> 1) - first[1], gather(code) - first[0]
+            z = gather(code >> 2) - bases[row, column]
             if z >= lowest and z <= highest:
-                row, column = gather(code >> 1) - first[1], gather(code) - first[0]
                 seen[row, column] |= uint8(_SEEN_OCCUPIED if value >= threshold else _SEEN_FREE)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from mapper.config.scan_odometry import ScanOdometryConfig
 from mapper.deskew import Twist, deskewed
 from mapper.errors import FrameError
-from mapper.frames import Frame, Scan
+from mapper.frames import Frame, Points32, Scan
 from mapper.odometry.scan_to_map.matching import Sweep
 from mapper.registration.gicp import prepared
 from mapper.thinning import thin
@@ -21,17 +21,33 @@ class ScanObservation:
 
     Attributes:
         scan: Points in range, body frame, with their times where the log has them.
+        middle_s: Middle of the sweep, seconds after the scan's stamp; 0 without times.
         sweep: The scan as taken all at once; None while that waits for the motion during the sweep.
         voxel_m: Voxels that a sweep is prepared with.
     """
 
     scan: Scan
+    middle_s: float
     sweep: Sweep | None
     voxel_m: float
 
     def as_swept(self, twist: Twist) -> Sweep:
-        """Return the scan as taken all at once, when the body moved like this during the sweep."""
-        return self.sweep or _sweep(deskewed(self.scan, twist), self.voxel_m)
+        """Return the scan as taken all at once in the middle of the sweep, if the body moved like this.
+
+        There an error of the motion cancels: half of the points move one way and half the other. At the
+        sweep's start it would move the pose, and so come back larger in the next motion.
+        """
+        return self.sweep or _sweep(self._deskewed(twist, moment_s=self.middle_s), self.voxel_m)
+
+    def points_at_stamp(self, twist: Twist) -> Points32:
+        """Return (M, 3) points as taken all at once at the stamp, one per voxel."""
+        points = self._deskewed(twist, moment_s=0.0).points_body
+        return points[thin(points, self.voxel_m)]
+
+    def _deskewed(self, twist: Twist, *, moment_s: float) -> Scan:
+        if self.scan.times_s is None:
+            return self.scan
+        return deskewed(replace(self.scan, times_s=self.scan.times_s - np.float32(moment_s)), twist)
 
 
 def observe_scan(frame: Frame, config: ScanOdometryConfig) -> ScanObservation:
@@ -51,10 +67,12 @@ def observe_scan(frame: Frame, config: ScanOdometryConfig) -> ScanObservation:
             f"{config.min_range_m:g} m and {config.max_range_m:g} m and {_FINER * config.voxel_m:g} m apart; "
             f"want {config.min_points} (odometry.min_points, min_range_m, max_range_m, voxel_m)"
         )
-    times_s = scan.times_s[in_range][kept] if scan.times_s is not None and config.deskew else None
-    thinned = replace(scan, points_body=points_body[kept], colors=None, times_s=times_s)
-    sweep = _sweep(thinned, config.voxel_m) if times_s is None else None
-    return ScanObservation(thinned, sweep, config.voxel_m)
+    thinned = replace(scan, points_body=points_body[kept], colors=None, times_s=None)
+    if scan.times_s is None:
+        return ScanObservation(thinned, 0.0, _sweep(thinned, config.voxel_m), config.voxel_m)
+    times_s = scan.times_s[in_range][kept]
+    middle_s = 0.5 * float(times_s.min() + times_s.max())
+    return ScanObservation(replace(thinned, times_s=times_s), middle_s, None, config.voxel_m)
 
 
 def _sweep(scan: Scan, voxel_m: float) -> Sweep:

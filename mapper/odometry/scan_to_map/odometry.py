@@ -18,7 +18,7 @@ from mapper.odometry.base import Diagnostics, Track
 from mapper.odometry.scan_to_map.matching import Matcher, Sweep
 from mapper.odometry.scan_to_map.observation import ScanObservation, observe_scan
 from mapper.registration.base import Aligner, Alignment
-from mapper.registration.degeneracy import Degeneracy, degeneracy_of, loosened
+from mapper.registration.degeneracy import degeneracy_of, loosened
 from mapper.registration.gicp import measured
 from mapper.timebase import NS_PER_S
 
@@ -27,18 +27,26 @@ _USUAL_OF = 20  # recent scans whose overlap tells what is usual
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Keyframe:
-    """A scan that became a node."""
+    """A scan that became a node.
+
+    Attributes:
+        node: Its number.
+        sweep: The scan as taken all at once in the middle of its sweep.
+        T_world_middle: (4, 4) pose of the body then.
+        T_world_body: (4, 4) pose of the body at the scan's stamp.
+    """
 
     node: int
     sweep: Sweep
+    T_world_middle: Transform
     T_world_body: Transform
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Placed:
-    """Where a scan was found, what the last keyframe says of it, and how."""
+    """Where a scan was found in the middle of its sweep, what the last keyframe says of it, and how."""
 
-    T_world_body: Transform
+    T_world_middle: Transform
     overlap: Alignment
     method: str
 
@@ -59,8 +67,9 @@ class ScanOdometry:
         self._rescuer: tuple[int, Aligner] | None = None
         self._overlaps: deque[float] = deque(maxlen=_USUAL_OF)
         self._keyframe: _Keyframe | None = None
-        self._last_stamp_ns = 0
-        self._last_world_body: Transform = np.eye(4)
+        self._first: ScanObservation | None = None
+        self._last_time_ns = 0
+        self._T_world_last: Transform = np.eye(4)
         self._twist: Twist = STILL
         self._lost = 0
         self._next_node = 0
@@ -75,59 +84,71 @@ class ScanOdometry:
 
     def track(self, observation: ScanObservation) -> Track:
         """Place the next observation, in time order."""
-        stamp_ns, twist = observation.scan.stamp_ns, self._twist
-        sweep = observation.as_swept(twist)
-        keyframe = self._keyframe
-        if keyframe is None:
-            return self._start(sweep, np.eye(4), twist, method="start")
-        elapsed_s = (stamp_ns - self._last_stamp_ns) / NS_PER_S
-        placed = self._place(sweep, keyframe, self._last_world_body @ twist.over(elapsed_s))
+        if self._keyframe is None:
+            return self._start(observation, np.eye(4), method="start")
+        time_ns = _time_ns(observation)
+        elapsed_s = (time_ns - self._last_time_ns) / NS_PER_S
+        sweep = observation.as_swept(self._twist)
+        placed = self._place(sweep, self._keyframe, self._T_world_last @ self._twist.over(elapsed_s))
+        if placed is not None and self._first is not None and self._first.scan.times_s is not None:
+            self._twist = twist_between(self._T_world_last, placed.T_world_middle, duration_s=elapsed_s)
+            sweep, placed = self._begin_again(self._first, observation, elapsed_s)
         if placed is None:
-            return self._lose(sweep, twist)
-        self._lost = 0
+            return self._lose(observation)
+        self._first, self._lost = None, 0
         self._overlaps.append(placed.overlap.inlier_ratio)
-        self._twist = twist_between(self._last_world_body, placed.T_world_body, duration_s=elapsed_s)
-        return self._follow(sweep, keyframe, placed, twist)
+        self._twist = twist_between(self._T_world_last, placed.T_world_middle, duration_s=elapsed_s)
+        return self._follow(observation, sweep, placed)
 
     def view(self, observation: ScanObservation, twist: Twist | None = None, /) -> ScanView:
         """Return what a place is recognised by. Pure."""
-        points = observation.as_swept(twist or STILL).prepared.points
-        return ScanView(observation.scan.stamp_ns, points.astype(np.float32))
+        return ScanView(observation.scan.stamp_ns, observation.points_at_stamp(twist or STILL))
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return nothing: every measurement was final when its scan was tracked."""
         return ()
 
+    def _begin_again(
+        self, first: ScanObservation, second: ScanObservation, elapsed_s: float
+    ) -> tuple[Sweep, _Placed | None]:
+        """Place a map's first two scans anew, now that the motion during their sweeps is known."""
+        assert self._keyframe is not None
+        self._matcher.clear()
+        self._next_node = self._keyframe.node
+        T_world_middle = self._keyframe.T_world_body @ self._twist.over(first.middle_s)
+        self._take_keyframe(first, first.as_swept(self._twist), T_world_middle)
+        sweep = second.as_swept(self._twist)
+        return sweep, self._place(sweep, self._keyframe, self._T_world_last @ self._twist.over(elapsed_s))
+
     def _place(self, sweep: Sweep, keyframe: _Keyframe, T_world_guess: Transform) -> _Placed | None:
         """Return the best place for a scan; None if none explains enough of it."""
-        best = self._judged(
-            sweep, keyframe, self._matcher.match(sweep, T_world_guess, reach="near"), method="map"
-        )
-        if self._overlaps_by(best) < self._config.usual_ratio:
+        near = self._matcher.match(sweep, T_world_guess, reach="near")
+        best = self._judged(sweep, keyframe, near, method="map")
+        if self._share_of_usual(best) < self._config.usual_ratio:
             far = self._matcher.match(sweep, T_world_guess, reach="far")
             best = _better(best, self._judged(sweep, keyframe, far, method="far"))
-        if self._overlaps_by(best) < self._config.usual_ratio and self._rescue is not None:
+        if self._share_of_usual(best) < self._config.usual_ratio and self._rescue is not None:
             found = self._aligner(keyframe).align(sweep.scan, np.eye(4))
             if found.converged:
-                T_world_found = keyframe.T_world_body @ found.T_target_source
+                T_world_found = keyframe.T_world_middle @ found.T_target_source
                 near = self._matcher.match(sweep, T_world_found, reach="near")
                 best = _better(best, self._judged(sweep, keyframe, near, method="rescued"))
-        return best if self._overlaps_by(best) >= self._config.lost_ratio else None
+        return best if self._share_of_usual(best) >= self._config.lost_ratio else None
 
     def _judged(
-        self, sweep: Sweep, keyframe: _Keyframe, T_world_body: Transform | None, *, method: str
+        self, sweep: Sweep, keyframe: _Keyframe, T_world_middle: Transform | None, *, method: str
     ) -> _Placed | None:
-        if T_world_body is None:
+        if T_world_middle is None:
             return None
         overlap = measured(
             keyframe.sweep.prepared,
             sweep.prepared,
-            inverse(keyframe.T_world_body) @ T_world_body,
+            inverse(keyframe.T_world_middle) @ T_world_middle,
             max_pair_distance_m=self._config.max_pair_distance_m,
         )
-        return _Placed(T_world_body, overlap, method) if overlap.converged else None
+        return _Placed(T_world_middle, overlap, method) if overlap.converged else None
 
-    def _overlaps_by(self, placed: _Placed | None) -> float:
+    def _share_of_usual(self, placed: _Placed | None) -> float:
         """Return a scan's overlap as a share of what is usual; of all of it while nothing is usual yet."""
         if placed is None:
             return 0.0
@@ -140,76 +161,95 @@ class ScanOdometry:
             self._rescuer = keyframe.node, self._rescue.prepare(keyframe.sweep.scan)
         return self._rescuer[1]
 
-    def _follow(self, sweep: Sweep, keyframe: _Keyframe, placed: _Placed, twist: Twist) -> Track:
+    def _follow(self, observation: ScanObservation, sweep: Sweep, placed: _Placed) -> Track:
         """Hang a placed scan on the last keyframe, or make it the next one."""
-        T_key_body = inverse(keyframe.T_world_body) @ placed.T_world_body
-        known = placed.overlap.information
-        assert known is not None  # overlaps that converged have it
-        degeneracy = degeneracy_of(known, points=sweep.prepared.points)
+        keyframe, overlap = self._keyframe, placed.overlap
+        assert keyframe is not None
+        assert overlap.information is not None  # overlaps that converged have it
+        T_world_body = placed.T_world_middle @ self._twist.over(-observation.middle_s)
+        T_key_body = inverse(keyframe.T_world_body) @ T_world_body
+        degeneracy = degeneracy_of(overlap.information, points=sweep.prepared.points)
         is_keyframe = (
             float(np.linalg.norm(T_key_body[:3, 3])) >= self._config.keyframe_distance_m
             or angle_between(np.eye(3), T_key_body[:3, :3]) >= self._config.keyframe_angle_rad
         )
-        self._take(sweep, placed.T_world_body, is_keyframe=is_keyframe)
         node = keyframe.node
         factors: tuple[BetweenFactor, ...] = ()
         if is_keyframe:
-            node = self._become_keyframe(sweep, placed.T_world_body)
-            information = with_model_error(loosened(known, degeneracy), T_key_body)
+            node = self._take_keyframe(observation, sweep, placed.T_world_middle)
+            information = with_model_error(loosened(overlap.information, degeneracy), T_key_body)
             factors = (BetweenFactor(keyframe.node, node, T_key_body, information),)
+        else:
+            self._take(observation, sweep, placed.T_world_middle, is_keyframe=False)
+        points = len(sweep.prepared.points)
         return Track(
-            stamp_ns=sweep.scan.stamp_ns,
+            stamp_ns=observation.scan.stamp_ns,
             node=node,
             T_node_body=np.eye(4) if is_keyframe else T_key_body,
-            T_world_body=placed.T_world_body,
+            T_world_body=T_world_body,
             is_keyframe=is_keyframe,
-            diagnostics=_diagnostics(sweep, placed.overlap, placed.method, degeneracy),
+            diagnostics=Diagnostics(
+                features=points,
+                matches=points,
+                inliers=overlap.pairs,
+                residual=overlap.inlier_rmse_m,
+                residual_unit="m",
+                method=placed.method,
+                unseen=degeneracy.text,
+            ),
             factors=factors,
             links=factors,
-            twist=twist,
+            twist=self._twist,
         )
 
-    def _start(self, sweep: Sweep, T_world_body: Transform, twist: Twist, *, method: str) -> Track:
+    def _start(self, observation: ScanObservation, T_world_body: Transform, *, method: str) -> Track:
         """Make a scan the first keyframe of a map; nothing says where it lies to earlier maps."""
         self._matcher.clear()
         self._overlaps.clear()
-        self._twist, self._lost = STILL, 0
-        self._take(sweep, T_world_body, is_keyframe=True)
-        node = self._become_keyframe(sweep, T_world_body)
-        points = len(sweep.prepared.points)
+        self._twist, self._lost, self._first = STILL, 0, observation
+        sweep = observation.as_swept(STILL)
+        node = self._take_keyframe(observation, sweep, T_world_body)
         return Track(
-            stamp_ns=sweep.scan.stamp_ns,
+            stamp_ns=observation.scan.stamp_ns,
             node=node,
             T_node_body=np.eye(4),
             T_world_body=T_world_body,
             is_keyframe=True,
-            diagnostics=Diagnostics(points, 0, 0, 0.0, "m", method),
-            twist=twist,
+            diagnostics=Diagnostics(len(sweep.prepared.points), 0, 0, 0.0, "m", method),
+            twist=STILL,
         )
 
-    def _lose(self, sweep: Sweep, twist: Twist) -> Track:
+    def _lose(self, observation: ScanObservation) -> Track:
         """Give the scan up, or begin a new map with it once enough in a row were lost."""
         self._lost += 1
         if 0 < self._config.max_lost_scans < self._lost:
-            return self._start(sweep, self._last_world_body, twist, method="new sub-map")
-        points = len(sweep.prepared.points)
+            return self._start(observation, self._T_world_last, method="new sub-map")
         return Track(
-            stamp_ns=sweep.scan.stamp_ns,
+            stamp_ns=observation.scan.stamp_ns,
             node=None,
             T_node_body=np.eye(4),
-            T_world_body=self._last_world_body,
+            T_world_body=self._T_world_last,
             is_keyframe=False,
-            diagnostics=Diagnostics(points, 0, 0, 0.0, "m", "lost"),
+            diagnostics=Diagnostics(len(observation.scan.points_body), 0, 0, 0.0, "m", "lost"),
         )
 
-    def _take(self, sweep: Sweep, T_world_body: Transform, *, is_keyframe: bool) -> None:
-        self._matcher.add(sweep, T_world_body, is_keyframe=is_keyframe)
-        self._last_stamp_ns, self._last_world_body = sweep.scan.stamp_ns, T_world_body
-
-    def _become_keyframe(self, sweep: Sweep, T_world_body: Transform) -> int:
-        self._keyframe = _Keyframe(self._next_node, sweep, T_world_body)
+    def _take_keyframe(self, observation: ScanObservation, sweep: Sweep, T_world_middle: Transform) -> int:
+        self._take(observation, sweep, T_world_middle, is_keyframe=True)
+        T_world_body = T_world_middle @ self._twist.over(-observation.middle_s)
+        self._keyframe = _Keyframe(self._next_node, sweep, T_world_middle, T_world_body)
         self._next_node += 1
         return self._keyframe.node
+
+    def _take(
+        self, observation: ScanObservation, sweep: Sweep, T_world_middle: Transform, *, is_keyframe: bool
+    ) -> None:
+        self._matcher.add(sweep, T_world_middle, is_keyframe=is_keyframe)
+        self._last_time_ns, self._T_world_last = _time_ns(observation), T_world_middle
+
+
+def _time_ns(observation: ScanObservation) -> int:
+    """Return the middle of a scan's sweep."""
+    return observation.scan.stamp_ns + round(observation.middle_s * NS_PER_S)
 
 
 def _better(one: _Placed | None, other: _Placed | None) -> _Placed | None:
@@ -217,16 +257,3 @@ def _better(one: _Placed | None, other: _Placed | None) -> _Placed | None:
     if one is None or other is None:
         return one or other
     return other if other.overlap.inlier_ratio > one.overlap.inlier_ratio else one
-
-
-def _diagnostics(sweep: Sweep, overlap: Alignment, method: str, degeneracy: Degeneracy) -> Diagnostics:
-    points = len(sweep.prepared.points)
-    return Diagnostics(
-        features=points,
-        matches=points,
-        inliers=overlap.pairs,
-        residual=overlap.inlier_rmse_m,
-        residual_unit="m",
-        method=method,
-        unseen=degeneracy.text,
-    )
