@@ -8,6 +8,7 @@ import typer
 from typer.core import TyperGroup
 
 from cli.build import build
+from cli.compare import compare
 from cli.convert import convert
 from cli.demo import demo
 from cli.doctor import doctor
@@ -17,6 +18,7 @@ from cli.export import export
 from cli.fuse import fuse
 from cli.loops import WithPairs, loops
 from cli.plan import WithPoints, plan
+from cli.report import report
 from cli.show_config import show_config
 from cli.solve import solve
 from cli.synth import synth
@@ -68,11 +70,13 @@ app.command("eval")(evaluate)
 app.command("export")(export)
 app.command("plan", cls=WithPoints)(plan)
 app.command("solve")(solve)
+app.command("compare")(compare)
 app.command("convert")(convert)
 app.command("synth")(synth)
 app.command("demo")(demo)
 app.command("config")(show_config)
 app.command("view")(view)
+app.command("report")(report)
 app.command("doctor")(doctor)
 app.add_typer(vocabulary, name="vocabulary")
 

@@ -33,7 +33,7 @@ class Metric:
 
 def text_table(metrics: Sequence[Metric]) -> str:
     """Return aligned lines of name, value and unit for a terminal; angles in degrees."""
-    rows = [_shown(metric) for metric in metrics]
+    rows = [shown(metric) for metric in metrics]
     name_width = max((len(name) for name, _, _ in rows), default=0)
     value_width = max((len(value) for _, value, _ in rows), default=0)
     return "\n".join(f"{name:<{name_width}}  {value:>{value_width}} {unit}" for name, value, unit in rows)
@@ -42,7 +42,7 @@ def text_table(metrics: Sequence[Metric]) -> str:
 def markdown_table(metrics: Sequence[Metric]) -> str:
     """Return a Markdown table for a report; angles in degrees."""
     lines = ["| metric | value | unit |", "| --- | ---: | --- |"]
-    lines += [f"| {name} | {value} | {unit} |" for name, value, unit in map(_shown, metrics)]
+    lines += [f"| {name} | {value} | {unit} |" for name, value, unit in map(shown, metrics)]
     return "\n".join(lines)
 
 
@@ -51,7 +51,7 @@ def json_text(metrics: Sequence[Metric]) -> str:
     return json.dumps([asdict(metric) for metric in metrics], indent=2, ensure_ascii=False)
 
 
-def _shown(metric: Metric) -> tuple[str, str, str]:
+def shown(metric: Metric) -> tuple[str, str, str]:
     """Degrees exist only here, on the screen."""
     if metric.unit == "rad":
         return metric.name, f"{math.degrees(metric.value):.6g}", "°"

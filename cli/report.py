@@ -1,0 +1,70 @@
+"""``mapper report``: runs as one HTML page."""
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli.options import Quiet
+
+if TYPE_CHECKING:
+    from mapper.export.report.data import Figure
+    from mapper.run import Run
+
+
+def report(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders that builds left.")],
+    out: Annotated[Path, typer.Option(help="HTML file to write.")] = Path("report.html"),
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write one self-contained page about a run, or about several side by side; it opens offline.
+
+    Example: mapper report runs/xyz runs/xyz-isvd --out report.html
+    """
+    from mapper.errors import RunError
+    from mapper.export.report.data import chapter_of
+    from mapper.export.report.page import write_report
+    from mapper.run import load_run
+
+    if out.exists() and not overwrite:
+        raise RunError(f"{out}: exists already; choose another --out, or pass --overwrite to replace it")
+    loaded = [load_run(run) for run in runs]
+    names = _names(runs)
+    write_report(out, [chapter_of(run, name, _figures(run)) for run, name in zip(loaded, names, strict=True)])
+    if not quiet:
+        print(out)
+
+
+def _names(runs: Sequence[Path]) -> list[str]:
+    """Return the folders' names; as they were given where that would not tell them apart."""
+    short = [run.resolve().name for run in runs]
+    seen = Counter(short)
+    return [str(run) if seen[name] > 1 else name for run, name in zip(runs, short, strict=True)]
+
+
+def _figures(run: "Run") -> "list[Figure]":
+    from evaluators.evaluate import evaluate
+    from evaluators.loops import loop_metrics
+    from evaluators.metric import shown
+    from mapper.export.report.data import Figure
+    from mapper.run import KEYFRAMES
+    from mapper.trajectory import read_tum
+
+    counts, truth = run.manifest.counts, run.truth()
+    metrics = evaluate(run.trajectory(), truth)
+    if truth is not None:
+        metrics += loop_metrics(run.loops(), read_tum(run.path / KEYFRAMES).stamps_ns, truth)
+    return [
+        Figure("log", run.manifest.input.title),
+        Figure("frames tracked", f"{counts.tracked} of {counts.listed}"),
+        Figure("frames lost", str(counts.lost)),
+        Figure("frames skipped", str(counts.skipped)),
+        Figure("nodes", str(counts.nodes)),
+        Figure("factors", str(counts.factors)),
+        Figure("loops that hold", f"{counts.loops} of {counts.loop_candidates}"),
+        Figure("octree leaves", f"{counts.leaves} of {run.config.octree.resolution_m:g} m"),
+        *(Figure(name, f"{value} {unit}") for name, value, unit in map(shown, metrics)),
+    ]

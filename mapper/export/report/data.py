@@ -1,0 +1,186 @@
+"""What the page's curves and plans are drawn from."""
+
+import base64
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper import run as files
+from mapper.errors import DataError
+from mapper.export.grid import grid_image, read_grid
+from mapper.export.jpeg import encode_jpeg
+from mapper.loops.closure import LoopClosure
+from mapper.octree.slice import OccupancyGrid
+from mapper.run import Run
+from mapper.story import Story, story_of
+from mapper.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, nearest
+
+_VIEW_PX = 1600
+_VIEW_QUALITY = 85
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One number about a run, as it is to be shown.
+
+    Attributes:
+        name: What it is.
+        value: With its unit.
+    """
+
+    name: str
+    value: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chapter:
+    """What a report says of one run.
+
+    Attributes:
+        name: Distinct among the report's runs.
+        run: The run.
+        story: What it has to tell.
+        figures: What it amounts to, e.g. how far it is from the truth.
+    """
+
+    name: str
+    run: Run
+    story: Story
+    figures: Sequence[Figure]
+
+
+def chapter_of(run: Run, name: str, figures: Sequence[Figure]) -> Chapter:
+    """Return what a report says of a run.
+
+    Raises:
+        MapperError: A file of the run cannot be read.
+    """
+    return Chapter(name, run, story_of(run), tuple(figures))
+
+
+def drawn(chapter: Chapter) -> dict[str, Any]:
+    """Return the numbers behind a run's curves and plans, ready for JSON; what is not known is None."""
+    story = chapter.story
+    begin_ns = int(story.trajectory.stamps_ns[0])
+    seconds = _Seconds(begin_ns)
+    records = story.records
+    return {
+        "name": chapter.name,
+        "frames": {
+            "t": seconds([record.stamp_ns for record in records]),
+            "outcome": [record.outcome for record in records],
+            "features": [record.diagnostics.features for record in records],
+            "matches": [record.diagnostics.matches for record in records],
+            "inliers": [record.diagnostics.inliers for record in records],
+            "residual": _rounded([record.diagnostics.residual for record in records]),
+            "ms": _rounded([story.frame_ms.get(record.stamp_ns, math.nan) for record in records]),
+        },
+        "residual_unit": residual_unit(story),
+        "path": _path(story.trajectory.stamps_ns, story.trajectory.positions_world, seconds),
+        "truth": None
+        if story.truth is None
+        else _path(story.truth.stamps_ns, story.truth.positions_world, seconds),
+        "error": _errors(story, seconds),
+        "loops": [_loop(loop, story, seconds) for loop in story.loops],
+        "slice": _plan(read_grid(chapter.run.path / f"{files.SLICE}.yaml")),
+    }
+
+
+def residual_unit(story: Story) -> str:
+    """Return what a run's residuals are measured in; empty if nothing was tracked."""
+    return next((r.diagnostics.residual_unit for r in story.records if r.outcome == "tracked"), "")
+
+
+def views_uri(run: Run) -> str | None:
+    """Return the run's picture of its cloud from two sides as a data URI; None if it has none."""
+    path = run.path / files.CLOUD_VIEWS
+    if not path.is_file():
+        return None
+    image = cv2.imread(str(path))
+    if image is None:
+        raise DataError(f"{path}: cannot be read as an image; make it again with mapper fuse")
+    rgb = np.ascontiguousarray(image[:, :, ::-1])
+    return _uri("jpeg", encode_jpeg(rgb, width_px=_VIEW_PX, quality=_VIEW_QUALITY))
+
+
+class _Seconds:
+    """Turns stamps into seconds since the run's first pose, to the millisecond."""
+
+    def __init__(self, begin_ns: int) -> None:
+        self._begin_ns = begin_ns
+
+    def __call__(self, stamps_ns: Sequence[int] | NDArray[np.int64]) -> list[float]:
+        since_ns = np.asarray(stamps_ns, np.int64) - self._begin_ns
+        return [round(float(s), 3) for s in since_ns / NS_PER_S]
+
+
+def _path(stamps_ns: NDArray[np.int64], positions: NDArray[np.float64], seconds: _Seconds) -> dict[str, Any]:
+    x, y, z = ([round(float(value), 3) for value in column] for column in positions.T)
+    return {"t": seconds(stamps_ns), "x": x, "y": y, "z": z}
+
+
+def _errors(story: Story, seconds: _Seconds) -> dict[str, Any] | None:
+    """Return how far the estimate is from the truth laid over it: the terms of the ATE, SE(3)-aligned."""
+    if story.truth is None:
+        return None
+    index, gap_ns = nearest(story.truth.stamps_ns, story.trajectory.stamps_ns)
+    near = gap_ns <= MAX_TRUTH_GAP_NS
+    miss = story.trajectory.positions_world[near] - story.truth.positions_world[index[near]]
+    return {
+        "t": seconds(story.trajectory.stamps_ns[near]),
+        "m": _rounded(np.linalg.norm(miss, axis=1).tolist()),
+    }
+
+
+def _loop(loop: LoopClosure, story: Story, seconds: _Seconds) -> dict[str, Any]:
+    T_world_node = story.graph.T_world_node
+    ends = None
+    if loop.i in T_world_node and loop.j in T_world_node:
+        ends = [[round(float(v), 3) for v in T_world_node[node][:2, 3]] for node in (loop.i, loop.j)]
+    return {
+        "i": loop.i,
+        "j": loop.j,
+        "t": seconds([loop.stamp_i_ns, loop.stamp_j_ns]),
+        "by": loop.proposed_by,
+        "matches": loop.matches,
+        "inliers": loop.inliers,
+        "rmse_m": _number(loop.rmse_m),
+        "before_m": _number(None if loop.before is None else loop.before.translation_m),
+        "after_m": _number(None if loop.after is None else loop.after.translation_m),
+        "weight": _number(loop.weight),
+        "verdict": loop.verdict,
+        "reason": loop.reason,
+        "ends": ends,
+    }
+
+
+def _plan(grid: OccupancyGrid) -> dict[str, Any]:
+    image = np.ascontiguousarray(grid_image(grid)[::-1, :, ::-1])
+    done, data = cv2.imencode(".png", image)
+    if not done:
+        raise DataError(f"a slice of {grid.cells.shape} cells cannot be encoded as PNG")
+    height, width = grid.cells.shape
+    return {
+        "uri": _uri("png", data.tobytes()),
+        "x": float(grid.origin_world_m[0]),
+        "y": float(grid.origin_world_m[1]),
+        "width_m": width * grid.resolution_m,
+        "height_m": height * grid.resolution_m,
+    }
+
+
+def _uri(kind: str, data: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
+
+
+def _rounded(values: Sequence[float]) -> list[float | None]:
+    return [_number(value) for value in values]
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else float(f"{value:.4g}")

@@ -1,0 +1,308 @@
+"use strict";
+(() => {
+  const SVG = "http://www.w3.org/2000/svg";
+  const MARGIN = { left: 52, right: 12, top: 8, bottom: 22 };
+  const CURVE_HEIGHT = 150;
+  const runs = JSON.parse(document.getElementById("data").textContent);
+  const shown = runs.map(() => true);
+  const redraws = [];
+  const followers = []; // told which second of which run the pointer is at
+
+  const colorOf = (run) => `var(--run${run % 6})`;
+  const redraw = () => redraws.forEach((draw) => draw());
+  const follow = (seconds) => followers.forEach((place) => place(seconds));
+
+  function element(parent, name, attributes = {}, text = null) {
+    const made = parent instanceof SVGElement || name === "svg"
+      ? document.createElementNS(SVG, name) : document.createElement(name);
+    for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+    if (text !== null) made.textContent = text;
+    parent.appendChild(made);
+    return made;
+  }
+
+  const short = (value) => value === null || value === undefined ? "–" : String(Number(value.toPrecision(4)));
+
+  /** Round numbers between two values, about as many as asked for. */
+  function ticks(low, high, count) {
+    const rough = (high - low) / count || 1;
+    const decade = 10 ** Math.floor(Math.log10(rough));
+    const step = [1, 2, 5, 10].map((s) => s * decade).find((s) => s >= rough);
+    const found = [];
+    for (let k = Math.ceil(low / step); k * step <= high; k++) found.push(k * step);
+    return found;
+  }
+
+  /** Index of the entry of a sorted list that is nearest to a value. */
+  function nearest(sorted, value) {
+    let low = 0, high = sorted.length - 1;
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (sorted[middle] < value) low = middle + 1; else high = middle;
+    }
+    return low > 0 && value - sorted[low - 1] < sorted[low] - value ? low - 1 : low;
+  }
+
+  function pathOf(xs, ys, toX, toY) {
+    let d = "", pen = "M";
+    for (let i = 0; i < xs.length; i++) {
+      if (ys[i] === null) { pen = "M"; continue; }
+      d += `${pen}${toX(xs[i]).toFixed(1)} ${toY(ys[i]).toFixed(1)}`;
+      pen = "L";
+    }
+    return d;
+  }
+
+  /** Buttons that show and hide what they name. */
+  function legend(figure, entries, onChange) {
+    const bar = element(figure, "div", { class: "legend" });
+    for (const entry of entries) {
+      const button = element(bar, "button", { type: "button", "aria-pressed": String(entry.on), style: `--of: ${entry.color}` }, entry.label);
+      button.addEventListener("click", () => {
+        entry.on = !entry.on;
+        button.setAttribute("aria-pressed", String(entry.on));
+        onChange();
+      });
+      entry.button = button;
+    }
+  }
+
+  // Curves over time: one line per run -----------------------------------------------------------------
+
+  function seriesOf(run, key, unit) {
+    const frames = runs[run].frames;
+    if (key === "residual" && runs[run].residual_unit !== unit) return null;
+    if (key === "error") {
+      const error = runs[run].error;
+      return error && { xs: error.t, ys: error.m };
+    }
+    const placed = frames[key].map((value, i) => frames.outcome[i] === "tracked" || key === "ms" || key === "features" ? value : null);
+    return placed.some((value) => value !== null) ? { xs: frames.t, ys: placed } : null;
+  }
+
+  let zoomed = null; // [from, to] in seconds, shared by all curves
+
+  function curve(figure) {
+    const { curve: key, unit } = figure.dataset;
+    const series = runs.map((_, run) => ({ run, ...seriesOf(run, key, unit) })).filter((one) => one.xs);
+    if (!series.length) { figure.hidden = true; return; }
+    if (unit) figure.querySelector("figcaption").textContent += `, ${unit}`;
+    const entries = series.map((one) => ({ ...one, on: true, color: colorOf(one.run), label: runs[one.run].name }));
+    legend(figure, entries, () => draw());
+    const svg = element(figure, "svg", { role: "img", "aria-label": figure.querySelector("figcaption").textContent });
+    const readOut = element(figure, "div", { class: "read-out" });
+    let toX, fromX, line;
+
+    function draw() {
+      const width = Math.max(figure.clientWidth, 200), height = CURVE_HEIGHT;
+      svg.replaceChildren();
+      svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+      svg.setAttribute("height", height);
+      for (const entry of entries) entry.button.hidden = !shown[entry.run];
+      const visible = entries.filter((entry) => entry.on && shown[entry.run]);
+      const all = visible.length ? visible : entries;
+      const times = (shown.includes(true) ? runs.filter((_, run) => shown[run]) : runs).map((run) => run.frames.t);
+      const [from, to] = zoomed || [Math.min(...times.map((t) => t[0])), Math.max(...times.map((t) => t[t.length - 1]))];
+      let top = 0;
+      for (const one of all) one.ys.forEach((y, i) => { if (y !== null && one.xs[i] >= from && one.xs[i] <= to && y > top) top = y; });
+      top = top || 1;
+      const right = width - MARGIN.right, bottom = height - MARGIN.bottom;
+      toX = (t) => MARGIN.left + (t - from) / (to - from || 1) * (right - MARGIN.left);
+      fromX = (x) => from + (x - MARGIN.left) / (right - MARGIN.left) * (to - from);
+      const toY = (y) => bottom - y / top * (bottom - MARGIN.top);
+      for (const y of ticks(0, top, 4)) {
+        element(svg, "line", { class: "grid", x1: MARGIN.left, x2: right, y1: toY(y), y2: toY(y) });
+        element(svg, "text", { x: MARGIN.left - 6, y: toY(y) + 4, "text-anchor": "end" }, short(y));
+      }
+      for (const t of ticks(from, to, Math.max(2, width / 110)))
+        element(svg, "text", { x: toX(t), y: height - 6, "text-anchor": "middle" }, `${short(t)} s`);
+      const clip = `clip-${key}-${unit}`;
+      element(element(svg, "clipPath", { id: clip }), "rect",
+        { x: MARGIN.left, y: 0, width: right - MARGIN.left, height: bottom + 1 });
+      for (const one of visible)
+        element(svg, "path", { class: "line", "clip-path": `url(#${clip})`, style: `stroke: ${one.color}`, d: pathOf(one.xs, one.ys, toX, toY) });
+      line = element(svg, "line", { class: "cursor", y1: MARGIN.top, y2: bottom, visibility: "hidden" });
+    }
+
+    function point(seconds) {
+      line.setAttribute("visibility", seconds === null ? "hidden" : "visible");
+      if (seconds === null) { readOut.textContent = ""; return; }
+      line.setAttribute("x1", toX(seconds));
+      line.setAttribute("x2", toX(seconds));
+      readOut.textContent = entries.filter((entry) => entry.on && shown[entry.run]).map((one) => {
+        const i = nearest(one.xs, seconds);
+        return `${one.label} at ${one.xs[i]} s: ${short(one.ys[i])}${unit ? ` ${unit}` : ""}`;
+      }).join("   ");
+    }
+
+    const xOf = (event) => event.clientX - svg.getBoundingClientRect().left;
+    let began = null, box = null;
+    svg.addEventListener("pointermove", (event) => {
+      follow(fromX(xOf(event)));
+      if (box) {
+        box.setAttribute("x", Math.min(began, xOf(event)));
+        box.setAttribute("width", Math.abs(xOf(event) - began));
+      }
+    });
+    svg.addEventListener("pointerleave", () => follow(null));
+    svg.addEventListener("pointerdown", (event) => {
+      began = xOf(event);
+      box = element(svg, "rect", { class: "zoom", x: began, y: MARGIN.top, width: 0, height: CURVE_HEIGHT - MARGIN.bottom - MARGIN.top });
+    });
+    addEventListener("pointerup", (event) => {
+      if (!box) return;
+      const [a, b] = [fromX(began), fromX(xOf(event))].sort((p, q) => p - q);
+      const wide = Math.abs(xOf(event) - began) > 5;
+      box.remove();
+      box = null;
+      if (wide) { zoomed = [a, b]; redraw(); }
+    });
+    svg.addEventListener("dblclick", () => { zoomed = null; redraw(); });
+    redraws.push(draw);
+    followers.push(point);
+  }
+
+  // Plans: the slice from above, with the path over it ----------------------------------------------------
+
+  function plan(figure) {
+    const index = Number(figure.dataset.of), run = runs[index], { slice } = run;
+    const held = run.loops.filter((loop) => loop.ends && loop.verdict === "accepted");
+    const refused = run.loops.filter((loop) => loop.ends && loop.verdict === "rejected");
+    const layers = [
+      { id: "truth", label: "truth", color: "var(--truth)", on: true, there: Boolean(run.truth) },
+      { id: "estimate", label: "estimate", color: colorOf(index), on: true, there: true },
+      { id: "accepted", label: `${held.length} loops that hold`, color: "var(--accepted)", on: true, there: held.length > 0 },
+      { id: "rejected", label: `${refused.length} refused`, color: "var(--rejected)", on: false, there: refused.length > 0 },
+    ].filter((layer) => layer.there);
+    legend(figure, layers, () => draw());
+    const svg = element(figure, "svg", { role: "img", "aria-label": `${run.name} from above` });
+    const readOut = element(figure, "div", { class: "read-out" });
+    const margin = 0.3;
+    const xs = [slice.x, slice.x + slice.width_m], ys = [slice.y, slice.y + slice.height_m];
+    for (const path of [run.path, run.truth]) if (path) { for (const x of path.x) xs.push(x); for (const y of path.y) ys.push(y); }
+    const least = (values) => values.reduce((a, b) => Math.min(a, b)), most = (values) => values.reduce((a, b) => Math.max(a, b));
+    const [x0, x1, y0, y1] = [least(xs) - margin, most(xs) + margin, least(ys) - margin, most(ys) + margin];
+    let scale, dot;
+    const toX = (x) => (x - x0) * scale, toY = (y) => (y1 - y) * scale;
+
+    function draw() {
+      const width = Math.max(figure.clientWidth, 200);
+      scale = Math.min(width / (x1 - x0), 620 / (y1 - y0));
+      const height = (y1 - y0) * scale;
+      svg.replaceChildren();
+      svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+      svg.setAttribute("height", height);
+      element(svg, "image", { href: slice.uri, x: toX(slice.x), y: toY(slice.y + slice.height_m), width: slice.width_m * scale, height: slice.height_m * scale, preserveAspectRatio: "none" });
+      for (const layer of layers.filter((one) => one.on)) {
+        const group = element(svg, "g", { class: `layer-${layer.id}`, style: `stroke: ${layer.color}` });
+        const path = { truth: run.truth, estimate: run.path }[layer.id];
+        if (path)
+          element(group, "path", { class: "line", "stroke-dasharray": layer.id === "truth" ? "5 3" : "none", d: pathOf(path.x, path.y, toX, toY) });
+        else
+          for (const loop of layer.id === "accepted" ? held : refused) {
+            const [a, b] = loop.ends;
+            element(group, "line", { x1: toX(a[0]), y1: toY(a[1]), x2: toX(b[0]), y2: toY(b[1]) });
+            element(group, "circle", { cx: toX(a[0]), cy: toY(a[1]), r: 1.5 });
+          }
+      }
+      const bar = [10, 5, 2, 1, 0.5, 0.2, 0.1].find((length) => length <= 0.25 * (x1 - x0)) || 0.1;
+      element(svg, "line", { x1: 8, x2: 8 + bar * scale, y1: height - 8, y2: height - 8, style: "stroke: var(--ink)", "stroke-width": 3 });
+      element(svg, "text", { x: 8, y: height - 14 }, `${bar} m`);
+      dot = element(svg, "circle", { class: "here", r: 5, visibility: "hidden", style: `fill: ${colorOf(index)}; stroke: white; stroke-width: 2` });
+    }
+
+    function place(seconds) {
+      dot.setAttribute("visibility", seconds === null ? "hidden" : "visible");
+      if (seconds === null) { readOut.textContent = ""; return; }
+      const i = nearest(run.path.t, seconds);
+      dot.setAttribute("cx", toX(run.path.x[i]));
+      dot.setAttribute("cy", toY(run.path.y[i]));
+      const error = run.error ? `, ${short(run.error.m[nearest(run.error.t, run.path.t[i])])} m from the truth` : "";
+      readOut.textContent = `${run.path.t[i]} s: x ${run.path.x[i]}, y ${run.path.y[i]}, z ${run.path.z[i]} m${error}`;
+    }
+
+    svg.addEventListener("pointermove", (event) => {
+      const box = svg.getBoundingClientRect();
+      const x = event.clientX - box.left, y = event.clientY - box.top;
+      let best = 0, least = Infinity;
+      run.path.x.forEach((_, i) => {
+        const miss = (toX(run.path.x[i]) - x) ** 2 + (toY(run.path.y[i]) - y) ** 2;
+        if (miss < least) { least = miss; best = i; }
+      });
+      follow(run.path.t[best]);
+    });
+    svg.addEventListener("pointerleave", () => follow(null));
+    redraws.push(draw);
+    followers.push(place);
+  }
+
+  // Loops: a table that sorts and filters ------------------------------------------------------------------
+
+  const COLUMNS = [
+    ["i", (loop) => loop.i], ["j", (loop) => loop.j], ["from, s", (loop) => loop.t[0]], ["to, s", (loop) => loop.t[1]],
+    ["proposed by", (loop) => loop.by], ["matches", (loop) => loop.matches], ["inliers", (loop) => loop.inliers],
+    ["RMSE, m", (loop) => loop.rmse_m], ["before, m", (loop) => loop.before_m], ["after, m", (loop) => loop.after_m],
+    ["weight", (loop) => loop.weight], ["verdict", (loop) => loop.verdict], ["reason", (loop) => loop.reason],
+  ];
+
+  function loopsTable(box) {
+    const loops = [...runs[Number(box.dataset.of)].loops];
+    if (!loops.length) return;
+    const controls = element(box, "div", { class: "controls" });
+    const select = element(controls, "select", { "aria-label": "verdict" });
+    for (const choice of ["all", "accepted", "rejected"]) element(select, "option", { value: choice }, choice);
+    const table = element(element(box, "div", { class: "scroll" }), "table", { class: "sortable" });
+    const head = element(element(table, "thead"), "tr"), body = element(table, "tbody");
+    let sorted = null, rising = true;
+    COLUMNS.forEach(([title, valueOf], column) => {
+      element(head, "th", {}, title).addEventListener("click", () => {
+        rising = sorted === column ? !rising : true;
+        sorted = column;
+        loops.sort((a, b) => {
+          const [p, q] = [valueOf(a), valueOf(b)];
+          if (p === null || q === null) return (p === null) - (q === null); // unknown last, either way
+          return (p < q ? -1 : p > q ? 1 : 0) * (rising ? 1 : -1);
+        });
+        fill();
+      });
+    });
+
+    function fill() {
+      body.replaceChildren();
+      for (const loop of loops.filter((one) => select.value === "all" || one.verdict === select.value)) {
+        const row = element(body, "tr", { class: loop.verdict });
+        for (const [, valueOf] of COLUMNS) {
+          const value = valueOf(loop), isNumber = typeof value !== "string";
+          element(row, "td", isNumber ? { class: "number" } : {}, isNumber ? short(value) : value);
+        }
+      }
+    }
+    select.addEventListener("change", fill);
+    fill();
+  }
+
+  // Which runs are shown, and which settings ---------------------------------------------------------------
+
+  for (const input of document.querySelectorAll("input[data-run]"))
+    input.addEventListener("change", () => {
+      shown[Number(input.dataset.run)] = input.checked;
+      for (const part of document.querySelectorAll(`[data-of="${input.dataset.run}"]`)) part.hidden = !input.checked;
+      redraw();
+    });
+
+  const search = document.getElementById("setting"), differing = document.getElementById("differing");
+  const sift = () => {
+    for (const row of document.querySelectorAll("table.settings tbody tr"))
+      row.hidden = !row.firstElementChild.textContent.includes(search.value.trim())
+        || (differing.checked && !row.classList.contains("differs"));
+  };
+  search.addEventListener("input", sift);
+  differing.addEventListener("change", sift);
+
+  document.querySelectorAll("figure.plan").forEach(plan);
+  document.querySelectorAll("figure.curve").forEach(curve);
+  document.querySelectorAll("div.loops").forEach(loopsTable);
+  sift();
+  redraw();
+  addEventListener("resize", redraw);
+})();

@@ -1,0 +1,205 @@
+"""The page: what can be said in words and tables is here; ``page.js`` draws the rest."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from importlib import resources
+from itertools import starmap
+from pathlib import Path
+from typing import Any
+
+from mapper import __version__
+from mapper.atomic import write_text
+from mapper.errors import ConfigError
+from mapper.export.report.data import Chapter, drawn, residual_unit, views_uri
+
+_CURVES = (
+    ("error", "Distance from the truth", "m"),
+    ("features", "Features of each frame", ""),
+    ("matches", "Matches of each frame", ""),
+    ("inliers", "Inliers of each frame", ""),
+    ("ms", "Time to track each frame", "ms"),
+)
+_POLICY = (
+    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
+    "base-uri 'none'; form-action 'none'"
+)
+
+
+def write_report(path: Path, chapters: Sequence[Chapter]) -> None:
+    """Write one page about some runs, whole or not at all; it loads nothing from anywhere.
+
+    Raises:
+        ConfigError: No runs, or two of one name.
+        MapperError: A file of a run cannot be read.
+    """
+    names = [chapter.name for chapter in chapters]
+    if not names or len(set(names)) < len(names):
+        raise ConfigError(
+            f"report: runs {', '.join(names) or 'none'}; want one or more, each of its own name"
+        )
+    write_text(path, page_of(chapters))
+
+
+def page_of(chapters: Sequence[Chapter]) -> str:
+    """Return the page's HTML."""
+    ours = resources.files("mapper.export.report")
+    title = " · ".join(chapter.name for chapter in chapters)
+    data = json.dumps([drawn(chapter) for chapter in chapters], allow_nan=False, separators=(",", ":"))
+    return "\n".join(
+        [
+            "<!DOCTYPE html>",
+            '<html lang="en">',
+            "<head>",
+            '<meta charset="utf-8">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            f'<meta http-equiv="Content-Security-Policy" content="{escape(_POLICY, quote=False)}">',
+            f"<title>{escape(title)} – mapper report</title>",
+            f"<style>\n{(ours / 'page.css').read_text(encoding='utf-8')}</style>",
+            "</head>",
+            "<body>",
+            _header(chapters),
+            "<main>",
+            _section("Summary", _table(["", *_names(chapters)], _figures(chapters))),
+            _section("Plans", _columns(starmap(_plan, enumerate(chapters)))),
+            _section("Over time", _curves(chapters)),
+            _section("Loops", "".join(starmap(_loops, enumerate(chapters)))),
+            _section("Views", _columns(starmap(_views, enumerate(chapters)))),
+            _section("Timing", _table(["", *_names(chapters)], _side_by_side(chapters, _timing))),
+            _section("Versions", _table(["", *_names(chapters)], _side_by_side(chapters, _versions))),
+            _section("Configuration", _settings(chapters)),
+            "</main>",
+            f"<footer>mapper {escape(__version__)}</footer>",
+            # Nothing inside a script element ends it but its end tag.
+            f'<script type="application/json" id="data">{data.replace("<", chr(92) + "u003c")}</script>',
+            f"<script>\n{(ours / 'page.js').read_text(encoding='utf-8')}</script>",
+            "</body>",
+            "</html>",
+            "",
+        ]
+    )
+
+
+def _header(chapters: Sequence[Chapter]) -> str:
+    boxes = "".join(
+        f'<label class="run run{i % 6}"><input type="checkbox" data-run="{i}" checked> {escape(chapter.name)}'
+        f" <small>{escape(chapter.run.manifest.input.title)}</small></label>"
+        for i, chapter in enumerate(chapters)
+    )
+    return f'<header><h1>mapper report</h1><div class="runs">{boxes}</div></header>'
+
+
+def _section(title: str, body: str) -> str:
+    return f'<section id="{title.lower().replace(" ", "-")}"><h2>{escape(title)}</h2>{body}</section>'
+
+
+def _columns(cells: Iterable[str]) -> str:
+    return f'<div class="columns">{"".join(cells)}</div>'
+
+
+def _table(head: Iterable[str], rows: Iterable[Sequence[str]], *, css: str = "beside") -> str:
+    """Return a table whose columns after the first belong to one run each."""
+    top = "".join(_cell("th", text, i) for i, text in enumerate(head))
+    body = "".join(f"<tr{_differs(row)}>{_cells(row)}</tr>" for row in rows)
+    table = f'<table class="{css}"><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>'
+    return f'<div class="scroll">{table}</div>'
+
+
+def _cells(row: Sequence[str]) -> str:
+    return "".join(_cell("td" if i else "th", text, i) for i, text in enumerate(row))
+
+
+def _cell(tag: str, text: str, column: int) -> str:
+    run = f' data-of="{column - 1}"' if column else ""
+    return f"<{tag}{run}>{escape(text)}</{tag}>"
+
+
+def _differs(row: Sequence[str]) -> str:
+    return ' class="differs"' if len(set(row[1:])) > 1 else ""
+
+
+def _names(chapters: Sequence[Chapter]) -> list[str]:
+    return [chapter.name for chapter in chapters]
+
+
+def _figures(chapters: Sequence[Chapter]) -> list[list[str]]:
+    return _side_by_side(chapters, lambda chapter: {figure.name: figure.value for figure in chapter.figures})
+
+
+def _side_by_side(chapters: Sequence[Chapter], of: Any) -> list[list[str]]:
+    """Return a row for everything that some run has a value of."""
+    columns: list[Mapping[str, str]] = [of(chapter) for chapter in chapters]
+    names = dict.fromkeys(name for column in columns for name in column)
+    return [[name, *(column.get(name, "–") for column in columns)] for name in names]
+
+
+def _timing(chapter: Chapter) -> dict[str, str]:
+    timing = chapter.run.manifest.timing
+    return {
+        "started": timing.started,
+        **{f"{stage}, s": f"{seconds:.2f}" for stage, seconds in timing.stage_s.items()},
+        "total, s": f"{timing.total_s:.2f}",
+        "log, s": f"{timing.log_s:.2f}",
+        "× real time": f"{timing.real_time_factor:.2f}",
+        "frames per second": f"{timing.frames_per_s:.1f}",
+        "peak memory, MB": f"{timing.peak_memory_mb:.0f}",
+    }
+
+
+def _versions(chapter: Chapter) -> dict[str, str]:
+    manifest = chapter.run.manifest
+    return {
+        "mapper": manifest.mapper_version,
+        "Python": manifest.python_version,
+        "platform": manifest.platform,
+        **manifest.libraries,
+    }
+
+
+def _settings(chapters: Sequence[Chapter]) -> str:
+    rows = sorted(
+        _side_by_side(chapters, lambda chapter: dict(_flat(chapter.run.config.model_dump(mode="json"))))
+    )
+    only = " checked" if any(_differs(row) for row in rows) else ""
+    return (
+        '<div class="controls"><input type="search" id="setting" placeholder="find a setting" '
+        'aria-label="find a setting"> <label><input type="checkbox" id="differing"'
+        f"{only}> only what differs</label></div>"
+        + _table(["", *_names(chapters)], rows, css="beside settings")
+    )
+
+
+def _flat(tree: Any, name: str = "") -> Iterable[tuple[str, str]]:
+    if isinstance(tree, dict) and tree:
+        for key, value in tree.items():
+            yield from _flat(value, f"{name}.{key}" if name else key)
+    else:
+        yield name, json.dumps(tree, ensure_ascii=False)
+
+
+def _plan(number: int, chapter: Chapter) -> str:
+    return f'<figure class="plan" data-of="{number}"><figcaption>{escape(chapter.name)}</figcaption></figure>'
+
+
+def _curves(chapters: Sequence[Chapter]) -> str:
+    """Return the places of the curves; residuals of different units are no one curve's."""
+    units = sorted({residual_unit(chapter.story) for chapter in chapters} - {""})
+    curves = [*_CURVES, *(("residual", "Residual of each frame", unit) for unit in units)]
+    return '<p class="hint">Drag to zoom in, double-click to see all again.</p>' + "".join(
+        f'<figure class="curve" data-curve="{key}" data-unit="{escape(unit)}">'
+        f"<figcaption>{title}</figcaption></figure>"
+        for key, title, unit in curves
+    )
+
+
+def _loops(number: int, chapter: Chapter) -> str:
+    loops = chapter.story.loops
+    held = sum(loop.verdict == "accepted" for loop in loops)
+    title = f"{escape(chapter.name)}: {held} of {len(loops)} candidates hold"
+    return f'<div class="loops" data-of="{number}"><h3>{title}</h3></div>'
+
+
+def _views(number: int, chapter: Chapter) -> str:
+    uri, name = views_uri(chapter.run), escape(chapter.name)
+    picture = f'<img src="{uri}" alt="{name} from above and from the side">' if uri else "<p>no picture</p>"
+    return f'<figure class="view" data-of="{number}"><figcaption>{name}</figcaption>{picture}</figure>'
