@@ -1,0 +1,264 @@
+import numpy as np
+import pytest
+
+from mapper.config.sources import SourceConfig
+from mapper.errors import FrameError, SourceError
+from mapper.geometry import exp
+from mapper.sources import open_source
+from mapper.timebase import NS_PER_S
+from mapper.trajectory import Trajectory, write_kitti, write_tum
+
+FIRST_NS = 1_544_676_777_123_456_789
+PERIOD_NS = 100_000_000
+SWEEP_S = np.linspace(0.0, 0.09, 40)
+POSES = np.array([exp(np.array([0.0, 0.0, 0.1 * i]), np.array([1.0 * i, 0.2, 0.0])) for i in range(12)])
+
+
+def points_of(i):
+    return np.random.default_rng(i).normal(0.0, 10.0, (40, 3)).astype(np.float32)
+
+
+def write_scan(path, i, *, times=None):
+    """Write scan ``i`` in the format of the path, with times where the format and the caller have some."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    points = points_of(i)
+    if path.suffix == ".bin":
+        np.column_stack([points, np.ones(len(points))]).astype(np.float32).tofile(path)
+    elif path.suffix == ".npy" and times is None:
+        np.save(path, points)
+    elif path.suffix == ".npy":
+        records = np.zeros(len(points), [("x", "f4"), ("y", "f4"), ("z", "f4"), ("timestamp", "f8")])
+        records["x"], records["y"], records["z"] = points.T
+        records["timestamp"] = times
+        np.save(path, records)
+    else:
+        np.savetxt(path, points, fmt="%.9g")
+
+
+def cloud_folder(folder, names):
+    for i, name in enumerate(names):
+        write_scan(folder / name, i)
+    return folder
+
+
+def stamps_of(source):
+    return [entry.stamp_ns for entry in source.entries()]
+
+
+def first_x(source):
+    """Which scans these are, by their first coordinate."""
+    return [entry.scan().points_body[0, 0] for entry in source.entries()]
+
+
+def assumed(rate):
+    return f"neither names nor a times.txt tell stamps; {rate} scans a second assumed (source.rate_hz)"
+
+
+@pytest.mark.parametrize("ending", [".bin", ".npy", ".xyz", ".txt", ".csv"])
+def test_a_folder_of_clouds_is_a_lidar_log(tmp_path, ending):
+    folder = cloud_folder(tmp_path / "yard", [f"{i}{ending}" for i in range(12)])
+    (folder / "README.txt").write_text("no cloud\n")
+    source = open_source(folder)
+    assert (source.kind, source.sensor, source.name, len(source)) == ("clouds", "lidar", "yard", 12)
+    assert source.truth is None
+    assert source.notes == [assumed(10)]
+    assert stamps_of(source) == [i * PERIOD_NS for i in range(12)]
+    assert first_x(source) == [points_of(i)[0, 0] for i in range(12)]  # 10 comes after 9
+    for _ in range(2):
+        scan = next(iter(source.entries())).load()
+        assert scan.stamp_ns == 0
+        assert scan.times_s is None
+        np.testing.assert_array_equal(scan.points_body, points_of(0))
+
+
+def test_nothing_is_read_before_it_is_asked_for(tmp_path):
+    folder = cloud_folder(tmp_path, ["0.npy", "1.npy", "2.npy"])
+    (folder / "1.npy").write_bytes(b"damaged")
+    entries = list(open_source(folder).entries())
+    assert len(entries[2].scan().points_body) == 40
+    with pytest.raises(FrameError, match=r"1\.npy: not a sound npy file"):
+        entries[1].scan()
+
+
+@pytest.mark.parametrize(
+    ("names", "step_ns"),
+    [
+        (["1544676777.123456789", "1544676777.223456789", "1544676777.323456789"], PERIOD_NS),
+        (["cloud_1544676777_123456789", "cloud_1544676777_223456789"], PERIOD_NS),
+        (["1544676777123456789", "1544676777223456789"], PERIOD_NS),
+        (["os1-1544676777123456", "os1-1544676777223456"], PERIOD_NS),
+        (["1544676777123", "1544676777223"], PERIOD_NS),
+        (["1544676777", "1544676778"], NS_PER_S),
+        (["99.9", "100.0", "100.05"], None),
+    ],
+)
+def test_names_that_are_stamps(tmp_path, names, step_ns):
+    source = open_source(cloud_folder(tmp_path, [f"{name}.npy" for name in names]))
+    assert source.notes == []
+    stamps_ns = stamps_of(source)
+    if step_ns is None:
+        assert stamps_ns == [99_900_000_000, 100_000_000_000, 100_050_000_000]
+    else:
+        assert np.diff(stamps_ns).tolist() == [step_ns] * (len(names) - 1)
+        assert 0 <= FIRST_NS - stamps_ns[0] < NS_PER_S
+
+
+def test_names_sort_by_time_even_where_text_would_not(tmp_path):
+    source = open_source(cloud_folder(tmp_path, ["5.25.npy", "5.5.npy", "5.125.npy"]))
+    assert stamps_of(source) == [5_125_000_000, 5_250_000_000, 5_500_000_000]
+    assert first_x(source) == [points_of(i)[0, 0] for i in (2, 0, 1)]
+
+
+@pytest.mark.parametrize("listed", ["times.txt", "stamps.txt", "timestamps.txt"])
+def test_a_list_of_stamps(tmp_path, listed):
+    folder = cloud_folder(tmp_path, ["a.npy", "b.npy", "c.npy"])
+    (folder / listed).write_text("1544676777.123456789\n1544676777223456789\n1.544676777323456789e9\n")
+    source = open_source(folder)
+    assert stamps_of(source) == [FIRST_NS + i * PERIOD_NS for i in range(3)]
+    assert source.notes == []
+
+
+def test_a_list_for_all_numbers_serves_some_of_the_scans(tmp_path):
+    folder = cloud_folder(tmp_path, ["000002.npy", "000005.npy"])
+    (folder / "times.txt").write_text("".join(f"{0.5 * i}\n" for i in range(9)))
+    assert stamps_of(open_source(folder)) == [1_000_000_000, 2_500_000_000]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("1\n2\n", "times.txt: 2 stamps for 3 scans; want a line for each"),
+        ("1\n2\n3\n4\n", "times.txt: 4 stamps for 3 scans"),
+        ("1\n2\nthree\n", "times.txt:3: stamp 'three' is not a decimal number of seconds"),
+        ("0 1\n1 2\n2 3\n", "times.txt:1: 2 columns, want 1: a stamp"),
+    ],
+)
+def test_a_list_that_does_not_fit_is_refused(tmp_path, text, says):
+    folder = cloud_folder(tmp_path, ["a.npy", "b.npy", "c.npy"])
+    (folder / "times.txt").write_text(text)
+    with pytest.raises(SourceError) as refusal:
+        open_source(folder)
+    assert says in str(refusal.value)
+
+
+def test_the_list_that_the_user_names_goes_before_names(tmp_path):
+    folder = cloud_folder(tmp_path / "log", ["10.5.npy", "11.5.npy"])
+    (tmp_path / "clock.txt").write_text("3\n4\n")
+    source = open_source(folder, SourceConfig(stamps_file="../clock.txt"))
+    assert stamps_of(source) == [3 * NS_PER_S, 4 * NS_PER_S]
+    with pytest.raises(
+        SourceError, match=r"clock.txt: no such file; source.stamps_file and truth_file start"
+    ):
+        open_source(folder, SourceConfig(stamps_file="clock.txt"))
+
+
+def test_the_rate_is_an_option_and_missing_numbers_keep_their_time(tmp_path):
+    folder = cloud_folder(tmp_path, ["scan_3.npy", "scan_4.npy", "scan_8.npy"])
+    source = open_source(folder, SourceConfig(rate_hz=20.0))
+    assert stamps_of(source) == [150_000_000, 200_000_000, 400_000_000]
+    assert source.notes == [assumed(20)]
+
+
+def test_names_without_numbers_are_counted(tmp_path):
+    assert stamps_of(open_source(cloud_folder(tmp_path, ["left.npy", "right.npy"]))) == [0, PERIOD_NS]
+
+
+def test_repeated_stamps_are_dropped_and_disorder_is_sorted(tmp_path):
+    folder = cloud_folder(tmp_path, ["a.npy", "b.npy", "c.npy", "d.npy"])
+    (folder / "times.txt").write_text("1\n3\n3\n2\n")
+    source = open_source(folder)
+    assert stamps_of(source) == [1 * NS_PER_S, 2 * NS_PER_S, 3 * NS_PER_S]
+    assert first_x(source) == [points_of(i)[0, 0] for i in (0, 3, 1)]
+    assert source.notes == [
+        "scans: out of time order in 1 places; sorted",
+        "scans: 1 stamps appear twice; the first was kept",
+    ]
+
+
+def test_the_commonest_ending_is_the_log_and_a_pattern_chooses_another(tmp_path):
+    folder = cloud_folder(tmp_path, ["os_1.npy", "os_2.npy", "os_3.npy", "velo_1.xyz", "velo_3.xyz"])
+    source = open_source(folder)
+    assert len(source) == 3
+    assert "2 .xyz files left out; source.pattern chooses others" in source.notes
+    source = open_source(folder, SourceConfig(pattern="velo_*"))
+    assert stamps_of(source) == [PERIOD_NS, 3 * PERIOD_NS]
+    assert source.notes == [assumed(10)]
+    with pytest.raises(SourceError, match=r"no cloud matches source.pattern=livox_\*"):
+        open_source(folder, SourceConfig(pattern="livox_*"))
+
+
+@pytest.mark.parametrize("at", ["", ".."])
+def test_tum_truth(tmp_path, at):
+    folder = cloud_folder(tmp_path / "log/scans", ["10.0.npy", "11.0.npy", "12.0.npy"])
+    truth = Trajectory(NS_PER_S * np.array([10, 11, 12]), POSES[:3])
+    write_tum(folder / at / "groundtruth.txt", truth)
+    source = open_source(tmp_path / "log")
+    assert source.name == "log"
+    np.testing.assert_array_equal(source.truth.stamps_ns, truth.stamps_ns)
+    np.testing.assert_allclose(source.truth.T_world_body, truth.T_world_body, atol=1e-12)
+
+
+def test_kitti_truth_has_a_line_a_scan_in_their_order(tmp_path):
+    folder = cloud_folder(tmp_path, ["c.npy", "a.npy", "b.npy"])
+    (folder / "times.txt").write_text("7\n8\n9\n")
+    write_kitti(folder / "poses.txt", Trajectory(np.arange(3), POSES[:3]))
+    truth = open_source(folder).truth
+    assert truth.stamps_ns.tolist() == [7 * NS_PER_S, 8 * NS_PER_S, 9 * NS_PER_S]
+    np.testing.assert_allclose(truth.T_world_body, POSES[:3], atol=1e-12)
+
+
+def test_poses_that_pair_with_no_scan_are_no_truth(tmp_path):
+    folder = cloud_folder(tmp_path, ["a.npy", "b.npy", "c.npy"])
+    write_kitti(folder / "poses.txt", Trajectory(np.arange(5), POSES[:5]))
+    source = open_source(folder)
+    assert source.truth is None
+    assert "poses.txt: 5 poses tell of 0 of 3 scans" in source.notes
+
+
+def test_point_times_count_from_the_stamp_of_the_scan(tmp_path):
+    for i in range(2):
+        begin_s = 1000.0 + i
+        write_scan(tmp_path / f"{begin_s}.npy", i, times=begin_s + SWEEP_S)
+    for entry in open_source(tmp_path).entries():
+        np.testing.assert_allclose(entry.load().times_s, SWEEP_S, atol=1e-6)
+
+
+def test_the_scale_is_an_option(tmp_path):
+    for i in range(2):
+        np.save(tmp_path / f"{i}.npy", 1000.0 * points_of(i))
+    with pytest.raises(FrameError, match="looks like millimetres"):
+        next(open_source(tmp_path).entries()).load()
+    scan = next(open_source(tmp_path, SourceConfig(cloud_scale=0.001)).entries()).scan()
+    np.testing.assert_allclose(scan.points_body, points_of(0), rtol=1e-5)
+
+
+def test_a_single_cloud_is_no_log(tmp_path):
+    write_scan(tmp_path / "one.npy", 0)
+    with pytest.raises(SourceError, match=r"one\.npy: one cloud is no log; .* mapper register SOURCE TARGET"):
+        open_source(tmp_path / "one.npy")
+    with pytest.raises(SourceError, match="not a log of a known format"):
+        open_source(tmp_path)
+
+
+def test_several_folders_of_clouds_are_named(tmp_path):
+    for name in ("ouster", "velodyne_left"):
+        cloud_folder(tmp_path / name, ["0.npy", "1.npy"])
+    with pytest.raises(SourceError, match="holds 2 folders of clouds; open one of ouster, velodyne_left"):
+        open_source(tmp_path)
+
+
+def test_an_unrelated_folder_is_told_what_was_looked_for(tmp_path):
+    (tmp_path / "notes.txt").write_text("milk\n")
+    (tmp_path / "0.bin").mkdir()
+    (tmp_path / "1.bin").mkdir()
+    with pytest.raises(SourceError) as refusal:
+        open_source(tmp_path)
+    for words in ("rgb.txt", "mbag", "7-Scenes", "velodyne/000000.bin", "two or more clouds, .bin .pcd .ply"):
+        assert words in str(refusal.value)
+
+
+def test_clouds_beside_images_do_not_hide_them(tiny_tum_log):
+    log = tiny_tum_log()
+    cloud_folder(log, ["0.npy", "1.npy"])
+    cloud_folder(log / "velodyne", ["0.bin", "1.bin"])
+    assert open_source(log).kind == "tum"
