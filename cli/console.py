@@ -58,7 +58,7 @@ class Bars(_Notes):
 
             def report(done: int, total: int) -> None:
                 rate = done / max(time.monotonic() - began, 1e-3)
-                bars.update(task, completed=done, total=total, rate=f"{rate:.0f}/s")
+                bars.update(task, completed=done, total=total, rate=_rate_text(rate))
 
             yield report
 
@@ -79,7 +79,11 @@ class Lines(_Notes):
             if now - said > _SECONDS_BETWEEN_LINES and done < total:
                 said = now
                 rate = done / (now - began)
-                self._show(f"{name}: {done}/{total}, {rate:.0f}/s, {(total - done) / rate:.0f} s left")
+                self._show(f"{name}: {done}/{total}, {_rate_text(rate)}, {(total - done) / rate:.0f} s left")
 
         yield report
         self._show(f"{name}: {reached[0]}/{reached[1]} in {time.monotonic() - began:.1f} s")
+
+
+def _rate_text(per_s: float) -> str:
+    return f"{per_s:.0f}/s" if per_s >= 10.0 else f"{per_s:.1f}/s"

@@ -148,6 +148,20 @@ def ate(matched: Matched) -> Statistics:
 def rpe(matched: Matched, *, delta: float = 1.0, unit: DeltaUnit = "frames") -> RelativeErrors:
     """Return the relative pose error over steps of a fixed length (Sturm et al. 2012, eq. 2–3).
 
+    Raises:
+        DataError: As ``step_errors``.
+    """
+    translation_m, rotation_rad = step_errors(matched, delta=delta, unit=unit)
+    return RelativeErrors(
+        translation_m=_statistics(translation_m),
+        rotation_rad=_statistics(rotation_rad),
+        pairs=len(translation_m),
+    )
+
+
+def step_errors(matched: Matched, *, delta: float, unit: DeltaUnit) -> tuple[Array, Array]:
+    """Return the relative pose errors over all steps of a fixed length, metres and radians, (N,) each.
+
     Every pose is compared with the one that lies nearest to ``delta`` ahead of it: in matched frames, in
     seconds, or in metres along the true path, so that every estimate is judged over the same pairs.
     Steps in metres or seconds that miss ``delta`` by more than a tenth are left out.
@@ -165,11 +179,7 @@ def rpe(matched: Matched, *, delta: float = 1.0, unit: DeltaUnit = "frames") -> 
     T_true = _relative(matched.T_truth_body[i], matched.T_truth_body[j])
     T_estimated = _relative(matched.T_map_body[i], matched.T_map_body[j])
     T_error = _relative(T_true, T_estimated)
-    return RelativeErrors(
-        translation_m=_statistics(_lengths(T_error[:, :3, 3])),
-        rotation_rad=_statistics(_angles_rad(T_error[:, :3, :3])),
-        pairs=len(i),
-    )
+    return _lengths(T_error[:, :3, 3]), _angles_rad(T_error[:, :3, :3])
 
 
 def start_end_offset(trajectory: Trajectory) -> Offset:

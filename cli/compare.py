@@ -1,0 +1,59 @@
+"""``mapper compare``: every method on one log, side by side."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cli.console import progress_for
+from cli.environment import prepare_libraries
+from cli.options import First, Last, Overrides, Quiet, Stride, assignments, merged, selection
+
+
+def compare(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Recorded log that mapper build can read.")],
+    method: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--method", help="Method to compare; may be given again. Omit for all that fit the log."
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder to create.")] = Path("compare"),
+    pairs: Annotated[
+        int | None, typer.Option(help="Pairs of frames to register; 0 for odometry alone.  [default: 30]")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Of the errors of the guesses.")] = None,
+    first: First = None,
+    last: Last = None,
+    stride: Stride = None,
+    set_: Overrides = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace OUT, once the new comparison is whole.")
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Run every method over the same frames, as odometry and on pairs with guesses that are off.
+
+    Example: mapper compare rgbd_dataset_freiburg1_xyz --method isvd --method gicp --out runs/compared
+    """
+    from evaluators.compare import compare as compare_methods
+    from evaluators.compare_files import write_comparison
+    from evaluators.compare_tables import tables_text
+    from mapper.config import overridden
+    from mapper.config.compare import CompareConfig
+    from mapper.sources import open_source
+    from mapper.staging import staged
+
+    prepare_libraries()
+    given = CompareConfig(methods=tuple(method or ()))
+    sugar = [*selection(first, last, stride, None), *assignments({"pairs": pairs, "seed": seed})]
+    config = overridden(given, merged(sugar, set_))
+    source = open_source(log, config.source)
+    progress = progress_for(quiet=quiet)
+    with staged(out, overwrite=overwrite) as folder:
+        comparison = compare_methods(source, config, progress=progress)
+        write_comparison(folder, comparison)
+        files = ", ".join(sorted(child.name for child in folder.iterdir()))
+    if not quiet:
+        print(tables_text(comparison))
+        print(f"files  {files}\nin     {out}")

@@ -1,0 +1,84 @@
+"""The methods that `mapper compare` knows, set up for a log's sensor."""
+
+from typing import Any, get_args
+
+from evaluators.methods import AnyRegistration, Method, odometry_method, registration_method
+from mapper.config.compare import CompareConfig
+from mapper.config.odometry import IsvdOdometryConfig, LocalMapConfig, PnpConfig
+from mapper.config.registration import VOXEL_M, RegistrationConfig
+from mapper.config.scan_odometry import KissOdometryConfig
+from mapper.config.sensors import Sensor
+from mapper.errors import ConfigError
+from mapper.sources.base import FrameSource
+
+_NEED_NO_GUESS = frozenset({"hough-ndt", "hough-gicp", "kiss-matcher"})
+
+
+def methods_for(source: FrameSource, config: CompareConfig) -> tuple[list[Method], list[str]]:
+    """Return the chosen methods that can use a log, and a sentence on those that cannot.
+
+    Raises:
+        ConfigError: No method of such a name, or none of them can use the log.
+    """
+    images, scans = _image_methods(config.rgbd.max_depth_m), _scan_methods(source.sensor)
+    names = [method.name for method in (*images, *scans)]
+    for name in config.methods:
+        if name not in names:
+            raise ConfigError(f"no method {name!r}; want one of {', '.join(names)}")
+    chosen = config.methods or names
+    blind = [m.name for m in images if m.name in chosen and source.sensor != "rgbd"]
+    methods = [m for m in (*images, *scans) if m.name in chosen and m.name not in blind]
+    notes = [f"{', '.join(blind)}: left out, for the log has no images"] if blind else []
+    if not methods:
+        raise ConfigError(f"{source.path}: {notes[0]}; choose others of {', '.join(m.name for m in scans)}")
+    return methods, notes
+
+
+def _image_methods(max_depth_m: float) -> list[Method]:
+    odometries = (
+        LocalMapConfig(max_depth_m=max_depth_m),
+        IsvdOdometryConfig(max_depth_m=max_depth_m),
+        PnpConfig(max_depth_m=max_depth_m),
+    )
+
+    def hybrid() -> AnyRegistration:
+        from mapper.registration.rgbd import HybridRgbd  # Open3D takes seconds to load
+
+        return HybridRgbd(max_depth_m=max_depth_m)
+
+    return [
+        *(odometry_method(member.kind, member.build, sees_images=True) for member in odometries),
+        registration_method("rgbd", hybrid, uses_guess=True, sees_images=True),
+    ]
+
+
+def _scan_methods(sensor: Sensor) -> list[Method]:
+    """Return every registration of scans, its lengths scaled to the scene by one voxel, and KISS-ICP."""
+    members: tuple[Any, ...] = get_args(get_args(RegistrationConfig)[0])
+    configs = [member(voxel_m=VOXEL_M[sensor]) for member in members]
+    registrations = [
+        registration_method(one.kind, one.build, uses_guess=one.kind not in _NEED_NO_GUESS) for one in configs
+    ]
+    kiss = kiss_icp(sensor)
+    return [
+        *sorted(registrations, key=lambda method: not method.uses_guess),
+        odometry_method(kiss.kind, kiss.build, sees_images=False),
+    ]
+
+
+def kiss_icp(sensor: Sensor) -> KissOdometryConfig:
+    """Return KISS-ICP as published: its answers are neither doubted nor rescued."""
+    published: dict[str, Any] = {"rescue": None, "usual_ratio": 0.0, "lost_ratio": 0.0, "deskew": False}
+    if sensor == "lidar":
+        return KissOdometryConfig(**published)
+    return KissOdometryConfig(
+        **published,
+        min_range_m=0.1,
+        max_range_m=10.0,
+        voxel_m=VOXEL_M["rgbd"],
+        map_voxel_m=0.1,
+        initial_threshold_m=0.2,
+        min_motion_m=0.01,
+        keyframe_distance_m=0.15,
+        max_pair_distance_m=0.15,
+    )

@@ -1,0 +1,75 @@
+"""What `mapper compare` compares, and how."""
+
+from typing import Annotated
+
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+
+from mapper.config.base import Config
+from mapper.config.sources import SourceConfig
+
+
+class GuessConfig(Config):
+    """How far from the truth a registration begins, at most."""
+
+    offset_m: NonNegativeFloat
+    turn_deg: Annotated[float, Field(ge=0.0, le=180.0)]
+
+    @property
+    def text(self) -> str:
+        """As in "0.2 m, 10°"."""
+        return f"{self.offset_m:g} m, {self.turn_deg:g}°"
+
+
+class TrialsConfig(Config):
+    """Which pairs of frames are registered, from which guesses, and what counts as right."""
+
+    frames_apart: Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
+    """Each distance gets as many pairs as the others."""
+    guesses: Annotated[tuple[GuessConfig, ...], Field(min_length=1)]
+    max_error_m: PositiveFloat
+    max_error_deg: PositiveFloat
+    """A registration farther off than either is wrong."""
+
+
+class RgbdCompareConfig(TrialsConfig):
+    """How RGB-D logs are compared on, whose scenes are a few metres wide."""
+
+    max_depth_m: PositiveFloat = 4.0
+    """Deeper measurements are no part of a scan."""
+    stride_px: PositiveInt = 2
+    """Every n-th row and column of the depth image becomes a point of the scan."""
+    frames_apart: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (1, 5, 15)
+    guesses: Annotated[tuple[GuessConfig, ...], Field(min_length=1)] = (
+        GuessConfig(offset_m=0.05, turn_deg=3.0),
+        GuessConfig(offset_m=0.2, turn_deg=10.0),
+        GuessConfig(offset_m=0.5, turn_deg=20.0),
+    )
+    max_error_m: PositiveFloat = 0.05
+    max_error_deg: PositiveFloat = 2.0
+
+
+class LidarCompareConfig(TrialsConfig):
+    """How LiDAR logs are compared on, whose scenes are a street wide; guesses are off in the plane only."""
+
+    frames_apart: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (1, 5, 10)
+    guesses: Annotated[tuple[GuessConfig, ...], Field(min_length=1)] = (
+        GuessConfig(offset_m=0.5, turn_deg=5.0),
+        GuessConfig(offset_m=2.0, turn_deg=20.0),
+        GuessConfig(offset_m=10.0, turn_deg=180.0),
+    )
+    max_error_m: PositiveFloat = 0.3
+    max_error_deg: PositiveFloat = 1.0
+
+
+class CompareConfig(Config):
+    """Everything ``mapper compare`` can be told."""
+
+    source: SourceConfig = SourceConfig()
+    methods: tuple[str, ...] = ()
+    """Which to compare; none names all that can use the log."""
+    pairs: NonNegativeInt = 30
+    """Pairs of frames to register, spread evenly over the log."""
+    seed: NonNegativeInt = 0
+    """Of the errors of the guesses."""
+    rgbd: RgbdCompareConfig = RgbdCompareConfig()
+    lidar: LidarCompareConfig = LidarCompareConfig()

@@ -1,0 +1,104 @@
+"""Open3D's hybrid photometric and geometric odometry between two RGB-D images (Park, Zhou & Koltun 2017)."""
+
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+import open3d
+from numpy.typing import NDArray
+
+from mapper.frames import NO_DISTORTION, PinholeCamera, RgbdFrame
+from mapper.geometry import Transform, inverse, nearest_rotation, transform
+from mapper.registration.base import Alignment, failed
+
+_O3D: Any = open3d  # its stubs know no buffers
+_DECIMALS = 10  # Open3D adds up in threads of its own, in any order: the last digits are never the same
+
+
+class HybridRgbd:
+    """Registers RGB-D frames by their grey values and depths, from a guess.
+
+    Open3D's own iterations and thresholds are kept. It knows no lens, so images are undistorted first.
+    """
+
+    def __init__(self, *, max_depth_m: float = 4.0) -> None:
+        """Start.
+
+        Args:
+            max_depth_m: Drop deeper measurements.
+        """
+        self._option = _O3D.pipelines.odometry.OdometryOption(depth_max=max_depth_m)
+
+    def prepare(self, target: RgbdFrame) -> "HybridRgbdAligner":
+        """Return the method bound to a target."""
+        return HybridRgbdAligner(target, self._option)
+
+
+class HybridRgbdAligner:
+    """The method bound to one target; see :class:`mapper.registration.base.Aligner`."""
+
+    def __init__(self, target: RgbdFrame, option: Any) -> None:
+        self._target = _image(target)
+        self._option = option
+        self._jacobian = _O3D.pipelines.odometry.RGBDOdometryJacobianFromHybridTerm()
+
+    def align(self, source: RgbdFrame, T_target_source: Transform) -> Alignment:
+        """Return the motion refined from a guess, between frames of one camera.
+
+        Open3D tells neither residual nor share of inliers, only how many pixels it paired: the residual is
+        NaN, and the ratio is that of all pixels with depth.
+        """
+        camera, T_body_camera = source.camera, source.T_body_camera
+        intrinsics = _O3D.camera.PinholeCameraIntrinsic(
+            camera.width_px, camera.height_px, camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px
+        )
+        found, T_found, information = _O3D.pipelines.odometry.compute_rgbd_odometry(
+            _image(source),
+            self._target,
+            intrinsics,
+            inverse(T_body_camera) @ T_target_source @ T_body_camera,
+            self._jacobian,
+            self._option,
+        )
+        pairs = round(float(information[5, 5]))  # Σ GᵀG, where G ends in the identity
+        if not found or not np.isfinite(T_found).all():
+            return failed(f"Open3D could not solve for the motion between {pairs} pixels")
+        T_found = np.round(T_found, _DECIMALS)
+        T_camera = transform(nearest_rotation(T_found[:3, :3]), T_found[:3, 3])
+        return Alignment(
+            T_body_camera @ T_camera @ inverse(T_body_camera),
+            converged=True,
+            inlier_ratio=pairs / max(int(np.count_nonzero(source.depth_m)), pairs, 1),
+            inlier_rmse_m=float("nan"),
+            pairs=pairs,
+        )
+
+
+def _image(frame: RgbdFrame) -> Any:
+    gray, depth_m = frame.gray, frame.depth_m
+    if frame.camera.distortion != NO_DISTORTION:
+        columns, rows = _undistorting_map(frame.camera)
+        gray = cv2.remap(gray, columns, rows, cv2.INTER_LINEAR)
+        depth_m = cv2.remap(depth_m, columns, rows, cv2.INTER_NEAREST)  # depths on both sides of an edge
+    return _O3D.geometry.RGBDImage.create_from_color_and_depth(
+        _O3D.geometry.Image(np.ascontiguousarray(gray)),
+        _O3D.geometry.Image(np.ascontiguousarray(depth_m)),
+        depth_scale=1.0,
+        depth_trunc=np.inf,
+        convert_rgb_to_intensity=True,
+    )
+
+
+@lru_cache(maxsize=8)
+def _undistorting_map(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return where in the raw image every pixel of the undistorted one is, columns and rows."""
+    columns, rows = cv2.initUndistortRectifyMap(
+        camera.matrix,
+        np.array(camera.distortion),
+        None,
+        camera.matrix,
+        (camera.width_px, camera.height_px),
+        cv2.CV_32FC1,
+    )
+    return columns, rows
