@@ -130,7 +130,7 @@ def test_malformed_poses_are_refused(tmp_path):
 
 @pytest.mark.parametrize("name", ["kitti_00", "mulran_kaist03"])
 def test_truth_of_real_logs_lays_scans_onto_each_other(name):
-    """Wrong axes or a wrong calibration would bring fewer points onto the first scan than no motion at all."""
+    """Wrong axes or a wrong calibration would bring fewer points onto the first scan than none at all."""
     if not (DATA / name).is_dir():
         pytest.skip(f"{DATA / name} is missing")
     source = open_source(DATA / name)

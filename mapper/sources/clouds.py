@@ -57,7 +57,7 @@ def read_scan(path: Path, *, scale: float | None = None) -> Scan:
         scale: Metres per unit of the file; None is 1, and refuses what looks like millimetres.
 
     Raises:
-        FrameError: The file is missing, damaged, empty or not in metres (folder, path) the sensor.
+        FrameError: The file is missing, damaged, empty or not in metres around the sensor.
     """
     return ScanEntry(0, path, scale).load()
 

@@ -42,13 +42,12 @@ def open_log(path: Path, config: SourceConfig) -> ScanLog:
     if not files:
         raise SourceError(f"{sequence}: no scan matches source.pattern={config.pattern}")
     at = sequence.resolve()
-    benchmark = at.parent.parent / "poses" / f"{at.name}.txt"
     return scan_log(
         sequence,
         files,
         kind="kitti",
         stamps_file=first_of([sequence], STAMP_FILES),
-        truth_file=first_of([sequence], ["poses.txt"]) or (benchmark if benchmark.is_file() else None),
+        truth_file=first_of([sequence, at.parent.parent / "poses"], ["poses.txt", f"{at.name}.txt"]),
         config=config,
         T_posed_lidar=_read_calibration(sequence / "calib.txt"),
         notes=notes,

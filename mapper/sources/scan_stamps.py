@@ -24,7 +24,7 @@ _UNITS_PER_S = (1, 1_000, 1_000_000, NS_PER_S)
 
 def in_order(paths: Iterable[Path]) -> list[Path]:
     """Return clouds by the stamps in their names, or else by the names, whose numbers count as numbers."""
-    by_name = sorted(paths, key=lambda path: [int(s) if s.isdecimal() else s for s in _split(path.name)])
+    by_name = sorted(paths, key=lambda path: (_natural(path.name), path.name))
     stamps_ns = _stamps_in(by_name)
     if stamps_ns is None:
         return by_name
@@ -113,5 +113,5 @@ def _epoch_ns(text: str) -> int | None:
     return next((value * (NS_PER_S // unit) for unit in units), None)
 
 
-def _split(name: str) -> list[str]:
-    return re.split(r"(\d+)", name)
+def _natural(name: str) -> list[str | int]:
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
