@@ -100,10 +100,33 @@ def refine(
         max_pair_distance_m: Points without a partner this near take no part.
         max_iterations: At most so many.
     """
+    found = refined_motion(
+        target,
+        source,
+        T_target_source,
+        kind=kind,
+        max_pair_distance_m=max_pair_distance_m,
+        max_iterations=max_iterations,
+    )
+    if isinstance(found, str):
+        return failed(found)
+    return measured(target, source, found, max_pair_distance_m=max_pair_distance_m)
+
+
+def refined_motion(
+    target: Prepared,
+    source: Prepared,
+    T_target_source: Transform,
+    *,
+    kind: Refiner,
+    max_pair_distance_m: float,
+    max_iterations: int = 40,
+) -> Transform | str:
+    """Return what ``refine`` does but not what it is worth, or why there is none."""
     import small_gicp
 
     if min(len(target.points), len(source.points)) < _MIN_PAIRS:
-        return failed(
+        return (
             f"{len(target.points)} and {len(source.points)} points after downsampling, "
             f"fewer than {_MIN_PAIRS}"
         )
@@ -129,9 +152,7 @@ def refine(
             translation_epsilon=_STEP_VOXELS * source.voxel_m,
         )
         T_refined = np.asarray(result.T_target_source)
-    if not is_rigid(T_refined):
-        return failed(f"{kind} diverged")
-    return measured(target, source, T_refined, max_pair_distance_m=max_pair_distance_m)
+    return T_refined if is_rigid(T_refined) else f"{kind} diverged"
 
 
 def measured(
