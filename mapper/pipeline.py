@@ -45,8 +45,11 @@ from mapper.timebase import NS_PER_S
 from mapper.tracked import Tracked, save_tracked, tracked_before, tracked_now
 from mapper.tracking import refuse_a_fragment, track_log
 from mapper.trajectory import Trajectory
+from mapper.watching import NOBODY, Watcher
 
-_FUSE_CONFIGS = frozenset({"octree", "slice", "traversable", "cloud", "mcap", "mesh", "costmap", "workers"})
+_FUSE_CONFIGS = frozenset(
+    {"octree", "slice", "traversable", "cloud", "mcap", "mesh", "costmap", "rerun", "workers"}
+)
 _TRACKING_STAGES = ("track", "solve", "level")
 _REMADE_BY_FUSE = frozenset(
     {
@@ -79,6 +82,7 @@ def build(
     out: Path,
     *,
     progress: Progress = SILENT,
+    watcher: Watcher = NOBODY,
     overwrite: bool = False,
 ) -> Run:
     """Track every frame, solve the graph once, level the world, then fuse every frame at its final pose.
@@ -87,7 +91,8 @@ def build(
         source: The log.
         config: Every knob.
         out: Run folder to create; until it is whole it is called ``OUT.partial``.
-        progress: Who watches.
+        progress: Who waits.
+        watcher: Who looks on.
         overwrite: Replace a run that is there, once the new one is whole.
 
     Raises:
@@ -96,7 +101,8 @@ def build(
     """
     with drafting(out, first_manifest(source), config, overwrite=overwrite) as draft:
         with draft.clock.stage("track"):
-            tracking = largest_part(track_log(source, config, progress=progress), progress=progress)
+            tracking = track_log(source, config, progress=progress, watcher=watcher)
+            tracking = largest_part(tracking, progress=progress)
         save_tracked(draft, tracked_now(tracking, source.truth))
         refuse_a_fragment(tracking, config)
         with draft.clock.stage("solve"):
@@ -105,13 +111,14 @@ def build(
         tracking = largest_part(tracking, progress=progress)
         with draft.clock.stage("level"):
             level = _level(source, tracking.trajectory(), config)
+        watcher.levelled(level.T_level_world)
         tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
         save_tracked(draft, tracked_now(tracking, source.truth))
         draft.update(
             solve=solved.report,
             levelling=Levelling(method=level.method, detail=level.detail),
         )
-        fuse_into(draft, source, config, progress)
+        fuse_into(draft, source, config, progress, watcher=watcher)
     return load_run(out)
 
 
@@ -239,6 +246,7 @@ def fuse_into(
     progress: Progress,
     *,
     before: Path | None = None,
+    watcher: Watcher = NOBODY,
 ) -> None:
     """Fuse a draft's trajectory and write everything that is made from the maps."""
     story = story_of(Run(draft.folder, config, draft.manifest))
@@ -265,6 +273,7 @@ def fuse_into(
             log_maps(log, maps, stamp_ns=int(trajectory.stamps_ns[0]))
             _write_maps(draft.folder, maps)
             _write_pictures(draft, maps, story)
+    watcher.mapped(story, maps)
     counts = draft.manifest.counts.model_copy(
         update={"leaves": len(maps.octree), "cloud_points": len(maps.cloud_points_world)}
     )

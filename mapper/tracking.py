@@ -16,6 +16,7 @@ from mapper.parallel import ordered_map
 from mapper.progress import Progress
 from mapper.sources.base import Entry, FrameSource, Skipped
 from mapper.trajectory import Trajectory, trajectory_from
+from mapper.watching import NOBODY, Step, Watcher
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +74,12 @@ def from_nothing(config: BuildConfig) -> Start:
 
 
 def track_log(
-    source: FrameSource, config: BuildConfig, *, progress: Progress, start: Start | None = None
+    source: FrameSource,
+    config: BuildConfig,
+    *,
+    progress: Progress,
+    start: Start | None = None,
+    watcher: Watcher = NOBODY,
 ) -> Tracking:
     """Track every frame of a log, in time order; reading and detecting run ahead in threads.
 
@@ -87,17 +93,17 @@ def track_log(
     skipped: list[Skipped] = []
     frame_ms: dict[int, float] = {}
 
-    def observe(entry: Entry) -> tuple[Any, float]:
+    def observe(entry: Entry) -> tuple[Entry, Any, float]:
         began = time.perf_counter()
         try:
             observation = odometry.observe(entry.load(colour=False))
         except FrameError as error:
             observation = Skipped(entry.stamp_ns, str(error))
-        return observation, time.perf_counter() - began
+        return entry, observation, time.perf_counter() - began
 
     observations = ordered_map(observe, source.entries(), workers=config.workers)
     with progress.stage("track") as report:
-        for done, (observation, observed_s) in enumerate(observations, start=1):
+        for done, (entry, observation, observed_s) in enumerate(observations, start=1):
             report(done, len(source))
             if isinstance(observation, Skipped):
                 skipped.append(observation)
@@ -105,12 +111,14 @@ def track_log(
                 continue
             began = time.perf_counter()
             track = odometry.track(observation)
+            view = partial(odometry.view, observation, track.twist)
             if track.is_keyframe and track.node is not None:
                 graph.add_node(track.node, track.stamp_ns, track.T_world_body)
-                closer.add(track.node, track, partial(odometry.view, observation, track.twist))
+                closer.add(track.node, track, view)
             frame_ms[track.stamp_ns] = 1e3 * (observed_s + time.perf_counter() - began)
             graph.add_factors(track.factors)
             tracks.append(track)
+            watcher.stepped(Step(entry, track, view, closer))
     graph.add_factors(odometry.finish())
     loops = (*start.loops, *closer.closures())
     graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")

@@ -35,6 +35,17 @@ class McapConfig(Config):
     """Log the milliseconds of every frame; without them two builds of a log give the same bytes."""
 
 
+class RerunConfig(Config):
+    """What a viewer is shown while a map is built."""
+
+    image_stride: PositiveInt = 3
+    """Every n-th frame is shown with its image and cloud, which costs reading it again."""
+    image_width_px: PositiveInt = 480
+    """Wider images are shrunk."""
+    cloud_points: PositiveInt = 20_000
+    """A frame's cloud is thinned to about so many points."""
+
+
 class CloudConfig(Config):
     """The coloured cloud."""
 
@@ -57,6 +68,7 @@ class BuildConfig(Config):
     traversable: TraversableConfig = TraversableConfig()
     cloud: CloudConfig = CloudConfig()
     mcap: McapConfig = McapConfig()
+    rerun: RerunConfig = RerunConfig()
     mesh: MeshConfig = MeshConfig()
     costmap: CostmapConfig = CostmapConfig()
     min_tracked_frames: PositiveInt = 10

@@ -4,6 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mapper.deskew import Twist
 from mapper.features.scan_view import ScanView
 from mapper.features.view import View
@@ -49,7 +52,9 @@ class Track:
         diagnostics: How it went.
         links: Where the new node lies from earlier ones, as far as is known now; ``factors`` may come later
             and better, but until then this is what ties the node to the path.
+        agreeing: (N,) which of the view's features agree with the pose; None where that is not told.
         twist: How the body is taken to have moved while a scan was swept; None where nothing was deskewed.
+        awaits_twist: The first scan of a map: how the body moved while it was swept, the next track tells.
     """
 
     stamp_ns: int
@@ -60,7 +65,9 @@ class Track:
     diagnostics: Diagnostics
     factors: Sequence[BetweenFactor] = field(default_factory=tuple)
     links: Sequence[BetweenFactor] = field(default_factory=tuple)
+    agreeing: NDArray[np.bool_] | None = None
     twist: Twist | None = None
+    awaits_twist: bool = False
 
 
 Observation = TypeVar("Observation")

@@ -201,6 +201,7 @@ class KeyframeOdometry:
             is_keyframe=is_keyframe,
             diagnostics=diagnostics,
             links=links,
+            agreeing=placement.landmark_of_feature >= 0,
         )
 
     def _lost(self, observation: Observation) -> Track:
