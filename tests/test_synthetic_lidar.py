@@ -160,7 +160,9 @@ def test_the_sensor_tilts_and_looks_around_as_far_as_told():
     assert 0.75 < max(apart) < 1.0
 
 
-@pytest.mark.parametrize(("scene", "loop_m"), [("street", 40.0), ("street", 300.0), ("courtyard", 60.0)])
+@pytest.mark.parametrize(
+    ("scene", "loop_m"), [("street", 40.0), ("street", 80.0), ("street", 300.0), ("courtyard", 60.0)]
+)
 @pytest.mark.parametrize("seed", range(3))
 def test_the_way_is_as_long_as_told_closes_and_is_free(scene, loop_m, seed):
     source = SyntheticLidarSource(exact(STREET, scene=scene, loop_m=loop_m, seed=seed))
@@ -173,8 +175,7 @@ def test_the_way_is_as_long_as_told_closes_and_is_free(scene, loop_m, seed):
     assert passing.min() < 0.5
     height_m = T_world_body[:, 2, 3] - source.scene.ground.height_m(T_world_body[:, :2, 3])
     np.testing.assert_allclose(height_m, 1.7)
-    for index in np.linspace(0, len(source) - 1, 5).astype(int):
-        assert np.linalg.norm(source.observe(index).points_body, axis=1).min() > 0.8
+    assert source.scene.solids.hulls.signed_distance_m(source.truth.positions_world).min() > 0.5
 
 
 def test_a_sweep_wants_a_pose_for_every_column():
@@ -193,7 +194,7 @@ def test_a_dense_map_is_exact_even_and_where_it_was_asked_for():
     assert len(np.unique(np.floor(points / 0.3), axis=0)) > 0.99 * len(points)
     far = T_world_map.copy()
     far[0, 3] += 1000.0
-    with pytest.raises(DataError, match="nowhere within 15"):
+    with pytest.raises(DataError, match="no part of the route is within 15"):
         sample_map(source.scene, far, radius_m=15.0)
 
 

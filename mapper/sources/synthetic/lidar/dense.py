@@ -36,7 +36,9 @@ def sample_map(
     stations = route.points(along_m)
     near = np.linalg.norm(stations - T_world_map[:2, 3], axis=1) <= radius_m
     if not near.any():
-        raise DataError(f"map: the route passes {T_world_map[:2, 3]} m nowhere within {radius_m} m")
+        raise DataError(
+            f"map: no part of the route is within {radius_m} m of {T_world_map[:2, 3]} m; move it nearer"
+        )
     heights_m = scene.ground.height_m(stations) + _MAPPER_HEIGHT_M
     T_map_world, rng = inverse(T_world_map), np.random.default_rng(0)
     points_map = np.empty((0, 3))

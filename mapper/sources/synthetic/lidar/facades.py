@@ -11,13 +11,26 @@ _NARROWEST_M, _WIDEST_M = 7.0, 17.0
 _GAP_CHANCE = 0.18
 
 
-def row(site: Site, start: Place, length_m: float, *, depth_m: float, rng: np.random.Generator) -> None:
-    """Build houses side by side along x of a place, facing −y; gaps are alleys and side streets."""
+def row(
+    site: Site, start: Place, length_m: float, *, depth_m: float, behind_m: float, rng: np.random.Generator
+) -> None:
+    """Build houses side by side, with alleys and side streets between some.
+
+    Args:
+        site: The world.
+        start: Their first corner; x runs along the row, and the houses face −y.
+        length_m: Length of the row; under 7 m nothing fits.
+        depth_m: Depth of the houses.
+        behind_m: How far behind the houses a gap ends at another house; 0 leaves it open.
+        rng: Source of the row.
+    """
     at_m = 0.0
     while length_m - at_m >= _NARROWEST_M:
         if at_m > 0.0 and rng.random() < _GAP_CHANCE:
             gap_m = float(rng.uniform(2.5, 8.0))
-            _close(site, start, (at_m, min(at_m + gap_m, length_m)), depth_m=depth_m, rng=rng)
+            if behind_m > 0.0:
+                x, y = start.world(at_m + gap_m / 2.0, depth_m + float(rng.uniform(0.1, 1.0)) * behind_m)
+                _close(site, Place(x, y, start.yaw_rad), gap_m + 6.0, rng=rng)
             at_m += gap_m
             continue
         width_m = float(min(rng.uniform(_NARROWEST_M, _WIDEST_M), length_m - at_m))
@@ -28,15 +41,11 @@ def row(site: Site, start: Place, length_m: float, *, depth_m: float, rng: np.ra
         at_m += width_m
 
 
-def _close(
-    site: Site, start: Place, span_m: tuple[float, float], *, depth_m: float, rng: np.random.Generator
-) -> None:
-    """Build the house that is seen at the far end of a gap."""
-    behind_m, wide_m = depth_m + float(rng.uniform(3.0, 20.0)), span_m[1] - span_m[0] + 6.0
-    x, y = start.world((span_m[0] + span_m[1]) / 2.0, behind_m)
+def _close(site: Site, place: Place, width_m: float, *, rng: np.random.Generator) -> None:
+    """Build the house that is seen through a gap, its middle at a place."""
     height_m = float(rng.uniform(4.0, 12.0))
-    center = (0.0, 2.0, (height_m - _FOOT_M) / 2.0)
-    site.add("house", Place(x, y, start.yaw_rad), center=center, size=(wide_m, 4.0, height_m + _FOOT_M))
+    center, size = (0.0, 2.0, (height_m - _FOOT_M) / 2.0), (width_m, 4.0, height_m + _FOOT_M)
+    site.add("house", place, center=center, size=size)
 
 
 def house(site: Site, place: Place, width_m: float, *, depth_m: float, rng: np.random.Generator) -> None:

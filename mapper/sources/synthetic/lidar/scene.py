@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from itertools import compress
 
 import numpy as np
 
@@ -18,8 +19,8 @@ from mapper.sources.synthetic.streams import Stream, rng_of
 
 _FACADE_M = 8.0
 """From the middle of the road to the houses."""
-_SMALLEST_BLOCK_M = 10.0
-_CLEARANCE_M = 1.5
+_HOUSE_M, _SMALLEST_BLOCK_M = 11.0, 10.0
+_CLEARANCE_M, _YARD_CLEARANCE_M = 1.5, 2.0
 _YARD_MARGIN_M = 5.0
 _TRIES = 40
 
@@ -32,7 +33,7 @@ class OutdoorScene:
         solids: Everything that stands on the ground.
         ground: The ground.
         route: The free way round.
-        world: Both for the ray caster.
+        world: Solids and ground, for the ray caster.
     """
 
     solids: Solids
@@ -61,15 +62,25 @@ def _street(site: Site, route: Route, rng: np.random.Generator) -> None:
     """Houses on both sides of a rectangle of streets, and what stands before them."""
     width, depth = route.size_m
     for side in _sides(width + 2 * _FACADE_M, depth + 2 * _FACADE_M):
-        row(site, side.outwards(), side.length_m, depth_m=12.0, rng=rng.spawn(1)[0])
+        house_rng = rng.spawn(1)[0]
+        row(site, side.outwards(), side.length_m, depth_m=_HOUSE_M, behind_m=20.0, rng=house_rng)
     block = (width - 2 * _FACADE_M, depth - 2 * _FACADE_M)
     if min(block) >= _SMALLEST_BLOCK_M:
-        for side in _sides(*block):
-            row(site, side.start, side.length_m, depth_m=min(block) / 2.2, rng=rng.spawn(1)[0])
+        _block(site, block, rng)
     free = _free_points(route)
     for side in _sides(width, depth):
         for line in (side.start, side.outwards()):
             _kerb(site, line, side.length_m, free=free, rng=rng.spawn(1)[0])
+
+
+def _block(site: Site, size_m: tuple[float, float], rng: np.random.Generator) -> None:
+    """Houses around a yard: the short rows lie between the gables of the long ones."""
+    deep_m = min(_HOUSE_M, min(size_m) / 2.2)
+    for number, side in enumerate(_sides(*size_m)):
+        inset_m = deep_m if number % 2 else 0.0
+        start = Place(*side.start.world(inset_m, 0.0), side.start.yaw_rad)
+        length_m = side.length_m - 2 * inset_m
+        row(site, start, length_m, depth_m=deep_m, behind_m=0.0, rng=rng.spawn(1)[0])
 
 
 def _courtyard(site: Site, route: Route, rng: np.random.Generator) -> None:
@@ -84,13 +95,13 @@ def _courtyard(site: Site, route: Route, rng: np.random.Generator) -> None:
     counts = (things.tree, 4, 7), (things.bench, 2, 4), (things.bicycle, 2, 5), (things.bin_, 0, 2)
     for build, fewest, most in counts:
         for _ in range(int(rng.integers(fewest, most + 1))):
-            for _ in range(_TRIES):
-                spot = rng.uniform(-0.5, 0.5, 2) * (width - 2.0, depth - 2.0)
-                if _distance_m(spot, free) > _CLEARANCE_M + 0.5 and _distance_m(spot, taken) > 2.5:
-                    taken = np.vstack([taken, spot])
-                    place = Place(float(spot[0]), float(spot[1]), float(rng.uniform(-np.pi, np.pi)))
-                    build(site, place, rng)
-                    break
+            spots = rng.uniform(-0.5, 0.5, (_TRIES, 2)) * (width - 2.0, depth - 2.0)
+            fits = (_distance_m(s, free) > _YARD_CLEARANCE_M and _distance_m(s, taken) > 2.5 for s in spots)
+            spot = next(compress(spots, fits), None)
+            if spot is not None:
+                taken = np.vstack([taken, spot])
+                place = Place(float(spot[0]), float(spot[1]), float(rng.uniform(-np.pi, np.pi)))
+                build(site, place, rng)
 
 
 def _kerb(site: Site, line: Place, length_m: float, *, free: Array, rng: np.random.Generator) -> None:
@@ -99,10 +110,10 @@ def _kerb(site: Site, line: Place, length_m: float, *, free: Array, rng: np.rand
     at_m = float(rng.uniform(0.0, 4.0))
     while at_m < length_m:
         kind = things.KINDS[int(rng.choice(len(things.KINDS), p=shares / shares.sum()))]
-        x, y = line.world(at_m + kind.along_m / 2.0, float(rng.uniform(*kind.offset_m)))
-        turn_rad = float(rng.normal(0.0, 0.02))
-        if _distance_m(np.array([x, y]), free) > _CLEARANCE_M + kind.across_m:
-            kind.build(site, Place(x, y, line.yaw_rad + turn_rad), rng)
+        offset_m, turn_rad = float(rng.uniform(*kind.offset_m)), float(rng.normal(0.0, 0.02))
+        spots = [line.world(at_m + share * kind.along_m, offset_m) for share in (0.0, 0.5, 1.0)]
+        if min(_distance_m(np.array(spot), free) for spot in spots) > _CLEARANCE_M + kind.across_m:
+            kind.build(site, Place(*spots[1], line.yaw_rad + turn_rad), rng)
         at_m += kind.along_m + float(rng.exponential(2.5))
 
 
