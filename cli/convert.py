@@ -8,37 +8,42 @@ import typer
 
 from cli.console import progress_for
 from cli.environment import prepare_libraries
-from cli.options import First, Last, Quiet, RequireTruth, Stride, selection
+from cli.options import First, Last, Overrides, Quiet, RequireTruth, Stride, merged, selection
 
 
 class LogFormat(StrEnum):
-    """A unified format."""
+    """A format to write."""
 
     TUM = "tum"
     MBAG = "mbag"
+    KITTI = "kitti"
+    MCAP = "mcap"
+    BAG = "bag"
 
 
 def convert(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Recorded log that mapper build can read.")],
-    out: Annotated[Path, typer.Option(help="Folder to create.")],
+    out: Annotated[Path, typer.Option(help="Folder to create, or a file that ends in .mcap or .bag.")],
     as_: Annotated[LogFormat, typer.Option("--as", help="Format to write.")],
     first: First = None,
     last: Last = None,
     stride: Stride = None,
     require_truth: RequireTruth = None,
+    set_: Overrides = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write a log in one of the unified formats; image files are copied byte for byte.
+    """Write a log in another format; image files go over byte for byte where it has room for them.
 
-    Example: mapper convert 7scenes/chess/seq-01 --as tum --out logs/chess
+    Example: mapper convert rgbd_dataset_freiburg1_xyz --as mcap --out xyz.mcap
     """
-    from mapper.config import load_config
+    from mapper.config import load_source_config
     from mapper.sources import open_source
     from mapper.sources.writers import write_log
 
     prepare_libraries()
-    config = load_config(None, selection(first, last, stride, require_truth))
-    source = open_source(log, config.source)
+    source = open_source(
+        log, load_source_config(None, merged(selection(first, last, stride, require_truth), set_))
+    )
     progress = progress_for(quiet=quiet)
     with progress.stage("convert") as report:
         skipped = write_log(source, out, kind=as_.value, on_progress=lambda done: report(done, len(source)))

@@ -6,7 +6,6 @@ cut), the records are walked from the start as far as they go. Either way a dama
 
 import os
 import struct
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
@@ -15,6 +14,7 @@ from typing import BinaryIO
 
 import lz4.frame
 import zstandard
+from isal import isal_zlib
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -214,7 +214,7 @@ def _unpacked(stored: bytes) -> bytes:
             raise DataError(f"a chunk compressed as {compression!r}; known are zstd and lz4")
     except (zstandard.ZstdError, RuntimeError, MemoryError) as error:  # RuntimeError is lz4's
         raise DataError(f"a chunk that cannot be decompressed: {error}") from None
-    if crc and zlib.crc32(data) != crc:
+    if crc and isal_zlib.crc32(data) != crc:
         raise DataError("a chunk whose checksum is wrong")
     return data
 

@@ -20,7 +20,6 @@ from mapper.sources.ros.messages import (
     PoseMessage,
 )
 from mapper.sources.ros.recording import Topic
-from mapper.sources.text import pose_from_numbers
 from mapper.timebase import NS_PER_S
 
 _POINT_TYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")  # PointField's constants
@@ -122,8 +121,8 @@ _READERS: Mapping[str, Callable[[Any], Message]] = {
 
 
 def _placed(header: Any, child: str, p: Any, q: Any) -> PoseMessage:
-    T_parent_child = pose_from_numbers(np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w]))
-    return PoseMessage(_ns(header.stamp), header.frame_id, child, T_parent_child)
+    numbers = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+    return PoseMessage(_ns(header.stamp), header.frame_id, child, numbers)
 
 
 def _ns(stamp: Any) -> int:

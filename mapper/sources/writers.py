@@ -1,4 +1,4 @@
-"""Logs written as TUM folders or in the thesis's mbag format (A12)."""
+"""Logs written in other formats: TUM folders and the thesis's mbag (A12) here, the rest elsewhere."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,11 +16,13 @@ from mapper.rotations import quaternion_from_rotation
 from mapper.sources.base import Accelerations, Entry, FrameSource, Skipped
 from mapper.sources.calibration_file import calibration_text
 from mapper.sources.images import SATURATED, bytes_of
+from mapper.sources.kitti_writing import write_kitti_log
 from mapper.sources.mbag import HEADER
+from mapper.sources.ros.writing import write_recording
 from mapper.timebase import MAX_TRUTH_GAP_NS, nearest, seconds_text_from_ns
 from mapper.trajectory import Trajectory, write_tum
 
-LogKind = Literal["tum", "mbag"]
+LogKind = Literal["tum", "mbag", "kitti", "mcap", "bag"]
 
 DEPTH_UNITS_PER_M = 5000.0
 """Depth units of images that are encoded here; copied images keep their own."""
@@ -42,24 +44,43 @@ class _Written:
 def write_log(
     source: FrameSource, out: Path, *, kind: LogKind, on_progress: Callable[[int], None] | None = None
 ) -> list[Skipped]:
-    """Write an RGB-D log as a folder of another format and return the frames that could not be.
+    """Write a log in another format and return the frames that could not be.
+
+    RGB-D logs become TUM or mbag folders, LiDAR logs KITTI folders, and both MCAP files or ROS 1 bags.
+
+    Args:
+        source: What to write.
+        out: File or folder to make; it must not exist or be empty.
+        kind: The format.
+        on_progress: Told how many frames are done, after each.
+
+    Raises:
+        SourceError: OUT is not empty, or no frame of the source can be read and is of a kind that the format
+            has room for.
+    """
+    if kind == "mcap" or kind == "bag":
+        return write_recording(source, out, kind=kind, on_progress=on_progress)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise SourceError(f"{out}: already there; give a folder that does not exist yet")
+    if kind == "kitti":
+        return write_kitti_log(source, out, on_progress=on_progress)
+    return _write_images_log(source, out, kind=kind, on_progress=on_progress)
+
+
+def _write_images_log(
+    source: FrameSource,
+    out: Path,
+    *,
+    kind: Literal["tum", "mbag"],
+    on_progress: Callable[[int], None] | None,
+) -> list[Skipped]:
+    """Write an RGB-D log as a folder of image files.
 
     Image files are copied byte for byte under names that are their stamps; frames without files are encoded
     as PNG, depth at 0.2 mm. ``calibration.toml`` keeps the camera and depth units. TUM keeps the whole truth;
     mbag has room for one pose a frame, the nearest within 20 ms. The lists, by which a log is recognised,
     are written last.
-
-    Args:
-        source: What to write.
-        out: Folder to make; it must not exist or be empty.
-        kind: "tum" or "mbag".
-        on_progress: Told how many frames are done, after each.
-
-    Raises:
-        SourceError: The folder is not empty, or no frame of the source is a readable RGB-D frame.
     """
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise SourceError(f"{out}: already there; give a folder that does not exist yet")
     camera = _camera_of(source)
     written: list[_Written] = []
     skipped: list[Skipped] = []

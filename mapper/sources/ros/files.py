@@ -4,6 +4,7 @@ from pathlib import Path
 
 from mapper.config.sources import SourceConfig
 from mapper.errors import SourceError
+from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.recording import Recording
 from mapper.sources.ros.source import MessageLog, log_of
 
@@ -26,7 +27,7 @@ def open_log(path: Path, config: SourceConfig) -> MessageLog:
     Raises:
         SourceError: It is damaged beyond reading, or nothing in it can be mapped.
     """
-    return log_of(open_recording(path), config)
+    return log_of(RecordingReader(open_recording(path)), config)
 
 
 def open_recording(path: Path) -> Recording:

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from mapper.errors import DataError
-from mapper.geometry import Transform
 from mapper.sources.ros.clouds import structured
 from mapper.sources.ros.messages import (
     CameraMessage,
@@ -145,15 +144,15 @@ def _cloud(m: _Fields) -> CloudMessage:
     data = _bytes(m["data"])
     stride = m["point_stride"]
     points = structured(data, fields, point_bytes=stride, shape=(1, len(data) // max(stride, 1)))
-    T_frame_points = _pose(m["pose"])
+    T_frame_points = pose_from_numbers(np.array(_numbers(m["pose"]["position"], m["pose"]["orientation"])))
     if T_frame_points is None:  # protobuf leaves zeros out: an empty pose is none
         T_frame_points = np.eye(4)
     return CloudMessage(_ns(m["timestamp"]), m["frame_id"], points, T_frame_points)
 
 
 def _transform(m: _Fields) -> list[PoseMessage]:
-    T_parent_child = _pose({"position": m["translation"], "orientation": m["rotation"]})
-    return [PoseMessage(_ns(m["timestamp"]), m["parent_frame_id"], m["child_frame_id"], T_parent_child)]
+    numbers = _numbers(m["translation"], m["rotation"])
+    return [PoseMessage(_ns(m["timestamp"]), m["parent_frame_id"], m["child_frame_id"], numbers)]
 
 
 def _transforms(m: _Fields) -> list[PoseMessage]:
@@ -161,7 +160,8 @@ def _transforms(m: _Fields) -> list[PoseMessage]:
 
 
 def _pose_in_frame(m: _Fields) -> list[PoseMessage]:
-    return [PoseMessage(_ns(m["timestamp"]), m["frame_id"], "", _pose(m["pose"]))]
+    numbers = _numbers(m["pose"]["position"], m["pose"]["orientation"])
+    return [PoseMessage(_ns(m["timestamp"]), m["frame_id"], "", numbers)]
 
 
 _READERS: Mapping[str, Callable[[_Fields], Message]] = {
@@ -175,9 +175,8 @@ _READERS: Mapping[str, Callable[[_Fields], Message]] = {
 }
 
 
-def _pose(m: _Fields) -> Transform | None:
-    p, q = m["position"], m["orientation"]
-    return pose_from_numbers(np.array([p["x"], p["y"], p["z"], q["x"], q["y"], q["z"], q["w"]], np.float64))
+def _numbers(p: _Fields, q: _Fields) -> tuple[float, ...]:
+    return (p["x"], p["y"], p["z"], q["x"], q["y"], q["z"], q["w"])
 
 
 def _ns(time: _Fields) -> int:

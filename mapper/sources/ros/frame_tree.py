@@ -6,6 +6,7 @@ import numpy as np
 
 from mapper.geometry import Transform, inverse
 from mapper.sources.ros.messages import PoseMessage
+from mapper.sources.text import pose_from_numbers
 
 
 class FrameTree:
@@ -15,9 +16,11 @@ class FrameTree:
         """Keep the first pose of every frame in its parent."""
         self._parents: dict[str, tuple[str, Transform]] = {}
         for pose in poses:
-            if pose.T_parent_child is not None:
-                child, parent = pose.child.lstrip("/"), pose.parent.lstrip("/")
-                self._parents.setdefault(child, (parent, pose.T_parent_child))
+            child, parent = pose.child.lstrip("/"), pose.parent.lstrip("/")
+            if child not in self._parents:
+                T_parent_child = pose_from_numbers(np.array(pose.numbers))
+                if T_parent_child is not None:
+                    self._parents[child] = (parent, T_parent_child)
 
     @property
     def frames(self) -> Sequence[str]:

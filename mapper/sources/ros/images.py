@@ -2,6 +2,7 @@
 
 import struct
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -107,7 +108,7 @@ def depth_m_of(message: ImageMessage, *, units_per_m: float, where: str) -> Dept
     order = ">" if message.is_big_endian else "<"
     pixels = _pixels(message, order + kind, 1, where=where)
     if kind == "f4":
-        return _measured(pixels.astype(np.float32))
+        return _measured(pixels)
     return depth_m_from(np.ascontiguousarray(pixels, dtype=np.uint16), units_per_m)
 
 
@@ -142,11 +143,11 @@ def _depth_m_of_file(message: FileMessage, *, units_per_m: float, where: str) ->
 
 def _measured(depth_m: DepthImage) -> DepthImage:
     """Return depth with 0 where it is not finite or not in front of the camera."""
-    measured: DepthImage = np.where(np.isfinite(depth_m) & (depth_m > 0.0), depth_m, np.float32(0.0))
-    return measured
+    is_measured = (depth_m > 0.0) & (depth_m < np.inf)
+    return np.where(is_measured, depth_m, np.float32(0.0)).astype(np.float32, copy=False)
 
 
-def _pixels(message: PixelsMessage, kind: str, channels: int, *, where: str) -> NDArray[np.generic]:
+def _pixels(message: PixelsMessage, kind: str, channels: int, *, where: str) -> NDArray[Any]:
     """Return a view of an image's rows as (H, W) or (H, W, channels), whatever their padding."""
     pixel = np.dtype(kind)
     shape = (message.height_px, message.width_px, channels)

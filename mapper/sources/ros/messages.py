@@ -1,5 +1,6 @@
 """What the messages that a map is made from say, in our own terms; ``decode`` reads every encoding."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -100,13 +101,13 @@ class PoseMessage:
         stamp_ns: When.
         parent: The frame that it is told in.
         child: The frame that it is told of; "" where the message does not name it.
-        T_parent_child: (4, 4); None where the numbers are no pose.
+        numbers: x y z in metres and qx qy qz qw of T_parent_child; they may be no pose.
     """
 
     stamp_ns: int
     parent: str
     child: str
-    T_parent_child: Transform | None
+    numbers: Sequence[float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,44 +1,32 @@
 """MCAP files and ROS bags as logs; see :class:`mapper.sources.base.FrameSource`."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
 
 from mapper.config.sensors import Sensor
 from mapper.config.sources import SourceConfig
-from mapper.errors import FrameError, SourceError
+from mapper.errors import SourceError
 from mapper.frames import NO_DISTORTION, PinholeCamera
-from mapper.geometry import Transform
 from mapper.sources.base import Accelerations, Entry
 from mapper.sources.calibration import Calibration
-from mapper.sources.ros.entries import CloudEntry, Located, RgbdMessages
-from mapper.sources.ros.frame_tree import FrameTree
+from mapper.sources.ros.entries import CloudEntry, RgbdMessages
 from mapper.sources.ros.images import MILLIMETRES_PER_M, size_of
-from mapper.sources.ros.index import Series, first_messages, index_of
+from mapper.sources.ros.index import Series
 from mapper.sources.ros.messages import (
-    TRANSFORMS,
     CameraMessage,
     FileMessage,
     ImageMessage,
-    ImuMessage,
-    Message,
     PixelsMessage,
-    PoseMessage,
 )
-from mapper.sources.ros.recording import Recording
+from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.time_line import ordered, paired
 from mapper.sources.ros.topics import CameraTopics, choose, frame_of
-from mapper.sources.text import time_order, truth_from
 from mapper.trajectory import Trajectory
 
 FINE_UNITS_PER_M = 5000.0
 """16-bit units of a metre in which depth in metres goes into files: 0.2 mm, as TUM's."""
 
-_MAX_READINGS = 20_000  # levelling asks for fewer, and an hour of a fast unit would take minutes to read
-_MAX_TRANSFORMS = 1_000
 _SAME_LENS_RATIO = 0.01
 _JPEG_START = b"\xff\xd8"
 _BROWN_CONRADY = ("plumb_bob", "brown_conrady", "rational_polynomial")
@@ -77,14 +65,14 @@ class _Frames:
     notes: Sequence[str]
 
 
-def log_of(recording: Recording, config: SourceConfig) -> MessageLog:
-    """Return a recording as a log: one pass finds out what there is, and nothing is decoded before its time.
+def log_of(reader: RecordingReader, config: SourceConfig) -> MessageLog:
+    """Return a recording as a log; no frame is decoded before its time.
 
     Raises:
         SourceError: Nothing in it can be mapped, a topic that was asked for is not there, images do not
             pair, or the camera is unknown.
     """
-    reader = _Reader(recording)
+    recording = reader.recording
     choice = choose(reader.series, reader.firsts, config.topics, path=recording.path)
     if isinstance(choice.frames, CameraTopics):
         frames = _rgbd(reader, choice.frames, config)
@@ -105,7 +93,7 @@ def log_of(recording: Recording, config: SourceConfig) -> MessageLog:
     )
 
 
-def _rgbd(reader: "_Reader", topics: CameraTopics, config: SourceConfig) -> _Frames:
+def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -> _Frames:
     color, depth = topics.color, topics.depth
     where = f"{reader.recording.path}"
     i, j, notes = paired(color, depth, max_gap_s=config.max_pair_gap_s, where=where)
@@ -133,7 +121,7 @@ def _rgbd(reader: "_Reader", topics: CameraTopics, config: SourceConfig) -> _Fra
     return _Frames("rgbd", frame, len(i), entry, notes)
 
 
-def _lidar(reader: "_Reader", clouds: Series, config: SourceConfig) -> _Frames:
+def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Frames:
     i, notes = ordered(clouds)
     frame = frame_of(reader.firsts.get(clouds.topic.name))
     body = config.body_frame or frame
@@ -150,7 +138,7 @@ def _lidar(reader: "_Reader", clouds: Series, config: SourceConfig) -> _Frames:
     return _Frames("lidar", body, len(i), entry, notes)
 
 
-def _camera(reader: "_Reader", topics: CameraTopics, config: SourceConfig) -> PinholeCamera:
+def _camera(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -> PinholeCamera:
     """Return the colour camera: the user's, else the recording's."""
     name = topics.color.topic.name
     first = reader.firsts[name]
@@ -189,7 +177,7 @@ def _calibration(info: CameraMessage, *, is_rectified: bool, name: str) -> Calib
     return Calibration(name, K[0], K[4], K[2], K[5], distortion=(k1, k2, p1, p2, k3), size_px=size_px)
 
 
-def _refuse_unregistered(reader: "_Reader", topics: CameraTopics, camera: PinholeCamera) -> None:
+def _refuse_unregistered(reader: RecordingReader, topics: CameraTopics, camera: PinholeCamera) -> None:
     """Depth must lie on colour's pixels: sizes must agree and, where both are told, focal lengths."""
     name = topics.depth.topic.name
     first = reader.firsts[name]
@@ -205,74 +193,6 @@ def _refuse_unregistered(reader: "_Reader", topics: CameraTopics, camera: Pinhol
         color = topics.color.topic.name
         raise SourceError(
             f"{reader.recording.path}: {name} ({told}) is not registered to {color} "
-            f"({camera.width_px}×{camera.height_px} px, focal length {camera.fx_px:.1f} px); record depth that "
-            "is, such as aligned_depth_to_color, or choose it with source.topics.depth=…"
+            f"({camera.width_px}×{camera.height_px} px, focal length {camera.fx_px:.1f} px); record depth "
+            "that is, such as aligned_depth_to_color, or choose it with source.topics.depth=…"
         )
-
-
-class _Reader:
-    """What one pass over a recording has found, and the small topics read in full."""
-
-    def __init__(self, recording: Recording) -> None:
-        self.recording = recording
-        self.series: Mapping[str, Series] = index_of(recording)
-        self.firsts: Mapping[str, Message] = first_messages(recording, self.series.values())
-        self.tree = FrameTree(self._transforms())
-
-    def located(self, series: Series, i: int) -> Located:
-        """Return message ``i`` of a topic, to be read later."""
-        return Located(self.recording, series.topic, int(series.stamps_ns[i]), series.place(i))
-
-    def truth(self, series: Series | None, *, body: str) -> tuple[Trajectory | None, list[str]]:
-        """Return the poses of a topic as those of the body, and notes."""
-        if series is None:
-            return None, []
-        poses: list[tuple[int, Transform | None]] = []
-        child = ""
-        for message in self._messages(series, most=len(series)):
-            assert isinstance(message, list)  # by its type
-            poses += [(pose.stamp_ns, pose.T_parent_child) for pose in message]
-            child = child or message[0].child
-        truth, notes = truth_from(poses, what=series.topic.name)
-        if truth is None or child.lstrip("/") in ("", body):
-            return truth, notes
-        T_child_body = self.tree.find(child, body)
-        if T_child_body is None:
-            notes.append(
-                f"{series.topic.name}: poses of {child}, which tf does not tie to {body}; taken as its own"
-            )
-            return truth, notes
-        return replace(truth, T_world_body=truth.T_world_body @ T_child_body), notes
-
-    def accelerations(self, series: Series | None, *, body: str) -> tuple[Accelerations | None, list[str]]:
-        """Return the readings of a topic, in the body's axes where tf ties the two, and notes."""
-        if series is None:
-            return None, []
-        readings = [
-            message
-            for message in self._messages(series, most=_MAX_READINGS)
-            if isinstance(message, ImuMessage)
-        ]
-        values = np.array([reading.acceleration_mps2 for reading in readings]).reshape(-1, 3)
-        usable = np.flatnonzero(np.isfinite(values).all(axis=1))
-        stamps_ns = np.array([reading.stamp_ns for reading in readings], dtype=np.int64)[usable]
-        if len(stamps_ns) == 0:
-            return None, [f"{series.topic.name}: no readings"]
-        order, notes = time_order(stamps_ns, what=series.topic.name)
-        T_body_imu = self.tree.find(body, frame_of(readings[0]))
-        R_body_imu = np.eye(3) if T_body_imu is None else T_body_imu[:3, :3]
-        return Accelerations(stamps_ns[order], values[usable][order] @ R_body_imu.T), notes
-
-    def _transforms(self) -> Iterator[PoseMessage]:
-        """Yield what tf tells, the static first: whole, or as much of it as names every frame."""
-        series = [one for one in self.series.values() if one.topic.type in TRANSFORMS]
-        for one in sorted(series, key=lambda one: "static" not in one.topic.name):
-            for message in self._messages(one, most=_MAX_TRANSFORMS):
-                assert isinstance(message, list)  # by its type
-                yield from message
-
-    def _messages(self, series: Series, *, most: int) -> Iterator[Message]:
-        """Yield a topic's messages, or ``most`` of them evenly spread; damaged ones are left out."""
-        for i in np.unique(np.linspace(0, len(series) - 1, min(most, len(series))).round().astype(int)):
-            with suppress(FrameError):
-                yield self.located(series, int(i)).read()

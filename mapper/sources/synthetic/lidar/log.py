@@ -4,17 +4,14 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 from mapper.config.synthetic import LidarSynthConfig
-from mapper.frames import Scan
 from mapper.parallel import ordered_map
+from mapper.sources.kitti_writing import save_scan
 from mapper.sources.synthetic.lidar.source import SyntheticLidarEntry, SyntheticLidarSource
 from mapper.sources.synthetic.log import appearing
 from mapper.timebase import seconds_text_from_ns
 from mapper.trajectory import write_kitti
 
-_TIMED = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<f4")])
 _WORKERS = 2
 
 
@@ -38,7 +35,7 @@ def write_lidar_log(
     source = SyntheticLidarSource(config)
 
     def save(entry: SyntheticLidarEntry) -> None:
-        _save_scan(clouds / f"{entry.index:06d}", entry.load())
+        save_scan(clouds / f"{entry.index:06d}", entry.load())
 
     with appearing(out) as folder:
         clouds = folder / "velodyne"
@@ -55,15 +52,3 @@ def write_lidar_log(
             "solids": source.scene.solids.as_json(),
         }
         (folder / "scene.json").write_text(json.dumps(scene, indent=1) + "\n", encoding="utf-8")
-
-
-def _save_scan(stem: Path, scan: Scan) -> None:
-    if scan.times_s is None:
-        records = np.zeros((len(scan.points_body), 4), dtype="<f4")  # the last is the intensity
-        records[:, :3] = scan.points_body
-        records.tofile(stem.with_suffix(".bin"))
-        return
-    timed = np.empty(len(scan.points_body), dtype=_TIMED)
-    timed["x"], timed["y"], timed["z"] = scan.points_body.T
-    timed["t"] = scan.times_s
-    np.save(stem.with_suffix(".npy"), timed)

@@ -1,0 +1,96 @@
+"""``mapper inspect``: what is in a log, and what mapper build would make of it."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli.environment import prepare_libraries
+from cli.options import Overrides
+
+if TYPE_CHECKING:
+    from mapper.sources.inspection import Inspection, LogFacts, Timing, TopicFacts
+
+
+def inspect(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Recorded log: a folder, .mbag, .mcap or .bag.")],
+    set_: Overrides = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Tell what is in a log: topics, rates, gaps, calibration, truth, and what mapper build would do with it.
+
+    Example: mapper inspect drive.mcap
+    """
+    import dataclasses
+    import json
+
+    from mapper.config import load_config, load_source_config
+    from mapper.sources.inspection import inspect_log
+
+    prepare_libraries()
+    overrides = set_ or []
+    found = inspect_log(log, load_source_config(None, overrides))
+    if found.log is None:
+        plan = f"nothing: {found.problem}"
+    else:
+        config = load_config(None, overrides, sensor=found.log.sensor)
+        plan = (
+            f"{found.log.sensor} frames, odometry {config.odometry.kind}, loops {config.loops.kind}, "
+            f"octree of {config.octree.resolution_m:g} m"
+        )
+    if as_json:
+        facts = {**dataclasses.asdict(found), "path": str(found.path), "build": plan}
+        print(json.dumps(facts, ensure_ascii=False, indent=1))
+    else:
+        print("\n".join(_lines(found, plan)))
+
+
+def _lines(found: "Inspection", plan: str) -> Iterator[str]:
+    rows = [("log", str(found.path))]
+    if found.log is not None:
+        rows += _log_rows(found.log)
+    rows.append(("mapper build", plan))
+    width = max(len(name) for name, _ in rows)
+    yield from (f"{name:<{width}}  {text}" for name, text in rows)
+    if found.topics:
+        yield ""
+        yield from _table(found.topics)
+
+
+def _log_rows(log: "LogFacts") -> list[tuple[str, str]]:
+    rows = [
+        ("format", f"{log.kind}, called {log.name}"),
+        ("frames", f"{log.frames.count}: {_timing_text(log.frames)}"),
+        ("content", log.content),
+    ]
+    if log.calibration is not None:
+        rows.append(("camera", log.calibration))
+    rows.append(("truth", log.truth or "none"))
+    if log.readings:
+        rows.append(("accelerations", f"{log.readings} readings"))
+    return [*rows, *(("note", note) for note in log.notes)]
+
+
+def _timing_text(timing: "Timing") -> str:
+    gaps = f"{timing.gaps} gaps, the longest {timing.longest_gap_s:.2f} s" if timing.gaps else "no gaps"
+    return f"{timing.duration_s:.1f} s at {timing.rate_hz:.1f} Hz, {gaps}"
+
+
+def _table(topics: "Sequence[TopicFacts]") -> Iterator[str]:
+    rows = [("topic", "type", "messages", "Hz", "gaps", "longest (s)")]
+    for topic in topics:
+        timing = topic.timing
+        numbers = (
+            f"{timing.count}",
+            f"{timing.rate_hz:.1f}",
+            f"{timing.gaps}",
+            f"{timing.longest_gap_s:.2f}",
+        )
+        rows.append((topic.name, topic.type, *numbers))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        name, type_, numbers = row[0], row[1], row[2:]
+        words = [f"{name:<{widths[0]}}", f"{type_:<{widths[1]}}"]
+        words += [f"{number:>{width}}" for number, width in zip(numbers, widths[2:], strict=True)]
+        yield "  ".join(words)

@@ -1,0 +1,189 @@
+"""What is in a log, without building anything from it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mapper.config.sensors import Sensor
+from mapper.config.sources import SourceConfig
+from mapper.errors import FrameError, SourceError
+from mapper.frames import Scan
+from mapper.sources import open_source
+from mapper.sources.base import FrameSource
+from mapper.sources.ros import files as recordings
+from mapper.sources.ros.index import Series
+from mapper.sources.ros.reader import RecordingReader
+from mapper.sources.ros.source import log_of
+from mapper.sources.selection import select
+from mapper.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
+from mapper.trajectory import Trajectory
+
+_GAP_PERIODS = 3.0
+"""A pause of as many usual periods is a gap."""
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """How messages or frames follow each other.
+
+    Attributes:
+        count: How many there are.
+        first_ns: Stamp of the first.
+        duration_s: From the first to the last.
+        rate_hz: One over the median time between two; 0 with fewer than two.
+        gaps: Pauses of more than three usual periods.
+        longest_gap_s: The longest time between two.
+    """
+
+    count: int
+    first_ns: int
+    duration_s: float
+    rate_hz: float
+    gaps: int
+    longest_gap_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class TopicFacts:
+    """A topic of a recording."""
+
+    name: str
+    type: str
+    encoding: str
+    timing: Timing
+
+
+@dataclass(frozen=True, slots=True)
+class LogFacts:
+    """What can be mapped of a log.
+
+    Attributes:
+        name: What the log calls itself.
+        kind: Which format it is in.
+        sensor: "rgbd" or "lidar".
+        frames: How its frames follow each other.
+        content: What the first frame that can be read is, in words.
+        calibration: The camera, in words; None of a LiDAR.
+        truth: What truth there is, in words; None without.
+        readings: How many accelerations there are.
+        notes: What opening it had to leave out or assume.
+    """
+
+    name: str
+    kind: str
+    sensor: Sensor
+    frames: Timing
+    content: str
+    calibration: str | None
+    truth: str | None
+    readings: int
+    notes: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Inspection:
+    """What is in a log.
+
+    Attributes:
+        path: What was opened.
+        topics: Every topic, of a recording.
+        log: What can be mapped; None if nothing can.
+        problem: Why nothing can; None if something can.
+    """
+
+    path: Path
+    topics: Sequence[TopicFacts]
+    log: LogFacts | None
+    problem: str | None
+
+
+def inspect_log(path: Path, config: SourceConfig) -> Inspection:
+    """Return what is in a log of any kind.
+
+    Raises:
+        SourceError: It is no log of a known format, or is damaged beyond reading.
+    """
+    if not (path.exists() and recordings.recognise(path)):
+        return Inspection(path, [], _facts(open_source(path, config)), None)
+    reader = RecordingReader(recordings.open_recording(path))
+    topics = [_topic(series) for series in reader.series.values()]
+    try:
+        return Inspection(path, topics, _facts(select(log_of(reader, config), config)), None)
+    except SourceError as error:
+        return Inspection(path, topics, None, str(error))
+
+
+def timing_of(stamps_ns: Stamps) -> Timing:
+    """Return how one or more stamps follow each other, whatever their order."""
+    ordered_ns = np.sort(stamps_ns)
+    apart_s = np.diff(ordered_ns) / NS_PER_S
+    usual_s = float(np.median(apart_s)) if len(apart_s) else 0.0
+    return Timing(
+        count=len(stamps_ns),
+        first_ns=int(ordered_ns[0]),
+        duration_s=int(ordered_ns[-1] - ordered_ns[0]) / NS_PER_S,
+        rate_hz=1.0 / usual_s if usual_s > 0.0 else 0.0,
+        gaps=int((apart_s > _GAP_PERIODS * usual_s).sum()) if usual_s > 0.0 else 0,
+        longest_gap_s=float(apart_s.max(initial=0.0)),
+    )
+
+
+def _topic(series: Series) -> TopicFacts:
+    topic = series.topic
+    return TopicFacts(topic.name, topic.type, topic.encoding, timing_of(series.stamps_ns))
+
+
+def _facts(source: FrameSource) -> LogFacts:
+    stamps_ns = np.array([entry.stamp_ns for entry in source.entries()], dtype=np.int64)
+    content, calibration = _first_frame(source)
+    return LogFacts(
+        name=source.name,
+        kind=source.kind,
+        sensor=source.sensor,
+        frames=timing_of(stamps_ns),
+        content=content,
+        calibration=calibration,
+        truth=None if source.truth is None else _truth_text(source.truth, stamps_ns),
+        readings=0 if source.accelerations is None else len(source.accelerations.stamps_ns),
+        notes=list(source.notes),
+    )
+
+
+def _first_frame(source: FrameSource) -> tuple[str, str | None]:
+    """Return what the first readable frame is, and its camera's calibration."""
+    reason = "there is none"
+    for entry in source.entries():
+        try:
+            frame = entry.load()
+        except FrameError as error:
+            reason = str(error)
+            continue
+        if isinstance(frame, Scan):
+            far_m = float(np.linalg.norm(frame.points_body, axis=1).max(initial=0.0))
+            timed = "with" if frame.times_s is not None else "without"
+            return (
+                f"scans, the first of {len(frame.points_body)} points to {far_m:.0f} m, {timed} times",
+                None,
+            )
+        camera = frame.camera
+        measured = float((frame.depth_m > 0.0).mean())
+        colour = "colour" if frame.image.ndim == 3 else "grey"
+        size = f"{camera.width_px}×{camera.height_px} px"
+        numbers = ", ".join(f"{v:g}" for v in (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px))
+        distortion = ", ".join(f"{k:g}" for k in camera.distortion) if any(camera.distortion) else "none"
+        return (
+            f"{colour} and depth of {size}, the first {measured:.0%} measured",
+            f"fx fy cx cy {numbers} px, distortion {distortion}",
+        )
+    return f"no frame can be read: {reason}", None
+
+
+def _truth_text(truth: Trajectory, stamps_ns: Stamps) -> str:
+    _, gap_ns = nearest(truth.stamps_ns, stamps_ns)
+    near = int((gap_ns <= MAX_TRUTH_GAP_NS).sum())
+    return (
+        f"{len(truth)} poses over {truth.path_length_m:.1f} m, "
+        f"within {MAX_TRUTH_GAP_NS / 1e6:g} ms of {near} of {len(stamps_ns)} frames"
+    )

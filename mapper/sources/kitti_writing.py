@@ -1,0 +1,77 @@
+"""LiDAR logs written as KITTI odometry folders: ``velodyne``, ``times.txt`` and ``poses.txt``."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from mapper.atomic import write_text
+from mapper.errors import FrameError, SourceError
+from mapper.frames import Scan
+from mapper.sources.base import FrameSource, Skipped
+from mapper.timebase import MAX_TRUTH_GAP_NS, Stamps, nearest, seconds_text_from_ns
+from mapper.trajectory import Trajectory, write_kitti
+
+_TIMED = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<f4")])
+
+
+def write_kitti_log(
+    source: FrameSource, out: Path, *, on_progress: Callable[[int], None] | None = None
+) -> list[Skipped]:
+    """Write a LiDAR log as a KITTI folder and return the scans that could not be.
+
+    There is no ``calib.txt``: poses are the LiDAR's own. They are written if every scan has a true one
+    within 20 ms, for KITTI's lines bear no stamps. Colours, and intensities, are not kept.
+
+    Args:
+        source: What to write.
+        out: Folder to make.
+        on_progress: Told how many scans are done, after each.
+
+    Raises:
+        SourceError: No frame of the source is a readable scan.
+    """
+    stamps_ns: list[int] = []
+    skipped: list[Skipped] = []
+    clouds = out / "velodyne"
+    clouds.mkdir(parents=True, exist_ok=True)
+    for done, entry in enumerate(source.entries(), start=1):
+        try:
+            scan = entry.load(colour=False)
+            if not isinstance(scan, Scan):
+                raise SourceError(f"{source.path}: images, not scans; KITTI folders hold scans: --as tum")
+            save_scan(clouds / f"{len(stamps_ns):06d}", scan)
+            stamps_ns.append(scan.stamp_ns)
+        except FrameError as error:
+            skipped.append(Skipped(entry.stamp_ns, str(error)))
+        if on_progress is not None:
+            on_progress(done)
+    if not stamps_ns:
+        reason = skipped[0].reason if skipped else "it has no frames"
+        raise SourceError(f"{source.path}: no frame can be written: {reason}")
+    truth = source.truth and _at(source.truth, np.array(stamps_ns, dtype=np.int64))
+    if truth is not None:
+        write_kitti(out / "poses.txt", truth)
+    write_text(out / "times.txt", "".join(f"{seconds_text_from_ns(stamp_ns)}\n" for stamp_ns in stamps_ns))
+    return skipped
+
+
+def save_scan(stem: Path, scan: Scan) -> None:
+    """Write KITTI's records, whose intensities are 0; where points have times, an array of x, y, z and t."""
+    if scan.times_s is None:
+        records = np.zeros((len(scan.points_body), 4), dtype="<f4")
+        records[:, :3] = scan.points_body
+        records.tofile(stem.with_suffix(".bin"))
+        return
+    timed = np.empty(len(scan.points_body), dtype=_TIMED)
+    timed["x"], timed["y"], timed["z"] = scan.points_body.T
+    timed["t"] = scan.times_s
+    np.save(stem.with_suffix(".npy"), timed)
+
+
+def _at(truth: Trajectory, stamps_ns: Stamps) -> Trajectory | None:
+    """Return the nearest true pose of every stamp; None where one is too far."""
+    index, gap_ns = nearest(truth.stamps_ns, stamps_ns)
+    if gap_ns.max() > MAX_TRUTH_GAP_NS:
+        return None
+    return Trajectory(stamps_ns, truth.T_world_body[index])
