@@ -115,7 +115,7 @@ def _after(before: Tracked, first: FrameSource, config: BuildConfig, progress: P
     assert isinstance(config.loops, KeyframeLoopsConfig)
     graph = before.graph
     closer = config.loops.build(config.graph.solve)
-    views = views_again(first, set(graph.stamps_ns.values()), config, progress=progress)
+    views = views_again(first, before.trajectory, set(graph.stamps_ns.values()), config, progress=progress)
     closer.know(graph, {node: views[stamp_ns] for node, stamp_ns in graph.stamps_ns.items()})
     odometry: Odometry[Any] = config.odometry.build()
     renumbered = Renumbered(odometry, first_node=max(graph.T_world_node) + 1)

@@ -17,7 +17,7 @@ from mapper.progress import SILENT, Progress
 from mapper.run import Run
 from mapper.solving import solve
 from mapper.sources.base import FrameSource
-from mapper.tracked import tracked_before
+from mapper.tracked import Tracked, tracked_before
 from mapper.views_again import views_again
 
 Pair = tuple[int, int]
@@ -66,7 +66,7 @@ def edit_loops(
         if _held(loops, pair) is not None or pairs.count(pair) > 1:
             raise LoopError(f"loop {_text(pair)}: there already")
     if pairs:
-        found = _measured(source, graph, pairs, run.config)
+        found = _measured(source, tracked, pairs, run.config)
         loops = [loop for loop in loops if (loop.i, loop.j) not in pairs] + found
     known = [factor for factor in graph.factors if factor.origin != "loop"]
     held = [loop.factor for loop in loops if loop.verdict == "accepted"]
@@ -99,10 +99,11 @@ def _in_time_order(graph: PoseGraph, pair: Pair) -> Pair:
 
 
 def _measured(
-    source: FrameSource, graph: PoseGraph, pairs: Sequence[Pair], config: BuildConfig
+    source: FrameSource, tracked: Tracked, pairs: Sequence[Pair], config: BuildConfig
 ) -> list[LoopClosure]:
-    verifier = _verifier(config)
-    views = views_again(source, {graph.stamps_ns[node] for pair in pairs for node in pair}, config)
+    verifier, graph = _verifier(config), tracked.graph
+    stamps_ns = {graph.stamps_ns[node] for pair in pairs for node in pair}
+    views = views_again(source, tracked.trajectory, stamps_ns, config)
     places = {stamp_ns: verifier.digest(seen) for stamp_ns, seen in views.items()}
     loops = []
     for i, j in pairs:

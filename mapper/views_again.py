@@ -4,24 +4,40 @@ from collections.abc import Collection
 from typing import Any
 
 from mapper.config import BuildConfig
+from mapper.deskew import twist_at
 from mapper.odometry.base import Odometry, Seen
 from mapper.parallel import ordered_map
 from mapper.progress import SILENT, Progress
 from mapper.sources.base import Entry, FrameSource
+from mapper.trajectory import Trajectory
 
 
 def views_again(
-    source: FrameSource, stamps_ns: Collection[int], config: BuildConfig, *, progress: Progress = SILENT
+    source: FrameSource,
+    trajectory: Trajectory,
+    stamps_ns: Collection[int],
+    config: BuildConfig,
+    *,
+    progress: Progress = SILENT,
 ) -> dict[int, Seen]:
     """Return what the odometry of a configuration sees in some frames of a log, by stamp.
+
+    Args:
+        source: The log.
+        trajectory: Where the body was: scans are deskewed by its motion.
+        stamps_ns: Of the frames; each has a pose.
+        config: Which odometry.
+        progress: Who watches.
 
     Raises:
         FrameError: A frame cannot be read.
     """
     odometry: Odometry[Any] = config.odometry.build()
+    index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
 
     def view(entry: Entry) -> tuple[int, Seen]:
-        return entry.stamp_ns, odometry.view(odometry.observe(entry.load(colour=False)))
+        twist = twist_at(trajectory, index_of[entry.stamp_ns])
+        return entry.stamp_ns, odometry.view(odometry.observe(entry.load(colour=False)), twist)
 
     entries = [entry for entry in source.entries() if entry.stamp_ns in stamps_ns]
     views = {}

@@ -160,6 +160,8 @@ class KeyframeLoops(Generic[Place]):
 
     def _is_worth_a_look(self, track: Track) -> bool:
         """Tell whether enough has changed since the last look, and if so, note it."""
+        if not track.is_sharp:
+            return False
         path_m = 0.0
         if self._looks:
             last = self._looks[-1]

@@ -54,7 +54,7 @@ class Track:
             and better, but until then this is what ties the node to the path.
         agreeing: (N,) which of the view's features agree with the pose; None where that is not told.
         twist: How the body is taken to have moved while a scan was swept; None where nothing was deskewed.
-        awaits_twist: The first scan of a map: how the body moved while it was swept, the next track tells.
+        is_sharp: False of what nobody should recognise a place by: a scan swept in unknown motion.
     """
 
     stamp_ns: int
@@ -67,7 +67,7 @@ class Track:
     links: Sequence[BetweenFactor] = field(default_factory=tuple)
     agreeing: NDArray[np.bool_] | None = None
     twist: Twist | None = None
-    awaits_twist: bool = False
+    is_sharp: bool = True
 
 
 Observation = TypeVar("Observation")

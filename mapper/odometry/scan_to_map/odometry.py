@@ -216,7 +216,7 @@ class ScanOdometry:
             T_world_body=T_world_body,
             is_keyframe=True,
             diagnostics=Diagnostics(len(sweep.prepared.points), 0, 0, 0.0, "m", method),
-            twist=STILL,
+            is_sharp=observation.scan.times_s is None,
         )
 
     def _lose(self, observation: ScanObservation) -> Track:
