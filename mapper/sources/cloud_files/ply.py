@@ -10,7 +10,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.sources.cloud_files.raw import Columns, refusing_damage
+from mapper.sources.cloud_files.raw import Columns, parse_rows, refusing_damage
 
 _NAMES = {
     "i1": ("char", "int8"),
@@ -91,9 +91,9 @@ def _read_vertices(stream: BinaryIO, encoding: str, elements: Sequence[_Element]
     dtype = vertex.dtype(byte_order)
     if encoding == "ascii":
         skipped = sum(element.count for element in before)
-        lines = [line for line in islice(stream, skipped, skipped + vertex.count) if line.strip()]
-        _refuse_fewer(vertex.count, len(lines))
-        return np.loadtxt(lines, dtype, comments=None, ndmin=1) if lines else np.empty(0, dtype)
+        vertices = parse_rows(islice(stream, skipped, skipped + vertex.count), dtype)
+        _refuse_fewer(vertex.count, len(vertices))
+        return vertices
     stream.seek(sum(element.count * element.dtype(byte_order).itemsize for element in before), os.SEEK_CUR)
     left = os.fstat(stream.fileno()).st_size - stream.tell()
     _refuse_fewer(vertex.count, max(left, 0) // max(dtype.itemsize, 1))

@@ -1,6 +1,6 @@
 """From a cloud file's columns to points that were measured, in metres around the sensor."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +23,7 @@ MIN_POINTS = 10
 _MAX_RANGE_M = 1000.0  # the longest automotive sensors see 0.5 km; a room in millimetres is beyond it
 _AWAY_RATIO = 10.0  # times the cloud's own size, and it cannot be a sweep around its origin
 _SAMPLES = 4096
+_LONGEST_REASON = 150
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,8 +86,18 @@ def refusing_damage(path: Path, *, what: str) -> Iterator[None]:
     except (OSError, FrameError):
         raise
     except Exception as error:  # parsers of foreign bytes raise whatever the line that met them raises
-        reason = next(iter(str(error).splitlines()), type(error).__name__)
-        raise FrameError(f"{path}: not a sound {what} file: {reason}") from None
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise FrameError(f"{path}: not a sound {what} file: {reason[:_LONGEST_REASON]}") from None
+
+
+def parse_rows(lines: Iterable[bytes], dtype: np.dtype[np.void]) -> NDArray[np.void]:
+    """Return the records in lines of text; blank lines are none.
+
+    Raises:
+        ValueError: A line is not one number of its type a field.
+    """
+    lines = [line for line in lines if line.strip()]
+    return np.loadtxt(lines, dtype, comments=None, ndmin=1) if lines else np.empty(0, dtype)
 
 
 def _measured(points: Points32) -> NDArray[np.bool_]:
