@@ -16,6 +16,7 @@ from cli.environment import prepare_environment
 from cli.evaluate import evaluate
 from cli.export import export
 from cli.fuse import fuse
+from cli.inspect import inspect
 from cli.loops import WithPairs, loops
 from cli.plan import WithPoints, plan
 from cli.report import report
@@ -71,6 +72,7 @@ app.command("export")(export)
 app.command("plan", cls=WithPoints)(plan)
 app.command("solve")(solve)
 app.command("compare")(compare)
+app.command("inspect")(inspect)
 app.command("convert")(convert)
 app.command("synth")(synth)
 app.command("demo")(demo)
