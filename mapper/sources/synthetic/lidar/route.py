@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.config.synthetic import LidarSynthConfig
-from mapper.geometry import Array, rotation_exp
+from mapper.geometry import Array
+from mapper.rotations import rotation_from_quaternion
 from mapper.sources.synthetic.lidar.ground import Ground
 from mapper.sources.synthetic.path import START_NS
 from mapper.sources.synthetic.plan import closed_spline
@@ -132,10 +133,11 @@ class Drive:
         T_world_lidar[:, :2, 3] = points
         T_world_lidar[:, 2, 3] = self.ground.height_m(points) + config.mount_height_m
         if config.tilt_rad > 0.0:
-            lean = config.tilt_rad * self._sine(times_s, 0.23, 1)
-            toward = 2.0 * np.pi * 0.07 * times_s + self.phases_rad[2]
-            axes = lean[:, None] * np.column_stack([np.cos(toward), np.sin(toward), 0.0 * toward])
-            T_world_lidar[:, :3, :3] @= np.array([rotation_exp(axis) for axis in axes])
+            half_rad = 0.5 * config.tilt_rad * self._sine(times_s, 0.23, 1)
+            toward_rad = 2.0 * np.pi * 0.07 * times_s + self.phases_rad[2]
+            x, y = np.sin(half_rad) * np.cos(toward_rad), np.sin(half_rad) * np.sin(toward_rad)
+            tilts = rotation_from_quaternion(np.column_stack([x, y, 0.0 * x, np.cos(half_rad)]))
+            T_world_lidar[:, :3, :3] @= tilts
         return T_world_lidar
 
     def _eased_s(self, times_s: Array) -> Array:
