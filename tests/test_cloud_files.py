@@ -1,11 +1,14 @@
 import laspy
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 from pypcd4 import Encoding, PointCloud
 
 from mapper.errors import FrameError
 from mapper.sources.cloud_files import ENDINGS, read_cloud
+from mapper.sources.cloud_files.ply import read_ply
 from mapper.sources.clouds import read_scan
 
 N = 60
@@ -219,6 +222,30 @@ def test_a_ply_header_that_counts_wrongly_is_refused(tmp_path, text, says):
     write_ply(path, text=text)
     path.write_bytes(path.read_bytes().replace(b"vertex 60", b"vertex 9999999999999"))
     assert refusal_of(path).startswith(f"not a sound PLY file: {says}")
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    kinds=st.lists(st.sampled_from(["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"]), min_size=1, max_size=6),
+    count=st.integers(0, 5),
+    text=st.booleans(),
+    byte_order=st.sampled_from("<>"),
+    seed=st.integers(0, 99),
+)
+def test_ply_vertices_are_what_plyfile_wrote(tmp_path, kinds, count, text, byte_order, seed):
+    rng = np.random.default_rng(seed)
+    vertices = np.zeros(count, [(f"property{i}", kind) for i, kind in enumerate(kinds)])
+    for i, kind in enumerate(kinds):
+        limits = np.iinfo(kind) if kind[0] in "iu" else np.finfo("f4")
+        vertices[f"property{i}"] = rng.uniform(limits.min / 2, limits.max / 2, count).astype(kind)
+    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(TRIANGLE, "face")]
+    PlyData(elements, text=text, byte_order=byte_order).write(tmp_path / "cloud.ply")
+    columns = read_ply(tmp_path / "cloud.ply")
+    assert list(columns) == list(vertices.dtype.names)
+    for name, values in columns.items():
+        assert values.dtype == vertices[name].dtype
+        # plyfile writes 18 digits of a number, which is more than a float64 has.
+        np.testing.assert_array_equal(values, vertices[name])
 
 
 def test_ply_vertices_behind_lists_are_refused(tmp_path):

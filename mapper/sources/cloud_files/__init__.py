@@ -6,9 +6,10 @@ from pathlib import Path
 from mapper.errors import FrameError
 from mapper.sources.cloud_files.bare import read_bin, read_npy, read_text
 from mapper.sources.cloud_files.las import read_las
+from mapper.sources.cloud_files.parsing import Columns
 from mapper.sources.cloud_files.pcd import read_pcd
 from mapper.sources.cloud_files.ply import read_ply
-from mapper.sources.cloud_files.raw import Columns, RawCloud, cloud_from
+from mapper.sources.cloud_files.raw import RawCloud, cloud_from
 
 __all__ = ["ENDINGS", "RawCloud", "read_cloud"]
 

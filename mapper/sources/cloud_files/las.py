@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from mapper.errors import FrameError
-from mapper.sources.cloud_files.raw import Columns, refusing_damage
+from mapper.sources.cloud_files.parsing import Columns, refusing_damage
 
 _EXTRAS = ("gps_time", "red", "green", "blue")
 _RECORDS_AT = 100  # a uint32: how many records of variable length follow the header (LAS 1.0 to 1.4)
@@ -24,9 +24,7 @@ def read_las(path: Path) -> Columns:
     with path.open("rb") as stream, refusing_damage(path, what="LAS"):
         records = int.from_bytes(stream.read(_RECORDS_AT + 4)[_RECORDS_AT:], "little")
         if records * _RECORD_BYTES > size:  # laspy would make as many empty ones
-            raise FrameError(
-                f"{path}: {size} bytes, but the header says {records} VLR records; is it damaged?"
-            )
+            raise FrameError(f"{path}: {size} bytes, but the header says {records} VLRs; is it damaged?")
         stream.seek(0)
         reader = laspy.open(stream, closefd=False, read_evlrs=False)
         header = reader.header

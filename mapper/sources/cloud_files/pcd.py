@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.errors import FrameError
-from mapper.sources.cloud_files.raw import Columns, parse_rows, refusing_damage
+from mapper.sources.cloud_files.parsing import Columns, parse_rows, refusing_damage
 
 _MOST_LINES = 100
 

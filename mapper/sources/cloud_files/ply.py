@@ -10,7 +10,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.sources.cloud_files.raw import Columns, parse_rows, refusing_damage
+from mapper.sources.cloud_files.parsing import Columns, parse_rows, refusing_damage
 
 _NAMES = {
     "i1": ("char", "int8"),

@@ -1,7 +1,5 @@
 """From a cloud file's columns to points that were measured, in metres around the sensor."""
 
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,11 +9,8 @@ from numpy.typing import NDArray
 
 from mapper.errors import FrameError
 from mapper.frames import Points32
+from mapper.sources.cloud_files.parsing import Column, Columns
 from mapper.sources.point_times import time_field
-
-Column = NDArray[np.number[Any]]
-Columns = Mapping[str, Column]
-"""(N,) values of each field of a cloud, by its name in the file."""
 
 MIN_POINTS = 10
 """Fewer points show no surface that anything could be aligned to."""
@@ -23,7 +18,6 @@ MIN_POINTS = 10
 _MAX_RANGE_M = 1000.0  # the longest automotive sensors see 0.5 km; a room in millimetres is beyond it
 _AWAY_RATIO = 10.0  # times the cloud's own size, and it cannot be a sweep around its origin
 _SAMPLES = 4096
-_LONGEST_REASON = 150
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,32 +68,6 @@ def cloud_from(columns: Columns, *, path: Path, scale: float | None) -> RawCloud
     return RawCloud(points, times, colors)
 
 
-@contextmanager
-def refusing_damage(path: Path, *, what: str) -> Iterator[None]:
-    """Turn whatever a parser raises on a damaged file into one line about it.
-
-    Raises:
-        FrameError: The parser gave up; what the system refuses stays an OSError.
-    """
-    try:
-        yield
-    except (OSError, FrameError):
-        raise
-    except Exception as error:  # parsers of foreign bytes raise whatever the line that met them raises
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise FrameError(f"{path}: not a sound {what} file: {reason[:_LONGEST_REASON]}") from None
-
-
-def parse_rows(lines: Iterable[bytes], dtype: np.dtype[np.void]) -> NDArray[np.void]:
-    """Return the records in lines of text; blank lines are none.
-
-    Raises:
-        ValueError: A line is not one number of its type a field.
-    """
-    lines = [line for line in lines if line.strip()]
-    return np.loadtxt(lines, dtype, comments=None, ndmin=1) if lines else np.empty(0, dtype)
-
-
 def _measured(points: Points32) -> NDArray[np.bool_]:
     x, y, z = points.T
     with np.errstate(over="ignore", invalid="ignore"):  # infinities of both signs
@@ -144,5 +112,5 @@ def _as_bytes(channels: NDArray[np.number[Any]]) -> NDArray[np.uint8]:
         channels = channels * 255.0
     elif top > 255:
         channels = channels / 257.0
-    colors: NDArray[np.uint8] = np.nan_to_num(channels).clip(0, 255).astype(np.uint8)
+    colors: NDArray[np.uint8] = np.nan_to_num(channels).round().clip(0, 255).astype(np.uint8)
     return colors

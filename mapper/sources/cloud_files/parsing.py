@@ -1,0 +1,43 @@
+"""What the parsers of cloud files share: their result, lines of text, and how they refuse damage."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.errors import FrameError
+
+Column = NDArray[np.number[Any]]
+Columns = Mapping[str, Column]
+"""(N,) values of each field of a cloud, by its name in the file."""
+
+_LONGEST_REASON = 150
+
+
+@contextmanager
+def refusing_damage(path: Path, *, what: str) -> Iterator[None]:
+    """Turn whatever a parser raises on a damaged file into one line about it.
+
+    Raises:
+        FrameError: The parser gave up; what the system refuses stays an OSError.
+    """
+    try:
+        yield
+    except (OSError, FrameError):
+        raise
+    except Exception as error:  # parsers of foreign bytes raise whatever the line that met them raises
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise FrameError(f"{path}: not a sound {what} file: {reason[:_LONGEST_REASON]}") from None
+
+
+def parse_rows(lines: Iterable[bytes], dtype: np.dtype[np.void]) -> NDArray[np.void]:
+    """Return the records in lines of text; blank lines are none.
+
+    Raises:
+        ValueError: A line is not one number of its type a field.
+    """
+    lines = [line for line in lines if line.strip()]
+    return np.loadtxt(lines, dtype, comments=None, ndmin=1) if lines else np.empty(0, dtype)
