@@ -39,7 +39,7 @@ def decode_ros(topic: Topic, data: memoryview) -> Message:
     try:
         message = deserialize(data, topic.type)
     except (SerdeError, AssertionError, IndexError, ValueError) as error:  # what damaged lengths lead to
-        raise DataError(f"{topic.type} cannot be read: {error}") from None
+        raise DataError(f"a damaged message: {error}") from None
     return read(message)
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import FrameError
+from mapper.errors import DataError, FrameError
 from mapper.frames import DepthImage, PinholeCamera, RgbdFrame, Scan
 from mapper.geometry import Transform
 from mapper.sources.base import ImageFiles
@@ -35,7 +35,11 @@ class Located:
         Raises:
             FrameError: It is damaged.
         """
-        return decode(self.topic, self.recording.read(self.place))
+        data = self.recording.read(self.place)
+        try:
+            return decode(self.topic, data)
+        except DataError as error:
+            raise FrameError(f"{self}: {error}") from None
 
     def image(self) -> ImageMessage:
         """Read and decode an image message, not its image.

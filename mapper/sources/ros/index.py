@@ -92,7 +92,7 @@ def first_messages(recording: Recording, series: Iterable[Series]) -> dict[str, 
         if one.topic.type not in READ:
             continue
         for i in range(min(_TRIED, len(one))):
-            with suppress(FrameError):
+            with suppress(DataError, FrameError):
                 firsts[one.topic.name] = decode(one.topic, recording.read(one.place(i)))
                 break
     return firsts

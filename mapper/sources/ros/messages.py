@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import DataError, FrameError
+from mapper.errors import DataError
 from mapper.geometry import Array, Transform
 from mapper.sources.ros.recording import Topic
 
@@ -154,7 +154,7 @@ def decode(topic: Topic, data: memoryview) -> Message:
     """Return what a message says; large payloads are views of ``data``.
 
     Raises:
-        FrameError: The message is damaged, or of a type or in an encoding that is not read.
+        DataError: The message is damaged, or of a type or in an encoding that is not read.
     """
     try:
         if topic.encoding in ("cdr", "ros1"):
@@ -164,5 +164,5 @@ def decode(topic: Topic, data: memoryview) -> Message:
         from mapper.sources.ros.foxglove import decode_foxglove
 
         return decode_foxglove(topic, data)
-    except (DataError, ValueError, KeyError, TypeError, OverflowError) as error:
-        raise FrameError(f"{topic.name}: a damaged message: {error}") from None
+    except (ValueError, KeyError, IndexError, TypeError, OverflowError) as error:
+        raise DataError(f"a damaged message: {error}") from None

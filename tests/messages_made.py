@@ -1,0 +1,71 @@
+"""Recordings made message by message, for the tests of reading them."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from conftest import FIRST_NS, PERIOD_NS, picture
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from mapper.frames import PinholeCamera
+from mapper.sources.mcap_log import mcap_writer
+from mapper.sources.ros.writing import Written
+from mapper.sources.rosbag_writing import bag_writer, camera_info_message, image_message
+
+CAMERA = PinholeCamera(64, 48, 60.0, 61.0, 31.5, 23.5, (0.1, -0.2, 0.001, 0.002, 0.05))
+COLOR, DEPTH = "/cam/color/image_raw", "/cam/aligned_depth/image_raw"
+
+
+def image(stamp_ns: int, topic: str, pixels: np.ndarray, encoding: str, *, frame: str = "optical") -> Written:
+    cdr = image_message(stamp_ns, pixels, encoding=encoding, frame=frame)
+    return Written(stamp_ns, topic, "sensor_msgs/msg/Image", cdr)
+
+
+def camera_info(
+    stamp_ns: int, topic: str = "/cam/color/camera_info", camera: PinholeCamera = CAMERA
+) -> Written:
+    cdr = camera_info_message(stamp_ns, camera, frame="optical")
+    return Written(stamp_ns, topic, "sensor_msgs/msg/CameraInfo", cdr)
+
+
+def shots(n: int = 6, *, first_ns: int = FIRST_NS) -> list[Written]:
+    """RGB-D messages whose depth, in millimetres, comes 5 ms before the colour."""
+    messages = []
+    for i in range(n):
+        stamp_ns = first_ns + i * PERIOD_NS
+        rgb, units = picture(i)
+        messages += [
+            image(stamp_ns - 5_000_000, DEPTH, units, "16UC1"),
+            image(stamp_ns, COLOR, rgb, "rgb8"),
+            camera_info(stamp_ns),
+        ]
+    return messages
+
+
+def write(path: Path, messages: Iterable[Written]) -> Path:
+    """Write messages in the order given, into whatever the path is named as."""
+    if path.suffix == ".mcap":
+        with mcap_writer(path) as writer:
+            for message in messages:
+                writer.write(message)
+    elif path.suffix == ".bag":
+        with bag_writer(path) as writer:
+            for message in messages:
+                writer.write(message)
+    else:
+        _write_folder(path, messages)
+    return path
+
+
+def _write_folder(path: Path, messages: Iterable[Written]) -> None:
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    connections = {}
+    with Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        for log_ns, message in enumerate(messages, start=FIRST_NS):
+            if message.topic not in connections:
+                connections[message.topic] = writer.add_connection(
+                    message.topic, message.type, typestore=store
+                )
+            writer.write(connections[message.topic], log_ns, message.cdr)
