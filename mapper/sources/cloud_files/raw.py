@@ -84,12 +84,12 @@ def _check_range(points: Points32, *, path: Path, is_scaled: bool) -> None:
     size_m = np.percentile(np.linalg.norm(sample - np.median(sample, axis=0), axis=1), 95)
     if range_m > _AWAY_RATIO * size_m:
         raise FrameError(
-            f"{path}: points {size_m:.3g} m around a place {range_m:.3g} m away from the origin; "
+            f"{path}: points {size_m:.3g} m around a place {range_m:.0f} m away from the origin; "
             "want them around the sensor: subtract a common offset before single precision rounds them"
         )
     if not is_scaled:
         raise FrameError(
-            f"{path}: 5 % of the points are farther than {range_m:.3g} m, which looks like millimetres; "
+            f"{path}: 5 % of the points are farther than {range_m:.0f} m, which looks like millimetres; "
             "--set source.cloud_scale=0.001, or 1 if these are metres"
         )
 
