@@ -112,13 +112,7 @@ class KissMatcherConfig(RefinedConfig):
         return KissMatcher(self)
 
 
-RegistrationConfig = Annotated[
-    HoughGicpConfig
-    | HoughNdtConfig
-    | IcpConfig
-    | PlaneIcpConfig
-    | GicpConfig
-    | NdtConfig
-    | KissMatcherConfig,
-    Field(discriminator="kind"),
-]
+AnyRegistration = (
+    HoughGicpConfig | HoughNdtConfig | IcpConfig | PlaneIcpConfig | GicpConfig | NdtConfig | KissMatcherConfig
+)
+RegistrationConfig = Annotated[AnyRegistration, Field(discriminator="kind")]

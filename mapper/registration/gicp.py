@@ -50,6 +50,32 @@ class Prepared:
         return indices[:, 0].astype(np.intp), np.sqrt(squared[:, 0])
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Neighbourhood:
+    """All points of a cloud, of any size, for distances to it alone."""
+
+    tree: Any
+
+    def distances_m(self, points: Points) -> Array:
+        """Return how far each of (M, 3) points is from the nearest of the cloud's."""
+        _, squared = self.tree.batch_knn_search(points, 1)
+        distances_m: Array = np.sqrt(squared[:, 0])
+        return distances_m
+
+
+def neighbourhood(points: Points32 | Points) -> Neighbourhood:
+    """Return a cloud's search tree.
+
+    Raises:
+        DataError: The cloud is empty.
+    """
+    import small_gicp
+
+    if len(points) == 0:
+        raise DataError("cloud: no points, so nothing is near it")
+    return Neighbourhood(small_gicp.KdTree(points, 1))
+
+
 def prepared(points: Points32 | Points, *, voxel_m: float, neighbours: int = _NEIGHBOURS) -> Prepared:
     """Return a cloud with one point a voxel, its normals, covariances and search tree.
 

@@ -1,0 +1,48 @@
+"""How far one cloud lies from another (Nagy, Gálai & Benedek 2016, §IV)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.errors import DataError
+from mapper.frames import Points32
+from mapper.geometry import Transform, apply
+from mapper.registration.gicp import neighbourhood
+
+
+@dataclass(frozen=True, slots=True)
+class CloudDistance:
+    """Distances of the points p of a cloud P to the nearest of a cloud Q: not the same the other way round.
+
+    Attributes:
+        mhd_m: Modified Hausdorff distance, their mean.
+        mpd_m: Their median, which what moved between the two scans does not disturb.
+    """
+
+    mhd_m: float
+    mpd_m: float
+
+
+class DistanceTo:
+    """Measures clouds against one cloud, whose search tree is built once."""
+
+    def __init__(self, points_target: Points32) -> None:
+        """Index the cloud Q, (N, 3) metres.
+
+        Raises:
+            DataError: It is empty.
+        """
+        self._neighbourhood = neighbourhood(points_target)
+
+    def of(self, points_source: Points32, T_target_source: Transform) -> CloudDistance:
+        """Return how far the cloud P, (M, 3) metres in its own frame, lies from Q under a motion.
+
+        Raises:
+            DataError: It is empty.
+        """
+        if len(points_source) == 0:
+            raise DataError("cloud distance: the source has no points")
+        distances_m = self._neighbourhood.distances_m(
+            apply(T_target_source, points_source.astype(np.float64))
+        )
+        return CloudDistance(float(distances_m.mean()), float(np.median(distances_m)))
