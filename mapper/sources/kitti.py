@@ -12,7 +12,7 @@ import numpy as np
 from mapper.config.sources import SourceConfig
 from mapper.errors import SourceError
 from mapper.geometry import Transform, nearest_rotation, transform
-from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, scan_log
+from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, has_clouds, scan_log
 from mapper.sources.scans import ScanLog
 from mapper.sources.text import parse_numbers, rows
 
@@ -55,10 +55,10 @@ def open_log(path: Path, config: SourceConfig) -> ScanLog:
 
 
 def _sequences(path: Path) -> list[Path]:
-    if clouds_in(path / "velodyne")[0]:
+    if has_clouds(path / "velodyne"):
         return [path]
     folders = [*path.glob("sequences/*"), *path.glob("*")]
-    return sorted(folder for folder in folders if clouds_in(folder / "velodyne")[0])
+    return sorted(folder for folder in folders if has_clouds(folder / "velodyne"))
 
 
 def _read_calibration(path: Path) -> Transform | None:

@@ -27,6 +27,11 @@ def is_cloud_name(path: Path) -> bool:
     return ending in ENDINGS and (ending not in _TEXT_ENDINGS or path.stem[-1:].isdecimal())
 
 
+def has_clouds(folder: Path) -> bool:
+    """Tell whether any file of a folder, which need not exist, is called as a cloud is."""
+    return any(map(is_cloud_name, _files(folder)))
+
+
 def clouds_in(folder: Path, pattern: str | None = None) -> tuple[list[Path], list[str]]:
     """Return a folder's clouds in order, and notes on what is left out.
 
