@@ -1,0 +1,138 @@
+import numpy as np
+import pytest
+
+from mapper.errors import DataError, FrameError
+from mapper.frames import Scan
+from mapper.geometry import exp
+from mapper.sources.ros.clouds import scan_from, structured
+from mapper.sources.ros.messages import CloudMessage
+from mapper.sources.ros.recording import Topic
+from mapper.sources.rosbag import decode_ros
+from mapper.sources.rosbag_writing import cloud_message
+
+STAMP_NS = 1_700_000_000_123_456_789
+TOPIC = Topic("/points", "sensor_msgs/msg/PointCloud2", "cdr")
+XYZ = [("x", 0, "<f4", 1), ("y", 4, "<f4", 1), ("z", 8, "<f4", 1)]
+
+
+def scan_of(message, *, T=None, colours=True):
+    return scan_from(message, T_body_frame=np.eye(4) if T is None else T, with_colours=colours, where="m")
+
+
+def some_points(n=50):
+    return np.random.default_rng(1).uniform(-20.0, 20.0, (n, 3)).astype(np.float32)
+
+
+def packed(points, fields, *, point_bytes, order="<"):
+    data = np.zeros(
+        len(points),
+        np.dtype(
+            {
+                "names": [f[0] for f in fields],
+                "offsets": [f[1] for f in fields],
+                "formats": [order + f[2][1:] for f in fields],
+                "itemsize": point_bytes,
+            }
+        ),
+    )
+    for axis, name in enumerate("xyz"):
+        data[name] = points[:, axis]
+    return data
+
+
+def test_what_is_written_is_read_bit_by_bit():
+    rng = np.random.default_rng(0)
+    points = some_points()
+    scan = Scan(
+        STAMP_NS,
+        points,
+        colors=rng.integers(0, 256, (50, 3), dtype=np.uint8),
+        times_s=np.linspace(0.0, 0.1, 50, dtype=np.float32),
+    )
+    data = memoryview(cloud_message(scan, frame="lidar"))
+    message = decode_ros(TOPIC, data)
+    again = scan_of(message)
+    assert (message.stamp_ns, message.frame) == (STAMP_NS, "lidar")
+    np.testing.assert_array_equal(again.points_body, points)
+    np.testing.assert_array_equal(again.colors, scan.colors)
+    np.testing.assert_allclose(again.times_s, scan.times_s, atol=1e-9)
+    assert scan_of(message, colours=False).colors is None
+
+
+def test_the_payload_is_not_copied():
+    data = memoryview(cloud_message(Scan(STAMP_NS, some_points()), frame="lidar"))
+    points = decode_ros(TOPIC, data).points
+    start = np.frombuffer(data, np.uint8).ctypes.data
+    assert start <= points.ctypes.data < start + len(data)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_fields_may_lie_anywhere_in_a_point_of_either_byte_order(order):
+    points = some_points()
+    fields = [("intensity", 0, "<u2", 1), ("z", 24, "<f8", 1), ("x", 4, "<f4", 1), ("y", 12, "<f8", 1)]
+    data = packed(points, fields, point_bytes=40, order=order).tobytes()
+    fields = [(name, offset, order + kind[1:], count) for name, offset, kind, count in fields]
+    view = structured(memoryview(data), fields, point_bytes=40, shape=(1, 50))
+    np.testing.assert_array_equal(scan_of(CloudMessage(STAMP_NS, "lidar", view)).points_body, points)
+
+
+def test_organised_rows_may_be_padded():
+    points = some_points(48)
+    data = packed(points, XYZ, point_bytes=12).view(np.uint8).reshape(4, 12 * 12)
+    data = np.pad(data, ((0, 0), (0, 20)), constant_values=77).tobytes()
+    view = structured(memoryview(data), XYZ, point_bytes=12, shape=(4, 12), row_bytes=164)
+    np.testing.assert_array_equal(scan_of(CloudMessage(STAMP_NS, "lidar", view)).points_body, points)
+
+
+def test_missing_returns_are_dropped_with_their_times():
+    points = some_points(8)
+    points[1] = 0.0
+    points[3, 2] = np.nan
+    points[5, 0] = np.inf
+    points[6] = [1e30, 1e30, 0.0]
+    fields = [*XYZ, ("t", 12, "<u4", 1)]
+    data = packed(points, fields, point_bytes=16)
+    data["t"] = np.arange(8) * 10_000_000
+    view = structured(memoryview(data.tobytes()), fields, point_bytes=16, shape=(1, 8))
+    scan = scan_of(CloudMessage(STAMP_NS, "lidar", view))
+    np.testing.assert_array_equal(scan.points_body, points[[0, 2, 4, 7]])
+    np.testing.assert_allclose(scan.times_s, [0.0, 0.02, 0.04, 0.07], atol=1e-9)
+
+
+def test_a_scan_is_told_in_the_body():
+    T_body_frame = exp(np.array([0.1, -0.2, 2.0]), np.array([0.5, 0.0, 1.2]))
+    points = some_points()
+    message = decode_ros(TOPIC, memoryview(cloud_message(Scan(STAMP_NS, points), frame="lidar")))
+    scan = scan_of(message, T=T_body_frame)
+    np.testing.assert_allclose(
+        scan.points_body, points @ T_body_frame[:3, :3].T + T_body_frame[:3, 3], atol=1e-5
+    )
+    np.testing.assert_array_equal(scan.origin_body, T_body_frame[:3, 3])
+
+
+def test_separate_colours_are_read():
+    fields = [*XYZ, ("r", 12, "<u1", 1), ("g", 13, "<u1", 1), ("b", 14, "<u1", 1)]
+    data = packed(some_points(3), fields, point_bytes=16)
+    data["r"], data["g"], data["b"] = [1, 2, 3], [4, 5, 6], [7, 8, 9]
+    view = structured(memoryview(data.tobytes()), fields, point_bytes=16, shape=(1, 3))
+    assert scan_of(CloudMessage(STAMP_NS, "lidar", view)).colors.tolist() == [[1, 4, 7], [2, 5, 8], [3, 6, 9]]
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        {"point_bytes": 12, "shape": (1, 51)},
+        {"point_bytes": 8, "shape": (1, 50)},
+        {"point_bytes": 12, "shape": (1, 2**40)},
+    ],
+)
+def test_numbers_that_do_not_fit_the_payload_are_refused(numbers):
+    data = packed(some_points(), XYZ, point_bytes=12).tobytes()
+    with pytest.raises(DataError, match="a cloud of 1×"):
+        structured(memoryview(data), XYZ, **numbers)
+
+
+def test_a_cloud_without_heights_is_refused():
+    view = structured(memoryview(bytes(80)), XYZ[:2], point_bytes=8, shape=(1, 10))
+    with pytest.raises(FrameError, match="m: points of x, y; want x, y and z"):
+        scan_of(CloudMessage(STAMP_NS, "lidar", view))

@@ -1,0 +1,104 @@
+import numpy as np
+import pytest
+
+from mapper.errors import SourceError
+from mapper.sources.ros.index import Series
+from mapper.sources.ros.recording import Topic
+from mapper.sources.ros.time_line import ordered, paired
+from mapper.timebase import NS_PER_S
+
+MS = 1_000_000
+
+
+def series(stamps_ms, name="/a", undated=0):
+    stamps_ns = np.array(stamps_ms, dtype=np.int64) * MS
+    return Series(
+        Topic(name, "", "cdr"),
+        stamps_ns,
+        np.arange(len(stamps_ns)),
+        np.zeros((len(stamps_ns), 3), np.int64),
+        undated,
+    )
+
+
+def pairs(color_ms, depth_ms, *, max_gap_s=0.02):
+    i, j, notes = paired(series(color_ms), series(depth_ms, "/d"), max_gap_s=max_gap_s, where="log")
+    return list(zip(i.tolist(), j.tolist(), strict=True)), notes
+
+
+def test_increasing_stamps_stay_as_they_are():
+    order, notes = ordered(series([0, 100, 200, 300, 5000, 5100]))
+    assert (order.tolist(), notes) == ([0, 1, 2, 3, 4, 5], [])
+
+
+def test_messages_that_overtook_each_other_are_sorted_and_duplicates_dropped():
+    order, notes = ordered(series([0, 200, 100, 300, 300, 400]))
+    assert order.tolist() == [0, 2, 1, 3, 5]
+    assert notes == [
+        "/a: out of time order in 1 places; sorted",
+        "/a: 1 stamps appear twice; the first was kept",
+    ]
+
+
+def test_stamps_that_cannot_be_right_are_left_out():
+    stamps = [100 * i for i in range(20)]
+    stamps[7], stamps[12] = 10**12, 3
+    order, notes = ordered(series(stamps, undated=2))
+    assert order.tolist() == [i for i in range(20) if i not in (7, 12)]
+    assert notes == ["/a: 4 of 22 messages have stamps that cannot be right; left out"]
+
+
+@pytest.mark.parametrize(
+    ("stamps", "kept"),
+    [
+        # ten seconds back: what comes again is left out
+        ([*range(0, 20_000, 100), *range(10_000, 30_000, 100)], [*range(200), *range(300, 400)]),
+        # an hour back for good, after a moment: the longer part is the log
+        ([*range(3_600_000, 3_601_000, 100), *range(0, 9_000, 100)], [*range(10, 100)]),
+    ],
+)
+def test_a_clock_that_was_set_back_never_mixes_two_times(stamps, kept):
+    order, notes = ordered(series(stamps))
+    assert sorted(order.tolist()) == sorted(kept)
+    assert (np.diff(np.array(stamps)[order]) > 0).all()
+    lost = len(stamps) - len(kept)
+    assert [note for note in notes if "set back" in note] == (
+        [f"/a: the clock was set back while recording; {lost} of {len(stamps)} frames bear times that other "
+         "frames have too; left out"] if lost else []
+    )  # fmt: skip
+
+
+def test_each_colour_image_gets_its_nearest_depth():
+    found, notes = pairs([0, 33, 67, 100], [5, 40, 60, 190])
+    assert found == [(0, 0), (1, 1), (2, 2)]
+    assert notes == ["1 of 4 colour images have no depth image within 20 ms; left out"]
+
+
+def test_images_of_two_times_with_the_same_stamp_are_not_paired():
+    """The clock is set back by two seconds, and depth stops just then."""
+    before, again = [100 * i for i in range(50)], [100 * i for i in range(30, 80)]
+    found, _ = pairs([*before, *again], before)
+    assert found == [(i, i) for i in range(50)]
+    found, notes = pairs([*before, *again], [*before, *again])
+    assert found == [*((i, i) for i in range(50)), *((i, i) for i in range(70, 100))]
+    assert any("20 of 100 frames bear times" in note for note in notes)
+
+
+def test_a_topic_that_stops_is_told():
+    found, notes = pairs(range(0, 10_000, 100), range(0, 4_000, 100))
+    assert len(found) == 40
+    assert notes == [
+        "60 of 100 colour images have no depth image within 20 ms; left out; /d stops 6.0 s before /a"
+    ]
+
+
+def test_nothing_that_pairs_is_an_error():
+    with pytest.raises(
+        SourceError, match=r"log: no image of /a .* within 20 ms; the closest are 0.05 s apart"
+    ):
+        pairs([0, 100], [50, 150])
+
+
+def test_gaps_are_given_in_seconds():
+    assert pairs([0, 100], [50, 150], max_gap_s=0.05)[0] == [(0, 0), (1, 0)]
+    assert NS_PER_S == 1000 * MS
