@@ -165,9 +165,14 @@ COURTYARD = LidarSynthConfig(
     speed_mps=1.2,
     tilt_rad=0.52,
     yaw_swing_rad=0.8,
-    sensor=LidarSensorConfig(rings=32, lowest_ring_rad=-0.5236, highest_ring_rad=0.2618),
+    sensor=LidarSensorConfig(
+        rings=32, lowest_ring_rad=-0.5236, highest_ring_rad=0.2618, motion_distortion=False
+    ),
 )
-"""A LiDAR carried by hand, strongly tilting and turning, past few things."""
+"""A LiDAR carried by hand, strongly tilting and turning, past few things.
+
+Its sweeps are free of motion: half a second apart, poses alone do not tell how each sweep turned.
+"""
 
 SCENES: Mapping[str, LidarSynthConfig] = {"street": STREET, "courtyard": COURTYARD}
 """Where ``mapper synth`` begins."""
