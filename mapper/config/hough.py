@@ -1,10 +1,13 @@
 """Configuration of the Hough-space registration (Nagy, Gálai & Benedek 2016)."""
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from mapper.config.base import Config
+
+if TYPE_CHECKING:
+    from mapper.registration.base import Registration
 
 Ratio = Annotated[float, Field(ge=0.0, le=1.0)]
 
@@ -52,8 +55,8 @@ class GroundConfig(Config):
     """Half the edge of the grid: points farther away along an axis are dropped."""
     min_obstacle_m: float = 0.5
     """Lowest height above the ground of what is no ground."""
-    max_obstacle_m: float = 4.0
-    """What is higher is cut off: the sparse sensor does not see it (C1)."""
+    max_obstacle_m: float = 8.0
+    """What is higher is cut off. C1 has 4 m; a tilted sensor sees little but walls, and more up to 8."""
     voxel_m: PositiveFloat = 0.4
     """Obstacles are thinned to one point per voxel, so that sparse and dense clouds weigh alike."""
 
@@ -104,3 +107,123 @@ class VotingConfig(Config):
     distinct_m: PositiveFloat = 2.0
     distinct_deg: PositiveFloat = 5.0
     """Peaks nearer to a higher one than both are the same peak."""
+
+
+class OverlapConfig(Config):
+    """How peaks are verified: by what the two scans saw of each other's obstacles."""
+
+    voxel_m: PositiveFloat = 0.4
+    """Obstacles of one scan within a voxel of those of the other overlap."""
+    obstacles: PositiveInt = 1000
+    """Voxels, and columns of ground, that are looked at, evenly chosen."""
+    step_m: PositiveFloat = 0.4
+    step_deg: PositiveFloat = 1.0
+    halvings: NonNegativeInt = 2
+    """From each peak the overlap is climbed in these steps, halved so often."""
+    candidates: PositiveInt = 6
+    """Peaks with the most overlap that are held against both scans' lines of sight."""
+    distinct_m: PositiveFloat = 1.0
+    distinct_deg: PositiveFloat = 3.0
+    """Motions nearer than both are the same."""
+    direction_deg: PositiveFloat = 1.0
+    """Resolution of the lines of sight."""
+    rays: PositiveInt = 40_000
+    """Points, evenly chosen, whose lines of sight are looked along."""
+    margin_m: PositiveFloat = 0.2
+    margin_ratio: NonNegativeFloat = 0.01
+    """An obstacle agrees with a surface at its range, give or take this and so much of the range. One nearer
+    than all that the other scan saw in its direction contradicts it."""
+    min_returns: PositiveInt = 3
+    """And it contradicts only where so many of the directions around it have a return."""
+    contradiction_weight: NonNegativeFloat = 5.0
+    """A motion's score is the share of obstacles that agree, less so many times that which contradicts."""
+
+
+class HoughTrustConfig(Config):
+    """When the answer is believed; otherwise there is none."""
+
+    min_centres: PositiveInt = 5
+    """A scan with fewer centres shows no objects."""
+    min_agreeing_ratio: Ratio = 0.1
+    """Share of each scan's obstacles that the other saw, too. Right answers had 0.12 and more."""
+    min_ground_ratio: Ratio = 0.15
+    """Share of a scan's ground that the other saw, too. Where two views have but a wall in common, any wall
+    will do: wrong answers that nothing contradicted had 0.07 and less, right ones 0.31 and more."""
+    max_contradicting_ratio: Ratio = 0.03
+    """Share of the obstacles that the other scan looked through, the mean of both. Right answers had 0.02 and
+    less, answers in other, similar places 0.037 and more."""
+    min_lead: NonNegativeFloat = 0.1
+    """By how much the score leads that of any other motion."""
+    pair_m: PositiveFloat = 0.5
+    """A point of the refined clouds counts as an inlier that lies so near to one of the other."""
+    min_share: Ratio = 0.004
+    """Each motion's displacements go along the surfaces' normals by this share, or the answer is loose."""
+    refined: PositiveInt = 3
+    """Candidates that are refined, where their scores are near."""
+    near_score: NonNegativeFloat = 0.3
+    """How near."""
+
+
+class GicpStagesConfig(Config):
+    """GICP on the whole clouds (Segal, Haehnel & Thrun 2009)."""
+
+    kind: Literal["gicp"] = "gicp"
+    pair_distances_m: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (1.0,)
+    """Largest distance between the points of a pair, from coarse to fine."""
+    max_iterations: PositiveInt = 30
+    """At each of these distances."""
+
+
+class NdtStagesConfig(Config):
+    """NDT on what is not ground (C4)."""
+
+    kind: Literal["ndt"] = "ndt"
+    cells_m: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (2.0, 1.0)
+    """Edges of the cells, from coarse to fine."""
+    min_points: Annotated[int, Field(ge=4)] = 6
+    """Cells with fewer points have no Gaussian."""
+    max_iterations: PositiveInt = 30
+    """At each of these cells."""
+    with_ground: bool = False
+
+
+class HoughConfig(Config):
+    """What the Hough-space registrations share."""
+
+    constellation: ConstellationConfig
+    voting: VotingConfig
+    overlap: OverlapConfig = OverlapConfig()
+    trust: HoughTrustConfig = HoughTrustConfig()
+    voxel_m: PositiveFloat = 0.4
+    """The clouds that are refined have one point per voxel."""
+    neighbours: Annotated[int, Field(ge=5)] = 10
+    """Nearest points that give each of these its normal."""
+    refinement: Annotated[GicpStagesConfig | NdtStagesConfig, Field(discriminator="kind")]
+
+    def build(self) -> "Registration":
+        """Return the method this configures."""
+        from mapper.registration.hough import Hough
+
+        return Hough(self)
+
+
+class HoughGicpConfig(HoughConfig):
+    """Occupied cells, Hough, GICP: our default."""
+
+    kind: Literal["hough-gicp"] = "hough-gicp"
+    constellation: ConstellationConfig = ConstellationConfig()
+    voting: VotingConfig = VotingConfig()
+    refinement: Annotated[GicpStagesConfig | NdtStagesConfig, Field(discriminator="kind")] = (
+        GicpStagesConfig()
+    )
+
+
+class HoughNdtConfig(HoughConfig):
+    """Objects, Hough, NDT, as published; peaks are verified, and tilted scans levelled, all the same."""
+
+    kind: Literal["hough-ndt"] = "hough-ndt"
+    constellation: ConstellationConfig = ConstellationConfig(
+        ground=GroundConfig(max_obstacle_m=4.0), centres=ObjectsConfig()
+    )
+    voting: VotingConfig = VotingConfig(angles=360)
+    refinement: Annotated[GicpStagesConfig | NdtStagesConfig, Field(discriminator="kind")] = NdtStagesConfig()

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mapper.config.hough import ConstellationConfig, GroundConfig
 from mapper.frames import Points32
-from mapper.geometry import Transform
+from mapper.geometry import Array, Points, Transform
 from mapper.registration.kernels import column_heights, thin_obstacles
 from mapper.registration.levelling import Levelling, level
 
@@ -28,6 +28,23 @@ class Ground:
     seen: NDArray[np.bool_]
     cell_m: float
 
+    @property
+    def points_level(self) -> Points:
+        """(G, 3) the ground at the middle of each column in which it was seen, metres."""
+        rows, columns = np.nonzero(self.seen)
+        half = 0.5 * len(self.seen) - 0.5
+        x, y = (columns - half) * self.cell_m, (rows - half) * self.cell_m
+        return np.column_stack([x, y, self.heights_level[rows, columns]])
+
+    def at(self, x: Array, y: Array) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+        """Return for (N,) places whether ground was seen there, and its height, metres."""
+        edge = len(self.seen)
+        columns = np.floor(x / self.cell_m + 0.5 * edge).astype(np.intp)
+        rows = np.floor(y / self.cell_m + 0.5 * edge).astype(np.intp)
+        inside = (columns >= 0) & (columns < edge) & (rows >= 0) & (rows < edge)
+        rows, columns = np.where(inside, rows, 0), np.where(inside, columns, 0)
+        return inside & self.seen[rows, columns], self.heights_level[rows, columns]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
@@ -36,13 +53,14 @@ class Surroundings:
     Attributes:
         levelling: How the scan stands; its level frame is that of the rest.
         ground: The ground.
-        obstacles: (M, 3) float32, metres, one point per voxel: x, y in the level frame and height
-            above the ground.
+        obstacles: (M, 3) float32 metres, level frame, one point per voxel.
+        heights_m: (M,) float32 their heights above the ground.
     """
 
     levelling: Levelling
     ground: Ground
     obstacles: Points32
+    heights_m: NDArray[np.float32]
 
 
 def surroundings(points_body: Points32, config: ConstellationConfig) -> Surroundings:
@@ -55,7 +73,8 @@ def surroundings(points_body: Points32, config: ConstellationConfig) -> Surround
     levelling = level(points_body, config.levelling)
     T_level_body = levelling.T_level_body
     ground = find_ground(points_body, T_level_body, config.ground)
-    return Surroundings(levelling, ground, find_obstacles(points_body, T_level_body, ground, config.ground))
+    obstacles, heights_m = find_obstacles(points_body, T_level_body, ground, config.ground)
+    return Surroundings(levelling, ground, obstacles, heights_m)
 
 
 def find_ground(points_body: Points32, T_level_body: Transform, config: GroundConfig) -> Ground:
@@ -78,10 +97,14 @@ def find_ground(points_body: Points32, T_level_body: Transform, config: GroundCo
 
 def find_obstacles(
     points_body: Points32, T_level_body: Transform, ground: Ground, config: GroundConfig
-) -> Points32:
-    """Return (M, 3) float32: x, y in the level frame and height above the ground, one point per voxel."""
+) -> tuple[Points32, NDArray[np.float32]]:
+    """Return what is neither ground nor too high, one point per voxel.
+
+    Returns:
+        (M, 3) float32 in the level frame, and (M,) their heights above the ground, metres.
+    """
     voxels_across = 2 * int(np.ceil(config.radius_m / config.voxel_m))
-    obstacles: Points32 = thin_obstacles(
+    obstacles = thin_obstacles(
         points_body,
         T_level_body,
         ground.heights_level,
@@ -91,4 +114,4 @@ def find_obstacles(
         config.voxel_m,
         voxels_across,
     )
-    return obstacles
+    return obstacles[:, :3], obstacles[:, 3]

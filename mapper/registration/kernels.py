@@ -102,7 +102,9 @@ def column_heights(points, T, cell_m, edge):
 
 @njit(cache=True, nogil=True)
 def thin_obstacles(points, T, floor, cell_m, low_m, high_m, voxel_m, voxel_edge):
-    """Return (M, 3) float32 means of the points in each voxel between two heights above the floor.
+    """Return (M, 4) float32 means (x, y, z, height above the floor) of the points in each voxel.
+
+    Points lower or higher than the limits are dropped.
 
     Args:
         points: (N, 3).
@@ -119,7 +121,7 @@ def thin_obstacles(points, T, floor, cell_m, low_m, high_m, voxel_m, voxel_edge)
     voxel_half, voxel_scale = 0.5 * voxel_edge, 1.0 / voxel_m
     layers = int64(np.ceil((high_m - low_m) * voxel_scale)) + 1
     slot = np.full(layers * voxel_edge * voxel_edge, -1, int32)
-    sums = np.empty((len(points), 3))
+    sums = np.empty((len(points), 4))
     counts = np.empty(len(points), int64)
     used = 0
     for i in range(len(points)):
@@ -142,15 +144,16 @@ def thin_obstacles(points, T, floor, cell_m, low_m, high_m, voxel_m, voxel_edge)
         if s < 0:
             s = slot[voxel] = used
             used += 1
-            sums[s, 0] = sums[s, 1] = sums[s, 2] = 0.0
+            sums[s] = 0.0
             counts[s] = 0
         sums[s, 0] += x
         sums[s, 1] += y
-        sums[s, 2] += height
+        sums[s, 2] += z
+        sums[s, 3] += height
         counts[s] += 1
-    means = np.empty((used, 3), float32)
+    means = np.empty((used, 4), float32)
     for s in range(used):
-        for axis in range(3):
+        for axis in range(4):
             means[s, axis] = sums[s, axis] / counts[s]
     return means
 

@@ -52,7 +52,7 @@ def centres_of(obstacles: Points32, config: CellsConfig | ObjectsConfig) -> Arra
     if isinstance(config, ObjectsConfig):
         part_of = _objects(flat, config)
     else:
-        _, part_of = np.unique(_cells(flat, config.cell_m), axis=0, return_inverse=True)
+        _, part_of = np.unique(_numbered(flat, config.cell_m), return_inverse=True)
     sizes = np.bincount(part_of)
     sums = np.column_stack([np.bincount(part_of, weights=flat[:, axis]) for axis in range(2)])
     large = sizes >= _least(flat, config)
@@ -63,7 +63,7 @@ def centres_of(obstacles: Points32, config: CellsConfig | ObjectsConfig) -> Arra
 def _least(flat: Array, config: CellsConfig | ObjectsConfig) -> float:
     """Return how many voxels make an object or an occupied cell, in a cloud of this density."""
     cell_m = config.coarse_m if isinstance(config, ObjectsConfig) else config.cell_m
-    _, counts = np.unique(_cells(flat, cell_m), axis=0, return_counts=True)
+    _, counts = np.unique(_numbered(flat, cell_m), return_counts=True)
     return max(1.0, config.min_voxels_ratio * float(np.median(counts)))
 
 
@@ -85,6 +85,14 @@ def _connected(flat: Array, cell_m: float) -> NDArray[np.intp]:
     image[cells[:, 0], cells[:, 1]] = 1
     labels: NDArray[np.int32] = cv2.connectedComponents(image, connectivity=8)[1]
     return labels[cells[:, 0], cells[:, 1]].astype(np.intp) - 1
+
+
+def _numbered(flat: Array, cell_m: float) -> NDArray[np.int64]:
+    """Return for each point the number of its cell."""
+    cells = _cells(flat, cell_m)
+    cells -= cells.min(axis=0)
+    numbers: NDArray[np.int64] = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
+    return numbers
 
 
 def _cells(flat: Array, cell_m: float) -> NDArray[np.int64]:
