@@ -1,12 +1,9 @@
 """The methods that `mapper compare` knows, set up for a log's sensor."""
 
-from typing import Any, get_args
-
 from evaluators.methods import AnyRegistration, Method, odometry_method, registration_method
+from evaluators.scales import kiss_icp, registrations_for
 from mapper.config.compare import CompareConfig
 from mapper.config.odometry import IsvdOdometryConfig, LocalMapConfig, PnpConfig
-from mapper.config.registration import VOXEL_M, RegistrationConfig
-from mapper.config.scan_odometry import KissOdometryConfig
 from mapper.config.sensors import Sensor
 from mapper.errors import ConfigError
 from mapper.sources.base import FrameSource
@@ -53,32 +50,13 @@ def _image_methods(max_depth_m: float) -> list[Method]:
 
 
 def _scan_methods(sensor: Sensor) -> list[Method]:
-    """Return every registration of scans, its lengths scaled to the scene by one voxel, and KISS-ICP."""
-    members: tuple[Any, ...] = get_args(get_args(RegistrationConfig)[0])
-    configs = [member(voxel_m=VOXEL_M[sensor]) for member in members]
+    """Return every registration of scans, those that need a guess first, and KISS-ICP."""
     registrations = [
-        registration_method(one.kind, one.build, uses_guess=one.kind not in _NEED_NO_GUESS) for one in configs
+        registration_method(one.kind, one.build, uses_guess=one.kind not in _NEED_NO_GUESS)
+        for one in registrations_for(sensor)
     ]
     kiss = kiss_icp(sensor)
     return [
         *sorted(registrations, key=lambda method: not method.uses_guess),
         odometry_method(kiss.kind, kiss.build, sees_images=False),
     ]
-
-
-def kiss_icp(sensor: Sensor) -> KissOdometryConfig:
-    """Return KISS-ICP as published: its answers are neither doubted nor rescued."""
-    published: dict[str, Any] = {"rescue": None, "usual_ratio": 0.0, "lost_ratio": 0.0, "deskew": False}
-    if sensor == "lidar":
-        return KissOdometryConfig(**published)
-    return KissOdometryConfig(
-        **published,
-        min_range_m=0.1,
-        max_range_m=10.0,
-        voxel_m=VOXEL_M["rgbd"],
-        map_voxel_m=0.1,
-        initial_threshold_m=0.2,
-        min_motion_m=0.01,
-        keyframe_distance_m=0.15,
-        max_pair_distance_m=0.15,
-    )

@@ -122,9 +122,11 @@ REGISTRATION_COLUMNS = (
 def odometry_notes(comparison: Comparison) -> list[str]:
     """Return what must be known to read the first table, a sentence each."""
     broken = [f"{run.method} {run.broke}" for run in comparison.runs if run.broke]
+    frames = max(run.frames for run in comparison.runs)
+    unread = f" ({len(comparison.skipped)} more cannot be read)" if comparison.skipped else ""
     return [
-        f"{comparison.runs[0].frames} frames of {comparison.log}; paths SE(3)-aligned; drift: error of the "
-        "translation over stretches of a tenth to a half of the path",
+        f"{frames} frames of {comparison.log}{unread}; paths SE(3)-aligned; drift: error of the translation "
+        "over stretches of a tenth to a half of the path",
         "no loops and no solve; registrations go from frame to frame, from the motion before, which also "
         "carries on where one fails",
         f"frames/s of the method alone: reading a frame takes {comparison.read_ms:.1f} ms more, making its "

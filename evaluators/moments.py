@@ -1,7 +1,7 @@
 """A log's frames, read and prepared once in the same way for every method."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -72,7 +72,8 @@ class Reader:
 
     def _prepared(self, frame: Frame) -> Moment:
         if not isinstance(frame, RgbdFrame):
-            return Moment(frame, frame, np.eye(4))
+            # Without times no method deskews: registrations of pairs could not, for they know no motion.
+            return Moment(frame, replace(frame, times_s=None), np.eye(4))
         scan = frame.scan(stride_px=self._config.stride_px, max_depth_m=self._config.max_depth_m)
         R_body_scan = _T_OPTICAL_UPRIGHT[:3, :3]
         points = np.ascontiguousarray(scan.points_body @ R_body_scan.astype(np.float32))

@@ -105,16 +105,17 @@ def pairs_of(stamps_ns: Stamps, truth: Trajectory, *, count: int, frames_apart: 
         stamps_ns: (N,) stamps of all frames.
         truth: Frames that it does not cover are left out.
         count: How many pairs, where the log has as many.
-        frames_apart: The distances.
+        frames_apart: The distances; those longer than the log are left out.
     """
     index, gap_ns = nearest(truth.stamps_ns, stamps_ns)
     known = gap_ns <= MAX_TRUTH_GAP_NS
     T_truth_body = truth.T_world_body[index]
+    starts = {gap: np.flatnonzero(known[:-gap] & known[gap:]) for gap in frames_apart}
+    gaps = [gap for gap in frames_apart if len(starts[gap])]
     pairs: list[Pair] = []
-    for wanted, gap in zip(_shares(count, len(frames_apart)), frames_apart, strict=True):
-        starts = np.flatnonzero(known[:-gap] & known[gap:])
-        spread = np.unique(np.linspace(0, len(starts) - 1, min(wanted, len(starts))).round().astype(int))
-        for i in starts[spread].tolist():
+    for wanted, gap in zip(_shares(count, len(gaps)), gaps, strict=True):
+        spread = np.linspace(0, len(starts[gap]) - 1, min(wanted, len(starts[gap]))).round().astype(int)
+        for i in starts[gap][spread].tolist():
             pairs.append(Pair(len(pairs), i, i + gap, inverse(T_truth_body[i]) @ T_truth_body[i + gap]))
     return pairs
 

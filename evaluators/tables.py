@@ -51,9 +51,9 @@ def markdown_table(columns: Sequence[Column], records: Sequence[Record]) -> str:
 
 
 def csv_text(records: Sequence[Record]) -> str:
-    """Return the records with every digit, one line each below their names; None is left empty."""
+    """Return one or more records with every digit, a line each below their names; None is left empty."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(records[0]) if records else [], lineterminator="\n")
+    writer = csv.DictWriter(text, list(records[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(records)
     return text.getvalue()

@@ -13,6 +13,7 @@ from mapper.geometry import Transform, inverse, nearest_rotation, transform
 from mapper.registration.base import Alignment, failed
 
 _O3D: Any = open3d  # its stubs know no buffers
+_MIN_PAIRS = 100
 _DECIMALS = 10  # Open3D adds up in threads of its own, in any order: the last digits are never the same
 
 
@@ -62,6 +63,8 @@ class HybridRgbdAligner:
             self._option,
         )
         pairs = round(float(information[5, 5]))  # Σ GᵀG, where G ends in the identity
+        if pairs < _MIN_PAIRS:  # Open3D calls that a success
+            return failed(f"{pairs} pixels agree, fewer than {_MIN_PAIRS}")
         if not found or not np.isfinite(T_found).all():
             return failed(f"Open3D could not solve for the motion between {pairs} pixels")
         T_found = np.round(T_found, _DECIMALS)
