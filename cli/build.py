@@ -1,6 +1,8 @@
 """``mapper build``: a log becomes a run."""
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,11 +21,16 @@ from cli.options import (
     merged,
     selection,
 )
+from cli.stepping import Stepping
 
 if TYPE_CHECKING:
     from evaluators.metric import Metric
     from mapper.config import BuildConfig
     from mapper.run import Run
+    from mapper.sources.base import FrameSource
+    from mapper.watching import Watcher
+
+    Onlooker = Callable[[FrameSource, BuildConfig], AbstractContextManager[Watcher]]
 
 
 def build(
@@ -50,6 +57,15 @@ def build(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace OUT, once the new run is whole.")
     ] = False,
+    rerun: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE.rrd|spawn|connect[:URL]", help="Show the build in Rerun while it goes on."
+        ),
+    ] = None,
+    step: Annotated[
+        bool, typer.Option("--step", help="With --rerun: wait for Enter after each frame.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Turn a recorded log into a pose graph, an octree map, a 2D slice and an MCAP log.
@@ -58,9 +74,10 @@ def build(
     """
     overrides = merged(selection(first, last, stride, require_truth), set_)
     if onto is None:
-        run, metrics = built(log, config, overrides, out, overwrite=overwrite, quiet=quiet)
+        onlooker = _onlooker(rerun, step=step, overwrite=overwrite)
+        run, metrics = built(log, config, overrides, out, overwrite=overwrite, quiet=quiet, onlooker=onlooker)
     else:
-        _refuse_both(config, onto)
+        _refuse_both(config, onto, rerun)
         run, metrics = appended(log, onto, overrides, out, overwrite=overwrite, quiet=quiet)
     if not quiet:
         from cli.summary import summary_text
@@ -76,12 +93,14 @@ def built(
     *,
     overwrite: bool,
     quiet: bool,
+    onlooker: "Onlooker | None" = None,
 ) -> "tuple[Run, list[Metric]]":
     """Build a run and judge its trajectory by the truth, if the log has any."""
     from evaluators.evaluate import evaluate
     from mapper.config import load_config, load_source_config
     from mapper.pipeline import build as build_run
     from mapper.sources import open_source
+    from mapper.watching import NOBODY
 
     prepare_libraries()
     source = open_source(log, load_source_config(config_file, overrides))
@@ -91,8 +110,40 @@ def built(
         progress.note("first run here: the kernels are compiled once, which takes about a minute")
     for note in source.notes:
         progress.note(note)
-    run = build_run(source, config, out, progress=progress, overwrite=overwrite)
+    with nullcontext(NOBODY) if onlooker is None else onlooker(source, config) as watcher:
+        run = build_run(source, config, out, progress=progress, watcher=watcher, overwrite=overwrite)
     return run, evaluate(run.trajectory(), run.truth())
+
+
+def _onlooker(rerun: str | None, *, step: bool, overwrite: bool) -> "Onlooker | None":
+    """Return who looks on at a build, refusing at once what would fail at its end."""
+    from mapper.errors import ConfigError, RunError, ViewerError
+
+    if rerun is None:
+        if step:
+            raise ConfigError("--step: there is nothing to see without --rerun")
+        return None
+    from mapper.export.rerun.target import check_target
+
+    target = check_target(rerun)
+    if Path(target).exists() and not overwrite:
+        raise RunError(f"{target}: exists already; choose another, or pass --overwrite to replace it")
+
+    @contextmanager
+    def onlooker(source: "FrameSource", config: "BuildConfig") -> "Iterator[Watcher]":
+        from mapper.export.rerun.live import watching
+
+        is_built = False
+        try:
+            with watching(target, source, config.rerun) as watcher:
+                yield Stepping(watcher) if step else watcher
+                is_built = True
+        except ViewerError as error:
+            if not is_built:
+                raise
+            print(f"mapper: {error}", file=sys.stderr)
+
+    return onlooker
 
 
 def appended(
@@ -114,9 +165,11 @@ def appended(
     return run, evaluate(run.trajectory(), run.truth())
 
 
-def _refuse_both(config: Path | None, onto: Path) -> None:
+def _refuse_both(config: Path | None, onto: Path, rerun: str | None) -> None:
     from mapper.errors import ConfigError
 
+    if rerun is not None:
+        raise ConfigError(f"--rerun {rerun}: not with --onto; look at the new run with mapper view")
     if config is not None:
         raise ConfigError(
             f"--config {config}: with --onto the settings of {onto} hold; turn single ones by --set"

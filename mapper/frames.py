@@ -70,6 +70,18 @@ class PinholeCamera:
         ).reshape(-1, 2)
         return ideal
 
+    def distort(self, pixels: Array) -> Array:
+        """Return where (N, 2) undistorted pixels lie in the image as taken: the inverse of ``undistort``."""
+        if self.distortion == NO_DISTORTION or len(pixels) == 0:
+            return pixels
+        rays = (pixels - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
+        points_camera = np.column_stack([rays, np.ones(len(rays))])
+        measured, _ = cv2.projectPoints(
+            points_camera, np.zeros(3), np.zeros(3), self.matrix, np.array(self.distortion)
+        )
+        raw: Array = measured.reshape(-1, 2)
+        return raw
+
     def project(self, points_camera: Points) -> Array:
         """Return the undistorted pixels (N, 2) of (N, 3) camera-frame points with positive depth."""
         normalised = points_camera[:, :2] / points_camera[:, 2:3]

@@ -104,7 +104,7 @@ def build(
             tracking = track_log(source, config, progress=progress, watcher=watcher)
             tracking = largest_part(tracking, progress=progress)
         save_tracked(draft, tracked_now(tracking, source.truth))
-        refuse_a_fragment(tracking, config)
+        refuse_a_fragment(tracking, config, sensor=source.sensor)
         with draft.clock.stage("solve"):
             solved = solve(tracking.graph, tracking.loops, config.graph)
         tracking = replace(tracking, graph=solved.graph, loops=solved.loops)
@@ -273,11 +273,11 @@ def fuse_into(
             log_maps(log, maps, stamp_ns=int(trajectory.stamps_ns[0]))
             _write_maps(draft.folder, maps)
             _write_pictures(draft, maps, story)
-    watcher.mapped(story, maps)
     counts = draft.manifest.counts.model_copy(
         update={"leaves": len(maps.octree), "cloud_points": len(maps.cloud_points_world)}
     )
     draft.update(counts=counts, timing=_timing(draft, trajectory, counts.read))
+    watcher.mapped(Run(draft.folder, config, draft.manifest), story, maps)
 
 
 def _write_maps(folder: Path, maps: Maps) -> None:

@@ -11,6 +11,7 @@ from mapper.sources.base import Entry
 
 if TYPE_CHECKING:
     from mapper.fusion import Maps
+    from mapper.run import Run
     from mapper.story import Story
 
 
@@ -42,8 +43,8 @@ class Watcher(Protocol):
         """See where the odometry's world lies in the levelled one, once the graph is solved."""
         ...
 
-    def mapped(self, story: "Story", maps: "Maps", /) -> None:
-        """See the results."""
+    def mapped(self, run: "Run", story: "Story", maps: "Maps", /) -> None:
+        """See the results; the run's folder still has the name of one that is being built."""
         ...
 
 
@@ -56,7 +57,7 @@ class Nobody:
     def levelled(self, T_level_world: Transform, /) -> None:
         """Ignore the world."""
 
-    def mapped(self, story: "Story", maps: "Maps", /) -> None:
+    def mapped(self, run: "Run", story: "Story", maps: "Maps", /) -> None:
         """Ignore the results."""
 
 

@@ -124,3 +124,11 @@ def test_grey_and_colour_of_a_frame_agree():
     grey = RgbdFrame(7, shot.gray, shot.depth_m, PLAIN)
     np.testing.assert_array_equal(grey.rgb, np.dstack([shot.gray] * 3))
     assert grey.gray is grey.image
+
+
+def test_distorting_undoes_undistorting():
+    camera = PinholeCamera(640, 480, 517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
+    pixels = np.random.default_rng(0).uniform([0.0, 0.0], [639.0, 479.0], (500, 2))
+    np.testing.assert_allclose(camera.distort(camera.undistort(pixels)), pixels, atol=1e-3)
+    plain = PinholeCamera(640, 480, 517.3, 516.5, 318.6, 255.3)
+    np.testing.assert_array_equal(plain.distort(pixels), pixels)

@@ -12,9 +12,10 @@ from mapper.frames import PinholeCamera
 from mapper.fusion import Maps, Snapshot
 from mapper.octree.octomap_file import read_map
 from mapper.run import Run
-from mapper.run_log import CAMERA
+from mapper.run_log import BODY, CAMERA
 from mapper.sources.cloud_files.ply import read_ply
 from mapper.sources.mcap_log import open_mcap
+from mapper.sources.ros.frame_tree import FrameTree
 from mapper.sources.ros.messages import CameraMessage, FileMessage, decode
 
 
@@ -57,8 +58,8 @@ def read_snapshots(path: Path) -> Iterator[Snapshot]:
             continue
         message = decode(topic, data)
         if isinstance(message, list):
-            poses = [pose.T_parent_child for pose in message if pose.child == CAMERA]
-            T_body_camera = next((T for T in poses if T is not None), T_body_camera)
+            T_told = FrameTree(message).find(BODY, CAMERA)
+            T_body_camera = T_body_camera if T_told is None else T_told
         elif isinstance(message, CameraMessage):
             camera = _camera(message)
         elif isinstance(message, FileMessage):

@@ -9,11 +9,12 @@ _DIRECTION = np.array([-0.6, -1.0, 0.9])  # from what is looked at to the eye
 _DISTANCE = 0.85  # in diagonals of what is looked at
 
 
-def blueprint_for(looking_at: Array | None) -> rrb.Blueprint:
+def blueprint_for(looking_at: Array | None, camera: str) -> rrb.Blueprint:
     """Return the map beside the images, the plan and the curves.
 
     Args:
         looking_at: (2, 3) lower and upper corner of what the 3D views look at first, metres.
+        camera: The entity whose images are shown.
     """
     eye = None if looking_at is None else _eye(looking_at)
     everything = ["+ /world/**", "- /world/map/traversable"]
@@ -29,7 +30,7 @@ def blueprint_for(looking_at: Array | None) -> rrb.Blueprint:
         ),
     )
     beside = rrb.Vertical(
-        rrb.Spatial2DView(name="camera", origin="/world/body/camera", contents="$origin/**"),
+        rrb.Spatial2DView(name="camera", origin=camera),
         rrb.Tabs(
             rrb.Spatial2DView(name="slice", origin="/slice"),
             rrb.TextDocumentView(name="about", origin="/about"),

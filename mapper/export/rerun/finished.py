@@ -23,8 +23,10 @@ def show_run(run: Run, target: str) -> None:
     story, maps = story_of(run), maps_of(run)
     with recorded(target, name=run.path.name, looking_at=extent(story, maps)) as log:
         log.images(list(snapshots_of(run)))
+        log.poses(story.trajectory)
         tell(log, story, maps)
-        log.about(in_words(run))
+        log.diagnostics(story.records)
+        log.about(in_words(run, name=run.path.name))
 
 
 def tell(log: RerunLog, story: Story, maps: Maps) -> None:
@@ -34,10 +36,9 @@ def tell(log: RerunLog, story: Story, maps: Maps) -> None:
         paths["truth"] = story.truth
     for name, trajectory in paths.items():
         log.path(name, trajectory)
-    log.body(story.trajectory)
     log.graph(story.graph)
     log.loops(story.loops, story.graph.T_world_node)
-    log.diagnostics(story.records, story.frame_ms)
+    log.times(story.frame_ms)
     log.voxels(maps.octree)
     log.cloud(maps.cloud_points_world, maps.cloud_colors)
     log.grid("slice", maps.grid)
@@ -54,7 +55,7 @@ def extent(story: Story, maps: Maps) -> Array:
     return np.array([points_world.min(axis=0), points_world.max(axis=0)])
 
 
-def in_words(run: Run) -> str:
+def in_words(run: Run, *, name: str) -> str:
     """Return a run as Markdown: its counts, its settings that matter, its times."""
     manifest = run.manifest
     counts, timing = manifest.counts, manifest.timing
@@ -69,4 +70,4 @@ def in_words(run: Run) -> str:
         ("mapper", manifest.mapper_version),
     )
     table = "\n".join(f"| {name} | {text.replace('|', '∣')} |" for name, text in rows)
-    return f"# {run.path.name}\n\n| | |\n| --- | --- |\n{table}\n"
+    return f"# {name}\n\n| | |\n| --- | --- |\n{table}\n"

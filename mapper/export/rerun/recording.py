@@ -3,7 +3,7 @@
 ==========================  =======================  ====================================================
 entity                      archetype                what it is
 ==========================  =======================  ====================================================
-/world/body                 Transform3D              pose of every frame
+/world/body                 Transform3D              pose of every frame; /world/live/body while building
 /world/body/camera          Pinhole, EncodedImage    images, and where they were taken
 /world/path/NAME            LineStrips3D             a trajectory: estimate, truth
 /world/graph/nodes          Points3D                 the solved keyframes
@@ -49,7 +49,7 @@ from mapper.timebase import Stamps
 from mapper.trajectory import Trajectory
 
 APPLICATION = "mapper"
-CAMERA = "world/body/camera"
+BODY = "world/body"
 TIMELINE = "stamp"
 _PATHS: dict[str, Rgb] = {"estimate": ESTIMATE, "truth": TRUTH}
 _VERDICTS: dict[Verdict, Rgb] = {"accepted": ACCEPTED, "rejected": REJECTED}
@@ -66,42 +66,56 @@ _DOT_PX = rr.Radius.ui_points(2.5)
 
 
 class RerunLog:
-    """One open recording; made by :func:`recorded`."""
+    """One open recording; made by :func:`recorded`.
 
-    def __init__(self, stream: rr.RecordingStream) -> None:
+    Attributes:
+        body: The entity that moves with the body.
+        camera: The entity that takes the images.
+        keeps: Whether its file is to be kept when an error ends the block.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, body: str) -> None:
         self._stream = stream
-        self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        self.body, self.camera = body, f"{body}/camera"
+        self.keeps = False
+        self.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        self.log(body, rr.TransformAxes3D(0.2))
         for name, color in _SERIES.items():
-            self._log(f"diagnostics/{name}", rr.SeriesLines(names=name, colors=[color]))
+            self.log(f"diagnostics/{name}", rr.SeriesLines(names=name, colors=[color]))
 
-    def body(self, trajectory: Trajectory) -> None:
+    def log(self, entity: str, what: Any, *, stamp_ns: int | None = None) -> None:
+        """Log something at a stamp, or for the whole recording."""
+        if stamp_ns is not None:
+            self._stream.set_time(TIMELINE, timestamp=np.datetime64(stamp_ns, "ns"))
+        self._stream.log(entity, what, static=stamp_ns is None, strict=True)
+
+    def poses(self, trajectory: Trajectory) -> None:
         """Log where the body was at every stamp."""
         self._columns(
-            "world/body",
+            self.body,
             trajectory.stamps_ns,
             rr.Transform3D.columns(
                 translation=trajectory.positions_world, mat3x3=trajectory.T_world_body[:, :3, :3]
             ),
         )
-        self._log("world/body", rr.TransformAxes3D(0.2))
 
     def images(self, snapshots: Sequence[Snapshot]) -> None:
         """Log images with the camera that took them, which sits still on the body."""
         if not snapshots:
             return
-        self.camera(snapshots[0].camera, snapshots[0].T_body_camera)
+        self.mount(snapshots[0].camera, snapshots[0].T_body_camera)
         blobs = [np.frombuffer(snapshot.jpeg, np.uint8) for snapshot in snapshots]
         self._columns(
-            CAMERA,
+            self.camera,
             np.array([snapshot.stamp_ns for snapshot in snapshots]),
             rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs)),
         )
 
-    def camera(self, camera: PinholeCamera, T_body_camera: Transform) -> None:
+    def mount(self, camera: PinholeCamera, T_body_camera: Transform) -> None:
         """Log a camera and where it sits on the body; Rerun knows no lens distortion."""
-        self._log(CAMERA, _transform(T_body_camera))
-        self._log(
-            CAMERA,
+        self.log(self.camera, transform_of(T_body_camera))
+        self.log(
+            self.camera,
             rr.Pinhole(
                 image_from_camera=camera.matrix,
                 resolution=[camera.width_px, camera.height_px],
@@ -112,19 +126,19 @@ class RerunLog:
     def path(self, name: str, trajectory: Trajectory) -> None:
         """Log a whole trajectory, "estimate" or "truth"."""
         strip = trajectory.positions_world.astype(np.float32)
-        self._log(f"world/path/{name}", rr.LineStrips3D([strip], colors=[_PATHS[name]], radii=_LINE_PX))
+        self.log(f"world/path/{name}", rr.LineStrips3D([strip], colors=[_PATHS[name]], radii=_LINE_PX))
 
     def graph(self, graph: PoseGraph) -> None:
         """Log the nodes, and the factors that are no loops, as lines by origin."""
         positions = {node: T[:3, 3] for node, T in graph.T_world_node.items()}
-        self._log(
+        self.log(
             "world/graph/nodes",
             rr.Points3D(np.array(list(positions.values())), colors=[ESTIMATE], radii=_DOT_PX),
         )
         for origin, color in FACTORS.items():
             ends = [(positions[f.i], positions[f.j]) for f in graph.factors if f.origin == origin]
             if ends and origin != "loop":
-                self._log(
+                self.log(
                     f"world/graph/{origin}", rr.LineStrips3D(np.array(ends), colors=[color], radii=_THIN_PX)
                 )
 
@@ -138,7 +152,7 @@ class RerunLog:
                 if loop.verdict == verdict
             ]
             if ends:
-                self._log(
+                self.log(
                     f"world/loops/{verdict}", rr.LineStrips3D(np.array(ends), colors=[color], radii=_LINE_PX)
                 )
         if loops:
@@ -158,16 +172,16 @@ class RerunLog:
         if occupied.any():
             colors = height_colors(leaves.centres_world[occupied, 2])
             indices = leaves.keys[occupied].astype(np.int32) - KEY_ZERO
-            self._log("world/map/voxels", rr.VoxelGridMap(indices, [leaves.edge_m] * 3, colors=colors))
+            self.log("world/map/voxels", rr.VoxelGridMap(indices, [leaves.edge_m] * 3, colors=colors))
 
     def cloud(self, points_world: NDArray[np.floating], colors: NDArray[np.uint8]) -> None:
         """Log (N, 3) points in metres with (N, 3) RGB bytes."""
-        self._log("world/map/cloud", rr.Points3D(points_world, colors=colors, radii=rr.Radius.ui_points(1.2)))
+        self.log("world/map/cloud", rr.Points3D(points_world, colors=colors, radii=rr.Radius.ui_points(1.2)))
 
     def grid(self, name: str, grid: OccupancyGrid) -> None:
         """Log a 2D grid in the world's z = 0 plane."""
         height, width = grid.cells.shape
-        self._log(
+        self.log(
             f"world/map/{name}",
             rr.GridMap(
                 data=grid.cells[::-1].tobytes(),
@@ -182,14 +196,14 @@ class RerunLog:
 
     def plan(self, grid: OccupancyGrid, paths: Mapping[str, Trajectory]) -> None:
         """Log the slice as an image seen from above, with trajectories over it."""
-        self._log("slice", rr.Image(np.ascontiguousarray(grid_image(grid)[::-1])))
+        self.log("slice", rr.Image(np.ascontiguousarray(grid_image(grid)[::-1])))
         height = grid.cells.shape[0]
         for name, trajectory in paths.items():
             cells = (trajectory.positions_world[:, :2] - grid.origin_world_m) / grid.resolution_m
             strip = np.column_stack([cells[:, 0], height - cells[:, 1]])
-            self._log(f"slice/{name}", rr.LineStrips2D([strip], colors=[_PATHS[name]], radii=_LINE_PX))
+            self.log(f"slice/{name}", rr.LineStrips2D([strip], colors=[_PATHS[name]], radii=_LINE_PX))
 
-    def diagnostics(self, records: Sequence[FrameRecord], frame_ms: Mapping[int, float]) -> None:
+    def diagnostics(self, records: Sequence[FrameRecord]) -> None:
         """Log how every frame went, as curves."""
         if not records:
             return
@@ -197,22 +211,20 @@ class RerunLog:
         for name in ("features", "matches", "inliers", "residual"):
             values = np.array([getattr(record.diagnostics, name) for record in records], np.float64)
             self._columns(f"diagnostics/{name}", stamps_ns, rr.Scalars.columns(scalars=values))
+
+    def times(self, frame_ms: Mapping[int, float]) -> None:
+        """Log how many milliseconds each frame took, by stamp, as a curve."""
         if frame_ms:
-            self._columns(
-                "diagnostics/ms",
-                np.array(list(frame_ms)),
-                rr.Scalars.columns(scalars=np.array(list(frame_ms.values()))),
-            )
+            values = np.array(list(frame_ms.values()))
+            self._columns("diagnostics/ms", np.array(list(frame_ms)), rr.Scalars.columns(scalars=values))
+
+    def look_at(self, corners: Array) -> None:
+        """Arrange the viewer anew, looking at what lies between two (2, 3) corners, metres."""
+        self._stream.send_blueprint(blueprint_for(corners, self.camera))
 
     def about(self, markdown: str) -> None:
         """Log the run in words."""
-        self._log("about", rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))
-
-    def _log(self, entity: str, what: Any, *, stamp_ns: int | None = None) -> None:
-        """Log something at a stamp, or for the whole recording."""
-        if stamp_ns is not None:
-            self._stream.set_time(TIMELINE, timestamp=np.datetime64(stamp_ns, "ns"))
-        self._stream.log(entity, what, static=stamp_ns is None, strict=True)
+        self.log("about", rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))
 
     def _columns(self, entity: str, stamps_ns: Stamps, columns: Any) -> None:
         index = rr.TimeColumn(TIMELINE, timestamp=np.asarray(stamps_ns).astype("datetime64[ns]"))
@@ -220,21 +232,30 @@ class RerunLog:
 
 
 @contextmanager
-def recorded(target: str, *, name: str, looking_at: Array | None = None) -> Iterator[RerunLog]:
+def recorded(
+    target: str,
+    *,
+    name: str,
+    body: str = BODY,
+    looking_at: Array | None = None,
+) -> Iterator[RerunLog]:
     """Yield a recording that goes to a target, see :func:`mapper.export.rerun.target.streaming`.
 
     Args:
         target: FILE.rrd, "spawn", "connect" or "connect:URL".
         name: What the viewer calls it.
+        body: The entity that is to move with the body.
         looking_at: (2, 3) lower and upper corner of what to look at first, metres; None leaves it to Rerun.
     """
     stream = rr.RecordingStream(APPLICATION)
-    with streaming(stream, target, blueprint_for(looking_at)):
+    log = RerunLog(stream, body)
+    with streaming(stream, target, blueprint_for(looking_at, log.camera), keeps=lambda: log.keeps):
         stream.send_recording_name(name)
-        yield RerunLog(stream)
+        yield log
 
 
-def _transform(T_parent_child: Transform) -> rr.Transform3D:
+def transform_of(T_parent_child: Transform) -> rr.Transform3D:
+    """Return a pose as Rerun has it."""
     return rr.Transform3D(translation=T_parent_child[:3, 3], mat3x3=T_parent_child[:3, :3])
 
 

@@ -3,7 +3,7 @@
 import os
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -40,8 +40,20 @@ def check_target(target: str) -> str:
 
 
 @contextmanager
-def streaming(recording: "rr.RecordingStream", target: str, blueprint: "rrb.Blueprint") -> Iterator[None]:
+def streaming(
+    recording: "rr.RecordingStream",
+    target: str,
+    blueprint: "rrb.Blueprint",
+    *,
+    keeps: Callable[[], bool],
+) -> Iterator[None]:
     """Send a recording to a target while inside; a file appears at the end, whole.
+
+    Args:
+        recording: What is sent.
+        target: FILE.rrd, "spawn", "connect" or "connect:URL".
+        blueprint: How it is arranged.
+        keeps: Whether an error inside leaves the file too, with what was recorded until then.
 
     Raises:
         ConfigError: The target is none.
@@ -51,9 +63,18 @@ def streaming(recording: "rr.RecordingStream", target: str, blueprint: "rrb.Blue
     if Path(target).suffix == ENDING:
         with replacing(Path(target)) as part:
             recording.save(part, default_blueprint=blueprint)
-            yield
+            failure = None
+            try:
+                yield
+            except BaseException as error:
+                if not keeps():
+                    raise
+                error.add_note(f"what it recorded so far is in {target}")
+                failure = error
             recording.flush()
             recording.disconnect()
+        if failure is not None:
+            raise failure
         return
     if target == _SPAWN:
         _refuse_without_screen()
@@ -66,7 +87,7 @@ def streaming(recording: "rr.RecordingStream", target: str, blueprint: "rrb.Blue
     try:
         recording.flush(timeout_sec=_FLUSH_S)
     except RuntimeError as error:
-        raise ViewerError(f"rerun: the viewer went away: {error}; build to a FILE{ENDING} instead") from None
+        raise ViewerError(f"rerun: the viewer went away: {error}; record to a FILE{ENDING} instead") from None
 
 
 def _spawn(recording: "rr.RecordingStream", blueprint: "rrb.Blueprint") -> None:

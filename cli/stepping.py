@@ -1,0 +1,56 @@
+"""``--step``: a build that waits for Enter after every frame, as the thesis's tool did."""
+
+import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mapper.fusion import Maps
+    from mapper.geometry import Transform
+    from mapper.run import Run
+    from mapper.story import Story
+    from mapper.watching import Step, Watcher
+
+
+class Stepping:
+    """Looks on together with another, and lets the build go on when a key says so."""
+
+    def __init__(self, other: "Watcher") -> None:
+        """Refuse to wait for somebody who is not there.
+
+        Raises:
+            ConfigError: Standard input is no terminal.
+        """
+        from mapper.errors import ConfigError
+
+        if not sys.stdin.isatty():
+            raise ConfigError("--step: waits for Enter after each frame, but standard input is no terminal")
+        self._other = other
+        self._frames = 0
+        self._waits = True
+        _say("stepping: Enter for the next frame, c and Enter to run on")
+
+    def stepped(self, step: "Step", /) -> None:
+        """Tell how the frame went, and wait."""
+        self._other.stepped(step)
+        self._frames += 1
+        if not self._waits:
+            return
+        how = step.track.diagnostics
+        place = "lost" if step.track.node is None else f"node {step.track.node}, {how.inliers} inliers"
+        kept = ", a keyframe" if step.track.is_keyframe else ""
+        _say(f"frame {self._frames} at {step.track.stamp_ns}: {how.method}, {place}{kept} ", end="")
+        sys.stderr.flush()
+        answer = sys.stdin.readline()
+        self._waits = answer.strip() != "c" and bool(answer)
+
+    def levelled(self, T_level_world: "Transform", /) -> None:
+        """Pass on."""
+        self._other.levelled(T_level_world)
+
+    def mapped(self, run: "Run", story: "Story", maps: "Maps", /) -> None:
+        """Pass on."""
+        self._other.mapped(run, story, maps)
+
+
+def _say(text: str, *, end: str = "\n") -> None:
+    print(text, end=end, file=sys.stderr)

@@ -1,0 +1,178 @@
+"""A build, told to a recording while it goes on.
+
+What tracking believes lies below /world/live, in a world that is upright only by guess; once the graph is
+solved and levelled, that entity is laid into the levelled world. The body stays where the odometry saw it:
+Rerun would not show poses that are logged anew at the same stamps.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+import rerun as rr
+
+from mapper.config import RerunConfig
+from mapper.config.sensors import Sensor
+from mapper.errors import FrameError
+from mapper.export.jpeg import encode_jpeg, shrunk_camera
+from mapper.export.palette import ACCEPTED, ESTIMATE, FACTORS, REJECTED, Rgb
+from mapper.export.rerun.finished import extent, in_words, tell
+from mapper.export.rerun.recording import RerunLog, recorded, transform_of
+from mapper.features.view import View
+from mapper.frames import RgbdFrame, Scan
+from mapper.fusion import Maps
+from mapper.geometry import Array, Transform, inverse
+from mapper.odometry.base import Track
+from mapper.run import Run
+from mapper.sources.base import FrameSource
+from mapper.story import Story
+from mapper.watching import Step
+
+_LIVE = "world/live"
+_BODY = f"{_LIVE}/body"
+_GROWTH = 0.02  # a path is logged anew once it has grown by so much: all of it, so in all 50 times its length
+_TOLD = ("features", "matches", "inliers", "residual")
+_UPRIGHT: dict[Sensor, Transform] = {
+    # x right, y down, z forward, held level, becomes x right, y forward, z up.
+    "rgbd": np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]),
+    "lidar": np.eye(4),
+}
+_MATCHED: Rgb = (60, 200, 120)
+_UNMATCHED: Rgb = (150, 150, 150)
+
+
+class LiveRerun:
+    """Looks on while a map is built, and tells a recording; made by :func:`watching`."""
+
+    def __init__(self, log: RerunLog, sensor: Sensor, config: RerunConfig) -> None:
+        self._log = log
+        self._config = config
+        self._T_guess_world = _UPRIGHT[sensor]
+        self._frames = 0
+        self._last_ns = 0
+        self._path: list[Array] = []
+        self._nodes: list[int] = []
+        self._factors: list[tuple[int, int]] = []
+        self._told_at = 0
+        self._told_loops = 0
+
+    def stepped(self, step: Step, /) -> None:
+        """Log where the body is and how tracking went; now and then the image, the cloud and the paths."""
+        track = step.track
+        self._last_ns = track.stamp_ns
+        self._log.keeps = True  # a build that fails is best understood by looking at it
+        for name in _TOLD:
+            value = float(getattr(track.diagnostics, name))
+            self._log.log(f"diagnostics/{name}", rr.Scalars(value), stamp_ns=track.stamp_ns)
+        if track.node is not None:
+            self._move(track)
+        if self._frames % self._config.image_stride == 0:
+            self._show(step)
+        self._frames += 1
+        if track.is_keyframe and track.node is not None:
+            self._nodes.append(track.node)
+            self._factors += [(factor.i, factor.j) for factor in (*track.links, *track.factors)]
+            self._tell_paths(step)
+
+    def levelled(self, T_level_world: Transform, /) -> None:
+        """Lay what was told so far into the levelled world."""
+        self._log.log(_LIVE, transform_of(T_level_world @ inverse(self._T_guess_world)))
+
+    def mapped(self, run: Run, story: Story, maps: Maps, /) -> None:
+        """Log the results; what was only believed is theirs to show now."""
+        for name in ("believed", "factors", "loops"):
+            self._log.log(f"{_LIVE}/{name}", rr.Clear(recursive=True), stamp_ns=self._last_ns)
+        tell(self._log, story, maps)
+        self._log.about(in_words(run, name=run.manifest.input.title))
+        self._log.look_at(extent(story, maps))
+
+    def _move(self, track: Track) -> None:
+        T_guess_body = self._T_guess_world @ track.T_world_body
+        self._path.append(T_guess_body[:3, 3].astype(np.float32))
+        self._log.log(self._log.body, transform_of(T_guess_body), stamp_ns=track.stamp_ns)
+
+    def _show(self, step: Step) -> None:
+        """Load the frame again, in colour, and log what the sensor saw."""
+        try:
+            frame = step.entry.load()
+        except FrameError:
+            return  # it was readable a moment ago; the second pass will tell
+        if isinstance(frame, RgbdFrame):
+            self._show_image(frame, step)
+            pixels = frame.depth_m.size
+            self._show_cloud(frame.scan(stride_px=_stride(pixels, self._config.cloud_points, power=2)))
+        else:
+            self._show_cloud(frame)
+
+    def _show_image(self, frame: RgbdFrame, step: Step) -> None:
+        width_px = self._config.image_width_px
+        camera = shrunk_camera(frame.camera, width_px=width_px)
+        if self._frames == 0:
+            self._log.mount(camera, frame.T_body_camera)
+        jpeg = encode_jpeg(frame.image, width_px=width_px, quality=80)
+        image = rr.EncodedImage(contents=jpeg, media_type="image/jpeg")
+        self._log.log(self._log.camera, image, stamp_ns=frame.stamp_ns)
+        view, agreeing = step.view(), step.track.agreeing
+        if not isinstance(view, View):
+            return
+        if agreeing is None:
+            agreeing = np.zeros(len(view), np.bool_)
+        scale = camera.width_px / frame.camera.width_px
+        dots = rr.Points2D(
+            (frame.camera.distort(view.pixels) + 0.5) * scale,
+            colors=np.where(agreeing[:, None], np.array(_MATCHED, np.uint8), np.array(_UNMATCHED, np.uint8)),
+            radii=rr.Radius.ui_points(1.5),
+        )
+        self._log.log(f"{self._log.camera}/features", dots, stamp_ns=frame.stamp_ns)
+
+    def _show_cloud(self, scan: Scan) -> None:
+        kept = slice(None, None, _stride(len(scan.points_body), self._config.cloud_points, power=1))
+        colors = None if scan.colors is None else scan.colors[kept]
+        points = rr.Points3D(scan.points_body[kept], colors=colors, radii=rr.Radius.ui_points(1.0))
+        self._log.log(f"{self._log.body}/cloud", points, stamp_ns=scan.stamp_ns)
+
+    def _tell_paths(self, step: Step) -> None:
+        """Log the path before loops, the nodes as believed with them, and what ties these; not every time."""
+        loops = step.closer.closures()
+        grown = len(self._nodes) >= (1.0 + _GROWTH) * self._told_at
+        if not grown and len(loops) == self._told_loops:
+            return
+        self._told_at, self._told_loops = len(self._nodes), len(loops)
+        believed = {node: (self._T_guess_world @ step.closer.believed(node))[:3, 3] for node in self._nodes}
+        self._strips("odometry", [np.array(self._path)], FACTORS["odometry"])
+        self._strips("believed", [np.array(list(believed.values()))], ESTIMATE)
+        self._strips("factors", [[believed[i], believed[j]] for i, j in self._factors], FACTORS["odometry"])
+        for verdict, color in (("accepted", ACCEPTED), ("rejected", REJECTED)):
+            ends = [
+                [believed[loop.i], believed[loop.j]]
+                for loop in loops
+                if loop.verdict == verdict and loop.i in believed and loop.j in believed
+            ]
+            self._strips(f"loops/{verdict}", ends, color)
+
+    def _strips(self, name: str, strips: Sequence[Sequence[Array] | Array], color: Rgb) -> None:
+        lines = rr.LineStrips3D(strips, colors=[color], radii=rr.Radius.ui_points(1.0))
+        self._log.log(f"{_LIVE}/{name}", lines, stamp_ns=self._last_ns)
+
+
+@contextmanager
+def watching(target: str, source: FrameSource, config: RerunConfig) -> Iterator[LiveRerun]:
+    """Yield a watcher that tells a target; a build that fails leaves what it recorded.
+
+    Args:
+        target: FILE.rrd, "spawn", "connect" or "connect:URL".
+        source: The log that is mapped.
+        config: What is shown.
+
+    Raises:
+        ConfigError: The target is none.
+        ViewerError: No viewer can be started or reached.
+    """
+    with recorded(target, name=source.name, body=_BODY) as log:
+        yield LiveRerun(log, source.sensor, config)
+
+
+def _stride(items: int, wanted: int, *, power: int) -> int:
+    """Return every how many-th item, along each of so many axes, leaves about as many as wanted."""
+    ratio: float = (items / wanted) ** (1.0 / power)
+    return max(1, round(ratio))
