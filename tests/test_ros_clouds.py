@@ -89,7 +89,7 @@ def test_missing_returns_are_dropped_with_their_times():
     points[1] = 0.0
     points[3, 2] = np.nan
     points[5, 0] = np.inf
-    points[6] = [1e30, 1e30, 0.0]
+    points[6] = [1e30, 1.0, 0.0]
     fields = [*XYZ, ("t", 12, "<u4", 1)]
     data = packed(points, fields, point_bytes=16)
     data["t"] = np.arange(8) * 10_000_000

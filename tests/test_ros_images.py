@@ -109,9 +109,9 @@ def test_depth_of_16_bits_is_millimetres(encoding, is_big_endian):
 def test_depth_of_32_bits_is_metres_and_what_is_no_depth_is_zero(kind):
     depth = np.linspace(0.5, 4.0, 48 * 64, dtype=np.float32).reshape(48, 64)
     wild = depth.copy()
-    wild[0, :4] = [np.nan, np.inf, -np.inf, -1.0]
+    wild[0, :5] = [np.nan, np.inf, -np.inf, -1.0, 65504.0]
     message = pixels(wild.astype(kind), "32FC1", is_big_endian=kind == ">f4")
-    depth[0, :4] = 0.0
+    depth[0, :5] = 0.0
     got = depth_m_of(message, units_per_m=1000.0, where="m")
     assert got.dtype == np.float32
     np.testing.assert_array_equal(got, depth)

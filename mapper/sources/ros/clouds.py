@@ -14,6 +14,7 @@ from mapper.sources.ros.messages import CloudMessage
 Field = tuple[str, int, str, int]
 """Name, offset in a point, numpy's name of its type with the byte order, and how many there are."""
 
+_FARTHEST_M = 5000.0
 _SEPARATE_COLOURS = (("r", "g", "b"), ("red", "green", "blue"))
 _PACKED_COLOURS = ("rgb", "rgba")
 
@@ -58,7 +59,8 @@ def structured(
 def scan_from(message: CloudMessage, *, T_body_frame: Transform, with_colours: bool, where: str) -> Scan:
     """Return what was measured of a cloud, in the body frame.
 
-    Points that are not finite, or at the sensor itself, are what drivers write for missing returns.
+    Points that are not finite, or at the sensor itself, are what drivers write for missing returns; points
+    beyond every sensor's reach are damage.
 
     Args:
         message: The cloud.
@@ -78,7 +80,7 @@ def scan_from(message: CloudMessage, *, T_body_frame: Transform, with_colours: b
         points_body[:, axis] = points[name]
     with np.errstate(over="ignore", invalid="ignore"):
         squared_m2 = np.einsum("ij,ij->i", points_body, points_body)
-    is_measured: NDArray[np.bool_] = np.isfinite(squared_m2) & (squared_m2 > 0.0)
+    is_measured: NDArray[np.bool_] = (squared_m2 > 0.0) & (squared_m2 < _FARTHEST_M**2)
     kept = slice(None) if is_measured.all() else np.flatnonzero(is_measured)
     points_body = points_body[kept]
     T_body_points = T_body_frame @ message.T_frame_points

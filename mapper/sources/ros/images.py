@@ -44,6 +44,7 @@ _COLOUR = {
     "bayer_grbg8": _Encoding(1, cv2.COLOR_BayerGB2RGB, cv2.COLOR_BayerGB2GRAY),
 }
 _DEPTH = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+_FARTHEST_M = 1000.0  # no depth camera reaches as far: a damaged message, or a simulator's sky
 _DEPTH_HEADER = struct.Struct("<iff")  # compressedDepth's: how it is stored, and two parameters of that
 
 
@@ -142,8 +143,8 @@ def _depth_m_of_file(message: FileMessage, *, units_per_m: float, where: str) ->
 
 
 def _measured(depth_m: DepthImage) -> DepthImage:
-    """Return depth with 0 where it is not finite or not in front of the camera."""
-    is_measured = (depth_m > 0.0) & (depth_m < np.inf)
+    """Return depth with 0 where it is not finite, not in front of the camera, or that of a rendered sky."""
+    is_measured = (depth_m > 0.0) & (depth_m < _FARTHEST_M)
     return np.where(is_measured, depth_m, np.float32(0.0)).astype(np.float32, copy=False)
 
 

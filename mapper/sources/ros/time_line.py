@@ -13,9 +13,12 @@ from mapper.timebase import NS_PER_S, Stamps, nearest
 
 _Indices = NDArray[np.intp]
 
-_MAX_SWAP_NS = NS_PER_S
-"""Messages overtake each other by less; what falls further back was taken after a clock was set back."""
 _NEIGHBOURS = 5
+_MAX_STRAY_NS = NS_PER_S
+"""A stamp further from the median of itself and its neighbours is damaged: even where frames are lost."""
+_STOPPED_S = 1.0
+_MAX_OVERTAKEN = 4
+"""So many messages may follow one that they should have preceded; more say that the clock was set back."""
 
 
 def ordered(series: Series) -> tuple[_Indices, list[str]]:
@@ -66,10 +69,9 @@ def paired(
             "(source.max_pair_gap_s)"
         )
     if alone := len(sound_color) - len(i):
-        notes.append(
-            f"{alone} of {len(sound_color)} colour images have no depth image within "
-            f"{max_gap_s * 1e3:g} ms; left out{_whose_end(color, depth)}"
-        )
+        without = f"no depth image within {max_gap_s * 1e3:g} ms"
+        notes.append(f"{alone} of {len(sound_color)} colour images have {without}; left out")
+    notes += _end_note(color, depth)
     kept = _without_overlap(color.stamps_ns[i], _epochs(color.stamps_ns[i]))
     notes += _overlap_note(color.topic.name, int((~kept).sum()), len(kept))
     i, j = i[kept], j[kept]
@@ -85,7 +87,7 @@ def _sound(series: Series) -> tuple[_Indices, list[str]]:
         windows = np.sort(sliding_window_view(stamps_ns, _NEIGHBOURS), axis=1)
         inner = slice(_NEIGHBOURS // 2, len(stamps_ns) - _NEIGHBOURS // 2)
         off_ns = np.abs(stamps_ns[inner].astype(np.float64) - windows[:, _NEIGHBOURS // 2])
-        is_sound[inner] = off_ns <= _MAX_SWAP_NS
+        is_sound[inner] = off_ns <= _MAX_STRAY_NS
     notes = []
     if wrong := series.undated + int((~is_sound).sum()):
         notes.append(
@@ -97,7 +99,10 @@ def _sound(series: Series) -> tuple[_Indices, list[str]]:
 
 def _epochs(stamps_ns: Stamps) -> NDArray[np.int64]:
     """Return how often the clock had been set back before each message, in the order of recording."""
-    return np.concatenate([[0], np.cumsum(np.diff(stamps_ns) < -_MAX_SWAP_NS)])
+    before = stamps_ns[:-1]
+    later = stamps_ns[np.minimum(np.arange(1, len(stamps_ns)) + _MAX_OVERTAKEN, len(stamps_ns) - 1)]
+    was_set_back = (stamps_ns[1:] < before) & (later < before)
+    return np.concatenate([[0], np.cumsum(was_set_back)])
 
 
 def _without_overlap(stamps_ns: Stamps, epochs: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -126,9 +131,10 @@ def _overlap_note(name: str, dropped: int, total: int) -> Sequence[str]:
     ]
 
 
-def _whose_end(color: Series, depth: Series) -> str:
-    """Say which topic stopped before the other, if that is why images are alone."""
-    ahead_s = (int(color.stamps_ns[-1]) - int(depth.stamps_ns[-1])) / NS_PER_S
-    if ahead_s > 1.0:
-        return f"; {depth.topic.name} stops {ahead_s:.1f} s before {color.topic.name}"
-    return ""
+def _end_note(color: Series, depth: Series) -> Sequence[str]:
+    """Say which topic stopped before the other, by the clock of the recorder."""
+    first, last = sorted((color, depth), key=lambda series: int(series.log_ns[-1]))
+    early_s = (int(last.log_ns[-1]) - int(first.log_ns[-1])) / NS_PER_S
+    if early_s <= _STOPPED_S:
+        return []
+    return [f"{first.topic.name} stops {early_s:.1f} s before {last.topic.name}"]
