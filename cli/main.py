@@ -19,6 +19,7 @@ from cli.fuse import fuse
 from cli.inspect import inspect
 from cli.loops import WithPairs, loops
 from cli.plan import WithPoints, plan
+from cli.register import register
 from cli.report import report
 from cli.show_config import show_config
 from cli.solve import solve
@@ -71,6 +72,7 @@ app.command("eval")(evaluate)
 app.command("export")(export)
 app.command("plan", cls=WithPoints)(plan)
 app.command("solve")(solve)
+app.command("register")(register)
 app.command("compare")(compare)
 app.command("inspect")(inspect)
 app.command("convert")(convert)

@@ -48,6 +48,10 @@ class VocabularyError(MapperError):
     """A vocabulary that is missing or damaged, or descriptors that it has no words for."""
 
 
+class RegistrationError(MapperError):
+    """Two clouds were registered, and the answer is not to be trusted."""
+
+
 class PlanError(MapperError):
     """A path that does not exist, or an end of it where the robot has no room."""
 

@@ -14,7 +14,7 @@ from evaluators.evaluate import evaluate
 from mapper.run import load_run
 from mapper.trajectory import read_tum
 
-VERBS = ["build", "fuse", "loops", "eval", "export", "plan", "solve", "compare", "convert", "synth", "demo", "config", "view", "report", "doctor", "inspect"]
+VERBS = ["build", "fuse", "loops", "eval", "export", "plan", "solve", "compare", "register", "convert", "synth", "demo", "config", "view", "report", "doctor", "inspect"]
 HEAVY = {"cv2", "numba", "gtsam", "matplotlib", "mahotas", "foxglove", "mcap", "pydantic", "numpy", "rich"}
 
 

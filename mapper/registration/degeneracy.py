@@ -7,7 +7,7 @@ import numpy as np
 from mapper.errors import DataError
 from mapper.geometry import Array, Points, adjoint, transform
 
-_MIN_SHARE = 0.01
+_MIN_SHARE = 0.004
 _MIN_ARM_M = 1e-3  # a pole's turning about itself must stay a number
 _PART = 0.5  # a motion is named for its rotation, its translation, or both when mixed
 _SAME_DIRECTION = 0.97  # squared cosine: 10°
@@ -55,8 +55,8 @@ def degeneracy_of(information: Array, *, points: Points, min_share: float = _MIN
     Args:
         information: (6, 6) of the source's tangent (rotation, translation), from point-to-plane distances.
         points: (N, 3) source points, metres, source frame.
-        min_share: A motion of which less is seen counts as not seen. Noise in the normals alone can make
-            it 0.004; street scans have 0.15 and more.
+        min_share: A motion of which less is seen counts as not seen. Noise of 2 cm in 20 cm voxels gives
+            0.002 where nothing is seen; an open yard with five boxes has 0.009, a street 0.15.
 
     Raises:
         DataError: The information is not finite or there is none, or there are no points.

@@ -1,0 +1,100 @@
+"""``mapper register``: how one cloud lies to another."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli.environment import prepare_libraries
+from cli.options import Overrides, Quiet
+
+if TYPE_CHECKING:
+    from mapper.config.sensors import Sensor
+    from mapper.config.sources import SourceConfig
+    from mapper.frames import Frame
+
+_CLOUD = "A cloud (.bin .pcd .ply .xyz .npy .las .laz), or LOG@N: the n-th frame of a log, from 0."
+
+
+def register(
+    source: Annotated[str, typer.Argument(metavar="SOURCE", help=f"What is aligned. {_CLOUD}")],
+    target: Annotated[
+        str, typer.Argument(metavar="TARGET", help="What it is aligned to: the same, or a map.")
+    ],
+    method: Annotated[
+        str,
+        typer.Option(help="hough-gicp, hough-ndt, icp, plane-icp, gicp, ndt, kiss-matcher; isvd for images."),
+    ] = "hough-gicp",
+    guess: Annotated[
+        str | None,
+        typer.Option(
+            metavar="POSE",
+            help='Where the source is in the target: "x y z roll pitch yaw" in m and °, or a file with a 4×4 '
+            "matrix or a TUM line.  [default: the same place]",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to create for the cloud, picture and recording.")
+    ] = None,
+    set_: Overrides = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace OUT, once the new folder is whole.")
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Register two clouds; the exit status is 1 when the answer is not to be trusted.
+
+    Example: mapper register scan_10.bin scan_00.bin --method hough-gicp --out registered
+    """
+    from evaluators.register import register as register_frames
+    from evaluators.register_files import registration_text, write_registration
+    from mapper.config import overridden
+    from mapper.config.register import register_config
+    from mapper.errors import RegistrationError
+    from mapper.registration.guess import parse_guess
+    from mapper.staging import staged
+
+    prepare_libraries()
+    overrides = set_ or []
+    opening = overridden(register_config(method, "lidar"), [o for o in overrides if o.startswith("source.")])
+    target_frame, target_sensor = _load(target, opening.source)
+    source_frame, source_sensor = _load(source, opening.source)
+    sensor: Sensor = "lidar" if "lidar" in (target_sensor, source_sensor) else "rgbd"
+    config = overridden(register_config(method, sensor), overrides)
+    registered = register_frames(target_frame, source_frame, config.registration, parse_guess(guess))
+    if not quiet:
+        print(registration_text(registered))
+    if out is not None:
+        with staged(out, overwrite=overwrite) as folder:
+            write_registration(
+                folder,
+                registered,
+                target=target_frame.scan(),
+                source=source_frame.scan(),
+                names=(target, source),
+                sensor=sensor,
+                config=config,
+            )
+            files = ", ".join(sorted(child.name for child in folder.iterdir()))
+        if not quiet:
+            print(f"files    {files}\nin       {out}")
+    if not registered.alignment.converged:
+        raise RegistrationError(f"{source} on {target}: not trusted: {registered.alignment.reason}")
+
+
+def _load(name: str, config: "SourceConfig") -> "tuple[Frame, Sensor]":
+    """Return the frame that a name stands for, and what took it."""
+    from mapper.errors import SourceError
+    from mapper.sources import open_source
+    from mapper.sources.clouds import read_scan
+
+    log, at, index = name.rpartition("@")
+    if not at or Path(name).exists():
+        if Path(name).is_dir():
+            raise SourceError(f"{name}: is a log; name one of its frames, as in {name}@0")
+        return read_scan(Path(name)), "lidar"
+    opened = open_source(Path(log), config)
+    entries = list(opened.entries())
+    if not index.isdecimal() or int(index) >= len(entries):
+        raise SourceError(f"{name}: want a frame of {log} from @0 to @{len(entries) - 1}")
+    return entries[int(index)].load(), opened.sensor

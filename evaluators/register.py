@@ -1,0 +1,126 @@
+"""One registration, told step by step: where it began, what each stage made of it, and how long that took."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from evaluators.cloud_distance import CloudDistance, DistanceTo
+from mapper.config.odometry import IsvdOdometryConfig
+from mapper.config.registration import AnyRegistration
+from mapper.errors import ConfigError
+from mapper.frames import Frame, RgbdFrame, Scan
+from mapper.geometry import Transform
+from mapper.registration.base import Alignment
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stage:
+    """How the clouds lay after one step.
+
+    Attributes:
+        name: "guess", "Hough" or "refined".
+        T_target_source: (4, 4) the motion by then.
+        distance: How far the source lay from the target under it.
+    """
+
+    name: str
+    T_target_source: Transform
+    distance: CloudDistance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registered:
+    """A registration and its course.
+
+    Attributes:
+        method: What the configuration calls it.
+        alignment: The answer.
+        stages: From the guess on; without "refined" where there was no answer at all.
+        seconds: Wall time of each step, in order.
+    """
+
+    method: str
+    alignment: Alignment
+    stages: tuple[Stage, ...]
+    seconds: Mapping[str, float]
+
+
+def register(
+    target: Frame,
+    source: Frame,
+    config: AnyRegistration | IsvdOdometryConfig,
+    T_target_source: Transform,
+) -> Registered:
+    """Return the motion between two frames, and how it was found.
+
+    Args:
+        target: Frame that stays.
+        source: Frame that is aligned to it.
+        config: The method.
+        T_target_source: (4, 4) guess, for methods that refine one.
+
+    Raises:
+        ConfigError: A method of images was given scans.
+        DataError: A frame without points.
+    """
+    motions = {"guess": T_target_source}
+    if isinstance(config, IsvdOdometryConfig):
+        alignment, seconds = _by_features(target, source, config)
+    else:
+        alignment, hough, seconds = _by_scans(target.scan(), source.scan(), config, T_target_source)
+        if hough is not None:
+            motions["Hough"] = hough
+    if alignment.converged or alignment.information is not None:
+        motions["refined"] = alignment.T_target_source
+    distance = DistanceTo(target.scan().points_body)
+    points_source = source.scan().points_body
+    stages = (Stage(name, T, distance.of(points_source, T)) for name, T in motions.items())
+    return Registered(config.kind, alignment, tuple(stages), seconds)
+
+
+def _by_scans(
+    target: Scan, source: Scan, config: AnyRegistration, T_target_source: Transform
+) -> tuple[Alignment, Transform | None, dict[str, float]]:
+    """Return the answer, Hough's own where the method has that stage, and the time of every step."""
+    from mapper.registration.hough import HoughAligner  # its kernels are not for those who ask for another
+
+    began = time.perf_counter()
+    aligner = config.build().prepare(target)
+    seconds = {"prepare": time.perf_counter() - began}
+    if isinstance(aligner, HoughAligner):
+        course = aligner.stages(source)
+        hough = None if course.hough is None else course.hough.T_target_source
+        return course.alignment, hough, seconds | course.seconds
+    began = time.perf_counter()
+    alignment = aligner.align(source, T_target_source)
+    return alignment, None, seconds | {"align": time.perf_counter() - began}
+
+
+def _by_features(
+    target: Frame, source: Frame, config: IsvdOdometryConfig
+) -> tuple[Alignment, dict[str, float]]:
+    from mapper.odometry.isvd import IsvdOdometry, find_shared_points
+    from mapper.registration.isvd import Isvd
+
+    if not isinstance(target, RgbdFrame) or not isinstance(source, RgbdFrame):
+        raise ConfigError("--method isvd matches images, and these are scans; name frames of an RGB-D log")
+    odometry = IsvdOdometry(config)
+    began = time.perf_counter()
+    seen_target = odometry.observe(target)
+    detected = time.perf_counter()
+    seen_source = odometry.observe(source)
+    for match in (config.match, config.fallback):
+        points_target, points_source, _ = find_shared_points(seen_target, seen_source, match)
+        alignment = Isvd(config.registration).fit(points_target, points_source)
+        if alignment.converged:
+            break
+    return alignment, {"prepare": detected - began, "align": time.perf_counter() - detected}
+
+
+def xyz_rpy(T_a_b: Transform) -> tuple[list[float], list[float]]:
+    """Return a pose as metres and as roll, pitch, yaw in degrees, for a screen or a file."""
+    from mapper.rotations import euler_from_rotation
+
+    return T_a_b[:3, 3].tolist(), np.degrees(euler_from_rotation(T_a_b[:3, :3])).tolist()

@@ -1,0 +1,90 @@
+"""A picture of two clouds from above and from the side, before and after they were registered."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mapper.config.sensors import Sensor
+from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure, save
+from mapper.export.palette import ESTIMATE, TRUTH
+from mapper.frames import Points32
+from mapper.geometry import Array, Transform, apply
+
+_DRAWN = 60_000
+_COLUMN_IN = 5.0
+_TITLES_IN = 0.5  # each row's, and the page's
+_MIN_ROW_IN = 0.8
+_INSIDE = (1.0, 99.0)  # percentiles of the source: a few far returns must not shrink the rest
+_MARGIN = 0.05
+_VIEWS: dict[Sensor, dict[str, Array]] = {
+    "lidar": {
+        "from above": np.array([[1.0, 0, 0], [0, 1, 0]]),
+        "from the side": np.array([[1.0, 0, 0], [0, 0, 1]]),
+    },
+    "rgbd": {
+        "from above": np.array([[1.0, 0, 0], [0, 0, 1]]),
+        "from the side": np.array([[0.0, 0, 1], [0, -1, 0]]),
+    },
+}
+"""Rows: what points right and what points up. A camera's y points down, its z into the scene."""
+
+
+def write_before_and_after(
+    path: Path,
+    points_target: Points32,
+    points_source: Points32,
+    stages: Sequence[tuple[str, Transform]],
+    *,
+    sensor: Sensor,
+    title: str,
+) -> None:
+    """Draw the target blue and the source red: a column for each stage, all at one scale.
+
+    Args:
+        path: PNG file to write.
+        points_target: (N, 3) metres.
+        points_source: (M, 3) metres, source frame.
+        stages: Name and T_target_source of each.
+        sensor: Tells which way is up.
+        title: Headline.
+    """
+    target, source = _thinned(points_target), _thinned(points_source)
+    moved = [apply(T, source) for _, T in stages]
+    views = _VIEWS[sensor]
+    windows = [_window(moved[-1] @ axes_of.T) for axes_of in views.values()]
+    heights_in = [
+        max(_COLUMN_IN * float(np.divide(*(high - low)[::-1])), _MIN_ROW_IN) for low, high in windows
+    ]
+    figure = new_figure(_COLUMN_IN * len(stages), sum(heights_in) + _TITLES_IN * (len(views) + 1))
+    grid = figure.add_gridspec(len(views), len(stages), height_ratios=heights_in)
+    for row, (view, axes_of) in enumerate(views.items()):
+        low, high = windows[row]
+        for column, ((name, _), cloud) in enumerate(zip(stages, moved, strict=True)):
+            axes = figure.add_subplot(grid[row, column])
+            for points, color in ((target, TRUTH), (cloud, ESTIMATE)):
+                right, up = (points @ axes_of.T).T
+                axes.plot(right, up, ",", color=hex_of(color), alpha=0.5)
+            axes.set_xlim(low[0], high[0])
+            axes.set_ylim(low[1], high[1])
+            axes.set_aspect("equal")
+            axes.set_title(f"{name}, {view}", fontsize=9, color=FAINT)
+            axes.tick_params(labelsize=7, colors=FAINT)
+            for spine in axes.spines.values():
+                spine.set_color(LINE)
+    figure.suptitle(title, fontsize=11, color=INK)
+    figure.tight_layout()
+    save(figure, path)
+
+
+def _thinned(points: Points32) -> Array:
+    """Return evenly chosen points, as many as are told apart."""
+    step = max(len(points) // _DRAWN, 1)
+    return points[::step].astype(np.float64)
+
+
+def _window(flat: Array) -> tuple[Array, Array]:
+    """Return the corners of what is shown of (N, 2) points."""
+    low, high = np.percentile(flat, _INSIDE, axis=0)
+    margin = _MARGIN * float((high - low).max()) + 1e-3
+    return low - margin, high + margin

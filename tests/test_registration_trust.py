@@ -1,0 +1,102 @@
+"""Wrong motions are told from right ones, where plain overlap would believe them."""
+
+import numpy as np
+import pytest
+
+from mapper.config.registration import KissMatcherConfig, NdtConfig, TrustConfig
+from mapper.frames import Scan
+from mapper.geometry import apply, exp
+from mapper.registration.gicp import measured, prepared
+from mapper.registration.kiss_matcher import KissMatcher
+from mapper.registration.ndt import Ndt, refine_by_cells
+from mapper.registration.trust import judged
+
+VOXEL_M = 0.3
+
+
+def yard(rng, *, points):
+    """A floor 40 m wide with a few boxes on it: most of what is seen is floor."""
+    floor = np.column_stack([*rng.uniform(-20.0, 20.0, (2, points)), np.zeros(points)])
+    sides = []
+    for x, y in ((5.0, 3.0), (-8.0, 6.0), (2.0, -9.0), (-6.0, -7.0), (12.0, -4.0)):
+        along, height = rng.uniform(0.0, 3.0, (2, points // 50))
+        zero = np.zeros_like(along)
+        sides += [
+            np.column_stack([x + along, y + zero, height]),
+            np.column_stack([x + zero, y + along, height]),
+        ]
+    return np.concatenate([floor, *sides])
+
+
+@pytest.fixture(scope="module")
+def clouds():
+    rng = np.random.default_rng(0)
+    return tuple(prepared(yard(rng, points=n), voxel_m=VOXEL_M) for n in (200_000, 40_000))
+
+
+def test_the_right_motion_is_believed(clouds):
+    alignment = judged(*clouds, np.eye(4), TrustConfig())
+    assert alignment.converged, alignment.reason
+    assert alignment.inlier_ratio > 0.9
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 1.0])
+def test_a_wrong_motion_over_the_same_floor_is_not(clouds, turn_rad):
+    wrong = exp(np.array([0.0, 0.0, turn_rad]), np.array([3.0, -2.0, 0.0]))
+    assert measured(*clouds, wrong, max_pair_distance_m=1.0).inlier_ratio > 0.75
+
+    alignment = judged(*clouds, wrong, TrustConfig())
+
+    assert not alignment.converged
+    assert "surfaces that face" in alignment.reason
+    assert np.array_equal(alignment.T_target_source, wrong)
+
+
+def test_a_floor_alone_is_degenerate_and_the_reason_says_along_what():
+    rng = np.random.default_rng(1)
+    floors = [
+        prepared(np.column_stack([*rng.uniform(-20.0, 20.0, (2, 50_000)), np.zeros(50_000)]), voxel_m=VOXEL_M)
+        for _ in range(2)
+    ]
+    alignment = judged(*floors, np.eye(4), TrustConfig())
+    assert not alignment.converged
+    assert alignment.reason == "degenerate: no surface shows translation along x and y, rotation about z"
+
+
+def test_ndt_says_so_where_open3d_only_warns():
+    rng = np.random.default_rng(2)
+    target, source = yard(rng, points=20_000), yard(rng, points=5_000)
+    far = exp(np.zeros(3), np.array([300.0, 0.0, 0.0]))
+    assert "no overlap" in refine_by_cells(target, source, far, cell_m=2.0)
+    assert "has 6 points" in refine_by_cells(target[:3], source, np.eye(4), cell_m=2.0)
+    assert refine_by_cells(target, source[:0], np.eye(4), cell_m=2.0) == "no points in the source"
+
+
+def test_ndt_prints_nothing(capfd):
+    target = Scan(0, yard(np.random.default_rng(3), points=20_000).astype(np.float32))
+    Ndt(NdtConfig()).prepare(target).align(target, exp(np.zeros(3), np.array([300.0, 0.0, 0.0])))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_clouds_without_features_do_not_crash_kiss_matcher():
+    rng = np.random.default_rng(4)
+    crowd = Scan(0, yard(rng, points=20_000).astype(np.float32))
+    scattered = Scan(0, rng.uniform(-200.0, 200.0, (500, 3)).astype(np.float32))
+    for target, source in ((crowd, scattered), (scattered, crowd)):
+        found = KissMatcher(KissMatcherConfig()).prepare(target).align(source, np.eye(4))
+        assert not found.converged
+        assert "to have features" in found.reason
+
+
+def test_a_dense_cloud_of_many_matches_is_the_same_every_time():
+    """With more matches than it takes, the library draws from them without a seed."""
+    rng = np.random.default_rng(5)
+    dense = yard(rng, points=100_000)
+    bumpy = (
+        dense + np.column_stack([*np.zeros((2, len(dense))), np.sin(dense[:, 0]) + np.cos(dense[:, 1])])
+    ).astype(np.float32)
+    T_turned = exp(np.array([0.0, 0.0, 0.4]), np.array([2.0, 1.0, 0.0]))
+    source = Scan(0, apply(T_turned, bumpy.astype(np.float64)).astype(np.float32))
+    aligner = KissMatcher(KissMatcherConfig(feature_voxels=1.0)).prepare(Scan(0, bumpy))
+    answers = {aligner.align(source, np.eye(4)).T_target_source.tobytes() for _ in range(2)}
+    assert len(answers) == 1
