@@ -72,7 +72,7 @@ def append(
         with draft.clock.stage("track"):
             start = _after(before, first, config, progress)
             tracking = track_log(last_session(source), config, progress=progress, start=start)
-        refuse_a_fragment(tracking, config)
+        refuse_a_fragment(tracking, config, sensor=source.sensor)
         _refuse_untied(second, run, tracking.loops, known)
         with draft.clock.stage("solve"):
             tracking = part_of(tracking, next(iter(known)), progress=progress)

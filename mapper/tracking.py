@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 from mapper.config import BuildConfig
+from mapper.config.sensors import Sensor
 from mapper.errors import FrameError, TrackingError
 from mapper.graph.model import PoseGraph
 from mapper.loops.closer import Closer
@@ -17,6 +18,11 @@ from mapper.progress import Progress
 from mapper.sources.base import Entry, FrameSource, Skipped
 from mapper.trajectory import Trajectory, trajectory_from
 from mapper.watching import NOBODY, Step, Watcher
+
+_DOUBTS: Mapping[Sensor, str] = {
+    "rgbd": "is there texture, and depth within max_depth_m, in the images?",
+    "lidar": "do the scans overlap, and are their units metres?",
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +131,7 @@ def track_log(
     return Tracking(tuple(tracks), tuple(skipped), graph, loops, frame_ms)
 
 
-def refuse_a_fragment(tracking: Tracking, config: BuildConfig) -> None:
+def refuse_a_fragment(tracking: Tracking, config: BuildConfig, *, sensor: Sensor) -> None:
     """Refuse to make a map from too little.
 
     Raises:
@@ -141,6 +147,5 @@ def refuse_a_fragment(tracking: Tracking, config: BuildConfig) -> None:
         )
     raise TrackingError(
         f"only {placed} of {read} frames read could be tracked, want at least {enough:.0f}; "
-        "is there texture, and depth within max_depth_m, in the images? "
-        "(min_tracked_frames and min_tracked_ratio set the limit)"
+        f"{_DOUBTS[sensor]} (min_tracked_frames and min_tracked_ratio set the limit)"
     )

@@ -71,9 +71,12 @@ class GicpOdometryConfig(ScanOdometryConfig):
 
 
 class IcpOdometryConfig(ScanOdometryConfig):
-    """Scan to the last keyframes by point-to-point ICP (Besl & McKay 1992)."""
+    """Scan to the last keyframes by ICP."""
 
     kind: Literal["icp"] = "icp"
+    distance: Literal["plane", "point"] = "plane"
+    """What is made small: from a point to the plane through its partner (Chen & Medioni 1992), or to the
+    partner itself (Besl & McKay 1992), which the rings on the road hold back."""
     pair_distances_m: tuple[PositiveFloat, ...] = (2.0, 1.0, 0.5)
     """Largest distance between the points of a pair, from coarse to fine."""
     map_keyframes: PositiveInt = 10

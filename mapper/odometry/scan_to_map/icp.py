@@ -1,4 +1,4 @@
-"""Scan to the last keyframes by point-to-point ICP (Besl & McKay 1992)."""
+"""Scan to the last keyframes by ICP (Besl & McKay 1992; Chen & Medioni 1992)."""
 
 from collections import deque
 
@@ -28,7 +28,7 @@ class IcpMatcher:
                 self._map,
                 sweep.prepared,
                 T_world_body,
-                kind="icp",
+                kind="plane-icp" if self._config.distance == "plane" else "icp",
                 max_pair_distance_m=distance_m,
                 max_iterations=self._config.max_iterations,
             )
