@@ -89,7 +89,7 @@ def compare(source: FrameSource, config: CompareConfig, *, progress: Progress = 
     runs = tuple(racer.run(truth, step) for racer in racers)
     trials: list[Trial] = []
     if truth is None:
-        notes = [*notes, "the log has no truth: no errors, and no registration of pairs"]
+        notes = [*notes, "the log has no truth for these frames: no errors, and no registration of pairs"]
     elif config.pairs:
         trials = _register(source, methods, truth, config, progress=progress)
     return Comparison(
@@ -138,7 +138,10 @@ class _Racer:
         began = time.perf_counter()
         trajectory = trajectory_from(())
         if self._tracker is not None and not self._broke:
-            trajectory = self._tracker.trajectory()
+            try:
+                trajectory = self._tracker.trajectory()
+            except Exception as error:  # as above
+                self._broke = f"broke down at the end: {reason_of(error)}"
         self._seconds += time.perf_counter() - began
         run = OdometryRun(
             method=self._method.name,

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -24,6 +25,7 @@ from mapper.sources import open_source
 from mapper.sources.synthetic.lidar import SyntheticLidarSource
 from mapper.trajectory import read_tum
 
+KITTI = Path(__file__).parents[2] / "shared/data/kitti_00"
 RGBD = CompareConfig(methods=("local-map", "isvd", "rgbd", "gicp", "kiss-icp"), pairs=3)
 LIDAR = CompareConfig(
     methods=("gicp", "hough-gicp", "kiss-icp"), pairs=3, lidar=LidarCompareConfig(frames_apart=(1, 2, 4))
@@ -244,3 +246,12 @@ def test_the_verb_prints_both_tables_and_leaves_a_folder(desk_log, tmp_path):
     refused = mapper("compare", desk_log, "--method", "magic", "--out", tmp_path / "other", status=1)
     assert "mapper: no method 'magic'; want one of local-map, isvd, pnp, rgbd, icp" in refused.stderr
     assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.skipif(not KITTI.is_dir(), reason=f"{KITTI} is not here")
+def test_real_scans_are_followed_to_centimetres():
+    source = open_source(KITTI, SourceConfig(last_frame=3))
+    comparison = compare(source, CompareConfig(methods=("gicp", "hough-gicp"), pairs=0))
+    for run in comparison.runs:
+        assert run.failures == 0
+        assert run.errors.ate_m < 0.03, run.method
