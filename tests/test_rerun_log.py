@@ -159,7 +159,7 @@ def test_the_recording_verifies_and_brings_its_blueprint(run):
 
 
 def test_a_recording_that_fails_leaves_no_file(tmp_path):
-    with pytest.raises(DataError), recorded(str(tmp_path / "x.rrd"), name="x"):
+    with pytest.raises(DataError), recorded(str(tmp_path / "x.rrd"), name="x", has_images=True):
         raise DataError("stop")
     assert list(tmp_path.iterdir()) == []
 
@@ -303,7 +303,7 @@ def test_a_scan_is_a_cloud_without_an_image(tmp_path):
 
     path = tmp_path / "scan.rrd"
     diagnostics = Diagnostics(50_000, 100, 90, 0.1, "m", "icp")
-    with recorded(str(path), name="scan", body="world/live/body") as log:
+    with recorded(str(path), name="scan", has_images=False, body="world/live/body") as log:
         watcher = LiveRerun(log, "lidar", RerunConfig(cloud_points=10_000))
         track = Track(7, 0, np.eye(4), np.eye(4), True, diagnostics)
         watcher.stepped(Step(Entry(), track, lambda: None, Closer()))

@@ -9,12 +9,12 @@ _DIRECTION = np.array([-0.6, -1.0, 0.9])  # from what is looked at to the eye
 _DISTANCE = 0.85  # in diagonals of what is looked at
 
 
-def blueprint_for(looking_at: Array | None, camera: str) -> rrb.Blueprint:
+def blueprint_for(looking_at: Array | None, camera: str | None) -> rrb.Blueprint:
     """Return the map beside the images, the plan and the curves.
 
     Args:
         looking_at: (2, 3) lower and upper corner of what the 3D views look at first, metres.
-        camera: The entity whose images are shown.
+        camera: The entity whose images are shown; None leaves no room for images.
     """
     eye = None if looking_at is None else _eye(looking_at)
     everything = ["+ /world/**", "- /world/map/traversable"]
@@ -29,8 +29,9 @@ def blueprint_for(looking_at: Array | None, camera: str) -> rrb.Blueprint:
             eye_controls=eye,
         ),
     )
+    images = [] if camera is None else [rrb.Spatial2DView(name="camera", origin=camera)]
     beside = rrb.Vertical(
-        rrb.Spatial2DView(name="camera", origin=camera),
+        *images,
         rrb.Tabs(
             rrb.Spatial2DView(name="slice", origin="/slice"),
             rrb.TextDocumentView(name="about", origin="/about"),
@@ -45,7 +46,7 @@ def blueprint_for(looking_at: Array | None, camera: str) -> rrb.Blueprint:
             rrb.TimeSeriesView(name="ms per frame", origin="/diagnostics/ms"),
             rrb.TimeSeriesView(name="residual", origin="/diagnostics/residual"),
         ),
-        row_shares=[3, 3, 2, 2],
+        row_shares=[*(3 for _ in images), 3, 2, 2],
     )
     return rrb.Blueprint(
         rrb.Horizontal(maps, beside, column_shares=[3, 2]),

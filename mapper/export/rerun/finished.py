@@ -20,9 +20,10 @@ def show_run(run: Run, target: str) -> None:
         ViewerError: No viewer can be started or reached.
         MapperError: A file of the run cannot be read.
     """
-    story, maps = story_of(run), maps_of(run)
-    with recorded(target, name=run.path.name, looking_at=extent(story, maps)) as log:
-        log.images(list(snapshots_of(run)))
+    story, maps, snapshots = story_of(run), maps_of(run), list(snapshots_of(run))
+    name, corners = run.path.name, extent(story, maps)
+    with recorded(target, name=name, has_images=bool(snapshots), looking_at=corners) as log:
+        log.images(snapshots)
         log.poses(story.trajectory)
         tell(log, story, maps)
         log.diagnostics(story.records)

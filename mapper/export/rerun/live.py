@@ -168,7 +168,8 @@ def watching(target: str, source: FrameSource, config: RerunConfig) -> Iterator[
         ConfigError: The target is none.
         ViewerError: No viewer can be started or reached.
     """
-    with recorded(target, name=source.name, body=_BODY) as log:
+    has_images = source.sensor == "rgbd"
+    with recorded(target, name=source.name, has_images=has_images, body=_BODY) as log:
         yield LiveRerun(log, source.sensor, config)
 
 

@@ -30,6 +30,7 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from mapper.export.grid import grid_image
@@ -74,9 +75,10 @@ class RerunLog:
         keeps: Whether its file is to be kept when an error ends the block.
     """
 
-    def __init__(self, stream: rr.RecordingStream, body: str) -> None:
+    def __init__(self, stream: rr.RecordingStream, body: str, *, has_images: bool) -> None:
         self._stream = stream
         self.body, self.camera = body, f"{body}/camera"
+        self._has_images = has_images
         self.keeps = False
         self.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         self.log(body, rr.TransformAxes3D(0.2))
@@ -218,9 +220,13 @@ class RerunLog:
             values = np.array(list(frame_ms.values()))
             self._columns("diagnostics/ms", np.array(list(frame_ms)), rr.Scalars.columns(scalars=values))
 
+    def blueprint(self, looking_at: Array | None) -> rrb.Blueprint:
+        """Return how the viewer is to arrange this recording."""
+        return blueprint_for(looking_at, self.camera if self._has_images else None)
+
     def look_at(self, corners: Array) -> None:
         """Arrange the viewer anew, looking at what lies between two (2, 3) corners, metres."""
-        self._stream.send_blueprint(blueprint_for(corners, self.camera))
+        self._stream.send_blueprint(self.blueprint(corners))
 
     def about(self, markdown: str) -> None:
         """Log the run in words."""
@@ -236,6 +242,7 @@ def recorded(
     target: str,
     *,
     name: str,
+    has_images: bool,
     body: str = BODY,
     looking_at: Array | None = None,
 ) -> Iterator[RerunLog]:
@@ -244,12 +251,13 @@ def recorded(
     Args:
         target: FILE.rrd, "spawn", "connect" or "connect:URL".
         name: What the viewer calls it.
+        has_images: Leave room for images.
         body: The entity that is to move with the body.
         looking_at: (2, 3) lower and upper corner of what to look at first, metres; None leaves it to Rerun.
     """
     stream = rr.RecordingStream(APPLICATION)
-    log = RerunLog(stream, body)
-    with streaming(stream, target, blueprint_for(looking_at, log.camera), keeps=lambda: log.keeps):
+    log = RerunLog(stream, body, has_images=has_images)
+    with streaming(stream, target, log.blueprint(looking_at), keeps=lambda: log.keeps):
         stream.send_recording_name(name)
         yield log
 
