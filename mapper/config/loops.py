@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mapper.features.view import View
     from mapper.loops.belief import Correction
     from mapper.loops.closer import Closer, KeyframeLoops
-    from mapper.loops.overlap import OverlapVerifier
+    from mapper.loops.scan_verification import ScanVerifier
     from mapper.loops.scans import ScanPlace
     from mapper.loops.verification import ImageVerifier
 
@@ -119,34 +119,44 @@ class PlaceLoopsConfig(KeyframeLoopsConfig):
         )
 
 
-class OverlapConfig(Config):
+class ScanVerificationConfig(Config):
     """What two scans must have in common to be two scans of one place."""
 
     voxel_m: PositiveFloat = 0.75
-    """One point is kept per voxel; upright points this near are counterparts."""
+    """One point is kept per voxel."""
     reach_m: PositiveFloat = 48.0
     """Farther points are dropped."""
     constellation: ConstellationConfig = ConstellationConfig(ground=GroundConfig(cell_m=1.0, voxel_m=0.75))
     """What stands around, from thin points: a cell of the ground has to be the larger."""
-    voting: VotingConfig = VotingConfig(angles=120)
-    pair_distances_m: tuple[PositiveFloat, ...] = (2.0, 1.0)
-    """Largest distance between the points of a pair, from coarse to fine."""
+    voting: VotingConfig = VotingConfig(angles=120, peaks=10)
+    pair_distances_m: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (2.0, 1.0)
+    """Largest distance between the points of a GICP pair, from coarse to fine."""
     max_iterations: PositiveInt = 20
-    min_upright: PositiveInt = 100
-    """Fewer points on upright surfaces say nothing."""
-    min_overlap: Ratio = 0.5
-    """A smaller share of upright points with a counterpart, in either direction, is no loop."""
+    """At each of these distances."""
+    direction_rad: PositiveFloat = 0.035
+    """Resolution of the lines of sight."""
+    guess_margin_m: PositiveFloat = 1.5
+    margin_m: PositiveFloat = 0.3
+    margin_ratio: NonNegativeFloat = 0.01
+    """What stands in one scan agrees with a surface of the other at its range, give or take this, before and
+    after GICP, and so much of the range. What is nearer than all in its direction was looked through."""
+    min_returns: PositiveInt = 3
+    """And so many of the nine directions around it have a return."""
+    min_agreeing_ratio: Ratio = 0.3
+    """A smaller share of what stands that agrees, in either direction, is no loop."""
+    max_contradicting_ratio: Ratio = 0.08
+    """A larger share that was looked through, of what was not hidden, is no loop: parked cars leave."""
     sigma_rad: NonNegativeFloat = 0.002
     sigma_m: NonNegativeFloat = 0.03
     """Errors that all points share: of deskewing, calibration and voxels."""
     remembered: PositiveInt = 16
     """Places whose search trees are kept."""
 
-    def build(self) -> "OverlapVerifier":
+    def build(self) -> "ScanVerifier":
         """Return the verifier this configures."""
-        from mapper.loops.overlap import OverlapVerifier
+        from mapper.loops.scan_verification import ScanVerifier
 
-        return OverlapVerifier(self)
+        return ScanVerifier(self)
 
 
 class ScanLoopsConfig(KeyframeLoopsConfig):
@@ -154,7 +164,7 @@ class ScanLoopsConfig(KeyframeLoopsConfig):
 
     kind: Literal["scans"] = "scans"
     min_gap_m: NonNegativeFloat = 20.0
-    min_motion_m: NonNegativeFloat = 2.5
+    min_motion_m: NonNegativeFloat = 3.0
     min_motion_rad: NonNegativeFloat = 1.0
     max_distance_m: PositiveFloat = 10.0
     max_tilt_rad: PositiveFloat = 0.8
@@ -163,7 +173,7 @@ class ScanLoopsConfig(KeyframeLoopsConfig):
     """So many of the candidates, at most, are proposed by looks; the others because they are near."""
     max_candidates: PositiveInt = 3
     context: ScanContextConfig = ScanContextConfig()
-    verification: OverlapConfig = OverlapConfig()
+    verification: ScanVerificationConfig = ScanVerificationConfig()
     gate: GateConfig = GateConfig(slack_m=1.0)
     agreement_path_m: PositiveFloat = 15.0
 

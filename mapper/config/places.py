@@ -42,11 +42,11 @@ class ScanContextConfig(Config):
 
     rings: PositiveInt = 20
     sectors: PositiveInt = 60
-    reach_m: PositiveFloat = 50.0
-    """Radius of the outermost ring; the published 80 m suits sparser surroundings."""
+    reach_m: PositiveFloat = 48.0
+    """Radius of the outermost ring; 80 m as published, but loops keep no farther points."""
     max_height_m: PositiveFloat = 15.0
     """What is higher counts as this high."""
     shortlist: PositiveInt = 50
     """So many places with the nearest ring keys are turned to where they fit best."""
-    min_similarity: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
+    min_similarity: Annotated[float, Field(ge=0.0, le=1.0)] = 0.4
     """Mean cosine between the sectors of two places, from which on one is proposed."""

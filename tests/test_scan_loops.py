@@ -1,0 +1,234 @@
+"""Loops between scans: streets driven again, either way, and places that only look alike."""
+
+from collections.abc import Sequence
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scan_world import on_street, street, view
+from view_world import Room, track
+
+from mapper.config import load_config
+from mapper.config.loops import PlaceLoopsConfig, ScanLoopsConfig, ScanVerificationConfig, ThesisLoopsConfig
+from mapper.errors import ConfigError
+from mapper.features.scan_view import ScanView
+from mapper.geometry import Transform, exp, inverse
+from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
+from mapper.loops.closer import KeyframeLoops
+from mapper.loops.closure import LoopClosure, discrepancy
+from mapper.timebase import NS_PER_S
+
+STEP_M = 3.0
+LINK = PoseSigmas(rotation_rad=0.002, translation_m=0.05).information
+TURN_BACK = exp(np.array([0.0, 0.0, np.pi]), np.zeros(3))
+
+
+@cache
+def drive(
+    seed: int, start_m: int, end_m: int, *, back: bool = False
+) -> tuple[list[Transform], list[ScanView]]:
+    """Return poses and views along a street, three metres; the way back is on the other lane."""
+    scene = street(seed)
+    along = np.arange(start_m, end_m, STEP_M)
+    yaw_rad, left_m = (np.pi, 1.5) if back else (0.0, 0.0)
+    poses = [on_street(scene, m, yaw_rad=yaw_rad, left_m=left_m) for m in (along[::-1] if back else along)]
+    return poses, [view(scene, T, seed=1000 * back + k) for k, T in enumerate(poses)]
+
+
+def drifting(truth: Sequence[Transform]) -> list[Transform]:
+    """Return the same way as an odometry tells it that is 1 % too long and turns to the left."""
+    poses = [truth[0]]
+    for before, after in pairwise(truth):
+        step = inverse(before) @ after
+        drift = exp(np.array([0.0, 0.0, 0.001]), 0.01 * step[:3, 3])
+        poses.append(poses[-1] @ step @ drift)
+    return poses
+
+
+def feed(
+    closer: KeyframeLoops, told: Sequence[Transform], views: Sequence[ScanView], *, first: int = 0
+) -> None:
+    """Add keyframes, two a second."""
+    for k, (T, seen) in enumerate(zip(told, views, strict=True)):
+        node, stamp_ns = first + k, (first + k) * NS_PER_S // 2
+        links = [BetweenFactor(node - 1, node, inverse(told[k - 1]) @ T, LINK)] if k else []
+        timed = ScanView(stamp_ns, seen.points_body)
+        closer.add(node, track(node, stamp_ns, T, links), lambda timed=timed: timed)
+
+
+def driven(truth: Sequence[Transform], views: Sequence[ScanView], **config) -> KeyframeLoops:
+    closer = ScanLoopsConfig(min_motion_m=1.0, **config).build("batch")
+    feed(closer, drifting(truth), views)
+    return closer
+
+
+def accepted(closer: KeyframeLoops) -> list[LoopClosure]:
+    return [loop for loop in closer.closures() if loop.verdict == "accepted"]
+
+
+def worst_m(loops: Sequence[LoopClosure], truth: Sequence[Transform]) -> float:
+    return max(discrepancy(loop.T_i_j, truth[loop.i], truth[loop.j]).translation_m for loop in loops)
+
+
+def test_a_lap_closes_on_its_beginning():
+    truth, views = drive(1, 0, 180)
+    closer = driven(truth, views)
+    again = range(round(street(1).route.length_m / STEP_M) + 1, len(truth))
+    found = accepted(closer)
+    assert {loop.j for loop in found} >= set(again)
+    assert worst_m(found, truth) < 0.15
+    told = drifting(truth)
+    assert discrepancy(truth[-1], np.eye(4), told[-1]).translation_m > 1.0
+    assert discrepancy(truth[-1], np.eye(4), closer.believed(len(truth) - 1)).translation_m < 0.5
+
+
+def test_a_street_driven_back_on_the_other_lane_is_the_same_street():
+    (out, views_out), (back, views_back) = drive(1, 0, 60), drive(1, 0, 60, back=True)
+    truth = [*out, *back]
+    found = accepted(driven(truth, [*views_out, *views_back]))
+    # What lies less than min_gap_m back along the path is the odometry's to know.
+    assert len({loop.j for loop in found}) >= len(back) - 8
+    assert worst_m(found, truth) < 0.15
+    turned = [discrepancy(loop.T_i_j, np.eye(4), np.eye(4)).rotation_rad for loop in found]
+    assert min(turned) > 2.8
+
+
+@pytest.mark.parametrize("tied", [True, False])
+def test_another_street_is_another_street(tied):
+    (one, views_one), (other, views_other) = drive(1, 0, 60), drive(2, 0, 60)
+    closer = ScanLoopsConfig(min_motion_m=1.0).build("batch")
+    feed(closer, one, views_one)
+    told = [one[0] @ inverse(other[0]) @ T for T in other]
+    if tied:
+        closer._ways.add([BetweenFactor(len(one) - 1, len(one), inverse(one[-1]) @ told[0], LINK)])
+    feed(closer, told, views_other, first=len(one))
+    assert closer.closures(), "streets look alike"
+    assert not accepted(closer)
+    assert {loop.reason.split(":")[0] for loop in closer.closures()} <= {"vote", "overlap", "sight", "gate"}
+
+
+def test_an_empty_field_closes_nothing_and_says_why():
+    rng = np.random.default_rng(0)
+    views = []
+    for k in range(30):
+        ground = rng.normal([0.0, 0.0, -1.7], [20.0, 20.0, 0.02], (8000, 3)).astype(np.float32)
+        views.append(ScanView(k, ground))
+    there_and_back = [exp(np.zeros(3), np.array([3.0 * min(k, 30 - k), 0.0, 0.0])) for k in range(30)]
+    closer = driven(there_and_back, views)
+    assert not accepted(closer)
+    assert closer.closures()
+    assert all(loop.reason.startswith("vote: ") for loop in closer.closures())
+
+
+def test_two_runs_tell_the_same():
+    truth, views = drive(1, 0, 180)
+    runs = [driven(truth, views).closures() for _ in range(2)]
+    for one, other in zip(*runs, strict=True):
+        assert (one.i, one.j, one.reason, one.similarity) == (
+            other.i,
+            other.j,
+            other.reason,
+            other.similarity,
+        )
+        np.testing.assert_array_equal(one.T_i_j, other.T_i_j)
+
+
+def test_a_drive_along_new_streets_compares_hardly_anything():
+    truth, views = drive(1, 0, 120)
+    closer = driven(truth, views)
+    assert len(closer.closures()) <= 0.2 * len(truth)
+    assert not accepted(closer)
+
+
+def test_an_earlier_drive_is_recognised_wherever_its_world_lies():
+    (first, views_first), (again, views_again) = drive(1, 0, 60), drive(1, 0, 60, back=True)
+    graph = PoseGraph(dict(enumerate(first)), {k: k for k in range(len(first))})
+    graph.add_factors(
+        BetweenFactor(k, k + 1, inverse(first[k]) @ first[k + 1], LINK) for k in range(len(first) - 1)
+    )
+    closer = ScanLoopsConfig(min_motion_m=1.0).build("batch")
+    closer.know(graph, dict(enumerate(views_first)))
+    T_other_world = exp(np.array([0.0, 0.0, 1.0]), np.array([500.0, -300.0, 20.0]))
+    feed(closer, [T_other_world @ T for T in again], views_again, first=len(first))
+    found = accepted(closer)
+    assert len({loop.j for loop in found}) >= 0.8 * len(again)
+    assert worst_m(found, [*first, *again]) < 0.15
+    for k, T in enumerate(again):
+        assert discrepancy(T, np.eye(4), closer.believed(len(first) + k)).translation_m < 0.5
+
+
+# Verification
+
+
+def verified(T_i: Transform, T_j: Transform, *, seeds=(1, 1), **config):
+    verifier = ScanVerificationConfig(**config).build()
+    i, j = (
+        verifier.digest(view(street(seed), T, seed=seed)) for seed, T in zip(seeds, (T_i, T_j), strict=True)
+    )
+    return verifier.verify(i, j)
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 1.3, np.pi])
+def test_two_scans_of_one_place_give_their_relative_pose_both_ways(yaw_rad):
+    scene = street(1)
+    T_i, T_j = on_street(scene, 30.0), on_street(scene, 36.0, yaw_rad=yaw_rad, left_m=1.0)
+    for a, b in ((T_i, T_j), (T_j, T_i)):
+        found = verified(a, b)
+        assert found.reason == ""
+        miss = discrepancy(found.T_i_j, a, b)
+        assert miss.translation_m < 0.1
+        assert miss.rotation_rad < 0.01
+        assert 0 < found.inliers <= found.matches
+        sigma_m = np.linalg.inv(found.information)[3:, 3:].diagonal() ** 0.5
+        assert (sigma_m > 0.03).all()
+        assert (sigma_m < 0.1).all()
+
+
+def test_what_was_looked_through_cannot_stand_there():
+    found = verified(
+        on_street(street(1), 10.0), on_street(street(2), 10.0), seeds=(1, 2), min_agreeing_ratio=0.0
+    )
+    assert found.T_i_j is None
+    assert found.reason.startswith("sight: ")
+
+
+def test_scans_that_share_too_little_are_not_one_place():
+    found = verified(on_street(street(1), 10.0), on_street(street(1), 14.0), min_agreeing_ratio=0.99)
+    assert found.reason.startswith("overlap: ")
+    assert found.matches > found.inliers > 0
+
+
+def test_a_corridor_does_not_say_how_far_along_it_one_is():
+    rng = np.random.default_rng(0)
+    along = np.linspace(-40.0, 40.0, 8000)
+    walls = [np.column_stack([along, np.full(8000, y), rng.uniform(-1.7, 3.0, 8000)]) for y in (-4.0, 4.0)]
+    floor = np.column_stack([along, rng.uniform(-4.0, 4.0, 8000), np.full(8000, -1.7)])
+    corridor = ScanView(0, np.vstack([*walls, floor]).astype(np.float32))
+    verifier = ScanVerificationConfig().build()
+    found = verifier.verify(verifier.digest(corridor), verifier.digest(corridor))
+    assert found.T_i_j is None
+    assert found.reason.startswith("degenerate: no surface shows translation along x")
+
+
+def test_a_place_is_kept_small():
+    place = ScanVerificationConfig().build().digest(view(street(1), on_street(street(1), 0.0)))
+    assert place.points_body.nbytes <= 100_000
+    assert place.points_body.dtype == np.float32
+
+
+def test_every_kind_of_loops_refuses_the_other_sensor():
+    scan, image = view(street(1), on_street(street(1), 0.0)), Room(1).view(np.eye(4), 0)
+    first = track(0, 0, np.eye(4))
+    for config in (PlaceLoopsConfig(), ThesisLoopsConfig()):
+        with pytest.raises(ConfigError, match="compare images, and these are scans; want scans"):
+            config.build("batch").add(0, first, lambda: scan)
+    with pytest.raises(ConfigError, match="compares scans, and these are images; want places or thesis"):
+        ScanLoopsConfig().build("batch").add(0, first, lambda: image)
+
+
+def test_the_configuration_names_the_kind():
+    loops = load_config(None, ["loops.kind=scans", "loops.verification.min_agreeing_ratio=0.4"]).loops
+    assert isinstance(loops, ScanLoopsConfig)
+    assert loops.verification.min_agreeing_ratio == 0.4
+    assert loops.verification.voting.peaks == ScanVerificationConfig().voting.peaks
