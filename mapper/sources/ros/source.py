@@ -186,7 +186,7 @@ def _refuse_unregistered(reader: RecordingReader, topics: CameraTopics, camera: 
     told = f"{size_px[0]}×{size_px[1]} px"
     is_same = size_px == (camera.width_px, camera.height_px)
     info = topics.depth_info and reader.firsts.get(topics.depth_info.topic.name)
-    if isinstance(info, CameraMessage) and len(info.K) == 9 and info.K[0] > 0.0:
+    if isinstance(info, CameraMessage) and info.K.shape == (9,) and info.K[0] > 0.0:
         told += f", focal length {info.K[0]:.1f} px"
         is_same &= abs(info.K[0] / camera.fx_px - 1.0) <= _SAME_LENS_RATIO
     if not is_same:

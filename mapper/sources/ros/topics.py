@@ -88,12 +88,11 @@ def choose(
     if color is not None and depth is not None and config.points is None:
         infos = pick.all(CAMERAS)
         info = pick.one("camera_info", config.camera_info, CAMERAS, _plain_rank, where=set().__contains__)
-        frames = CameraTopics(
-            color,
-            depth,
-            info or _info_of(color, infos, firsts, default=True),
-            _info_of(depth, infos, firsts, default=False),
+        info = info or next(
+            iter([*_beside(color, infos), *_of_frame(color, infos, firsts), *infos[:1]]), None
         )
+        depth_info = next((one for one in _beside(depth, infos) if one is not info), None)
+        frames = CameraTopics(color, depth, info, depth_info)
         told = f"colour {color.topic.name}, depth {depth.topic.name}"
         notes = [_choice_note(told, config.color and config.depth, "color=… and source.topics.depth")]
         if points is not None:
@@ -183,19 +182,18 @@ def _is_packed(name: str) -> bool:
     return name.endswith(_TRANSPORTS)
 
 
-def _info_of(
-    image: Series, infos: Sequence[Series], firsts: Mapping[str, Message], *, default: bool
-) -> Series | None:
-    """Return the calibration beside an image topic, else of its frame, else (by ``default``) the only one."""
+def _beside(image: Series, infos: Sequence[Series]) -> list[Series]:
+    """Return the calibrations in an image topic's own namespace."""
     name = image.topic.name
     for transport in _TRANSPORTS:
         name = name.removesuffix(transport)
-    folder = name.rpartition("/")[0]
-    beside = [one for one in infos if one.topic.name.rpartition("/")[0] == folder]
+    return [one for one in infos if one.topic.name.rpartition("/")[0] == name.rpartition("/")[0]]
+
+
+def _of_frame(image: Series, infos: Sequence[Series], firsts: Mapping[str, Message]) -> list[Series]:
+    """Return the calibrations of an image's coordinate frame."""
     frame = frame_of(firsts.get(image.topic.name))
-    of_frame = [one for one in infos if frame and frame_of(firsts.get(one.topic.name)) == frame]
-    only = infos if default and len(infos) == 1 else []
-    return next(iter([*beside, *of_frame, *only]), None)
+    return [one for one in infos if frame and frame_of(firsts.get(one.topic.name)) == frame]
 
 
 def frame_of(message: Message | None) -> str:
