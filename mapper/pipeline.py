@@ -67,7 +67,7 @@ _REMADE_BY_FUSE = frozenset(
 )
 _OUTDATED_BY_FUSE = frozenset(
     {
-        *(EXPORTERS[kind].file_name for kind in ("voxels", "voxel-mesh", "costmap")),
+        *(EXPORTERS[kind].file_name for kind in ("voxels", "voxel-mesh", "costmap", "foxglove-layout")),
         *(f"{files.COSTMAP}{ending}" for ending in EXPORTERS["costmap"].beside),
         files.PLAN,
         files.PLAN_VIEW,

@@ -1,4 +1,5 @@
 import errno
+import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -139,6 +140,13 @@ def check_g2o(run, path):
     assert read_g2o(path).T_world_node.keys() == run.graph().T_world_node.keys()
 
 
+def check_layout(run, path):
+    panels = json.loads(path.read_text())["content"]["items"]
+    assert (
+        panels[0]["content"]["config"]["topics"]["/map/octree"]["cubeSize"] == run.config.octree.resolution_m
+    )
+
+
 CHECKS = {
     "octomap": check_octomap,
     "ply": check_ply,
@@ -150,6 +158,7 @@ CHECKS = {
     "costmap": check_costmap,
     "tum": check_tum,
     "kitti": check_kitti,
+    "foxglove-layout": check_layout,
     "g2o": check_g2o,
 }
 
@@ -268,7 +277,7 @@ class Missing:
 @pytest.mark.parametrize(
     ("error", "message"),
     [
-        (ModuleNotFoundError("No module named 'open3d'", name="open3d"), r"pip install 'mapper\[mesh\]'"),
+        (ModuleNotFoundError("No module named 'open3d'", name="open3d"), "pip install open3d"),
         (
             OSError("libGL.so.1: cannot open shared object file"),
             r"libGL\.so\.1 is missing; apt-get install libgl1",

@@ -67,6 +67,9 @@ EXPORTERS = {
     ),
     "tum": Exporter("trajectory as TUM text", "run_files:tum", "trajectory.tum", (".tum", ".txt")),
     "kitti": Exporter("trajectory as KITTI text", "run_files:kitti", "trajectory.kitti", (".kitti", ".txt")),
+    "foxglove-layout": Exporter(
+        "how Foxglove is to show run.mcap", "foxglove_layout:layout", "foxglove_layout.json", (".json",)
+    ),
     "g2o": Exporter("pose graph", "run_files:g2o", "graph.g2o", (".g2o",)),
 }
 
