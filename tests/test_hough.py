@@ -1,0 +1,203 @@
+import numpy as np
+import pytest
+
+from mapper.config.hough import HoughGicpConfig, HoughNdtConfig, HoughTrustConfig
+from mapper.config.synthetic import COURTYARD, STREET
+from mapper.frames import Scan
+from mapper.geometry import angle_between, apply, inverse, rotation_exp, transform
+from mapper.registration.hough import Hough
+from mapper.sources.synthetic.lidar import SyntheticLidarSource
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def source_of(config, seed):
+    sensor = config.sensor.model_copy(update={"motion_distortion": False, "rings": 32})
+    return SyntheticLidarSource(config.model_copy(update={"seed": seed, "sensor": sensor}))
+
+
+def moved(scan, T_new_body):
+    return Scan(
+        stamp_ns=scan.stamp_ns,
+        points_body=apply(T_new_body, scan.points_body.astype(np.float64)).astype(np.float32),
+        origin_body=apply(T_new_body, scan.origin_body[np.newaxis])[0],
+    )
+
+
+def pair_of(log, i, j, *, yaw_rad, shift_m):
+    """Return two scans, the second told in a frame turned and set off, and the motion between them."""
+    T_source_new = transform(rotation_exp(yaw_rad * UP), np.array(shift_m))
+    T_i_j = inverse(log.truth.T_world_body[i]) @ log.truth.T_world_body[j]
+    return log.observe(i), moved(log.observe(j), inverse(T_source_new)), T_i_j @ T_source_new
+
+
+def miss(alignment, T_target_source):
+    gap = inverse(T_target_source) @ alignment.T_target_source
+    return np.linalg.norm(gap[:3, 3]), np.degrees(angle_between(gap[:3, :3], np.eye(3)))
+
+
+@pytest.fixture(scope="module")
+def street():
+    return pair_of(source_of(STREET, 3), 0, 12, yaw_rad=2.5, shift_m=(-1.0, 3.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def courtyard():
+    log = source_of(COURTYARD, 5)
+    tilts_rad = [np.arccos(log.truth.T_world_body[i][2, 2]) for i in (3, 6)]
+    assert max(tilts_rad) > np.radians(20.0)
+    return pair_of(log, 3, 6, yaw_rad=-2.0, shift_m=(0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("config", [HoughGicpConfig(), HoughNdtConfig()], ids=lambda c: c.kind)
+def test_recovers_any_yaw_both_ways_without_a_guess(street, config):
+    target, source, T_target_source = street
+    method = config.build()
+    for a, b, T_a_b in ((target, source, T_target_source), (source, target, inverse(T_target_source))):
+        found = method.prepare(a).align(b, np.eye(4))
+
+        miss_m, miss_deg = miss(found, T_a_b)
+        assert found.converged, found.reason
+        assert miss_m < 0.05
+        assert miss_deg < 0.2
+        assert found.pairs > 1000
+        assert np.linalg.eigvalsh(found.information).min() > 0.0
+
+
+def test_recovers_motion_between_tilted_scans(courtyard):
+    target, source, T_target_source = courtyard
+
+    found = HoughGicpConfig().build().prepare(target).align(source, np.eye(4))
+
+    miss_m, miss_deg = miss(found, T_target_source)
+    assert found.converged, found.reason
+    assert miss_m < 0.05
+    assert miss_deg < 0.2
+
+
+@pytest.mark.parametrize("kept_ratio", [0.1, 0.25])
+def test_recovers_a_sparse_scan_in_a_dense_one(street, kept_ratio):
+    target, source, T_target_source = street
+    keep = np.random.default_rng(0).random(len(source.points_body)) < kept_ratio
+    sparse = Scan(stamp_ns=0, points_body=source.points_body[keep], origin_body=source.origin_body)
+
+    found = HoughGicpConfig().build().prepare(target).align(sparse, np.eye(4))
+
+    assert found.converged, found.reason
+    assert miss(found, T_target_source)[0] < 0.1
+
+
+def test_same_answer_whatever_the_guess_and_the_order(street):
+    target, source, _ = street
+    before = source.points_body.copy()
+    aligner = HoughGicpConfig().build().prepare(target)
+    first = aligner.align(source, np.eye(4))
+    aligner.align(target, np.eye(4))
+    again = aligner.align(source, transform(np.eye(3), np.array([50.0, 0.0, 0.0])))
+
+    assert np.array_equal(first.T_target_source, again.T_target_source)
+    assert np.array_equal(source.points_body, before)
+
+
+def test_tells_its_stages(street):
+    target, source, T_target_source = street
+    stages = HoughGicpConfig().build().prepare(target).stages(source)
+
+    gap = inverse(T_target_source) @ stages.hough.T_target_source
+    assert np.linalg.norm(gap[:3, 3]) < 0.5
+    assert list(stages.seconds) == ["describe", "vote", "verify", "prepare source", "refine"]
+    assert min(stages.seconds.values()) >= 0.0
+    assert stages.peaks[0].votes > 0
+    assert stages.overlap.agree > 0.3
+    assert stages.alignment.converged
+
+
+@pytest.mark.parametrize("seeds", [(0, 1), (2, 3), (4, 6)])
+@pytest.mark.parametrize("config", [STREET, COURTYARD], ids=lambda c: c.scene)
+def test_strangers_are_refused(config, seeds):
+    a, b = (source_of(config, seed).observe(4) for seed in seeds)
+
+    found = HoughGicpConfig().build().prepare(a).align(b, np.eye(4))
+
+    assert not found.converged
+    assert found.reason
+
+
+def test_an_answer_beyond_the_range_is_refused():
+    log = source_of(STREET, 3)
+    target, source, _ = pair_of(log, 0, 0, yaw_rad=1.0, shift_m=(25.0, 0.0, 0.0))
+
+    assert not HoughGicpConfig().build().prepare(target).align(source, np.eye(4)).converged
+
+
+def test_two_motions_as_good_as_each_other_are_none():
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-20.0, 20.0, (2, 40_000))
+    field = np.column_stack([x, y, rng.normal(-1.7, 0.01, x.shape)])
+    posts = []
+    for k in range(8):  # a ring of eight posts looks the same every 45°
+        angle = k * np.pi / 4.0
+        height = rng.uniform(-1.7, 2.0, 600)
+        around = rng.uniform(0.0, 2.0 * np.pi, 600)
+        posts.append(
+            np.column_stack(
+                [
+                    9.0 * np.cos(angle) + 0.5 * np.cos(around),
+                    9.0 * np.sin(angle) + 0.5 * np.sin(around),
+                    height,
+                ]
+            )
+        )
+    scan = Scan(stamp_ns=0, points_body=np.concatenate([field, *posts]).astype(np.float32))
+
+    found = HoughGicpConfig().build().prepare(scan).align(scan, np.eye(4))
+
+    assert not found.converged
+    assert "ambiguous" in found.reason
+
+
+def nothing(_):
+    return np.empty((0, 3))
+
+
+def one_point(_):
+    return np.array([[5.0, 1.0, 0.0]])
+
+
+def empty_field(rng):
+    x, y = rng.uniform(-30.0, 30.0, (2, 20_000))
+    return np.column_stack([x, y, rng.normal(-1.7, 0.01, x.shape)])
+
+
+def line(rng):
+    return np.outer(rng.uniform(-30.0, 30.0, 5000), [1.0, 0.2, 0.05])
+
+
+def one_place(_):
+    return np.tile([3.0, 2.0, 1.0], (5000, 1))
+
+
+def far_away(rng):
+    return rng.normal(0.0, 10.0, (5000, 3)) + 5000.0
+
+
+@pytest.mark.parametrize("make", [nothing, one_point, empty_field, line, one_place, far_away])
+@pytest.mark.parametrize("config", [HoughGicpConfig(), HoughNdtConfig()], ids=lambda c: c.kind)
+def test_bad_scans_are_refused_with_a_reason(street, make, config):
+    bad = Scan(stamp_ns=0, points_body=make(np.random.default_rng(0)).astype(np.float32))
+    method = config.build()
+
+    for target, source in ((street[0], bad), (bad, street[0]), (bad, bad)):
+        found = method.prepare(target).align(source, np.eye(4))
+        assert not found.converged
+        assert found.reason
+
+
+def test_trust_can_be_asked_for_more(street):
+    target, source, _ = street
+    config = HoughGicpConfig(trust=HoughTrustConfig(min_agreeing_ratio=0.99))
+
+    found = Hough(config).prepare(target).align(source, np.eye(4))
+
+    assert not found.converged
+    assert "overlap" in found.reason
