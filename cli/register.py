@@ -9,9 +9,10 @@ from cli.environment import prepare_libraries
 from cli.options import Overrides, Quiet
 
 if TYPE_CHECKING:
+    from evaluators.register import Registered
     from mapper.config.sensors import Sensor
     from mapper.config.sources import SourceConfig
-    from mapper.frames import Frame
+    from mapper.frames import Frame, Scan
 
 _CLOUD = "A cloud (.bin .pcd .ply .xyz .npy .las .laz), or LOG@N: the n-th frame of a log, from 0."
 
@@ -36,10 +37,12 @@ def register(
     out: Annotated[
         Path | None, typer.Option(help="Folder to create for the cloud, picture and recording.")
     ] = None,
+    rerun: Annotated[
+        str | None,
+        typer.Option(metavar="TARGET", help="Show it in Rerun: FILE.rrd, spawn or connect[:URL]."),
+    ] = None,
     set_: Overrides = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace OUT, once the new folder is whole.")
-    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT, and the .rrd file.")] = False,
     quiet: Quiet = False,
 ) -> None:
     """Register two clouds; the exit status is 1 when the answer is not to be trusted.
@@ -55,6 +58,8 @@ def register(
     from mapper.staging import staged
 
     prepare_libraries()
+    if rerun is not None:
+        _refuse_to_lose(rerun, overwrite=overwrite)
     overrides = set_ or []
     opening = overridden(register_config(method, "lidar"), [o for o in overrides if o.startswith("source.")])
     target_frame, target_sensor = _load(target, opening.source)
@@ -78,8 +83,30 @@ def register(
             files = ", ".join(sorted(child.name for child in folder.iterdir()))
         if not quiet:
             print(f"files    {files}\nin       {out}")
+    if rerun is not None:
+        _shown(rerun, registered, target_frame.scan(), source_frame.scan(), f"{source} on {target}", sensor)
     if not registered.alignment.converged:
         raise RegistrationError(f"{source} on {target}: not trusted: {registered.alignment.reason}")
+
+
+def _refuse_to_lose(rerun: str, *, overwrite: bool) -> None:
+    from mapper.errors import RunError
+    from mapper.export.rerun.target import check_target
+
+    if Path(check_target(rerun)).exists() and not overwrite:
+        raise RunError(f"{rerun}: exists already; choose another, or pass --overwrite to replace it")
+
+
+def _shown(
+    rerun: str, registered: "Registered", target: "Scan", source: "Scan", name: str, sensor: "Sensor"
+) -> None:
+    from mapper.export.rerun.registration import record_registration
+
+    stages = [
+        (f"{stage.name}: MPD {stage.distance.mpd_m:.3f} m", stage.T_target_source)
+        for stage in registered.stages
+    ]
+    record_registration(rerun, target.points_body, source.points_body, stages, sensor=sensor, name=name)
 
 
 def _load(name: str, config: "SourceConfig") -> "tuple[Frame, Sensor]":

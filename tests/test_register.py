@@ -148,6 +148,15 @@ def test_frames_of_a_log_are_named_by_their_number(desk_log):
         assert f"method   {method}" in result.stdout
 
 
+def test_it_can_be_watched_in_rerun(clouds, tmp_path):
+    target, source, _ = clouds
+    recording = tmp_path / "registered.rrd"
+    assert mapper(source, target, "--rerun", recording, "--quiet").exit_code == 0
+    assert recording.read_bytes().startswith(b"RRF2")
+    assert "exists already" in mapper(source, target, "--rerun", recording).stderr
+    assert "want FILE.rrd" in mapper(source, target, "--rerun", "somewhere").stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
