@@ -129,7 +129,7 @@ def _refuse_untied(second: FrameSource, run: Run, loops: Sequence[LoopClosure], 
     if any(loop.verdict == "accepted" for loop in between):
         return
     if not between:
-        why = "nothing in it looks like a known place"
+        why = "nothing in it looks like a known place (min_similarity of loops.places or loops.context)"
     else:
         refused = Counter(loop.reason.split(":")[0] for loop in between).most_common()
         why = f"{len(between)} candidates compared, none held: {', '.join(f'{by} {n}' for by, n in refused)}"

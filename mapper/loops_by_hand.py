@@ -1,11 +1,12 @@
 """Loops that a user adds to a finished run or takes from it: solved and fused again, but not tracked."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from mapper.config import BuildConfig
-from mapper.config.loops import NoLoopsConfig, PlaceLoopsConfig
+from mapper.config.loops import NoLoopsConfig, PlaceLoopsConfig, ScanLoopsConfig
+from mapper.config.sensors import Sensor
 from mapper.errors import ConfigError, LoopError
 from mapper.graph.chain import by_odometry
 from mapper.graph.model import PoseGraph
@@ -24,6 +25,11 @@ Pair = tuple[int, int]
 """Two nodes."""
 
 _REMOVED = "hand: removed"
+_LOOPS: Mapping[Sensor, PlaceLoopsConfig | ScanLoopsConfig] = {
+    "rgbd": PlaceLoopsConfig(),
+    "lidar": ScanLoopsConfig(),
+}
+"""How the frames of a run are compared that looked for no loops itself."""
 
 
 def edit_loops(
@@ -101,7 +107,7 @@ def _in_time_order(graph: PoseGraph, pair: Pair) -> Pair:
 def _measured(
     source: FrameSource, tracked: Tracked, pairs: Sequence[Pair], config: BuildConfig
 ) -> list[LoopClosure]:
-    verifier, graph = _verifier(config), tracked.graph
+    verifier, graph = _verifier(config, source.sensor), tracked.graph
     stamps_ns = {graph.stamps_ns[node] for pair in pairs for node in pair}
     views = views_again(source, tracked.trajectory, stamps_ns, config)
     places = {stamp_ns: verifier.digest(seen) for stamp_ns, seen in views.items()}
@@ -113,9 +119,8 @@ def _measured(
     return loops
 
 
-def _verifier(config: BuildConfig) -> Verifier[Any]:
-    """Return what compares two frames; a run that looked for no loops has that of the default."""
-    loops = PlaceLoopsConfig() if isinstance(config.loops, NoLoopsConfig) else config.loops
+def _verifier(config: BuildConfig, sensor: Sensor) -> Verifier[Any]:
+    loops = _LOOPS[sensor] if isinstance(config.loops, NoLoopsConfig) else config.loops
     return loops.verification.build()
 
 

@@ -1,0 +1,100 @@
+"""Loops between scans by hand and between two drives, from logs on disk to run folders."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from evaluators.trajectory import align, associate, ate
+from mapper.appending import append
+from mapper.config import load_config, overridden
+from mapper.config.synthetic import STREET, LidarSensorConfig
+from mapper.errors import ConfigError, LoopError
+from mapper.loops.closure import discrepancy
+from mapper.loops_by_hand import edit_loops
+from mapper.pipeline import build
+from mapper.run import load_run, open_log
+from mapper.sources import open_source
+from mapper.sources.synthetic.lidar import write_lidar_log
+
+SETTINGS = ("octree.resolution_m=0.5", "octree.max_range_m=30", "loops.kind=none")
+DRIVE = STREET.model_copy(
+    update={
+        "seed": 5,
+        "loop_m": 150.0,
+        "duration_s": 6.0,
+        "rate_hz": 5.0,
+        "sensor": LidarSensorConfig(rings=24, azimuth_steps=360),
+    }
+)
+AGAIN = DRIVE.model_copy(update={"duration_s": 5.0, "speed_mps": 4.0, "yaw_swing_rad": 0.5})
+ELSEWHERE = DRIVE.model_copy(update={"seed": 6})
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("drives")
+    for name, config in (("drive", DRIVE), ("again", AGAIN), ("elsewhere", ELSEWHERE)):
+        write_lidar_log(folder / name, config)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def first(logs):
+    """A drive along new streets, on which no loops were looked for."""
+    config = load_config(None, SETTINGS, sensor="lidar")
+    return build(open_source(logs / "drive", config.source), config, logs / "run")
+
+
+def appended(run, log, out):
+    config = overridden(run.config, ["loops.kind=scans"])
+    return append(open_source(log, config.source), run, config, out)
+
+
+def error_m(run):
+    matched = associate(run.trajectory(), run.truth())
+    return ate(align(matched, "se3").moved(matched)).rmse
+
+
+def test_a_loop_between_scans_can_be_added_by_hand(first, tmp_path):
+    shutil.copytree(first.path, tmp_path / "run")
+    copy = load_run(tmp_path / "run")
+    edited = edit_loops(open_log(copy), copy, add=[(2, 9)])
+    (loop,) = edited.loops()
+    truth = edited.truth()
+    T_world_body = dict(zip(truth.stamps_ns.tolist(), truth.T_world_body, strict=True))
+    miss = discrepancy(loop.T_i_j, T_world_body[loop.stamp_i_ns], T_world_body[loop.stamp_j_ns])
+    assert (loop.proposed_by, loop.verdict) == ("hand", "accepted")
+    assert miss.translation_m < 0.1
+    assert miss.rotation_rad < 0.01
+    assert 0 < loop.inliers <= loop.matches
+
+
+def test_scans_of_two_places_are_no_loop_whoever_says_so(first, tmp_path):
+    shutil.copytree(first.path, tmp_path / "run")
+    copy = load_run(tmp_path / "run")
+    with pytest.raises(LoopError, match=r"loop 0 → 20: not added; (vote|overlap|sight): "):
+        edit_loops(open_log(copy), copy, add=[(0, 20)])
+    assert load_run(copy.path).loops() == []
+
+
+def test_a_second_drive_is_tied_to_the_first(first, logs, tmp_path):
+    joined = appended(first, logs / "again", tmp_path / "joined")
+    nodes = len(first.graph().T_world_node)
+    between = [loop for loop in joined.loops() if loop.verdict == "accepted" and loop.i < nodes <= loop.j]
+    assert len(between) >= 5
+    assert {loop.proposed_by for loop in between} == {"scans"}
+    assert error_m(joined) < 0.1
+    np.testing.assert_allclose(joined.graph().T_world_node[0], first.graph().T_world_node[0], atol=1e-9)
+
+
+def test_a_drive_elsewhere_is_refused(first, logs, tmp_path):
+    with pytest.raises(LoopError, match="no loop ties it"):
+        appended(first, logs / "elsewhere", tmp_path / "joined")
+    assert not (tmp_path / "joined").exists()
+
+
+def test_loops_between_images_are_refused_for_scans(logs, tmp_path):
+    config = load_config(None, ["loops.kind=places"], sensor="lidar")
+    with pytest.raises(ConfigError, match="compare images, and these are scans; want scans"):
+        build(open_source(logs / "drive", config.source), config, tmp_path / "run")
