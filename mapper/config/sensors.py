@@ -16,7 +16,7 @@ DEFAULTS: Mapping[Sensor, Mapping[str, Any]] = {
         "slice": {"min_height_m": 0.3, "max_height_m": 2.0, "above": "ground"},
         "traversable": {"max_step_m": 0.2, "slope_window_m": 2.0, "head_room_m": 2.0, "max_gap_m": 1.0},
         "costmap": {"robot_radius_m": 0.5, "inflation_radius_m": 2.0, "cost_scaling": 3.0},
-        "cloud": {"voxel_m": 0.1, "frame_stride": 1},
+        "cloud": {"voxel_m": 0.1, "frame_stride": 4},
     },
 }
 """A street is coarser than a room: what would be a step indoors is within the noise of the road."""

@@ -4,6 +4,7 @@ import zlib
 from dataclasses import dataclass
 
 import numpy as np
+from isal import isal_zlib
 from numba import njit
 from numpy.typing import NDArray
 
@@ -15,7 +16,7 @@ from mapper.octree.window import FREE, OCCUPIED, UNTOUCHED
 PACKED_BYTES = BLOCK_VOXELS // 8
 """Bytes of one bit per voxel of a block."""
 
-_QUICK = 1  # zlib's fastest level: cells are mostly runs, which more effort shrinks little further
+_QUICK = 1  # cells are mostly runs, which more effort shrinks little further
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +56,7 @@ class Sight:
     def compressed(self) -> bytes:
         """Return the sight as a short string of bytes, the same for the same sight."""
         steps = np.diff(self.codes, prepend=np.int64(0)).astype("<i8")
-        return zlib.compress(steps.tobytes() + self.free.tobytes() + self.occupied.tobytes(), _QUICK)
+        return isal_zlib.compress(steps.tobytes() + self.free.tobytes() + self.occupied.tobytes(), _QUICK)
 
 
 def pack(cast: Cast) -> Sight:
