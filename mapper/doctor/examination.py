@@ -1,6 +1,5 @@
 """Every look the doctor takes, in the order in which they are told."""
 
-import os
 from collections.abc import Callable
 
 from mapper.doctor import machine
@@ -30,7 +29,7 @@ def examine(*, progress: Progress = SILENT) -> list[Finding]:
         tried = ordered_map(
             lambda name: look_at_library(name, least.get(name, "0")),
             SELF_TESTS,
-            workers=len(os.sched_getaffinity(0)),
+            workers=machine.processors(),
         )
         for done, finding in enumerate(tried, start=1):
             findings.append(finding)

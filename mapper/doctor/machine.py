@@ -39,11 +39,17 @@ def look_at_glibc() -> Finding:
     return Finding("glibc", "well", told)
 
 
+def processors() -> int:
+    """Return how many processors this process may use."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))  # a container may have fewer than the machine
+    return os.cpu_count() or 1
+
+
 def look_at_threads() -> Finding:
     """Return how many processors we may use, and whether libraries start threads of their own."""
-    processors = len(os.sched_getaffinity(0))
     each = os.environ.get(_THREADS, "unset")
-    told = f"{processors} processors for us, {_THREADS} is {each}"
+    told = f"{processors()} processors for us, {_THREADS} is {each}"
     if each != "1":
         return Finding(
             "threads", "warning", told, f"unset {_THREADS}: small matrices are slower with several"
@@ -53,8 +59,11 @@ def look_at_threads() -> Finding:
 
 def look_at_memory() -> Finding:
     """Return how much memory is there."""
-    meminfo = Path("/proc/meminfo").read_text(encoding="ascii")
-    kilobytes = {name: int(value) for name, value in re.findall(r"^(\w+): +(\d+) kB", meminfo, re.MULTILINE)}
+    meminfo = Path("/proc/meminfo")
+    if not meminfo.exists():
+        return Finding("memory", "well", "this system does not tell")
+    lines = re.findall(r"^(\w+): +(\d+) kB", meminfo.read_text(encoding="ascii"), re.MULTILINE)
+    kilobytes = {name: int(value) for name, value in lines}
     total_gb, free_gb = (kilobytes[name] * 1024 / 1e9 for name in ("MemTotal", "MemAvailable"))
     told = f"{free_gb:.1f} GB of {total_gb:.1f} GB available"
     if free_gb < _LEAST_MEMORY_GB:
