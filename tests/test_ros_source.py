@@ -155,7 +155,7 @@ def test_what_is_missing_is_named(tmp_path, kept, why):
 def test_depth_that_is_not_registered_is_refused(tmp_path):
     other = PinholeCamera(64, 48, 45.0, 45.0, 31.5, 23.5)
     messages = [*shots(2), camera_info(FIRST_NS, "/cam/aligned_depth/camera_info", other)]
-    why = r"aligned_depth/image_raw \(64×48 px, focal length 45.0 px\) is not registered to /cam/color/image_raw"
+    why = r"aligned_depth/image_raw \(64×48 px, focal length 45.0 px\) is not registered to /cam/color"
     with pytest.raises(SourceError, match=why):
         opened(tmp_path / "a.mcap", messages)
     small = [image(FIRST_NS, DEPTH, np.ones((24, 32), np.uint16), "16UC1"), *shots(1)[1:]]

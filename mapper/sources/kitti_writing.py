@@ -34,12 +34,12 @@ def write_kitti_log(
     stamps_ns: list[int] = []
     skipped: list[Skipped] = []
     clouds = out / "velodyne"
-    clouds.mkdir(parents=True, exist_ok=True)
     for done, entry in enumerate(source.entries(), start=1):
         try:
             scan = entry.load(colour=False)
             if not isinstance(scan, Scan):
                 raise SourceError(f"{source.path}: images, not scans; KITTI folders hold scans: --as tum")
+            clouds.mkdir(parents=True, exist_ok=True)
             save_scan(clouds / f"{len(stamps_ns):06d}", scan)
             stamps_ns.append(scan.stamp_ns)
         except FrameError as error:

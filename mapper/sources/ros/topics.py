@@ -88,9 +88,8 @@ def choose(
     if color is not None and depth is not None and config.points is None:
         infos = pick.all(CAMERAS)
         info = pick.one("camera_info", config.camera_info, CAMERAS, _plain_rank, where=set().__contains__)
-        info = info or next(
-            iter([*_beside(color, infos), *_of_frame(color, infos, firsts), *infos[:1]]), None
-        )
+        only = infos if len(infos) == 1 else []
+        info = info or next(iter([*_beside(color, infos), *_of_frame(color, infos, firsts), *only]), None)
         depth_info = next((one for one in _beside(depth, infos) if one is not info), None)
         frames = CameraTopics(color, depth, info, depth_info)
         told = f"colour {color.topic.name}, depth {depth.topic.name}"
