@@ -24,6 +24,7 @@ from mapper.octree.slice import OccupancyGrid, cut_slice
 from mapper.parallel import ordered_map
 from mapper.progress import Progress
 from mapper.sources.base import Entry, FrameSource
+from mapper.thinning import thin
 from mapper.trajectory import Trajectory
 
 _COLOURED_HEIGHTS_M = -1.0, 8.0  # the same in every scan
@@ -44,6 +45,19 @@ class Snapshot:
     jpeg: bytes
     camera: PinholeCamera
     T_body_camera: Transform
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanSnapshot:
+    """A thinned scan.
+
+    Attributes:
+        stamp_ns: The scan's stamp.
+        points_body: (N, 3) float32 metres, body frame.
+    """
+
+    stamp_ns: int
+    points_body: Points32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +99,7 @@ class _Fused:
     sight: Sight | None = None
     remembered: Remembered | None = None
     scan: Scan | None = None
-    snapshot: Snapshot | None = None
+    snapshot: Snapshot | ScanSnapshot | None = None
     reason: str = ""
 
 
@@ -95,7 +109,7 @@ def fuse_log(
     config: BuildConfig,
     *,
     progress: Progress,
-    on_snapshot: Callable[[Snapshot], None],
+    on_snapshot: Callable[[Snapshot | ScanSnapshot], None],
     before: SightFile | None,
     after: SightWriter,
 ) -> Maps:
@@ -108,7 +122,7 @@ def fuse_log(
         trajectory: Final body poses in the levelled world; frames without a pose are left out.
         config: The octree, cloud, slice and mcap parts matter.
         progress: Who watches.
-        on_snapshot: Gets every ``mcap.image_stride``-th frame's image.
+        on_snapshot: Gets every ``mcap.image_stride``-th frame's image, or its points if it has no image.
         before: What the frames saw when they were fused the last time.
         after: Gets what they see now.
     """
@@ -189,7 +203,7 @@ def _prepared(job: _Job, config: BuildConfig, caster: Caster) -> _Fused:
         if job.feeds_cloud or job.feeds_log or config.octree.attributes:
             frame = job.entry.load()
             scan = deskewed(frame.scan(), job.twist)
-            snapshot = _snapshot(frame, config.mcap) if job.feeds_log else None
+            snapshot = _snapshot(frame, scan, config.mcap) if job.feeds_log else None
         elif job.known is None:
             scan = deskewed(job.entry.scan(), job.twist)
     except FrameError as error:  # it was readable in the first pass, so the log changed under us
@@ -201,9 +215,9 @@ def _prepared(job: _Job, config: BuildConfig, caster: Caster) -> _Fused:
     return _Fused(job, sight, remember(job.entry.stamp_ns, job.T_world_body, sight), scan, snapshot)
 
 
-def _snapshot(frame: Frame, config: McapConfig) -> Snapshot | None:
+def _snapshot(frame: Frame, scan: Scan, config: McapConfig) -> Snapshot | ScanSnapshot:
     if not isinstance(frame, RgbdFrame):
-        return None
+        return ScanSnapshot(scan.stamp_ns, scan.points_body[thin(scan.points_body, config.scan_voxel_m)])
     return Snapshot(
         frame.stamp_ns,
         encode_jpeg(frame.image, width_px=config.image_width_px, quality=config.image_quality),

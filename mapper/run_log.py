@@ -7,7 +7,7 @@ from dataclasses import asdict
 from mapper.export.foxglove_parts import WORLD
 from mapper.export.mcap_log import McapLog
 from mapper.export.palette import TRUTH, height_colors
-from mapper.fusion import Maps, Snapshot
+from mapper.fusion import Maps, ScanSnapshot, Snapshot
 from mapper.loops.closure import Discrepancy, LoopClosure
 from mapper.records import FrameRecord
 from mapper.story import Story
@@ -34,8 +34,12 @@ def log_story(log: McapLog, story: Story) -> None:
         log.loop(loop.stamp_j_ns, _loop_fields(loop))
 
 
-def log_snapshot(log: McapLog, snapshot: Snapshot) -> None:
-    """Log an image with its camera and where that sits on the body."""
+def log_snapshot(log: McapLog, snapshot: Snapshot | ScanSnapshot) -> None:
+    """Log an image with its camera and where that sits on the body, or a scan by height."""
+    if isinstance(snapshot, ScanSnapshot):
+        points_body = snapshot.points_body
+        log.scan(snapshot.stamp_ns, points_body, colors=height_colors(points_body[:, 2]), frame=BODY)
+        return
     log.transform(snapshot.stamp_ns, snapshot.T_body_camera, parent=BODY, child=CAMERA)
     log.calibration(snapshot.stamp_ns, snapshot.camera, frame=CAMERA)
     log.image(snapshot.stamp_ns, snapshot.jpeg, frame=CAMERA)

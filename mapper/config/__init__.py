@@ -26,11 +26,13 @@ class McapConfig(Config):
     """What goes into ``run.mcap``."""
 
     image_stride: NonNegativeInt = 10
-    """Every n-th frame's colour image is logged; 0 logs none."""
+    """Every n-th frame's colour image, or scan, is logged; 0 logs none."""
     image_width_px: PositiveInt = 320
     """Wider images are shrunk."""
     image_quality: Annotated[int, Field(ge=1, le=100)] = 80
     """As libjpeg counts."""
+    scan_voxel_m: PositiveFloat = 0.3
+    """Scans are thinned to one point per voxel."""
     frame_times: bool = True
     """Log the milliseconds of every frame; without them two builds of a log give the same bytes."""
 

@@ -212,6 +212,12 @@ class McapLog:
             )
         self._points(f"/map/{name}", stamp_ns, points_world, colors)
 
+    def scan(
+        self, stamp_ns: int, points: NDArray[np.floating], *, colors: NDArray[np.uint8], frame: str
+    ) -> None:
+        """Log (N, 3) points in metres with (N, 3) RGB bytes on /scan, in a frame that moves."""
+        self._points("/scan", stamp_ns, points, colors, frame=frame)
+
     def plan(self, stamp_ns: int, waypoints_world: Points) -> None:
         """Log a planned path through (N, 3) points on /plan, and as dots below that.
 
@@ -318,7 +324,13 @@ class McapLog:
         self._write(topic, ros2.encode_record(record), stamp_ns)
 
     def _points(
-        self, topic: str, stamp_ns: int, points: NDArray[np.floating], colors: NDArray[np.uint8]
+        self,
+        topic: str,
+        stamp_ns: int,
+        points: NDArray[np.floating],
+        colors: NDArray[np.uint8],
+        *,
+        frame: str = WORLD,
     ) -> None:
         packed = np.empty(len(points), _POINT)
         packed["position"] = points
@@ -332,7 +344,7 @@ class McapLog:
             topic,
             messages.PointCloud(
                 timestamp=timestamp_of(stamp_ns),
-                frame_id=WORLD,
+                frame_id=frame,
                 pose=pose_of(np.eye(4)),
                 point_stride=_POINT.itemsize,
                 fields=[
