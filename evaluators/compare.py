@@ -39,7 +39,7 @@ class Comparison:
         runs: Each method over the whole log.
         step: Of the runs' relative errors.
         trials: Every registration of every pair.
-        read_ms: What reading a frame takes, for all methods alike and not counted as theirs.
+        read_ms: What reading a frame takes of the CPU, for all methods alike and not counted as theirs.
         scan_ms: What making its scan takes, likewise.
         skipped: Frames that could not be read.
         notes: What had to be left out, a sentence each.
@@ -72,9 +72,9 @@ def trials_config(config: CompareConfig, sensor: Sensor) -> TrialsConfig:
 def compare(source: FrameSource, config: CompareConfig, *, progress: Progress = SILENT) -> Comparison:
     """Run every chosen method over the whole log, and on pairs of its frames.
 
-    Frames are read one at a time and shown to one method after the other: memory does not grow with the log,
-    and methods that are timed do not compete. A method that breaks down is told with its reason, and the
-    others go on.
+    Frames are read one at a time and shown to one method after the other, so memory does not grow with the
+    log. Times are of the CPU: they are what one core would take, whatever else the machine does. A method
+    that breaks down is told with its reason, and the others go on.
 
     Raises:
         ConfigError: No method of such a name, or none of them can use the log.
@@ -124,25 +124,25 @@ class _Racer:
         if self._broke:
             return
         self._T_body_seen = np.eye(4) if self._method.sees_images else moment.T_body_scan
-        began = time.perf_counter()
+        began = time.process_time()
         try:
             self._tracker = self._tracker or self._method.tracker()
             self._failures += not self._tracker.add(self._method.view(moment))
         except Exception as error:  # a library's breakdown is a result, and the other methods go on
             self._broke = f"broke down at frame {self._frames}: {reason_of(error)}"
-        self._seconds += time.perf_counter() - began
+        self._seconds += time.process_time() - began
         self._frames += 1
 
     def run(self, truth: Trajectory | None, step: Step) -> OdometryRun:
         """Return what became of the method."""
-        began = time.perf_counter()
+        began = time.process_time()
         trajectory = trajectory_from(())
         if self._tracker is not None and not self._broke:
             try:
                 trajectory = self._tracker.trajectory()
             except Exception as error:  # as above
                 self._broke = f"broke down at the end: {reason_of(error)}"
-        self._seconds += time.perf_counter() - began
+        self._seconds += time.process_time() - began
         run = OdometryRun(
             method=self._method.name,
             frames=self._frames,

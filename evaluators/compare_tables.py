@@ -129,8 +129,8 @@ def odometry_notes(comparison: Comparison) -> list[str]:
         "over stretches of a tenth to a half of the path",
         "no loops and no solve; registrations go from frame to frame, from the motion before, which also "
         "carries on where one fails",
-        f"frames/s of the method alone: reading a frame takes {comparison.read_ms:.1f} ms more, making its "
-        f"scan {comparison.scan_ms:.1f} ms",
+        f"frames/s: of the method alone, by CPU time, so on one core; reading a frame takes "
+        f"{comparison.read_ms:.1f} ms more, making its scan {comparison.scan_ms:.1f} ms",
         *broken,
         *comparison.notes,
     ]
@@ -146,7 +146,7 @@ def registration_notes(comparison: Comparison) -> list[str]:
         f"seed {comparison.config.seed}",
         f"right: within {config.max_error_m:g} m and {config.max_error_deg:g}° of the truth; wrong: farther "
         "off, but trusted; median and 95 % are of the right ones only",
-        "prepare: what the target alone takes; align: the rest",
+        "prepare: CPU time that the target alone takes; align: the rest",
     ]
 
 

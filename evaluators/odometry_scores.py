@@ -62,7 +62,7 @@ class OdometryRun:
         method: Its name.
         frames: Frames that it was given.
         failures: Frames that it could not place, or registrations that did not converge.
-        seconds: What it took, without what is common to all methods.
+        seconds: Of the CPU, without what is common to all methods.
         trajectory: T_world_body, laid over the truth where there is one.
         matched: The poses that have a true one, laid over it; None without truth or with too few.
         errors: How far they are from it.
@@ -87,7 +87,7 @@ class OdometryRun:
 
     @property
     def frames_per_s(self) -> float:
-        """Of the method alone."""
+        """Of the method alone, on one core."""
         return self.frames / self.seconds if self.seconds > 0.0 else 0.0
 
 

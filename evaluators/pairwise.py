@@ -51,8 +51,8 @@ class Trial:
         outcome: What became of it.
         translation_m: Distance from the true position; infinite without an answer.
         rotation_rad: Angle from the true rotation; infinite without an answer.
-        prepare_ms: What the target alone took.
-        align_ms: What the source took.
+        prepare_ms: Of the CPU, for the target alone.
+        align_ms: The same, for the source.
         reason: Why there is no answer.
     """
 
@@ -178,14 +178,14 @@ def _trial(
     T_true = pair.T_target_source
     if not method.sees_images:
         T_guess, T_true = target.upright(T_guess), target.upright(T_true)
-    began = prepared = time.perf_counter()
+    began = prepared = time.process_time()
     try:
         aligner = method.registration().prepare(method.view(target))
-        prepared = time.perf_counter()
+        prepared = time.process_time()
         alignment = aligner.align(method.view(source), T_guess)
     except Exception as error:  # a library's breakdown is a result, and the other methods go on
         alignment = failed(f"broke down: {reason_of(error)}")
-    aligned = time.perf_counter()
+    aligned = time.process_time()
     outcome, translation_m, rotation_rad = judged(alignment, T_true, config)
     return Trial(
         method=method.name,
