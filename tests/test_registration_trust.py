@@ -91,7 +91,7 @@ def test_clouds_without_features_do_not_crash_kiss_matcher():
 def test_a_dense_cloud_of_many_matches_is_the_same_every_time():
     """With more matches than it takes, the library draws from them without a seed."""
     rng = np.random.default_rng(5)
-    dense = yard(rng, points=100_000)
+    dense = yard(rng, points=40_000)
     bumpy = (
         dense + np.column_stack([*np.zeros((2, len(dense))), np.sin(dense[:, 0]) + np.cos(dense[:, 1])])
     ).astype(np.float32)

@@ -21,6 +21,7 @@ topic                  schema                        Foxglove            Rerun
 /loops                 mapper/msg/Loop               plots, raw values   plots, raw values
 /errors/NAME           mapper/msg/PathError          plots, raw values   plots, raw values
 /trials/NAME           mapper/msg/Trial              raw values          plots, raw values
+/registration          mapper/msg/Registration       raw values          plots, raw values
 =====================  ============================  ==================  ===========================
 
 So lines are logged as dots too, the slice is a ROS message (Rerun ignores foxglove.Grid) and so are the
