@@ -186,6 +186,16 @@ def test_what_is_told_by_pointing_clicking_and_dragging(page):
         )
         assert browser.run(labels) == before
 
+        bar = "document.querySelector('.plan svg text').textContent"
+        everything = browser.run(bar)
+        x, y = browser.centre(".plan svg")
+        browser.mouse("mousePressed", x, y, clicks=1)
+        browser.mouse("mouseMoved", x + 40, y + 40)
+        browser.mouse("mouseReleased", x + 40, y + 40, clicks=1)
+        assert float(browser.run(bar).split()[0]) < float(everything.split()[0])
+        browser.run("document.querySelector('.plan svg').dispatchEvent(new MouseEvent('dblclick'))")
+        assert browser.run(bar) == everything
+
         shown = "[...document.querySelectorAll('.settings tbody tr')].filter(e => !e.hidden).length"
         differing, everything = browser.run(shown), "document.querySelectorAll('.settings tbody tr').length"
         assert 0 < differing < browser.run(everything)

@@ -67,6 +67,34 @@
     }
   }
 
+  /** Call back with the corners, in pixels, of a box that is dragged over a figure. */
+  function onDrag(svg, zoom) {
+    let began = null, box = null;
+    const at = (event) => {
+      const frame = svg.getBoundingClientRect();
+      return [event.clientX - frame.left, event.clientY - frame.top];
+    };
+    svg.addEventListener("pointerdown", (event) => {
+      event.preventDefault();
+      began = at(event);
+      box = element(svg, "rect", { class: "zoom" });
+    });
+    svg.addEventListener("pointermove", (event) => {
+      if (!box) return;
+      at(event).forEach((now, axis) => {
+        box.setAttribute("xy"[axis], Math.min(began[axis], now));
+        box.setAttribute(["width", "height"][axis], Math.abs(now - began[axis]));
+      });
+    });
+    addEventListener("pointerup", (event) => {
+      if (!box) return;
+      const ended = at(event);
+      box.remove();
+      box = null;
+      if (Math.abs(ended[0] - began[0]) > 5) zoom(began.map((a, i) => Math.min(a, ended[i])), began.map((a, i) => Math.max(a, ended[i])));
+    });
+  }
+
   // Curves over time: one line per run -----------------------------------------------------------------
 
   function seriesOf(run, key, unit) {
@@ -136,26 +164,11 @@
     }
 
     const xOf = (event) => event.clientX - svg.getBoundingClientRect().left;
-    let began = null, box = null;
-    svg.addEventListener("pointermove", (event) => {
-      follow(fromX(xOf(event)));
-      if (box) {
-        box.setAttribute("x", Math.min(began, xOf(event)));
-        box.setAttribute("width", Math.abs(xOf(event) - began));
-      }
-    });
+    svg.addEventListener("pointermove", (event) => follow(fromX(xOf(event))));
     svg.addEventListener("pointerleave", () => follow(null));
-    svg.addEventListener("pointerdown", (event) => {
-      began = xOf(event);
-      box = element(svg, "rect", { class: "zoom", x: began, y: MARGIN.top, width: 0, height: CURVE_HEIGHT - MARGIN.bottom - MARGIN.top });
-    });
-    addEventListener("pointerup", (event) => {
-      if (!box) return;
-      const [a, b] = [fromX(began), fromX(xOf(event))].sort((p, q) => p - q);
-      const wide = Math.abs(xOf(event) - began) > 5;
-      box.remove();
-      box = null;
-      if (wide) { zoomed = [a, b]; redraw(); }
+    onDrag(svg, (low, high) => {
+      zoomed = [fromX(low[0]), fromX(high[0])];
+      redraw();
     });
     svg.addEventListener("dblclick", () => { zoomed = null; redraw(); });
     redraws.push(draw);
@@ -181,7 +194,8 @@
     const xs = [slice.x, slice.x + slice.width_m], ys = [slice.y, slice.y + slice.height_m];
     for (const path of [run.path, run.truth]) if (path) { for (const x of path.x) xs.push(x); for (const y of path.y) ys.push(y); }
     const least = (values) => values.reduce((a, b) => Math.min(a, b)), most = (values) => values.reduce((a, b) => Math.max(a, b));
-    const [x0, x1, y0, y1] = [least(xs) - margin, most(xs) + margin, least(ys) - margin, most(ys) + margin];
+    const everything = [least(xs) - margin, most(xs) + margin, least(ys) - margin, most(ys) + margin];
+    let [x0, x1, y0, y1] = everything;
     let scale, dot;
     const toX = (x) => (x - x0) * scale, toY = (y) => (y1 - y) * scale;
 
@@ -205,7 +219,7 @@
             element(group, "circle", { cx: toX(a[0]), cy: toY(a[1]), r: 1.5 });
           }
       }
-      const bar = [10, 5, 2, 1, 0.5, 0.2, 0.1].find((length) => length <= 0.25 * (x1 - x0)) || 0.1;
+      const bar = [100, 50, 20, 10, 5, 2, 1, 0.5, 0.2, 0.1, 0.05, 0.02].find((length) => length <= 0.25 * (x1 - x0)) || 0.01;
       element(svg, "line", { x1: 8, x2: 8 + bar * scale, y1: height - 8, y2: height - 8, style: "stroke: var(--ink)", "stroke-width": 3 });
       element(svg, "text", { x: 8, y: height - 14 }, `${bar} m`);
       dot = element(svg, "circle", { class: "here", r: 5, visibility: "hidden", style: `fill: ${colorOf(index)}; stroke: white; stroke-width: 2` });
@@ -232,6 +246,12 @@
       follow(run.path.t[best]);
     });
     svg.addEventListener("pointerleave", () => follow(null));
+    onDrag(svg, (low, high) => {
+      const flat = high[1] - low[1] < 5 ? 5 : 0;
+      [x0, x1, y0, y1] = [x0 + low[0] / scale, x0 + high[0] / scale, y1 - (high[1] + flat) / scale, y1 - low[1] / scale];
+      draw();
+    });
+    svg.addEventListener("dblclick", () => { [x0, x1, y0, y1] = everything; draw(); });
     redraws.push(draw);
     followers.push(place);
   }

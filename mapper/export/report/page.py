@@ -20,6 +20,7 @@ _CURVES = (
     ("inliers", "Inliers of each frame", ""),
     ("ms", "Time to track each frame", "ms"),
 )
+_HINT = '<p class="hint">Drag to zoom in, double-click to see all again.</p>'
 _POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
     "base-uri 'none'; form-action 'none'"
@@ -61,7 +62,7 @@ def page_of(chapters: Sequence[Chapter]) -> str:
             _header(chapters),
             "<main>",
             _section("Summary", _table(["", *_names(chapters)], _figures(chapters))),
-            _section("Plans", _columns(starmap(_plan, enumerate(chapters)))),
+            _section("Plans", _HINT + _columns(starmap(_plan, enumerate(chapters)))),
             _section("Over time", _curves(chapters)),
             _section("Loops", "".join(starmap(_loops, enumerate(chapters)))),
             _section("Views", _columns(starmap(_views, enumerate(chapters)))),
@@ -185,7 +186,7 @@ def _curves(chapters: Sequence[Chapter]) -> str:
     """Return the places of the curves; residuals of different units are no one curve's."""
     units = sorted({residual_unit(chapter.story) for chapter in chapters} - {""})
     curves = [*_CURVES, *(("residual", "Residual of each frame", unit) for unit in units)]
-    return '<p class="hint">Drag to zoom in, double-click to see all again.</p>' + "".join(
+    return _HINT + "".join(
         f'<figure class="curve" data-curve="{key}" data-unit="{escape(unit)}">'
         f"<figcaption>{title}</figcaption></figure>"
         for key, title, unit in curves
