@@ -1,5 +1,7 @@
 """What a sensor's logs begin with, and how a user's words stand over it."""
 
+from pathlib import Path
+
 import pytest
 
 from mapper.config import load_config, load_source_config
@@ -52,3 +54,9 @@ def test_the_source_is_known_before_the_sensor(tmp_path):
 def test_a_wrong_knob_of_the_source_is_named():
     with pytest.raises(ConfigError, match=r"source\.strid"):
         load_source_config(None, ["source.strid=2"])
+
+
+def test_the_outdoor_file_spells_the_defaults_out():
+    path = Path(__file__).parents[1] / "configs/lidar_outdoor.toml"
+
+    assert load_config(path, sensor="lidar") == load_config(sensor="lidar")
