@@ -26,8 +26,8 @@ class TrustConfig(Config):
     surface_voxels: PositiveFloat = 0.33
     """A source point agrees that lies this near to a target point, and to the surface about it."""
     min_agreeing_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.3
-    """Of the surfaces that face any one direction, so large a share has to agree. On streets, in yards and
-    rooms, against scans and dense maps, nearly all right answers had more and every wrong one 0.28 or less."""
+    """Of the surfaces that face any one direction, so large a share has to agree. On streets and in yards,
+    against scans and dense maps, nearly all right answers had more, and every wrong one 0.28 or less."""
 
 
 class RefinedConfig(Config):
