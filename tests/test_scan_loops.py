@@ -199,6 +199,12 @@ def test_scans_that_share_too_little_are_not_one_place():
     assert found.matches > found.inliers > 0
 
 
+def test_too_little_stands_here_to_tell_the_place_by():
+    found = verified(on_street(street(1), 10.0), on_street(street(1), 14.0), min_compared=5000)
+    assert found.reason.startswith("overlap: ")
+    assert found.reason.endswith("points to compare, want 5000")
+
+
 def test_a_corridor_does_not_say_how_far_along_it_one_is():
     rng = np.random.default_rng(0)
     along = np.linspace(-40.0, 40.0, 8000)

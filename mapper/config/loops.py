@@ -144,8 +144,10 @@ class ScanVerificationConfig(Config):
     """And so many of the nine directions around it have a return."""
     min_agreeing_ratio: Ratio = 0.3
     """A smaller share of what stands that agrees, in either direction, is no loop."""
-    max_contradicting_ratio: Ratio = 0.08
+    max_contradicting_ratio: Ratio = 0.06
     """A larger share that was looked through, of what was not hidden, is no loop: parked cars leave."""
+    min_compared: PositiveInt = 100
+    """Fewer points that agree or contradict say nothing: bare yards all look alike."""
     sigma_rad: NonNegativeFloat = 0.002
     sigma_m: NonNegativeFloat = 0.03
     """Errors that all points share: of deskewing, calibration and voxels."""
@@ -174,7 +176,7 @@ class ScanLoopsConfig(KeyframeLoopsConfig):
     max_candidates: PositiveInt = 3
     context: ScanContextConfig = ScanContextConfig()
     verification: ScanVerificationConfig = ScanVerificationConfig()
-    gate: GateConfig = GateConfig(slack_m=1.0)
+    gate: GateConfig = GateConfig(slack_m=1.0, drift_rad_per_m=0.005)
     agreement_path_m: PositiveFloat = 15.0
 
     def build(self, correction: "Correction", /) -> "KeyframeLoops[ScanPlace]":

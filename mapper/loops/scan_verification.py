@@ -151,8 +151,10 @@ class ScanVerifier:
         """Return the verdict of the scan that likes the motion less."""
         config = self._config
         worse = min(self._testimonies(i, j, T_i_j, margin_m), key=lambda of: of.score)
-        reason = ""
-        if worse.agreeing < config.min_agreeing_ratio:
+        compared, reason = worse.agree + worse.through, ""
+        if compared < config.min_compared:
+            reason = f"overlap: {compared} points to compare, want {config.min_compared}"
+        elif worse.agreeing < config.min_agreeing_ratio:
             reason = (
                 f"overlap: {worse.agreeing:.0%} of what stands in one stands in the other, "
                 f"want {config.min_agreeing_ratio:.0%}"
@@ -162,7 +164,7 @@ class ScanVerifier:
                 f"sight: {worse.contradicting:.0%} of what stands in one was looked through in the other, "
                 f"at most {config.max_contradicting_ratio:.0%}"
             )
-        return Verification(worse.agree + worse.through, reason, worse.agree)
+        return Verification(compared, reason, worse.agree)
 
     def _refined(self, i: ScanPlace, j: ScanPlace, T_i_j: Transform) -> Alignment:
         for distance_m in self._config.pair_distances_m:
