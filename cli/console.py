@@ -11,11 +11,11 @@ _SECONDS_BETWEEN_LINES = 10.0
 _MOST_NOTES = 5
 
 
-def progress_for(*, quiet: bool) -> Progress:
-    """Return who watches a job: nobody, a terminal, or a file."""
+def progress_for(*, quiet: bool, prompts: bool = False) -> Progress:
+    """Return who watches a job: nobody, a terminal, or a file; bars and prompts would write over each other."""
     if quiet:
         return SILENT
-    return Bars() if sys.stderr.isatty() else Lines()
+    return Bars() if sys.stderr.isatty() and not prompts else Lines()
 
 
 class _Notes:
