@@ -1,13 +1,29 @@
 """``mapper config``: every knob with its value."""
 
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
 from cli.options import ConfigFile, Overrides
 
 
-def show_config(config: ConfigFile = None, set_: Overrides = None) -> None:
+class SensorName(StrEnum):
+    """Whose defaults."""
+
+    RGBD = "rgbd"
+    LIDAR = "lidar"
+
+
+def show_config(
+    config: ConfigFile = None,
+    set_: Overrides = None,
+    sensor: Annotated[SensorName, typer.Option(help="Whose defaults to begin with.")] = SensorName.RGBD,
+) -> None:
     """Print every setting that a build with these options would use, as JSON.
 
     Example: mapper config --set odometry.kind=isvd > isvd.json, then: mapper build LOG --config isvd.json
     """
     from mapper.config import load_config
 
-    print(load_config(config, set_ or ()).model_dump_json(indent=2))
+    print(load_config(config, set_ or (), sensor=sensor.value).model_dump_json(indent=2))
