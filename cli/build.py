@@ -75,7 +75,9 @@ def build(
     overrides = merged(selection(first, last, stride, require_truth), set_)
     if onto is None:
         onlooker = _onlooker(rerun, step=step, overwrite=overwrite)
-        run, metrics = built(log, config, overrides, out, overwrite=overwrite, quiet=quiet, onlooker=onlooker)
+        run, metrics = built(
+            log, config, overrides, out, overwrite=overwrite, quiet=quiet, prompts=step, onlooker=onlooker
+        )
     else:
         _refuse_both(config, onto, rerun)
         run, metrics = appended(log, onto, overrides, out, overwrite=overwrite, quiet=quiet)
@@ -93,6 +95,7 @@ def built(
     *,
     overwrite: bool,
     quiet: bool,
+    prompts: bool = False,
     onlooker: "Onlooker | None" = None,
 ) -> "tuple[Run, list[Metric]]":
     """Build a run and judge its trajectory by the truth, if the log has any."""
@@ -105,7 +108,7 @@ def built(
     prepare_libraries()
     source = open_source(log, load_source_config(config_file, overrides))
     config = load_config(config_file, overrides, sensor=source.sensor)
-    progress = progress_for(quiet=quiet)
+    progress = progress_for(quiet=quiet, prompts=prompts)
     if not has_compiled_code():
         progress.note("first run here: the kernels are compiled once, which takes about a minute")
     for note in source.notes:

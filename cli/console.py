@@ -12,7 +12,7 @@ _MOST_NOTES = 5
 
 
 def progress_for(*, quiet: bool, prompts: bool = False) -> Progress:
-    """Return who watches a job: nobody, a terminal, or a file; bars and prompts would write over each other."""
+    """Return who watches a job: nobody, a terminal, or a file; bars would be drawn over prompts."""
     if quiet:
         return SILENT
     return Bars() if sys.stderr.isatty() and not prompts else Lines()
