@@ -144,8 +144,9 @@ def _depth_m_of_file(message: FileMessage, *, units_per_m: float, where: str) ->
 
 def _measured(depth_m: DepthImage) -> DepthImage:
     """Return depth with 0 where it is not finite, not in front of the camera, or that of a rendered sky."""
-    is_measured = (depth_m > 0.0) & (depth_m < _FARTHEST_M)
-    return np.where(is_measured, depth_m, np.float32(0.0)).astype(np.float32, copy=False)
+    measured: DepthImage = np.array(depth_m, dtype=np.float32)  # aligned, which a message need not be
+    np.copyto(measured, 0.0, where=~((measured >= 0.0) & (measured < _FARTHEST_M)))
+    return measured
 
 
 def _pixels(message: PixelsMessage, kind: str, channels: int, *, where: str) -> NDArray[Any]:

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from mapper.errors import DataError, FrameError
 from mapper.sources.ros import foxglove
-from mapper.sources.ros.messages import READ, WITH_HEADER, Message, decode
+from mapper.sources.ros.messages import READ, SMALL, WITH_HEADER, Message, decode
 from mapper.sources.ros.recording import Place, Recording, Topic
 from mapper.timebase import NS_PER_S, Stamps
 
 _NO_STAMP = 1 << 62  # in the year 2116; differences of smaller ones fit into 64 bits
 _TRIED = 10
+_KEPT_BYTES = 32 << 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,6 +30,7 @@ class Series:
         log_ns: (N,) when they were recorded.
         places: (N, 3) block, offset and length of each.
         undated: How many more have no header that can be read; they are left out.
+        kept: Bytes of small messages by their number: to read them again would unpack the whole file again.
     """
 
     topic: Topic
@@ -36,6 +38,7 @@ class Series:
     log_ns: Stamps
     places: NDArray[np.int64]
     undated: int
+    kept: Mapping[int, bytes] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -47,17 +50,19 @@ class Series:
 
 @dataclass(slots=True)
 class _Growing:
-    """A topic's messages so far: 40 bytes each."""
+    """A topic's messages so far: 40 bytes each, and what is kept."""
 
     stamps_ns: "array[int]" = field(default_factory=lambda: array("q"))
     log_ns: "array[int]" = field(default_factory=lambda: array("q"))
     places: "array[int]" = field(default_factory=lambda: array("q"))
     undated: int = 0
+    kept: dict[int, bytes] = field(default_factory=dict)
 
 
 def index_of(recording: Recording) -> Mapping[str, Series]:
     """Return the series of every topic that has messages, by its name."""
     growing: dict[Topic, _Growing] = {}
+    room_bytes = _KEPT_BYTES
     for topic, log_ns, place, data in recording.messages():
         series = growing.get(topic)
         if series is None:
@@ -69,6 +74,9 @@ def index_of(recording: Recording) -> Mapping[str, Series]:
         if not 0 <= stamp_ns < _NO_STAMP:
             series.undated += 1
             continue
+        if topic.type in SMALL and len(data) <= room_bytes:
+            series.kept[len(series.stamps_ns)] = bytes(data)
+            room_bytes -= len(data)
         series.stamps_ns.append(stamp_ns)
         series.log_ns.append(log_ns)
         series.places.extend(place)
@@ -79,6 +87,7 @@ def index_of(recording: Recording) -> Mapping[str, Series]:
             log_ns=np.array(series.log_ns, np.int64),
             places=np.array(series.places, np.int64).reshape(-1, 3),
             undated=series.undated,
+            kept=series.kept,
         )
         for topic, series in sorted(growing.items(), key=lambda item: item[0].name)
         if series.stamps_ns

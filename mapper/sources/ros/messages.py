@@ -148,6 +148,7 @@ TRANSFORMS = frozenset(
 )
 WITH_HEADER = IMAGES | CAMERAS | CLOUDS | IMUS | POSES | {"foxglove.FrameTransform"}
 READ = WITH_HEADER | TRANSFORMS
+SMALL = IMUS | POSES | TRANSFORMS
 
 
 def decode(topic: Topic, data: memoryview) -> Message:
