@@ -73,8 +73,8 @@ def build(
     Example: mapper build rgbd_dataset_freiburg1_xyz --out runs/xyz --set octree.resolution_m=0.1
     """
     overrides = merged(selection(first, last, stride, require_truth), set_)
+    onlooker = _onlooker(rerun, step=step, overwrite=overwrite)
     if onto is None:
-        onlooker = _onlooker(rerun, step=step, overwrite=overwrite)
         run, metrics = built(
             log, config, overrides, out, overwrite=overwrite, quiet=quiet, prompts=step, onlooker=onlooker
         )

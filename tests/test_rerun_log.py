@@ -347,6 +347,7 @@ def test_stepping_waits_after_each_frame_until_told_to_run_on(desk_log, tmp_path
     ("arguments", "message"),
     [
         (["--step"], "--step: there is nothing to see without --rerun"),
+        (["--step", "--onto", "RUN"], "--step: there is nothing to see without --rerun"),
         (
             ["--rerun", "LIVE", "--step"],
             "--step: waits for Enter after each frame, but standard input is no terminal",
