@@ -1,0 +1,48 @@
+import numpy as np
+
+from mapper.geometry import Transform, exp, inverse
+from mapper.rotations import quaternion_from_rotation
+from mapper.sources.ros.frame_tree import FrameTree
+from mapper.sources.ros.messages import PoseMessage
+
+T_BASE_MAST = exp(np.array([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 3.0]))
+T_MAST_LIDAR = exp(np.array([-0.3, 0.1, 2.0]), np.array([0.0, 0.5, 0.1]))
+T_BASE_IMU = exp(np.array([0.0, 0.0, 1.5]), np.array([0.2, 0.0, 0.0]))
+
+
+def told(parent: str, child: str, T: Transform) -> PoseMessage:
+    return PoseMessage(0, parent, child, (*T[:3, 3], *quaternion_from_rotation(T[:3, :3])))
+
+
+TREE = FrameTree(
+    [
+        told("base", "/mast", T_BASE_MAST),
+        told("/mast", "lidar", T_MAST_LIDAR),
+        told("base", "imu", T_BASE_IMU),
+        told("base", "imu", np.eye(4)),  # the first counts
+        PoseMessage(0, "base", "broken", (0.0,) * 7),
+        told("elsewhere", "other", np.eye(4)),
+    ]
+)
+
+
+def test_frames_are_found_up_down_and_across():
+    np.testing.assert_allclose(TREE.find("base", "lidar"), T_BASE_MAST @ T_MAST_LIDAR, atol=1e-12)
+    np.testing.assert_allclose(TREE.find("lidar", "base"), inverse(T_BASE_MAST @ T_MAST_LIDAR), atol=1e-12)
+    T_imu_lidar = inverse(T_BASE_IMU) @ T_BASE_MAST @ T_MAST_LIDAR
+    np.testing.assert_allclose(TREE.find("imu", "/lidar"), T_imu_lidar, atol=1e-12)
+
+
+def test_a_frame_is_itself_even_if_nobody_tells_of_it():
+    np.testing.assert_array_equal(TREE.find("nobody", "nobody"), np.eye(4))
+
+
+def test_what_nothing_connects_is_not_found():
+    for frame in ("other", "broken", "nobody"):
+        assert TREE.find("base", frame) is None
+
+
+def test_a_circle_ends():
+    circle = FrameTree([told("a", "b", np.eye(4)), told("b", "a", np.eye(4))])
+    assert circle.find("a", "c") is None
+    assert list(circle.frames) == ["a", "b"]
