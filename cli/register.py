@@ -31,7 +31,7 @@ def register(
         typer.Option(
             metavar="POSE",
             help='Where the source is in the target: "x y z roll pitch yaw" in m and °, or a file with a 4×4 '
-            "matrix or a TUM line.  [default: the same place]",
+            "matrix or a TUM line. For the four that refine one.  [default: the same place]",
         ),
     ] = None,
     out: Annotated[
@@ -52,7 +52,7 @@ def register(
     from evaluators.register import register as register_frames
     from evaluators.register_files import registration_text, write_registration
     from mapper.config import overridden
-    from mapper.config.register import register_config
+    from mapper.config.register import check_method, register_config
     from mapper.errors import RegistrationError
     from mapper.registration.guess import parse_guess
     from mapper.staging import staged
@@ -60,13 +60,15 @@ def register(
     prepare_libraries()
     if rerun is not None:
         _refuse_to_lose(rerun, overwrite=overwrite)
+    check_method(method, guess=guess)
+    T_target_source = parse_guess(guess)
     overrides = set_ or []
     opening = overridden(register_config(method, "lidar"), [o for o in overrides if o.startswith("source.")])
     target_frame, target_sensor = _load(target, opening.source)
     source_frame, source_sensor = _load(source, opening.source)
     sensor: Sensor = "lidar" if "lidar" in (target_sensor, source_sensor) else "rgbd"
     config = overridden(register_config(method, sensor), overrides)
-    registered = register_frames(target_frame, source_frame, config.registration, parse_guess(guess))
+    registered = register_frames(target_frame, source_frame, config.registration, T_target_source)
     if not quiet:
         print(registration_text(registered))
     if out is not None:

@@ -23,7 +23,7 @@ class Stage:
     """How the clouds lay after one step.
 
     Attributes:
-        name: "guess", "Hough" or "refined".
+        name: "before", "Hough" or "refined".
         T_target_source: (4, 4) the motion by then.
         distance: How far the source lay from the target under it.
     """
@@ -40,7 +40,7 @@ class Registered:
     Attributes:
         method: What the configuration calls it.
         alignment: The answer.
-        stages: From the guess on; without "refined" where there was no answer at all.
+        stages: From the beginning on; without "refined" where there was no answer at all.
         seconds: Wall time of each step, in order.
     """
 
@@ -68,7 +68,7 @@ def register(
         ConfigError: A method of images was given scans.
         DataError: A frame without points.
     """
-    motions = {"guess": T_target_source}
+    motions = {"before": T_target_source}
     if isinstance(config, IsvdOdometryConfig):
         alignment, seconds = _by_features(target, source, config)
     else:

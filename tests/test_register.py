@@ -133,10 +133,10 @@ def test_what_is_not_trusted_is_written_all_the_same_and_told_in_one_line(clouds
     assert record["reason"] in result.stderr
 
 
-def test_clouds_that_never_meet_leave_only_the_guess(street):
+def test_clouds_that_never_meet_leave_nothing_refined(street):
     far = exp(np.zeros(3), np.array([500.0, 0.0, 0.0]))
     registered = register(street.observe(0), street.observe(1), GicpConfig(), far)
-    assert [stage.name for stage in registered.stages] == ["guess"]
+    assert [stage.name for stage in registered.stages] == ["before"]
     assert "do not overlap" in registration_text(registered)
     assert "xyz" not in registration_text(registered)
 
@@ -164,7 +164,8 @@ def test_it_can_be_watched_in_rerun(clouds, tmp_path):
         (("{log}@x", "{log}@0"), "want a frame of"),
         (("{log}", "{log}@0"), "is a log; name one of its frames"),
         (("{log}@1", "{log}@0", "--method", "magic"), "--method magic: want one of hough-gicp"),
-        (("{log}@1", "{log}@0", "--guess", "1 2 3"), "3 numbers; want"),
+        (("{log}@1", "{log}@0", "--method", "gicp", "--guess", "1 2 3"), "3 numbers; want"),
+        (("{log}@1", "{log}@0", "--guess", "1 2 3 0 0 0"), "hough-gicp has no use for one"),
         (("{log}@1", "{log}@0", "--set", "registration.nonsense=1"), "Extra inputs are not permitted"),
     ],
 )

@@ -7,7 +7,7 @@ from pydantic import Field
 from mapper.config.base import Config
 from mapper.config.hough import HoughGicpConfig
 from mapper.config.odometry import IsvdOdometryConfig
-from mapper.config.registration import VOXEL_M, AnyRegistration
+from mapper.config.registration import NEED_NO_GUESS, VOXEL_M, AnyRegistration
 from mapper.config.sensors import Sensor
 from mapper.config.sources import SourceConfig
 from mapper.errors import ConfigError
@@ -24,14 +24,23 @@ class RegisterConfig(Config):
     registration: AnyRegistration | IsvdOdometryConfig = Field(HoughGicpConfig(), discriminator="kind")
 
 
-def register_config(method: str, sensor: Sensor) -> RegisterConfig:
-    """Return a method's configuration, scaled to what a sensor sees.
+def check_method(method: str, *, guess: str | None) -> None:
+    """Refuse a name that no method has, and a guess that the method would not look at.
 
     Raises:
-        ConfigError: No such method.
+        ConfigError: Either.
     """
     if method not in _METHODS:
         raise ConfigError(f"--method {method}: want one of {', '.join(_METHODS)}")
+    if guess is not None and method in {*NEED_NO_GUESS, "isvd"}:
+        others = [name for name in _METHODS if name not in {*NEED_NO_GUESS, "isvd"}]
+        raise ConfigError(
+            f"--guess: {method} has no use for one; leave it out, or choose {', '.join(others)}"
+        )
+
+
+def register_config(method: str, sensor: Sensor) -> RegisterConfig:
+    """Return a known method's configuration, scaled to what a sensor sees."""
     member: Any = _METHODS[method]
     return RegisterConfig(
         registration=member() if member is IsvdOdometryConfig else member(voxel_m=VOXEL_M[sensor])

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 VOXEL_M = {"lidar": 0.3, "rgbd": 0.05}
 """What suits a scene some tens of metres wide, and one of a few metres."""
 
+NEED_NO_GUESS = frozenset({"hough-gicp", "hough-ndt", "kiss-matcher"})
+"""They look for the motion everywhere, and not at a guess."""
+
 Distances = Annotated[tuple[PositiveFloat, ...], Field(min_length=1)]
 
 

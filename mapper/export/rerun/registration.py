@@ -27,7 +27,7 @@ def record_registration(
     sensor: Sensor,
     name: str,
 ) -> None:
-    """Send both clouds to a file or a viewer; the timeline "stage" steps from the guess to the answer.
+    """Send both clouds to a file or a viewer; the timeline "stage" steps from the beginning to the answer.
 
     Args:
         target: FILE.rrd, "spawn", "connect" or "connect:URL", as ``streaming`` takes it.
