@@ -24,6 +24,8 @@ topic                  schema                        Foxglove            Rerun
 /registration          mapper/msg/Registration       raw values          plots, raw values
 =====================  ============================  ==================  ===========================
 
+``mapper export RUN --as foxglove-layout`` arranges them in Foxglove.
+
 So lines are logged as dots too, the slice is a ROS message (Rerun ignores foxglove.Grid) and so are the
 diagnostics (Rerun keeps JSON as opaque bytes).
 
