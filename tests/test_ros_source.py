@@ -175,7 +175,8 @@ def test_depth_units_can_be_set(tmp_path):
     np.testing.assert_array_equal(frame.depth_m, picture(0)[1].astype(np.float32) / np.float32(5000))
 
 
-def test_truth_is_led_to_the_sensor_by_tf(tmp_path):
+@pytest.mark.parametrize("name", ["a.mcap", "a.bag", "a"])
+def test_truth_is_led_to_the_sensor_by_tf(tmp_path, name):
     poses = [exp(np.array([0.0, 0.0, 0.1 * i]), np.array([float(i), 0.0, 0.0])) for i in range(4)]
     messages = [
         transforms(("odom", "base_link", np.eye(4)), topic="/tf"),
@@ -183,11 +184,11 @@ def test_truth_is_led_to_the_sensor_by_tf(tmp_path):
         *(cloud(t) for t in stamps(4)),
         *(odometry(t, T) for t, T in zip(stamps(4), poses, strict=True)),
     ]
-    assert opened(tmp_path / "a.mcap", messages).truth is None
+    assert opened(tmp_path / name, messages).truth is None
     topics = TopicsConfig(truth="/odom")
-    source = open_source(tmp_path / "a.mcap", SourceConfig(topics=topics))
+    source = open_source(tmp_path / name, SourceConfig(topics=topics))
     np.testing.assert_allclose(source.truth.T_world_body, [T @ T_BASE_LIDAR for T in poses], atol=1e-12)
-    based = open_source(tmp_path / "a.mcap", SourceConfig(topics=topics, body_frame="base_link"))
+    based = open_source(tmp_path / name, SourceConfig(topics=topics, body_frame="base_link"))
     np.testing.assert_allclose(based.truth.T_world_body, poses, atol=1e-12)
     own, moved = (next(log.entries()).load() for log in (source, based))
     expected = own.points_body @ T_BASE_LIDAR[:3, :3].T + T_BASE_LIDAR[:3, 3]
@@ -195,7 +196,7 @@ def test_truth_is_led_to_the_sensor_by_tf(tmp_path):
     with pytest.raises(
         SourceError, match=r"body_frame=wheel: tf does not connect .* tells of base_link, lidar, odom"
     ):
-        open_source(tmp_path / "a.mcap", SourceConfig(body_frame="wheel"))
+        open_source(tmp_path / name, SourceConfig(body_frame="wheel"))
 
 
 def test_accelerations_are_told_in_the_body_where_tf_ties_the_two(tmp_path):

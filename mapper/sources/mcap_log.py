@@ -193,6 +193,8 @@ def _walked(file: BinaryIO, path: Path) -> _Contents:
 
 def _unpacked(stored: bytes) -> bytes:
     """Return the records of a chunk; any other record is its own content."""
+    if len(stored) < _RECORD.size:
+        raise DataError("a chunk beyond the end of the file")
     opcode, length = _RECORD.unpack_from(stored)
     if opcode != Opcode.CHUNK:
         return stored

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mapper.errors import DataError
 from mapper.sources.ros.clouds import Field, structured
@@ -34,7 +34,7 @@ def decode_ros(topic: Topic, data: memoryview) -> Message:
     read = _READERS.get(topic.type)
     if read is None:
         raise DataError(f"messages of type {topic.type} are not read")
-    store = _store(topic.encoding)
+    store = typestore(topic.encoding)
     deserialize = store.deserialize_ros1 if topic.encoding == "ros1" else store.deserialize_cdr
     try:
         message = deserialize(data, topic.type)
@@ -44,9 +44,14 @@ def decode_ros(topic: Topic, data: memoryview) -> Message:
 
 
 @cache
-def _store(encoding: str) -> Any:
+def typestore(encoding: str) -> Any:
     """Return the standard messages; what a map is made from has not changed since Humble and Noetic."""
-    return get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
+    if encoding != "ros1":
+        return get_typestore(Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):  # rosbags leaves them out of Noetic's
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))
+    return store
 
 
 def _pixels(m: Any) -> PixelsMessage:
@@ -117,6 +122,7 @@ _READERS: Mapping[str, Callable[[Any], Message]] = {
     "nav_msgs/msg/Odometry": _pose_stamped,
     "geometry_msgs/msg/TransformStamped": _transform_stamped,
     "tf2_msgs/msg/TFMessage": _transforms,
+    "tf/msg/tfMessage": _transforms,
 }
 
 

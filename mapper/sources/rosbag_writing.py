@@ -2,20 +2,19 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer
-from rosbags.typesys import Stores, get_typestore
 
 from mapper.atomic import replacing
 from mapper.frames import PinholeCamera, Scan
 from mapper.geometry import Array, Transform
 from mapper.rotations import quaternion_from_rotation
 from mapper.sources.ros.writing import Written
+from mapper.sources.rosbag import typestore
 from mapper.timebase import NS_PER_S
 
 _CLOUD_TYPES = {"f4": 7, "u4": 6}  # PointField's constants
@@ -23,7 +22,7 @@ _CLOUD_TYPES = {"f4": 7, "u4": 6}  # PointField's constants
 
 def definition(type_: str) -> str:
     """Return the text that defines a message type and all that it is made of, as ROS 2 has it."""
-    text, _ = _ros2().generate_msgdef(type_, ros_version=2)
+    text, _ = typestore("cdr").generate_msgdef(type_, ros_version=2)
     return str(text)
 
 
@@ -144,9 +143,9 @@ class BagWriter:
         """Append a message, in ROS 1's serialisation."""
         if message.topic not in self._connections:
             self._connections[message.topic] = self._writer.add_connection(
-                message.topic, message.type, typestore=get_typestore(Stores.ROS1_NOETIC)
+                message.topic, message.type, typestore=typestore("ros1")
             )
-        data = _ros2().cdr_to_ros1(message.cdr, message.type)
+        data = typestore("cdr").cdr_to_ros1(message.cdr, message.type)
         self._writer.write(self._connections[message.topic], message.stamp_ns, data)
 
 
@@ -160,13 +159,8 @@ def bag_writer(path: Path) -> Iterator[BagWriter]:
             yield BagWriter(writer)
 
 
-@cache
-def _ros2() -> Any:
-    return get_typestore(Stores.ROS2_HUMBLE)
-
-
 def _made(type_: str, **fields: Any) -> Any:
-    return _ros2().types[type_](**fields)
+    return typestore("cdr").types[type_](**fields)
 
 
 def _header(stamp_ns: int, frame: str) -> Any:
@@ -176,4 +170,4 @@ def _header(stamp_ns: int, frame: str) -> Any:
 
 
 def _encoded(type_: str, header: Any, **fields: Any) -> bytes:
-    return bytes(_ros2().serialize_cdr(_made(type_, header=header, **fields), type_))
+    return bytes(typestore("cdr").serialize_cdr(_made(type_, header=header, **fields), type_))

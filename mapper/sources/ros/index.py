@@ -71,7 +71,7 @@ def index_of(recording: Recording) -> Mapping[str, Series]:
             stamp_ns = stamp_of(topic, data) if topic.type in WITH_HEADER else log_ns
         except DataError:
             stamp_ns = _NO_STAMP
-        if not 0 <= stamp_ns < _NO_STAMP:
+        if not (0 <= stamp_ns < _NO_STAMP and 0 <= log_ns < _NO_STAMP):
             series.undated += 1
             continue
         if topic.type in SMALL and len(data) <= room_bytes:
