@@ -205,13 +205,26 @@ def test_too_little_stands_here_to_tell_the_place_by():
     assert found.reason.endswith("points to compare, want 5000")
 
 
+def test_a_square_yard_looks_the_same_four_ways():
+    rng = np.random.default_rng(0)
+    along, up = rng.uniform(-12.0, 12.0, 12000), rng.uniform(-1.7, 3.0, 12000)
+    wall = np.column_stack([along, np.full(12000, 12.0), up])
+    turns = [exp(np.array([0.0, 0.0, k * np.pi / 2.0]), np.zeros(3))[:3, :3] for k in range(4)]
+    floor = np.column_stack([rng.uniform(-12.0, 12.0, (12000, 2)), np.full(12000, -1.7)])
+    yard = ScanView(0, np.vstack([floor, *(wall @ R.T for R in turns)]).astype(np.float32))
+    verifier = ScanVerificationConfig().build()
+    found = verifier.verify(verifier.digest(yard), verifier.digest(yard))
+    assert found.T_i_j is None
+    assert found.reason.startswith("rival: ")
+
+
 def test_a_corridor_does_not_say_how_far_along_it_one_is():
     rng = np.random.default_rng(0)
     along = np.linspace(-40.0, 40.0, 8000)
     walls = [np.column_stack([along, np.full(8000, y), rng.uniform(-1.7, 3.0, 8000)]) for y in (-4.0, 4.0)]
     floor = np.column_stack([along, rng.uniform(-4.0, 4.0, 8000), np.full(8000, -1.7)])
     corridor = ScanView(0, np.vstack([*walls, floor]).astype(np.float32))
-    verifier = ScanVerificationConfig().build()
+    verifier = ScanVerificationConfig(min_lead=0.0).build()
     found = verifier.verify(verifier.digest(corridor), verifier.digest(corridor))
     assert found.T_i_j is None
     assert found.reason.startswith("degenerate: no surface shows translation along x")

@@ -148,6 +148,9 @@ class ScanVerificationConfig(Config):
     """A larger share that was looked through, of what was not hidden, is no loop: parked cars leave."""
     min_compared: PositiveInt = 100
     """Fewer points that agree or contradict say nothing: bare yards all look alike."""
+    min_lead: NonNegativeFloat = 0.07
+    """By what a motion's share that agrees, less the share that contradicts, has to lead that of others:
+    where two fit alike, as in a square yard, neither is believed."""
     sigma_rad: NonNegativeFloat = 0.002
     sigma_m: NonNegativeFloat = 0.03
     """Errors that all points share: of deskewing, calibration and voxels."""
@@ -177,6 +180,7 @@ class ScanLoopsConfig(KeyframeLoopsConfig):
     context: ScanContextConfig = ScanContextConfig()
     verification: ScanVerificationConfig = ScanVerificationConfig()
     gate: GateConfig = GateConfig(slack_m=1.0, drift_rad_per_m=0.005)
+    min_agreeing: NonNegativeInt = 2
     agreement_path_m: PositiveFloat = 15.0
 
     def build(self, correction: "Correction", /) -> "KeyframeLoops[ScanPlace]":

@@ -12,6 +12,7 @@ from mapper.features.scan_view import ScanView
 from mapper.geometry import Array, Points, Transform, apply, inverse
 from mapper.graph.noise import softened
 from mapper.loops.base import Verification
+from mapper.loops.closure import Discrepancy, discrepancy, exceeds
 from mapper.loops.scans import ScanPlace
 from mapper.odometry.base import Seen
 from mapper.registration.base import Alignment
@@ -23,6 +24,9 @@ from mapper.registration.levelling import level
 from mapper.registration.objects import centres_of
 from mapper.registration.overlap_kernels import look, range_picture
 from mapper.registration.voting import vote
+
+_SAME = Discrepancy(translation_m=3.0, rotation_rad=0.3)
+"""Guesses nearer to a motion are taken for it: GICP would lead from there to the same."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,27 +105,37 @@ class ScanVerifier:
     def verify(self, i: ScanPlace, j: ScanPlace) -> Verification:
         """Return how scan j lies to scan i, or why they are not of one place."""
         config = self._config
-        guess = self._guess(i, j)
-        if guess is None:
+        guesses = self._guesses(i, j)
+        if not guesses:
             return Verification(0, "vote: nothing stands in both that could agree on a motion")
+        _, guess = guesses[0]
         told = self._told(i, j, guess, margin_m=config.guess_margin_m)
         if told.reason:
             return told
         alignment = self._refined(i, j, guess)
         if not alignment.converged:
             return replace(told, reason=f"gicp: {alignment.reason}")
-        told = self._told(i, j, alignment.T_target_source, margin_m=config.margin_m)
-        told = replace(told, rmse_m=alignment.inlier_rmse_m)
-        return told if told.reason else self._measured(told, alignment, self._cloud(j))
+        T_i_j = alignment.T_target_source
+        told = replace(self._told(i, j, T_i_j, margin_m=config.margin_m), rmse_m=alignment.inlier_rmse_m)
+        if told.reason:
+            return told
+        rivals = [score for score, other in guesses if exceeds(discrepancy(other, np.eye(4), T_i_j), _SAME)]
+        lead = self._score(i, j, T_i_j) - max(rivals, default=-1.0)
+        if lead < config.min_lead:
+            return replace(told, reason=f"rival: leads another motion by {lead:.2f}, want {config.min_lead}")
+        return self._measured(told, alignment, self._cloud(j))
 
-    def _guess(self, i: ScanPlace, j: ScanPlace) -> Transform | None:
-        """Return the voted motion that both scans like best."""
+    def _guesses(self, i: ScanPlace, j: ScanPlace) -> list[tuple[float, Transform]]:
+        """Return planar motions that what stands in both scans votes for, scored, the best first."""
         centres = self._outlook(i).centres_level, self._outlook(j).centres_level
         peaks = vote(*centres, self._config.voting)
         guesses = [inverse(i.T_level_body) @ peak.motion @ j.T_level_body for peak in peaks]
-        margin_m = self._config.guess_margin_m
-        scores = [min(of.score for of in self._testimonies(i, j, guess, margin_m)) for guess in guesses]
-        return guesses[int(np.argmax(scores))] if guesses else None
+        scored = [(self._score(i, j, guess), guess) for guess in guesses]
+        return sorted(scored, key=lambda of: -of[0])
+
+    def _score(self, i: ScanPlace, j: ScanPlace, T_i_j: Transform) -> float:
+        """Return how much more agrees than contradicts, for the scan that likes a guess less."""
+        return min(of.score for of in self._testimonies(i, j, T_i_j, self._config.guess_margin_m))
 
     def _testimonies(
         self, i: ScanPlace, j: ScanPlace, T_i_j: Transform, margin_m: float
