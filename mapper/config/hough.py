@@ -149,9 +149,14 @@ class HoughTrustConfig(Config):
     min_ground_ratio: Ratio = 0.15
     """Share of a scan's ground that the other saw, too. Where two views have but a wall in common, any wall
     will do: wrong answers that nothing contradicted had 0.07 and less, right ones 0.31 and more."""
-    max_contradicting_ratio: Ratio = 0.03
-    """Share of the obstacles that the other scan looked through, the mean of both. Right answers had 0.02 and
-    less, answers in other, similar places 0.037 and more."""
+    max_contradicting_ratio: Ratio = 0.015
+    """Share of the obstacles that the other scan looked through, the mean of both. Right answers had 0.008
+    and less, or 0.014 where a cloud's origin was not where it was seen from; answers in other, similar
+    courtyards 0.016 and more."""
+    many_centres: PositiveInt = 150
+    max_contradicting_many_ratio: Ratio = 0.03
+    """The same where both scans have many centres, whose agreement is no chance: traffic may contradict more.
+    Right answers had 0.023 and less, wrong ones 0.1 and more."""
     min_lead: NonNegativeFloat = 0.1
     """By how much the score leads that of any other motion."""
     pair_m: PositiveFloat = 0.5

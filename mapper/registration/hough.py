@@ -211,11 +211,19 @@ class HoughAligner:
             max_pair_distance_m=trust.pair_m,
         )
         if alignment.converged:
-            reason = self._doubt(best, refined) or self._looseness(cloud, alignment)
+            reason = self._doubt(best, refined, self._tolerance(source)) or self._looseness(cloud, alignment)
             alignment = replace(alignment, converged=not reason, reason=reason)
         return alignment, best.overlap
 
-    def _doubt(self, best: Candidate, others: list[Candidate]) -> str:
+    def _tolerance(self, source: Witness) -> float:
+        """Return the share of obstacles that may contradict an answer."""
+        trust = self._config.trust
+        fewest = min(len(self._target.centres_level), len(source.centres_level))
+        if fewest < trust.many_centres:
+            return trust.max_contradicting_ratio
+        return trust.max_contradicting_many_ratio
+
+    def _doubt(self, best: Candidate, others: list[Candidate], max_contradicting: float) -> str:
         """Return why the best candidate is not to be believed, or nothing."""
         trust, overlap = self._config.trust, best.overlap
         if overlap.agree < trust.min_agreeing_ratio:
@@ -228,10 +236,10 @@ class HoughAligner:
                 f"{overlap.ground:.0%} of the ground is where the other scan saw it, "
                 f"less than {trust.min_ground_ratio:.0%}: the clouds hardly overlap"
             )
-        if overlap.through > trust.max_contradicting_ratio:
+        if overlap.through > max_contradicting:
             return (
                 f"{overlap.through:.1%} of the obstacles are where the other scan looked through, "
-                f"more than {trust.max_contradicting_ratio:.1%}"
+                f"more than {max_contradicting:.1%}"
             )
         for other in others:
             if (
