@@ -65,6 +65,17 @@ def test_a_folder_of_mcap_files_is_one_log(tmp_path):
     ]
 
 
+def test_a_file_of_a_folder_that_cannot_be_read_is_told(tmp_path):
+    write(tmp_path / "drive/drive_0.mcap", shots(3))
+    (tmp_path / "drive/drive_1.mcap").write_bytes(b"")
+    source = open_source(tmp_path / "drive")
+    assert len(source) == 3
+    assert any("drive_1.mcap: does not begin as MCAP files do" in note for note in source.notes)
+    (tmp_path / "drive/drive_0.mcap").write_bytes(b"")
+    with pytest.raises(SourceError, match=r"drive_0.mcap"):
+        open_source(tmp_path / "drive")
+
+
 def test_header_stamps_count_and_not_when_messages_were_recorded(tmp_path):
     source = open_source(write(tmp_path / "log", shots(4)))  # recorded a nanosecond apart
     assert [entry.stamp_ns for entry in source.entries()] == [FIRST_NS + i * PERIOD_NS for i in range(4)]

@@ -28,7 +28,7 @@ class DatabaseRecording:
         try:
             with closing(self._connect()) as database:
                 rows = database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeDecodeError) as error:  # damage may reach into the error's own text
             raise SourceError(f"{path}: not a .db3 file that rosbag2 wrote: {error}") from None
         self._topics = {number: Topic(name, type_, encoding) for number, name, type_, encoding in rows}
 
@@ -41,10 +41,10 @@ class DatabaseRecording:
                     "SELECT id, topic_id, timestamp, data FROM messages ORDER BY id"
                 ):
                     count += 1
-                    if topic in self._topics:
+                    if topic in self._topics and isinstance(data, bytes) and isinstance(log_ns, int):
                         place = Place(0, row, len(data))
                         yield Recorded(self._topics[topic], log_ns, place, memoryview(data))
-            except sqlite3.Error as error:
+            except (sqlite3.Error, UnicodeDecodeError) as error:
                 self.notes.append(
                     f"{self.path.name}: damaged after {count} messages ({error}); read as far as it goes"
                 )
@@ -58,9 +58,9 @@ class DatabaseRecording:
         try:
             with closing(self._connect()) as database:
                 row = database.execute("SELECT data FROM messages WHERE id = ?", [place.offset]).fetchone()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeDecodeError) as error:
             raise FrameError(f"{self.path}: message {place.offset} cannot be read: {error}") from None
-        if row is None:
+        if row is None or not isinstance(row[0], bytes):
             raise FrameError(f"{self.path}: message {place.offset} is not there any more")
         return memoryview(row[0])
 
@@ -74,20 +74,22 @@ class JoinedRecording:
 
     kind = "rosbag2"
 
-    def __init__(self, path: Path, parts: Sequence[Recording]) -> None:
+    def __init__(self, path: Path, parts: Sequence[Recording], *, lost: Sequence[str]) -> None:
         """Join the files of a folder.
 
         Args:
             path: The folder.
             parts: Its files in the order in which they were recorded.
+            lost: Why others cannot be read.
         """
         self.path = path
         self._parts = parts
+        self._lost = lost
 
     @property
     def notes(self) -> Sequence[str]:
         """What was lost, a sentence each."""
-        return [note for part in self._parts for note in part.notes]
+        return [*self._lost, *(note for part in self._parts for note in part.notes)]
 
     def messages(self) -> Iterator[Recorded]:
         """Yield every message that can be read, file by file."""

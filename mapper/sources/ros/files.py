@@ -31,16 +31,25 @@ def open_log(path: Path, config: SourceConfig) -> MessageLog:
 
 
 def open_recording(path: Path) -> Recording:
-    """Open a file, or the files of a folder one after the other.
+    """Open a file, or those files of a folder that can be read, one after the other.
 
     Raises:
-        SourceError: A file is not what its name says, or cannot be read.
+        SourceError: The file, or every file of the folder, is not what its name says or cannot be read.
     """
-    if path.is_dir():
-        from mapper.sources.ros.bag_folder import JoinedRecording
+    if not path.is_dir():
+        return _opened(path)
+    from mapper.sources.ros.bag_folder import JoinedRecording
 
-        return JoinedRecording(path, [_opened(part) for part in _parts(path)])
-    return _opened(path)
+    parts: list[Recording] = []
+    lost: list[str] = []
+    for part in _parts(path):
+        try:
+            parts.append(_opened(part))
+        except SourceError as error:
+            lost.append(str(error))
+    if not parts:
+        raise SourceError(lost[0])
+    return JoinedRecording(path, parts, lost=lost)
 
 
 def _opened(path: Path) -> Recording:
