@@ -201,3 +201,22 @@ def test_trust_can_be_asked_for_more(street):
 
     assert not found.converged
     assert "overlap" in found.reason
+
+
+def test_along_a_corridor_nothing_is_known():
+    def corridor(seed):
+        rng = np.random.default_rng(seed)
+        x, y = rng.uniform(-25.0, 25.0, 30_000), rng.uniform(-4.0, 4.0, 30_000)
+        walls = [
+            np.column_stack(
+                [rng.uniform(-25.0, 25.0, 8000), np.full(8000, side), rng.uniform(-1.7, 2.0, 8000)]
+            )
+            for side in (-4.0, 4.0)
+        ]
+        points = np.concatenate([np.column_stack([x, y, np.full(30_000, -1.7)]), *walls])
+        return Scan(stamp_ns=0, points_body=(points + rng.normal(0.0, 0.01, points.shape)).astype(np.float32))
+
+    found = HoughGicpConfig().build().prepare(corridor(0)).align(corridor(1), np.eye(4))
+
+    assert not found.converged
+    assert found.reason

@@ -247,9 +247,10 @@ class HoughAligner:
                 and other.overlap.ground >= trust.min_ground_ratio
                 and not self._is_near(best, other)
             ):
+                gap_m, turn_rad = _gap(best, other)
                 return (
-                    f"ambiguous: a motion {_gap_m(best, other):.1f} m away scores {other.score:.2f}, "
-                    f"within {trust.min_lead:g} of the best"
+                    f"ambiguous: a motion {gap_m:.1f} m and {np.degrees(turn_rad):.0f}° away scores "
+                    f"{other.score:.2f}, within {trust.min_lead:g} of the best"
                 )
         return ""
 
@@ -265,13 +266,15 @@ class HoughAligner:
 
     def _is_near(self, a: Candidate, b: Candidate) -> bool:
         """Tell whether two candidates are the same motion."""
+        gap_m, turn_rad = _gap(a, b)
         overlap = self._config.overlap
-        turn_rad = angle_between(a.T_target_source[:3, :3], b.T_target_source[:3, :3])
-        return _gap_m(a, b) <= overlap.distinct_m and turn_rad <= np.radians(overlap.distinct_deg)
+        return gap_m <= overlap.distinct_m and turn_rad <= np.radians(overlap.distinct_deg)
 
 
-def _gap_m(a: Candidate, b: Candidate) -> float:
-    return float(np.linalg.norm(a.T_target_source[:3, 3] - b.T_target_source[:3, 3]))
+def _gap(a: Candidate, b: Candidate) -> tuple[float, float]:
+    """Return how far two motions place the source apart, in metres and radians."""
+    gap_m = float(np.linalg.norm(a.T_target_source[:3, 3] - b.T_target_source[:3, 3]))
+    return gap_m, angle_between(a.T_target_source[:3, :3], b.T_target_source[:3, :3])
 
 
 class _Clock:
