@@ -225,3 +225,15 @@ def test_a_camera_of_rectified_images_has_no_distortion(tmp_path):
     ]
     camera = next(opened(tmp_path / "a.mcap", messages).entries()).load().camera
     assert camera == PinholeCamera(64, 48, CAMERA.fx_px, CAMERA.fy_px, CAMERA.cx_px, CAMERA.cy_px)
+
+
+def test_points_of_a_camera_are_told_to_look_forward(tmp_path):
+    points = np.random.default_rng(0).uniform(1.0, 5.0, (20, 3)).astype(np.float32)
+    messages = [
+        Written(
+            t, "/points", "sensor_msgs/msg/PointCloud2", cloud_message(Scan(t, points), frame="depth_optical")
+        )
+        for t in stamps(2)
+    ]
+    notes = opened(tmp_path / "a.mcap", messages).notes
+    assert notes[-1].startswith("points are in depth_optical, whose z looks forward")

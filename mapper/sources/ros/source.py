@@ -132,6 +132,11 @@ def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Fr
             f"frame {frame}; it tells of {', '.join(reader.tree.frames) or 'no frames'}"
         )
 
+    if "optical" in body:
+        notes.append(
+            f"points are in {body}, whose z looks forward; if tf knows a body with z up, set source.body_frame"
+        )
+
     def entry(k: int) -> Entry:
         return CloudEntry(reader.located(clouds, int(i[k])), T_body_frame)
 
