@@ -21,8 +21,8 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> FrameSource:
     """Return a recorded log, recognised by its files, with the configured selection of its frames.
 
     Args:
-        path: Folder of a TUM, Poznań, 7-Scenes, Redwood or KITTI log or of clouds, an mbag file or its folder,
-            an MCAP file, or a ROS bag.
+        path: Folder of a TUM, Poznań, 7-Scenes, Redwood or KITTI log or of clouds, an mbag file or its
+            folder, an MCAP file, or a ROS bag.
         config: Selection, pairing, camera, and what a folder of clouds does not tell by itself.
 
     Raises:

@@ -1,0 +1,126 @@
+"""What one pass over a recording finds, and its small topics read in full."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.errors import DataError, FrameError
+from mapper.rotations import rotation_from_quaternion
+from mapper.sources.base import Accelerations
+from mapper.sources.ros.entries import Located
+from mapper.sources.ros.frame_tree import FrameTree
+from mapper.sources.ros.index import Series, first_messages, index_of
+from mapper.sources.ros.messages import TRANSFORMS, ImuMessage, Message, PoseMessage, decode
+from mapper.sources.ros.recording import Recording
+from mapper.sources.ros.time_line import ordered
+from mapper.sources.ros.topics import frame_of
+from mapper.trajectory import Trajectory
+
+_MAX_READINGS = 20_000  # levelling asks for fewer, and an hour of a fast unit would take minutes to read
+_MAX_TRANSFORMS = 1_000
+_UNIT_TOLERANCE = 0.01
+_FARTHEST_M = 1e8  # farther than anything drives: a damaged message
+
+
+class RecordingReader:
+    """A recording and its index, from one pass over it.
+
+    Attributes:
+        recording: The file.
+        series: When and where the messages of each topic are, by its name.
+        firsts: The first whole message of each topic whose type is read.
+        tree: The coordinate frames.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        """Read the recording from end to end."""
+        self.recording = recording
+        self.series: Mapping[str, Series] = index_of(recording)
+        self.firsts: Mapping[str, Message] = first_messages(recording, self.series.values())
+        self.tree = FrameTree(self._transforms())
+
+    def located(self, series: Series, i: int) -> Located:
+        """Return message ``i`` of a topic, to be read later."""
+        return Located(self.recording, series.topic, int(series.stamps_ns[i]), series.place(i))
+
+    def truth(self, series: Series | None, *, body: str) -> tuple[Trajectory | None, list[str]]:
+        """Return the poses of a topic as those of the body, and notes."""
+        if series is None:
+            return None, []
+        order, order_notes = ordered(series)
+        poses = list(self._poses(series, order))
+        child = next((pose.child.lstrip("/") for pose in poses), "")
+        truth, pose_notes = _trajectory(poses, what=series.topic.name)
+        notes = [*order_notes, *pose_notes]
+        if truth is None or child in ("", body):
+            return truth, notes
+        T_child_body = self.tree.find(child, body)
+        if T_child_body is None:
+            untied = (
+                f"{series.topic.name}: poses of {child}, which tf does not tie to {body}; taken as its own"
+            )
+            return truth, [*notes, untied]
+        return replace(truth, T_world_body=truth.T_world_body @ T_child_body), notes
+
+    def accelerations(self, series: Series | None, *, body: str) -> tuple[Accelerations | None, list[str]]:
+        """Return the readings of a topic, in the body's axes where tf ties the two, and notes."""
+        if series is None:
+            return None, []
+        order, notes = ordered(series)
+        readings = [
+            message
+            for message in self._messages(series, _spread(order, most=_MAX_READINGS))
+            if isinstance(message, ImuMessage) and np.isfinite(message.acceleration_mps2).all()
+        ]
+        if not readings:
+            return None, [*notes, f"{series.topic.name}: no readings"]
+        stamps_ns = np.array([reading.stamp_ns for reading in readings], dtype=np.int64)
+        acceleration_imu = np.array([reading.acceleration_mps2 for reading in readings])
+        T_body_imu = self.tree.find(body, frame_of(readings[0]))
+        R_body_imu = np.eye(3) if T_body_imu is None else T_body_imu[:3, :3]
+        return Accelerations(stamps_ns, acceleration_imu @ R_body_imu.T), notes
+
+    def _transforms(self) -> Iterator[PoseMessage]:
+        """Yield what tf tells, the static first: whole, or as much of it as names every frame."""
+        series = [one for one in self.series.values() if one.topic.type in TRANSFORMS]
+        for one in sorted(series, key=lambda one: "static" not in one.topic.name):
+            yield from self._poses(one, _spread(np.arange(len(one)), most=_MAX_TRANSFORMS))
+
+    def _poses(self, series: Series, indices: NDArray[np.intp]) -> Iterator[PoseMessage]:
+        for message in self._messages(series, indices):
+            if isinstance(message, list):
+                yield from message
+
+    def _messages(self, series: Series, indices: NDArray[np.intp]) -> Iterator[Message]:
+        """Yield some of a topic's messages; damaged ones are left out."""
+        for i in indices.tolist():
+            with suppress(FrameError, DataError):
+                data = series.kept.get(i) or self.recording.read(series.place(i))
+                yield decode(series.topic, memoryview(data))
+
+
+def _spread(indices: NDArray[np.intp], *, most: int) -> NDArray[np.intp]:
+    """Return all of the indices, or every n-th where there are more than ``most``."""
+    return indices[:: -(-len(indices) // most) or 1]
+
+
+def _trajectory(poses: Sequence[PoseMessage], *, what: str) -> tuple[Trajectory | None, list[str]]:
+    """Return poses that are in time order, and notes on those that had to go."""
+    numbers = np.array([pose.numbers for pose in poses], dtype=np.float64).reshape(-1, 7)
+    with np.errstate(invalid="ignore", over="ignore"):
+        is_rotation = np.abs((numbers[:, 3:] ** 2).sum(axis=1) - 1.0) < _UNIT_TOLERANCE
+        usable = is_rotation & (np.abs(numbers[:, :3]) < _FARTHEST_M).all(axis=1)
+    notes = []
+    if dropped := int((~usable).sum()):
+        notes.append(f"{what}: {dropped} of {len(poses)} poses are not finite rigid motions; dropped")
+    if not usable.any():
+        return None, [*notes, f"{what}: no usable ground truth"]
+    numbers = numbers[usable]
+    T_world_child = np.tile(np.eye(4), (len(numbers), 1, 1))
+    T_world_child[:, :3, :3] = rotation_from_quaternion(numbers[:, 3:])
+    T_world_child[:, :3, 3] = numbers[:, :3]
+    stamps_ns = np.array([pose.stamp_ns for pose in poses], dtype=np.int64)[usable]
+    return Trajectory(stamps_ns, T_world_child), notes
