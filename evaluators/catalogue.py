@@ -4,11 +4,10 @@ from evaluators.methods import AnyRegistration, Method, odometry_method, registr
 from evaluators.scales import kiss_icp, registrations_for
 from mapper.config.compare import CompareConfig
 from mapper.config.odometry import IsvdOdometryConfig, LocalMapConfig, PnpConfig
+from mapper.config.registration import NEED_NO_GUESS
 from mapper.config.sensors import Sensor
 from mapper.errors import ConfigError
 from mapper.sources.base import FrameSource
-
-_NEED_NO_GUESS = frozenset({"hough-ndt", "hough-gicp", "kiss-matcher"})
 
 
 def methods_for(source: FrameSource, config: CompareConfig) -> tuple[list[Method], list[str]]:
@@ -52,7 +51,7 @@ def _image_methods(max_depth_m: float) -> list[Method]:
 def _scan_methods(sensor: Sensor) -> list[Method]:
     """Return every registration of scans, those that need a guess first, and KISS-ICP."""
     registrations = [
-        registration_method(one.kind, one.build, uses_guess=one.kind not in _NEED_NO_GUESS)
+        registration_method(one.kind, one.build, uses_guess=one.kind not in NEED_NO_GUESS)
         for one in registrations_for(sensor)
     ]
     kiss = kiss_icp(sensor)

@@ -20,13 +20,17 @@ Status = Literal["building", "complete", "failed", "interrupted"]
 _LIBRARIES = (
     "foxglove-sdk",
     "gtsam",
+    "kiss-icp",
     "mahotas",
     "matplotlib",
     "mcap",
     "numba",
     "numpy",
+    "open3d",
     "opencv-contrib-python-headless",
     "pydantic",
+    "rosbags",
+    "small-gicp",
 )
 
 

@@ -143,6 +143,6 @@ def _record(row: dict[str, str]) -> FrameRecord:
             residual=float(row["residual"]),
             residual_unit=row["residual_unit"],
             method=row["method"],
-            unseen=row["unseen"],
+            unseen=row.get("unseen", ""),  # runs of before 2026-11-21 have no such column
         ),
     )
