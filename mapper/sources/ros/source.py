@@ -133,9 +133,7 @@ def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Fr
         )
 
     if "optical" in body:
-        notes.append(
-            f"points are in {body}, whose z looks forward; if tf knows a body with z up, set source.body_frame"
-        )
+        notes.append(f"points are in {body}, whose z looks forward; source.body_frame can take another")
 
     def entry(k: int) -> Entry:
         return CloudEntry(reader.located(clouds, int(i[k])), T_body_frame)
