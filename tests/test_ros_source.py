@@ -7,13 +7,14 @@ from messages_made import CAMERA, COLOR, DEPTH, camera_info, image, shots, write
 from rosbags.typesys import Stores, get_typestore
 
 from mapper.config.sources import CameraConfig, SourceConfig, TopicsConfig
-from mapper.errors import SourceError
+from mapper.errors import FrameError, SourceError
 from mapper.frames import PinholeCamera, Scan
 from mapper.geometry import exp
 from mapper.rotations import quaternion_from_rotation
 from mapper.sources import open_source
 from mapper.sources.ros.writing import Written
 from mapper.sources.rosbag_writing import cloud_message, imu_message, pose_message
+from mapper.sources.writers import write_log
 
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 T_BASE_LIDAR = exp(np.array([0.0, 0.0, 1.5]), np.array([0.2, 0.0, 1.1]))
@@ -237,3 +238,20 @@ def test_points_of_a_camera_are_told_to_look_forward(tmp_path):
     ]
     notes = opened(tmp_path / "a.mcap", messages).notes
     assert notes[-1].startswith("points are in depth_optical, whose z looks forward")
+
+
+def test_a_topic_whose_images_are_all_damaged_is_named(tmp_path):
+    messages = [m._replace(cdr=m.cdr[:40]) if m.topic == COLOR else m for m in shots(3)]
+    with pytest.raises(SourceError, match="/cam/color/image_raw: none of its first images can be read"):
+        opened(tmp_path / "a.mcap", messages)
+
+
+def test_a_damaged_first_image_file_does_not_hide_the_log(tiny_tum_log, tmp_path):
+    source = open_source(tiny_tum_log(4, ending=".jpg"))
+    file = next(source.entries()).files.colour
+    file.write_bytes(file.read_bytes()[:100])
+    write_log(open_source(source.path), tmp_path / "log.mcap", kind="mcap")
+    again = list(open_source(tmp_path / "log.mcap").entries())
+    with pytest.raises(FrameError, match="truncated JPEG"):
+        again[0].load()
+    assert again[1].load().image.shape == (48, 64, 3)

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from mapper.errors import DataError, FrameError
 from mapper.sources.ros import foxglove
-from mapper.sources.ros.messages import READ, SMALL, WITH_HEADER, Message, decode
+from mapper.sources.ros.images import size_of
+from mapper.sources.ros.messages import READ, SMALL, WITH_HEADER, ImageMessage, Message, decode
 from mapper.sources.ros.recording import Place, Recording, Topic
 from mapper.timebase import NS_PER_S, Stamps
 
@@ -102,7 +103,10 @@ def first_messages(recording: Recording, series: Iterable[Series]) -> dict[str, 
             continue
         for i in range(min(_TRIED, len(one))):
             with suppress(DataError, FrameError):
-                firsts[one.topic.name] = decode(one.topic, recording.read(one.place(i)))
+                message = decode(one.topic, recording.read(one.place(i)))
+                if isinstance(message, ImageMessage):
+                    size_of(message, where=one.topic.name)  # raises if it holds no image
+                firsts[one.topic.name] = message
                 break
     return firsts
 

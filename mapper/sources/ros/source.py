@@ -97,7 +97,7 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
     color, depth = topics.color, topics.depth
     where = f"{reader.recording.path}"
     i, j, notes = paired(color, depth, max_gap_s=config.max_pair_gap_s, where=where)
-    first_color, first_depth = reader.firsts[color.topic.name], reader.firsts[depth.topic.name]
+    first_color, first_depth = _first_image(reader, color), _first_image(reader, depth)
     camera = _camera(reader, topics, config)
     _refuse_unregistered(reader, topics, camera)
     frame, depth_frame = frame_of(first_color), frame_of(first_depth)
@@ -141,11 +141,19 @@ def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Fr
     return _Frames("lidar", body, len(i), entry, notes)
 
 
+def _first_image(reader: RecordingReader, series: Series) -> ImageMessage:
+    first = reader.firsts.get(series.topic.name)
+    if not isinstance(first, ImageMessage):
+        raise SourceError(
+            f"{reader.recording.path}: {series.topic.name}: none of its first images can be read"
+        )
+    return first
+
+
 def _camera(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -> PinholeCamera:
     """Return the colour camera: the user's, else the recording's."""
     name = topics.color.topic.name
-    first = reader.firsts[name]
-    assert isinstance(first, ImageMessage)  # by its type
+    first = _first_image(reader, topics.color)
     width_px, height_px = size_of(first, where=f"{reader.recording.path}: {name}")
     if config.camera is not None:
         numbers = (config.camera.fx_px, config.camera.fy_px, config.camera.cx_px, config.camera.cy_px)
@@ -183,8 +191,7 @@ def _calibration(info: CameraMessage, *, is_rectified: bool, name: str) -> Calib
 def _refuse_unregistered(reader: RecordingReader, topics: CameraTopics, camera: PinholeCamera) -> None:
     """Depth must lie on colour's pixels: sizes must agree and, where both are told, focal lengths."""
     name = topics.depth.topic.name
-    first = reader.firsts[name]
-    assert isinstance(first, ImageMessage)  # by its type
+    first = _first_image(reader, topics.depth)
     size_px = size_of(first, where=f"{reader.recording.path}: {name}")
     told = f"{size_px[0]}×{size_px[1]} px"
     is_same = size_px == (camera.width_px, camera.height_px)
