@@ -48,7 +48,10 @@ def _loops_of(path: Path, truth: "Trajectory") -> "list[Metric]":
     from mapper.trajectory import read_tum
 
     run = load_run(path)
-    return loop_metrics(run.loops(), read_tum(path / KEYFRAMES).stamps_ns, truth)
+    loops = run.config.loops
+    looked_every_m = loops.min_motion_m if loops.kind == "scans" else 0.0
+    keyframes_ns = read_tum(path / KEYFRAMES).stamps_ns
+    return loop_metrics(run.loops(), keyframes_ns, truth, looked_every_m=looked_every_m)
 
 
 def _trajectories(estimate: Path, truth: Path | None) -> "tuple[Trajectory, Trajectory | None]":

@@ -17,17 +17,23 @@ REVISIT_M, REVISIT_RAD, REVISIT_S = 0.5, np.deg2rad(20.0), 5.0
 """A keyframe revisits what an earlier one saw from so near, in so nearly the same direction, so long ago."""
 
 
-def loop_metrics(loops: Sequence[LoopClosure], keyframes_ns: Stamps, truth: Trajectory) -> list[Metric]:
+def loop_metrics(
+    loops: Sequence[LoopClosure], keyframes_ns: Stamps, truth: Trajectory, *, looked_every_m: float = 0.0
+) -> list[Metric]:
     """Return how many loops hold, how many of them are wrong, and how many true revisits have one.
 
     Args:
         loops: Every candidate with its verdict.
         keyframes_ns: (N,) int64 stamps of all nodes, in time order.
         truth: Where the body really was; what it does not cover is not judged.
+        looked_every_m: How far a run went between two looks for loops: one found from so near counts for a
+            keyframe too.
     """
     held = [loop for loop in loops if loop.verdict == "accepted"]
     revisits = revisits_of(keyframes_ns, truth)
-    found = np.isin(keyframes_ns, [loop.stamp_j_ns for loop in held])
+    along_m = _along(keyframes_ns, truth)
+    found_m = along_m[np.isin(keyframes_ns, [loop.stamp_j_ns for loop in held])]
+    found = (np.abs(along_m[:, np.newaxis] - found_m) <= looked_every_m).any(axis=1)
     return [
         Metric("loops", len(held), "loops"),
         Metric("loops wrongly accepted", sum(_wrong(held, truth)), "loops"),
@@ -49,6 +55,14 @@ def revisits_of(keyframes_ns: Stamps, truth: Trajectory) -> NDArray[np.bool_]:
         cosine = 0.5 * (np.einsum("nij,ij->n", earlier[:, :3, :3], T_truth_body[j, :3, :3]) - 1.0)
         revisit[j] = (near & (cosine >= np.cos(REVISIT_RAD))).any()
     return revisit
+
+
+def _along(keyframes_ns: Stamps, truth: Trajectory) -> Array:
+    """Return (N,) metres of true path up to every keyframe."""
+    index, _ = nearest(truth.stamps_ns, keyframes_ns)
+    steps_m = np.linalg.norm(np.diff(truth.positions_world, axis=0), axis=1)
+    along_m: Array = np.concatenate([[0.0], np.cumsum(steps_m)])[index]
+    return along_m
 
 
 def _wrong(held: Sequence[LoopClosure], truth: Trajectory) -> list[bool]:

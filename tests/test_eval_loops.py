@@ -78,3 +78,8 @@ def test_without_revisits_there_are_none(truth):
 def test_what_the_truth_does_not_cover_is_not_judged(truth):
     late = truth.stamps_ns + 1000 * NS_PER_S
     assert not revisits_of(late, truth).any()
+
+
+def test_where_looks_are_rare_a_loop_counts_for_the_keyframes_around(truth):
+    told = values(loop_metrics([closure(2, 18, 0.0)], truth.stamps_ns, truth, looked_every_m=1.0))
+    assert told["true revisits with a loop"] == 5  # 16 to 20 s, half a metre apart
