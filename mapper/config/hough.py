@@ -144,6 +144,9 @@ class HoughTrustConfig(Config):
 
     min_centres: PositiveInt = 5
     """A scan with fewer centres shows no objects."""
+    min_score: float = 0.0
+    """A best candidate with a lower score is refused without being refined. Right ones had 0.3 and more,
+    those of different streets −0.4 and less."""
     min_agreeing_ratio: Ratio = 0.1
     """Share of each scan's obstacles that the other saw, too. Right answers had 0.12 and more."""
     min_ground_ratio: Ratio = 0.15

@@ -41,7 +41,7 @@ class Stages:
         peaks: Of the accumulator, the highest first.
         hough: The verified candidate with the best score; None where there is none.
         alignment: The answer.
-        overlap: Of the answer; None where nothing was refined.
+        overlap: Of the answer, or of the candidate where that was not refined; None without either.
         seconds: Wall time of each step, in order.
     """
 
@@ -151,11 +151,18 @@ class HoughAligner:
         if not candidates:
             reason = "no offset within the accumulator joins any two centres"
             return Stages(peaks, None, failed(reason), None, clock.seconds)
+        best = candidates[0]
+        if best.score < config.trust.min_score:
+            reason = (
+                f"under the best motion {best.overlap.agree:.0%} of a scan's obstacles are where the other "
+                f"saw any, and {best.overlap.through:.0%} where it looked through: different places"
+            )
+            return Stages(peaks, best, failed(reason), best.overlap, clock.seconds)
         cloud = cloud_of(source, seen, config)
         clock.lap("prepare source")
         alignment, overlap = self._refined(seen, cloud, candidates)
         clock.lap("refine")
-        return Stages(peaks, candidates[0], alignment, overlap, clock.seconds)
+        return Stages(peaks, best, alignment, overlap, clock.seconds)
 
     def _too_little(self, source: Witness) -> str:
         """Return why there is nothing to vote for, or nothing."""
