@@ -89,7 +89,7 @@ app.add_typer(vocabulary, name="vocabulary")
 def version(
     show: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
 ) -> None:
-    """Map recorded RGB-D and LiDAR logs: a trajectory, a pose graph, an octree, a 2D slice and an MCAP log."""
+    """Map recorded RGB-D and LiDAR logs: trajectory, pose graph, octree, 2D slice and MCAP log."""
     if show:
         print(f"mapper {__version__}")
         raise typer.Exit

@@ -14,8 +14,43 @@ from evaluators.evaluate import evaluate
 from mapper.run import load_run
 from mapper.trajectory import read_tum
 
-VERBS = ["build", "fuse", "loops", "eval", "export", "plan", "solve", "compare", "register", "convert", "synth", "demo", "config", "view", "report", "doctor", "inspect"]
-HEAVY = {"cv2", "numba", "gtsam", "matplotlib", "mahotas", "foxglove", "mcap", "pydantic", "numpy", "rich"}
+VERBS = [
+    "build",
+    "fuse",
+    "loops",
+    "eval",
+    "export",
+    "plan",
+    "solve",
+    "compare",
+    "register",
+    "convert",
+    "synth",
+    "demo",
+    "config",
+    "view",
+    "report",
+    "doctor",
+    "inspect",
+]
+HEAVY = {
+    "cv2",
+    "numba",
+    "gtsam",
+    "matplotlib",
+    "mahotas",
+    "foxglove",
+    "mcap",
+    "pydantic",
+    "numpy",
+    "rich",
+    "open3d",
+    "small_gicp",
+    "kiss_icp",
+    "rerun",
+    "rosbags",
+    "laspy",
+}
 
 
 def mapper(*arguments, status=0):

@@ -8,9 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from mapper.config.synthetic import STREET, LidarSensorConfig
+from mapper.sources.synthetic.lidar import write_lidar_log
+
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 LOG = "rgbd_dataset_freiburg1_xyz"
+SCANS = "kitti_00"
 
 BLOCK = re.compile(r"<!-- run[^>]*-->\n```(console|python)\n(.*?)```", re.DOTALL)
 CONSOLE = [text for kind, text in BLOCK.findall(README) if kind == "console"]
@@ -33,6 +37,9 @@ def row_names(lines):
 def place(desk_log, tmp_path_factory):
     place = tmp_path_factory.mktemp("readme")
     (place / LOG).symlink_to(desk_log)
+    sensor = LidarSensorConfig(rings=32, azimuth_steps=450, motion_distortion=False)
+    write_lidar_log(place / SCANS, STREET.model_copy(update={"duration_s": 1.2, "sensor": sensor}))
+    (place / SCANS / "times.txt").unlink()  # the real one tells no stamps either
     (place / "configs").symlink_to(ROOT / "configs")
     return place
 

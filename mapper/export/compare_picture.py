@@ -154,7 +154,12 @@ def _draw_shares(axes: "Axes", errors: Mapping[str, Array], names: Sequence[str]
 def _draw_boxes(axes: "Axes", values: Mapping[str, Array]) -> None:
     """Draw boxes from quartile to quartile, whiskers from the 5th to the 95th percentile."""
     boxes = axes.boxplot(
-        list(values.values()), orientation="horizontal", whis=(5, 95), showfliers=False, patch_artist=True, widths=0.6
+        list(values.values()),
+        orientation="horizontal",
+        whis=(5, 95),
+        showfliers=False,
+        patch_artist=True,
+        widths=0.6,
     )
     for number, (box, median) in enumerate(zip(boxes["boxes"], boxes["medians"], strict=True)):
         box.set(facecolor=hex_of(color_of(number)), alpha=0.55, edgecolor=INK, linewidth=0.6)
