@@ -144,8 +144,8 @@ def registration_notes(comparison: Comparison) -> list[str]:
     return [
         f"{len(pairs)} pairs, {apart} frames apart; guesses are off by up to as much, "
         f"seed {comparison.config.seed}",
-        f"right: within {config.max_error_m:g} m and {config.max_error_deg:g}° of the truth; wrong: farther "
-        "off, but trusted; median and 95 % are of the right ones only",
+        f"right: within {config.max_error_m:g} m and {math.degrees(config.max_error_rad):.3g}° of the truth; "
+        "wrong: farther off, but trusted; median and 95 % are of the right ones only",
         "prepare: CPU time that the target alone takes; align: the rest",
     ]
 

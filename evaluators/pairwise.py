@@ -134,7 +134,7 @@ def guesses_for(pair: Pair, guesses: Sequence[GuessConfig], *, level: bool, seed
     drawn: list[Transform] = []
     for kind, guess in enumerate(guesses):
         rng = np.random.default_rng((seed, pair.number, kind))
-        offset_m, turn_rad = guess.offset_m * rng.random(), np.deg2rad(guess.turn_deg) * rng.random()
+        offset_m, turn_rad = guess.offset_m * rng.random(), guess.turn_rad * rng.random()
         direction, axis = rng.standard_normal(3), rng.standard_normal(3)
         if level:
             direction[2], axis = 0.0, np.array([0.0, 0.0, np.sign(axis[2])])
@@ -211,7 +211,7 @@ def judged(
     T_found = alignment.T_target_source
     translation_m = float(np.linalg.norm(T_found[:3, 3] - T_target_source[:3, 3]))
     rotation_rad = angle_between(T_found[:3, :3], T_target_source[:3, :3])
-    right = translation_m <= config.max_error_m and rotation_rad <= np.deg2rad(config.max_error_deg)
+    right = translation_m <= config.max_error_m and rotation_rad <= config.max_error_rad
     return "right" if right else "wrong", translation_m, rotation_rad
 
 

@@ -12,7 +12,7 @@ AnyConfig = TypeVar("AnyConfig", bound=Config)
 
 _INDOORS = 0.1
 """A depth camera sees 4 m where a LiDAR sees 40."""
-_MAX_CAMERA_TILT_DEG = 60.0
+_MAX_CAMERA_TILT_RAD = 1.05
 """A camera carried by hand looks down on tables."""
 
 
@@ -53,7 +53,7 @@ def _hough_indoors(config: HoughConfig) -> HoughConfig:
     small = shrunk(config, _INDOORS)
     levelling = small.constellation.levelling.model_copy(
         update=config.constellation.levelling.model_dump(include=heights)
-        | {"max_tilt_deg": _MAX_CAMERA_TILT_DEG}
+        | {"max_tilt_rad": _MAX_CAMERA_TILT_RAD}
     )
     constellation = small.constellation.model_copy(update={"levelling": levelling})
     return small.model_copy(update={"constellation": constellation})

@@ -18,7 +18,10 @@ from mapper.registration.base import Alignment, failed
 from mapper.trajectory import Trajectory
 
 FRAME_NS = 100_000_000
-GUESSES = (GuessConfig(offset_m=0.1, turn_deg=5.0), GuessConfig(offset_m=3.0, turn_deg=180.0))
+GUESSES = (
+    GuessConfig(offset_m=0.1, turn_rad=np.deg2rad(5.0)),
+    GuessConfig(offset_m=3.0, turn_rad=np.deg2rad(180.0)),
+)
 
 
 def straight(n):

@@ -99,7 +99,7 @@ def test_peaks_are_distinct_and_descending(rng):
             turn = a.alpha_rad - b.alpha_rad
             turn = abs(np.arctan2(np.sin(turn), np.cos(turn)))
             apart_m = np.hypot(a.dx_m - b.dx_m, a.dy_m - b.dy_m)
-            assert apart_m > config.distinct_m or turn > np.radians(config.distinct_deg)
+            assert apart_m > config.distinct_m or turn > config.distinct_rad
 
 
 def test_nothing_votes_for_nothing():

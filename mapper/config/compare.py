@@ -1,5 +1,6 @@
 """What `mapper compare` compares, and how."""
 
+import math
 from typing import Annotated
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -12,12 +13,12 @@ class GuessConfig(Config):
     """How far from the truth a registration begins, at most."""
 
     offset_m: NonNegativeFloat
-    turn_deg: Annotated[float, Field(ge=0.0, le=180.0)]
+    turn_rad: Annotated[float, Field(ge=0.0, le=math.pi)]
 
     @property
     def text(self) -> str:
         """As in "0.2 m, 10°"."""
-        return f"{self.offset_m:g} m, {self.turn_deg:g}°"
+        return f"{self.offset_m:g} m, {math.degrees(self.turn_rad):.3g}°"
 
 
 class TrialsConfig(Config):
@@ -27,7 +28,7 @@ class TrialsConfig(Config):
     """Each distance gets as many pairs as the others."""
     guesses: Annotated[tuple[GuessConfig, ...], Field(min_length=1)]
     max_error_m: PositiveFloat
-    max_error_deg: PositiveFloat
+    max_error_rad: PositiveFloat
     """A registration farther off than either is wrong."""
 
 
@@ -40,12 +41,12 @@ class RgbdCompareConfig(TrialsConfig):
     """Every n-th row and column of the depth image becomes a point of the scan."""
     frames_apart: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (1, 5, 15)
     guesses: Annotated[tuple[GuessConfig, ...], Field(min_length=1)] = (
-        GuessConfig(offset_m=0.05, turn_deg=3.0),
-        GuessConfig(offset_m=0.2, turn_deg=10.0),
-        GuessConfig(offset_m=0.5, turn_deg=20.0),
+        GuessConfig(offset_m=0.05, turn_rad=math.radians(3.0)),
+        GuessConfig(offset_m=0.2, turn_rad=math.radians(10.0)),
+        GuessConfig(offset_m=0.5, turn_rad=math.radians(20.0)),
     )
     max_error_m: PositiveFloat = 0.05
-    max_error_deg: PositiveFloat = 2.0
+    max_error_rad: PositiveFloat = math.radians(2.0)
 
 
 class LidarCompareConfig(TrialsConfig):
@@ -53,12 +54,12 @@ class LidarCompareConfig(TrialsConfig):
 
     frames_apart: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (1, 5, 10)
     guesses: Annotated[tuple[GuessConfig, ...], Field(min_length=1)] = (
-        GuessConfig(offset_m=0.5, turn_deg=5.0),
-        GuessConfig(offset_m=2.0, turn_deg=20.0),
-        GuessConfig(offset_m=10.0, turn_deg=180.0),
+        GuessConfig(offset_m=0.5, turn_rad=math.radians(5.0)),
+        GuessConfig(offset_m=2.0, turn_rad=math.radians(20.0)),
+        GuessConfig(offset_m=10.0, turn_rad=math.radians(180.0)),
     )
     max_error_m: PositiveFloat = 0.3
-    max_error_deg: PositiveFloat = 1.0
+    max_error_rad: PositiveFloat = math.radians(1.0)
 
 
 class CompareConfig(Config):

@@ -15,9 +15,9 @@ Ratio = Annotated[float, Field(ge=0.0, le=1.0)]
 class LevellingConfig(Config):
     """Which way is up in one scan: the plane most points lie on and few below, by random samples."""
 
-    max_tilt_deg: Annotated[float, Field(gt=0.0, lt=80.0)] = 40.0
+    max_tilt_rad: Annotated[float, Field(gt=0.0, lt=1.4)] = 0.7
     """Steeper planes are walls."""
-    level_above_deg: NonNegativeFloat = 5.0
+    level_above_rad: NonNegativeFloat = 0.09
     """A smaller tilt stays: on a sloping street the plane would tilt what gravity has levelled."""
     inlier_m: PositiveFloat = 0.12
     """Largest distance of a ground point from the plane."""
@@ -105,7 +105,7 @@ class VotingConfig(Config):
     peaks: PositiveInt = 20
     """Distinct peaks that are verified."""
     distinct_m: PositiveFloat = 2.0
-    distinct_deg: PositiveFloat = 5.0
+    distinct_rad: PositiveFloat = 0.09
     """Peaks nearer to a higher one than both are the same peak."""
 
 
@@ -117,15 +117,15 @@ class OverlapConfig(Config):
     obstacles: PositiveInt = 1000
     """Voxels, and columns of ground, that are looked at, evenly chosen."""
     step_m: PositiveFloat = 0.4
-    step_deg: PositiveFloat = 1.0
+    step_rad: PositiveFloat = 0.0175
     halvings: NonNegativeInt = 2
     """From each peak the overlap is climbed in these steps, halved so often."""
     candidates: PositiveInt = 6
     """Peaks with the most overlap that are held against both scans' lines of sight."""
     distinct_m: PositiveFloat = 1.0
-    distinct_deg: PositiveFloat = 3.0
+    distinct_rad: PositiveFloat = 0.05
     """Motions nearer than both are the same."""
-    direction_deg: PositiveFloat = 1.0
+    direction_rad: PositiveFloat = 0.0175
     """Resolution of the lines of sight."""
     rays: PositiveInt = 40_000
     """Points, evenly chosen, whose lines of sight are looked along."""

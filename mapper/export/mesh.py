@@ -209,9 +209,7 @@ def _open3d() -> Any:
     try:
         import open3d
     except ModuleNotFoundError as error:
-        raise DependencyError(
-            f"mesh needs {error.name}, which is missing: pip install open3d"
-        ) from None
+        raise DependencyError(f"mesh needs {error.name}, which is missing: pip install open3d") from None
     except (ImportError, OSError) as error:
         found = re.search(r"lib[\w.+-]+\.so[.\d]*", str(error))
         raise DependencyError(

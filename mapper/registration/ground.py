@@ -67,7 +67,7 @@ def surroundings(points_body: Points32, config: ConstellationConfig) -> Surround
     """Return what is around a sensor.
 
     Args:
-        points_body: (N, 3) metres, body frame, z less than ``levelling.max_tilt_deg`` from up.
+        points_body: (N, 3) metres, body frame, z less than ``levelling.max_tilt_rad`` from up.
         config: Its knobs.
     """
     levelling = level(points_body, config.levelling)

@@ -275,7 +275,7 @@ class HoughAligner:
         """Tell whether two candidates are the same motion."""
         gap_m, turn_rad = _gap(a, b)
         overlap = self._config.overlap
-        return gap_m <= overlap.distinct_m and turn_rad <= np.radians(overlap.distinct_deg)
+        return gap_m <= overlap.distinct_m and turn_rad <= overlap.distinct_rad
 
 
 def _gap(a: Candidate, b: Candidate) -> tuple[float, float]:

@@ -31,10 +31,10 @@ def level(points_body: Points32, config: LevellingConfig) -> Levelling:
     """Return how a scan stands; a scan without ground is taken as it is.
 
     The best of many planes through three random points is refitted to its inliers. It only turns the scan
-    when the tilt is larger than ``level_above_deg``.
+    when the tilt is larger than ``level_above_rad``.
 
     Args:
-        points_body: (N, 3) metres, z less than ``max_tilt_deg`` from up.
+        points_body: (N, 3) metres, z less than ``max_tilt_rad`` from up.
         config: Its knobs.
     """
     few = points_body[thin(points_body, config.cell_m, config.reach_m)].astype(np.float64)
@@ -44,7 +44,7 @@ def level(points_body: Points32, config: LevellingConfig) -> Levelling:
     plane, score = score_planes(
         few,
         triples,
-        np.cos(np.radians(config.max_tilt_deg)),
+        np.cos(config.max_tilt_rad),
         config.min_height_m,
         config.max_height_m,
         config.inlier_m,
@@ -59,7 +59,7 @@ def level(points_body: Points32, config: LevellingConfig) -> Levelling:
     if ratio < config.min_inlier_ratio:
         return Levelling(np.eye(4), 0.0, 0.0)
     tilt_rad = float(np.arccos(np.clip(up[2], -1.0, 1.0)))
-    R = _shortest_turn(up) if np.degrees(tilt_rad) > config.level_above_deg else np.eye(3)
+    R = _shortest_turn(up) if tilt_rad > config.level_above_rad else np.eye(3)
     return Levelling(transform(R, np.array([0.0, 0.0, height_m])), tilt_rad, ratio)
 
 

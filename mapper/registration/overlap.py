@@ -76,7 +76,7 @@ def witness(scan: Scan, config: HoughConfig) -> Witness:
         picture=range_picture(
             _some(scan.points_body, overlap.rays),
             scan.origin_body,
-            np.radians(overlap.direction_deg),
+            overlap.direction_rad,
         ),
         origin_body=scan.origin_body,
     )
@@ -108,7 +108,7 @@ class PlanarFit:
         turn = np.angle(np.exp(1j * (self.alpha_rad - other.alpha_rad)))
         return bool(
             np.hypot(self.dx_m - other.dx_m, self.dy_m - other.dy_m) <= config.distinct_m
-            and abs(turn) <= np.radians(config.distinct_deg)
+            and abs(turn) <= config.distinct_rad
         )
 
 
@@ -125,7 +125,7 @@ def climbed(
         overlap.voxel_m,
         config.constellation.ground.min_obstacle_m,
         overlap.step_m,
-        np.radians(overlap.step_deg),
+        overlap.step_rad,
         overlap.halvings,
     )
     share = total / (NEAR * max(len(source.heights_m), 1))
@@ -219,7 +219,7 @@ def _seen(
         by.origin_body,
         points_level,
         T_by_level,
-        np.radians(config.direction_deg),
+        config.direction_rad,
         config.margin_m,
         config.margin_ratio,
         config.min_returns,

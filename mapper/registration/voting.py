@@ -70,5 +70,5 @@ def vote(target: Array, source: Array, config: VotingConfig) -> list[Peak]:
             votes=int(heights[i]),
             score=float(heights[i] / norm),
         )
-        for i in distinct(offsets_m, turns, config.peaks, config.distinct_m, np.radians(config.distinct_deg))
+        for i in distinct(offsets_m, turns, config.peaks, config.distinct_m, config.distinct_rad)
     ]
