@@ -28,6 +28,7 @@ class Counted:
 
     def __init__(self, source):
         self._source = source
+        self.sensor = source.sensor
         self.read = []
 
     def entries(self):

@@ -160,6 +160,13 @@ def laspy(folder: Path) -> None:
     _expect_near(np.array(laspy.read(path).xyz), np.eye(3))
 
 
+def lz4(_folder: Path) -> None:
+    """Compress and decompress."""
+    from lz4 import frame
+
+    _expect(frame.decompress(frame.compress(b"mapper")) == b"mapper", "the bytes came back others")
+
+
 def pypcd4(folder: Path) -> None:
     """Write a cloud and read it back."""
     from pypcd4 import PointCloud
@@ -227,6 +234,7 @@ SELF_TESTS: dict[str, Callable[[Path], None]] = {
     "kiss-icp": kiss_icp,
     "kiss-matcher": kiss_matcher,
     "laspy": laspy,
+    "lz4": lz4,
     "mahotas": mahotas,
     "matplotlib": matplotlib,
     "mcap": mcap,
