@@ -24,7 +24,7 @@ from mcap.writer import CompressionType, Writer
 
 from mapper.atomic import replacing
 from mapper.errors import DataError, SourceError
-from mapper.sources.ros.recording import BlockRecording, Part, Span, Topic
+from mapper.sources.ros.recording import BlockRecording, Part, Span, Topic, ros2_name
 from mapper.sources.ros.writing import Written
 
 _MAGIC = b"\x89MCAP0\r\n"
@@ -119,6 +119,8 @@ class _Contents:
 
     def add_channel(self, channel: Channel) -> None:
         type_ = self._schemas.get(channel.schema_id, "")
+        if channel.message_encoding == "ros1":  # a bag that was converted
+            type_ = ros2_name(type_)
         self._topics[channel.id] = Topic(channel.topic, type_, channel.message_encoding)
 
     def split(self, data: bytes) -> Iterator[Part]:

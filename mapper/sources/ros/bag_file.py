@@ -15,7 +15,7 @@ from typing import BinaryIO
 import lz4.frame
 
 from mapper.errors import DataError, SourceError
-from mapper.sources.ros.recording import BlockRecording, Part, Span, Topic
+from mapper.sources.ros.recording import BlockRecording, Part, Span, Topic, ros2_name
 from mapper.timebase import NS_PER_S
 
 _MAGIC = b"#ROSBAG V2.0\n"
@@ -65,8 +65,8 @@ class _Contents:
 
     def add_connection(self, fields: _Fields, data: bytes) -> None:
         told = _fields(data)
-        package, _, name = told[b"type"].decode().partition("/")
-        self._topics[fields[b"conn"]] = Topic(fields[b"topic"].decode(), f"{package}/msg/{name}", "ros1")
+        type_ = ros2_name(told[b"type"].decode())
+        self._topics[fields[b"conn"]] = Topic(fields[b"topic"].decode(), type_, "ros1")
 
     def split(self, data: bytes) -> Iterator[Part]:
         """Yield the messages of a chunk."""

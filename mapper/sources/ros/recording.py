@@ -27,6 +27,12 @@ class Topic:
     encoding: str
 
 
+def ros2_name(type_: str) -> str:
+    """Return what ROS 2 calls a message type of ROS 1: "sensor_msgs/msg/Image" for "sensor_msgs/Image"."""
+    package, slash, name = type_.partition("/")
+    return type_ if not slash or name.startswith("msg/") else f"{package}/msg/{name}"
+
+
 class Place(NamedTuple):
     """Where a message's bytes lie: in which block of the recording, and where in it."""
 
