@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from conftest import FIRST_NS, PERIOD_NS, picture
 from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
 from messages_made import CAMERA, COLOR, DEPTH, camera_info, image, shots, write
 from rosbags.highlevel import AnyReader
 
@@ -74,6 +75,24 @@ def test_a_file_of_a_folder_that_cannot_be_read_is_told(tmp_path):
     (tmp_path / "drive/drive_0.mcap").write_bytes(b"")
     with pytest.raises(SourceError, match=r"drive_0.mcap"):
         open_source(tmp_path / "drive")
+
+
+def test_a_bag_that_was_converted_to_mcap_is_a_log(tmp_path):
+    bag = write(tmp_path / "log.bag", shots(3))
+    path = tmp_path / "converted.mcap"
+    with AnyReader([bag]) as reader, path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros1")
+        channels = {}
+        for connection in reader.connections:
+            schema = writer.register_schema(connection.msgtype.replace("/msg/", "/"), "ros1msg", b"")
+            channels[connection.topic] = writer.register_channel(connection.topic, "ros1", schema)
+        for connection, log_ns, data in reader.messages():
+            writer.add_message(channels[connection.topic], log_time=log_ns, data=data, publish_time=log_ns)
+        writer.finish()
+    source = open_source(path)
+    assert [entry.stamp_ns for entry in source.entries()] == [FIRST_NS + i * PERIOD_NS for i in range(3)]
+    np.testing.assert_array_equal(next(source.entries()).load().image, picture(0)[0])
 
 
 def test_header_stamps_count_and_not_when_messages_were_recorded(tmp_path):
@@ -164,9 +183,14 @@ def test_what_is_no_recording_is_refused_by_name(tmp_path):
             open_source(tmp_path / name)
 
 
-def test_a_recording_without_an_index_is_read_all_the_same(tmp_path):
-    from mcap.writer import CompressionType, IndexType, Writer
+def test_a_recording_of_which_nothing_is_left_tells_what_was_lost(tmp_path):
+    path = write(tmp_path / "log.mcap", shots(3))
+    path.write_bytes(path.read_bytes()[:60])
+    with pytest.raises(SourceError, match=r"nothing to map: no message .* can be read; log.mcap: .* cut off"):
+        open_source(path)
 
+
+def test_a_recording_without_an_index_is_read_all_the_same(tmp_path):
     path = tmp_path / "log.mcap"
     with path.open("wb") as file:  # neither chunks nor index nor summary
         writer = Writer(

@@ -145,7 +145,7 @@ def test_a_choice_that_cannot_be_is_refused(tmp_path, topics, why):
         ),
         (DEPTH, "nothing to map: depth images /cam/aligned_depth/image_raw, but neither colour images"),
         ("/cam/color/camera_info", r"no images with depth and no point clouds, only /cam/color/camera_info"),
-        ("", "no messages that can be read"),
+        ("", "no message of it can be read"),
     ],
 )
 def test_what_is_missing_is_named(tmp_path, kept, why):

@@ -121,7 +121,9 @@ def _camera_of(source: FrameSource) -> PinholeCamera:
 def _load(entry: Entry) -> RgbdFrame:
     frame = entry.load()
     if not isinstance(frame, RgbdFrame):
-        raise FrameError(f"frame {entry.stamp_ns}: a scan without images; TUM and mbag hold RGB-D frames")
+        raise FrameError(
+            f"frame {entry.stamp_ns}: a scan without images; TUM and mbag hold RGB-D frames: --as kitti"
+        )
     return frame
 
 

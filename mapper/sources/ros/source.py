@@ -73,7 +73,10 @@ def log_of(reader: RecordingReader, config: SourceConfig) -> MessageLog:
             pair, or the camera is unknown.
     """
     recording = reader.recording
-    choice = choose(reader.series, reader.firsts, config.topics, path=recording.path)
+    try:
+        choice = choose(reader.series, reader.firsts, config.topics, path=recording.path)
+    except SourceError as error:
+        raise SourceError("; ".join([str(error), *recording.notes])) from None
     if isinstance(choice.frames, CameraTopics):
         frames = _rgbd(reader, choice.frames, config)
     else:

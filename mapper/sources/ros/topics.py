@@ -147,7 +147,7 @@ class _Picker:
         if any(one.topic.type.startswith(_OWN_TYPES) for one in self._series.values()):
             raise SourceError(
                 f"{self._path}: a run that mapper wrote: its trajectory, its map and images without depth; "
-                "build from the log that it was made from, or look at it: mapper inspect"
+                "build from the log that it was made from, or look at the run: mapper view"
             )
 
 
@@ -211,4 +211,6 @@ def _what_there_is(color: Series | None, depth: Series | None, series: Iterable[
     if depth is not None:
         return f"depth images {depth.topic.name}, but neither colour images nor point clouds"
     names = ", ".join(f"{one.topic.name} ({one.topic.type})" for one in series)
-    return f"no images with depth and no point clouds, only {names or 'no messages that can be read'}"
+    return (
+        f"no images with depth and no point clouds, only {names}" if names else "no message of it can be read"
+    )
