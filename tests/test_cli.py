@@ -47,6 +47,7 @@ HEAVY = {
     "open3d",
     "small_gicp",
     "kiss_icp",
+    "kiss_matcher",
     "rerun",
     "rosbags",
     "laspy",
@@ -79,6 +80,15 @@ def test_help_loads_nothing_heavy():
     code = "import sys; from cli.main import app; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert not HEAVY & {name.split(".")[0] for name in loaded.split()}
+
+
+def test_a_build_on_images_loads_nothing_that_only_scans_recordings_and_viewers_need(desk_log, tmp_path):
+    code = "import sys; from cli.main import app; app(standalone_mode=False); print(*sys.modules)"
+    arguments = ["build", desk_log, "--out", tmp_path / "run", "--last", "11", "--quiet"]
+    ran = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True)
+    assert not ran.stderr
+    loaded = {name.split(".")[0] for name in ran.stdout.split()}
+    assert not loaded & {"open3d", "small_gicp", "kiss_icp", "kiss_matcher", "rerun", "rosbags", "laspy"}
 
 
 def test_build_prints_a_table(desk_log, tmp_path):
