@@ -24,7 +24,10 @@ def register(
     ],
     method: Annotated[
         str,
-        typer.Option(help="hough-gicp, hough-ndt, icp, plane-icp, gicp, ndt, kiss-matcher; isvd for images."),
+        typer.Option(
+            help="hough-gicp or hough-ndt for scans with z up; icp, plane-icp, gicp, ndt, kiss-matcher; "
+            "isvd for images."
+        ),
     ] = "hough-gicp",
     guess: Annotated[
         str | None,
@@ -120,8 +123,10 @@ def _load(name: str, config: "SourceConfig") -> "tuple[Frame, Sensor]":
     log, at, index = name.rpartition("@")
     if not at or Path(name).exists():
         if Path(name).is_dir():
-            raise SourceError(f"{name}: is a log; name one of its frames, as in {name}@0")
-        return read_scan(Path(name)), "lidar"
+            raise SourceError(
+                f"{name}: is a folder; name a log's frame, as in {name}@0, or a run's cloud, as in {name}/cloud.ply"
+            )
+        return read_scan(Path(name), scale=config.cloud_scale), "lidar"
     opened = open_source(Path(log), config)
     entries = list(opened.entries())
     if not index.isdecimal() or int(index) >= len(entries):

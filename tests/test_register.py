@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from cli.main import app
 from evaluators.register import register
 from evaluators.register_files import registration_text
+from mapper.config.hough import HoughGicpConfig
 from mapper.config.odometry import IsvdOdometryConfig
 from mapper.config.register import register_config
 from mapper.config.registration import GicpConfig
@@ -138,6 +139,24 @@ def test_frames_of_a_log_are_named_by_their_number(desk_log):
         assert f"method   {method}" in result.stdout
 
 
+def test_clouds_in_other_units_are_scaled_as_told(clouds, tmp_path):
+    target, source, T_target_source = clouds
+    in_mm = []
+    for path in (source, target):
+        in_mm.append(tmp_path / path.with_suffix(".npy").name)
+        np.save(in_mm[-1], 1000.0 * read_scan(path).points_body)
+    out = tmp_path / "registered"
+
+    refused = mapper(*in_mm)
+    assert refused.exit_code == 1
+    assert "--set source.cloud_scale=0.001" in refused.stderr
+    result = mapper(*in_mm, "--set", "source.cloud_scale=0.001", "--out", out)
+
+    assert result.exit_code == 0, result.output
+    found = np.array(json.loads((out / "manifest.json").read_text())["T_target_source"])
+    assert np.linalg.norm((inverse(T_target_source) @ found)[:3, 3]) < 0.1
+
+
 def test_it_can_be_watched_in_rerun(clouds, tmp_path):
     target, source, _ = clouds
     recording = tmp_path / "registered.rrd"
@@ -152,11 +171,18 @@ def test_it_can_be_watched_in_rerun(clouds, tmp_path):
     [
         (("{log}@999", "{log}@0"), "want a frame of {log} from @0 to @"),
         (("{log}@x", "{log}@0"), "want a frame of"),
-        (("{log}", "{log}@0"), "is a log; name one of its frames"),
+        (("{log}", "{log}@0"), "is a folder; name a log's frame, as in"),
         (("{log}@1", "{log}@0", "--method", "magic"), "--method magic: want one of hough-gicp"),
         (("{log}@1", "{log}@0", "--method", "gicp", "--guess", "1 2 3"), "3 numbers; want"),
         (("{log}@1", "{log}@0", "--guess", "1 2 3 0 0 0"), "hough-gicp has no use for one"),
-        (("{log}@1", "{log}@0", "--set", "registration.nonsense=1"), "Extra inputs are not permitted"),
+        (
+            ("{log}@1", "{log}@0"),
+            "wants z up, and a camera's frame has it ahead; choose icp, plane-icp, gicp",
+        ),
+        (
+            ("{log}@1", "{log}@0", "--method", "icp", "--set", "registration.nonsense=1"),
+            "Extra inputs are not permitted",
+        ),
     ],
 )
 def test_a_mistake_is_one_line(arguments, complaint, desk_log):
@@ -175,6 +201,7 @@ def test_isvd_says_that_it_needs_images():
 def test_a_method_is_scaled_to_what_the_sensor_sees():
     assert register_config("gicp", "lidar").registration.voxel_m == 0.3
     assert register_config("gicp", "rgbd").registration.voxel_m == 0.05
+    assert register_config("hough-gicp", "lidar").registration == HoughGicpConfig()
 
 
 def test_a_guess_is_read_in_every_form(tmp_path):

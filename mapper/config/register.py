@@ -5,7 +5,7 @@ from typing import Any, get_args
 from pydantic import Field
 
 from mapper.config.base import Config
-from mapper.config.hough import HoughGicpConfig
+from mapper.config.hough import HoughConfig, HoughGicpConfig
 from mapper.config.odometry import IsvdOdometryConfig
 from mapper.config.registration import NEED_NO_GUESS, VOXEL_M, AnyRegistration
 from mapper.config.sensors import Sensor
@@ -40,8 +40,17 @@ def check_method(method: str, *, guess: str | None) -> None:
 
 
 def register_config(method: str, sensor: Sensor) -> RegisterConfig:
-    """Return a known method's configuration, scaled to what a sensor sees."""
+    """Return a known method's configuration, scaled to what a sensor sees.
+
+    Raises:
+        ConfigError: The method looks for the ground, and a camera's frame has its z ahead.
+    """
     member: Any = _METHODS[method]
-    return RegisterConfig(
-        registration=member() if member is IsvdOdometryConfig else member(voxel_m=VOXEL_M[sensor])
-    )
+    if sensor == "lidar" or member is IsvdOdometryConfig:
+        return RegisterConfig(registration=member())
+    if issubclass(member, HoughConfig):
+        others = [name for name, other in _METHODS.items() if not issubclass(other, HoughConfig)]
+        raise ConfigError(
+            f"--method {method}: wants z up, and a camera's frame has it ahead; choose {', '.join(others)}"
+        )
+    return RegisterConfig(registration=member(voxel_m=VOXEL_M[sensor]))
