@@ -124,7 +124,8 @@ def _load(name: str, config: "SourceConfig") -> "tuple[Frame, Sensor]":
     if not at or Path(name).exists():
         if Path(name).is_dir():
             raise SourceError(
-                f"{name}: is a folder; name a log's frame, as in {name}@0, or a run's cloud, as in {name}/cloud.ply"
+                f"{name}: is a folder; name a log's frame, as in {name}@0, "
+                f"or a run's cloud, as in {name}/cloud.ply"
             )
         return read_scan(Path(name), scale=config.cloud_scale), "lidar"
     opened = open_source(Path(log), config)
