@@ -34,6 +34,7 @@ _PANEL_IN = 3.0
 _HEAD_IN = 0.5
 _LEGEND_IN = 1.3
 _MARGIN_RATIO = 0.15
+_WIDE = 1e3  # from here on ticks at 1, 2, 5 would be written over one another
 
 
 def color_of(number: int) -> Rgb:
@@ -146,7 +147,7 @@ def _draw_shares(axes: "Axes", errors: Mapping[str, Array], names: Sequence[str]
         # Each curve goes on to the edge, so that shares can be read off there.
         x, y = np.append(known, farthest), np.append(share, share[-1] if len(share) else 0.0)
         axes.step(x, y, where="post", color=color, linewidth=1.3, label=name)
-    axes.set_xscale("log")
+    _scale(axes)
     axes.set_ylim(0.0, 1.02)
     axes.grid(color=LINE, linewidth=0.4)
 
@@ -166,8 +167,19 @@ def _draw_boxes(axes: "Axes", values: Mapping[str, Array]) -> None:
         median.set(color=INK, linewidth=1.2)
     axes.set_yticks(range(1, len(values) + 1), list(values))
     axes.invert_yaxis()
-    axes.set_xscale("log")
+    _scale(axes)
     axes.grid(color=LINE, linewidth=0.4, axis="x")
+
+
+def _scale(axes: "Axes") -> None:
+    """Lay what was drawn out by its logarithm, with ticks at 1, 2, 5 where powers of ten are too few."""
+    from matplotlib.ticker import LogLocator
+
+    axes.set_xscale("log")
+    low, high = axes.get_xlim()
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < _WIDE * low else (1.0,)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.minorticks_off()
 
 
 def _reference(paths: Mapping[str, Trajectory], truth: Trajectory | None) -> Array:
