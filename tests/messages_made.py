@@ -53,16 +53,17 @@ def write(path: Path, messages: Iterable[Written]) -> Path:
             for message in messages:
                 writer.write(message)
     else:
-        _write_folder(path, messages)
+        write_folder(Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3), messages)
     return path
 
 
-def _write_folder(path: Path, messages: Iterable[Written]) -> None:
+def write_folder(folder: Writer, messages: Iterable[Written]) -> None:
+    """Write messages as ROS 2 records them, a nanosecond apart."""
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     connections = {}
-    with Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+    with folder as writer:
         for log_ns, message in enumerate(messages, start=FIRST_NS):
             if message.topic not in connections:
                 connections[message.topic] = writer.add_connection(

@@ -1,12 +1,17 @@
 """MCAP files, ROS 1 bags and ROS 2 folders: whole, cut off, damaged."""
 
+import shutil
+import sqlite3
+
 import numpy as np
 import pytest
 from conftest import FIRST_NS, PERIOD_NS, picture
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
-from messages_made import CAMERA, COLOR, DEPTH, camera_info, image, shots, write
+from messages_made import CAMERA, COLOR, DEPTH, camera_info, image, shots, write, write_folder
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as FolderWriter
 
 from mapper.errors import FrameError, SourceError
 from mapper.frames import PinholeCamera
@@ -64,6 +69,37 @@ def test_a_folder_of_mcap_files_is_one_log(tmp_path):
     assert [entry.load().stamp_ns for entry in source.entries()] == [
         FIRST_NS + i * PERIOD_NS for i in range(6)
     ]
+
+
+@pytest.mark.parametrize("storage", list(StoragePlugin))
+def test_messages_that_rosbag2_compressed_are_read(tmp_path, storage):
+    writer = FolderWriter(tmp_path / "log", version=8, storage_plugin=storage)
+    writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    write_folder(writer, shots(3))
+    frames = [entry.load() for entry in open_source(tmp_path / "log").entries()]
+    assert [frame.stamp_ns for frame in frames] == [FIRST_NS + i * PERIOD_NS for i in range(3)]
+    np.testing.assert_array_equal(frames[0].image, picture(0)[0])
+
+
+def test_files_that_rosbag2_compressed_come_with_what_unpacks_them(tmp_path):
+    writer = FolderWriter(tmp_path / "log", version=8)
+    writer.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
+    write_folder(writer, shots(3))
+    with pytest.raises(SourceError, match=r"log.db3.zstd: compressed as a whole.*: zstd -d .*log.db3.zstd"):
+        open_source(tmp_path / "log")
+
+
+def test_the_journal_of_a_recorder_that_was_killed_is_read(tmp_path):
+    whole = write(tmp_path / "log", shots(3)) / "log.db3"
+    killed = tmp_path / "killed.db3"
+    database = sqlite3.connect(whole)
+    database.execute("PRAGMA journal_mode = WAL")
+    database.execute("DELETE FROM messages WHERE id > 6")  # the third image and its depth
+    database.commit()
+    for ending in ("", "-wal"):
+        shutil.copy(f"{whole}{ending}", f"{killed}{ending}")
+    database.close()
+    assert len(open_source(killed)) == 2
 
 
 def test_a_file_of_a_folder_that_cannot_be_read_is_told(tmp_path):

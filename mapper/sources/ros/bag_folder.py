@@ -65,8 +65,11 @@ class DatabaseRecording:
         return memoryview(row[0])
 
     def _connect(self) -> sqlite3.Connection:
-        # Immutable: neither a lock nor a journal is made beside somebody's log.
-        return sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
+        # Immutable: neither a lock nor a journal is made beside somebody's log. But where a recorder was
+        # killed, its journal holds the last messages, and such a database is read with it or not at all.
+        has_journal = self.path.with_name(f"{self.path.name}-wal").exists()
+        how = "mode=ro" if has_journal else "mode=ro&immutable=1"
+        return sqlite3.connect(f"{self.path.resolve().as_uri()}?{how}", uri=True)
 
 
 class JoinedRecording:

@@ -11,14 +11,15 @@ from mapper.sources.ros.source import MessageLog, log_of
 LOOKED_FOR = ".mcap, .bag (ROS 1), .db3 or a folder of them (ROS 2)"
 
 _ENDINGS = (".mcap", ".bag", ".db3")
-_IN_FOLDERS = (".mcap", ".db3")
+_PACKED = ".zstd"
+_IN_FOLDERS = (".mcap", ".db3", _PACKED)
 
 
 def recognise(path: Path) -> bool:
     """Tell whether a path is named as a recording, or a folder as ROS 2 records it."""
     if path.is_dir():
         return bool(_parts(path))
-    return path.suffix in _ENDINGS
+    return path.suffix in (*_ENDINGS, _PACKED)
 
 
 def open_log(path: Path, config: SourceConfig) -> MessageLog:
@@ -66,6 +67,10 @@ def _opened(path: Path) -> Recording:
         from mapper.sources.ros.bag_folder import DatabaseRecording
 
         return DatabaseRecording(path)
+    if path.suffix == _PACKED:
+        raise SourceError(
+            f"{path}: compressed as a whole, so no part can be read alone; unpack it first: zstd -d {path}"
+        )
     raise SourceError(f"{path}: not a recording; known are {', '.join(_ENDINGS)}")
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mapper.errors import DataError, FrameError
 from mapper.sources.ros import foxglove
 from mapper.sources.ros.images import size_of
-from mapper.sources.ros.messages import READ, SMALL, WITH_HEADER, ImageMessage, Message, decode
+from mapper.sources.ros.messages import READ, SMALL, WITH_HEADER, ImageMessage, Message, decode, unpacked
 from mapper.sources.ros.recording import Place, Recording, Topic
 from mapper.timebase import NS_PER_S, Stamps
 
@@ -119,6 +119,7 @@ def stamp_of(topic: Topic, data: memoryview) -> int:
     """
     if topic.encoding not in ("cdr", "ros1"):
         return foxglove.stamp_of(topic.encoding, data)
+    data = unpacked(topic, data)
     if len(data) < 12:
         raise DataError(f"{topic.name}: a message of {len(data)} bytes has no header")
     if topic.encoding == "ros1":  # a sequence number, then seconds and nanoseconds

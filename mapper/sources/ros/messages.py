@@ -150,6 +150,24 @@ WITH_HEADER = IMAGES | CAMERAS | CLOUDS | IMUS | POSES | {"foxglove.FrameTransfo
 READ = WITH_HEADER | TRANSFORMS
 SMALL = IMUS | POSES | TRANSFORMS
 
+_ZSTD = b"\x28\xb5\x2f\xfd"  # how its frames begin, and no CDR message does
+
+
+def unpacked(topic: Topic, data: memoryview) -> memoryview:
+    """Return a message as it was sent; rosbag2 can compress each, which only its metadata.yaml tells.
+
+    Raises:
+        DataError: It cannot be decompressed.
+    """
+    if topic.encoding != "cdr" or data[: len(_ZSTD)] != _ZSTD:
+        return data
+    import zstandard
+
+    try:
+        return memoryview(zstandard.decompress(data))
+    except (zstandard.ZstdError, MemoryError) as error:
+        raise DataError(f"a message that cannot be decompressed: {error}") from None
+
 
 def decode(topic: Topic, data: memoryview) -> Message:
     """Return what a message says; large payloads are views of ``data``.
@@ -161,7 +179,7 @@ def decode(topic: Topic, data: memoryview) -> Message:
         if topic.encoding in ("cdr", "ros1"):
             from mapper.sources.rosbag import decode_ros  # loads rosbags, which only ROS logs need
 
-            return decode_ros(topic, data)
+            return decode_ros(topic, unpacked(topic, data))
         from mapper.sources.ros.foxglove import decode_foxglove
 
         return decode_foxglove(topic, data)
