@@ -65,6 +65,27 @@ def test_follows_a_street(config):
     assert np.degrees(angle_rad) < limit_deg
 
 
+def test_sweeps_with_one_middle_do_not_divide_by_the_time_between_them():
+    log = list(scans(motion_distortion=True)[:6])
+    whole = log[3]
+    inner = (whole.times_s > 0.01) & (whole.times_s < whole.times_s.max() - np.float32(0.01))
+    earlier_s, later_s = (np.float64(t.min()) + t.max() for t in (whole.times_s, whole.times_s[inner]))
+    shift_ns = round(0.5e9 * (earlier_s - later_s))
+    log.insert(
+        4,
+        Scan(
+            whole.stamp_ns + shift_ns, whole.points_body[inner], whole.origin_body, None, whole.times_s[inner]
+        ),
+    )
+
+    tracks = tracked(GicpOdometryConfig(), log)
+
+    assert all(track.node is not None for track in tracks)
+    assert np.linalg.norm(tracks[4].T_world_body[:3, 3] - tracks[3].T_world_body[:3, 3]) < 0.02
+    speeds_mps = [np.linalg.norm(track.twist.translation_mps) for track in tracks[2:]]
+    assert max(speeds_mps) < 1.2 * min(speeds_mps)
+
+
 @pytest.mark.parametrize("config", EVERY_KIND, ids=lambda config: config.kind)
 def test_the_same_scans_give_the_same_bytes(config):
     first, second = (tracked(config, scans()[:6]) for _ in range(2))

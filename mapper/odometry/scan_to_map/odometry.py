@@ -23,6 +23,7 @@ from mapper.registration.gicp import measured
 from mapper.timebase import NS_PER_S
 
 _USUAL_OF = 20  # recent scans whose overlap tells what is usual
+_MIN_ELAPSED_S = 0.005  # over less, an error of millimetres would be a velocity
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,13 +92,13 @@ class ScanOdometry:
         sweep = observation.as_swept(self._twist)
         placed = self._place(sweep, self._keyframe, self._T_world_last @ self._twist.over(elapsed_s))
         if placed is not None and self._first is not None and self._first.scan.times_s is not None:
-            self._twist = twist_between(self._T_world_last, placed.T_world_middle, duration_s=elapsed_s)
+            self._twist = self._twist_to(placed.T_world_middle, elapsed_s)
             sweep, placed = self._begin_again(self._first, observation, elapsed_s)
         if placed is None:
             return self._lose(observation)
         self._first, self._lost = None, 0
         self._overlaps.append(placed.overlap.inlier_ratio)
-        self._twist = twist_between(self._T_world_last, placed.T_world_middle, duration_s=elapsed_s)
+        self._twist = self._twist_to(placed.T_world_middle, elapsed_s)
         return self._follow(observation, sweep, placed)
 
     def view(self, observation: ScanObservation, twist: Twist | None = None, /) -> ScanView:
@@ -119,6 +120,12 @@ class ScanOdometry:
         self._take_keyframe(first, first.as_swept(self._twist), T_world_middle)
         sweep = second.as_swept(self._twist)
         return sweep, self._place(sweep, self._keyframe, self._T_world_last @ self._twist.over(elapsed_s))
+
+    def _twist_to(self, T_world_middle: Transform, elapsed_s: float) -> Twist:
+        """Return the velocity since the last scan; that of before where sweeps overlap and no time passed."""
+        if elapsed_s < _MIN_ELAPSED_S:
+            return self._twist
+        return twist_between(self._T_world_last, T_world_middle, duration_s=elapsed_s)
 
     def _place(self, sweep: Sweep, keyframe: _Keyframe, T_world_guess: Transform) -> _Placed | None:
         """Return the best place for a scan; None if none explains enough of it."""
