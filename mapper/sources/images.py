@@ -40,6 +40,17 @@ def decode_colour(data: bytes, where: str) -> Image:
     return _eight_bit(_decoded(data, _RGB, where), where)
 
 
+def encode_colour(image: Image) -> bytes:
+    """Return an (H, W, 3) RGB or (H, W) grey image as a PNG file."""
+    return _png(image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1]))
+
+
+def encode_depth(depth_m: DepthImage, units_per_m: float) -> bytes:
+    """Return (H, W) depth as a PNG file of 16-bit units; what is too far for these is no measurement."""
+    units = np.rint(depth_m * units_per_m)
+    return _png(np.where(units < SATURATED, units, 0).astype(np.uint16))
+
+
 def read_grey(path: ImageFile) -> Image:
     """Return the (H, W) uint8 luminance of a file; cheaper than colour for a JPEG.
 
@@ -102,6 +113,11 @@ def bytes_of(path: ImageFile) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise FrameError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
+    _, encoded = cv2.imencode(".png", pixels)
+    return encoded.tobytes()
 
 
 def _eight_bit(image: NDArray[np.uint8] | NDArray[np.uint16], where: str) -> Image:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,17 +14,15 @@ from mapper.frames import PinholeCamera, RgbdFrame
 from mapper.rotations import quaternion_from_rotation
 from mapper.sources.base import Accelerations, Entry, FrameSource, Skipped
 from mapper.sources.calibration_file import calibration_text
-from mapper.sources.images import SATURATED, bytes_of
+from mapper.sources.images import bytes_of, encode_colour, encode_depth
 from mapper.sources.kitti_writing import write_kitti_log
 from mapper.sources.mbag import HEADER
+from mapper.sources.ros.source import FINE_UNITS_PER_M
 from mapper.sources.ros.writing import write_recording
 from mapper.timebase import MAX_TRUTH_GAP_NS, nearest, seconds_text_from_ns
 from mapper.trajectory import Trajectory, write_tum
 
 LogKind = Literal["tum", "mbag", "kitti", "mcap", "bag"]
-
-DEPTH_UNITS_PER_M = 5000.0
-"""Depth units of images that are encoded here; copied images keep their own."""
 
 _NO_POSE = ["nan"] * 7
 
@@ -139,16 +136,9 @@ def _write_images(entry: Entry, out: Path) -> _Written:
         return _Written(entry.stamp_ns, colour, depth, files.depth_stamp_ns, files.depth_units_per_m)
     frame = _load(entry)
     colour, depth = Path("rgb", f"{stamp}.png"), Path("depth", f"{stamp}.png")
-    units = np.rint(frame.depth_m * DEPTH_UNITS_PER_M)
-    write_bytes(out / colour, _png(np.ascontiguousarray(frame.rgb[:, :, ::-1])))
-    write_bytes(out / depth, _png(np.where(units < SATURATED, units, 0).astype(np.uint16)))
-    return _Written(entry.stamp_ns, colour, depth, entry.stamp_ns, DEPTH_UNITS_PER_M)
-
-
-def _png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
-    _, encoded = cv2.imencode(".png", pixels)
-    data: bytes = encoded.tobytes()
-    return data
+    write_bytes(out / colour, encode_colour(frame.image))
+    write_bytes(out / depth, encode_depth(frame.depth_m, FINE_UNITS_PER_M))
+    return _Written(entry.stamp_ns, colour, depth, entry.stamp_ns, FINE_UNITS_PER_M)
 
 
 def _list_text(title: str, name: str, files: dict[int, Path]) -> str:

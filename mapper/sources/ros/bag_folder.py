@@ -9,8 +9,6 @@ from pathlib import Path
 from mapper.errors import FrameError, SourceError
 from mapper.sources.ros.recording import Place, Recorded, Recording, Topic
 
-_MAGIC = b"SQLite format 3\x00"
-
 
 class DatabaseRecording:
     """A .db3 file: a message's place is its row. See :class:`Recording`."""
@@ -109,12 +107,6 @@ class JoinedRecording:
         """
         block, number = divmod(place.block, len(self._parts))
         return self._parts[number].read(place._replace(block=block))
-
-
-def is_database(path: Path) -> bool:
-    """Tell whether a file begins as SQLite's do."""
-    with path.open("rb") as file:
-        return file.read(len(_MAGIC)) == _MAGIC
 
 
 def in_sequence(paths: Sequence[Path]) -> list[Path]:

@@ -2,15 +2,13 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mapper.errors import DataError, FrameError
 from mapper.frames import DepthImage, PinholeCamera, RgbdFrame, Scan
 from mapper.geometry import Transform
 from mapper.sources.base import ImageFiles
-from mapper.sources.images import SATURATED
+from mapper.sources.images import encode_colour, encode_depth
 from mapper.sources.ros.clouds import scan_from
 from mapper.sources.ros.images import depth_file_of, depth_m_of, image_of
 from mapper.sources.ros.messages import CloudMessage, FileMessage, ImageMessage, Message, decode
@@ -153,8 +151,7 @@ class _ColourFile:
         message = self.message.image()
         if isinstance(message, FileMessage):
             return bytes(message.data)
-        image = image_of(message, colour=True, where=f"{self.message}")
-        return _png(image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1]))
+        return encode_colour(image_of(message, colour=True, where=f"{self.message}"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,11 +168,4 @@ class _DepthFile:
         if file is not None:
             return file
         depth_m = depth_m_of(message, units_per_m=self.units_per_m, where=f"{self.message}")
-        units = np.rint(depth_m * self.units_per_m)
-        return _png(np.where(units < SATURATED, units, 0).astype(np.uint16))
-
-
-def _png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
-    _, encoded = cv2.imencode(".png", pixels)
-    data: bytes = encoded.tobytes()
-    return data
+        return encode_depth(depth_m, self.units_per_m)
