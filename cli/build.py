@@ -37,7 +37,8 @@ def build(
     log: Annotated[
         Path,
         typer.Argument(
-            metavar="LOG", help="Recorded log: a TUM, Poznań, KITTI or numbered folder, .mcap, .bag or .mbag."
+            metavar="LOG",
+            help="Recorded log: a folder (TUM, Poznań, KITTI, numbered, clouds), .mcap, .bag or .mbag.",
         ),
     ],
     out: Annotated[Path, typer.Option(help="Run folder to create.")],

@@ -47,8 +47,8 @@ def synth(
 ) -> None:
     """Ray-cast a walk through a furnished flat, or a drive through streets, as a log with exact truth.
 
-    Example: mapper synth logs/spin --path spin --seconds 10 --set sensor.exposure_s=0.01
-    Example: mapper synth logs/yard --sensor lidar --scene courtyard --rings 16
+    Example: mapper synth logs/spin --path spin --seconds 10 --set sensor.exposure_s=0.01, or: mapper synth
+    logs/yard --sensor lidar --scene courtyard --rings 16
     """
     from mapper.config import overridden
     from mapper.config.synthetic import SCENES, SynthConfig
