@@ -8,7 +8,7 @@ from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError
 
-from mapper.config.base import Config
+from mapper.config.base import Config, Ratio
 from mapper.config.export import MeshConfig
 from mapper.config.graph import GraphConfig
 from mapper.config.loops import LoopsConfig, PlaceLoopsConfig
@@ -75,7 +75,7 @@ class BuildConfig(Config):
     costmap: CostmapConfig = CostmapConfig()
     min_tracked_frames: PositiveInt = 10
     """With fewer frames tracked there is no map worth the name, and the build ends in an error."""
-    min_tracked_ratio: Annotated[float, Field(ge=0.0, le=1.0)] = 0.2
+    min_tracked_ratio: Ratio = 0.2
     """The same, as a share of the frames that could be read."""
     workers: NonNegativeInt = 2
     """Threads that decode and detect ahead; the result does not depend on it."""

@@ -1,6 +1,11 @@
 """What every configuration class shares."""
 
-from pydantic import BaseModel, ConfigDict
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Ratio = Annotated[float, Field(ge=0.0, le=1.0)]
+"""A share."""
 
 
 class Config(BaseModel):

@@ -4,12 +4,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from mapper.config.base import Config
+from mapper.config.base import Config, Ratio
 
 if TYPE_CHECKING:
     from mapper.registration.base import Registration
-
-Ratio = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 class LevellingConfig(Config):

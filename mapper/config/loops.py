@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from mapper.config.base import Config
+from mapper.config.base import Config, Ratio
 from mapper.config.hough import ConstellationConfig, GroundConfig, VotingConfig
 from mapper.config.odometry import IsvdConfig, MatchConfig
 from mapper.config.places import PlacesConfig, ScanContextConfig
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from mapper.loops.scan_verification import ScanVerifier
     from mapper.loops.scans import ScanPlace
     from mapper.loops.verification import ImageVerifier
-
-Ratio = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 class VerificationConfig(Config):

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from mapper.config.base import Config
+from mapper.config.base import Config, Ratio
 from mapper.config.features import DetectorConfig, OrbConfig, SurfConfig, UniformOrbConfig
 from mapper.config.scan_odometry import (
     GicpOdometryConfig,
@@ -53,7 +53,7 @@ class IsvdConfig(Config):
     """Pairs this close after the motion are said to agree with it."""
     min_agreeing: Annotated[int, Field(ge=3)] = 20
     """A motion that fewer pairs agree with is refused."""
-    min_agreement_ratio: Annotated[float, Field(ge=0.0, le=1.0)] = 0.25
+    min_agreement_ratio: Ratio = 0.25
     """A motion that a smaller share of the pairs agrees with is refused."""
 
 
@@ -123,7 +123,7 @@ class KeyframeConfig(Config):
     """Keyframe when the inliers fall below this share of the most since the last keyframe."""
     hasty_keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
     """The same share while the last keyframe is young and the inliers are not weak: for fast motion."""
-    mapped_ratio: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
+    mapped_ratio: Ratio = 0.5
     """Keyframe when the inliers are a smaller share of the near features: much of the view is new."""
     min_keyframe_gap: PositiveInt = 4
     """Frames for which a keyframe is young."""
@@ -132,7 +132,7 @@ class KeyframeConfig(Config):
     """Window of the local bundle adjustment."""
     min_shared_landmarks: PositiveInt = 15
     """Keyframes that share fewer are not covisible."""
-    min_found_ratio: Annotated[float, Field(ge=0.0, le=1.0)] = 0.25
+    min_found_ratio: Ratio = 0.25
     """Young landmarks found in a smaller share of the frames that should show them are forgotten."""
     factors_per_keyframe: PositiveInt = 4
     vocabulary: Path | None = None
@@ -143,7 +143,7 @@ class KeyframeConfig(Config):
     """M: draws of four pairs for P3P, at most (B3)."""
     ransac_tolerance_px: PositiveFloat = 4.0
     """β: how far a pair that agrees with P3P may lie off (B3)."""
-    min_agreement_ratio: Annotated[float, Field(ge=0.0, le=1.0)] = 0.3
+    min_agreement_ratio: Ratio = 0.3
     """A pose that a smaller share of the matches agrees with is refused: what repeats gave 0.28."""
     relocalisation_keyframes: PositiveInt = 5
     """A lost frame is compared with as many keyframes that look like it, and as many of the nearest."""

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field, PositiveFloat, PositiveInt
 
-from mapper.config.base import Config
+from mapper.config.base import Config, Ratio
 from mapper.config.features import OrbConfig, UniformOrbConfig
 
 
@@ -29,7 +29,7 @@ class PlacesConfig(Config):
 
     path: Path | None = None
     """File of the vocabulary; None is the one trained on synthetic logs that comes with the toolkit."""
-    min_similarity: Annotated[float, Field(ge=0.0, le=1.0)] = 0.32
+    min_similarity: Ratio = 0.32
     """Of two images' words (eq. 10), as published. It suits images of about 1000 features; 0.22 would do for
     500, 0.45 for 2000."""
     min_deviations: PositiveFloat = 3.0
@@ -48,5 +48,5 @@ class ScanContextConfig(Config):
     """What is higher counts as this high."""
     shortlist: PositiveInt = 50
     """So many places with the nearest ring keys are turned to where they fit best."""
-    min_similarity: Annotated[float, Field(ge=0.0, le=1.0)] = 0.4
+    min_similarity: Ratio = 0.4
     """Mean cosine between the sectors of two places, from which on one is proposed."""

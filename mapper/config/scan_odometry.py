@@ -1,17 +1,15 @@
 """Odometry methods for scans."""
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
-from mapper.config.base import Config
+from mapper.config.base import Config, Ratio
 from mapper.config.hough import HoughGicpConfig, HoughNdtConfig
 
 if TYPE_CHECKING:
     from mapper.odometry.scan_to_map.matching import Matcher
     from mapper.odometry.scan_to_map.odometry import ScanOdometry
-
-Ratio = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 class ScanOdometryConfig(Config):

@@ -5,9 +5,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
-from mapper.config.base import Config
-
-Ratio = Annotated[float, Field(ge=0.0, le=1.0)]
+from mapper.config.base import Config, Ratio
 
 
 class SensorConfig(Config):
