@@ -137,6 +137,22 @@ def test_json_of_another_shape_is_an_error(data):
         read("foxglove.RawImage", data, "json")
 
 
+@pytest.mark.parametrize(
+    ("encoding", "data"),
+    [
+        ("protobuf", b"\x08\x05"),  # a number where the time belongs
+        ("protobuf", b"\x0a\xff"),
+        ("json", b"{"),
+        ("json", b'{"timestamp": null}'),
+        ("json", b'{"timestamp": {"sec": "x", "nsec": 0}}'),
+        ("json", b'{"timestamp": {"sec": 1e999, "nsec": 0}}'),
+    ],
+)
+def test_a_damaged_stamp_is_an_error(encoding, data):
+    with pytest.raises(DataError):
+        stamp_of(encoding, memoryview(data))
+
+
 def test_what_is_not_read_is_named():
     with pytest.raises(DataError, match=r"messages of type foxglove.Log are not read"):
         decode_foxglove(Topic("/log", "foxglove.Log", "protobuf"), memoryview(b""))

@@ -95,13 +95,13 @@ def stamp_of(encoding: str, data: memoryview) -> int:
     Raises:
         DataError: The message is damaged, has none, or is neither protobuf nor JSON.
     """
-    if encoding == "protobuf":
-        for number, value in _wire(data):
-            if number == 1:
-                return _ns(_parsed("time", value))
-        return 0
-    if encoding == "json":
-        return _ns(_json(data).get("timestamp", {}))
+    try:
+        if encoding == "protobuf":
+            return next((_ns(_parsed("time", value)) for number, value in _wire(data) if number == 1), 0)
+        if encoding == "json":
+            return _ns(_json(data).get("timestamp", {}))
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        raise DataError(f"a damaged timestamp: {error}") from None
     raise DataError(f"messages encoded as {encoding!r} are not read; known are cdr, ros1, protobuf and json")
 
 
