@@ -9,6 +9,7 @@ from mapper.geometry import Transform, is_rigid
 from mapper.odometry.scan_to_map.matching import Reach, Sweep
 
 _CLEAR_CYCLE = 10
+_STEP_CELLS = 0.01  # shorter steps end the refinement: what they would add is below a scan's noise
 
 
 class GicpMatcher:
@@ -58,6 +59,7 @@ class GicpMatcher:
             max_correspondence_distance=cell_m,
             num_threads=1,  # sums are added up in the order of the points
             max_iterations=self._config.max_iterations,
+            translation_epsilon=_STEP_CELLS * cell_m,
         )
         T_found = np.asarray(result.T_target_source)
         return T_found if result.num_inliers > 0 and is_rigid(T_found) else None
