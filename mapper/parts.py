@@ -1,4 +1,4 @@
-"""Parts of a path that the odometry left untied: loops lay them together, and what none ties is left out."""
+"""Parts of a path that the odometry left untied: wheels and loops tie them; what nothing ties is left out."""
 
 from collections import Counter
 from collections.abc import Set
@@ -39,7 +39,7 @@ def part_of(tracking: Tracking, node: int, *, progress: Progress) -> Tracking:
     kept = frozenset(next(nodes for nodes in parts if node in nodes))
     left_out = sum(frames[node] for nodes in parts for node in nodes if node not in kept)
     progress.note(
-        f"{left_out} of {len(tracking.placed)} frames lie in {len(parts) - 1} parts of the path that no loop "
+        f"{left_out} of {len(tracking.placed)} frames lie in {len(parts) - 1} parts of the path that nothing "
         "ties to the rest; they are left out"
     )
     graph = tracking.graph
@@ -69,12 +69,14 @@ def _refused_unless(loop: LoopClosure, kept: Set[int]) -> LoopClosure:
 
 
 def laid_together(graph: PoseGraph) -> PoseGraph:
-    """Return the graph with every part that only loops tie to earlier ones moved to where the first one says.
+    """Return the graph with every part that the odometry left untied moved to where the first tie says.
 
     A part begun after a loss stands where the camera was last seen, which may be rooms away from where it
     was: no place for a solver to start from.
     """
-    known = PoseGraph(graph.T_world_node, graph.stamps_ns, [f for f in graph.factors if f.origin != "loop"])
+    known = PoseGraph(
+        graph.T_world_node, graph.stamps_ns, [f for f in graph.factors if f.origin == "odometry"]
+    )
     waiting = components(known)
     if len(waiting) <= 1:
         return graph
@@ -89,7 +91,7 @@ def laid_together(graph: PoseGraph) -> PoseGraph:
 
 
 def _tie(graph: PoseGraph, part: Set[int], T_world_laid: dict[int, Transform]) -> Transform | None:
-    """Return the motion that puts a part where the first loop from what is laid wants it."""
+    """Return the motion that puts a part where the first factor from what is laid wants it."""
     for factor in graph.factors:
         if factor.i in T_world_laid and factor.j in part:
             wanted, node = T_world_laid[factor.i] @ factor.T_i_j, factor.j

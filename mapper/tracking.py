@@ -10,6 +10,7 @@ from mapper.config import BuildConfig
 from mapper.config.sensors import Sensor
 from mapper.errors import FrameError, TrackingError
 from mapper.graph.model import PoseGraph
+from mapper.graph.wheels import wheel_factors
 from mapper.loops.closer import Closer
 from mapper.loops.closure import LoopClosure
 from mapper.odometry.base import Odometry, Track
@@ -126,6 +127,7 @@ def track_log(
             tracks.append(track)
             watcher.stepped(Step(entry, track, view, closer))
     graph.add_factors(odometry.finish())
+    graph.add_factors(wheel_factors(graph.stamps_ns, source.wheels, config.graph.wheels))
     loops = (*start.loops, *closer.closures())
     graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")
     return Tracking(tuple(tracks), tuple(skipped), graph, loops, frame_ms)

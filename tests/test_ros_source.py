@@ -200,6 +200,21 @@ def test_truth_is_led_to_the_sensor_by_tf(tmp_path, name):
         open_source(tmp_path / name, SourceConfig(body_frame="wheel"))
 
 
+def test_wheels_must_be_asked_for_and_are_led_to_the_sensor(tmp_path):
+    poses = [exp(np.array([0.0, 0.0, 0.1 * i]), np.array([float(i), 0.0, 0.0])) for i in range(4)]
+    wheels = [odometry(t, T) for t, T in zip(stamps(4), poses, strict=True)]
+    tied = [transforms(("base_link", "lidar", T_BASE_LIDAR)), *(cloud(t) for t in stamps(4)), *wheels]
+    assert opened(tmp_path / "a.mcap", tied).wheels is None
+    asked = SourceConfig(topics=TopicsConfig(wheels="/odom"))
+    source = open_source(tmp_path / "a.mcap", asked)
+    np.testing.assert_allclose(source.wheels.T_world_body, [T @ T_BASE_LIDAR for T in poses], atol=1e-12)
+    assert source.truth is None
+    opened(tmp_path / "b.mcap", [*shots(4), *wheels])
+    source = open_source(tmp_path / "b.mcap", asked)
+    np.testing.assert_allclose(source.wheels.T_world_body[0, :3, 2], [1.0, 0.0, 0.0], atol=1e-12)
+    assert any("/odom: tf does not tie base_link to optical" in note for note in source.notes)
+
+
 def test_accelerations_are_told_in_the_body_where_tf_ties_the_two(tmp_path):
     R = T_BASE_LIDAR[:3, :3]
     messages = [

@@ -2,11 +2,28 @@
 
 from typing import Literal
 
-from pydantic import PositiveFloat, PositiveInt
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 
 from mapper.config.base import Config
 
 KernelKind = Literal["cauchy", "huber", "dcs"]
+
+
+class WheelFactorsConfig(Config):
+    """How far wheels are believed: not far, for they slip, but over any way."""
+
+    use: bool = True
+    """Tie keyframes by the wheels, where a log has them."""
+    max_gap_s: PositiveFloat = 0.2
+    """Between two readings; in a longer gap it is not known where the wheels were."""
+    least_m: PositiveFloat = 0.01
+    path_share: NonNegativeFloat = 0.05
+    """Error of the position, as a share of the metres driven."""
+    least_rad: PositiveFloat = 0.01
+    turn_share: NonNegativeFloat = 0.05
+    """Error of the heading, as a share of the radians turned."""
+    rad_per_m: NonNegativeFloat = 0.02
+    """Error of the heading per metre driven."""
 
 
 class GraphConfig(Config):
@@ -26,6 +43,7 @@ class GraphConfig(Config):
     initial: Literal["auto", "given", "chordal"] = "auto"
     """Where the batch solve begins: at the "given" estimates, at a "chordal" relaxation that needs none, or
     "auto": at the relaxation where the estimates fit badly, nothing is in doubt, and it serves better."""
+    wheels: WheelFactorsConfig = WheelFactorsConfig()
     max_iterations: PositiveInt = 100
     """Of each connected component's last descent."""
     relative_error: PositiveFloat = 1e-8

@@ -35,6 +35,18 @@ class TopicsConfig(Config):
     """Inertial readings, of which the accelerations tell which way is up."""
     truth: str | None = None
     """True poses (Odometry, PoseStamped, TransformStamped); None is /ground_truth, if there is one."""
+    wheels: str | None = None
+    """Wheel odometry (Odometry, PoseStamped, TransformStamped); None uses none."""
+
+
+class WheelsConfig(Config):
+    """How a log's wheels move its body."""
+
+    wheelbase_m: PositiveFloat | None = None
+    """Between the axles; a log's encoders.txt needs it, its wheels.txt does not."""
+    body_in_base: tuple[float, float, float, float, float, float, float] | None = None
+    """x y z (metres) qx qy qz qw of the body in the frame that the wheels move, x forward, y left, z up; None
+    is what tf tells, or else its origin, looking forward."""
 
 
 class SourceConfig(Config):
@@ -55,6 +67,7 @@ class SourceConfig(Config):
     """Frames per second of numbered files without stamps; None is the format's own (30, Poznań, scans 10)."""
     camera: CameraConfig | None = None
     topics: TopicsConfig = TopicsConfig()
+    wheels: WheelsConfig = WheelsConfig()
     body_frame: str | None = None
     """Frame in a bag's tf that is a LiDAR's body, e.g. base_link; None is the cloud's own frame."""
     pattern: str | None = None

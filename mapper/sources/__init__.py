@@ -8,6 +8,7 @@ from mapper.sources import clouds, kitti, mbag, numbered, poznan, tum
 from mapper.sources.base import FrameSource
 from mapper.sources.ros import files as recordings
 from mapper.sources.selection import select
+from mapper.sources.wheels import read_wheels
 
 __all__ = ["open_source"]
 
@@ -32,6 +33,10 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> FrameSource:
         raise SourceError(f"{path}: no such file or folder")
     for log_format in _FORMATS:
         if log_format.recognise(path):
-            return select(log_format.open_log(path, config), config)
+            log: FrameSource = log_format.open_log(path, config)
+            if log.wheels is None and path.is_dir():
+                log.wheels, notes = read_wheels(path, config.wheels, sensor=log.sensor)
+                log.notes = [*log.notes, *notes]
+            return select(log, config)
     looked_for = "; ".join(log_format.LOOKED_FOR for log_format in _FORMATS)
     raise SourceError(f"{path}: not a log of a known format; looked for {looked_for}")

@@ -103,6 +103,7 @@ class FrameSource(Protocol):
         sensor: What its frames are.
         truth: Where the body really was, if the log tells.
         accelerations: Accelerometer readings, if the log has them.
+        wheels: Where its wheels say the body was, in a frame of their own that drifts, if it has wheels.
         notes: What opening it had to leave out or assume, a sentence each.
     """
 
@@ -112,6 +113,7 @@ class FrameSource(Protocol):
     sensor: Sensor
     truth: Trajectory | None
     accelerations: Accelerations | None
+    wheels: Trajectory | None
     notes: Sequence[str]
 
     def __len__(self) -> int:

@@ -42,7 +42,8 @@ class Session:
 class ChainedLog:
     """Sessions one after the other; see :class:`mapper.sources.base.FrameSource`.
 
-    There are no accelerations: two logs' readings may be in different axes.
+    There are no accelerations: two logs' readings may be in different axes. There are no wheels: each log's
+    are in a frame of their own.
     """
 
     sessions: Sequence[Session]
@@ -53,6 +54,7 @@ class ChainedLog:
     notes: Sequence[str]
     sensor: Sensor
     accelerations: Accelerations | None = None
+    wheels: Trajectory | None = None
 
     def __len__(self) -> int:
         return sum(len(session.stamps_ns) for session in self.sessions)

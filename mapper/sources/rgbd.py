@@ -69,6 +69,7 @@ class RgbdLog:
     notes: Sequence[str]
     images: Sequence[RgbdEntry]
     sensor: Sensor = "rgbd"
+    wheels: Trajectory | None = None
 
     def __len__(self) -> int:
         return len(self.images)

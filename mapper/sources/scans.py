@@ -57,6 +57,7 @@ class ScanLog:
     scans: Sequence[ScanEntry]
     sensor: Sensor = "lidar"
     accelerations: Accelerations | None = None
+    wheels: Trajectory | None = None
 
     def __len__(self) -> int:
         return len(self.scans)

@@ -26,6 +26,7 @@ class Selection:
     sensor: Sensor
     truth: Trajectory | None
     accelerations: Accelerations | None
+    wheels: Trajectory | None
     notes: Sequence[str]
     source: FrameSource
     is_used: NDArray[np.bool_]
@@ -74,6 +75,7 @@ def select(source: FrameSource, config: SourceConfig) -> FrameSource:
         sensor=source.sensor,
         truth=source.truth,
         accelerations=source.accelerations,
+        wheels=source.wheels,
         notes=notes,
         source=source,
         is_used=is_used,

@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.config.sensors import Sensor
+from mapper.config.sources import WheelsConfig
 from mapper.errors import DataError, FrameError
 from mapper.rotations import rotation_from_quaternion
 from mapper.sources.base import Accelerations
@@ -17,6 +19,7 @@ from mapper.sources.ros.messages import TRANSFORMS, ImuMessage, Message, PoseMes
 from mapper.sources.ros.recording import Recording
 from mapper.sources.ros.time_line import ordered
 from mapper.sources.ros.topics import frame_of
+from mapper.sources.wheels import mounting
 from mapper.trajectory import Trajectory
 
 _MAX_READINGS = 20_000  # levelling asks for fewer, and an hour of a fast unit would take minutes to read
@@ -50,11 +53,7 @@ class RecordingReader:
         """Return the poses of a topic as those of the body, and notes."""
         if series is None:
             return None, []
-        order, order_notes = ordered(series)
-        poses = list(self._poses(series, order))
-        child = next((pose.child.lstrip("/") for pose in poses), "")
-        truth, pose_notes = _trajectory(poses, what=series.topic.name)
-        notes = [*order_notes, *pose_notes]
+        truth, child, notes = self._told(series)
         if truth is None or child in ("", body):
             return truth, notes
         T_child_body = self.tree.find(child, body)
@@ -64,6 +63,29 @@ class RecordingReader:
             )
             return truth, [*notes, untied]
         return replace(truth, T_world_body=truth.T_world_body @ T_child_body), notes
+
+    def wheels(
+        self, series: Series | None, *, body: str, config: WheelsConfig, sensor: Sensor
+    ) -> tuple[Trajectory | None, list[str]]:
+        """Return T_odom_body of a topic of wheel odometry, and notes; tf ties the two unless the user does.
+
+        Raises:
+            SourceError: What the user set is no pose.
+        """
+        if series is None:
+            return None, []
+        wheels, child, notes = self._told(series)
+        if wheels is None:
+            return None, notes
+        T_base_body = self.tree.find(child, body) if child and config.body_in_base is None else None
+        if T_base_body is None:
+            T_base_body = mounting(config, sensor)
+            if config.body_in_base is None:
+                notes.append(
+                    f"{series.topic.name}: tf does not tie {child or 'it'} to {body}, which is taken to be "
+                    "at its origin, looking forward; --set source.wheels.body_in_base=…"
+                )
+        return replace(wheels, T_world_body=wheels.T_world_body @ T_base_body), notes
 
     def accelerations(self, series: Series | None, *, body: str) -> tuple[Accelerations | None, list[str]]:
         """Return the readings of a topic, in the body's axes where tf ties the two, and notes."""
@@ -82,6 +104,14 @@ class RecordingReader:
         T_body_imu = self.tree.find(body, frame_of(readings[0]))
         R_body_imu = np.eye(3) if T_body_imu is None else T_body_imu[:3, :3]
         return Accelerations(stamps_ns, acceleration_imu @ R_body_imu.T), notes
+
+    def _told(self, series: Series) -> tuple[Trajectory | None, str, list[str]]:
+        """Return the poses of a topic in time order, whose they are, and notes."""
+        order, order_notes = ordered(series)
+        poses = list(self._poses(series, order))
+        child = next((pose.child.lstrip("/") for pose in poses), "")
+        told, pose_notes = _trajectory(poses, what=series.topic.name)
+        return told, child, [*order_notes, *pose_notes]
 
     def _transforms(self) -> Iterator[PoseMessage]:
         """Yield what tf tells, the static first: whole, or as much of it as names every frame."""
@@ -117,7 +147,7 @@ def _trajectory(poses: Sequence[PoseMessage], *, what: str) -> tuple[Trajectory 
     if dropped := int((~usable).sum()):
         notes.append(f"{what}: {dropped} of {len(poses)} poses are not finite rigid motions; dropped")
     if not usable.any():
-        return None, [*notes, f"{what}: no usable ground truth"]
+        return None, [*notes, f"{what}: no usable pose"]
     numbers = numbers[usable]
     T_world_child = np.tile(np.eye(4), (len(numbers), 1, 1))
     T_world_child[:, :3, :3] = rotation_from_quaternion(numbers[:, 3:])

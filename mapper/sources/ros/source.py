@@ -42,6 +42,7 @@ class MessageLog:
     sensor: Sensor
     truth: Trajectory | None
     accelerations: Accelerations | None
+    wheels: Trajectory | None
     notes: Sequence[str]
     count: int
     entry: Callable[[int], Entry]
@@ -83,6 +84,9 @@ def log_of(reader: RecordingReader, config: SourceConfig) -> MessageLog:
         frames = _lidar(reader, choice.frames, config)
     truth, truth_notes = reader.truth(choice.truth, body=frames.body)
     accelerations, imu_notes = reader.accelerations(choice.imu, body=frames.body)
+    wheels, wheel_notes = reader.wheels(
+        choice.wheels, body=frames.body, config=config.wheels, sensor=frames.sensor
+    )
     return MessageLog(
         path=recording.path,
         name=recording.path.resolve().stem,
@@ -90,7 +94,8 @@ def log_of(reader: RecordingReader, config: SourceConfig) -> MessageLog:
         sensor=frames.sensor,
         truth=truth,
         accelerations=accelerations,
-        notes=[*choice.notes, *recording.notes, *frames.notes, *truth_notes, *imu_notes],
+        wheels=wheels,
+        notes=[*choice.notes, *recording.notes, *frames.notes, *truth_notes, *wheel_notes, *imu_notes],
         count=frames.count,
         entry=frames.entry,
     )

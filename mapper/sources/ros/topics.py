@@ -53,12 +53,14 @@ class Choice:
         frames: What is mapped: images, or clouds.
         imu: Inertial readings, if there are any.
         truth: True poses, if there are any.
+        wheels: Wheel odometry, if it was asked for.
         notes: What was guessed, a sentence each.
     """
 
     frames: CameraTopics | Series
     imu: Series | None
     truth: Series | None
+    wheels: Series | None
     notes: Sequence[str]
 
 
@@ -83,6 +85,7 @@ def choose(
     points = pick.one("points", config.points, CLOUDS, _cloud_rank, where=lambda name: len(series[name]) > 1)
     imu = pick.one("imu", config.imu, IMUS, _plain_rank, where=lambda name: _feels_gravity(firsts.get(name)))
     truth = pick.one("truth", config.truth, POSES, _plain_rank, where=lambda name: name == TRUTH)
+    wheels = pick.one("wheels", config.wheels, POSES, _plain_rank, where=set().__contains__)
     pick.refuse_own_runs()
     frames: CameraTopics | Series
     if color is not None and depth is not None and config.points is None:
@@ -103,7 +106,7 @@ def choose(
         notes = [_choice_note(f"point clouds {points.topic.name}", config.points, "points")]
     else:
         raise SourceError(f"{path}: nothing to map: {_what_there_is(color, depth, series.values())}")
-    return Choice(frames, imu, truth, notes)
+    return Choice(frames, imu, truth, wheels, notes)
 
 
 class _Picker:

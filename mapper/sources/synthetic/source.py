@@ -71,6 +71,7 @@ class SyntheticSource:
         sensor: "rgbd".
         truth: The exact pose of every frame, also of dropped ones.
         accelerations: None; there is no accelerometer.
+        wheels: None; they are not simulated.
         notes: Empty.
     """
 
@@ -85,6 +86,7 @@ class SyntheticSource:
         self.kind = "synthetic"
         self.sensor: Sensor = "rgbd"
         self.accelerations: Accelerations | None = None
+        self.wheels: Trajectory | None = None
         self.notes: Sequence[str] = ()
 
     @cached_property

@@ -58,6 +58,7 @@ class SyntheticLidarSource:
         sensor: "lidar".
         truth: The exact pose at every stamp.
         accelerations: None; there is no accelerometer.
+        wheels: None; they are not simulated.
         notes: Empty.
     """
 
@@ -71,6 +72,7 @@ class SyntheticLidarSource:
         self.kind = "synthetic"
         self.sensor: Sensor = "lidar"
         self.accelerations: Accelerations | None = None
+        self.wheels: Trajectory | None = None
         self.notes: Sequence[str] = ()
 
     @cached_property

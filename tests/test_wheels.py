@@ -1,0 +1,195 @@
+"""Wheel odometry: from encoders and files to factors that tie what the camera lost."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from mapper.config import BuildConfig, load_config
+from mapper.config.graph import WheelFactorsConfig
+from mapper.config.sources import SourceConfig, WheelsConfig
+from mapper.config.synthetic import SynthConfig
+from mapper.errors import SourceError
+from mapper.geometry import angle_between, exp, inverse, transform
+from mapper.graph.wheels import wheel_factors
+from mapper.parts import largest_part
+from mapper.progress import SILENT
+from mapper.sensing.wheels import driven, pose_at
+from mapper.solving import solve
+from mapper.sources import open_source
+from mapper.sources.synthetic.source import SyntheticSource
+from mapper.tracking import track_log
+from mapper.trajectory import Trajectory, write_tum
+
+S = 1_000_000_000
+R_BASE_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def planar(x, y, yaw):
+    return transform(exp(np.array([0.0, 0.0, yaw]), np.zeros(3))[:3, :3], np.array([x, y, 0.0]))
+
+
+def on_a_line(n, *, step_m=0.5, turn_rad=0.0):
+    T = [np.linalg.matrix_power(planar(step_m, 0.0, turn_rad), k) for k in range(n)]
+    return Trajectory(np.arange(n, dtype=np.int64) * S // 10, np.array(T))
+
+
+def test_a_held_wheel_drives_an_exact_arc_at_any_rate():
+    wheelbase_m, steering_rad = 0.8, 0.3
+    radius_m = wheelbase_m / np.tan(steering_rad)
+    for n in (2, 7):
+        path_m = np.linspace(5.0, 5.0 + radius_m * np.pi / 2.0, n)
+        wheels = driven(
+            np.arange(n, dtype=np.int64), path_m, np.full(n, steering_rad), wheelbase_m=wheelbase_m
+        )
+        np.testing.assert_allclose(wheels.T_world_body[0], np.eye(4), atol=0)
+        quarter = planar(radius_m, radius_m, np.pi / 2.0)
+        np.testing.assert_allclose(wheels.T_world_body[-1], quarter, atol=1e-12)
+
+
+def test_driving_back_the_same_way_ends_where_it_began():
+    path_m = np.array([0.0, 1.0, 2.5, 1.0, 0.0])
+    steering_rad = np.array([0.1, -0.3, 0.2, -0.3, 0.1])
+    wheels = driven(np.arange(5, dtype=np.int64), path_m, steering_rad, wheelbase_m=0.5)
+    np.testing.assert_allclose(wheels.T_world_body[-1], np.eye(4), atol=1e-12)
+
+
+def test_poses_are_interpolated_but_never_guessed():
+    wheels = on_a_line(3)
+    at = {stamp_ns: pose_at(wheels, stamp_ns, max_gap_ns=S // 10) for stamp_ns in (-1, 0, S // 40, S // 5)}
+    assert at[-1] is None
+    assert pose_at(wheels, S // 5 + 1, max_gap_ns=S) is None
+    assert (at[0][0, 3], at[S // 5][0, 3]) == (0.0, 1.0)
+    assert at[S // 40][0, 3] == pytest.approx(0.125)
+    assert pose_at(wheels, S // 40, max_gap_ns=S // 10 - 1) is None
+
+
+def test_factors_follow_time_and_are_less_sure_the_longer_the_way():
+    wheels = on_a_line(11, turn_rad=0.1)
+    stamps_ns = {7: 0, 3: S // 10, 5: S, 9: 2 * S}  # node 9 comes after the wheels stopped
+    config = WheelFactorsConfig()
+    near, far = wheel_factors(stamps_ns, wheels, config)
+    assert [(f.i, f.j, f.origin) for f in (near, far)] == [(7, 3, "wheel"), (3, 5, "wheel")]
+    np.testing.assert_allclose(near.T_i_j, planar(0.5, 0.0, 0.1), atol=1e-12)
+    np.testing.assert_allclose(
+        far.T_i_j, inverse(wheels.T_world_body[1]) @ wheels.T_world_body[10], atol=1e-12
+    )
+    sigma_rad, sigma_m = far.information[0, 0] ** -0.5, far.information[5, 5] ** -0.5
+    assert sigma_m == pytest.approx(config.least_m + config.path_share * 4.5)
+    assert sigma_rad == pytest.approx(config.least_rad + config.turn_share * 0.9 + config.rad_per_m * 4.5)
+    assert near.information[5, 5] > far.information[5, 5]
+
+
+def test_there_and_back_is_a_long_way():
+    wheels = on_a_line(11)
+    there_and_back = replace(wheels, T_world_body=wheels.T_world_body[[*range(6), 4, 3, 2, 1, 0]])
+    (factor,) = wheel_factors({0: 0, 1: S}, there_and_back, WheelFactorsConfig())
+    np.testing.assert_allclose(factor.T_i_j, np.eye(4), atol=1e-12)
+    assert factor.information[5, 5] ** -0.5 == pytest.approx(0.01 + 0.05 * 5.0)
+
+
+def test_without_wheels_or_when_told_so_there_are_no_factors():
+    stamps_ns = {0: 0, 1: S // 10}
+    assert wheel_factors(stamps_ns, None, WheelFactorsConfig()) == []
+    assert wheel_factors(stamps_ns, on_a_line(3), WheelFactorsConfig(use=False)) == []
+    assert wheel_factors({0: 5 * S}, on_a_line(3), WheelFactorsConfig()) == []
+
+
+def test_poses_beside_a_log_are_led_to_a_camera_that_looks_forward(tiny_tum_log):
+    log = tiny_tum_log(3)
+    base = on_a_line(4, turn_rad=0.2)
+    write_tum(log / "wheels.txt", base)
+    source = open_source(log)
+    assert source.notes == ["wheels.txt: wheel odometry, 4 poses"]
+    expected = base.T_world_body @ transform(R_BASE_OPTICAL, np.zeros(3))
+    np.testing.assert_allclose(source.wheels.T_world_body, expected, atol=1e-12)
+    assert len(open_source(log, SourceConfig(first_frame=1)).wheels) == 4
+    mounted = WheelsConfig(body_in_base=(0.1, 0.0, 0.4, 0.0, 0.0, 0.0, 1.0))
+    wheels = open_source(log, SourceConfig(wheels=mounted)).wheels
+    np.testing.assert_allclose(wheels.T_world_body[0][:3, 3], [0.1, 0.0, 0.4], atol=1e-12)
+
+
+def test_encoders_beside_a_log_want_a_wheelbase(tiny_tum_log):
+    log = tiny_tum_log(3)
+    (log / "encoders.txt").write_text("# stamp path_m steering_rad\n2.0 1.5 0.0\n1.0 0.5 0.0\n")
+    with pytest.raises(
+        SourceError, match=r"encoders.txt: the wheelbase is unknown; --set source.wheels.whee"
+    ):
+        open_source(log)
+    source = open_source(log, SourceConfig(wheels=WheelsConfig(wheelbase_m=0.5)))
+    assert source.wheels.stamps_ns.tolist() == [S, 2 * S]
+    np.testing.assert_allclose(source.wheels.positions_world, [[0, 0, 0], [1, 0, 0]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "why"),
+    [
+        ("encoders.txt", "1.0 2.0\n", r"encoders.txt:1: 2 columns, want 3: stamp path_m steering_rad"),
+        ("encoders.txt", "1.0 2.0 1.6\n", r"encoders.txt:1: .* within ±π/2 rad"),
+        ("encoders.txt", "# none\n", r"encoders.txt: no readings"),
+        ("wheels.txt", "1.0 0 0 0\n", r"wheels.txt:1: 4 columns, want 8"),
+    ],
+)
+def test_malformed_files_are_named(tiny_tum_log, name, text, why):
+    log = tiny_tum_log(2)
+    (log / name).write_text(text)
+    with pytest.raises(SourceError, match=why):
+        open_source(log, SourceConfig(wheels=WheelsConfig(wheelbase_m=0.5)))
+
+
+def test_a_mounting_without_a_rotation_is_refused(tiny_tum_log):
+    log = tiny_tum_log(2)
+    write_tum(log / "wheels.txt", on_a_line(2))
+    with pytest.raises(SourceError, match=r"body_in_base=\(0.0, .* its quaternion is zero"):
+        open_source(log, SourceConfig(wheels=WheelsConfig(body_in_base=(0.0,) * 7)))
+
+
+@pytest.fixture(scope="module")
+def interrupted():
+    """A walk during which the lens is covered for two seconds, and wheels that drift on the way."""
+    source = SyntheticSource(
+        SynthConfig(
+            duration_s=8.0,
+            frame_rate_hz=15.0,
+            width_px=320,
+            height_px=240,
+            texture_px_per_m=96,
+            blackout_start_s=3.0,
+            blackout_duration_s=2.0,
+        )
+    )
+    rng = np.random.default_rng(4)
+    truth, T = source.truth.T_world_body, [np.eye(4)]
+    for before, after in pairwise(truth):
+        step = inverse(before) @ after
+        step[:3, 3] *= 1.02
+        T.append(T[-1] @ step @ exp(rng.normal(0.0, 5e-4, 3), rng.normal(0.0, 5e-4, 3)))
+    source.wheels = Trajectory(source.stamps_ns, np.array(T))
+    return source
+
+
+def mapped(source, config):
+    tracking = largest_part(track_log(source, config, progress=SILENT), progress=SILENT)
+    solved = solve(tracking.graph, tracking.loops, config.graph)
+    return replace(tracking, graph=solved.graph).trajectory()
+
+
+def test_wheels_tie_what_lies_before_and_after_a_covered_lens(interrupted):
+    config: BuildConfig = load_config(None, ["loops.kind=none"])
+    alone = mapped(
+        interrupted,
+        config.model_copy(
+            update={"graph": config.graph.model_copy(update={"wheels": WheelFactorsConfig(use=False)})}
+        ),
+    )
+    tied = mapped(interrupted, config)
+    covered, begun_anew_after = 30, config.odometry.max_lost_frames
+    assert len(alone) < 60
+    assert len(tied) == len(interrupted) - covered - begun_anew_after
+    first, last = (np.searchsorted(interrupted.truth.stamps_ns, tied.stamps_ns[k]) for k in (0, -1))
+    truth = interrupted.truth.T_world_body
+    want = inverse(truth[first]) @ truth[last]
+    got = inverse(tied.T_world_body[0]) @ tied.T_world_body[-1]
+    assert np.linalg.norm(got[:3, 3] - want[:3, 3]) < 0.15
+    assert angle_between(got[:3, :3], want[:3, :3]) < 0.05
