@@ -9,6 +9,7 @@ from textwrap import wrap
 
 from evaluators.metric import Metric
 from mapper.loops.closure import LoopClosure
+from mapper.records import FrameRecord
 from mapper.run import Run
 
 _LINE_WIDTH = 110
@@ -23,6 +24,7 @@ def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
         ("keyframes", f"{counts.nodes}, with {counts.factors} factors"),
         ("loops", _loops_text(run.loops())),
         *((metric.name, _value_text(metric)) for metric in metrics if metric.name.startswith(_SHOWN)),
+        *_left_open(run.records()),
         ("octree", f"{counts.leaves} leaves of {run.config.octree.resolution_m:g} m"),
     ]
     if run.manifest.input.appended:
@@ -55,6 +57,15 @@ def _loops_text(loops: Sequence[LoopClosure]) -> str:
         before_m, after_m = (median(column) for column in zip(*moved, strict=True))
         text += f"; median residual {before_m:.3f} m before the solve, {after_m:.3f} m after"
     return text
+
+
+def _left_open(records: Sequence[FrameRecord]) -> list[tuple[str, str]]:
+    """Return a row on the motions that no surface showed, if there were any."""
+    unseen = Counter(record.diagnostics.unseen for record in records if record.diagnostics.unseen)
+    if not unseen:
+        return []
+    text, _ = unseen.most_common(1)[0]
+    return [("left open", f"in {unseen.total()} frames, mostly {text}: no surface showed it")]
 
 
 def _row(name: str, text: str, *, indent: int) -> str:

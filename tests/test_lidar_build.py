@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from cli.summary import summary_text
 from evaluators.evaluate import evaluate
 from mapper.config import load_config, overridden
 from mapper.config.synthetic import STREET, LidarSensorConfig
@@ -87,6 +88,20 @@ def test_fusing_again_along_the_same_poses_gives_the_same_map(log, tmp_path):
     fused = fuse(open_log(load_run(copy.path)), copy, overridden(copy.config, ["slice.max_height_m=1.5"]))
 
     assert (fused.path / "map.ot").read_bytes() == before
+
+
+def test_a_build_tells_which_motions_no_surface_showed(run, tmp_path):
+    assert "left open" not in summary_text(run, [])
+    rng = np.random.default_rng(0)
+    field = np.column_stack([rng.uniform(-30.0, 30.0, (9000, 2)), rng.normal(-1.7, 0.01, 9000)])
+    folder = tmp_path / "field"
+    folder.mkdir()
+    for number in range(10):
+        np.save(folder / f"{number:06}.npy", field.astype(np.float32))
+
+    text = " ".join(summary_text(built(folder, tmp_path / "run", "octree.resolution_m=0.5"), []).split())
+
+    assert "left open in 9 frames, mostly translation along x and y, rotation about z: no surface" in text
 
 
 def test_an_odometry_that_needs_images_says_so(log, tmp_path):
