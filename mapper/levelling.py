@@ -137,7 +137,7 @@ def _up(
         doubts.append(f"planes do not agree: {told}")
     else:
         doubts.append(f"only {len(patches)} flat patches seen, want {_MIN_PATCHES}")
-    return up_guess, "camera", "; ".join([*doubts, "up is the camera's mean up direction"])
+    return up_guess, "camera", "; ".join([*doubts, "up is the sensor's mean up direction"])
 
 
 def _up_by_accelerometer(
