@@ -111,7 +111,8 @@ def _timed(
 
 
 def _thinned(scan: Scan) -> Scan:
-    return Scan(scan.stamp_ns, scan.points_body[::_WARM_UP_STRIDE])
+    # A view with gaps would have kernels compiled for itself and none for whole scans.
+    return Scan(scan.stamp_ns, np.ascontiguousarray(scan.points_body[::_WARM_UP_STRIDE]))
 
 
 def _by_features(
