@@ -83,7 +83,7 @@ class RecordingReader:
             if config.body_in_base is None:
                 notes.append(
                     f"{series.topic.name}: tf does not tie {child or 'it'} to {body}, which is taken to be "
-                    "at its origin, looking forward; --set source.wheels.body_in_base=…"
+                    "at its origin, looking forward; a config file can set source.wheels.body_in_base"
                 )
         return replace(wheels, T_world_body=wheels.T_world_body @ T_base_body), notes
 
