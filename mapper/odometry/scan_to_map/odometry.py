@@ -115,6 +115,7 @@ class ScanOdometry:
         """Place a map's first two scans anew, now that the motion during their sweeps is known."""
         assert self._keyframe is not None
         self._matcher.clear()
+        self._rescuer = None
         self._next_node = self._keyframe.node
         T_world_middle = self._keyframe.T_world_body @ self._twist.over(first.middle_s)
         self._take_keyframe(first, first.as_swept(self._twist), T_world_middle)
