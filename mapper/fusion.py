@@ -9,7 +9,7 @@ import numpy as np
 from mapper.cloud import CloudBuilder, Colors
 from mapper.config import BuildConfig, McapConfig
 from mapper.config.octree import OctreeConfig
-from mapper.deskew import Twist, deskewed, twist_at
+from mapper.deskew import STILL, Twist, deskewed, twist_at
 from mapper.errors import FrameError
 from mapper.export.jpeg import encode_jpeg, shrunk_camera
 from mapper.export.palette import height_colors
@@ -180,7 +180,7 @@ def _jobs(
             yield _Job(
                 entry,
                 T_world_body,
-                twist_at(trajectory, index),
+                STILL if source.sensor == "rgbd" else twist_at(trajectory, index),
                 known,
                 feeds_cloud=index % config.cloud.frame_stride == 0,
                 feeds_log=image_stride > 0 and index % image_stride == 0,

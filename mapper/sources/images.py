@@ -8,12 +8,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.errors import DataError, FrameError
-from mapper.frames import DepthImage, Image
+from mapper.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
 from mapper.sources import png
 from mapper.sources.base import ImageFile
 
 SATURATED = 65535
 """The largest 16-bit depth is a sensor's way to say "nothing" (7-Scenes) or "too far": no measurement."""
+
+FINE_UNITS_PER_M = 5000.0
+"""16-bit units of a metre in which depth in metres goes into files: 0.2 mm, as TUM's."""
 
 # A camera's calibration holds for the pixels as stored, so a rotation tag must not turn them.
 _RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
@@ -101,6 +104,23 @@ def depth_m_from(units: NDArray[np.uint16], units_per_m: float) -> DepthImage:
     """Return (H, W) float32 metres of 16-bit units; 0, and what is saturated, is no measurement."""
     depth_m: DepthImage = _metres(units, np.float32(units_per_m))
     return depth_m
+
+
+def check_size(shape: tuple[int, ...], camera: PinholeCamera, where: str) -> None:
+    """Refuse an (H, W, …) image that is not as large as its camera's; ``where`` is what an error names.
+
+    Raises:
+        FrameError: It is not.
+    """
+    want = (camera.height_px, camera.width_px)
+    if shape[:2] != want:
+        raise FrameError(f"{where}: {shape[1]}×{shape[0]} px, but the log has {want[1]}×{want[0]}")
+
+
+def scan_of(depth_m: DepthImage, camera: PinholeCamera, *, stamp_ns: int) -> Scan:
+    """Return the measured pixels of (H, W) depth as a scan in the camera's frame, without a colour image."""
+    no_image = np.broadcast_to(np.uint8(0), depth_m.shape)
+    return RgbdFrame(stamp_ns, no_image, depth_m, camera).scan()
 
 
 def bytes_of(path: ImageFile) -> bytes:

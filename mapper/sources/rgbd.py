@@ -10,10 +10,10 @@ from mapper.config.sensors import Sensor
 from mapper.config.sources import CameraConfig
 from mapper.errors import FrameError, SourceError
 from mapper.frames import DepthImage, PinholeCamera, RgbdFrame, Scan
-from mapper.sources.base import Accelerations, Entry, ImageFile, ImageFiles
+from mapper.sources.base import Accelerations, Entry, ImageFiles
 from mapper.sources.calibration import Calibration
 from mapper.sources.calibration_file import FILE_NAMES, read_calibration
-from mapper.sources.images import read_colour, read_depth_m, read_grey
+from mapper.sources.images import check_size, read_colour, read_depth_m, read_grey, scan_of
 from mapper.sources.text import parse_numbers, parse_stamp, rows, time_order
 from mapper.trajectory import Trajectory
 
@@ -33,7 +33,7 @@ class RgbdEntry:
             FrameError: A file is missing, damaged, of the wrong kind or of another size than the camera's.
         """
         image = read_colour(self.files.colour) if colour else read_grey(self.files.colour)
-        self._check_size(self.files.colour, image.shape[:2])
+        check_size(image.shape, self.camera, f"{self.files.colour}")
         return RgbdFrame(self.stamp_ns, image, self._depth_m(), self.camera)
 
     def scan(self) -> Scan:
@@ -42,19 +42,12 @@ class RgbdEntry:
         Raises:
             FrameError: As ``load``.
         """
-        depth_m = self._depth_m()
-        no_image = np.broadcast_to(np.uint8(0), depth_m.shape)
-        return RgbdFrame(self.stamp_ns, no_image, depth_m, self.camera).scan()
+        return scan_of(self._depth_m(), self.camera, stamp_ns=self.stamp_ns)
 
     def _depth_m(self) -> DepthImage:
         depth_m = read_depth_m(self.files.depth, self.files.depth_units_per_m)
-        self._check_size(self.files.depth, depth_m.shape)
+        check_size(depth_m.shape, self.camera, f"{self.files.depth}")
         return depth_m
-
-    def _check_size(self, path: ImageFile, shape: tuple[int, ...]) -> None:
-        want = (self.camera.height_px, self.camera.width_px)
-        if shape != want:
-            raise FrameError(f"{path}: {shape[1]}×{shape[0]} px, but the log has {want[1]}×{want[0]}")
 
 
 @dataclass(slots=True, eq=False)

@@ -14,10 +14,9 @@ from mapper.frames import PinholeCamera, RgbdFrame
 from mapper.rotations import quaternion_from_rotation
 from mapper.sources.base import Accelerations, Entry, FrameSource, Skipped
 from mapper.sources.calibration_file import calibration_text
-from mapper.sources.images import bytes_of, encode_colour, encode_depth
+from mapper.sources.images import FINE_UNITS_PER_M, bytes_of, encode_colour, encode_depth
 from mapper.sources.kitti_writing import write_kitti_log
 from mapper.sources.mbag import HEADER
-from mapper.sources.ros.source import FINE_UNITS_PER_M
 from mapper.sources.ros.writing import write_recording
 from mapper.timebase import MAX_TRUTH_GAP_NS, nearest, seconds_text_from_ns
 from mapper.trajectory import Trajectory, write_tum

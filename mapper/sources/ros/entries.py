@@ -2,13 +2,11 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from mapper.errors import DataError, FrameError
 from mapper.frames import DepthImage, PinholeCamera, RgbdFrame, Scan
 from mapper.geometry import Transform
 from mapper.sources.base import ImageFiles
-from mapper.sources.images import encode_colour, encode_depth
+from mapper.sources.images import check_size, encode_colour, encode_depth, scan_of
 from mapper.sources.ros.clouds import scan_from
 from mapper.sources.ros.images import depth_file_of, depth_m_of, image_of
 from mapper.sources.ros.messages import CloudMessage, FileMessage, ImageMessage, Message, decode
@@ -83,7 +81,7 @@ class RgbdMessages:
             FrameError: A message is damaged, in an encoding that is not read, or of another size.
         """
         image = image_of(self.colour.image(), colour=colour, where=f"{self.colour}")
-        self._check_size(self.colour, image.shape[:2])
+        check_size(image.shape, self.camera, f"{self.colour}")
         return RgbdFrame(self.stamp_ns, image, self._depth_m(), self.camera)
 
     def scan(self) -> Scan:
@@ -92,19 +90,12 @@ class RgbdMessages:
         Raises:
             FrameError: As ``load``.
         """
-        depth_m = self._depth_m()
-        no_image = np.broadcast_to(np.uint8(0), depth_m.shape)
-        return RgbdFrame(self.stamp_ns, no_image, depth_m, self.camera).scan()
+        return scan_of(self._depth_m(), self.camera, stamp_ns=self.stamp_ns)
 
     def _depth_m(self) -> DepthImage:
         depth_m = depth_m_of(self.depth.image(), units_per_m=self.units_per_m, where=f"{self.depth}")
-        self._check_size(self.depth, depth_m.shape)
+        check_size(depth_m.shape, self.camera, f"{self.depth}")
         return depth_m
-
-    def _check_size(self, message: Located, shape: tuple[int, ...]) -> None:
-        want = (self.camera.height_px, self.camera.width_px)
-        if shape != want:
-            raise FrameError(f"{message}: {shape[1]}×{shape[0]} px, but the log has {want[1]}×{want[0]}")
 
 
 @dataclass(frozen=True, slots=True)

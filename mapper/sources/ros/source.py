@@ -10,6 +10,7 @@ from mapper.errors import SourceError
 from mapper.frames import NO_DISTORTION, PinholeCamera
 from mapper.sources.base import Accelerations, Entry
 from mapper.sources.calibration import Calibration
+from mapper.sources.images import FINE_UNITS_PER_M
 from mapper.sources.ros.entries import CloudEntry, RgbdMessages
 from mapper.sources.ros.images import MILLIMETRES_PER_M, size_of
 from mapper.sources.ros.index import Series
@@ -23,9 +24,6 @@ from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.time_line import ordered, paired
 from mapper.sources.ros.topics import CameraTopics, choose, frame_of
 from mapper.trajectory import Trajectory
-
-FINE_UNITS_PER_M = 5000.0
-"""16-bit units of a metre in which depth in metres goes into files: 0.2 mm, as TUM's."""
 
 _SAME_LENS_RATIO = 0.01
 _JPEG_START = b"\xff\xd8"
