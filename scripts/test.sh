@@ -6,4 +6,4 @@ bash scripts/setup.sh --dev
 .venv/bin/ruff check .
 .venv/bin/ruff format --check .
 .venv/bin/mypy
-.venv/bin/pytest "$@"
+.venv/bin/pytest -n auto --dist loadfile --no-loadscope-reorder "$@"  # a file's fixtures are made once
