@@ -21,6 +21,7 @@ from cli.loops import WithPairs, loops
 from cli.plan import WithPoints, plan
 from cli.register import register
 from cli.report import report
+from cli.sensor import sensor
 from cli.show_config import show_config
 from cli.solve import solve
 from cli.synth import synth
@@ -82,6 +83,7 @@ app.command("config")(show_config)
 app.command("view")(view)
 app.command("report")(report)
 app.command("doctor")(doctor)
+app.add_typer(sensor, name="sensor")
 app.add_typer(vocabulary, name="vocabulary")
 
 
