@@ -27,6 +27,7 @@ HOMES = {
     "pyoctomap": (),
     "evo": (),
     "rerun": ("mapper/export/rerun/",),
+    "distributed": ("mapper/workers.py",),
 }
 
 
