@@ -19,12 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from evaluators.cloud_distance import DistanceTo
+from evaluators.scan_pairs import fewer_rings, merged, perturbed
 from mapper.config.hough import HoughConfig, HoughGicpConfig, HoughNdtConfig
 from mapper.config.registration import KissMatcherConfig
 from mapper.config.sources import SourceConfig
 from mapper.config.synthetic import COURTYARD, STREET, LidarSynthConfig
 from mapper.frames import Scan
-from mapper.geometry import Transform, angle_between, apply, inverse, transform
+from mapper.geometry import Transform, angle_between, inverse
 from mapper.registration.base import Registration
 from mapper.sources import open_source
 from mapper.sources.synthetic.lidar import SyntheticLidarSource
@@ -32,8 +33,6 @@ from mapper.sources.synthetic.lidar import SyntheticLidarSource
 RIGHT_M, RIGHT_DEG = 0.3, 1.0
 NEAR_M = 10.0
 END_SCANS = 4
-RINGS, KEPT_RINGS = 64, 16
-MAP_VOXEL_M = 0.05
 COLUMNS = (
     *("scans", "method", "right", "wrong", "median cm", "95 % cm"),
     *("median °", "MPD cm (truth's)", "prepare ms", "align ms"),
@@ -74,33 +73,6 @@ def rendered(config: LidarSynthConfig, *, seed: int, count: int) -> Log:
     return Log([source.observe(int(i)) for i in chosen], [poses[i] for i in chosen])
 
 
-def moved(scan: Scan, T_new_body: Transform) -> Scan:
-    """Return a scan told in another frame."""
-    return Scan(
-        stamp_ns=scan.stamp_ns,
-        points_body=apply(T_new_body, scan.points_body.astype(np.float64)).astype(np.float32),
-        origin_body=apply(T_new_body, scan.origin_body[np.newaxis])[0],
-    )
-
-
-def perturbed(
-    scan: Scan,
-    T_world_body: Transform,
-    T_world_target: Transform,
-    rng: np.random.Generator,
-    *,
-    offset_m: float,
-) -> tuple[Scan, Transform]:
-    """Return a scan told in a frame of any yaw, at most so far from the target, and that frame's pose."""
-    yaw, bearing = rng.uniform(-np.pi, np.pi, 2)
-    reach_m = offset_m * np.sqrt(rng.random())
-    c, s = np.cos(yaw), np.sin(yaw)
-    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ T_world_body[:3, :3]
-    x, y = T_world_target[:2, 3] + reach_m * np.array([np.cos(bearing), np.sin(bearing)])
-    T_world_new = transform(R, np.array([x, y, T_world_body[2, 3]]))
-    return moved(scan, inverse(T_world_new) @ T_world_body), T_world_new
-
-
 def near_pairs(logs: list[Log], *, count: int, offset_m: float = NEAR_M) -> Iterator[Pair]:
     """Yield perturbed pairs of scans taken within 10 m of each other, so many over all logs."""
     rng = np.random.default_rng(0)
@@ -135,36 +107,23 @@ def sparse_pairs(logs: list[Log], *, count: int, rings: bool) -> Iterator[Pair]:
         for j in rng.permutation(len(log.scans))[:share]:
             thin = sparse(log.scans[j], rng, rings=rings)
             source, T_world_source = perturbed(thin, log.T_world_body[j], middle, rng, offset_m=NEAR_M)
-            target = merged(log, without=int(j), T_world_map=middle)
+            target = map_of_others(log, without=int(j), T_world_map=middle)
             yield Pair(target, source, inverse(middle) @ T_world_source)
 
 
 def sparse(scan: Scan, rng: np.random.Generator, *, rings: bool) -> Scan:
     """Return every fourth ring, by elevation, or one point in ten."""
     if rings:
-        x, y, z = scan.points_body.T
-        elevation = np.arctan2(z, np.hypot(x, y))
-        low, high = np.percentile(elevation, [0.5, 99.5])
-        keep = ((elevation - low) / (high - low) * RINGS).astype(int) % (RINGS // KEPT_RINGS) == 0
-    else:
-        keep = rng.random(len(scan.points_body)) < 0.1
+        return fewer_rings(scan)
+    keep = rng.random(len(scan.points_body)) < 0.1
     return Scan(stamp_ns=scan.stamp_ns, points_body=scan.points_body[keep], origin_body=scan.origin_body)
 
 
-def merged(log: Log, *, without: int, T_world_map: Transform) -> Scan:
-    """Return a dense map of all scans but one, one point per 5 cm voxel."""
-    points = np.concatenate(
-        [
-            apply(inverse(T_world_map) @ T, scan.points_body.astype(np.float64))
-            for i, (scan, T) in enumerate(zip(log.scans, log.T_world_body, strict=True))
-            if i != without
-        ]
-    )
-    cells = np.floor(points / MAP_VOXEL_M).astype(np.int64)
-    cells -= cells.min(axis=0)
-    _, y, z = cells.max(axis=0) + 1
-    _, first = np.unique((cells[:, 0] * y + cells[:, 1]) * z + cells[:, 2], return_index=True)
-    return Scan(stamp_ns=0, points_body=points[np.sort(first)].astype(np.float32))
+def map_of_others(log: Log, *, without: int, T_world_map: Transform) -> Scan:
+    """Return a dense map of all scans but one."""
+    scans = [scan for i, scan in enumerate(log.scans) if i != without]
+    poses = [inverse(T_world_map) @ T for i, T in enumerate(log.T_world_body) if i != without]
+    return merged(scans, poses)
 
 
 def far_pairs(log: Log, *, count: int) -> Iterator[Pair]:
