@@ -117,6 +117,15 @@ def load_source_config(path: Path | None = None, overrides: Sequence[str] = ()) 
     return _validated(BuildConfig, {"source": tree.get("source", {})}, str(path or "overrides")).source
 
 
+def read_config(path: Path, model: type[AnyConfig]) -> AnyConfig:
+    """Return what a TOML or JSON file holds, as a model of any kind; what it leaves out is the model's own.
+
+    Raises:
+        ConfigError: The file cannot be read or parsed, or the model refuses a name or a value.
+    """
+    return _checked(model, _read(path), str(path))
+
+
 def _read(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
@@ -188,8 +197,12 @@ def _kind(member: type[Config]) -> str:
 
 
 def _validated(model: type[AnyConfig], tree: dict[str, Any], where: str) -> AnyConfig:
+    return _checked(model, _with_kinds(tree, model()), where)
+
+
+def _checked(model: type[AnyConfig], tree: dict[str, Any], where: str) -> AnyConfig:
     try:
-        return model.model_validate(_with_kinds(tree, model()))
+        return model.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"]) or "configuration"

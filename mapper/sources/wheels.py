@@ -15,6 +15,7 @@ from mapper.sources.text import parse_numbers, parse_stamp, pose_from_numbers, r
 from mapper.trajectory import Trajectory, read_tum
 
 POSES, READINGS = "wheels.txt", "encoders.txt"
+_POSE_COLUMNS = 8
 
 _LOOKING_FORWARD: Mapping[Sensor, Transform] = {
     "rgbd": transform(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3)),
@@ -49,18 +50,24 @@ def read_wheels(folder: Path, config: WheelsConfig, *, sensor: Sensor) -> tuple[
     Raises:
         SourceError: A file is malformed, or there are readings but no wheelbase.
     """
-    if (folder / POSES).is_file():
-        path = folder / POSES
+    path = next((folder / name for name in (POSES, READINGS) if (folder / name).is_file()), None)
+    return (None, []) if path is None else read_wheels_file(path, config, sensor=sensor)
+
+
+def read_wheels_file(path: Path, config: WheelsConfig, *, sensor: Sensor) -> tuple[Trajectory, list[str]]:
+    """Return T_odom_body and notes as above of one file: poses if it is ``wheels.txt`` or has eight columns.
+
+    Raises:
+        SourceError: As above.
+    """
+    if path.name == POSES or len(next(rows(path), (0, []))[1]) == _POSE_COLUMNS:
         notes: list[str] = []
         try:
             T_odom_base = read_tum(path)
         except DataError as error:
             raise SourceError(str(error)) from None
-    elif (folder / READINGS).is_file():
-        path = folder / READINGS
-        T_odom_base, notes = _integrated(path, config.wheelbase_m)
     else:
-        return None, []
+        T_odom_base, notes = _integrated(path, config.wheelbase_m)
     wheels = replace(T_odom_base, T_world_body=T_odom_base.T_world_body @ mounting(config, sensor))
     return wheels, [*notes, f"{path.name}: wheel odometry, {len(wheels)} poses"]
 
