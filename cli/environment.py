@@ -3,18 +3,13 @@
 import os
 from pathlib import Path
 
-_ONE_THREAD_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
 
 def prepare_environment() -> None:
-    """Leave the threads to us, and give compiled code a place where it may be kept.
-
-    Small matrices are slower with several threads, and ``workers`` of our own already fill the machine.
-    """
-    for name in _ONE_THREAD_EACH:
-        os.environ.setdefault(name, "1")
+    """Leave the threads to us, and give compiled code a place where it may be kept."""
     import mapper
+    from mapper.threads import one_thread_per_library
 
+    one_thread_per_library()
     package = Path(mapper.__file__).parent
     if not os.access(package, os.W_OK):  # numba keeps its code beside ours, and refuses to work if it cannot
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mapper" / "numba"
