@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mapper.export.compare_picture import color_of
+from mapper.export.panels import color_of
 from mapper.export.mcap_log import McapLog
 from mapper.export.palette import TRUTH
 from mapper.export.ros2 import Value

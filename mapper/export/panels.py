@@ -1,0 +1,124 @@
+"""What pictures of several panels share: the page, its panels, their colours, and what is drawn in many."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure
+from mapper.export.palette import Rgb
+from mapper.geometry import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_COLORS: tuple[Rgb, ...] = (
+    (214, 69, 37),
+    (222, 111, 161),
+    (38, 145, 87),
+    (124, 58, 196),
+    (224, 160, 32),
+    (23, 165, 184),
+    (196, 40, 140),
+    (120, 94, 60),
+    (92, 70, 150),
+    (140, 179, 36),
+    (30, 33, 41),
+    (140, 146, 158),
+)
+_PANEL_IN = 3.0
+_HEAD_IN = 0.5
+_MARGIN_RATIO = 0.15
+_WIDE = 1e3  # from here on ticks at 1, 2, 5 would be written over one another
+
+
+def color_of(number: int) -> Rgb:
+    """Return the colour of the n-th method."""
+    return _COLORS[number % len(_COLORS)]
+
+
+def page(
+    title: str,
+    *,
+    columns: int,
+    rows: int,
+    width_in: float = _PANEL_IN,
+    height_in: float = _PANEL_IN,
+    beside_in: float = 0.0,
+) -> "Figure":
+    """Return an empty page for so many panels of one size, a headline above and room for a legend beside."""
+    figure = new_figure(width_in * columns + beside_in, height_in * rows + _HEAD_IN)
+    _, page_in = figure.get_size_inches()
+    figure.text(0.02, 1.0 - 0.2 / page_in, title, fontsize=12, fontweight="bold", color=INK, va="top")
+    return figure
+
+
+def panel(figure: "Figure", number: int, *, columns: int, rows: int, beside_in: float = 0.0) -> "Axes":
+    """Return the axes of a panel; panels are numbered from the upper left."""
+    width_in, height_in = figure.get_size_inches()
+    row, column = divmod(number, columns)
+    cell_width_in, cell_height_in = (width_in - beside_in) / columns, (height_in - _HEAD_IN) / rows
+    left_in, below_in, above_in, right_in = 0.85, 0.45, 0.3, 0.15
+    axes = figure.add_axes(
+        (
+            (column * cell_width_in + left_in) / width_in,
+            ((rows - 1 - row) * cell_height_in + below_in) / height_in,
+            (cell_width_in - left_in - right_in) / width_in,
+            (cell_height_in - below_in - above_in) / height_in,
+        )
+    )
+    axes.tick_params(colors=FAINT, labelsize=7)
+    for spine in axes.spines.values():
+        spine.set_color(LINE)
+    return axes
+
+
+def draw_boxes(axes: "Axes", values: Mapping[str, Array]) -> None:
+    """Draw boxes from quartile to quartile, whiskers from the 5th to the 95th percentile."""
+    boxes = axes.boxplot(
+        list(values.values()),
+        orientation="horizontal",
+        whis=(5, 95),
+        showfliers=False,
+        patch_artist=True,
+        widths=0.6,
+    )
+    for number, (box, median) in enumerate(zip(boxes["boxes"], boxes["medians"], strict=True)):
+        box.set(facecolor=hex_of(color_of(number)), alpha=0.55, edgecolor=INK, linewidth=0.6)
+        median.set(color=INK, linewidth=1.2)
+    axes.set_yticks(range(1, len(values) + 1), list(values))
+    axes.invert_yaxis()
+    by_logarithm(axes)
+    axes.grid(color=LINE, linewidth=0.4, axis="x")
+
+
+def by_logarithm(axes: "Axes") -> None:
+    """Lay what was drawn out by its logarithm, with ticks at 1, 2, 5 where powers of ten are too few."""
+    from matplotlib.ticker import LogLocator
+
+    axes.set_xscale("log")
+    low, high = axes.get_xlim()
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < _WIDE * low else (1.0,)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.minorticks_off()
+
+
+def widest_axes(positions: Array) -> Array:
+    """Return (2, 3) unit vectors along which positions are spread most."""
+    if len(positions) < 3:
+        return np.eye(3)[:2]
+    *_, axes = np.linalg.svd(positions - positions.mean(axis=0), full_matrices=False)
+    signs = np.sign(axes[np.arange(3), np.abs(axes).argmax(axis=1)])  # the same whichever LAPACK chose
+    widest: Array = (axes * signs[:, None])[:2]
+    return widest
+
+
+def extent(seen: Array) -> tuple[Array, Array]:
+    """Return the corners of a square around (N, 2) points."""
+    if not len(seen):
+        return np.full(2, -1.0), np.full(2, 1.0)
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    half = max((0.5 + _MARGIN_RATIO) * float((high - low).max()), 1e-3)
+    middle = 0.5 * (low + high)
+    return middle - half, middle + half
