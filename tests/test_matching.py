@@ -1,5 +1,6 @@
 """Mutual nearest neighbours, the ratio test and the homography filter."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -98,6 +99,21 @@ def test_homography_tells_true_pairs_from_false_ones():
     assert mask[:120].all()
     assert mask[120:].sum() <= 2
     assert (mask == again).all()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_another_seed_is_another_sample_of_the_same_pairs(seed):
+    rng = np.random.default_rng(6)
+    a = rng.uniform(0, 600, (200, 2)).astype(np.float32)
+    b = (a + np.array([20.0, 5.0]) + rng.normal(0.0, 2.0, a.shape)).astype(np.float32)
+    b[120:] = rng.uniform(0, 600, (80, 2))
+    _, plain = cv2.findHomography(a, b, cv2.RANSAC, 4.0, maxIters=2000, confidence=0.995)
+
+    mask = homography_inliers(a, b, tolerance_px=4.0, iterations=2000, seed=seed)
+
+    assert mask[:120].mean() > 0.6
+    assert mask[120:].mean() < 0.1
+    assert (mask == plain.ravel()).all() == (seed == 0)
 
 
 def test_three_pairs_make_no_homography():

@@ -79,6 +79,20 @@ def test_p3p_draws_the_same_every_time():
     assert (first[1] == second[1]).all()
 
 
+def test_another_seed_draws_other_pairs():
+    points_world, pixels, truth = pairs(np.random.default_rng(7), noise_px=2.0)
+    pixels[:80] += 60.0
+    poses = [
+        ransac_p3p(points_world, pixels, INTRINSICS, tolerance_px=4.0, iterations=100, seed=seed)
+        for seed in (0, 1, 2)
+    ]
+    assert len({T_camera_world.tobytes() for T_camera_world, _ in poses}) == 3
+    for T_camera_world, agreeing in poses:
+        assert (np.diff(agreeing) > 0).all()
+        assert (agreeing >= 80).mean() > 0.95
+        assert np.linalg.norm((inverse(truth) @ T_camera_world)[:3, 3]) < 0.05
+
+
 def test_points_in_one_line_have_no_pose():
     line = np.outer(np.linspace(1.0, 2.0, 30), [0.1, 0.2, 1.0])
     pixels = np.tile(INTRINSICS[2:], (30, 1)) + np.random.default_rng(0).uniform(-200, 200, (30, 2))

@@ -23,7 +23,7 @@ class PaperCell:
         row: As printed, e.g. "fr1/xyz".
         column: As printed, e.g. "7", "MP4", "ISVD+LC".
         published: As printed; None where the paper has no such cell.
-        ours: One per seed, in the table's unit; a method without randomness has one. Empty if every try failed.
+        ours: One per seed, in the table's unit; a method without chance has one. Empty if every try failed.
         failures: Why the other seeds gave nothing, a line each.
     """
 

@@ -30,6 +30,8 @@ class MatchConfig(Config):
     homography_tolerance_px: PositiveFloat = 4.0
     """ε of alg. 8; the thesis leaves it open, as it does the ratio."""
     homography_iterations: PositiveInt = 2000
+    seed: NonNegativeInt = 0
+    """Of RANSAC's draws, here and where loops are verified by P3P."""
 
 
 class IsvdConfig(Config):
@@ -143,6 +145,8 @@ class KeyframeConfig(Config):
     """M: draws of four pairs for P3P, at most (B3)."""
     ransac_tolerance_px: PositiveFloat = 4.0
     """β: how far a pair that agrees with P3P may lie off (B3)."""
+    ransac_seed: NonNegativeInt = 0
+    """Of P3P's draws."""
     min_agreement_ratio: Ratio = 0.3
     """A pose that a smaller share of the matches agrees with is refused: what repeats gave 0.28."""
     relocalisation_keyframes: PositiveInt = 5

@@ -60,28 +60,43 @@ def match_mutual(a: Described, b: Described, *, max_ratio: float) -> Pairs:
 
 
 def homography_inliers(
-    a: NDArray[np.float32], b: NDArray[np.float32], *, tolerance_px: float, iterations: int
+    a: NDArray[np.float32], b: NDArray[np.float32], *, tolerance_px: float, iterations: int, seed: int = 0
 ) -> NDArray[np.bool_]:
     """Return which pairs agree with the homography that most pairs agree with (thesis alg. 8).
 
-    RANSAC over four pairs (Fischler & Bolles 1981), by OpenCV, whose random numbers are the same every time.
+    RANSAC over four pairs (Fischler & Bolles 1981), by OpenCV.
 
     Args:
         a: (M, 2) pixels in the first image.
         b: (M, 2) their partners in the second.
         tolerance_px: How far from its partner a pixel may be mapped.
         iterations: Most samples to try; fewer are needed when many pairs agree.
+        seed: Of the samples; see ``drawing_order``.
 
     Returns:
         (M,) mask; all False when no homography exists.
     """
-    none = np.zeros(len(a), np.bool_)
+    agree = np.zeros(len(a), np.bool_)
     if len(a) < _HOMOGRAPHY_POINTS:
-        return none
+        return agree
+    order = drawing_order(len(a), seed)
     found, mask = cv2.findHomography(
-        a, b, cv2.RANSAC, tolerance_px, maxIters=iterations, confidence=_CONFIDENCE
+        a[order], b[order], cv2.RANSAC, tolerance_px, maxIters=iterations, confidence=_CONFIDENCE
     )
-    return none if found is None else mask.ravel().astype(np.bool_)
+    if found is not None:
+        agree[order] = mask.ravel()
+    return agree
+
+
+def drawing_order(count: int, seed: int) -> NDArray[np.intp]:
+    """Return the order in which OpenCV's RANSAC is given its pairs: their own for seed 0, else shuffled.
+
+    Its random numbers are the same every time, so that another order is what makes another sample.
+    """
+    if seed == 0:
+        return np.arange(count, dtype=np.intp)
+    shuffled: NDArray[np.intp] = np.random.default_rng(seed).permutation(count)
+    return shuffled
 
 
 def _words(descriptors: Descriptors) -> NDArray[np.uint64]:

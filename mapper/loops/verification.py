@@ -73,6 +73,7 @@ class ImageVerifier:
             j.intrinsics,
             tolerance_px=_P3P_TOLERANCE_PX,
             iterations=_P3P_ITERATIONS,
+            seed=self._config.match.seed,
         )
         return pairs[:0] if found is None else pairs[found[1]]
 
@@ -91,6 +92,7 @@ class ImageVerifier:
             j.pixels[pairs[:, 1]].astype(np.float32),
             tolerance_px=match.homography_tolerance_px,
             iterations=match.homography_iterations,
+            seed=match.seed,
         )
         return pairs[agree]
 

@@ -4,18 +4,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.features.matching import drawing_order
 from mapper.geometry import Array, Points, Transform
 
 _CONFIDENCE = 0.999
 
 
 def ransac_p3p(
-    points_world: Points, pixels: Array, intrinsics: Array, *, tolerance_px: float, iterations: int
+    points_world: Points,
+    pixels: Array,
+    intrinsics: Array,
+    *,
+    tolerance_px: float,
+    iterations: int,
+    seed: int = 0,
 ) -> tuple[Transform, NDArray[np.intp]] | None:
     """Return the T_camera_world that most pairs agree with, and which do; None if no four pairs give any.
 
-    Three pairs have up to four solutions (Gao et al. 2003), and a fourth chooses among them. OpenCV draws
-    them from a generator of its own with a fixed seed, so that the same pairs give the same pose.
+    Three pairs have up to four solutions (Gao et al. 2003), and a fourth chooses among them.
 
     Args:
         points_world: (N, 3) metres, N ≥ 4.
@@ -23,11 +29,13 @@ def ransac_p3p(
         intrinsics: (≥ 4,) fx, fy, cx, cy.
         tolerance_px: A pair agrees when its point projects this close to its pixel: β.
         iterations: How many draws at most; fewer once a better one has become unlikely.
+        seed: Of the draws; see ``drawing_order``.
     """
     fx, fy, cx, cy = intrinsics[:4]
+    order = drawing_order(len(pixels), seed)
     found, rotation, translation, agreeing = cv2.solvePnPRansac(
-        points_world,
-        pixels,
+        points_world[order],
+        pixels[order],
         np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
         None,
         iterationsCount=iterations,
@@ -40,4 +48,4 @@ def ransac_p3p(
     T_camera_world = np.eye(4)
     T_camera_world[:3, :3], _ = cv2.Rodrigues(rotation)
     T_camera_world[:3, 3] = translation[:, 0]
-    return T_camera_world, agreeing[:, 0].astype(np.intp)
+    return T_camera_world, np.sort(order[agreeing[:, 0]])

@@ -80,6 +80,7 @@ class Recall:
             observation.intrinsics,
             tolerance_px=self._config.ransac_tolerance_px,
             iterations=self._config.ransac_iterations,
+            seed=self._config.ransac_seed,
         )
         if found is None:
             return None
