@@ -38,7 +38,7 @@ def staged(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
         partial.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"{partial}: cannot be created: {error.strerror}") from None
-    with _locked(partial):
+    with locked(partial):
         _empty(partial)
         yield partial
         _swap(partial, out)
@@ -58,7 +58,7 @@ def _is_ours(folder: Path) -> bool:
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path) -> Iterator[None]:
     """Hold the folder's lock, which the system releases even when the process is killed."""
     handle = os.open(folder, os.O_RDONLY)
     try:
