@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from mapper.config.base import Config, Ratio
+from mapper.config.depth_noise import DepthNoiseConfig
 from mapper.config.features import DetectorConfig, OrbConfig, SurfConfig, UniformOrbConfig
+from mapper.config.graph import WheelNoiseConfig
 from mapper.config.scan_odometry import (
     GicpOdometryConfig,
     HoughOdometryConfig,
@@ -18,6 +20,8 @@ from mapper.config.scan_odometry import (
 if TYPE_CHECKING:
     from mapper.odometry.isvd import IsvdOdometry
     from mapper.odometry.local_map.odometry import KeyframeOdometry
+    from mapper.odometry.wheels import WheelsOdometry
+    from mapper.trajectory import Trajectory
 
 
 class MatchConfig(Config):
@@ -84,7 +88,7 @@ class IsvdOdometryConfig(Config):
     relocalisation_keyframes: PositiveInt = 20
     """How many of the nearest keyframes, and as many of the others in turn, a lost frame is compared with."""
 
-    def build(self) -> "IsvdOdometry":
+    def build(self, _wheels: "Trajectory | None" = None, /) -> "IsvdOdometry":
         """Return the odometry this configures."""
         from mapper.odometry.isvd import IsvdOdometry  # imported only when asked for
 
@@ -105,6 +109,8 @@ class KeyframeConfig(Config):
     """bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017); a Kinect's is 40 to 43."""
     disparity_sigma_px: PositiveFloat = 1.0
     """Noise of the virtual disparity relative to that of a pixel."""
+    depth_noise: DepthNoiseConfig | None = None
+    """The sensor's own, which then counts instead; mapper sensor depth measures it."""
     depth_residual: bool = True
     """Poses and bundles have to explain bf / z too; without it only pixels (Zhao et al. 2020, eq. 5–7)."""
     local_search_px: PositiveFloat = 4.0
@@ -162,7 +168,7 @@ class LocalMapConfig(KeyframeConfig):
     max_predicted_steps: PositiveFloat = 10.0
     """Longer gaps, in frame intervals, are not extrapolated over."""
 
-    def build(self) -> "KeyframeOdometry":
+    def build(self, _wheels: "Trajectory | None" = None, /) -> "KeyframeOdometry":
         """Return the odometry this configures."""
         from mapper.odometry.local_map.motion import MotionPlacing
         from mapper.odometry.local_map.odometry import KeyframeOdometry
@@ -175,7 +181,7 @@ class PnpConfig(KeyframeConfig):
 
     kind: Literal["pnp"] = "pnp"
 
-    def build(self) -> "KeyframeOdometry":
+    def build(self, _wheels: "Trajectory | None" = None, /) -> "KeyframeOdometry":
         """Return the odometry this configures."""
         from mapper.odometry.local_map.odometry import KeyframeOdometry
         from mapper.odometry.local_map.pnp import PnpPlacing
@@ -183,10 +189,32 @@ class PnpConfig(KeyframeConfig):
         return KeyframeOdometry(self, partial(PnpPlacing, self))
 
 
+class WheelsOdometryConfig(WheelNoiseConfig):
+    """The wheels alone (thesis 2.6.3): no frame is looked at, of either sensor, but keyframes for loops."""
+
+    kind: Literal["wheels"] = "wheels"
+    keyframe_distance_m: PositiveFloat = 0.3
+    keyframe_angle_rad: PositiveFloat = 0.2
+    """A frame this far, or turned this much, from the last keyframe is one itself."""
+    detector: Annotated[OrbConfig | UniformOrbConfig, Field(discriminator="kind")] = UniformOrbConfig()
+    """What loops recognise images by; scans are recognised by their points."""
+
+    def build(self, wheels: "Trajectory | None" = None, /) -> "WheelsOdometry":
+        """Return the odometry this configures.
+
+        Raises:
+            ConfigError: There are no wheels.
+        """
+        from mapper.odometry.wheels import WheelsOdometry
+
+        return WheelsOdometry(self, wheels)
+
+
 OdometryConfig = Annotated[
     IsvdOdometryConfig
     | LocalMapConfig
     | PnpConfig
+    | WheelsOdometryConfig
     | GicpOdometryConfig
     | IcpOdometryConfig
     | KissOdometryConfig

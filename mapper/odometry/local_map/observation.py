@@ -13,6 +13,7 @@ from mapper.features.windowed import FeatureGrid, Words, pack, sort_into_grid
 from mapper.frames import Frame, RgbdFrame
 from mapper.geometry import Array, Points, Transform
 from mapper.places.vocabulary import Vocabulary
+from mapper.sensing.depth_noise import pixel_weights
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +110,13 @@ def observe(frame: Frame, detector: Detector, vocabulary: Vocabulary, config: Ke
         bits=bits,
         words=vocabulary.words_of(bits),
         measured=np.column_stack([pixels, disparity_px]),
-        weights=np.column_stack([sigma_px, sigma_px, sigma_px * config.disparity_sigma_px]) ** -2.0,
+        weights=pixel_weights(
+            sigma_px,
+            depth_m,
+            virtual_baseline_px_m=config.virtual_baseline_px_m,
+            disparity_sigma_px=config.disparity_sigma_px,
+            depth_noise=config.depth_noise,
+        ),
         points_camera=np.column_stack([rays * depth_m[:, None], depth_m]),
         grid=grid,
         intrinsics=intrinsics,
