@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mapper.export.panels import color_of
 from mapper.export.mcap_log import McapLog
 from mapper.export.palette import TRUTH
+from mapper.export.panels import color_of
 from mapper.export.ros2 import Value
 from mapper.geometry import Array
 from mapper.timebase import Stamps
