@@ -158,6 +158,22 @@ class AttributeLayer:
             self._arrays,
         )
 
+    def add_layer(self, other: "AttributeLayer", slots: NDArray[np.int64], own: NDArray[np.int64]) -> None:
+        """Add what another map knows about the same voxels.
+
+        Args:
+            other: Its layer.
+            slots: (B,) of its blocks.
+            own: (B,) slots of this map's blocks at the same places.
+
+        Raises:
+            MapSizeError: The layer would not fit into this machine's memory; nothing has changed then.
+        """
+        rows = other.arrays.rows
+        held = slots < len(rows)
+        held[held] = rows[slots[held]] >= 0
+        _add_rows(self.claim(own[held]), self._arrays, rows[slots[held]], other.arrays)
+
     def block_colors(self, slots: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Return the (B, 512, 3) uint8 mean RGB of blocks that have attributes, white where there is none."""
         rows = np.repeat(self._arrays.rows[slots], BLOCK_VOXELS)
@@ -314,6 +330,22 @@ def _flush(table, layer, packed, stamp_ns, count, colored, red, green, blue):
         layer.color_sums[row, voxel, 0] += uint32(red)
         layer.color_sums[row, voxel, 1] += uint32(green)
         layer.color_sums[row, voxel, 2] += uint32(blue)
+
+
+@njit(cache=True, nogil=True)
+def _add_rows(own_rows, own, rows, other):
+    """Add attributes block by block; a colour's weight stays at or below the full one."""
+    for b in range(len(rows)):
+        into, row = own_rows[b], rows[b]
+        for voxel in range(BLOCK_VOXELS):
+            own.hits[into, voxel] += other.hits[row, voxel]
+            own.last_seen_ns[into, voxel] = max(own.last_seen_ns[into, voxel], other.last_seen_ns[row, voxel])
+            weight = int64(own.color_weights[into, voxel]) + int64(other.color_weights[row, voxel])
+            shift = int64(weight > _FULL_WEIGHT)
+            own.color_weights[into, voxel] = uint32(weight >> shift)
+            for channel in range(3):
+                total = int64(own.color_sums[into, voxel, channel]) + other.color_sums[row, voxel, channel]
+                own.color_sums[into, voxel, channel] = uint32(total >> shift)
 
 
 @njit(cache=True, nogil=True)

@@ -13,7 +13,14 @@ COLOR_NODE = np.dtype([("value", "<f4"), ("rgb", "u1", 3), ("mask", "u1")])
 """A node as a ColorOcTree's ``.ot`` file lists it: log-odds, RGB, and a bit for each child that exists."""
 
 
-def colored(nodes: NDArray[np.void], store: BlockStore, attributes: AttributeLayer) -> NDArray[np.void]:
+def colored(
+    nodes: NDArray[np.void],
+    store: BlockStore,
+    attributes: AttributeLayer,
+    *,
+    root_depth: int = 0,
+    root_code: int = 0,
+) -> NDArray[np.void]:
     """Return (N,) COLOR_NODE: the nodes of a pruned tree in preorder, with their colours.
 
     A leaf above the voxels has the mean colour of the voxels that were pruned into it, and an inner node that
@@ -24,46 +31,65 @@ def colored(nodes: NDArray[np.void], store: BlockStore, attributes: AttributeLay
         nodes: (N,) NODE of the same map.
         store: Its blocks.
         attributes: Their attributes.
+        root_depth: Depth of the first node.
+        root_code: Morton code of the first node at its depth.
     """
     out = np.empty(len(nodes), COLOR_NODE)
     out["value"], out["mask"] = nodes["value"], nodes["mask"]
     slots = attributes.slots
     colors = attributes.block_colors(slots)
     rgb = np.empty((len(nodes), 3), np.uint8)
-    _colors_in_preorder(np.ascontiguousarray(nodes["mask"]), store.codes[slots], colors, rgb)
+    masks = np.ascontiguousarray(nodes["mask"])
+    _colors_in_preorder(masks, store.codes[slots], colors, root_depth, root_code, rgb)
     out["rgb"] = rgb
     return out
 
 
+def parent_color(children: NDArray[np.uint8], *, pruned: bool) -> NDArray[np.uint8]:
+    """Return the (3,) colour of the parent of eight nodes, given their (8, 3) colours, white where absent.
+
+    Args:
+        children: uint8 RGB.
+        pruned: The children are gone, since they were leaves of equal value.
+    """
+    if pruned:
+        return np.asarray(_pruned(children.copy()))
+    colored = (children != UNSET).any(axis=1)
+    return np.asarray(_mean(children[colored].sum(axis=0, dtype=np.int64), np.count_nonzero(colored)))
+
+
 @njit(cache=True, nogil=True)
-def _colors_in_preorder(masks, codes, colors, rgb):
+def _colors_in_preorder(masks, codes, colors, root_depth, root_code, rgb):
     """Write the (N, 3) colours of nodes.
 
     Args:
         masks: (N,) uint8 of the nodes in preorder.
         codes: (B,) int64 increasing codes of the blocks that have colours.
         colors: (B, 512, 3) uint8 those.
+        root_depth: Depth of the first node.
+        root_code: Its Morton code there.
         rgb: What is written.
     """
     pending, index = np.zeros(KEY_BITS + 1, int64), np.zeros(KEY_BITS + 1, int64)
     prefix = np.zeros(KEY_BITS + 2, int64)
     sums, counts = np.zeros((KEY_BITS + 1, 3), int64), np.zeros(KEY_BITS + 1, int64)
-    depth = 0
+    depth = root_depth
+    prefix[depth] = root_code
     for i in range(len(masks)):
         pending[depth], index[depth] = masks[i], i
         sums[depth], counts[depth] = 0, 0
         if masks[i] == 0:
             rgb[i] = _leaf_color(prefix[depth], depth, codes, colors)
-        while depth >= 0 and pending[depth] == 0:
+        while depth >= root_depth and pending[depth] == 0:
             node = index[depth]
             if masks[node]:
                 rgb[node] = _mean(sums[depth], counts[depth])
             depth -= 1
-            if depth >= 0 and _is_set(rgb[node]):
+            if depth >= root_depth and _is_set(rgb[node]):
                 counts[depth] += 1
                 for channel in range(3):
                     sums[depth, channel] += rgb[node, channel]
-        if depth >= 0:
+        if depth >= root_depth:
             child = 0
             while not (pending[depth] >> child) & 1:
                 child += 1

@@ -1,8 +1,8 @@
 """The height of the ground under every column of the map, where streets rise and fall."""
 
 from collections import deque
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -19,6 +19,37 @@ _MIN_COLUMNS = 4
 _NOTHING = np.iinfo(np.int32).max
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """The ground's height in square cells of a few metres, and linearly between their middles.
+
+    Attributes:
+        heights_m: (R, C) of the ground in the world at the cells' middles.
+        first: (2,) x and y key of the first column of cell (0, 0).
+        columns: Edge of a cell in voxels.
+    """
+
+    heights_m: Array
+    first: NDArray[np.int64]
+    columns: int
+
+    def under(self, *, first: NDArray[np.int64], shape: tuple[int, int]) -> Array:
+        """Return (H, W) metres: the height under each column of a grid whose first has these x and y keys."""
+        (x, y), (height, width) = first - self.first, shape
+        by_row = _between(self.heights_m, (np.arange(y, y + height) + 0.5) / self.columns - 0.5)
+        return _between(by_row.T, (np.arange(x, x + width) + 0.5) / self.columns - 0.5).T
+
+
+def _between(values: Array, places: Array) -> Array:
+    """Return the rows at fractional places; beyond the first and the last row these go on."""
+    places = np.clip(places, 0.0, len(values) - 1.0)
+    below = np.minimum(places.astype(np.int64), max(len(values) - 2, 0))
+    share = (places - below)[:, np.newaxis]
+    above = np.minimum(below + 1, len(values) - 1)
+    found: Array = values[below] * (1.0 - share) + values[above] * share
+    return found
+
+
 def ground_heights(
     octree: OctreeMap, *, first: NDArray[np.int64], shape: tuple[int, int], floor_z_m: float
 ) -> Array:
@@ -33,18 +64,34 @@ def ground_heights(
         shape: H, W.
         floor_z_m: Height of the floor that the ground is followed from, near x = y = 0.
     """
+    lowest = lowest_occupied(octree, first=first, shape=shape)
+    ground = find_ground(lowest, first=first, resolution_m=octree.resolution_m, floor_z_m=floor_z_m)
+    return ground.under(first=first, shape=shape)
+
+
+def lowest_occupied(
+    octree: OctreeMap, *, first: NDArray[np.int64], shape: tuple[int, int]
+) -> NDArray[np.int32]:
+    """Return (H, W) tops of each column's lowest occupied voxel, in voxels above z = 0.
+
+    Where nothing is occupied stands a number larger than any, so the minimum joins several maps.
+    """
     lowest = np.full(shape, _NOTHING, dtype=np.int32)
     slots = octree.blocks.sorted_slots()
     codes = octree.blocks.codes[slots]
-    first = np.asarray(first, dtype=np.int64)
     _lowest_occupied(codes, slots, octree.blocks.table.values, octree.occupied_log_odds, first, lowest)
-    columns = max(1, round(_CELL_M / octree.resolution_m))
-    low_m = _cells(lowest, columns) * octree.resolution_m
+    return lowest
+
+
+def find_ground(
+    lowest: NDArray[np.int32], *, first: NDArray[np.int64], resolution_m: float, floor_z_m: float
+) -> Ground:
+    """Return the ground below what ``lowest_occupied`` found; see ``ground_heights``."""
+    columns = max(1, round(_CELL_M / resolution_m))
+    low_m = _cells(lowest, columns) * resolution_m
     origin = (KEY_ZERO - first[::-1]) // columns
-    heights_m = _followed(low_m, origin, floor_z_m, max_step_m=_MAX_SLOPE * columns * octree.resolution_m)
-    padded = (heights_m.shape[1] * columns, heights_m.shape[0] * columns)
-    smooth: Array = cv2.resize(heights_m, padded, interpolation=cv2.INTER_LINEAR)
-    return smooth[: shape[0], : shape[1]]
+    heights_m = _followed(low_m, origin, floor_z_m, max_step_m=_MAX_SLOPE * columns * resolution_m)
+    return Ground(heights_m, first, columns)
 
 
 @njit(cache=True, nogil=True)

@@ -19,6 +19,7 @@ from mapper.octree.levels import Parent
 from mapper.octree.nearest import Nearest, nearest_occupied
 from mapper.octree.seen_through import SeenThrough
 from mapper.octree.sight import Sight
+from mapper.octree.summing import Overlap, add_blocks
 from mapper.octree.tree_reader import TreeLeaves, fill
 
 
@@ -285,6 +286,35 @@ class OctreeMap:
         blocks, voxels = np.nonzero(known)
         self.blocks.table.values[slots[blocks], voxels] = values
         self._known = len(values)
+
+    def add(self, other: "OctreeMap", *, slots: NDArray[np.int64] | None = None) -> Overlap:
+        """Add the log-odds of an independent map voxel by voxel: Bayes' rule with a prior of 0.5.
+
+        Attributes are added as well if this map has any. Log-odds may leave the sensor model's limits; call
+        ``clamp`` after the last map.
+
+        Args:
+            other: A map of the same resolution; with attributes if this one has them.
+            slots: Of its blocks those that are added; None adds all.
+
+        Raises:
+            MapSizeError: The map would be too large; it has not changed then.
+        """
+        slots = other.blocks.sorted_slots() if slots is None else slots
+        own = self.blocks.claim(other.blocks.codes[slots])
+        if self.attributes is not None and other.attributes is not None:
+            self.attributes.add_layer(other.attributes, slots, own)
+        born, overlap = add_blocks(
+            self.blocks.table.values, own, other.blocks.table.values, slots, self.occupied_log_odds
+        )
+        self._known += born
+        return Overlap(*overlap)
+
+    def clamp(self) -> None:
+        """Bring all log-odds back between the sensor model's limits."""
+        sensor = self._sensor()
+        values = self.blocks.table.values[: len(self.blocks)]
+        np.clip(values, sensor.lowest, sensor.highest, out=values)
 
     def leaves(self, *, depth: int = KEY_BITS, parent: Parent = "max") -> Leaves:
         """Return every known voxel, in Morton order: the order does not depend on that of the scans.

@@ -1,5 +1,6 @@
 """OctoMap's files: ``.bt`` (free or occupied) and ``.ot`` (log-odds), byte for byte as the C++ library's."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,10 +16,12 @@ from mapper.octree.color_tree import COLOR_NODE, colored
 from mapper.octree.keys import KEY_BITS
 from mapper.octree.map import OctreeMap, log_odds
 from mapper.octree.map_file import MAGIC, parse_map
-from mapper.octree.tree import NODE, nodes_in_preorder, words_in_preorder
+from mapper.octree.tree import NODE, children_in, nodes_in_preorder, words_in_preorder
 
 _FULL = b"# Octomap OcTree file"
 _BINARY = b"# Octomap OcTree binary file"
+LEAF_ROOT = np.zeros(1, "<u2")
+"""The words of a ``.bt`` file whose root is a leaf: it has one all the same."""
 _TREE_NAMES = {"OcTree": "OcTree", "1": "OcTree", "ColorOcTree": "ColorOcTree"}
 
 _FAULTS = {
@@ -43,26 +46,52 @@ def write_ot(path: Path, octree: OctreeMap) -> None:
     tree_name = "OcTree"
     if octree.attributes is not None and octree.attributes.has_colors:
         nodes, tree_name = colored(nodes, octree.blocks, octree.attributes), "ColorOcTree"
-    _write(path, _header_bytes(_FULL, len(nodes), octree.resolution_m, tree_name=tree_name), nodes)
+    write_tree(
+        path,
+        [nodes],
+        binary=False,
+        node_count=len(nodes),
+        resolution_m=octree.resolution_m,
+        tree_name=tree_name,
+    )
 
 
 def write_bt(path: Path, octree: OctreeMap) -> None:
     """Write the maximum-likelihood map (each voxel free or occupied) as an OcTree, pruned; atomic."""
     words, node_count = np.empty(0, np.uint16), 0
     if len(octree):
-        words, node_count = words_in_preorder(octree.blocks, octree.occupied_log_odds)
-    _write(path, _header_bytes(_BINARY, node_count, octree.resolution_m), words.astype("<u2", copy=False))
+        words, _ = words_in_preorder(octree.blocks, octree.occupied_log_odds)
+        words, node_count = words if len(words) else LEAF_ROOT, 1 + children_in(words)
+    words = words.astype("<u2", copy=False)
+    write_tree(path, [words], binary=True, node_count=node_count, resolution_m=octree.resolution_m)
 
 
-def _write(path: Path, header: bytes, payload: NDArray[np.generic]) -> None:
+def write_tree(
+    path: Path,
+    payload: Iterable[NDArray[np.generic]],
+    *,
+    binary: bool,
+    node_count: int,
+    resolution_m: float,
+    tree_name: str = "OcTree",
+) -> None:
+    """Write a tree whose nodes are there already; atomic.
+
+    Args:
+        path: File to write.
+        payload: What follows the header, piece after piece, so that a tree need not fit into memory.
+        binary: A ``.bt`` file, of words; otherwise an ``.ot`` file, of nodes.
+        node_count: How many nodes the payload describes.
+        resolution_m: Edge of a voxel.
+        tree_name: OctoMap's name for the kind of tree.
+    """
     with atomic.replacing(path) as part, part.open("wb") as file:
-        file.write(header)
-        file.write(payload.data)
+        file.write(_header_bytes(_BINARY if binary else _FULL, node_count, resolution_m, tree_name))
+        for piece in payload:
+            file.write(piece.data)
 
 
-def _header_bytes(
-    first_line: bytes, node_count: int, resolution_m: float, *, tree_name: str = "OcTree"
-) -> bytes:
+def _header_bytes(first_line: bytes, node_count: int, resolution_m: float, tree_name: str) -> bytes:
     return first_line + (
         "\n# (feel free to add / change comments, but leave the first line as it is!)\n#\n"
         f"id {tree_name}\nsize {node_count}\nres {resolution_m:g}\ndata\n"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mapper.config.octree import SliceConfig
 from mapper.errors import DataError
 from mapper.geometry import Array
-from mapper.octree.ground import ground_heights
+from mapper.octree.ground import Ground, find_ground, lowest_occupied
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap
 
@@ -63,29 +63,77 @@ def cut_slice(octree: OctreeMap, config: SliceConfig, *, floor_z_m: float = 0.0)
     Raises:
         DataError: The band is empty or nothing is known inside it.
     """
-    lowest, highest = _band(octree, config, floor_z_m)
+    first, last = block_extent(octree)
+    shape = int(last[1] - first[1]), int(last[0] - first[0])
+    ground = None
+    if config.above == "ground":
+        lowest = lowest_occupied(octree, first=first, shape=shape)
+        ground = find_ground(lowest, first=first, resolution_m=octree.resolution_m, floor_z_m=floor_z_m)
+    seen = see_band(octree, config, first=first, shape=shape, ground=ground, floor_z_m=floor_z_m)
+    return grid_of(seen, config, first=first, resolution_m=octree.resolution_m, floor_z_m=floor_z_m)
+
+
+def block_extent(octree: OctreeMap) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the (2,) x and y keys of the first column of any block, and those just after the last."""
+    keys = block_keys(octree.blocks.codes)[:, :2]
+    if not len(keys):
+        return np.full(2, KEY_ZERO), np.full(2, KEY_ZERO)
+    return keys.min(axis=0), keys.max(axis=0) + (1 << BLOCK_BITS)
+
+
+def see_band(
+    octree: OctreeMap,
+    config: SliceConfig,
+    *,
+    first: NDArray[np.int64],
+    shape: tuple[int, int],
+    ground: Ground | None,
+    floor_z_m: float,
+) -> NDArray[np.uint8]:
+    """Return (H, W) uint8 flags of what the band's voxels show in each column; ``or`` joins several maps.
+
+    Args:
+        octree: A map, or a part of one, that lies inside the grid.
+        config: Heights.
+        first: (2,) x and y keys of the column of row 0 and column 0.
+        shape: H, W.
+        ground: What the band follows; None if it is level.
+        floor_z_m: Height of the floor in the world.
+
+    Raises:
+        DataError: The band has no voxels.
+    """
+    lowest, highest = _band(config, octree.resolution_m, floor_z_m)
     slots = octree.blocks.sorted_slots()
     codes = octree.blocks.codes[slots]
-    keys = block_keys(codes)
-    if config.above == "floor":
-        inside = (keys[:, 2] + (1 << BLOCK_BITS) > lowest) & (keys[:, 2] <= highest)
-        codes, slots, keys = codes[inside], slots[inside], keys[inside]
-    if len(codes):
-        first, last = keys.min(axis=0), keys.max(axis=0) + (1 << BLOCK_BITS)
-        seen = np.zeros((last[1] - first[1], last[0] - first[0]), dtype=np.uint8)
-        bases = _bases(octree, config, first=first[:2], shape=seen.shape, floor_z_m=floor_z_m)
-        _flatten(
-            codes,
-            slots,
-            octree.blocks.table.values,
-            octree.occupied_log_odds,
-            first,
-            lowest,
-            highest,
-            bases,
-            seen,
-        )
-    if not len(codes) or not seen.any():
+    bases = np.zeros(shape, dtype=np.int64)
+    if ground is None:
+        z = block_keys(codes)[:, 2]
+        inside = (z + (1 << BLOCK_BITS) > lowest) & (z <= highest)
+        codes, slots = codes[inside], slots[inside]
+    else:
+        heights_m = ground.under(first=first, shape=shape) - floor_z_m
+        bases += np.rint(heights_m / octree.resolution_m).astype(np.int64)
+    seen = np.zeros(shape, dtype=np.uint8)
+    values, threshold = octree.blocks.table.values, octree.occupied_log_odds
+    _flatten(codes, slots, values, threshold, first, lowest, highest, bases, seen)
+    return seen
+
+
+def grid_of(
+    seen: NDArray[np.uint8],
+    config: SliceConfig,
+    *,
+    first: NDArray[np.int64],
+    resolution_m: float,
+    floor_z_m: float,
+) -> OccupancyGrid:
+    """Return what ``see_band`` saw as a grid just large enough for it.
+
+    Raises:
+        DataError: Nothing was seen.
+    """
+    if not seen.any():
         raise DataError(
             f"slice: nothing is known {config.min_height_m:g} to {config.max_height_m:g} m above the floor "
             f"at z = {floor_z_m:g} m; set slice.min_height_m and slice.max_height_m to where the map is"
@@ -98,37 +146,21 @@ def cut_slice(octree: OctreeMap, config: SliceConfig, *, floor_z_m: float = 0.0)
     cells[seen & _SEEN_FREE != 0] = FREE
     cells[seen & _SEEN_OCCUPIED != 0] = OCCUPIED
     corner = np.array([first[0] + columns[0], first[1] + rows[0]]) - KEY_ZERO
-    return OccupancyGrid(cells, corner * octree.resolution_m, octree.resolution_m)
+    return OccupancyGrid(cells, corner * resolution_m, resolution_m)
 
 
-def _band(octree: OctreeMap, config: SliceConfig, floor_z_m: float) -> tuple[int, int]:
+def _band(config: SliceConfig, resolution_m: float, floor_z_m: float) -> tuple[int, int]:
     """Return the lowest and the highest z key whose voxel centres lie in the band."""
     bottom_m, top_m = floor_z_m + config.min_height_m, floor_z_m + config.max_height_m
     # The allowance keeps a centre that lies on the edge, as 0.075 m at 5 cm, from hanging on a rounding.
-    lowest = int(np.ceil(bottom_m / octree.resolution_m - 0.5 - 1e-9)) + KEY_ZERO
-    highest = int(np.floor(top_m / octree.resolution_m - 0.5 + 1e-9)) + KEY_ZERO
+    lowest = int(np.ceil(bottom_m / resolution_m - 0.5 - 1e-9)) + KEY_ZERO
+    highest = int(np.floor(top_m / resolution_m - 0.5 + 1e-9)) + KEY_ZERO
     if lowest > highest:
         raise DataError(
-            f"slice: no voxel of {octree.resolution_m:g} m has its centre {config.min_height_m:g} to "
+            f"slice: no voxel of {resolution_m:g} m has its centre {config.min_height_m:g} to "
             f"{config.max_height_m:g} m above the floor; raise slice.max_height_m"
         )
     return lowest, highest
-
-
-def _bases(
-    octree: OctreeMap,
-    config: SliceConfig,
-    *,
-    first: NDArray[np.int64],
-    shape: tuple[int, ...],
-    floor_z_m: float,
-) -> NDArray[np.int64]:
-    """Return (H, W) by how many voxels the band is raised in each column."""
-    bases = np.zeros(shape, dtype=np.int64)
-    if config.above == "ground":
-        ground_m = ground_heights(octree, first=first, shape=(shape[0], shape[1]), floor_z_m=floor_z_m)
-        bases += np.rint((ground_m - floor_z_m) / octree.resolution_m).astype(np.int64)
-    return bases
 
 
 @njit(cache=True, nogil=True)

@@ -28,12 +28,14 @@ _FREE, _OCCUPIED, _INNER = 1, 2, 3
 
 
 class UpperNodes(NamedTuple):
-    """Nodes of depths 13 … 0, level after level, each level in Morton order; the root comes last.
+    """Nodes from the tops of subtrees up to the root, level after level, each in Morton order.
+
+    Subtrees are blocks, whose tops have depth 13, or larger tiles.
 
     Attributes:
-        nodes: (M,) NODE; the first B are the tops of the blocks.
-        first_children: (M,) int64 index of the lowest child, which the others follow; −1 for a block.
-        starts: (B + 1,) int64 where each block's part begins and the last one ends.
+        nodes: (M,) NODE; the first B are the tops, the last is the root.
+        first_children: (M,) int64 index of the lowest child, which the others follow; −1 for a top.
+        starts: (B + 1,) int64 where each subtree's part begins and the last one ends.
     """
 
     nodes: NDArray[np.void]
@@ -41,43 +43,71 @@ class UpperNodes(NamedTuple):
     starts: NDArray[np.int64]
 
 
-def nodes_in_preorder(store: BlockStore) -> NDArray[np.void]:
-    """Return (N,) NODE, the payload of an ``.ot`` file; the store has at least one block."""
+def nodes_in_preorder(store: BlockStore, *, root_depth: int = 0) -> NDArray[np.void]:
+    """Return (N,) NODE, the payload of an ``.ot`` file; the store has at least one block.
+
+    Args:
+        store: The blocks.
+        root_depth: Depth of a node above all blocks that takes the root's place; it is listed first.
+    """
     slots = store.sorted_slots()
     parts, starts = np.empty(len(slots) * _PYRAMID, NODE), np.zeros(len(slots) + 1, np.int64)
     _write_nodes(store.table.values, slots, parts, starts)
-    upper = _upper_nodes(store.codes[slots], parts[starts[:-1]], starts)
+    upper = upper_nodes(store.codes[slots], parts[starts[:-1]], starts, levels=BLOCK_DEPTH - root_depth)
     payload = np.empty(starts[-1] + len(upper.nodes), NODE)
     return payload[: _assemble_nodes(upper, parts, payload)]
 
 
-def words_in_preorder(store: BlockStore, threshold: np.float32) -> tuple[NDArray[np.uint16], int]:
-    """Return (W,) uint16, the payload of a ``.bt`` file, and how many nodes it describes.
+def words_in_preorder(
+    store: BlockStore, threshold: np.float32, *, root_depth: int = 0
+) -> tuple[NDArray[np.uint16], np.void]:
+    """Return (W,) uint16, a word for each inner node as a ``.bt`` file lists them, and the root's NODE.
 
     Args:
         store: Has at least one block.
         threshold: Log-odds from which a voxel is occupied.
+        root_depth: Depth of a node above all blocks that takes the root's place.
     """
     slots = store.sorted_slots()
     parts, starts = np.empty(len(slots) * _WORDS, np.uint16), np.zeros(len(slots) + 1, np.int64)
     tops = np.empty(len(slots), NODE)
     _write_words(store.table.values, slots, threshold, parts, starts, tops)
-    upper = _upper_nodes(store.codes[slots], tops, starts)
+    upper = upper_nodes(store.codes[slots], tops, starts, levels=BLOCK_DEPTH - root_depth)
     payload = np.zeros(starts[-1] + len(upper.nodes), np.uint16)
-    payload = payload[: max(_assemble_words(upper, parts, payload), 1)]  # the root has a word even as a leaf
-    children = (payload | (payload >> 1)) & 0x5555
-    return payload, 1 + int(np.bitwise_count(children).sum(dtype=np.int64))
+    return payload[: _assemble_words(upper, parts, payload)], upper.nodes[-1]
 
 
-def _upper_nodes(codes: NDArray[np.int64], tops: NDArray[np.void], starts: NDArray[np.int64]) -> UpperNodes:
-    levels = [(codes, tops, np.full(len(codes), -1))]
+def children_in(words: NDArray[np.uint16]) -> int:
+    """Return how many nodes the words of a ``.bt`` file describe: all but the root."""
+    return int(np.bitwise_count((words | (words >> 1)) & 0x5555).sum(dtype=np.int64))
+
+
+def upper_nodes(
+    codes: NDArray[np.int64], tops: NDArray[np.void], starts: NDArray[np.int64], *, levels: int
+) -> UpperNodes:
+    """Return the nodes above subtrees that all have their tops at one depth.
+
+    Args:
+        codes: (B,) increasing Morton codes of the tops, at their own depth.
+        tops: (B,) NODE.
+        starts: (B + 1,) where each subtree's part of a payload begins.
+        levels: How far up the root is.
+    """
+    above = [(codes, tops, np.full(len(codes), -1))]
     first = 0
-    for _ in range(BLOCK_DEPTH):
-        codes, nodes, _ = levels[-1]
-        levels.append(_parents(codes, nodes, first))
+    for _ in range(levels):
+        codes, nodes, _ = above[-1]
+        above.append(_parents(codes, nodes, first))
         first += len(codes)
-    nodes, first_children = (np.concatenate([level[i] for level in levels]) for i in (1, 2))
+    nodes, first_children = (np.concatenate([level[i] for level in above]) for i in (1, 2))
     return UpperNodes(nodes, first_children, starts)
+
+
+def word_of(upper: UpperNodes, node: int) -> NDArray[np.uint16]:
+    """Return the (1,) uint16 word of an upper node that has children."""
+    word = np.empty(1, np.uint16)
+    _write_upper_word(upper, node, word, 0, np.empty(8, np.float32), np.empty(8, np.uint8))
+    return word
 
 
 @njit(cache=True, nogil=True)
@@ -242,12 +272,18 @@ def _assemble_words(upper, parts, payload):
                 payload[at] = parts[i]
                 at += 1
         elif upper.nodes[node].mask:
-            values[:], masks[:] = np.nan, 0
-            child = upper.first_children[node]
-            for i in range(8):
-                if (upper.nodes[node].mask >> i) & 1:
-                    values[i], masks[i] = upper.nodes[child].value, upper.nodes[child].mask
-                    child += 1
-            at = _write_word(payload, at, values, masks, 0)
+            at = _write_upper_word(upper, node, payload, at, values, masks)
             top = _push_children(upper, node, stack, top)
     return at
+
+
+@njit(cache=True, nogil=True)
+def _write_upper_word(upper, node, payload, at, values, masks):
+    """Write the word of a node above the blocks; ``values`` and ``masks`` (8,) are scratch."""
+    values[:], masks[:] = np.nan, 0
+    child = upper.first_children[node]
+    for i in range(8):
+        if (upper.nodes[node].mask >> i) & 1:
+            values[i], masks[i] = upper.nodes[child].value, upper.nodes[child].mask
+            child += 1
+    return _write_word(payload, at, values, masks, 0)
