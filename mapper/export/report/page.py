@@ -8,9 +8,9 @@ from itertools import starmap
 from pathlib import Path
 from typing import Any
 
-from mapper import __version__
 from mapper.atomic import write_text
 from mapper.errors import ConfigError
+from mapper.export.html import document, section
 from mapper.export.report.data import Chapter, drawn, residual_unit, views_uri
 
 _CURVES = (
@@ -21,10 +21,6 @@ _CURVES = (
     ("ms", "Time to track each frame", "ms"),
 )
 _HINT = '<p class="hint">Drag to zoom in, double-click to see all again.</p>'
-_POLICY = (
-    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
-    "base-uri 'none'; form-action 'none'"
-)
 
 
 def write_report(path: Path, chapters: Sequence[Chapter]) -> None:
@@ -47,37 +43,24 @@ def page_of(chapters: Sequence[Chapter]) -> str:
     ours = resources.files("mapper.export.report")
     title = " · ".join(chapter.name for chapter in chapters)
     data = json.dumps([drawn(chapter) for chapter in chapters], allow_nan=False, separators=(",", ":"))
-    return "\n".join(
-        [
-            "<!DOCTYPE html>",
-            '<html lang="en">',
-            "<head>",
-            '<meta charset="utf-8">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f'<meta http-equiv="Content-Security-Policy" content="{escape(_POLICY, quote=False)}">',
-            f"<title>{escape(title)} – mapper report</title>",
-            f"<style>\n{(ours / 'page.css').read_text(encoding='utf-8')}</style>",
-            "</head>",
-            "<body>",
-            _header(chapters),
-            "<main>",
-            _section("Summary", _table(["", *_names(chapters)], _figures(chapters))),
-            _section("Plans", _HINT + _columns(starmap(_plan, enumerate(chapters)))),
-            _section("Over time", _curves(chapters)),
-            _section("Loops", "".join(starmap(_loops, enumerate(chapters)))),
-            _section("Views", _columns(starmap(_views, enumerate(chapters)))),
-            _section("Timing", _table(["", *_names(chapters)], _side_by_side(chapters, _timing))),
-            _section("Versions", _table(["", *_names(chapters)], _side_by_side(chapters, _versions))),
-            _section("Configuration", _settings(chapters)),
-            "</main>",
-            f"<footer>mapper {escape(__version__)}</footer>",
+    return document(
+        f"{title} – mapper report",
+        header=_header(chapters),
+        main=[
+            section("Summary", _table(["", *_names(chapters)], _figures(chapters))),
+            section("Plans", _HINT + _columns(starmap(_plan, enumerate(chapters)))),
+            section("Over time", _curves(chapters)),
+            section("Loops", "".join(starmap(_loops, enumerate(chapters)))),
+            section("Views", _columns(starmap(_views, enumerate(chapters)))),
+            section("Timing", _table(["", *_names(chapters)], _side_by_side(chapters, _timing))),
+            section("Versions", _table(["", *_names(chapters)], _side_by_side(chapters, _versions))),
+            section("Configuration", _settings(chapters)),
+        ],
+        scripts=[
             # Nothing inside a script element ends it but its end tag.
             f'<script type="application/json" id="data">{data.replace("<", chr(92) + "u003c")}</script>',
             f"<script>\n{(ours / 'page.js').read_text(encoding='utf-8')}</script>",
-            "</body>",
-            "</html>",
-            "",
-        ]
+        ],
     )
 
 
@@ -87,11 +70,7 @@ def _header(chapters: Sequence[Chapter]) -> str:
         f" <small>{escape(chapter.run.manifest.input.title)}</small></label>"
         for i, chapter in enumerate(chapters)
     )
-    return f'<header><h1>mapper report</h1><div class="runs">{boxes}</div></header>'
-
-
-def _section(title: str, body: str) -> str:
-    return f'<section id="{title.lower().replace(" ", "-")}"><h2>{escape(title)}</h2>{body}</section>'
+    return f'<h1>mapper report</h1><div class="runs">{boxes}</div>'
 
 
 def _columns(cells: Iterable[str]) -> str:
