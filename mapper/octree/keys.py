@@ -66,6 +66,13 @@ def morton(x, y, z):
     return spread(x) | (spread(y) << 1) | (spread(z) << 2)
 
 
+def codes_of_blocks(blocks: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the (B,) Morton codes of (B, 3) blocks, counted from the lowest there can be."""
+    x, y, z = (spread.py_func(blocks[:, axis]) for axis in range(3))
+    codes: NDArray[np.int64] = x | (y << 1) | (z << 2)
+    return codes
+
+
 @njit(cache=True, nogil=True)
 def codes_of(points_world, resolution_m):
     """Return the (N,) int64 Morton codes of (N, 3) float64 points, metres; −1 is out of range."""
