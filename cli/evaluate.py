@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from evaluators.evaluate import Judged
     from evaluators.metric import Metric
+    from mapper.run import Run
+    from mapper.timebase import Stamps
     from mapper.trajectory import Trajectory
 
 
@@ -15,50 +18,144 @@ class Align(StrEnum):
     """How the estimate is laid over the truth first."""
 
     NONE = "none"
+    YAW = "yaw"
     SE3 = "se3"
     SIM3 = "sim3"
 
 
+class Format(StrEnum):
+    """How the numbers are printed."""
+
+    TEXT = "text"
+    MARKDOWN = "markdown"
+    CSV = "csv"
+    JSON = "json"
+
+
 def evaluate(
-    estimate: Annotated[Path, typer.Argument(metavar="RUN|TRAJECTORY", help="Run folder or TUM trajectory.")],
+    estimate: Annotated[
+        Path, typer.Argument(metavar="RUN|TRAJECTORY", help="Run folder, or TUM or KITTI trajectory.")
+    ],
     truth: Annotated[
-        Path | None, typer.Option(help="TUM trajectory of the truth; omit for the run's own.")
+        Path | None, typer.Option(help="TUM or KITTI trajectory of the truth; omit for the run's own.")
     ] = None,
-    align: Annotated[Align, typer.Option(help="How the estimate is laid over the truth.")] = Align.SE3,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON, every digit, angles in radians.")] = False,
+    times: Annotated[
+        Path | None, typer.Option(help="Seconds, one a line, of poses in KITTI text; else they pair by line.")
+    ] = None,
+    log: Annotated[
+        Path | None, typer.Option(help="Log of a bare trajectory, to tell which of its frames have a pose.")
+    ] = None,
+    align: Annotated[
+        Align, typer.Option(help="How the estimate is laid over the truth; yaw is for worlds with z up.")
+    ] = Align.SE3,
+    lengths: Annotated[
+        str | None,
+        typer.Option(metavar="M,M…", help="Lengths of the relative errors' segments; omit to suit the path."),
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder to draw the errors into.")] = None,
+    format_: Annotated[
+        Format,
+        typer.Option("--format", help="csv and json have every digit and each length, angles in radians."),
+    ] = Format.TEXT,
+    json: Annotated[bool, typer.Option("--json", help="Short for --format json.")] = False,
 ) -> None:
-    """Print ATE and RPE as the TUM benchmark defines them, which loops are right, and the end's offset.
+    """Print ATE, RPE and relative errors as the benchmarks define them, coverage, and which loops are right.
 
-    Example: mapper eval runs/xyz --align sim3, or: mapper eval estimate.tum --truth groundtruth.txt
+    Example: mapper eval runs/xyz --align yaw --plot plots, or: mapper eval 00.txt --truth poses/00.txt
     """
-    from evaluators.evaluate import evaluate as evaluate_trajectory
-    from evaluators.metric import json_text, text_table
+    from evaluators.evaluate import ALIGNED, judged
 
-    trajectory, known = _trajectories(estimate, truth)
-    names = (str(estimate), str(truth) if truth else "its truth")
-    metrics = evaluate_trajectory(trajectory, known, alignment=align.value, names=names)
-    if estimate.is_dir() and known is not None:
-        metrics += _loops_of(estimate, known)
-    print(json_text(metrics) if json else text_table(metrics))
+    run, trajectory, known = _loaded(estimate, truth, times)
+    found = judged(
+        trajectory,
+        known,
+        alignment=align.value,
+        frames_ns=_frames_ns(run, log),
+        lengths_m=None if lengths is None else _numbers(lengths),
+        names=(str(estimate), str(truth) if truth else "its truth"),
+    )
+    metrics = list(found.metrics)
+    if run is not None and known is not None:
+        metrics += _loops_of(run, known)
+    if plot is not None:
+        from evaluators.plots import write_trajectory_errors
+
+        write_trajectory_errors(plot, found, title=f"{estimate.resolve().name}, {ALIGNED[align.value]}")
+    print(_text(metrics, found, Format.JSON if json else format_))
 
 
-def _loops_of(path: Path, truth: "Trajectory") -> "list[Metric]":
+def _loaded(
+    estimate: Path, truth: Path | None, times: Path | None
+) -> "tuple[Run | None, Trajectory, Trajectory | None]":
+    from evaluators.poses import is_kitti, read_poses
+    from mapper.errors import DataError
+    from mapper.run import load_run
+
+    untimed = [path for path in (estimate, truth) if path and path.is_file() and is_kitti(path)]
+    if times is not None and not untimed:
+        raise DataError(f"{times}: --times is for poses in KITTI text, which neither file is")
+    if times is None and len(untimed) == 1 and truth is not None:
+        raise DataError(f"{untimed[0]}: KITTI text has no stamps to pair poses by; tell them with --times")
+    known = read_poses(truth, times=times) if truth else None
+    if estimate.is_file():
+        return None, read_poses(estimate, times=times), known
+    run = load_run(estimate)
+    return run, run.trajectory(), known or run.truth()
+
+
+def _frames_ns(run: "Run | None", log: Path | None) -> "Stamps | None":
+    import numpy as np
+
+    from mapper.config import load_source_config
+    from mapper.errors import DataError
+    from mapper.sources import open_source
+
+    if run is not None:
+        if log is not None:
+            raise DataError(f"{log}: --log is for bare trajectories; {run.path} knows the frames of its log")
+        return np.array([record.stamp_ns for record in run.records()], dtype=np.int64)
+    if log is None:
+        return None
+    source = open_source(log, load_source_config(None, []))
+    return np.array([entry.stamp_ns for entry in source.entries()], dtype=np.int64)
+
+
+def _numbers(text: str) -> list[float]:
+    from mapper.errors import DataError
+
+    try:
+        return [float(word) for word in text.split(",")]
+    except ValueError:
+        raise DataError(f"--lengths {text}: want metres with commas between, as in 1,2,5") from None
+
+
+def _loops_of(run: "Run", truth: "Trajectory") -> "list[Metric]":
     from evaluators.loops import loop_metrics
-    from mapper.run import KEYFRAMES, load_run
+    from mapper.run import KEYFRAMES
     from mapper.trajectory import read_tum
 
-    run = load_run(path)
     loops = run.config.loops
     looked_every_m = loops.min_motion_m if loops.kind == "scans" else 0.0
-    keyframes_ns = read_tum(path / KEYFRAMES).stamps_ns
+    keyframes_ns = read_tum(run.path / KEYFRAMES).stamps_ns
     return loop_metrics(run.loops(), keyframes_ns, truth, looked_every_m=looked_every_m)
 
 
-def _trajectories(estimate: Path, truth: Path | None) -> "tuple[Trajectory, Trajectory | None]":
-    from mapper.run import load_run
-    from mapper.trajectory import read_tum
+def _text(metrics: "list[Metric]", found: "Judged", format_: Format) -> str:
+    from dataclasses import asdict
 
-    if estimate.is_file():
-        return read_tum(estimate), read_tum(truth) if truth else None
-    run = load_run(estimate)
-    return run.trajectory(), read_tum(truth) if truth else run.truth()
+    from evaluators import metric, tables
+    from evaluators.segments import LENGTH_COLUMNS, length_records, segment_metrics
+
+    if format_ in (Format.JSON, Format.CSV):
+        if len(found.lengths) > 1:
+            metrics = metrics + [one for length in found.lengths for one in segment_metrics([length])]
+        if format_ is Format.JSON:
+            return metric.json_text(metrics)
+        return tables.csv_text([asdict(one) for one in metrics]).rstrip("\n")
+    of_metrics, of_records = (
+        (metric.text_table, tables.text_table)
+        if format_ is Format.TEXT
+        else (metric.markdown_table, tables.markdown_table)
+    )
+    records = length_records(found.lengths)
+    return "\n\n".join([of_metrics(metrics), *([of_records(LENGTH_COLUMNS, records)] if records else [])])

@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass
 
 from mapper.errors import DataError
 
+_DEGREES = {"rad": "°", "rad/m": "°/m"}
+
 
 @dataclass(frozen=True, slots=True)
 class Metric:
@@ -53,8 +55,8 @@ def json_text(metrics: Sequence[Metric]) -> str:
 
 def shown(metric: Metric) -> tuple[str, str, str]:
     """Degrees exist only here, on the screen."""
-    if metric.unit == "rad":
-        return metric.name, f"{math.degrees(metric.value):.6g}", "°"
+    if metric.unit in _DEGREES:
+        return metric.name, f"{math.degrees(metric.value):.6g}", _DEGREES[metric.unit]
     if isinstance(metric.value, int):
         return metric.name, str(metric.value), metric.unit
     return metric.name, f"{metric.value:.6g}", metric.unit

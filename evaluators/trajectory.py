@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.errors import DataError
-from mapper.geometry import Array, Transform, angle_between, fit_rigid
+from mapper.geometry import Array, Points, Transform, angle_between, fit_rigid, rotation_exp, transform
 from mapper.timebase import NS_PER_S, Stamps, nearest
 from mapper.trajectory import Trajectory, start_to_end
 
-AlignmentKind = Literal["none", "se3", "sim3"]
+AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 DeltaUnit = Literal["frames", "m", "s"]
 
 _DELTA_TOLERANCE_RATIO = 0.1
@@ -122,7 +122,9 @@ def associate(
 def align(matched: Matched, kind: AlignmentKind) -> Similarity:
     """Return what lays the estimate over the truth with the least squared distance of positions.
 
-    "none" moves nothing, "se3" fits a rigid motion (Arun et al. 1987), "sim3" a scale as well (Umeyama 1991).
+    "none" moves nothing; "yaw" shifts, and turns about z (Zhang & Scaramuzza 2018), which is all that is open
+    where z is up in both worlds; "se3" fits a rigid motion (Arun et al. 1987), "sim3" a scale as well
+    (Umeyama 1991).
 
     Raises:
         DataError: Fewer than three pairs for a fit.
@@ -131,10 +133,19 @@ def align(matched: Matched, kind: AlignmentKind) -> Similarity:
         return Similarity(np.eye(4))
     if len(matched) < 3:
         raise DataError(f"{len(matched)} matched poses: an alignment by {kind} needs 3; align by none")
-    T_truth_map, scale = fit_rigid(
-        matched.T_truth_body[:, :3, 3], matched.T_map_body[:, :3, 3], with_scale=kind == "sim3"
-    )
-    return Similarity(T_truth_map, scale)
+    positions_truth, positions_map = matched.T_truth_body[:, :3, 3], matched.T_map_body[:, :3, 3]
+    if kind == "yaw":
+        return Similarity(_fit_yaw(positions_truth, positions_map))
+    return Similarity(*fit_rigid(positions_truth, positions_map, with_scale=kind == "sim3"))
+
+
+def _fit_yaw(target: Points, source: Points) -> Transform:
+    """Return the shift and turn about z that take (N, 3) points to their partners with least squares."""
+    target_mean, source_mean = target.mean(axis=0), source.mean(axis=0)
+    covariance = (target - target_mean).T @ (source - source_mean)
+    sine, cosine = covariance[1, 0] - covariance[0, 1], covariance[0, 0] + covariance[1, 1]
+    R = rotation_exp(np.array([0.0, 0.0, np.arctan2(sine, cosine)]))
+    return transform(R, target_mean - R @ source_mean)
 
 
 def ate(matched: Matched) -> Statistics:
@@ -142,7 +153,7 @@ def ate(matched: Matched) -> Statistics:
 
     The pairs are compared as they are; lay the estimate over the truth first.
     """
-    return _statistics(_lengths(matched.T_map_body[:, :3, 3] - matched.T_truth_body[:, :3, 3]))
+    return statistics(_lengths(matched.T_map_body[:, :3, 3] - matched.T_truth_body[:, :3, 3]))
 
 
 def rpe(matched: Matched, *, delta: float = 1.0, unit: DeltaUnit = "frames") -> RelativeErrors:
@@ -153,8 +164,8 @@ def rpe(matched: Matched, *, delta: float = 1.0, unit: DeltaUnit = "frames") -> 
     """
     translation_m, rotation_rad = step_errors(matched, delta=delta, unit=unit)
     return RelativeErrors(
-        translation_m=_statistics(translation_m),
-        rotation_rad=_statistics(rotation_rad),
+        translation_m=statistics(translation_m),
+        rotation_rad=statistics(rotation_rad),
         pairs=len(translation_m),
     )
 
@@ -171,11 +182,16 @@ def step_errors(matched: Matched, *, delta: float, unit: DeltaUnit) -> tuple[Arr
     """
     if not delta > 0.0:
         raise DataError(f"RPE over {delta} {unit}: the step must be > 0")
-    i, j = _steps(_progress(matched, unit), delta, 0.0 if unit == "frames" else _DELTA_TOLERANCE_RATIO)
+    i, j = _steps(progress_of(matched, unit), delta, 0.0 if unit == "frames" else _DELTA_TOLERANCE_RATIO)
     if not len(i):
         raise DataError(
             f"RPE over {delta:g} {unit}: no two of the {len(matched)} matched poses are that far apart"
         )
+    return motion_errors(matched, i, j)
+
+
+def motion_errors(matched: Matched, i: NDArray[np.intp], j: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Return how wrong the motions from poses i to poses j are, metres and radians, (N,) each."""
     T_true = _relative(matched.T_truth_body[i], matched.T_truth_body[j])
     T_estimated = _relative(matched.T_map_body[i], matched.T_map_body[j])
     T_error = _relative(T_true, T_estimated)
@@ -197,8 +213,11 @@ def start_end_offset(trajectory: Trajectory) -> Offset:
     )
 
 
-def _progress(matched: Matched, unit: DeltaUnit) -> Array:
-    """Return (N,) how far along the log every pose is, in the unit; it never decreases."""
+def progress_of(matched: Matched, unit: DeltaUnit) -> Array:
+    """Return (N,) how far along the log every pose is, in the unit; it never decreases.
+
+    Metres are those of the true path, so that every estimate is judged over the same stretches.
+    """
     if unit == "frames":
         return np.arange(len(matched), dtype=np.float64)
     if unit == "s":
@@ -246,7 +265,8 @@ def _lengths(vectors: Array) -> Array:
     return lengths
 
 
-def _statistics(errors: Array) -> Statistics:
+def statistics(errors: Array) -> Statistics:
+    """Return what (N ≥ 1,) errors come to."""
     return Statistics(
         rmse=float(np.sqrt(np.mean(errors**2))),
         mean=float(errors.mean()),

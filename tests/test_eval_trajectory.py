@@ -9,7 +9,7 @@ from evo.core.trajectory import PoseTrajectory3D
 from evaluators.evaluate import evaluate
 from evaluators.trajectory import Matched, align, associate, ate, rpe, start_end_offset
 from mapper.errors import DataError
-from mapper.geometry import exp, inverse, transform
+from mapper.geometry import exp, inverse, rotation_exp, transform
 from mapper.trajectory import Trajectory, read_kitti, read_tum, write_tum
 
 SHARED = Path(__file__).parents[2] / "shared"
@@ -207,6 +207,37 @@ def test_the_alignment_is_stated_and_scale_only_where_it_was_fitted():
         names = [metric.name for metric in evaluate(half, truth, alignment=kind)]
         assert stated in names
         assert "scale of the estimate" not in names
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_yaw_alignment_is_the_best_of_all_turns_about_z(seed):
+    truth = walk(80, seed=seed)
+    matched = associate(shaken(truth, seed=seed + 20), truth)
+    positions, true = matched.T_map_body[:, :3, 3], matched.T_truth_body[:, :3, 3]
+
+    def rmse(yaw_rad):
+        R = rotation_exp(np.array([0.0, 0.0, yaw_rad]))
+        misses = (true - true.mean(axis=0)) - (positions - positions.mean(axis=0)) @ R.T
+        return np.sqrt((misses**2).sum(axis=1).mean())
+
+    T_truth_map = align(matched, "yaw").T_truth_map
+    found = ate(align(matched, "yaw").moved(matched)).rmse
+
+    np.testing.assert_allclose(T_truth_map[2, :3], [0.0, 0.0, 1.0], atol=1e-12)
+    assert found <= min(rmse(yaw) for yaw in np.linspace(-np.pi, np.pi, 3601)) + 1e-12
+    assert found >= ate(align(matched, "se3").moved(matched)).rmse
+
+
+def test_a_level_estimate_is_laid_on_the_truth_by_yaw_alone_and_a_tilted_one_is_told():
+    truth = walk(60, seed=8)
+    T_turned = transform(rotation_exp(np.array([0.0, 0.0, 2.5])), [4.0, -3.0, 2.0])
+    level = {m.name: m.value for m in evaluate(truth.moved(T_turned), truth, alignment="yaw")}
+    assert level["ATE RMSE, yaw-aligned"] < 1e-9
+    assert level["tilt that SE(3) would add"] < 1e-6
+    tilted = truth.moved(exp(np.array([0.3, 0.0, 0.0]), np.zeros(3)))
+    values = {m.name: m.value for m in evaluate(tilted, truth, alignment="yaw")}
+    assert values["tilt that SE(3) would add"] == pytest.approx(0.3)
+    assert values["ATE RMSE, yaw-aligned"] > 0.1
 
 
 def test_an_aligned_estimate_lies_on_the_truth(tmp_path):

@@ -1,0 +1,40 @@
+"""Trajectories as people keep them: TUM text, or KITTI's with or without a list of times."""
+
+from pathlib import Path
+
+import numpy as np
+
+from mapper.sources.text import parse_stamp, rows
+from mapper.trajectory import Trajectory, read_kitti, read_tum
+
+_KITTI_COLUMNS = 12
+
+
+def is_kitti(path: Path) -> bool:
+    """Tell whether a file begins with a row-major 3×4 pose, which has no stamp.
+
+    Raises:
+        SourceError: The file cannot be read.
+    """
+    _, words = next(rows(path), (0, []))
+    return len(words) == _KITTI_COLUMNS
+
+
+def read_poses(path: Path, *, times: Path | None = None) -> Trajectory:
+    """Return a trajectory from TUM or KITTI text, whichever it is.
+
+    Args:
+        path: The poses.
+        times: Seconds, one a line, of KITTI's poses; without it pose i gets i nanoseconds, which only
+            orders them.
+
+    Raises:
+        SourceError: A file cannot be read, or a time is no number.
+        DataError: A line is malformed, or there are more or fewer times than poses.
+    """
+    if not is_kitti(path):
+        return read_tum(path)
+    if times is None:
+        return read_kitti(path)
+    stamps = [parse_stamp(words[0], where=f"{times}:{number}") for number, words in rows(times)]
+    return read_kitti(path, np.array(stamps, dtype=np.int64))

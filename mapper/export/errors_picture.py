@@ -1,0 +1,117 @@
+"""Pictures of one path's errors: where along the path, when, and over which lengths."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mapper.export.page import FAINT, INK, LINE, hex_of, save
+from mapper.export.palette import END, ESTIMATE, START, TRUTH
+from mapper.export.panels import draw_boxes, extent, page, panel, widest_axes
+from mapper.geometry import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.collections import LineCollection
+
+_COLOR_MAP = "turbo"
+_WIDTH_IN, _HEIGHT_IN = 5.6, 4.4
+
+
+def write_errors(
+    path: Path,
+    *,
+    positions: Array,
+    truth: Array,
+    elapsed: Array,
+    elapsed_name: str,
+    errors_m: Array,
+    errors_rad: Array,
+    relative_percent: Mapping[str, Array],
+    title: str,
+) -> None:
+    """Draw a path coloured by its error, its errors over time, and boxes of those over segments.
+
+    Args:
+        path: PNG file to write.
+        positions: (N, 3) metres, laid over the truth.
+        truth: (N, 3) where the body really was at the same moments.
+        elapsed: (N,) how far along the log the poses are.
+        elapsed_name: In what: "s", "poses".
+        errors_m: (N,) distances from the true positions.
+        errors_rad: (N,) angles to the true rotations.
+        relative_percent: Length in words to the (S,) errors of the translation over it, in percent of it;
+            empty where the path is too short for any.
+        title: Headline.
+    """
+    figure = page(title, columns=2, rows=2, width_in=_WIDTH_IN, height_in=_HEIGHT_IN)
+    path_axes, position_axes, length_axes, rotation_axes = (
+        panel(figure, number, columns=2, rows=2) for number in range(4)
+    )
+    path_axes.set_title("over the truth, seen from where it is widest", fontsize=9, color=INK)
+    colored = draw_path(path_axes, positions, truth=truth, errors_m=errors_m)
+    place = path_axes.inset_axes((0.6, 0.95, 0.36, 0.025))
+    bar = figure.colorbar(colored, cax=place, orientation="horizontal")
+    bar.ax.tick_params(labelsize=7, colors=FAINT)
+    bar.set_label("distance from the truth, m", fontsize=7, color=FAINT)
+    for axes, values, name in (
+        (position_axes, errors_m, "distance from the truth, m"),
+        (rotation_axes, np.degrees(errors_rad), "angle to the truth, °"),
+    ):
+        _draw_over_time(axes, elapsed, values, name=name)
+        axes.set_xlabel(elapsed_name, color=FAINT, fontsize=8)
+    if relative_percent:
+        draw_boxes(length_axes, relative_percent)
+        length_axes.set_xlabel("error of the translation over a segment, %", color=FAINT, fontsize=8)
+    else:
+        length_axes.text(0.5, 0.5, "too short a path", color=FAINT, transform=length_axes.transAxes)
+    save(figure, path)
+
+
+def draw_path(
+    axes: "Axes", positions: Array, *, truth: Array, errors_m: Array, most_m: float | None = None
+) -> "LineCollection":
+    """Draw a path over the truth, from the side on which that is widest, coloured by its error.
+
+    Args:
+        axes: Where.
+        positions: (N, 3) metres, laid over the truth.
+        truth: (M, 3) metres.
+        errors_m: (N,) distances from the truth.
+        most_m: Error of the strongest colour; None is the largest.
+
+    Returns:
+        What a colour bar is made for.
+    """
+    from matplotlib.collections import LineCollection
+
+    axes_world = widest_axes(truth)
+    seen, true = positions @ axes_world.T, truth @ axes_world.T
+    axes.plot(*true.T, color=hex_of(TRUTH), linewidth=3.0, alpha=0.3)
+    colored = LineCollection(list(np.stack([seen[:-1], seen[1:]], axis=1)), cmap=_COLOR_MAP, linewidths=1.6)
+    colored.set_array(0.5 * (errors_m[:-1] + errors_m[1:]))
+    colored.set_clim(0.0, float(errors_m.max()) if most_m is None else most_m)
+    axes.add_collection(colored)
+    axes.plot(*seen[0], "o", color=hex_of(START), markersize=5)
+    axes.plot(*seen[-1], "s", color=hex_of(END), markersize=5)
+    low, high = extent(np.concatenate([seen, true]))
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal")
+    axes.set_xlabel("m", color=FAINT, fontsize=8)
+    axes.set_ylabel("m", color=FAINT, fontsize=8)
+    return colored
+
+
+def _draw_over_time(axes: "Axes", elapsed: Array, values: Array, *, name: str) -> None:
+    axes.plot(elapsed, values, color=hex_of(ESTIMATE), linewidth=1.0)
+    for label, value, style in (
+        ("RMSE", float(np.sqrt(np.mean(values**2))), "dashed"),
+        ("median", float(np.median(values)), "dotted"),
+    ):
+        axes.axhline(value, color=INK, linewidth=0.8, linestyle=style, label=f"{label} {value:.3g}")
+    axes.set_ylim(bottom=0.0)
+    axes.set_ylabel(name, color=FAINT, fontsize=8)
+    axes.grid(color=LINE, linewidth=0.4)
+    axes.legend(loc="best", fontsize=7, framealpha=0.9, edgecolor=LINE)

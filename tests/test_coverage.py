@@ -1,0 +1,57 @@
+"""Which share of a log has a pose."""
+
+import numpy as np
+import pytest
+
+from evaluators.coverage import frame_coverage, time_coverage
+from evaluators.evaluate import judged
+from mapper.geometry import transform
+from mapper.trajectory import Trajectory
+
+MS = 1_000_000
+FRAMES_NS = 7_000_000_000 + np.arange(100, dtype=np.int64) * 33 * MS
+
+
+def values_of(metrics):
+    return {metric.name: metric.value for metric in metrics}
+
+
+def test_every_frame_with_a_pose_counts_and_the_longest_run_without_is_told():
+    kept = np.ones(100, bool)
+    kept[[10, 40, 41, 42, 99]] = False
+    values = values_of(frame_coverage(FRAMES_NS, FRAMES_NS[kept]))
+    assert values == {
+        "coverage, frames with a pose": 95.0,
+        "frames without a pose": 5,
+        "gaps": 3,
+        "longest gap": pytest.approx(4 * 0.033),
+    }
+
+
+def test_rounded_stamps_still_belong_to_their_frames_but_a_neighbour_s_do_not():
+    rounded = (FRAMES_NS + 4 * MS)[::2]
+    assert values_of(frame_coverage(FRAMES_NS, rounded))["coverage, frames with a pose"] == 50.0
+    quick = FRAMES_NS[0] + np.arange(100, dtype=np.int64) * 5 * MS  # 20 ms would reach four frames on
+    assert values_of(frame_coverage(quick, quick[::2]))["coverage, frames with a pose"] == 50.0
+
+
+def test_without_frames_the_truth_s_time_counts_up_to_pauses():
+    poses_ns = np.concatenate([FRAMES_NS[20:50], FRAMES_NS[80:]])
+    values = values_of(time_coverage(poses_ns, begin_ns=int(FRAMES_NS[0]), end_ns=int(FRAMES_NS[-1])))
+    assert values["gaps"] == 2
+    assert values["longest gap"] == pytest.approx(31 * 0.033)
+    assert values["coverage, share of the truth's time"] == pytest.approx(100.0 * (99 - 20 - 31) / 99)
+
+
+def test_a_late_truth_and_a_missing_pose_are_no_gaps():
+    poses_ns = np.delete(FRAMES_NS, [30, 60])
+    values = values_of(time_coverage(poses_ns, begin_ns=int(FRAMES_NS[2]) + 1, end_ns=int(FRAMES_NS[90])))
+    assert values["coverage, share of the truth's time"] == 100.0
+    assert values["gaps"] == 0
+
+
+def test_poses_without_times_have_no_coverage():
+    poses = np.array([transform(np.eye(3), [0.1 * k, 0.0, 0.0]) for k in range(100)])
+    numbered, timed = Trajectory(np.arange(100), poses), Trajectory(FRAMES_NS, poses)
+    assert "longest gap" not in values_of(judged(numbered, numbered).metrics)
+    assert values_of(judged(timed, timed).metrics)["coverage, share of the truth's time"] == 100.0
