@@ -7,7 +7,7 @@ import numpy as np
 from mapper.errors import DataError
 from mapper.frames import Points32
 from mapper.geometry import Transform, apply
-from mapper.registration.gicp import neighbourhood
+from mapper.registration.kd_tree import kd_tree
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class DistanceTo:
         Raises:
             DataError: It is empty.
         """
-        self._neighbourhood = neighbourhood(points_target)
+        self._tree = kd_tree(points_target)
 
     def of(self, points_source: Points32, T_target_source: Transform) -> CloudDistance:
         """Return how far the cloud P, (M, 3) metres in its own frame, lies from Q under a motion.
@@ -42,7 +42,5 @@ class DistanceTo:
         """
         if len(points_source) == 0:
             raise DataError("cloud distance: the source has no points")
-        distances_m = self._neighbourhood.distances_m(
-            apply(T_target_source, points_source.astype(np.float64))
-        )
+        _, distances_m = self._tree.nearest(apply(T_target_source, points_source.astype(np.float64)))
         return CloudDistance(float(distances_m.mean()), float(np.median(distances_m)))

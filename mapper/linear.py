@@ -54,3 +54,35 @@ def solve_positive(A, b):
             total -= L[k, i] * x[k]
         x[i] = total / L[i, i]
     return x
+
+
+@njit(cache=True, nogil=True)
+def twist_exp(delta, T):
+    """Return exp(δ) · T for a (6,) twist (rotation, translation) and a (4, 4) motion."""
+    wx, wy, wz = delta[0], delta[1], delta[2]
+    K = np.array([[0.0, -wz, wy], [wz, 0.0, -wx], [-wy, wx, 0.0]])
+    angle = np.sqrt(wx * wx + wy * wy + wz * wz)
+    if angle < 1e-8:
+        a, b, c = 1.0, 0.5, 1.0 / 6.0
+    else:
+        a = np.sin(angle) / angle
+        b = (1.0 - np.cos(angle)) / angle**2
+        c = (angle - np.sin(angle)) / angle**3
+    KK = product(K, K)
+    R = np.eye(3) + a * K + b * KK
+    V = np.eye(3) + b * K + c * KK
+    moved = np.eye(4)
+    moved[:3, :3] = product(R, T)
+    moved[:3, 3] = turned(R, T[:3, 3]) + turned(V, delta[3:])
+    # Products of many small rotations drift off SO(3): one Gram–Schmidt step keeps them on it.
+    for i in range(3):
+        for j in range(i):
+            dot = 0.0
+            for k in range(3):
+                dot += moved[i, k] * moved[j, k]
+            for k in range(3):
+                moved[i, k] -= dot * moved[j, k]
+        norm = np.sqrt(moved[i, 0] ** 2 + moved[i, 1] ** 2 + moved[i, 2] ** 2)
+        for k in range(3):
+            moved[i, k] /= norm
+    return moved

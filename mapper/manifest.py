@@ -30,7 +30,6 @@ _LIBRARIES = (
     "opencv-contrib-python-headless",
     "pydantic",
     "rosbags",
-    "small-gicp",
 )
 
 

@@ -1,10 +1,11 @@
-"""One point per voxel, the first that fell into it."""
+"""Points by voxels: the first that fell into each, or the mean of all."""
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from mapper.frames import Points32
+from mapper.geometry import Points
 
 _EMPTY = -1
 
@@ -18,16 +19,32 @@ def thin(points: Points32, voxel_m: float) -> NDArray[np.intp]:
         points: (N, 3) finite, metres.
         voxel_m: Edge of a voxel.
     """
-    size = 1 << max(4, int(2 * len(points)).bit_length())
-    kept: NDArray[np.intp] = _first_of_each(points, 1.0 / voxel_m, size)
-    return kept
+    firsts: NDArray[np.intp] = _voxels(points, 1.0 / voxel_m, _table_size(points))[1]
+    return firsts
+
+
+def voxel_means(points: Points | Points32, voxel_m: float) -> Points:
+    """Return (M, 3) float64 means of the points in every voxel, in the order of each voxel's first point.
+
+    Args:
+        points: (N, 3) finite, metres.
+        voxel_m: Edge of a voxel.
+    """
+    voxel_of, firsts = _voxels(points, 1.0 / voxel_m, _table_size(points))
+    means: Points = _means(points, voxel_of, len(firsts))
+    return means
+
+
+def _table_size(points: Points | Points32) -> int:
+    return 1 << max(4, int(2 * len(points)).bit_length())
 
 
 @njit(cache=True, nogil=True)
-def _first_of_each(points, voxels_per_m, size):  # type: ignore[no-untyped-def]
+def _voxels(points, voxels_per_m, size):  # type: ignore[no-untyped-def]
+    """Return (N,) each point's voxel, numbered as they are met, and (M,) the first point of each."""
     slots = np.full(size, _EMPTY, np.int64)
     cells = np.empty((len(points), 3), np.int64)
-    kept = np.empty(len(points), np.int64)
+    voxel_of, firsts = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
     count = 0
     for index in range(len(points)):
         x = np.int64(np.floor(points[index, 0] * voxels_per_m))
@@ -42,6 +59,21 @@ def _first_of_each(points, voxels_per_m, size):  # type: ignore[no-untyped-def]
         if slots[slot] == _EMPTY:
             slots[slot] = count
             cells[count] = (x, y, z)
-            kept[count] = index
+            firsts[count] = index
             count += 1
-    return kept[:count].copy()
+        voxel_of[index] = slots[slot]
+    return voxel_of, firsts[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+def _means(points, voxel_of, count):  # type: ignore[no-untyped-def]
+    sums, counts = np.zeros((count, 3)), np.zeros(count)
+    for index in range(len(points)):
+        voxel = voxel_of[index]
+        for k in range(3):
+            sums[voxel, k] += points[index, k]
+        counts[voxel] += 1.0
+    for voxel in range(count):
+        for k in range(3):
+            sums[voxel, k] /= counts[voxel]
+    return sums

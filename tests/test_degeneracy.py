@@ -6,7 +6,8 @@ import pytest
 from mapper.errors import DataError
 from mapper.geometry import apply, exp, transform
 from mapper.registration.degeneracy import degeneracy_of, loosened
-from mapper.registration.gicp import measured, prepared
+from mapper.registration.refining import measured
+from mapper.registration.surfaces import prepared
 
 N = 20_000
 

@@ -21,7 +21,7 @@ HOMES = {
     "typer": ("cli/",),
     "rich": ("cli/",),
     "open3d": ("mapper/export/mesh.py", "mapper/registration/ndt.py", "mapper/registration/rgbd.py"),
-    "small_gicp": ("mapper/registration/gicp.py", "mapper/odometry/scan_to_map/gicp.py"),
+    "small_gicp": (),
     "kiss_icp": ("mapper/odometry/scan_to_map/kiss.py",),
     "kiss_matcher": ("mapper/registration/kiss_matcher.py",),
     "pyoctomap": (),

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from mapper.geometry import angle_between, apply, exp, inverse
+from mapper.linear import twist_exp
 from mapper.odometry.local_map.bundle import adjust
-from mapper.odometry.local_map.pose import normal_matrix, refine_pose, twist_exp
+from mapper.odometry.local_map.pose import normal_matrix, refine_pose
 
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5, 40.0])
 

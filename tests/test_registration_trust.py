@@ -6,9 +6,10 @@ import pytest
 from mapper.config.registration import KissMatcherConfig, NdtConfig, TrustConfig
 from mapper.frames import Scan
 from mapper.geometry import apply, exp
-from mapper.registration.gicp import measured, prepared
 from mapper.registration.kiss_matcher import KissMatcher
 from mapper.registration.ndt import Ndt, refine_by_cells
+from mapper.registration.refining import measured
+from mapper.registration.surfaces import prepared
 from mapper.registration.trust import judged
 
 VOXEL_M = 0.3

@@ -60,7 +60,7 @@ class IterativeConfig(RefinedConfig):
 
 
 class IcpConfig(IterativeConfig):
-    """Point-to-point ICP (Besl & McKay 1992), by small_gicp."""
+    """Point-to-point ICP (Besl & McKay 1992)."""
 
     kind: Literal["icp"] = "icp"
 
@@ -72,7 +72,7 @@ class PlaneIcpConfig(IterativeConfig):
 
 
 class GicpConfig(IterativeConfig):
-    """Generalised ICP (Segal, Haehnel & Thrun 2009), by small_gicp."""
+    """Generalised ICP (Segal, Haehnel & Thrun 2009)."""
 
     kind: Literal["gicp"] = "gicp"
 

@@ -52,15 +52,6 @@ def open3d(_folder: Path) -> None:
     _expect_near(found.transformation[:3, 3], _SHIFT_M)
 
 
-def small_gicp(_folder: Path) -> None:
-    """Register by generalised ICP."""
-    import small_gicp
-
-    source, target = _corners()
-    found = small_gicp.align(target, source, downsampling_resolution=0.1)
-    _expect_near(found.T_target_source[:3, 3], _SHIFT_M)
-
-
 def kiss_icp(_folder: Path) -> None:
     """Register points to a voxel map."""
     from kiss_icp.mapping import VoxelHashMap
@@ -247,7 +238,6 @@ SELF_TESTS: dict[str, Callable[[Path], None]] = {
     "rerun-sdk": rerun,
     "rich": rich,
     "rosbags": rosbags,
-    "small-gicp": small_gicp,
     "typer": typer,
     "zstandard": zstandard,
 }

@@ -17,12 +17,13 @@ from mapper.loops.scans import ScanPlace
 from mapper.odometry.base import Seen
 from mapper.registration.base import Alignment
 from mapper.registration.degeneracy import degeneracy_of
-from mapper.registration.gicp import Prepared, prepared, refine
 from mapper.registration.ground import find_ground, find_obstacles
 from mapper.registration.kernels import thin
 from mapper.registration.levelling import level
 from mapper.registration.objects import centres_of
 from mapper.registration.overlap_kernels import look, range_picture
+from mapper.registration.refining import refine
+from mapper.registration.surfaces import Prepared, prepared
 from mapper.registration.voting import vote
 
 _SAME = Discrepancy(translation_m=3.0, rotation_rad=0.3)

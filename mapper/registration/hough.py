@@ -10,7 +10,6 @@ from mapper.frames import Scan
 from mapper.geometry import Points, Transform, angle_between, inverse
 from mapper.registration.base import Alignment, failed
 from mapper.registration.degeneracy import degeneracy_of
-from mapper.registration.gicp import Prepared, measured, prepared, refined_motion
 from mapper.registration.ndt import refine_by_cells
 from mapper.registration.overlap import (
     Overlap,
@@ -21,6 +20,8 @@ from mapper.registration.overlap import (
     settled,
     witness,
 )
+from mapper.registration.refining import measured, refined_motion
+from mapper.registration.surfaces import Prepared, prepared
 from mapper.registration.voting import Peak, vote
 
 

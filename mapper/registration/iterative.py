@@ -4,7 +4,8 @@ from mapper.config.registration import IterativeConfig, RefinedConfig
 from mapper.frames import Scan
 from mapper.geometry import Transform
 from mapper.registration.base import Alignment
-from mapper.registration.gicp import Prepared, Refiner, prepared, refine
+from mapper.registration.refining import Refiner, refine
+from mapper.registration.surfaces import Prepared, prepared
 from mapper.registration.trust import judged
 
 

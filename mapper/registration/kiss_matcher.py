@@ -11,8 +11,8 @@ from mapper.config.registration import KissMatcherConfig
 from mapper.frames import Scan
 from mapper.geometry import Transform, is_rigid, transform
 from mapper.registration.base import Alignment, failed
-from mapper.registration.gicp import Prepared, prepared
 from mapper.registration.iterative import cloud_of, refined
+from mapper.registration.surfaces import Prepared, prepared
 
 _CROWD = 5  # points this near together, in feature voxels, surely have a normal and a feature
 _CROWD_VOXELS = 1.5
@@ -65,10 +65,10 @@ def _thinned(target: Prepared, source: Prepared, voxel_m: float) -> tuple[Prepar
 
 def _crowded(cloud: Prepared) -> int:
     """Return how many points have neighbours enough. The library crashes on clouds where none has."""
-    if len(cloud.points) < _CROWD:
+    if cloud.tree is None or len(cloud.points) < _CROWD:
         return 0
-    _, squared = cloud.tree.batch_knn_search(cloud.points, _CROWD)
-    return int((squared[:, -1] <= (_CROWD_VOXELS * cloud.voxel_m) ** 2).sum())
+    _, distances_m = cloud.tree.nearest_few(cloud.points, _CROWD)
+    return int((distances_m[:, -1] <= _CROWD_VOXELS * cloud.voxel_m).sum())
 
 
 def _matched(target: Prepared, source: Prepared) -> Transform | None:

@@ -8,7 +8,7 @@ from mapper.config.registration import NdtConfig
 from mapper.frames import Scan
 from mapper.geometry import Points, Transform, is_rigid, nearest_rotation, transform
 from mapper.registration.base import Alignment, failed
-from mapper.registration.gicp import Prepared, prepared
+from mapper.registration.surfaces import Prepared, prepared
 from mapper.registration.trust import judged
 
 

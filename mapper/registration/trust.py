@@ -9,7 +9,8 @@ from mapper.config.registration import TrustConfig
 from mapper.geometry import Array, Transform, apply
 from mapper.registration.base import Alignment
 from mapper.registration.degeneracy import degeneracy_of
-from mapper.registration.gicp import Prepared, measured
+from mapper.registration.refining import measured
+from mapper.registration.surfaces import Prepared
 
 _FEW = 0.01  # of all surface; of fewer that face a direction, degeneracy speaks
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from mapper.linear import solve_positive, turned
+from mapper.linear import solve_positive, turned, twist_exp
 from mapper.odometry.local_map.pose import (
     CHI2_2DOF,
     CHI2_3DOF,
@@ -13,7 +13,6 @@ from mapper.odometry.local_map.pose import (
     pose_jacobian,
     projection_jacobian,
     residual,
-    twist_exp,
 )
 
 

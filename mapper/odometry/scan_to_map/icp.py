@@ -7,7 +7,8 @@ import numpy as np
 from mapper.config.scan_odometry import IcpOdometryConfig
 from mapper.geometry import Points, Transform, apply
 from mapper.odometry.scan_to_map.matching import Reach, Sweep
-from mapper.registration.gicp import Prepared, prepared, refine
+from mapper.registration.refining import refine
+from mapper.registration.surfaces import Prepared, prepared
 
 
 class IcpMatcher:

@@ -5,7 +5,7 @@ from typing import Literal, Protocol
 
 from mapper.frames import Scan
 from mapper.geometry import Transform
-from mapper.registration.gicp import Prepared
+from mapper.registration.surfaces import Prepared
 
 Reach = Literal["near", "far"]
 """How far the truth may be from a guess: as far as motion is foreseen, or as far as the method can."""

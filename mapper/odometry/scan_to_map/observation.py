@@ -9,7 +9,7 @@ from mapper.deskew import Twist, deskewed
 from mapper.errors import FrameError
 from mapper.frames import Frame, Points32, Scan
 from mapper.odometry.scan_to_map.matching import Sweep
-from mapper.registration.gicp import prepared
+from mapper.registration.surfaces import prepared
 from mapper.thinning import thin
 
 _FINER = 0.5  # a prepared point is the mean of those thinned to this part of its voxel

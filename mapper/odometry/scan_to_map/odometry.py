@@ -19,7 +19,8 @@ from mapper.odometry.scan_to_map.matching import Matcher, Sweep
 from mapper.odometry.scan_to_map.observation import ScanObservation, observe_scan
 from mapper.registration.base import Aligner, Alignment
 from mapper.registration.degeneracy import degeneracy_of, loosened
-from mapper.registration.gicp import measured
+from mapper.registration.refining import measured
+from mapper.sources.base import Entry
 from mapper.timebase import NS_PER_S
 
 _USUAL_OF = 20  # recent scans whose overlap tells what is usual
@@ -74,6 +75,14 @@ class ScanOdometry:
         self._twist: Twist = STILL
         self._lost = 0
         self._next_node = 0
+
+    def read(self, entry: Entry) -> ScanObservation:
+        """Observe a frame of a log, without its colours. Pure.
+
+        Raises:
+            FrameError: It cannot be read, or not be used.
+        """
+        return self.observe(entry.load(colour=False))
 
     def observe(self, frame: Frame) -> ScanObservation:
         """Return a frame's points in range, thinned. Pure.

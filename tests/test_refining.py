@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import small_gicp
 
-from mapper.errors import DataError
 from mapper.geometry import apply, exp, inverse
-from mapper.registration.gicp import measured, prepared, refine
+from mapper.registration.refining import measured, refine
+from mapper.registration.surfaces import prepared
 
 VOXEL_M = 0.2
 KINDS = ("icp", "plane-icp", "gicp")
@@ -111,6 +112,28 @@ def test_too_few_points_and_clouds_apart_are_no_answer():
     assert "do not overlap" in apart.reason
 
 
-def test_points_beyond_the_voxel_index_are_refused_rather_than_dropped():
-    with pytest.raises(DataError, match=r"900000 m is beyond 209715 m"):
-        prepared(np.full((30, 3), 9e5, np.float32), voxel_m=VOXEL_M)
+@pytest.mark.parametrize("kind", ["icp", "gicp"])
+def test_the_motion_is_the_one_that_small_gicp_finds(kind):
+    rng = np.random.default_rng(6)
+    target, source = walls(rng, tilt_rad=0.5), moved(walls(rng, tilt_rad=0.5), MOTION)
+    found = refine(
+        prepared(target, voxel_m=VOXEL_M),
+        prepared(source, voxel_m=VOXEL_M),
+        np.eye(4),
+        kind=kind,
+        max_pair_distance_m=0.6,
+        max_iterations=100,
+    )
+    theirs, tree = small_gicp.preprocess_points(target, VOXEL_M, 10, 1)
+    peer = small_gicp.align(
+        theirs,
+        small_gicp.preprocess_points(source, VOXEL_M, 10, 1)[0],
+        tree,
+        registration_type=kind.upper(),
+        max_correspondence_distance=0.6,
+        num_threads=1,
+        max_iterations=100,
+        rotation_epsilon=1e-5,
+        translation_epsilon=1e-5,
+    )
+    assert np.abs(found.T_target_source - peer.T_target_source).max() < (5e-3 if kind == "icp" else 1e-3)

@@ -1,0 +1,212 @@
+"""A map of Gaussians, one a cell, in which scans are placed: voxelised GICP (Koide et al. 2021)."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mapper.geometry import Array, Transform, is_rigid
+from mapper.registration.descent import FLATNESS, add_pair, inverse_of, moved, stepped, turned
+from mapper.registration.surfaces import Prepared
+
+_EMPTY = -1
+_FIRST_CAPACITY = 1 << 14
+_CLEAR_CYCLE = 10
+_BITS = 21
+"""Of each coordinate of a cell in its key; cells 2²¹ apart would be taken for one."""
+
+
+class GaussianCells:
+    """Where the surfaces of clouds lie: the mean and the mean covariance of the points in each cell.
+
+    Cells that as many clouds in a row have not touched are forgotten, every so often.
+    """
+
+    def __init__(self, cell_m: float, *, remembered: int) -> None:
+        """Make an empty map.
+
+        Args:
+            cell_m: Edge of the cells, metres.
+            remembered: How many clouds long a cell is kept that none of them touches.
+        """
+        self.cell_m = cell_m
+        self._remembered = remembered
+        self._clouds = self._count = 0
+        self._cells = _room_for(_FIRST_CAPACITY)
+
+    def __len__(self) -> int:
+        """Return how many cells there are."""
+        return self._count
+
+    def insert(self, cloud: Prepared, T_world_cloud: Transform) -> None:
+        """Take in a cloud where it lies."""
+        capacity = len(self._cells.keys)
+        while capacity < self._count + len(cloud.points):
+            capacity *= 2
+        if capacity > len(self._cells.keys):
+            self._keep(np.arange(self._count), capacity)
+        self._clouds += 1
+        self._count = _insert(
+            *self._cells, self._count, self._clouds, self.cell_m, cloud.points, cloud.normals, T_world_cloud
+        )
+        if self._clouds % _CLEAR_CYCLE == 0:
+            touched = self._cells.touched[: self._count]
+            self._keep(np.flatnonzero(touched + self._remembered >= self._clouds), capacity)
+
+    def align(
+        self,
+        cloud: Prepared,
+        T_world_cloud: Transform,
+        *,
+        max_iterations: int,
+        step_rad: float,
+        step_m: float,
+    ) -> Transform | None:
+        """Return where a cloud lies, from a guess; None if nothing of it lies in any cell.
+
+        Args:
+            cloud: What is placed.
+            T_world_cloud: (4, 4) guess.
+            max_iterations: At most so many.
+            step_rad: A step that turns less and
+            step_m: moves less than this is the last.
+        """
+        T_found, pairs = _descend(
+            self._cells.table,
+            self._cells.keys,
+            self._cells.gaussians,
+            self.cell_m,
+            cloud.points,
+            cloud.normals,
+            T_world_cloud,
+            max_iterations,
+            np.array([step_rad, step_m]),
+        )
+        return T_found if pairs > 0 and is_rigid(T_found) else None
+
+    def _keep(self, kept: NDArray[np.intp], capacity: int) -> None:
+        """Keep some cells, with room for more."""
+        before, self._cells, self._count = self._cells, _room_for(capacity), len(kept)
+        for now, then in zip(self._cells[1:], before[1:], strict=True):
+            now[: len(kept)] = then[kept]
+        _index(self._cells.table, self._cells.keys, self._count)
+
+
+class _Cells(NamedTuple):
+    """Cells in the order in which they were met.
+
+    Attributes:
+        table: Open-addressing hash table of their indices, at most half full.
+        keys: (C,) of their coordinates.
+        sums: (C, 10) of positions, of covariances (xx, xy, xz, yy, yz, zz) and of ones.
+        gaussians: (C, 9) the same, as means.
+        touched: (C,) number of the last cloud that had a point in them.
+    """
+
+    table: NDArray[np.int64]
+    keys: NDArray[np.int64]
+    sums: Array
+    gaussians: Array
+    touched: NDArray[np.int64]
+
+
+def _room_for(capacity: int) -> _Cells:
+    return _Cells(
+        np.full(2 * capacity, _EMPTY, np.int64),
+        np.zeros(capacity, np.int64),
+        np.zeros((capacity, 10)),
+        np.zeros((capacity, 9)),
+        np.zeros(capacity, np.int64),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _key(x, y, z):  # type: ignore[no-untyped-def]
+    mask = (1 << _BITS) - 1
+    return (
+        ((np.int64(np.floor(x)) & mask) << (2 * _BITS))
+        | ((np.int64(np.floor(y)) & mask) << _BITS)
+        | (np.int64(np.floor(z)) & mask)
+    )
+
+
+@njit(cache=True, nogil=True)
+def _slot(table, keys, key):  # type: ignore[no-untyped-def]
+    """Return where a key is in the table, or where it would be."""
+    slot = (key * 0x9E3779B97F4A7C1 >> 20) & (len(table) - 1)
+    while table[slot] != _EMPTY and keys[table[slot]] != key:
+        slot = (slot + 1) & (len(table) - 1)
+    return slot
+
+
+@njit(cache=True, nogil=True)
+def _index(table, keys, count):  # type: ignore[no-untyped-def]
+    for cell in range(count):
+        table[_slot(table, keys, keys[cell])] = cell
+
+
+@njit(cache=True, nogil=True)
+def _insert(  # type: ignore[no-untyped-def]
+    table, keys, sums, gaussians, touched, count, cloud, cell_m, points, normals, T
+):
+    """Add points and their surfaces' covariances to their cells; return how many cells there are."""
+    p, m = np.empty(3), np.empty(3)
+    for i in range(len(points)):
+        moved(T, points[i], p)
+        turned(T, normals[i], m)
+        key = _key(p[0] / cell_m, p[1] / cell_m, p[2] / cell_m)
+        slot = _slot(table, keys, key)
+        if table[slot] == _EMPTY:
+            table[slot], keys[count] = count, key
+            count += 1
+        cell, k = table[slot], 3
+        for row in range(3):
+            sums[cell, row] += p[row]
+            for column in range(row, 3):
+                sums[cell, k] += (1.0 if row == column else 0.0) - FLATNESS * m[row] * m[column]
+                k += 1
+        sums[cell, 9] += 1.0
+        touched[cell] = cloud
+        for k in range(9):
+            gaussians[cell, k] = sums[cell, k] / sums[cell, 9]
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _descend(  # type: ignore[no-untyped-def]
+    table, keys, gaussians, cell_m, points, normals, T, iterations, steps
+):
+    """Return T_world_source after Gauss–Newton on points and their cells' Gaussians, and how many pairs.
+
+    Points farther from the mean of their cell than its edge take no part.
+    """
+    p, m, pairs = np.empty(3), np.empty(3), 0
+    for _ in range(iterations):
+        sums, pairs = np.zeros(27), 0
+        for i in range(len(points)):
+            moved(T, points[i], p)
+            cell = table[_slot(table, keys, _key(p[0] / cell_m, p[1] / cell_m, p[2] / cell_m))]
+            if cell == _EMPTY:
+                continue
+            mean_and_covariance = gaussians[cell]
+            x = mean_and_covariance[0] - p[0]
+            y = mean_and_covariance[1] - p[1]
+            z = mean_and_covariance[2] - p[2]
+            if x * x + y * y + z * z > cell_m * cell_m:
+                continue
+            pairs += 1
+            turned(T, normals[i], m)
+            weight = inverse_of(
+                mean_and_covariance[3] + 1.0 - FLATNESS * m[0] * m[0],
+                mean_and_covariance[4] - FLATNESS * m[0] * m[1],
+                mean_and_covariance[5] - FLATNESS * m[0] * m[2],
+                mean_and_covariance[6] + 1.0 - FLATNESS * m[1] * m[1],
+                mean_and_covariance[7] - FLATNESS * m[1] * m[2],
+                mean_and_covariance[8] + 1.0 - FLATNESS * m[2] * m[2],
+            )
+            add_pair(sums, T, p, x, y, z, weight)
+        T, is_last = stepped(sums, pairs, T, steps)
+        if is_last:
+            break
+    return T, pairs

@@ -1,0 +1,155 @@
+"""A motion refined by the nearest pairs of two clouds, by ICP, plane ICP or GICP; and what it is worth."""
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.geometry import Array, Transform, apply, is_rigid
+from mapper.registration.base import Alignment, failed
+from mapper.registration.descent import GAUSSIAN, PLANE, POINT, descend_on_points
+from mapper.registration.surfaces import Prepared
+
+Refiner = Literal["icp", "plane-icp", "gicp"]
+
+_MIN_PAIRS = 20
+_STEP_VOXELS = 0.003  # steps shorter than this end the refinement: 1 mm at 0.3 m
+_STEP_RAD = 3.5e-4
+_MIN_SIGMA_VOXELS = 0.03  # a scan against itself must not look infinitely certain
+_DISTANCES: Mapping[Refiner, int] = {"icp": POINT, "plane-icp": PLANE, "gicp": GAUSSIAN}
+
+
+def refine(
+    target: Prepared,
+    source: Prepared,
+    T_target_source: Transform,
+    *,
+    kind: Refiner,
+    max_pair_distance_m: float,
+    max_iterations: int = 40,
+) -> Alignment:
+    """Return the motion refined from a guess by the nearest pairs, as ``measured`` with that pair distance.
+
+    It tells no right answer from a wrong one: that is for the caller, who knows what overlap to expect.
+
+    Args:
+        target: Cloud that stays; its normals and tree are used.
+        source: Cloud that moves.
+        T_target_source: (4, 4) guess.
+        kind: ``icp`` (Besl & McKay 1992), ``plane-icp`` (Chen & Medioni 1992), ``gicp`` (Segal, Haehnel
+            & Thrun 2009).
+        max_pair_distance_m: Points without a partner this near take no part.
+        max_iterations: At most so many.
+    """
+    found = refined_motion(
+        target,
+        source,
+        T_target_source,
+        kind=kind,
+        max_pair_distance_m=max_pair_distance_m,
+        max_iterations=max_iterations,
+    )
+    if isinstance(found, str):
+        return failed(found)
+    return measured(target, source, found, max_pair_distance_m=max_pair_distance_m)
+
+
+def refined_motion(
+    target: Prepared,
+    source: Prepared,
+    T_target_source: Transform,
+    *,
+    kind: Refiner,
+    max_pair_distance_m: float,
+    max_iterations: int = 40,
+) -> Transform | str:
+    """Return what ``refine`` does but not what it is worth, or why there is none."""
+    if min(len(target.points), len(source.points)) < _MIN_PAIRS or target.tree is None:
+        return (
+            f"{len(target.points)} and {len(source.points)} points after downsampling, "
+            f"fewer than {_MIN_PAIRS}"
+        )
+    T_refined: Transform = descend_on_points(
+        target.tree.points,
+        target.tree.axes,
+        target.tree.cuts,
+        target.normals,
+        source.points,
+        source.normals,
+        T_target_source,
+        _DISTANCES[kind],
+        max_pair_distance_m,
+        max_iterations,
+        np.array([_STEP_RAD, _STEP_VOXELS * source.voxel_m]),
+    )
+    return T_refined if is_rigid(T_refined) else f"{kind} diverged"
+
+
+def measured(
+    target: Prepared,
+    source: Prepared,
+    T_target_source: Transform,
+    *,
+    max_pair_distance_m: float,
+    max_surface_distance_m: float = np.inf,
+) -> Alignment:
+    """Return what a motion is worth, by whatever method it was found.
+
+    A pair is a source point and the target point nearest to it. The information is that of point-to-plane
+    distances, Σ JᵀJ / σ² with J = [(s × m)ᵀ, mᵀ] and m = Rᵀn (the source's tangent, multiplied on the
+    right): what the surfaces can fix, by whichever residual the motion was found. (Point-to-point residuals
+    would claim to see the motion along a wall.) σ is what the residuals show. Points that share a normal are
+    not independent, so as many count once as went into each normal.
+
+    Args:
+        target: Cloud that stays.
+        source: Cloud that moves.
+        T_target_source: (4, 4) motion in question.
+        max_pair_distance_m: How near the points of a pair must be to agree.
+        max_surface_distance_m: How near the source point must be to the target's surface. Finite, it tells
+            wrong motions from right ones better than the distance between points, which is mostly that
+            between samples; points with no surface about them then do not agree.
+    """
+    indices, distances_m = target.nearest(apply(T_target_source, source.points))
+    near = distances_m <= max_pair_distance_m
+    if near.sum() < _MIN_PAIRS:
+        return failed(
+            f"{near.sum()} of {len(source.points)} points have a partner within {max_pair_distance_m:g} m, "
+            f"fewer than {_MIN_PAIRS}: the clouds do not overlap"
+        )
+    jacobian, residuals_m = _plane_rows(target, source, T_target_source, indices[near], near)
+    known = jacobian.any(axis=1)
+    rms_m = float(np.sqrt((residuals_m**2).sum() / max(known.sum(), 1)))
+    sigma_m = max(rms_m, _MIN_SIGMA_VOXELS * source.voxel_m)
+    agree = np.where(known, np.abs(residuals_m), np.inf) <= max_surface_distance_m
+    pairs = int(agree.sum())
+    return Alignment(
+        T_target_source,
+        converged=True,
+        inlier_ratio=pairs / len(near),
+        inlier_rmse_m=float(np.sqrt((distances_m[near][agree] ** 2).sum() / max(pairs, 1))),
+        pairs=pairs,
+        information=_gram(jacobian) / (target.neighbours * sigma_m**2),
+    )
+
+
+def _plane_rows(
+    target: Prepared,
+    source: Prepared,
+    T_target_source: Transform,
+    partners: NDArray[np.intp],
+    paired: NDArray[np.bool_],
+) -> tuple[Array, Array]:
+    """Return (M, 6) Jacobian rows and (M,) distances along the target's normals; 0 where there is none."""
+    normals, points_source = target.normals[partners], source.points[paired]
+    differences = apply(T_target_source, points_source) - target.points[partners]
+    normals_source = normals @ T_target_source[:3, :3]
+    jacobian = np.hstack([np.cross(points_source, normals_source), normals_source])
+    return jacobian, np.einsum("ni,ni->n", normals, differences)
+
+
+def _gram(rows: Array) -> Array:
+    """Return rowsᵀ·rows, summed in one order however many threads a BLAS would take."""
+    product: Array = np.einsum("ni,nj->ij", rows, rows)
+    return product

@@ -1,0 +1,127 @@
+"""Clouds prepared for registration: one point a voxel, the normals of their surfaces, a search tree."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mapper.errors import DataError
+from mapper.frames import Points32
+from mapper.geometry import Array, Points
+from mapper.registration.kd_tree import KdTree, kd_tree, neighbours_of
+from mapper.thinning import voxel_means
+
+_NEIGHBOURS = 10
+_FEWEST_NEIGHBOURS = 5
+_VOXELS_ACROSS = 2**20  # within, positions in voxels are exact to a millionth of one
+_LINE = 1e-12
+"""Share of a spread's square that a normal has to stand out by; points on one line have none."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prepared:
+    """A downsampled cloud, ready to be either side of any number of registrations.
+
+    Attributes:
+        normals: (N, 3) unit normals that look to the origin; zero where the neighbours are too few to tell.
+        voxel_m: Edge of the voxels, metres.
+        neighbours: Points that each normal rests on.
+        tree: Of the points; None of none.
+    """
+
+    normals: Array
+    voxel_m: float
+    neighbours: int
+    tree: KdTree | None
+
+    @property
+    def points(self) -> Points:
+        """(N, 3) means of the points in each occupied voxel, metres."""
+        return np.empty((0, 3)) if self.tree is None else self.tree.points
+
+    def nearest(self, points: Points) -> tuple[NDArray[np.int64], Array]:
+        """Return which prepared point is nearest to each of (M, 3) points, and how far it is."""
+        if self.tree is None:
+            return np.zeros(len(points), np.int64), np.full(len(points), np.inf)
+        return self.tree.nearest(points)
+
+
+def prepared(points: Points32 | Points, *, voxel_m: float, neighbours: int = _NEIGHBOURS) -> Prepared:
+    """Return a cloud with one point a voxel, its normals and search tree.
+
+    Args:
+        points: (N, 3) finite positions, metres.
+        voxel_m: Edge of the voxels, metres.
+        neighbours: Nearest points, itself included, that give each normal.
+
+    Raises:
+        DataError: A point lies more than 2²⁰ voxels from the origin.
+    """
+    if len(points) == 0:
+        return Prepared(np.empty((0, 3)), voxel_m, neighbours, None)
+    farthest_m, limit_m = float(np.abs(points).max()), _VOXELS_ACROSS * voxel_m
+    if farthest_m >= limit_m:
+        raise DataError(
+            f"cloud: a coordinate of {farthest_m:.0f} m is beyond {limit_m:.0f} m, the most at "
+            f"{voxel_m} m voxels; move the cloud to the origin or enlarge voxel_m"
+        )
+    tree = kd_tree(voxel_means(points, voxel_m))
+    return Prepared(_normals(tree, min(neighbours, len(tree.points))), voxel_m, neighbours, tree)
+
+
+def _normals(tree: KdTree, neighbours: int) -> Array:
+    normals = np.zeros_like(tree.points)
+    if neighbours >= _FEWEST_NEIGHBOURS:
+        about, _ = neighbours_of(tree.points, tree.axes, tree.cuts, tree.points, neighbours)
+        _look_to_the_origin(tree.points, about, normals)
+    return normals
+
+
+@njit(cache=True, nogil=True)
+def _look_to_the_origin(points, about, normals):  # type: ignore[no-untyped-def]
+    """Fill in the normals of the planes that fit the points about each point best."""
+    count = about.shape[1]
+    for i in range(len(points)):
+        mx = my = mz = 0.0
+        for j in about[i]:
+            mx, my, mz = mx + points[j, 0], my + points[j, 1], mz + points[j, 2]
+        mx, my, mz = mx / count, my / count, mz / count
+        xx = xy = xz = yy = yz = zz = 0.0
+        for j in about[i]:
+            x, y, z = points[j, 0] - mx, points[j, 1] - my, points[j, 2] - mz
+            xx, xy, xz = xx + x * x, xy + x * y, xz + x * z
+            yy, yz, zz = yy + y * y, yz + y * z, zz + z * z
+        nx, ny, nz = _least_axis(xx, xy, xz, yy, yz, zz)
+        sign = -1.0 if nx * points[i, 0] + ny * points[i, 1] + nz * points[i, 2] > 0.0 else 1.0
+        normals[i, 0], normals[i, 1], normals[i, 2] = sign * nx, sign * ny, sign * nz
+
+
+@njit(cache=True, nogil=True)
+def _least_axis(xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]
+    """Return the unit eigenvector of a symmetric matrix's least eigenvalue (Smith 1961); 0 if it has none.
+
+    The rows of the matrix without that eigenvalue span a plane: the eigenvector is normal to it, and the
+    longest of their three products is the surest.
+    """
+    mean = (xx + yy + zz) / 3.0
+    a, b, c = xx - mean, yy - mean, zz - mean
+    spread = np.sqrt((a * a + b * b + c * c + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
+    if spread == 0.0:
+        return 0.0, 0.0, 0.0
+    determinant = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
+    cosine = min(max(determinant / (2.0 * spread**3), -1.0), 1.0)
+    least = mean + 2.0 * spread * np.cos((np.arccos(cosine) + 2.0 * np.pi) / 3.0)
+    a, b, c = xx - least, yy - least, zz - least
+    x, y, z = xy * yz - xz * b, xz * xy - a * yz, a * b - xy * xy
+    square = x * x + y * y + z * z
+    for u, v, w in (
+        (xy * c - xz * yz, xz * xz - a * c, a * yz - xy * xz),
+        (b * c - yz * yz, yz * xz - xy * c, xy * yz - b * xz),
+    ):
+        if u * u + v * v + w * w > square:
+            x, y, z, square = u, v, w, u * u + v * v + w * w
+    if square <= _LINE * spread**4:
+        return 0.0, 0.0, 0.0
+    length = np.sqrt(square)
+    return x / length, y / length, z / length
