@@ -124,6 +124,7 @@ class Reproduction:
         missing: The paper's sequences that are not at hand.
         seeds: How many were run where chance plays a part.
         notes: What holds for all tables, a sentence each, e.g. "first 200 frames only".
+        pictures: PNG files that were drawn while the tables were measured.
     """
 
     paper: str
@@ -132,3 +133,4 @@ class Reproduction:
     missing: tuple[str, ...] = ()
     seeds: int = 1
     notes: tuple[str, ...] = ()
+    pictures: tuple[Path, ...] = ()

@@ -1,0 +1,151 @@
+"""Scans registered to maps without a guess: the trials of Nagy, Gálai & Benedek (2016), on other scenes."""
+
+import hashlib
+import re
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+import mapper
+from evaluators.cells import Cell
+from evaluators.cloud_distance import DistanceTo
+from evaluators.papers.hough_pairs import Clouds, Pair, find_pairs
+from evaluators.register import Registered, register
+from evaluators.scan_pairs import perturbed
+from evaluators.tables import Record, Value
+from mapper.config.hough import HoughGicpConfig, HoughNdtConfig
+from mapper.export.registration_picture import write_before_and_after
+from mapper.geometry import angle_between, inverse
+from mapper.rotations import euler_from_rotation
+
+OFFSET_M = 10.0
+METHODS: dict[str, HoughNdtConfig | HoughGicpConfig] = {
+    "hough-ndt": HoughNdtConfig(),
+    "hough-gicp": HoughGicpConfig(),
+}
+DISTANCES = tuple(f"{kind}_{stage}_m" for kind in ("mhd", "mpd") for stage in ("input", "hough", "final"))
+_STAGES = {"before": "input", "Hough": "hough", "refined": "final"}
+"""What ``register`` calls the paper's stages."""
+
+
+@dataclass(frozen=True, slots=True)
+class HoughTrial:
+    """One pair, turned and set off by chance, and one method.
+
+    Attributes:
+        pair: The scan and the map.
+        method: One of ``METHODS``.
+        seed: Of the yaw, which is any, and of the offset, up to 10 m. A pair whose truth nobody knows is
+            turned only, for it stands as far off as it does.
+        picture: PNG file to draw; None draws none.
+    """
+
+    pair: Pair
+    method: str
+    seed: int
+    picture: Path | None
+
+    def __call__(self) -> list[Record]:
+        """Return the trial's row of Table 1, and how far its answer is from the truth; None is not known.
+
+        Raises:
+            MapperError: A cloud cannot be read, or is empty.
+        """
+        clouds = self._perturbed(self.pair.clouds())
+        registered = register(clouds.target, clouds.source, METHODS[self.method], np.eye(4))
+        if self.picture is not None:
+            write_before_and_after(
+                self.picture,
+                clouds.target.points_body,
+                clouds.source.points_body,
+                [(stage.name, stage.T_target_source) for stage in registered.stages],
+                sensor="lidar",
+                title=f"{self.pair.name}, {self.pair.sensor} (red) in its map (blue): {self.method}",
+            )
+        record: dict[str, Value] = {
+            "pair": self.pair.name,
+            "sensor": self.pair.sensor,
+            "method": self.method,
+            "seed": self.seed,
+            **dict.fromkeys(("offset_m", "yaw_deg")),
+            **dict.fromkeys(
+                f"{measure}_{stage}_m" for measure in ("mhd", "mpd") for stage in _STAGES.values()
+            ),
+            "seconds": sum(registered.seconds.values()),
+            **dict.fromkeys(("error_m", "error_deg", "mpd_truth_m", "right")),
+            "trusted": int(registered.alignment.converged),
+            "reason": registered.alignment.reason,
+        }
+        for stage in registered.stages:
+            record[f"mhd_{_STAGES[stage.name]}_m"] = stage.distance.mhd_m
+            record[f"mpd_{_STAGES[stage.name]}_m"] = stage.distance.mpd_m
+        return [record | self._against_truth(clouds, registered)]
+
+    def _perturbed(self, clouds: Clouds) -> Clouds:
+        # Whichever the method, a pair is perturbed alike.
+        rng = np.random.default_rng([self.seed, zlib.crc32(f"{self.pair.name} {self.pair.sensor}".encode())])
+        if clouds.T_target_source is None:
+            source, _ = perturbed(clouds.source, np.eye(4), np.eye(4), rng, offset_m=0.0)
+            return Clouds(clouds.target, source, None)
+        source, T_target_source = perturbed(
+            clouds.source, clouds.T_target_source, np.eye(4), rng, offset_m=OFFSET_M
+        )
+        return Clouds(clouds.target, source, T_target_source)
+
+    def _against_truth(self, clouds: Clouds, registered: Registered) -> dict[str, Value]:
+        """Return where the scan was, by the truth or else by a trusted answer, and how far that is off."""
+        alignment, truth = registered.alignment, clouds.T_target_source
+        T_target_source = alignment.T_target_source if truth is None else truth
+        told: dict[str, Value] = {}
+        if truth is not None or alignment.converged:
+            told["offset_m"] = float(np.linalg.norm(T_target_source[:3, 3]))
+            told["yaw_deg"] = abs(float(np.degrees(euler_from_rotation(T_target_source[:3, :3])[2])))
+        if truth is None:
+            return told
+        distance = DistanceTo(clouds.target.points_body).of(clouds.source.points_body, truth)
+        told |= {"mpd_truth_m": distance.mpd_m, "right": 0}
+        if registered.stages[-1].name == "refined":
+            miss = inverse(truth) @ alignment.T_target_source
+            error_m = float(np.linalg.norm(miss[:3, 3]))
+            error_deg = float(np.degrees(angle_between(miss[:3, :3], np.eye(3))))
+            within_m, within_deg = self.pair.within
+            is_right = alignment.converged and error_m < within_m and error_deg < within_deg
+            told |= {"error_m": error_m, "error_deg": error_deg, "right": int(is_right)}
+        return told
+
+
+def hough_cells(logs: Path, *, seeds: int, pictures: Path) -> list[Cell]:
+    """Return the trials of a folder's pairs, by both methods and every seed; those of seed 0 draw a picture.
+
+    Args:
+        logs: As for :func:`~evaluators.papers.hough_pairs.find_pairs`.
+        seeds: How often each pair is perturbed.
+        pictures: Folder for the pictures.
+
+    Raises:
+        ConfigError: ``pairs.toml`` cannot be read.
+        SourceError: There are no pairs.
+    """
+    cells = []
+    for pair in find_pairs(logs.resolve()):
+        identity = pair.identity()
+        for method in METHODS:
+            for seed in range(seeds):
+                name = f"{pair.name}, {pair.sensor}, {method}"
+                picture = pictures.resolve() / f"{_file_name(name)}.png" if seed == 0 else None
+                trial = HoughTrial(pair, method, seed, picture)
+                cells.append(Cell(_key(trial, identity), f"{name}, seed {seed}", trial))
+    return cells
+
+
+def _key(trial: HoughTrial, identity: str) -> str:
+    names = f"{trial.pair.name} {trial.pair.sensor} {trial.seed}"
+    config = METHODS[trial.method].model_dump_json()
+    told = "\n".join((mapper.__version__, identity, names, config))
+    return f"hough-{hashlib.sha256(told.encode()).hexdigest()[:24]}"
+
+
+def _file_name(name: str) -> str:
+    return re.sub(r"[^\w-]+", "_", name)

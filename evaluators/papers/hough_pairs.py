@@ -1,0 +1,302 @@
+"""Which scan belongs into which map: pairs that are given, or made of what is at hand."""
+
+import re
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Protocol
+
+import numpy as np
+from pydantic import Field, PositiveFloat
+
+from evaluators.scan_pairs import fewer_rings, merged, moved
+from mapper.config import read_config
+from mapper.config.base import Config
+from mapper.errors import MapperError, SourceError
+from mapper.fingerprint import fingerprint
+from mapper.frames import Scan
+from mapper.geometry import Transform, inverse, transform
+from mapper.rotations import rotation_from_euler, rotation_from_quaternion
+from mapper.sources import clouds, kitti, open_source
+from mapper.sources.base import Entry
+from mapper.sources.cloud_files import ENDINGS
+from mapper.sources.clouds import read_scan
+
+GIVEN = "pairs.toml"
+ALL_RINGS, FEW_RINGS = "all rings", "16 rings"
+RIGHT_M, RIGHT_DEG = 0.3, 1.0
+SCANS_PER_LOG = 4
+MAP_SCANS = 20
+"""So many scans before the one that is left out, and as many after it, make the map."""
+
+_VLP_POINTS = 30_000  # what a VLP-16 gives in a turn; a scan with no more is not thinned further
+_RELLIS_M, _RELLIS_DEG = 0.5, 2.5  # the extrinsics are themselves good to about 0.1 m and 1°
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clouds:
+    """A scan and the map it belongs into.
+
+    Attributes:
+        target: The map.
+        source: The scan, told in its own frame.
+        T_target_source: Its pose in the map; None if nobody knows.
+    """
+
+    target: Scan
+    source: Scan
+    T_target_source: Transform | None
+
+
+class Pair(Protocol):
+    """A scan and a map that have not been read yet; picklable."""
+
+    @property
+    def name(self) -> str:
+        """What people call it."""
+        ...
+
+    @property
+    def sensor(self) -> str:
+        """What took the scan."""
+        ...
+
+    @property
+    def within(self) -> tuple[float, float]:
+        """How near to its pose an answer is right: metres and degrees."""
+        ...
+
+    def identity(self) -> str:
+        """Return what tells it from any other, also after its files have changed."""
+        ...
+
+    def clouds(self) -> Clouds:
+        """Read both.
+
+        Raises:
+            MapperError: One of them cannot be read.
+        """
+        ...
+
+
+class PairConfig(Config):
+    """One ``[[pair]]`` of ``pairs.toml``."""
+
+    name: str
+    scan: Path
+    """A cloud of any kind that is read, in metres around its sensor, z up; relative to ``pairs.toml``."""
+    map: Path
+    """The same; without a pose within 10 m of the scan."""
+    sensor: str = ""
+    """Pairs of one sensor are summed up together; HDL and VLP beside the paper's."""
+    pose: Annotated[tuple[float, ...], Field(min_length=6, max_length=6)] | None = None
+    """Of the scan in the map: x y z in metres, roll pitch yaw in degrees."""
+    within_m: PositiveFloat = RIGHT_M
+    within_deg: PositiveFloat = RIGHT_DEG
+    """How near to the pose an answer is right."""
+
+
+class PairsConfig(Config):
+    """``pairs.toml``."""
+
+    pair: Annotated[tuple[PairConfig, ...], Field(min_length=1)]
+
+
+@dataclass(frozen=True, slots=True)
+class GivenPair:
+    """Two cloud files."""
+
+    name: str
+    sensor: str
+    scan: Path
+    map: Path
+    T_map_scan: tuple[tuple[float, ...], ...] | None
+    within: tuple[float, float]
+
+    def identity(self) -> str:
+        """Return both files' fingerprints and the pose."""
+        return f"{fingerprint(self.scan)} {fingerprint(self.map)} {self.T_map_scan} {self.within}"
+
+    def clouds(self) -> Clouds:
+        """Read both; a map whose pose is known is moved so that its origin is where the scan was taken."""
+        target, source = _read(self.map), _read(self.scan)
+        if self.T_map_scan is None:
+            return Clouds(target, source, None)
+        T_map_scan = np.array(self.T_map_scan)
+        T_map_here = transform(np.eye(3), T_map_scan[:3, 3])
+        here = moved(target, inverse(T_map_here))
+        return Clouds(Scan(0, here.points_body), source, inverse(T_map_here) @ T_map_scan)
+
+
+@dataclass(frozen=True, slots=True)
+class LogPair:
+    """A scan of a log, and a map of those around it at their true poses."""
+
+    log: Path
+    index: int
+    sensor: str
+    within: tuple[float, float] = (RIGHT_M, RIGHT_DEG)
+
+    @property
+    def name(self) -> str:
+        """The log and which of its scans."""
+        return f"{self.log.resolve().name} scan {self.index}"
+
+    def identity(self) -> str:
+        """Return the log's fingerprint, which scan it is, and how it is thinned."""
+        return f"{fingerprint(self.log)} {self.index} {self.sensor} {MAP_SCANS}"
+
+    def clouds(self) -> Clouds:
+        """Read the scans and join them."""
+        pair = _left_out(self.log, self.index)
+        if self.sensor == ALL_RINGS:
+            return pair
+        return Clouds(pair.target, fewer_rings(pair.source), pair.T_target_source)
+
+
+def find_pairs(logs: Path) -> list[Pair]:
+    """Return the pairs of a folder: those of its ``pairs.toml``, or else what can be made of its logs.
+
+    A log is the folder or one in it. Of LiDAR logs with truth, scans evenly chosen are left out one by one;
+    two sensors' clouds of one moment are a pair where an extrinsic calibration ties them, as RELLIS-3D's do.
+
+    Raises:
+        ConfigError: ``pairs.toml`` cannot be read.
+        SourceError: It names files that are missing, or there are no pairs.
+    """
+    if not logs.is_dir():
+        raise SourceError(f"{logs}: no such folder")
+    if (logs / GIVEN).is_file():
+        return _given(logs / GIVEN)
+    pairs = _made_of(logs)
+    if not pairs:
+        folders = sorted(child for child in logs.iterdir() if child.is_dir())
+        pairs = [pair for folder in folders for pair in _made_of(folder)]
+    if not pairs:
+        raise SourceError(
+            f"{logs}: no {GIVEN}, and neither it nor a folder in it is a LiDAR log with truth; "
+            f"list pairs in {logs / GIVEN}: [[pair]] name, scan, map"
+        )
+    return pairs
+
+
+def _given(path: Path) -> list[Pair]:
+    pairs: list[Pair] = []
+    for pair in read_config(path, PairsConfig).pair:
+        scan, target = path.parent / pair.scan, path.parent / pair.map
+        for file in (scan, target):
+            if not file.is_file():
+                raise SourceError(f"{path}: pair {pair.name!r}: {file}: no such file")
+        T_map_scan = None
+        if pair.pose is not None:
+            x, y, z, *angles_deg = pair.pose
+            T_map_scan = _rows(rotation_from_euler(*np.radians(angles_deg)), (x, y, z))
+        within = (pair.within_m, pair.within_deg)
+        pairs.append(GivenPair(pair.name, pair.sensor, scan, target, T_map_scan, within))
+    names = [pair.name for pair in pairs]
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise SourceError(f"{path}: {len(names)} pairs, but more than one is called {min(twice)!r}")
+    return pairs
+
+
+def _made_of(folder: Path) -> list[Pair]:
+    return _cross_sensor(folder) or _of_log(folder)
+
+
+def _cross_sensor(folder: Path) -> list[Pair]:
+    """Return the clouds of one moment that an extrinsic of a folder, ``vel2os1.yaml``, ties."""
+    pairs: list[Pair] = []
+    for path in sorted(folder.glob("*2*.yaml")):
+        for split in re.finditer("2", path.stem):
+            source, target = path.stem[: split.start()], path.stem[split.end() :]
+            scans, maps = _numbered(folder, source), _numbered(folder, target)
+            T_target_source = _extrinsic(path)
+            if not source or not target or T_target_source is None:
+                continue
+            pairs += [
+                GivenPair(
+                    f"{folder.resolve().name} {number}",
+                    f"{source} on {target}",
+                    scans[number],
+                    maps[number],
+                    T_target_source,
+                    (_RELLIS_M, _RELLIS_DEG),
+                )
+                for number in sorted(scans.keys() & maps.keys())
+            ]
+    return pairs
+
+
+def _numbered(folder: Path, sensor: str) -> dict[str, Path]:
+    """Return the clouds that are called by a sensor and a number: ``vel000104.bin``, ``os1_000104.bin``."""
+    name = re.compile(re.escape(sensor) + r"[_-]?(\d+)")
+    found = ((name.fullmatch(path.stem), path) for path in folder.iterdir() if path.suffix in ENDINGS)
+    return {match[1]: path for match, path in found if match}
+
+
+def _extrinsic(path: Path) -> tuple[tuple[float, ...], ...] | None:
+    """Return the motion of a calibration file with ``q: w x y z`` and ``t: x y z``; None if it has others."""
+    numbers: dict[str, float] = {}
+    part = ""
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        name, _, value = line.partition(":")
+        if not value.strip():
+            part = name.strip()
+        else:
+            try:
+                numbers[f"{part}.{name.strip()}"] = float(value)
+            except ValueError:
+                return None
+    try:
+        quaternion = np.array([numbers[f"q.{axis}"] for axis in "xyzw"])
+        return _rows(rotation_from_quaternion(quaternion), tuple(numbers[f"t.{axis}"] for axis in "xyz"))
+    except KeyError:
+        return None
+
+
+def _rows(R: np.ndarray, translation_m: tuple[float, ...]) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, transform(R, np.array(translation_m)).tolist()))
+
+
+def _of_log(folder: Path) -> list[Pair]:
+    if not kitti.recognise(folder) and not clouds.recognise(folder):
+        return []
+    try:
+        posed = _posed(folder)
+    except MapperError:  # several sequences, or none that can be opened: the folders in it are asked next
+        return []
+    if len(posed) < 3:
+        return []
+    chosen = np.linspace(0, len(posed) - 1, SCANS_PER_LOG + 2).astype(int)[1:-1]
+    pairs: list[Pair] = []
+    for index in dict.fromkeys(int(i) for i in chosen):
+        pairs.append(LogPair(folder, index, ALL_RINGS))
+        if len(posed[index][0].scan().points_body) > _VLP_POINTS:
+            pairs.append(LogPair(folder, index, FEW_RINGS))
+    return pairs
+
+
+def _posed(log: Path) -> list[tuple[Entry, Transform]]:
+    """Return the scans of a log whose pose is known."""
+    source = open_source(log)
+    if source.truth is None or source.sensor != "lidar":
+        return []
+    poses = dict(zip(source.truth.stamps_ns.tolist(), source.truth.T_world_body, strict=True))
+    return [(entry, poses[entry.stamp_ns]) for entry in source.entries() if entry.stamp_ns in poses]
+
+
+@lru_cache(maxsize=1)
+def _left_out(log: Path, index: int) -> Clouds:
+    """Return a scan, and the map of those around it in the frame of the middle one."""
+    posed = _posed(log)
+    first, last = max(index - MAP_SCANS, 0), min(index + MAP_SCANS, len(posed) - 1)
+    T_map_world = inverse(posed[(first + last) // 2][1])
+    others = [posed[i] for i in range(first, last + 1) if i != index]
+    target = merged([entry.scan() for entry, _ in others], [T_map_world @ T for _, T in others])
+    entry, T_world_body = posed[index]
+    return Clouds(target, entry.scan(), T_map_world @ T_world_body)
+
+
+@lru_cache(maxsize=2)
+def _read(path: Path) -> Scan:
+    return read_scan(path)
