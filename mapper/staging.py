@@ -44,6 +44,28 @@ def staged(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
         _swap(partial, out)
 
 
+@contextmanager
+def resumed(out: Path, *, mark: str) -> Iterator[Path]:
+    """Yield OUT to go on filling: a new folder, or one that an earlier session left unfinished or whole.
+
+    Args:
+        out: The folder.
+        mark: Name of the file by which such a folder is known; the caller writes it first of all.
+
+    Raises:
+        RunError: OUT holds something else, cannot be made, or another process is filling it.
+    """
+    out = out.resolve()
+    if out.exists() and not (out.is_dir() and ((out / mark).is_file() or not any(out.iterdir()))):
+        raise RunError(f"{out}: holds something else (no {mark}); choose another --out")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"{out}: cannot be created: {error.strerror}") from None
+    with locked(out):
+        yield out
+
+
 def _refuse_to_lose(out: Path, *, overwrite: bool) -> None:
     if not out.exists():
         return
