@@ -31,12 +31,19 @@ def synth(
         SensorKind, typer.Option(help="A camera in a flat, or a LiDAR outdoors.")
     ] = SensorKind.RGBD,
     seconds: Annotated[float | None, typer.Option(help="Length of the log.")] = None,
-    path: Annotated[str | None, typer.Option(help="rgbd: loop, desk or spin.")] = None,
+    path: Annotated[str | None, typer.Option(help="rgbd: loop, desk, spin or wall.")] = None,
     rooms: Annotated[int | None, typer.Option(help="rgbd: rooms of the flat, an even number from 4.")] = None,
+    plane_at: Annotated[
+        float | None,
+        typer.Option(metavar="METRES", help="rgbd: stand still before a bare wall so far away."),
+    ] = None,
     scene: Annotated[
         LidarScene | None, typer.Option(help="lidar: a car round a block, or a yard crossed by hand.")
     ] = None,
     rings: Annotated[int | None, typer.Option(help="lidar: beams, one above the other.")] = None,
+    wheels: Annotated[
+        bool, typer.Option("--wheels", help="Wheels carry the sensor; wheels.txt tells what they counted.")
+    ] = False,
     noise: Annotated[float | None, typer.Option(help="Times the sensor's noise; 0 is exact.")] = None,
     seed: Annotated[int | None, typer.Option(help="Another scene, another way through it.")] = None,
     set_: Annotated[
@@ -51,24 +58,28 @@ def synth(
     logs/yard --sensor lidar --scene courtyard --rings 16
     """
     from mapper.config import overridden
-    from mapper.config.synthetic import SCENES, SynthConfig
+    from mapper.config.synthetic import SCENES, SynthConfig, SynthWheelsConfig
 
     common = {"duration_s": seconds, "seed": seed}
+    carried = {"wheels": SynthWheelsConfig() if wheels else None}
     if sensor is SensorKind.RGBD:
         from mapper.sources.synthetic import write_tum_log
 
-        _refuse({"--scene": scene, "--rings": rings}, sensor)
-        given = common | {"path": path, "rooms": rooms} | _camera_noise(noise)
-        flat = overridden(SynthConfig(), merged(assignments(given), set_))
+        _refuse({"--scene": scene, "--rings": rings}, f"--sensor {sensor}")
+        if plane_at is not None:
+            _refuse({"--path": path}, "--plane-at")
+        given = common | {"path": path, "rooms": rooms} | _at_wall(plane_at) | _camera_noise(noise)
+        flat = overridden(SynthConfig().model_copy(update=carried), merged(assignments(given), set_))
         prepare_libraries()
         with progress_for(quiet=quiet).stage("render") as report:
             write_tum_log(out, flat, on_progress=report)
     else:
         from mapper.sources.synthetic.lidar import write_lidar_log
 
-        _refuse({"--path": path, "--rooms": rooms}, sensor)
+        _refuse({"--path": path, "--rooms": rooms, "--plane-at": plane_at}, f"--sensor {sensor}")
         given = common | {"sensor.rings": rings} | _lidar_noise(noise)
-        outdoors = overridden(SCENES[scene or LidarScene.STREET], merged(assignments(given), set_))
+        outdoors = SCENES[scene or LidarScene.STREET].model_copy(update=carried)
+        outdoors = overridden(outdoors, merged(assignments(given), set_))
         prepare_libraries()
         with progress_for(quiet=quiet).stage("scan") as report:
             write_lidar_log(out, outdoors, on_progress=report)
@@ -77,12 +88,29 @@ def synth(
         print(f"{out}: a {kind} log; map it with mapper build {out} --out RUN")
 
 
-def _refuse(options: dict[str, object], sensor: SensorKind) -> None:
+def _refuse(options: dict[str, object], beside: str) -> None:
     from mapper.errors import ConfigError
 
     for name, value in options.items():
         if value is not None:
-            raise ConfigError(f"{name} {value}: has no meaning with --sensor {sensor}; leave it out")
+            raise ConfigError(f"{name} {value}: has no meaning with {beside}; leave it out")
+
+
+def _at_wall(distance_m: float | None) -> dict[str, object]:
+    """Return the knobs of a tripod before a wall on which nothing hangs."""
+    from mapper.config.synthetic import SynthConfig
+
+    if distance_m is None:
+        return {}
+    return {
+        "path": "wall",
+        "wall_distance_m": distance_m,
+        "room_size_m": max(SynthConfig().room_size_m, 1.2 * distance_m),
+        "furniture_per_room": 0,
+        "posters_per_room": 0,
+        "shake_m": 0.0,
+        "shake_rad": 0.0,
+    }
 
 
 def _camera_noise(noise: float | None) -> dict[str, object]:

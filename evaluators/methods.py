@@ -11,7 +11,7 @@ from mapper.errors import FrameError
 from mapper.frames import Frame, RgbdFrame, Scan
 from mapper.geometry import Transform, apply, interpolate, inverse, nearest_rotation, transform
 from mapper.graph.model import PoseGraph
-from mapper.odometry.base import Odometry, Track
+from mapper.odometry.base import FrameOdometry, Track
 from mapper.parts import largest_part
 from mapper.progress import SILENT
 from mapper.registration.base import Alignment, failed
@@ -70,7 +70,7 @@ class Method:
         return moment.frame if self.sees_images else moment.scan
 
 
-def odometry_method(name: str, build: Callable[[], Odometry[Any]], *, sees_images: bool) -> Method:
+def odometry_method(name: str, build: Callable[[], FrameOdometry[Any]], *, sees_images: bool) -> Method:
     """Return a row for an odometry of the project."""
     return Method(
         name,
@@ -102,7 +102,7 @@ def reason_of(error: Exception) -> str:
 class OdometryTracker:
     """An odometry of the project with its own estimates: no loops, and nothing solved afterwards."""
 
-    def __init__(self, odometry: Odometry[Any]) -> None:
+    def __init__(self, odometry: FrameOdometry[Any]) -> None:
         self._odometry = odometry
         self._tracks: list[Track] = []
 
@@ -135,7 +135,7 @@ class OdometryPairs:
     image would look like from elsewhere, nobody knows.
     """
 
-    def __init__(self, build: Callable[[], Odometry[Any]]) -> None:
+    def __init__(self, build: Callable[[], FrameOdometry[Any]]) -> None:
         self._build = build
 
     def prepare(self, target: Frame) -> "OdometryPair":
@@ -146,7 +146,7 @@ class OdometryPairs:
 class OdometryPair:
     """An odometry that has seen one frame; good for one alignment, for it remembers that too."""
 
-    def __init__(self, odometry: Odometry[Any], target: Frame) -> None:
+    def __init__(self, odometry: FrameOdometry[Any], target: Frame) -> None:
         self._odometry = odometry
         self._target = odometry.track(odometry.observe(target))
 

@@ -25,6 +25,7 @@ from mapper.sources.base import FrameSource
 from mapper.sources.chained import ChainedLog, chained, last_session
 from mapper.tracked import Tracked, save_tracked, tracked_before, tracked_now
 from mapper.tracking import Start, refuse_a_fragment, track_log
+from mapper.trajectory import Trajectory
 from mapper.views_again import views_again
 
 _SETTLED = ("odometry", "level")
@@ -70,8 +71,9 @@ def append(
         before = tracked_before(run)
         known = before.graph.T_world_node.keys()
         with draft.clock.stage("track"):
-            start = _after(before, first, config, progress)
-            tracking = track_log(last_session(source), config, progress=progress, start=start)
+            session = last_session(source)
+            start = _after(before, first, session.wheels, config, progress)
+            tracking = track_log(session, config, progress=progress, start=start)
         refuse_a_fragment(tracking, config, sensor=source.sensor)
         _refuse_untied(second, run, tracking.loops, known)
         with draft.clock.stage("solve"):
@@ -110,14 +112,20 @@ def _manifest(run: Run, source: ChainedLog, config: SourceConfig) -> Manifest:
     )
 
 
-def _after(before: Tracked, first: FrameSource, config: BuildConfig, progress: Progress) -> Start:
+def _after(
+    before: Tracked,
+    first: FrameSource,
+    wheels: Trajectory | None,
+    config: BuildConfig,
+    progress: Progress,
+) -> Start:
     """Return the start of a session that knows the places of the one before."""
     assert isinstance(config.loops, KeyframeLoopsConfig)
     graph = before.graph
     closer = config.loops.build(config.graph.solve)
     views = views_again(first, before.trajectory, set(graph.stamps_ns.values()), config, progress=progress)
     closer.know(graph, {node: views[stamp_ns] for node, stamp_ns in graph.stamps_ns.items()})
-    odometry: Odometry[Any] = config.odometry.build()
+    odometry: Odometry[Any] = config.odometry.build(wheels)
     renumbered = Renumbered(odometry, first_node=max(graph.T_world_node) + 1)
     known = [factor for factor in graph.factors if factor.origin != "loop"]
     return Start(renumbered, closer, PoseGraph(graph.T_world_node, graph.stamps_ns, known), before.loops)

@@ -4,11 +4,11 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 from mapper.config import BuildConfig
 from mapper.config.sensors import Sensor
-from mapper.errors import FrameError, TrackingError
+from mapper.errors import ConfigError, FrameError, TrackingError
 from mapper.graph.model import PoseGraph
 from mapper.graph.wheels import wheel_factors
 from mapper.loops.closer import Closer
@@ -20,9 +20,10 @@ from mapper.sources.base import Entry, FrameSource, Skipped
 from mapper.trajectory import Trajectory, trajectory_from
 from mapper.watching import NOBODY, Step, Watcher
 
-_DOUBTS: Mapping[Sensor, str] = {
+_DOUBTS: Mapping[Sensor | Literal["wheels"], str] = {
     "rgbd": "is there texture, and depth within max_depth_m, in the images?",
     "lidar": "do the scans overlap, and are their units metres?",
+    "wheels": "do the wheels' readings cover the frames' times, without gaps beyond odometry.max_gap_s?",
 }
 
 
@@ -75,9 +76,19 @@ class Start:
     loops: Sequence[LoopClosure] = ()
 
 
-def from_nothing(config: BuildConfig) -> Start:
-    """Return the start of a log that is the first of its place."""
-    return Start(config.odometry.build(), config.loops.build(config.graph.solve), PoseGraph())
+def from_nothing(source: FrameSource, config: BuildConfig) -> Start:
+    """Return the start of a log that is the first of its place.
+
+    Raises:
+        ConfigError: The odometry wants wheels and the log has none, or does not count what the loops go by.
+    """
+    if config.odometry.kind == "wheels" and config.loops.kind == "thesis":
+        raise ConfigError(
+            "loops.kind=thesis looks from frames with many features, and odometry.kind=wheels counts none; "
+            "want loops.kind=places, scans or none"
+        )
+    odometry = config.odometry.build(source.wheels)
+    return Start(odometry, config.loops.build(config.graph.solve), PoseGraph())
 
 
 def track_log(
@@ -93,7 +104,7 @@ def track_log(
     A frame that cannot be read is skipped and reported, not fatal. With a ``start`` the graph and the loops
     returned are those of all sessions, the tracks those of this log.
     """
-    start = start or from_nothing(config)
+    start = start or from_nothing(source, config)
     odometry, closer, before = start.odometry, start.closer, start.graph
     graph = PoseGraph(dict(before.T_world_node), dict(before.stamps_ns), list(before.factors))
     tracks: list[Track] = []
@@ -103,7 +114,7 @@ def track_log(
     def observe(entry: Entry) -> tuple[Entry, Any, float]:
         began = time.perf_counter()
         try:
-            observation = odometry.observe(entry.load(colour=False))
+            observation = odometry.read(entry)
         except FrameError as error:
             observation = Skipped(entry.stamp_ns, str(error))
         return entry, observation, time.perf_counter() - began
@@ -127,7 +138,8 @@ def track_log(
             tracks.append(track)
             watcher.stepped(Step(entry, track, view, closer))
     graph.add_factors(odometry.finish())
-    graph.add_factors(wheel_factors(graph.stamps_ns, source.wheels, config.graph.wheels))
+    if config.odometry.kind != "wheels":  # else they have had their say
+        graph.add_factors(wheel_factors(graph.stamps_ns, source.wheels, config.graph.wheels))
     loops = (*start.loops, *closer.closures())
     graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")
     return Tracking(tuple(tracks), tuple(skipped), graph, loops, frame_ms)
@@ -147,7 +159,8 @@ def refuse_a_fragment(tracking: Tracking, config: BuildConfig, *, sensor: Sensor
         raise TrackingError(
             f"none of {len(tracking.skipped)} frames could be read; the first: {tracking.skipped[0].reason}"
         )
+    doubts = _DOUBTS["wheels" if config.odometry.kind == "wheels" else sensor]
     raise TrackingError(
         f"only {placed} of {read} frames read could be tracked, want at least {enough:.0f}; "
-        f"{_DOUBTS[sensor]} (min_tracked_frames and min_tracked_ratio set the limit)"
+        f"{doubts} (min_tracked_frames and min_tracked_ratio set the limit)"
     )

@@ -32,12 +32,12 @@ def views_again(
     Raises:
         FrameError: A frame cannot be read.
     """
-    odometry: Odometry[Any] = config.odometry.build()
+    odometry: Odometry[Any] = config.odometry.build(source.wheels)
     index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
 
     def view(entry: Entry) -> tuple[int, Seen]:
         twist = twist_at(trajectory, index_of[entry.stamp_ns])
-        return entry.stamp_ns, odometry.view(odometry.observe(entry.load(colour=False)), twist)
+        return entry.stamp_ns, odometry.view(odometry.read(entry), twist)
 
     entries = [entry for entry in source.entries() if entry.stamp_ns in stamps_ns]
     views = {}

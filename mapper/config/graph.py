@@ -9,11 +9,9 @@ from mapper.config.base import Config
 KernelKind = Literal["cauchy", "huber", "dcs"]
 
 
-class WheelFactorsConfig(Config):
+class WheelNoiseConfig(Config):
     """How far wheels are believed: not far, for they slip, but over any way."""
 
-    use: bool = True
-    """Tie keyframes by the wheels, where a log has them."""
     max_gap_s: PositiveFloat = 0.2
     """Between two readings; in a longer gap it is not known where the wheels were."""
     least_m: PositiveFloat = 0.01
@@ -24,6 +22,13 @@ class WheelFactorsConfig(Config):
     """Error of the heading, as a share of the radians turned."""
     rad_per_m: NonNegativeFloat = 0.02
     """Error of the heading per metre driven."""
+
+
+class WheelFactorsConfig(WheelNoiseConfig):
+    """What the wheels add to another odometry; where they are the odometry, their word counts once."""
+
+    use: bool = True
+    """Tie keyframes by the wheels, where a log has them."""
 
 
 class GraphConfig(Config):

@@ -10,6 +10,7 @@ from mapper.config.hough import HoughGicpConfig, HoughNdtConfig
 if TYPE_CHECKING:
     from mapper.odometry.scan_to_map.matching import Matcher
     from mapper.odometry.scan_to_map.odometry import ScanOdometry
+    from mapper.trajectory import Trajectory
 
 
 class ScanOdometryConfig(Config):
@@ -38,7 +39,7 @@ class ScanOdometryConfig(Config):
     max_pair_distance_m: PositiveFloat = 0.5
     """A point this near to one of the last keyframe's overlaps with it."""
 
-    def build(self) -> "ScanOdometry":
+    def build(self, _wheels: "Trajectory | None" = None, /) -> "ScanOdometry":
         """Return the odometry this configures."""
         from mapper.odometry.scan_to_map.odometry import ScanOdometry
 

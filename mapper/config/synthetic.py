@@ -29,6 +29,19 @@ class SensorConfig(Config):
     """Motion during this time blurs the image; 0 is a perfect shutter."""
 
 
+class SynthWheelsConfig(Config):
+    """Wheels that carry the sensor, and how wrongly they count."""
+
+    rate_hz: PositiveFloat = 50.0
+    """Poses per second."""
+    path_sigma: NonNegativeFloat = 0.01
+    """Standard deviation, over logs, of the share by which wheels are larger than they are taken to be."""
+    turn_sigma: NonNegativeFloat = 0.01
+    """The same of the distance between them, and so of turns."""
+    heading_rad_per_sqrt_m: NonNegativeFloat = 0.005
+    """Standard deviation of the heading after a metre of uneven floor; it grows with the way's root."""
+
+
 class SynthConfig(Config):
     """One synthetic log: the same configuration gives the same bytes."""
 
@@ -46,8 +59,11 @@ class SynthConfig(Config):
     texture_px_per_m: PositiveInt = 256
     """Detail of walls and floors; smaller is faster to make and enough for small images."""
 
-    path: Literal["loop", "desk", "spin"] = "loop"
-    """"loop": walk through every room; "desk": small motions before a desk; "spin": turn fast on the spot."""
+    path: Literal["loop", "desk", "spin", "wall"] = "loop"
+    """"loop": walk through every room; "desk": small motions before a desk; "spin": turn fast on the spot;
+    "wall": stand before a wall, looking straight at it."""
+    wall_distance_m: PositiveFloat = 1.5
+    """From the camera to that wall."""
     laps: PositiveFloat = 1.0
     """Rounds of the loop."""
     overlap_m: NonNegativeFloat = 1.0
@@ -62,6 +78,8 @@ class SynthConfig(Config):
     shake_m: NonNegativeFloat = 0.015
     """Amplitude of the hand's unsteadiness along each axis."""
     shake_rad: NonNegativeFloat = 0.02
+    wheels: SynthWheelsConfig | None = None
+    """Wheels carry the camera, which then neither shakes nor nods, and are read; None is a walker's hand."""
 
     width_px: PositiveInt = 640
     height_px: PositiveInt = 480
@@ -76,6 +94,12 @@ class SynthConfig(Config):
     """For this long the lens is covered: black images without depth; 0 never."""
     image_format: Literal["png", "jpg"] = "png"
     """How colour images are stored; "jpg" is a fifth of the size and not exact."""
+
+    @model_validator(mode="after")
+    def _wheels_stay_on_the_floor(self) -> Self:
+        if self.wheels is not None and self.path == "desk":
+            raise ValueError("path desk moves up and down, which wheels do not; want loop or spin")
+        return self
 
 
 IDEAL_SENSOR = SensorConfig(
@@ -148,6 +172,8 @@ class LidarSynthConfig(Config):
     """The sensor's up swings this far from the ground's normal, in changing directions."""
     yaw_swing_rad: Annotated[float, Field(ge=0.0, le=1.6)] = 0.0
     """The sensor turns this far to either side of the direction of travel."""
+    wheels: SynthWheelsConfig | None = None
+    """What is read of the vehicle's wheels."""
 
     sensor: LidarSensorConfig = LidarSensorConfig()
 

@@ -8,7 +8,7 @@ from typing import Generic, Protocol
 import numpy as np
 
 from mapper.config.loops import KeyframeLoopsConfig
-from mapper.errors import ConfigError
+from mapper.errors import ConfigError, FrameError
 from mapper.geometry import Transform
 from mapper.graph.model import PoseGraph
 from mapper.loops.agreement import Agreement
@@ -135,9 +135,14 @@ class KeyframeLoops(Generic[Place]):
         """Look for loops from a new node, and remember it as a place."""
         self._belief.add(node, track)
         self._ways.add(track.links)
-        if not self._is_worth_a_look(track):
+        look = self._look_from(track)
+        if look is None:
             return
-        place = self._verifier.digest(view())
+        try:
+            place = self._verifier.digest(view())
+        except FrameError:
+            return  # who tracks without looking meets a damaged frame here; the second pass will tell
+        self._looks.append(look)
         proposer, limit = self._proposer_of(place), self._config.max_candidates
         for proposal in proposer.propose(node, place, before=self._old_enough(), limit=limit):
             if proposal.proposed_by == "nearby" and proposal.node in self._elsewhere:
@@ -158,19 +163,18 @@ class KeyframeLoops(Generic[Place]):
         """Return where a node is believed to be now (4, 4), with the loops so far."""
         return self._belief.pose_of(node)
 
-    def _is_worth_a_look(self, track: Track) -> bool:
-        """Tell whether enough has changed since the last look, and if so, note it."""
+    def _look_from(self, track: Track) -> _Look | None:
+        """Return the look to be taken from here; None where too little has changed since the last."""
         if not track.is_sharp:
-            return False
+            return None
         path_m = 0.0
         if self._looks:
             last = self._looks[-1]
             moved = discrepancy(np.eye(4), last.T_world_body, track.T_world_body)
             if not exceeds(moved, Discrepancy(self._config.min_motion_m, self._config.min_motion_rad)):
-                return False
+                return None
             path_m = last.path_m + moved.translation_m
-        self._looks.append(_Look(track.stamp_ns, track.T_world_body, path_m))
-        return True
+        return _Look(track.stamp_ns, track.T_world_body, path_m)
 
     def _proposer_of(self, place: Place) -> Proposer[Place]:
         """Return the proposer; the first place that is seen decides which."""

@@ -13,6 +13,7 @@ from mapper.features.view import View
 from mapper.frames import Frame
 from mapper.geometry import Transform
 from mapper.graph.model import BetweenFactor
+from mapper.sources.base import Entry
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,11 +80,11 @@ Seen = View | ScanView
 class Odometry(Protocol[Observation]):
     """Frame-by-frame tracking, split so that the costly, stateless half can run ahead in threads."""
 
-    def observe(self, frame: Frame) -> Observation:
-        """Reduce a frame to what tracking needs. Pure: no state is read or written.
+    def read(self, entry: Entry) -> Observation:
+        """Reduce a log's frame to what tracking needs, and read no more. Pure: no state is read or written.
 
         Raises:
-            FrameError: The frame is of a kind that this method cannot use.
+            FrameError: The frame cannot be read, or is of a kind that this method cannot use.
         """
         ...
 
@@ -97,9 +98,24 @@ class Odometry(Protocol[Observation]):
         Args:
             observation: Of the frame.
             twist: How the body moved while a scan was swept; images do not look at it.
+
+        Raises:
+            FrameError: The frame was not needed before, and cannot be read.
         """
         ...
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return the measurements that were still being refined when the log ended."""
+        ...
+
+
+class FrameOdometry(Odometry[Observation], Protocol[Observation]):
+    """An odometry that sees each frame, and so can be given one that is no log's."""
+
+    def observe(self, frame: Frame) -> Observation:
+        """Reduce a frame to what tracking needs. Pure: no state is read or written.
+
+        Raises:
+            FrameError: The frame is of a kind that this method cannot use.
+        """
         ...

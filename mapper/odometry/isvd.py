@@ -21,6 +21,7 @@ from mapper.odometry.keyframes import SharpestKeyframes
 from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
 from mapper.sensing.depth_filter import dif
+from mapper.sources.base import Entry
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,6 +99,14 @@ class IsvdOdometry:
         self._sharpest = SharpestKeyframes(config.keyframe_interval)
         self._next_node = 0
         self._turn = 0
+
+    def read(self, entry: Entry) -> IsvdObservation:
+        """Observe a frame of a log, without its colours. Pure.
+
+        Raises:
+            FrameError: It cannot be read, or not be used.
+        """
+        return self.observe(entry.load(colour=False))
 
     def observe(self, frame: Frame) -> IsvdObservation:
         """Return a frame's features with their 3D points. Pure.

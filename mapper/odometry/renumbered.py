@@ -5,9 +5,9 @@ from dataclasses import replace
 from typing import Generic
 
 from mapper.deskew import Twist
-from mapper.frames import Frame
 from mapper.graph.model import BetweenFactor
 from mapper.odometry.base import Observation, Odometry, Seen, Track
+from mapper.sources.base import Entry
 
 
 class Renumbered(Generic[Observation]):
@@ -17,9 +17,9 @@ class Renumbered(Generic[Observation]):
         self._odometry = odometry
         self._first_node = first_node
 
-    def observe(self, frame: Frame) -> Observation:
+    def read(self, entry: Entry) -> Observation:
         """Reduce a frame to what tracking needs. Pure."""
-        return self._odometry.observe(frame)
+        return self._odometry.read(entry)
 
     def track(self, observation: Observation) -> Track:
         """Place the next observation, in time order."""

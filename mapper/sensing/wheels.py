@@ -49,3 +49,26 @@ def pose_at(wheels: Trajectory, stamp_ns: int, *, max_gap_ns: int) -> Transform 
         return None
     fraction = (stamp_ns - begin_ns) / (end_ns - begin_ns)
     return interpolate(wheels.T_world_body[after - 1], wheels.T_world_body[after], fraction)
+
+
+class Odometer:
+    """Counts the metres that wheels drove and the radians they turned, to and fro."""
+
+    def __init__(self, wheels: Trajectory) -> None:
+        """Add up the ways between the poses."""
+        steps_m = np.linalg.norm(np.diff(wheels.positions_world, axis=0), axis=1)
+        chords = np.linalg.norm(np.diff(wheels.T_world_body[:, :3, :3], axis=0), axis=(1, 2))
+        steps_rad = 2.0 * np.arcsin(
+            np.minimum(chords / np.sqrt(8.0), 1.0)
+        )  # |R_a − R_b|_F = √8 sin(angle / 2)
+        self._start_ns = int(wheels.stamps_ns[0])  # nanoseconds since 1970 are too many for a float
+        self._since_start_ns = (wheels.stamps_ns - self._start_ns).astype(np.float64)
+        self._counts = [np.concatenate([[0.0], np.cumsum(steps)]) for steps in (steps_m, steps_rad)]
+
+    def between(self, begin_ns: int, end_ns: int) -> tuple[float, float]:
+        """Return the metres driven and the radians turned from one time to a later one."""
+        span_ns = np.array([begin_ns - self._start_ns, end_ns - self._start_ns], dtype=np.float64)
+        path_m, turn_rad = (
+            np.diff(np.interp(span_ns, self._since_start_ns, count)) for count in self._counts
+        )
+        return float(path_m[0]), float(turn_rad[0])

@@ -42,8 +42,8 @@ class Session:
 class ChainedLog:
     """Sessions one after the other; see :class:`mapper.sources.base.FrameSource`.
 
-    There are no accelerations: two logs' readings may be in different axes. There are no wheels: each log's
-    are in a frame of their own.
+    There are no accelerations: two logs' readings may be in different axes. There are no wheels but a single
+    session's: each log's are in a frame of their own.
     """
 
     sessions: Sequence[Session]
@@ -134,7 +134,12 @@ def _chain(sessions: Sequence[Session]) -> ChainedLog:
         truth=truth,
         notes=notes,
         sensor=logs[0].sensor,
+        wheels=_shifted(logs[0].wheels, sessions[0].shift_ns) if len(logs) == 1 else None,
     )
+
+
+def _shifted(wheels: Trajectory | None, shift_ns: int) -> Trajectory | None:
+    return wheels and replace(wheels, stamps_ns=wheels.stamps_ns + shift_ns)
 
 
 def _stamps(source: FrameSource) -> Stamps:

@@ -9,15 +9,15 @@ import numpy as np
 from mapper.config.sensors import Sensor
 from mapper.config.sources import WheelsConfig
 from mapper.errors import DataError, SourceError
-from mapper.geometry import Transform, transform
+from mapper.geometry import Transform, inverse, transform
 from mapper.sensing.wheels import driven
 from mapper.sources.text import parse_numbers, parse_stamp, pose_from_numbers, rows, time_order
-from mapper.trajectory import Trajectory, read_tum
+from mapper.trajectory import Trajectory, read_tum, write_tum
 
 POSES, READINGS = "wheels.txt", "encoders.txt"
 _POSE_COLUMNS = 8
 
-_LOOKING_FORWARD: Mapping[Sensor, Transform] = {
+LOOKING_FORWARD: Mapping[Sensor, Transform] = {
     "rgbd": transform(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3)),
     "lidar": np.eye(4),
 }
@@ -31,7 +31,7 @@ def mounting(config: WheelsConfig, sensor: Sensor) -> Transform:
         SourceError: What was set is no pose.
     """
     if config.body_in_base is None:
-        return _LOOKING_FORWARD[sensor]
+        return LOOKING_FORWARD[sensor]
     T_base_body = pose_from_numbers(np.array(config.body_in_base))
     if T_base_body is None:
         raise SourceError(f"source.wheels.body_in_base={config.body_in_base}: its quaternion is zero")
@@ -70,6 +70,15 @@ def read_wheels_file(path: Path, config: WheelsConfig, *, sensor: Sensor) -> tup
         T_odom_base, notes = _integrated(path, config.wheelbase_m)
     wheels = replace(T_odom_base, T_world_body=T_odom_base.T_world_body @ mounting(config, sensor))
     return wheels, [*notes, f"{path.name}: wheel odometry, {len(wheels)} poses"]
+
+
+def write_wheels(folder: Path, wheels: Trajectory, *, sensor: Sensor) -> None:
+    """Write T_odom_body as the ``wheels.txt`` of a log, of a base that has its origin in the body's.
+
+    So it reads back without a mounting's being told.
+    """
+    T_odom_base = wheels.T_world_body @ inverse(LOOKING_FORWARD[sensor])
+    write_tum(folder / POSES, replace(wheels, T_world_body=T_odom_base))
 
 
 def _integrated(path: Path, wheelbase_m: float | None) -> tuple[Trajectory, list[str]]:

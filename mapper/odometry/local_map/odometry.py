@@ -21,6 +21,7 @@ from mapper.odometry.local_map.observation import Observation, observe
 from mapper.odometry.local_map.placing import Placement, Placing, unmatched
 from mapper.odometry.local_map.recall import Recall
 from mapper.places.vocabulary import load_vocabulary
+from mapper.sources.base import Entry
 
 MakePlacing = Callable[[LandmarkMap, LocalSearch, Recall], Placing]
 
@@ -46,6 +47,14 @@ class KeyframeOdometry:
         self._frames_since_keyframe = 0
         self._lost_frames = 0  # since the last one that was placed
         self._stray_frames = 0  # those of them that show enough to begin with
+
+    def read(self, entry: Entry) -> Observation:
+        """Observe a frame of a log, without its colours. Pure.
+
+        Raises:
+            FrameError: It cannot be read, or not be used.
+        """
+        return self.observe(entry.load(colour=False))
 
     def observe(self, frame: Frame) -> Observation:
         """Detect features and look up their depth. Pure; safe in any thread.

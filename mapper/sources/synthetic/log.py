@@ -16,6 +16,7 @@ from mapper.parallel import ordered_map
 from mapper.sources.synthetic.boxes import write_scene
 from mapper.sources.synthetic.path import seconds_of
 from mapper.sources.synthetic.source import SyntheticEntry, SyntheticSource
+from mapper.sources.wheels import write_wheels
 from mapper.timebase import seconds_text_from_ns
 from mapper.trajectory import write_tum
 
@@ -97,9 +98,11 @@ def _write(folder: Path, source: SyntheticSource, on_progress: Callable[[int, in
         (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     write_tum(folder / "groundtruth.txt", source.truth)
     (folder / "calibration.toml").write_text(_calibration_text(source.camera), encoding="utf-8")
-    knobs = config.model_dump(mode="json")
-    if not config.moving_boxes:  # a flat in which nothing moves says what it always said
-        del knobs["moving_boxes"]
+    if source.wheels is not None:
+        write_wheels(folder, source.wheels, sensor=source.sensor)
+    news = {name for name in ("moving_boxes", "wheels") if not getattr(config, name)}
+    news |= {"wall_distance_m"} if config.path != "wall" else set()
+    knobs = config.model_dump(mode="json", exclude=news)  # a flat without them says what it always said
     moving = source.movers.as_json(seconds_of(source.stamps_ns))
     write_scene(folder / "scene.json", source.scene.boxes, knobs, moving=moving)
 

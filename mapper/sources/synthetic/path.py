@@ -1,4 +1,4 @@
-"""How the camera moves: a walk round the flat, small motions before a desk, or a fast turn on the spot."""
+"""How the camera moves: round the flat, a little before a desk, fast on the spot, or not, before a wall."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.config.synthetic import SynthConfig
+from mapper.errors import SourceError
 from mapper.geometry import Array
 from mapper.sources.synthetic.plan import DESK_SIZE_M, Plan, closed_spline
 from mapper.sources.synthetic.scene import Scene
@@ -54,8 +55,10 @@ def make_motion(config: SynthConfig, scene: Scene) -> Motion:
         duration_s, steady = _loop(config, scene.plan, rng)
     elif config.path == "desk":
         duration_s, steady = _STILL_S, _before_desk(scene.plan, rng)
-    else:
+    elif config.path == "spin":
         duration_s, steady = _STILL_S, _spin(config, scene.plan)
+    else:
+        duration_s, steady = _STILL_S, _before_wall(config, scene.plan)
     if config.duration_s is not None:
         duration_s = config.duration_s
     return Motion(duration_s, steady, _shake(config, rng))
@@ -94,7 +97,7 @@ def _look(angles_rad: Array) -> Array:
 
 def _shake(config: SynthConfig, rng: np.random.Generator) -> Callable[[Array], Array]:
     """Each axis sways with three sines between breathing and walking pace."""
-    amplitudes = np.array([config.shake_m] * 3 + [config.shake_rad] * 3)
+    amplitudes = np.array([config.shake_m] * 3 + [config.shake_rad] * 3) * (config.wheels is None)
     rates_hz = rng.uniform([[0.2], [0.6], [1.2]], [[0.5], [1.1], [1.9]], (3, 6))
     phases_rad = rng.uniform(0.0, 2.0 * np.pi, (3, 6))
     shares = np.array([0.55, 0.3, 0.15])[:, None]
@@ -119,6 +122,7 @@ def _loop(
     closed_parameter = np.append(parameter, len(plan.route))
     glances = max(round(lap_m / 4.0), 1)
     phases_rad = rng.uniform(0.0, 2.0 * np.pi, 3)
+    nods = config.wheels is None
 
     def heading(along_m: Array) -> Array:
         u = np.interp(np.mod(along_m, lap_m), travelled_m, closed_parameter)
@@ -152,8 +156,8 @@ def _loop(
         along_m = walked_m(times_s)
         laps = np.floor(along_m / lap_m)
         u = np.interp(along_m - laps * lap_m, travelled_m, closed_parameter)
-        height_m = _EYE_HEIGHT_M + 0.08 * np.sin(turns(along_m, 2) + phases_rad[1])
-        pitch = _LOOK_DOWN_RAD + 0.10 * np.sin(turns(along_m, glances + 1) + phases_rad[2])
+        height_m = _EYE_HEIGHT_M + nods * 0.08 * np.sin(turns(along_m, 2) + phases_rad[1])
+        pitch = _LOOK_DOWN_RAD + nods * 0.10 * np.sin(turns(along_m, glances + 1) + phases_rad[2])
         gaze = laps * lap_turn + np.interp(along_m - laps * lap_m, closed_grid_m, closed_yaw)
         positions = np.column_stack([closed_spline(plan.route, u), height_m])
         return positions, np.column_stack([gaze, pitch, np.zeros(len(pitch))])
@@ -194,17 +198,34 @@ def _before_desk(plan: Plan, rng: np.random.Generator) -> Callable[[Array], tupl
     return steady
 
 
+def _before_wall(config: SynthConfig, plan: Plan) -> Callable[[Array], tuple[Array, Array]]:
+    """Look straight at the first room's wall x = x0, which has no door."""
+    room = plan.rooms[0]
+    if config.wall_distance_m > room.x1_m - room.x0_m:
+        raise SourceError(
+            f"wall_distance_m {config.wall_distance_m:g}: the room is {room.x1_m - room.x0_m:.2f} m wide; "
+            "make it wider by --set room_size_m=…"
+        )
+    position = [room.x0_m + config.wall_distance_m, 0.5 * (room.y0_m + room.y1_m), _EYE_HEIGHT_M]
+
+    def steady(times_s: Array) -> tuple[Array, Array]:
+        count = len(times_s)
+        return np.tile(position, (count, 1)), np.tile([np.pi, 0.0, 0.0], (count, 1))
+
+    return steady
+
+
 def _spin(config: SynthConfig, plan: Plan) -> Callable[[Array], tuple[Array, Array]]:
     """Turn in the first room's free middle, now slower, now at the highest rate."""
     spot = closed_spline(plan.route, np.zeros(1))[0]
-    fastest, breath_hz = config.max_yaw_rate_rad_s, 0.2
+    fastest, breath_hz, nods = config.max_yaw_rate_rad_s, 0.2, config.wheels is None
 
     def steady(times_s: Array) -> tuple[Array, Array]:
         phase_rad = 2.0 * np.pi * breath_hz * times_s
         drift = 0.08 * np.column_stack([np.sin(phase_rad), np.cos(phase_rad)])
         positions = np.column_stack([spot + drift, np.full(len(drift), _EYE_HEIGHT_M)])
         yaw = fastest * (0.65 * times_s + 0.35 * (1.0 - np.cos(phase_rad)) / (2.0 * np.pi * breath_hz))
-        pitch = _LOOK_DOWN_RAD + 0.12 * np.sin(0.7 * phase_rad)
+        pitch = _LOOK_DOWN_RAD + nods * 0.12 * np.sin(0.7 * phase_rad)
         return positions, np.column_stack([yaw, pitch, np.zeros(len(yaw))])
 
     return steady

@@ -19,6 +19,7 @@ from mapper.sources.synthetic.raycast import Rendering, render
 from mapper.sources.synthetic.scene import Scene, make_scene
 from mapper.sources.synthetic.sensor import observe
 from mapper.sources.synthetic.streams import Stream, rng_of
+from mapper.sources.synthetic.wheels import counted
 from mapper.timebase import Stamps
 from mapper.trajectory import Trajectory
 
@@ -67,11 +68,12 @@ class SyntheticSource:
         motion: Its pose at any time.
         stamps_ns: (N,) stamps of all frames, also of those that the log drops.
         path: A name for messages.
+        name: The same.
         kind: "synthetic".
         sensor: "rgbd".
         truth: The exact pose of every frame, also of dropped ones.
         accelerations: None; there is no accelerometer.
-        wheels: None; they are not simulated.
+        wheels: What the vehicle's would have counted; None without.
         notes: Empty.
     """
 
@@ -82,11 +84,20 @@ class SyntheticSource:
         self.camera = camera_of(config)
         self.motion: Motion = make_motion(config, self.scene)
         self.stamps_ns: Stamps = frame_stamps(config, self.motion)
-        self.path = Path(f"synthetic-{config.path}-{config.seed}")
+        self.name = f"synthetic-{config.path}-{config.seed}"
+        self.path = Path(self.name)
         self.kind = "synthetic"
         self.sensor: Sensor = "rgbd"
         self.accelerations: Accelerations | None = None
         self.wheels: Trajectory | None = None
+        if config.wheels is not None:
+            self.wheels = counted(
+                config.wheels,
+                self.motion.poses,
+                duration_s=float(seconds_of(self.stamps_ns[-1:])[0]),
+                sensor=self.sensor,
+                rng=rng_of(config.seed, Stream.WHEELS),
+            )
         self.notes: Sequence[str] = ()
 
     @cached_property

@@ -16,6 +16,7 @@ class Stream(IntEnum):
     DROPS = 5
     MOVERS = 6
     GROUND = 7
+    WHEELS = 8
 
 
 def rng_of(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:

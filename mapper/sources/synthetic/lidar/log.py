@@ -9,6 +9,7 @@ from mapper.parallel import ordered_map
 from mapper.sources.kitti_writing import save_scan
 from mapper.sources.synthetic.lidar.source import SyntheticLidarEntry, SyntheticLidarSource
 from mapper.sources.synthetic.log import appearing
+from mapper.sources.wheels import write_wheels
 from mapper.timebase import seconds_text_from_ns
 from mapper.trajectory import write_kitti
 
@@ -46,8 +47,11 @@ def write_lidar_log(
         times = [seconds_text_from_ns(int(stamp_ns)) for stamp_ns in source.stamps_ns]
         (folder / "times.txt").write_text("\n".join(times) + "\n", encoding="utf-8")
         write_kitti(folder / "poses.txt", source.truth)
+        if source.wheels is not None:
+            write_wheels(folder, source.wheels, sensor=source.sensor)
+        news = {"wheels"} if config.wheels is None else set()  # without them it says what it always said
         scene = {
-            "config": config.model_dump(mode="json"),
+            "config": config.model_dump(mode="json", exclude=news),
             "ground": source.scene.ground.as_json(),
             "solids": source.scene.solids.as_json(),
         }

@@ -14,6 +14,7 @@ from mapper.sources.synthetic.lidar.scene import OutdoorScene, make_outdoor_scen
 from mapper.sources.synthetic.lidar.sensor import firing_times_s, render_scan, render_sweep
 from mapper.sources.synthetic.path import seconds_of
 from mapper.sources.synthetic.streams import Stream, rng_of
+from mapper.sources.synthetic.wheels import counted
 from mapper.timebase import Stamps
 from mapper.trajectory import Trajectory
 
@@ -58,7 +59,7 @@ class SyntheticLidarSource:
         sensor: "lidar".
         truth: The exact pose at every stamp.
         accelerations: None; there is no accelerometer.
-        wheels: None; they are not simulated.
+        wheels: What the vehicle's would have counted; None without.
         notes: Empty.
     """
 
@@ -73,6 +74,14 @@ class SyntheticLidarSource:
         self.sensor: Sensor = "lidar"
         self.accelerations: Accelerations | None = None
         self.wheels: Trajectory | None = None
+        if config.wheels is not None:
+            self.wheels = counted(
+                config.wheels,
+                self.drive.poses,
+                duration_s=float(seconds_of(self.stamps_ns[-1:])[0]),
+                sensor=self.sensor,
+                rng=rng_of(config.seed, Stream.WHEELS),
+            )
         self.notes: Sequence[str] = ()
 
     @cached_property
