@@ -18,12 +18,14 @@ from cli.export import export
 from cli.fuse import fuse
 from cli.inspect import inspect
 from cli.loops import WithPairs, loops
+from cli.merge import merge
 from cli.plan import WithPoints, plan
 from cli.register import register
 from cli.report import report
 from cli.sensor import sensor
 from cli.show_config import show_config
 from cli.solve import solve
+from cli.sweep import sweep
 from cli.synth import synth
 from cli.view import view
 from cli.vocabulary import vocabulary
@@ -71,10 +73,12 @@ app.command("fuse")(fuse)
 app.command("loops", cls=WithPairs)(loops)
 app.command("eval")(evaluate)
 app.command("export")(export)
+app.command("merge")(merge)
 app.command("plan", cls=WithPoints)(plan)
 app.command("solve")(solve)
 app.command("register")(register)
 app.command("compare")(compare)
+app.command("sweep")(sweep)
 app.command("inspect")(inspect)
 app.command("convert")(convert)
 app.command("synth")(synth)

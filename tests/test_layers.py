@@ -28,6 +28,7 @@ HOMES = {
     "evo": (),
     "rerun": ("mapper/export/rerun/",),
     "distributed": ("mapper/workers.py",),
+    "pyarrow": ("evaluators/parquet.py",),
 }
 
 

@@ -1,0 +1,58 @@
+"""``mapper sweep``: many logs by many methods and configurations."""
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cli.console import progress_for
+from cli.environment import has_compiled_code, prepare_libraries
+from cli.options import Quiet
+
+
+def sweep(
+    file: Annotated[
+        Path,
+        typer.Argument(metavar="SWEEP.toml", help="Names the logs, the methods and the configurations."),
+    ],
+    out: Annotated[
+        Path, typer.Option(help="Folder for the results; what is finished there is not run again.")
+    ],
+    processes: Annotated[
+        int | None, typer.Option(help="Builds at a time, a core each; omit for one on every core.")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="tcp://HOST:PORT", help="Let the workers of this Dask scheduler build instead."),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Build every log by every method in every configuration, and set the results side by side.
+
+    The same command goes on where a sweep was interrupted or killed, and tries again what failed.
+
+    Example: mapper sweep sweep.toml --out sweeps/first --processes 4
+    """
+    from evaluators.sweep import plan_sweep, run_sweep
+    from evaluators.sweep_files import files_of, write_sweep
+    from evaluators.sweep_tables import summary_text
+    from mapper.errors import ConfigError
+
+    if scheduler is not None and processes is not None:
+        raise ConfigError(f"--processes {processes}: has no meaning with --scheduler; leave it out")
+    prepare_libraries()
+    progress = progress_for(quiet=quiet)
+    plan = plan_sweep(file, out)
+    if not has_compiled_code():
+        progress.note("first run here: the kernels are compiled once, which takes about a minute")
+    results = run_sweep(
+        plan,
+        processes=processes or os.cpu_count() or 1,
+        scheduler=scheduler,
+        progress=progress,
+    )
+    records = write_sweep(plan, results, title=file.stem)
+    if not quiet:
+        print(summary_text(records))
+        print(*files_of(plan), sep="\n")

@@ -1,0 +1,69 @@
+"""What `mapper sweep` goes through."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BeforeValidator, Field, NonNegativeInt, model_validator
+
+from mapper.config.base import Config
+
+
+def _assignments(given: Any) -> Any:
+    """Return a table of knobs as ``key.path=value``; a list stays what it is."""
+    return tuple(_flat(given, "")) if isinstance(given, Mapping) else given
+
+
+def _flat(tree: Mapping[str, Any], parent: str) -> Iterator[str]:
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{parent}{name}.")
+        elif isinstance(value, list):
+            raise ValueError(f"{parent}{name} is a list; write it into a config file")
+        else:
+            yield f"{parent}{name}={value}"
+
+
+Name = Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[^\s/].*$")]
+Assignments = Annotated[tuple[str, ...], BeforeValidator(_assignments)]
+"""``key.path=value`` as for ``--set``, or a table of the same."""
+
+
+class ConfigurationConfig(Config):
+    """Knobs that are turned for every method alike."""
+
+    name: Name
+    set: Assignments = ()
+
+
+class MethodConfig(ConfigurationConfig):
+    """A way to map a log: a configuration file, and knobs turned on top of it."""
+
+    config: Path | None = None
+    """TOML file, beside the sweep's own; None begins with the defaults for the log's sensor."""
+
+
+class SweepConfig(Config):
+    """Logs × methods × configurations, each a build of its own."""
+
+    logs: Annotated[tuple[str, ...], Field(min_length=1)]
+    """Paths or globs, beside the sweep's own file."""
+    method: Annotated[tuple[MethodConfig, ...], Field(min_length=1)]
+    configuration: Annotated[tuple[ConfigurationConfig, ...], Field(min_length=1)] = (
+        ConfigurationConfig(name="default"),
+    )
+    """They win over what the method says."""
+    seeds: tuple[NonNegativeInt, ...] = ()
+    """Each build is repeated with these in place of every seed of its configuration, if it has any."""
+    keep: Literal["nothing", "trajectory", "run"] = "trajectory"
+    """What is kept of each build beside its numbers: "trajectory" with manifest, configuration and summary
+    picture, or the whole run folder."""
+
+    @model_validator(mode="after")
+    def _no_name_twice(self) -> Self:
+        for kind, variants in (("method", self.method), ("configuration", self.configuration)):
+            names = [variant.name for variant in variants]
+            for name in names:
+                if names.count(name) > 1:
+                    raise ValueError(f"two of [[{kind}]] are called {name!r}; want different names")
+        return self
