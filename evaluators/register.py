@@ -118,7 +118,7 @@ def _thinned(scan: Scan) -> Scan:
 def _by_features(
     target: Frame, source: Frame, config: IsvdOdometryConfig
 ) -> tuple[Alignment, dict[str, float]]:
-    from mapper.odometry.isvd import IsvdOdometry, find_shared_points
+    from mapper.odometry.isvd import IsvdOdometry, matched_pairs, shared_points
     from mapper.registration.isvd import Isvd
 
     if not isinstance(target, RgbdFrame) or not isinstance(source, RgbdFrame):
@@ -129,8 +129,8 @@ def _by_features(
     detected = time.perf_counter()
     seen_source = odometry.observe(source)
     for match in (config.match, config.fallback):
-        points_target, points_source, _ = find_shared_points(seen_target, seen_source, match)
-        alignment = Isvd(config.registration).fit(points_target, points_source)
+        pairs = matched_pairs(seen_target, seen_source, match)
+        alignment = Isvd(config.registration).fit(*shared_points(seen_target, seen_source, pairs))
         if alignment.converged:
             break
     return alignment, {"prepare": detected - began, "align": time.perf_counter() - detected}

@@ -9,8 +9,8 @@ import numpy as np
 from mapper.config.odometry import IsvdOdometryConfig, MatchConfig
 from mapper.deskew import Twist
 from mapper.errors import FrameError
-from mapper.features.detectors import Features, build_detector
-from mapper.features.matching import homography_inliers, match_mutual
+from mapper.features.detectors import Detector, Features, build_detector
+from mapper.features.matching import Pairs, homography_inliers, match_mutual
 from mapper.features.view import View
 from mapper.frames import Frame, PinholeCamera, RgbdFrame
 from mapper.geometry import Array, Points, Transform, apply, inverse, mean_rotation, transform
@@ -43,7 +43,7 @@ class IsvdObservation:
     T_body_camera: Transform
 
 
-SharedPoints = Callable[[IsvdObservation, IsvdObservation, MatchConfig], tuple[Points, Points, int]]
+FindPairs = Callable[[IsvdObservation, IsvdObservation, MatchConfig], Pairs]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,17 +82,24 @@ class IsvdOdometry:
     features and depth errors, so it is right in proportion rather than in size.
     """
 
-    def __init__(self, config: IsvdOdometryConfig, *, shared_points: SharedPoints | None = None) -> None:
+    def __init__(
+        self,
+        config: IsvdOdometryConfig,
+        *,
+        detector: Detector | None = None,
+        find_pairs: FindPairs | None = None,
+    ) -> None:
         """Start before the first frame.
 
         Args:
             config: Every knob.
-            shared_points: Stands in for ``find_shared_points``, so that runs that differ only in what they
-                make of the pairs need not match again.
+            detector: Stands in for the configured one, so that odometries that look at the same frames
+                need not detect again.
+            find_pairs: Stands in for ``matched_pairs``, so that they need not match again.
         """
         self._config = config
-        self._shared_points = shared_points or find_shared_points
-        self._detector = build_detector(config.detector)
+        self._detector = detector or build_detector(config.detector)
+        self._find_pairs = find_pairs or matched_pairs
         self._isvd = Isvd(config.registration)
         self._recent: deque[Placed] = deque(maxlen=max(config.previous_frames, config.keyframe_interval))
         self._keyframes: list[Placed] = []
@@ -172,11 +179,13 @@ class IsvdOdometry:
         """Return the registrations that succeeded, in the order of the earlier frames."""
         candidates = []
         for placed in earlier:
-            target, source, matches = self._shared_points(placed.observation, observation, match)
-            alignment, weight = self._isvd.fit_weighted(target, source)
+            pairs = self._find_pairs(placed.observation, observation, match)
+            alignment, weight = self._isvd.fit_weighted(
+                *shared_points(placed.observation, observation, pairs)
+            )
             if alignment.converged:
                 T_world_body = placed.T_world_body @ alignment.T_target_source
-                candidates.append(Candidate(placed, alignment, weight, matches, T_world_body))
+                candidates.append(Candidate(placed, alignment, weight, len(pairs), T_world_body))
         return candidates
 
     def _combine(self, candidates: Sequence[Candidate]) -> Transform:
@@ -252,13 +261,8 @@ class IsvdOdometry:
         )
 
 
-def find_shared_points(
-    target: IsvdObservation, source: IsvdObservation, match: MatchConfig
-) -> tuple[Points, Points, int]:
-    """Return the (M, 3) points that two frames share, each in its own body frame, and the number of matches.
-
-    Thesis alg. 8: matches filtered by a homography are counted; those with depth on both sides give points.
-    """
+def matched_pairs(target: IsvdObservation, source: IsvdObservation, match: MatchConfig) -> Pairs:
+    """Return the features that two frames share (thesis alg. 8)."""
     pairs = match_mutual(target.features, source.features, max_ratio=match.max_ratio)
     if match.filter == "homography":
         pairs = pairs[
@@ -267,8 +271,14 @@ def find_shared_points(
                 source.features.pixels[pairs[:, 1]],
                 tolerance_px=match.homography_tolerance_px,
                 iterations=match.homography_iterations,
+                seed=match.seed,
             )
         ]
+    return pairs
+
+
+def shared_points(target: IsvdObservation, source: IsvdObservation, pairs: Pairs) -> tuple[Points, Points]:
+    """Return the (M, 3) points of the pairs with depth on both sides, each in its own body frame."""
     points_target, points_source = target.points_body[pairs[:, 0]], source.points_body[pairs[:, 1]]
     measured = np.isfinite(points_target[:, 2]) & np.isfinite(points_source[:, 2])
-    return points_target[measured], points_source[measured], len(pairs)
+    return points_target[measured], points_source[measured]

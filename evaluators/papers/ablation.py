@@ -1,0 +1,125 @@
+"""ISVD with several settings on one log, in lockstep: each frame is read, looked at and matched once."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+from mapper.config import BuildConfig
+from mapper.config.features import DetectorConfig
+from mapper.config.odometry import IsvdOdometryConfig, MatchConfig
+from mapper.errors import ConfigError, FrameError, MapperError
+from mapper.features.detectors import Features, build_detector
+from mapper.features.matching import Pairs
+from mapper.frames import Frame, Image
+from mapper.graph.model import PoseGraph
+from mapper.odometry.base import Track
+from mapper.odometry.isvd import IsvdObservation, IsvdOdometry, matched_pairs
+from mapper.solving import solve
+from mapper.sources.base import FrameSource
+from mapper.tracking import Tracking, refuse_a_fragment
+from mapper.trajectory import Trajectory
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Followed:
+    """What a setting made of a log.
+
+    Attributes:
+        estimate: Poses of the frames that were placed; None if too few were.
+        frames: How many could be read.
+        failure: Why there is no estimate, or empty.
+    """
+
+    estimate: Trajectory | None
+    frames: int
+    failure: str = ""
+
+    @property
+    def lost(self) -> int:
+        """How many frames were read, but not placed."""
+        return self.frames - (0 if self.estimate is None else len(self.estimate))
+
+
+def follow(source: FrameSource, variants: Mapping[str, BuildConfig]) -> dict[str, Followed]:
+    """Return what every setting makes of a log.
+
+    Raises:
+        ConfigError: An odometry is not ISVD.
+    """
+    eyes: dict[DetectorConfig, _Eyes] = {}
+    followers = {}
+    for name, config in variants.items():
+        if not isinstance(config.odometry, IsvdOdometryConfig):
+            raise ConfigError(f"{name}: odometry.kind is {config.odometry.kind}, want isvd")
+        detector = config.odometry.detector
+        followers[name] = _Follower(config, config.odometry, eyes.setdefault(detector, _Eyes(detector)))
+    for entry in source.entries():
+        try:
+            frame = entry.load(colour=False)
+        except FrameError:
+            continue  # as a build does
+        for follower in followers.values():
+            follower.add(frame)
+    return {name: follower.followed() for name, follower in followers.items()}
+
+
+class _Eyes:
+    """A detector and a matcher that look at a frame once, however many odometries ask."""
+
+    def __init__(self, config: DetectorConfig) -> None:
+        self._detector = build_detector(config)
+        self._gray: Image | None = None
+        self._pairs: dict[tuple[int, MatchConfig], Pairs] = {}
+
+    @property
+    def scale_factor(self) -> float:
+        """The detector's."""
+        return self._detector.scale_factor
+
+    def detect(self, gray: Image) -> Features:
+        """Return the features of the newest image."""
+        if gray is not self._gray:
+            self._gray, self._features = gray, self._detector.detect(gray)
+            self._pairs.clear()
+        return self._features
+
+    def match(self, target: IsvdObservation, source: IsvdObservation, match: MatchConfig) -> Pairs:
+        """Return the pairs of an earlier frame and the newest."""
+        key = (target.stamp_ns, match)
+        if key not in self._pairs:
+            self._pairs[key] = matched_pairs(target, source, match)
+        return self._pairs[key]
+
+
+class _Follower:
+    """One setting on its way through the log."""
+
+    def __init__(self, config: BuildConfig, odometry: IsvdOdometryConfig, eyes: _Eyes) -> None:
+        self._config = config
+        self._odometry = IsvdOdometry(odometry, detector=eyes, find_pairs=eyes.match)
+        self._closer = config.loops.build(config.graph.solve)
+        self._graph = PoseGraph()
+        self._tracks: list[Track] = []
+
+    def add(self, frame: Frame) -> None:
+        """Track the next frame, and look for loops from it."""
+        observation = self._odometry.observe(frame)
+        track = self._odometry.track(observation)
+        self._tracks.append(track)
+        if track.node is None:
+            return
+        self._graph.add_node(track.node, track.stamp_ns, track.T_world_body)
+        self._graph.add_factors(track.factors)
+        self._closer.add(track.node, track, partial(self._odometry.view, observation))
+
+    def followed(self) -> Followed:
+        """Return the poses with the loops' correction."""
+        loops = tuple(self._closer.closures())
+        self._graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")
+        tracking = Tracking(tuple(self._tracks), (), self._graph, loops, {})
+        try:
+            refuse_a_fragment(tracking, self._config, sensor="rgbd")
+            solved = solve(self._graph, loops, self._config.graph)
+        except MapperError as error:
+            return Followed(None, len(self._tracks), str(error))
+        return Followed(replace(tracking, graph=solved.graph).trajectory(), len(self._tracks))

@@ -1,0 +1,63 @@
+"""What the papers have in common whose tables are measured on sequences."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from evaluators.cells import CellResult
+from evaluators.papers.measured import Measurement
+from evaluators.papers.model import PaperPath, PaperTable
+from mapper.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """Which frames of every sequence are used.
+
+    Attributes:
+        first: Index of the first.
+        last: Index of the last; None is the log's.
+    """
+
+    first: int = 0
+    last: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.first < 0 or (self.last is not None and self.last < self.first):
+            raise ConfigError(f"--first {self.first} --last {self.last}: want 0 ≤ first ≤ last")
+
+    @property
+    def is_whole(self) -> bool:
+        """Nothing is cut."""
+        return self == Cut()
+
+    def __str__(self) -> str:
+        return f"{self.first} … {'end' if self.last is None else self.last}"
+
+    def overrides(self, most: int | None = None) -> list[str]:
+        """Return what says so to a configuration; a paper may itself use so many frames at most."""
+        ends = [] if self.last is None else [self.last]
+        if most is not None:
+            ends.append(most - 1)
+        return [f"source.first_frame={self.first}", *(f"source.last_frame={end}" for end in sorted(ends)[:1])]
+
+
+@dataclass(frozen=True, slots=True)
+class Book:
+    """A paper.
+
+    Attributes:
+        title: Who wrote it, and where.
+        sequences: The sequences of each table, by what tables are called on the command line.
+        jobs: Returns what is to be measured of a sequence for some tables, with a seed: takes the tables, the
+            sequence, its log, the seed, which frames, and a folder for trajectories.
+        table_of: Returns a table with what all jobs came to.
+        drawn: Returns the trajectories that jobs have left.
+    """
+
+    title: str
+    sequences: dict[str, list[str]]
+    jobs: Callable[[Sequence[str], str, Path, int, Cut, Path], Sequence[Measurement]]
+    table_of: Callable[[str, Sequence[Any], Sequence[CellResult]], PaperTable]
+    drawn: Callable[[Sequence[Any]], Sequence[PaperPath]] = lambda _: ()

@@ -1,0 +1,167 @@
+"""The tables of Somlyai's PhD thesis measured again: what each part of ISVD is worth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from evaluators.cells import CellResult
+from evaluators.papers.ablation import Followed, follow
+from evaluators.papers.book import Book, Cut
+from evaluators.papers.measured import Place, cells_of, failed, measured, notes_of
+from evaluators.papers.model import PaperCell, PaperPath, PaperTable
+from evaluators.papers.sequences import slug
+from evaluators.papers.thesis_tables import Ablation, tables
+from evaluators.tables import Record
+from evaluators.trajectory import align, associate, ate
+from mapper.config import BuildConfig
+from mapper.config.seeds import seeded
+from mapper.errors import DataError
+from mapper.sources import open_source
+from mapper.trajectory import Trajectory, read_tum, write_tum
+
+
+@dataclass(frozen=True, slots=True)
+class ThesisJob:
+    """One table's settings on one sequence with one seed.
+
+    Attributes:
+        table: Of ``tables()``.
+        sequence: As the thesis calls it.
+        log: Where it lies.
+        seed: Of RANSAC.
+        cut: Which frames are used.
+        paths: Folder for the trajectories.
+    """
+
+    table: str
+    sequence: str
+    log: Path
+    seed: int
+    cut: Cut
+    paths: Path
+
+    @property
+    def name(self) -> str:
+        """What is measured."""
+        return f"thesis-{self.table}-{slug(self.sequence)}"
+
+    @property
+    def places(self) -> list[Place]:
+        """Which figures it gives."""
+        return [place for setting in self._ablation.settings for place in self._places(setting)]
+
+    def configs(self) -> dict[str, BuildConfig]:
+        """Return the settings with the seed and the frames in use."""
+        cut = self.cut.overrides(self._ablation.sequences[self.sequence])
+        return {
+            name: seeded(setting.config(*cut), self.seed) for name, setting in self._ablation.settings.items()
+        }
+
+    def __call__(self) -> list[Record]:
+        """Follow the log with every setting."""
+        configs = self.configs()
+        source = open_source(self.log, next(iter(configs.values())).source)
+        if source.truth is None:
+            raise DataError(f"{self.log}: has no ground truth, so there is no error to tell")
+        records: list[Record] = []
+        for setting, followed in follow(source, configs).items():
+            records += self._judged(setting, followed, source.truth)
+        return records
+
+    @property
+    def _ablation(self) -> Ablation:
+        return tables()[self.table]
+
+    def _places(self, setting: str) -> list[Place]:
+        rows = self._ablation.places(self._ablation.row(self.sequence), setting)
+        return [Place(self.table, row, column) for row, column in rows]
+
+    def _judged(self, setting: str, followed: Followed, truth: Trajectory) -> list[Record]:
+        places = self._places(setting)
+        if followed.estimate is None:
+            return [failed(place, followed.failure) for place in places]
+        try:
+            values = self._ablation.judge(followed.estimate, truth)
+        except DataError as error:
+            return [failed(place, str(error)) for place in places]
+        if self._has_pictures:
+            self._keep(setting, followed.estimate, truth)
+        note = (
+            f"{self.sequence}, {setting}, seed {self.seed}: "
+            f"{followed.lost} of {followed.frames} frames were not placed."
+            if followed.lost
+            else ""
+        )
+        return [measured(place, float(value), note) for place, value in zip(places, values, strict=True)]
+
+    @property
+    def _has_pictures(self) -> bool:
+        return self.table == "5.5" and self.seed == 0
+
+    def _keep(self, setting: str, estimate: Trajectory, truth: Trajectory) -> None:
+        """Write both trajectories, the estimate laid over the truth."""
+        T_truth_map = align(associate(estimate, truth), "se3").T_truth_map
+        write_tum(self._path(setting), estimate.moved(T_truth_map))
+        first_ns, last_ns = estimate.stamps_ns[0], estimate.stamps_ns[-1]
+        during = (truth.stamps_ns >= first_ns) & (truth.stamps_ns <= last_ns)
+        write_tum(self._path("truth"), Trajectory(truth.stamps_ns[during], truth.T_world_body[during]))
+
+    def _path(self, name: str) -> Path:
+        cut = "" if self.cut.is_whole else f".{self.cut.first}-{self.cut.last}"
+        return self.paths / f"{slug(self.sequence)}{cut}.{name}.tum"
+
+    def drawn(self) -> list[PaperPath]:
+        """Return the trajectories that were kept."""
+        if not self._has_pictures:
+            return []
+        kept = [setting for setting in self._ablation.settings if self._path(setting).is_file()]
+        truth = self._path("truth")
+        return [
+            PaperPath(
+                self.sequence,
+                setting,
+                ate(associate(read_tum(self._path(setting)), read_tum(truth))).rmse,
+                self._path(setting),
+                truth,
+            )
+            for setting in kept
+        ]
+
+
+def table_of(name: str, jobs: Sequence[ThesisJob], results: Sequence[CellResult]) -> PaperTable:
+    """Return a table with what its jobs came to."""
+    ablation = tables()[name]
+    own = tuple(
+        PaperCell(row, column, figure, ())
+        for row, line in ablation.own.items()
+        for column, figure in line.items()
+    )
+    return PaperTable(
+        name=ablation.name,
+        title=ablation.title,
+        source=ablation.source,
+        metric=ablation.metric,
+        unit=ablation.unit,
+        cells=(*own, *cells_of(name, jobs, results, ablation.printed)),
+        axis=ablation.axis,
+        notes=(*ablation.notes, *notes_of(name, results)),
+    )
+
+
+def _jobs(
+    names: Sequence[str], sequence: str, log: Path, seed: int, cut: Cut, paths: Path
+) -> Sequence[ThesisJob]:
+    return [
+        ThesisJob(name, sequence, log, seed, cut, paths)
+        for name in names
+        if sequence in tables()[name].sequences
+    ]
+
+
+BOOK = Book(
+    title="Somlyai, PhD thesis, Óbuda University",
+    sequences={name: [*ablation.sequences] for name, ablation in tables().items()},
+    jobs=_jobs,
+    table_of=table_of,
+    drawn=lambda jobs: [path for job in jobs for path in job.drawn()],
+)

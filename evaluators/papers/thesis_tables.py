@@ -1,0 +1,210 @@
+"""Which settings the tables of Somlyai's PhD thesis (Óbuda University) compare, and on which sequences."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from evaluators.papers.measured import CONFIGS, ate_rmse_m
+from evaluators.papers.published import Figures, figures, published
+from evaluators.trajectory import associate, rpe
+from mapper.config import BuildConfig, load_config
+from mapper.geometry import inverse, rotation_log
+from mapper.trajectory import Trajectory
+
+POZNAN = "Poznań/trajectory1"
+_OWN_LOG = "the thesis's own log"
+_MM_PER_M = 1000.0
+
+
+class Setting(NamedTuple):
+    """A file of ``configs/thesis`` with overrides on top."""
+
+    file: str
+    overrides: tuple[str, ...] = ()
+
+    def config(self, *more: str) -> BuildConfig:
+        """Return the configuration."""
+        return load_config(CONFIGS / "thesis" / f"{self.file}.toml", [*self.overrides, *more])
+
+
+Places = Callable[[str, str], Sequence[tuple[str, str]]]
+"""Row and column of each figure that a sequence and a setting give."""
+Judge = Callable[[Trajectory, Trajectory], Sequence[float]]
+"""These figures, of an estimate and the truth."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ablation:
+    """A table: some sequences, each with settings that differ in one thing.
+
+    Attributes:
+        name: As printed.
+        title: What it tells.
+        source: Where it is printed.
+        metric: What its figures are.
+        unit: Of its figures; empty where columns differ.
+        printed: The thesis's figures of logs that may be at hand.
+        sequences: And how many of their first frames are used; None is all.
+        settings: By what they are called in the table.
+        places: Where figures belong.
+        judge: How they are worked out.
+        axis: What the settings count.
+        own: The thesis's figures of a log that nobody else has.
+        notes: What a reader has to know.
+    """
+
+    name: str
+    title: str
+    source: str
+    metric: str
+    unit: str
+    printed: Figures
+    sequences: Mapping[str, int | None]
+    settings: Mapping[str, Setting]
+    places: Places = lambda row, setting: [(row, setting)]
+    judge: Judge = lambda estimate, truth: [ate_rmse_m(estimate, truth)]
+    axis: str = ""
+    own: Figures = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def row(self, sequence: str) -> str:
+        """Return what a sequence is called in the table."""
+        frames = self.sequences[sequence]
+        return sequence if frames is None else f"{sequence} first {frames} frames"
+
+
+@cache
+def tables() -> Mapping[str, Ablation]:
+    """Return the tables that can be measured again, by what they are called on the command line."""
+    iterations = figures("isvd_iterations", rows="the columns")
+    previous = figures("isvd_previous_frames")
+    loops = figures("isvd_loop_dif")
+    long_loop = figures("loop_2100_frames")
+    return {
+        "4.1": _icp_or_svd(iterations),
+        "4.2": Ablation(
+            name="Table 4.2",
+            title="Loop closure on a long log",
+            source=published()["loop_2100_frames"]["source"],
+            metric="ATE RMSE",
+            unit="m",
+            printed=long_loop,
+            sequences={"fr3/long_office": 2100},
+            settings={"ISVD+DIF": Setting("ISVD+DIF"), "ISVD+DIF+LC": Setting("ISVD+LC+DIF")},
+        ),
+        "5.1": Ablation(
+            name="Table 5.1",
+            title="ISVD by the number of its iterations",
+            source=published()["isvd_iterations"]["source"],
+            metric="ATE RMSE",
+            unit="m",
+            printed=iterations,
+            sequences=dict.fromkeys(iterations),
+            settings={count: _iterations(count) for count in next(iter(iterations.values()))},
+            axis="iterations",
+        ),
+        "5.2": Ablation(
+            name="Table 5.2",
+            title="ISVD by the number of previous frames (MP) that each frame is registered against",
+            source=published()["isvd_previous_frames"]["source"],
+            metric="ATE RMSE",
+            unit="m",
+            printed=previous,
+            sequences=dict.fromkeys(previous),
+            settings={mp: Setting(mp) for mp in next(iter(previous.values()))},
+            axis="MP",
+        ),
+        "5.5": Ablation(
+            name="Table 5.5",
+            title="ISVD alone, with loop closure (LC) and with the depth image filter (DIF)",
+            source=published()["isvd_loop_dif"]["source"],
+            metric="ATE RMSE",
+            unit="m",
+            printed=loops,
+            sequences=dict.fromkeys(loops),
+            settings={
+                "ISVD": Setting("ISVD"),
+                "ISVD+LC": Setting("ISVD+LC"),
+                "ISVD+LC+DIF": Setting("ISVD+LC+DIF"),
+                "ISVD+LC, graph": Setting("ISVD+LC", ("graph.solve=batch",)),
+                "ISVD+LC+DIF, graph": Setting("ISVD+LC+DIF", ("graph.solve=batch",)),
+            },
+            notes=("“graph” is ours: the same loops as constraints of a pose graph.",),
+        ),
+        "detectors": _detectors(iterations),
+    }
+
+
+def _iterations(count: str) -> Setting:
+    """Return ISVD with so many iterations: nothing stops early, and even the first plain fit is accepted."""
+    if count == "auto":
+        return Setting("ISVD")
+    fixed = {"max_iterations": count, "min_pairs": 20, "agreement_mm": 5000, "min_agreement_ratio": 0}
+    return Setting("ISVD", tuple(f"odometry.registration.{key}={value}" for key, value in fixed.items()))
+
+
+def _icp_or_svd(test_logs: Figures) -> Ablation:
+    """Return algorithms 5 and 6, which differ in one line, by how far off the path's end is."""
+    table = published()["icp_vs_svd"]
+    columns = [f"{name} [{unit}]" for name, unit in (column.rsplit("_", 1) for column in table["columns"])]
+    own = {f"{step}, {_OWN_LOG}": dict(zip(columns, row, strict=True)) for step, row in table["rows"].items()}
+    halving = "odometry.registration.threshold=halving"
+    return Ablation(
+        name="Table 4.1",
+        title="ICP or SVD in each iteration",
+        source=table["source"],
+        metric="error at the end of the path",
+        unit="",
+        printed={},
+        sequences=dict.fromkeys(test_logs),
+        settings={
+            step: Setting("MP1", (halving, f"odometry.registration.step={step.lower()}"))
+            for step in table["rows"]
+        },
+        places=lambda row, step: [(f"{step}, {row}", column) for column in columns],
+        judge=_end_error,
+        own=own,
+        notes=(
+            "The thesis's own log is not at hand: its rows tell of another path, so there is no ratio.",
+            "Axes are the camera's at the start (x right, y down, z forward); roll turns about z, pitch "
+            "about x, yaw about y. “total” is the mean of the three amounts, as the printed totals are.",
+        ),
+    )
+
+
+def _end_error(estimate: Trajectory, truth: Trajectory) -> list[float]:
+    """Return how far off the last pose is from the first: along and about three axes, and their means."""
+    matched = associate(estimate, truth)
+    T_start_end, T_true_start_end = (
+        inverse(T[0]) @ T[-1] for T in (matched.T_map_body, matched.T_truth_body)
+    )
+    offset_mm = (T_start_end - T_true_start_end)[:3, 3] * _MM_PER_M
+    pitch, yaw, roll = rotation_log(T_start_end[:3, :3] @ T_true_start_end[:3, :3].T)
+    turned_rad = np.array([roll, pitch, yaw])
+    return [*offset_mm, *turned_rad, np.abs(offset_mm).mean(), np.abs(turned_rad).mean()]
+
+
+def _detectors(test_logs: Figures) -> Ablation:
+    """Return the settings of figure 5.6 with SIFT, which §4.1.2 names too."""
+    mean = "odometry.average=mean"
+    detectors = {
+        "orb2": ("odometry.detector.kind=orb", "odometry.previous_frames=2"),
+        "sift2": ("odometry.detector.kind=sift", "odometry.previous_frames=2"),
+        **{f"surf{mp}": (f"odometry.previous_frames={mp}",) for mp in (1, 2, 4, 8)},
+        **{f"surf{mp}-avg": (f"odometry.previous_frames={mp}", mean) for mp in (4, 8)},
+    }
+    return Ablation(
+        name="Figure 5.6",
+        title="Detectors by the error from frame to frame; the number is MP, “avg” the plain mean of MP",
+        source="Somlyai thesis Figure 5.6, a drawing without figures",
+        metric="RPE RMSE, consecutive",
+        unit="m",
+        printed={},
+        sequences={POZNAN: 300, **dict.fromkeys(test_logs)},
+        settings={name: Setting("ISVD", overrides) for name, overrides in detectors.items()},
+        judge=lambda estimate, truth: [rpe(associate(estimate, truth)).translation_m.rmse],
+        notes=("The thesis draws Poznań's trajectory1: ORB is the worst, SURF with MP 4 and 8 the best.",),
+    )
