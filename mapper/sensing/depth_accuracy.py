@@ -1,0 +1,181 @@
+"""The figures by which a depth camera's accuracy is told (thesis 2.6.1, 2.6.2)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from statistics import median
+
+import numpy as np
+
+from mapper.errors import DataError, FrameError, SourceError
+from mapper.frames import Image, PinholeCamera, RgbdFrame
+from mapper.geometry import Array
+from mapper.sources.base import Entry, FrameSource
+
+_WORST = 100
+"""One in so many pixels is among the worst 1 %."""
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """A rectangle of an image, in pixels."""
+
+    column: int
+    row: int
+    width: int
+    height: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Rows and columns, to index an image by."""
+        return slice(self.row, self.row + self.height), slice(self.column, self.column + self.width)
+
+    def refuse_outside(self, camera: PinholeCamera) -> None:
+        """Refuse to reach beyond a camera's image.
+
+        Raises:
+            DataError: It does, or is too small to hold a plane.
+        """
+        right, bottom = self.column + self.width, self.row + self.height
+        if min(self.column, self.row) < 0 or right > camera.width_px or bottom > camera.height_px:
+            raise DataError(
+                f"patch {self}: reaches beyond the image of {camera.width_px}×{camera.height_px} px"
+            )
+        if min(self.width, self.height) < 3:
+            raise DataError(f"patch {self}: want at least 3×3 px")
+
+    def __str__(self) -> str:
+        return f"{self.column},{self.row},{self.width},{self.height}"
+
+
+def central_patch(camera: PinholeCamera) -> Patch:
+    """Return the middle third of an image, each way."""
+    width, height = camera.width_px // 3, camera.height_px // 3
+    return Patch((camera.width_px - width) // 2, (camera.height_px - height) // 2, width, height)
+
+
+@dataclass(frozen=True, slots=True)
+class Accuracy:
+    """How far the depths of a plane are from it.
+
+    Attributes:
+        max_error_m: Δd, the largest error (eq. 2.46).
+        max_error_99_m: Δd without the worst 1 % of the pixels.
+        mean_error_m: Positive where the plane is measured too far away.
+        std_m: s, the standard deviation.
+    """
+
+    max_error_m: float
+    max_error_99_m: float
+    mean_error_m: float
+    std_m: float
+
+
+def accuracy_of(depth_m: Array, reference_m: Array | float) -> Accuracy:
+    """Return how far depths are from where they should be.
+
+    Δd = max(|d − min δ|, |d − max δ|) is the largest |δ − d|; of n pixels the worst n // 100 are left out.
+
+    Args:
+        depth_m: Measured depths, 0 where there is none.
+        reference_m: True depth of each, or of all.
+
+    Raises:
+        DataError: Nothing is measured.
+    """
+    errors_m = (depth_m - reference_m)[depth_m > 0.0]
+    if not len(errors_m):
+        raise DataError("accuracy: no pixel has a depth")
+    sizes_m = np.sort(np.abs(errors_m))
+    kept = len(sizes_m) - len(sizes_m) // _WORST
+    return Accuracy(
+        max_error_m=float(sizes_m[-1]),
+        max_error_99_m=float(sizes_m[kept - 1]),
+        mean_error_m=float(errors_m.mean()),
+        std_m=float(errors_m.std()),
+    )
+
+
+def typical(many: Sequence[Accuracy]) -> Accuracy:
+    """Return the median of each figure: a largest error grows with the number of frames, this does not."""
+    return Accuracy(**{f.name: median(getattr(one, f.name) for one in many) for f in fields(Accuracy)})
+
+
+def quantisation_step_m(depth_m: Array) -> float | None:
+    """Return the median gap between neighbouring depths that occur; None if fewer than three do."""
+    values = np.unique(depth_m[depth_m > 0.0])
+    return float(np.median(np.diff(values))) if len(values) > 2 else None
+
+
+@dataclass(frozen=True, slots=True)
+class DepthLevel:
+    """What one distance showed.
+
+    Attributes:
+        name: Which log, or which distances.
+        distance_m: Of the plane, along the optical axis.
+        frames: How many showed it.
+        patches: Planes in them.
+        measured_ratio: Share of their pixels that had a depth.
+        tilt_rad: Between the plane's normal and the optical axis.
+        raw: Of the depth image as it is.
+        filtered: After DIF.
+        step_m: Of quantisation, where the depths that occur tell it.
+        temporal_m: Standard deviation of a pixel from frame to frame; None where pixels cannot be compared.
+        fixed_m: Standard deviation of the pixels' means: what averaging over time leaves.
+    """
+
+    name: str
+    distance_m: float
+    frames: int
+    patches: int
+    measured_ratio: float
+    tilt_rad: float
+    raw: Accuracy
+    filtered: Accuracy
+    step_m: float | None = None
+    temporal_m: float | None = None
+    fixed_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResidualMap:
+    """Where in an image the depth is off.
+
+    Attributes:
+        image: (H, W) uint8 grey image.
+        error_m: (H, W) depth less that of the plane; NaN where there is none.
+        caption: A few words.
+    """
+
+    image: Image
+    error_m: Array
+    caption: str
+
+
+def first_frame(source: FrameSource) -> RgbdFrame:
+    """Return the first frame of a log that can be read.
+
+    Raises:
+        SourceError: None can, or they are scans.
+    """
+    if source.sensor != "rgbd":
+        raise SourceError(f"{source.path}: a log of scans; this measures depth images, so want an RGB-D log")
+    reason = "it has no frames"
+    for entry in source.entries():
+        try:
+            return depth_frame(entry)
+        except FrameError as error:
+            reason = str(error)
+    raise SourceError(f"{source.path}: no frame can be read; the last: {reason}")
+
+
+def depth_frame(entry: Entry) -> RgbdFrame:
+    """Load a frame with its depth.
+
+    Raises:
+        FrameError: It has none, or cannot be read.
+    """
+    frame = entry.load(colour=False)
+    if not isinstance(frame, RgbdFrame):
+        raise FrameError(f"frame {entry.stamp_ns}: a scan, not a depth image")
+    return frame

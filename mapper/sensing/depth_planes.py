@@ -1,0 +1,91 @@
+"""Planes through patches of depth images, and what is left of the depth beside them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.geometry import Array
+
+_ROUNDS = 4
+_OUTLIER_SIGMAS = 4.0
+_LEAST_SIGMA_M = 1e-6
+_SAFE_DETERMINANT = 1e-18
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Planes:
+    """T planes, each through a patch of N pixels.
+
+    On a plane the inverse depth is linear in the ray (x, y, 1) of a pixel: 1 / z = p·x + q·y + r.
+
+    Attributes:
+        coefficients: (T, 3) p, q, r in 1/m.
+        depth_m: (T, N) depth of the plane at every pixel.
+        used: (T, N) which pixels the plane rests on.
+        sigma_m: (T,) standard deviation of their depths from the plane.
+    """
+
+    coefficients: Array
+    depth_m: Array
+    used: NDArray[np.bool_]
+    sigma_m: Array
+
+    @property
+    def distance_m(self) -> Array:
+        """(T,) depth at which the optical axis meets the plane."""
+        distance: Array = 1.0 / self.coefficients[:, 2]
+        return distance
+
+    @property
+    def tilt_rad(self) -> Array:
+        """(T,) angle between the plane's normal and the optical axis."""
+        p, q, r = self.coefficients.T
+        tilt: Array = np.arctan2(np.hypot(p, q), np.abs(r))
+        return tilt
+
+
+def fit_planes(depth_m: Array, rays: Array) -> Planes:
+    """Fit a plane to every patch by least squares of the depths, without those more than 4 σ off.
+
+    Args:
+        depth_m: (T, N) depth along the optical axis, 0 or less where nothing was measured.
+        rays: (T, N, 2) x / z and y / z of every pixel.
+    """
+    directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=2)
+    measured = depth_m > 0.0
+    inverse_depth = np.divide(1.0, depth_m, out=np.zeros_like(depth_m), where=measured)
+    coefficients = _solved(directions, inverse_depth, measured)
+    used = measured
+    for _ in range(_ROUNDS):
+        on_plane_m, sigma_m = _beside(coefficients, directions, depth_m, used)
+        limit_m = _OUTLIER_SIGMAS * np.maximum(sigma_m, _LEAST_SIGMA_M)
+        used = measured & (np.abs(depth_m - on_plane_m) <= limit_m[:, None])
+        # Gauss–Newton: z changes by −z² · ray with the coefficients.
+        rows = -directions * on_plane_m[..., None] ** 2
+        coefficients = coefficients + _solved(rows, depth_m - on_plane_m, used)
+    on_plane_m, sigma_m = _beside(coefficients, directions, depth_m, used)
+    return Planes(coefficients, on_plane_m, used, sigma_m)
+
+
+def _beside(
+    coefficients: Array, directions: Array, depth_m: Array, used: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """Return (T, N) depth on the planes, and (T,) how far the pixels in use scatter about it."""
+    with np.errstate(divide="ignore"):
+        on_plane_m = 1.0 / (directions @ coefficients[..., None])[..., 0]
+    squares = np.where(used, (depth_m - on_plane_m) ** 2, 0.0).sum(axis=1)
+    # A plane takes three degrees of freedom.
+    return on_plane_m, np.sqrt(squares / np.maximum(used.sum(axis=1) - 3, 1))
+
+
+def _solved(rows: Array, values: Array, used: NDArray[np.bool_]) -> Array:
+    """Return (T, 3) least-squares solutions of the rows (T, N, 3) in use; 0 where they leave it open."""
+    kept = np.where(used[..., None], rows, 0.0)
+    columns = kept.swapaxes(1, 2)
+    normal, side = columns @ kept, (columns @ values[..., None])[..., 0]
+    open_ = np.linalg.det(normal) < _SAFE_DETERMINANT * np.trace(normal, axis1=1, axis2=2) ** 3
+    normal[open_] = np.eye(3)
+    side[open_] = 0.0
+    solution: Array = np.linalg.solve(normal, side[..., None])[..., 0]
+    return solution
