@@ -3,7 +3,7 @@
 import fcntl
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -19,12 +19,15 @@ def partial_of(out: Path) -> Path:
 
 
 @contextmanager
-def staged(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
+def staged(
+    out: Path, *, overwrite: bool = False, keeps: Callable[[Path], bool] = lambda _: False
+) -> Iterator[Path]:
     """Yield ``OUT.partial`` to fill; on success it takes OUT's place, on failure it stays for inspection.
 
     Args:
         out: Folder to create.
         overwrite: Replace a folder of ours that is there; it stays untouched until the new one is whole.
+        keeps: Tells whether what an earlier process left in ``OUT.partial`` is still of use.
 
     Raises:
         RunError: OUT exists and may not be replaced, or another process is filling ``OUT.partial``.
@@ -39,7 +42,8 @@ def staged(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
     except OSError as error:
         raise RunError(f"{partial}: cannot be created: {error.strerror}") from None
     with locked(partial):
-        _empty(partial)
+        if not keeps(partial):
+            _empty(partial)
         yield partial
         _swap(partial, out)
 

@@ -1,6 +1,6 @@
 """Pictures of a run: the trajectory or a path over the slice, the cloud from two sides, a pose graph."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mapper.export.grid import grid_image
 from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure, save
 from mapper.export.palette import END, ESTIMATE, FACTORS, PLAN, START, TRUTH, UNKNOWN_CELL, Rgb
+from mapper.export.panels import color_of
 from mapper.frames import Points32
 from mapper.geometry import Array
 from mapper.graph.model import PoseGraph, Solution
@@ -27,6 +28,7 @@ _VIEW_PX = 900
 _BELIEVED = 0.5  # weight from which a factor counts as held
 _TILT_RAD = np.deg2rad(32.0)
 _TURN_RAD = np.deg2rad(-35.0)
+_NAMED = 12  # of many runs only the first are in the legend
 _SWEPT_PX = 4  # pixels per cell
 _SWEPT_ALPHA = 70
 _BACKDROP: Rgb = (22, 24, 30)
@@ -105,6 +107,38 @@ def write_path(
     axes.plot(*ends[1:-1].T, ".", color=hex_of(PLAN), markersize=5)
     _mark(axes, ends[0], color=START, marker="o", label="start")
     _mark(axes, ends[-1], color=END, marker="s", label="goal")
+    _finish_map(axes, low, high)
+    save(figure, path)
+
+
+def write_merged(
+    path: Path,
+    *,
+    grid: OccupancyGrid,
+    paths_world: Mapping[str, Array],
+    tile_m: float,
+    title: str,
+    lines: Sequence[str] = (),
+) -> None:
+    """Draw the paths of several runs over the slice of the map that they make together.
+
+    Args:
+        path: PNG file to write.
+        grid: The slice, the map's frame.
+        paths_world: (N, 3) positions of each run, metres, the map's frame.
+        tile_m: Edge of the tiles that the map is cut into, drawn as lines.
+        title: Headline.
+        lines: Figures worth knowing, shown below the headline.
+    """
+    low, high = _extent(grid, list(paths_world.values()))
+    figure, axes = _map_page(title, lines, aspect=float(np.divide(*(high - low)[::-1])))
+    _draw_over(axes, grid_image(grid), grid)
+    for draw, (start, end) in zip((axes.axvline, axes.axhline), zip(low, high, strict=True), strict=True):
+        for border_m in np.arange(np.ceil(start / tile_m), np.floor(end / tile_m) + 1) * tile_m:
+            draw(border_m, color=hex_of(PLAN), linewidth=0.5, alpha=0.35)
+    for index, (name, positions) in enumerate(paths_world.items()):
+        label = name if index < _NAMED else None
+        axes.plot(*positions[:, :2].T, color=hex_of(color_of(index)), linewidth=1.4, label=label)
     _finish_map(axes, low, high)
     save(figure, path)
 

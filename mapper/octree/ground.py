@@ -16,7 +16,8 @@ _MAX_SLOPE = 0.3
 _LOW_PERCENT = 20.0  # below it are reflections
 _START_M = 0.5
 _MIN_COLUMNS = 4
-_NOTHING = np.iinfo(np.int32).max
+NOTHING = np.iinfo(np.int32).max
+"""Top of the lowest occupied voxel of a column that has none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,9 +75,9 @@ def lowest_occupied(
 ) -> NDArray[np.int32]:
     """Return (H, W) tops of each column's lowest occupied voxel, in voxels above z = 0.
 
-    Where nothing is occupied stands a number larger than any, so the minimum joins several maps.
+    Where nothing is occupied stands ``NOTHING``, so the minimum joins several maps.
     """
-    lowest = np.full(shape, _NOTHING, dtype=np.int32)
+    lowest = np.full(shape, NOTHING, dtype=np.int32)
     slots = octree.blocks.sorted_slots()
     codes = octree.blocks.codes[slots]
     _lowest_occupied(codes, slots, octree.blocks.table.values, octree.occupied_log_odds, first, lowest)
@@ -115,7 +116,7 @@ def _cells(lowest: NDArray[np.int32], columns: int) -> Array:
         band = lowest[row * columns : (row + 1) * columns]
         for column in range(columns_of):
             seen = band[:, column * columns : (column + 1) * columns]
-            seen = seen[seen != _NOTHING]
+            seen = seen[seen != NOTHING]
             if len(seen) >= _MIN_COLUMNS:
                 cells[row, column] = np.percentile(seen, _LOW_PERCENT)
     return cells

@@ -1,0 +1,109 @@
+"""``mapper merge``: many runs as one map."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli.console import progress_for
+from cli.environment import prepare_libraries
+from cli.options import Quiet
+
+if TYPE_CHECKING:
+    from mapper.merging.merge import Merged
+    from mapper.merging.placing import Placed
+    from mapper.run import Run
+
+
+class Place(StrEnum):
+    """Where the runs lie in the map."""
+
+    BUILT = "built"
+    TRUTH = "truth"
+
+
+def merge(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN…", help="Run folders that builds left.")],
+    out: Annotated[Path, typer.Option(metavar="MAP", help="Folder to create.")],
+    place: Annotated[
+        Place,
+        typer.Option(
+            help="built: every run's world is the map's, as in a chain of --onto. "
+            "truth: the runs' truths share a frame; the first run's world is the map's."
+        ),
+    ] = Place.BUILT,
+    poses: Annotated[
+        Path | None,
+        typer.Option(help="File of the worlds' poses in the map: a line RUN tx ty tz qx qy qz qw for each."),
+    ] = None,
+    tile_m: Annotated[
+        float, typer.Option(help="About how long a tile's edge is: a power of two in voxels.")
+    ] = 50.0,
+    processes: Annotated[int, typer.Option(help="Workers on this machine.")] = 1,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler whose workers see the same files."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a map that is there.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Add up the octrees of many runs tile by tile, out of core: map.bt, map.ot, the slice, and the tiles.
+
+    A merge that was stopped goes on where it was: give the same command again.
+
+    Example: mapper merge runs/monday runs/tuesday --out maps/campus --processes 2, or: mapper merge runs/*
+    --out maps/city --place truth --scheduler tcp://10.0.0.1:8786
+    """
+    from mapper.errors import ConfigError
+    from mapper.merging.merge import merge as merge_runs
+    from mapper.run import load_run
+
+    prepare_libraries()
+    if poses is not None and place is not Place.BUILT:
+        raise ConfigError(f"--place {place} and --poses {poses}: both say where the runs lie; give one")
+    merged = merge_runs(
+        _placed([load_run(run) for run in runs], place, poses),
+        out,
+        tile_m=tile_m,
+        processes=processes,
+        scheduler=scheduler,
+        progress=progress_for(quiet=quiet),
+        overwrite=overwrite,
+    )
+    if not quiet:
+        print(_summary(merged))
+
+
+def _placed(runs: "list[Run]", place: Place, poses: Path | None) -> "list[Placed]":
+    from mapper.merging.placing import as_built, by_poses, by_truth
+
+    if poses is not None:
+        return by_poses(runs, poses)
+    return by_truth(runs) if place is Place.TRUTH else as_built(runs)
+
+
+def _summary(merged: "Merged") -> str:
+    from evaluators.tables import MISSING, Column, text_table
+
+    manifest = merged.map.manifest
+    records = [{**run.model_dump(), "name": Path(run.path).name} for run in manifest.runs]
+    columns = [
+        Column("name", "run"),
+        Column("placed", "placed"),
+        Column("voxels", "voxels"),
+        Column("shared_voxels", "known before"),
+        Column("agreement", "walls alike", lambda share: MISSING if share is None else f"{share:.0%}"),
+    ]
+    jobs = {"split": merged.split, "join": merged.join, "slice": merged.see}
+    seconds = ", ".join(f"{name} {sum(job.seconds for job in done):.1f}" for name, done in jobs.items())
+    peak_mb = max(job.peak_memory_mb for done in jobs.values() for job in done)
+    lines = [
+        text_table(columns, records),
+        "",
+        manifest.summary,
+        f"workers' seconds: {seconds}; between them {merged.shuffle_bytes / 1e6:.1f} MB; "
+        f"largest process {peak_mb:.0f} MB",
+        str(merged.map.path),
+    ]
+    return "\n".join(lines)

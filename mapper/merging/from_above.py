@@ -1,0 +1,97 @@
+"""The slice and the picture of the whole: one raster, into which the tiles put what their columns show."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.errors import DataError
+from mapper.export.picture import write_merged
+from mapper.geometry import apply
+from mapper.merging.jobs import Crew
+from mapper.merging.merged_map import MapManifest
+from mapper.merging.placing import Placed
+from mapper.merging.steps import JoinedTile, SeenColumn, Site, save_ground, see_column
+from mapper.octree.ground import NOTHING, find_ground
+from mapper.octree.slice import OccupancyGrid, grid_of
+
+_MAX_TILT = np.cos(np.deg2rad(5.0))
+
+
+def look_from_above(
+    site: Site,
+    crew: Crew,
+    joined: Mapping[int, JoinedTile],
+    manifest: MapManifest,
+    placed: Sequence[Placed],
+) -> tuple[list[SeenColumn], OccupancyGrid | None, list[str]]:
+    """Return what became of every column of tiles, the slice, and the reason if there is none."""
+    first = np.min([tile.first for tile in joined.values()], axis=0)
+    last = np.max([tile.last for tile in joined.values()], axis=0)
+    shape = int(last[1] - first[1]), int(last[0] - first[0])
+    columns = defaultdict(list)
+    for tile in joined:
+        columns[tuple(site.window(tile)[0].tolist())].append(tile)
+    ground_path = None
+    if manifest.slice.above == "ground":
+        lowest = np.full(shape, NOTHING, np.int32)
+        for tile in joined:
+            _over(np.minimum, lowest, first, site, tile, "lowest")
+        ground = find_ground(
+            lowest, first=first, resolution_m=manifest.octree.resolution_m, floor_z_m=manifest.floor_z_m
+        )
+        ground_path = site.scratch / "ground.npz"
+        save_ground(ground_path, ground)
+    jobs = {
+        site.tiling.name_of(tiles[0]): partial(
+            see_column, site, tiles, manifest.slice, ground=ground_path, floor_z_m=manifest.floor_z_m
+        )
+        for tiles in columns.values()
+    }
+    done = [seen for _, seen in crew.run("slice", jobs, SeenColumn)]
+    if any(item.T_map_world[2, 2] < _MAX_TILT for item in placed):
+        return done, None, ["no slice: a run is tilted by more than 5°, so z is not up in the map"]
+    seen = np.zeros(shape, np.uint8)
+    for tiles in columns.values():
+        _over(np.bitwise_or, seen, first, site, tiles[0], "seen")
+    try:
+        grid = grid_of(
+            seen,
+            manifest.slice,
+            first=first,
+            resolution_m=manifest.octree.resolution_m,
+            floor_z_m=manifest.floor_z_m,
+        )
+    except DataError as error:
+        return done, None, [f"no {error}"]
+    return done, grid, []
+
+
+def _over(
+    join: np.ufunc, whole: NDArray[Any], first: NDArray[np.int64], site: Site, tile: int, piece: str
+) -> None:
+    """Join a tile's piece into the raster of the whole, whose first column has these keys."""
+    array = np.load(site.piece(tile, piece))
+    x, y = site.window(tile)[0] - first
+    rows, columns = (slice(max(at, 0), at + size) for at, size in zip((y, x), array.shape, strict=True))
+    into = whole[rows, columns]
+    join(into, array[max(-y, 0) :, max(-x, 0) :][: into.shape[0], : into.shape[1]], out=into)
+
+
+def draw(path: Path, grid: OccupancyGrid, placed: Sequence[Placed], manifest: MapManifest) -> None:
+    """Draw the runs' paths over the slice."""
+    write_merged(
+        path,
+        grid=grid,
+        paths_world={
+            item.run.path.name: apply(item.T_map_world, item.run.trajectory().positions_world)
+            for item in placed
+        },
+        tile_m=manifest.tile_m,
+        title=f"{len(placed)} runs merged",
+        lines=[manifest.summary],
+    )

@@ -1,0 +1,277 @@
+"""From many runs to one map on disk: the whole story."""
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from pydantic import ValidationError
+
+from mapper import run as files
+from mapper.config.octree import OctreeConfig
+from mapper.errors import ConfigError, RunError
+from mapper.export.grid import write_grid
+from mapper.fingerprint import fingerprint
+from mapper.geometry import apply
+from mapper.merging.assembling import write_whole_bt, write_whole_ot
+from mapper.merging.from_above import draw, look_from_above
+from mapper.merging.jobs import Crew
+from mapper.merging.merged_map import TILES, MapManifest, MergedMap, RunInMap, Tile, open_map
+from mapper.merging.placing import Placed, doubts
+from mapper.merging.steps import (
+    Effort,
+    JoinedTile,
+    SeenColumn,
+    Site,
+    SplitRun,
+    join_tile,
+    split_run,
+)
+from mapper.merging.tiling import tiling_for
+from mapper.progress import SILENT, Progress
+from mapper.staging import MARK, staged
+
+DEFAULT_TILE_M = 50.0
+
+_SCRATCH = "work"
+_MUST_AGREE = (
+    "resolution_m",
+    "hit_probability",
+    "miss_probability",
+    "clamp_min_probability",
+    "clamp_max_probability",
+    "occupied_probability",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Merged:
+    """A merge that is done.
+
+    Attributes:
+        map: What came out.
+        split: What each run took, in no order.
+        join: What each tile took.
+        see: What each column of tiles took.
+        shuffle_bytes: What was written by the first jobs for the second ones to read.
+    """
+
+    map: MergedMap
+    split: tuple[Effort, ...]
+    join: tuple[Effort, ...]
+    see: tuple[Effort, ...]
+    shuffle_bytes: int
+
+
+def merge(
+    placed: Sequence[Placed],
+    out: Path,
+    *,
+    tile_m: float = DEFAULT_TILE_M,
+    processes: int = 1,
+    scheduler: str | None = None,
+    progress: Progress = SILENT,
+    overwrite: bool = False,
+) -> Merged:
+    """Add up the maps of runs, tile by tile, as independent evidence (Bayes, prior 0.5).
+
+    No process ever holds more than one run's map, or one tile and one run's part of it. The bytes do not
+    depend on who did the jobs or in which order; the order of the runs shows in the last bit of a log-odds. A
+    merge that was stopped goes on where it was when it is started again with the same runs.
+
+    Args:
+        placed: The runs, and where their worlds lie.
+        out: Folder to create; until it is whole it is called ``OUT.partial``.
+        tile_m: About how long the edge of a tile is.
+        processes: Workers on this machine.
+        scheduler: Address of a Dask scheduler instead; its workers must see the same files.
+        progress: Who watches.
+        overwrite: Replace a map that is there, once the new one is whole.
+
+    Raises:
+        ConfigError: The runs do not agree in resolution or sensor model, or the tiles' edge is impossible.
+        RunError: OUT is there already, a run comes twice or lacks its map, or a job failed.
+    """
+    config = _common_config(placed)
+    tiling = tiling_for(config.resolution_m, tile_m)
+    manifest = MapManifest(
+        status="merging",
+        octree=config,
+        slice=placed[0].run.config.slice,
+        tile_m=tiling.edge_m,
+        floor_z_m=_floor_z_m(placed[0]),
+        runs=tuple(_described(item) for item in placed),
+    )
+    with staged(out, overwrite=overwrite, keeps=lambda partial: _begun_alike(partial, manifest)) as folder:
+        manifest.save(folder)
+        site = Site(folder, folder / _SCRATCH, tiling, config)
+        crew = Crew(site.scratch / "done", processes, scheduler, progress)
+        split = _split(site, crew, placed)
+        joined = _join(site, crew, split, follows_ground=manifest.slice.above == "ground")
+        has_colors = any(part.has_colors for part in split)
+        write_whole_ot(folder / files.OCTREE_OT, site, joined, has_colors=has_colors)
+        write_whole_bt(folder / files.OCTREE_BT, site, joined)
+        seen, grid, missing = look_from_above(site, crew, joined, manifest, placed)
+        notes = [*doubts(placed), *missing]
+        manifest = _completed(manifest, site, split, joined, seen, notes)
+        if grid is not None:
+            write_grid(folder, files.SLICE, grid)
+            draw(folder / files.SUMMARY, grid, placed, manifest)
+        for note in manifest.notes:
+            progress.note(note)
+        _clean(site, joined)
+        manifest.save(folder)
+    return Merged(
+        map=open_map(out),
+        split=tuple(part.effort for part in split),
+        join=tuple(tile.effort for tile in joined.values()),
+        see=tuple(column.effort for column in seen),
+        shuffle_bytes=sum(sum(part.part_bytes.values()) for part in split),
+    )
+
+
+def _common_config(placed: Sequence[Placed]) -> OctreeConfig:
+    """Return the configuration of the map, after the runs have been found fit to be merged."""
+    if not placed:
+        raise ConfigError("nothing to merge; name the run folders")
+    first = placed[0].run
+    seen: set[Path] = set()
+    for run in (item.run for item in placed):
+        if not (run.path / files.OCTREE_MAP).is_file():
+            raise RunError(f"{run.path}: has no {files.OCTREE_MAP}; make it with mapper fuse {run.path}")
+        if run.path.resolve() in seen:
+            raise RunError(f"{run.path}: given twice, and its evidence would count twice; name it once")
+        seen.add(run.path.resolve())
+        for name in _MUST_AGREE:
+            value, wanted = getattr(run.config.octree, name), getattr(first.config.octree, name)
+            if value != wanted:
+                raise ConfigError(
+                    f"{run.path}: octree.{name} is {value:g}, but {wanted:g} in {first.path}; make its maps "
+                    f"again with mapper fuse {run.path} --set octree.{name}={wanted:g}"
+                )
+    attributes = all(item.run.config.octree.attributes for item in placed)
+    return first.config.octree.model_copy(update={"attributes": attributes, "dynamic": "none"})
+
+
+def _described(item: Placed) -> RunInMap:
+    return RunInMap(
+        path=str(item.run.path.resolve()),
+        fingerprint=fingerprint(item.run.path / files.OCTREE_MAP),
+        T_map_world=tuple(tuple(row) for row in item.T_map_world.tolist()),
+        placed=item.how,
+    )
+
+
+def _floor_z_m(first: Placed) -> float:
+    """Return the height in the map of the first run's floor, below the middle of its path."""
+    if first.stays:
+        return 0.0
+    middle = first.run.trajectory().positions_world.mean(axis=0) * [1.0, 1.0, 0.0]
+    return float(apply(first.T_map_world, middle[np.newaxis])[0, 2])
+
+
+def _begun_alike(partial: Path, manifest: MapManifest) -> bool:
+    """Tell whether what was left behind is the beginning of this very merge."""
+    try:
+        return MapManifest.model_validate_json((partial / MARK).read_bytes()) == manifest
+    except (OSError, ValidationError):
+        return False
+
+
+def _split(site: Site, crew: Crew, placed: Sequence[Placed]) -> list[SplitRun]:
+    jobs = {
+        f"{index:04d}": partial(
+            split_run,
+            site,
+            index,
+            item.run.path.resolve() / files.OCTREE_MAP,
+            None if item.stays else item.T_map_world,
+        )
+        for index, item in enumerate(placed)
+    }
+    done = dict(crew.run("split", jobs, SplitRun))
+    return [done[name] for name in jobs]
+
+
+def _join(
+    site: Site, crew: Crew, split: Sequence[SplitRun], *, follows_ground: bool
+) -> dict[int, JoinedTile]:
+    """Return what became of every tile, in Morton order."""
+    tiles = sorted({tile for part in split for tile in part.part_bytes})
+    if not tiles:
+        raise RunError("nothing is known in any of the runs' maps; there is nothing to merge")
+    jobs = {
+        site.tiling.name_of(tile): partial(
+            join_tile,
+            site,
+            tile,
+            [run for run, part in enumerate(split) if tile in part.part_bytes],
+            has_colors=any(part.has_colors for part in split),
+            follows_ground=follows_ground,
+        )
+        for tile in tiles
+    }
+    tile_of = dict(zip(jobs, tiles, strict=True))
+    done = {}
+    for name, joined in crew.run("join", jobs, JoinedTile):
+        done[tile_of[name]] = joined
+        shutil.rmtree(site.parts(tile_of[name]), ignore_errors=True)
+    return {tile: done[tile] for tile in tiles}
+
+
+def _completed(
+    manifest: MapManifest,
+    site: Site,
+    split: Sequence[SplitRun],
+    joined: Mapping[int, JoinedTile],
+    seen: Sequence[SeenColumn],
+    notes: Sequence[str],
+) -> MapManifest:
+    """Return the manifest of the map when it is whole."""
+    runs_of = {tile: [run for run, part in enumerate(split) if tile in part.part_bytes] for tile in joined}
+    counts = np.zeros((len(split), 3), np.int64)
+    for tile, result in joined.items():
+        counts[runs_of[tile]] += np.array(result.overlaps)
+    runs = tuple(
+        run.model_copy(
+            update={
+                "voxels": part.voxels,
+                "shared_voxels": int(shared),
+                "agreement": round(float(both / either), 4) if either else None,
+            }
+        )
+        for run, part, (shared, both, either) in zip(manifest.runs, split, counts, strict=True)
+    )
+    lower_m = {tile: site.tiling.lower_m(tile) for tile in joined}
+    tiles = tuple(
+        Tile(
+            name=site.tiling.name_of(tile),
+            lower_m=tuple(lower_m[tile].tolist()),
+            upper_m=tuple((lower_m[tile] + site.tiling.edge_m).tolist()),
+            voxels=result.voxels,
+            runs=tuple(runs_of[tile]),
+        )
+        for tile, result in joined.items()
+    )
+    area_m2 = sum(column.known_columns for column in seen) * site.tiling.resolution_m**2
+    return manifest.model_copy(
+        update={
+            "status": "complete",
+            "runs": runs,
+            "tiles": tiles,
+            "voxels": sum(result.voxels for result in joined.values()),
+            "area_km2": round(area_m2 / 1e6, 9),
+            "notes": tuple(notes),
+        }
+    )
+
+
+def _clean(site: Site, joined: Mapping[int, JoinedTile]) -> None:
+    """Remove what only the merge needed, and what a worker that was killed may have left among the tiles."""
+    shutil.rmtree(site.scratch)
+    wanted = {site.tile(tile) for tile in joined}
+    for file in (site.folder / TILES).iterdir():
+        if file not in wanted:
+            file.unlink()

@@ -1,0 +1,144 @@
+"""What a merged map says about itself, and how a part of it is opened."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import ValidationError
+
+import mapper
+from mapper.atomic import write_text
+from mapper.config.base import Config
+from mapper.config.octree import OctreeConfig, SliceConfig
+from mapper.errors import RunError
+from mapper.geometry import Array
+from mapper.octree.map import OctreeMap
+from mapper.octree.octomap_file import read_map
+from mapper.staging import MARK, partial_of
+
+TILES = "tiles"
+
+Corner = tuple[float, float, float]
+
+
+class RunInMap(Config):
+    """A run that was merged."""
+
+    path: str
+    """Absolute."""
+    fingerprint: str
+    """Of its map.octree."""
+    T_map_world: tuple[tuple[float, ...], ...]
+    """4 × 4."""
+    placed: str
+    """How its pose is known."""
+    voxels: int = 0
+    """Known ones, in its own map."""
+    shared_voxels: int = 0
+    """Those that the sum of the runs before it knew as well."""
+    agreement: float | None = None
+    """Of the shared voxels that either takes for occupied, the share that both do."""
+
+
+class Tile(Config):
+    """A cube of the map, with a map file of its own."""
+
+    name: str
+    """The way down the octree, a digit for the child taken at each depth; names the file."""
+    lower_m: Corner
+    upper_m: Corner
+    voxels: int
+    """Known ones."""
+    runs: tuple[int, ...]
+    """Places of the runs in the list that know something here."""
+
+
+class MapManifest(Config):
+    """``manifest.json`` of a merged map."""
+
+    kind: Literal["merged map"] = "merged map"
+    status: Literal["merging", "complete"]
+    mapper_version: str = mapper.__version__
+    octree: OctreeConfig
+    slice: SliceConfig
+    tile_m: float
+    floor_z_m: float
+    runs: tuple[RunInMap, ...]
+    tiles: tuple[Tile, ...] = ()
+    voxels: int = 0
+    area_km2: float = 0.0
+    """Of the columns in which anything is known."""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def summary(self) -> str:
+        """How large it is, in a line."""
+        return (
+            f"{self.voxels} voxels of {self.octree.resolution_m:g} m in {len(self.tiles)} tiles of "
+            f"{self.tile_m:g} m, {1e6 * self.area_km2:.0f} m² seen from above"
+        )
+
+    def save(self, folder: Path) -> None:
+        """Write the manifest atomically."""
+        write_text(folder / MARK, self.model_dump_json(indent=2) + "\n")
+
+
+@dataclass(frozen=True, slots=True)
+class MergedMap:
+    """A merged map on disk.
+
+    Attributes:
+        path: Its folder.
+        manifest: What it says about itself.
+    """
+
+    path: Path
+    manifest: MapManifest
+
+    def tile_path(self, tile: Tile) -> Path:
+        """Return the file of a tile."""
+        return self.path / TILES / f"{tile.name}.octree"
+
+    def load(self, lower_m: Array, upper_m: Array) -> OctreeMap:
+        """Return the map of all tiles that a box touches.
+
+        Args:
+            lower_m: (3,) lower corner in the map, metres.
+            upper_m: (3,) upper corner.
+
+        Raises:
+            MapFileError: A tile is missing or damaged.
+            MapSizeError: They would not fit into memory.
+        """
+        octree = OctreeMap(self.manifest.octree)
+        for tile in self.manifest.tiles:
+            if np.less_equal(tile.lower_m, upper_m).all() and np.greater_equal(tile.upper_m, lower_m).all():
+                octree.add(read_map(self.tile_path(tile)))
+        return octree
+
+
+def is_map(folder: Path) -> bool:
+    """Tell whether a folder holds a merged map."""
+    try:
+        return '"kind": "merged map"' in (folder / MARK).read_text(encoding="utf-8")[:200]
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def open_map(folder: Path) -> MergedMap:
+    """Return a finished merged map.
+
+    Raises:
+        RunError: The folder is missing, holds no merged map, or one that is not finished.
+    """
+    if not is_map(folder):
+        if is_map(partial_of(folder)):
+            raise RunError(f"{folder}: not finished; the command that began it goes on where it stopped")
+        raise RunError(f"{folder}: no merged map; make one with mapper merge RUN… --out {folder}")
+    try:
+        manifest = MapManifest.model_validate_json((folder / MARK).read_bytes())
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise RunError(f"{folder / MARK}: {first['loc']}: {first['msg']}; by another version?") from None
+    return MergedMap(folder, manifest)

@@ -1,0 +1,152 @@
+"""Where the runs' worlds lie in the map: as they are, by their truths, or as a file tells."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mapper.errors import DataError, RunError
+from mapper.geometry import Array, Transform, fit_rigid, inverse, transform
+from mapper.rotations import rotation_from_quaternion
+from mapper.run import Run
+from mapper.timebase import NS_PER_S, nearest
+
+_MAX_GAP_NS = NS_PER_S // 50
+_LEVER_M = 1.0
+"""A straight path alone would not tell how a run is turned about it; the body's axes, so long, do."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """A run in the map.
+
+    Attributes:
+        run: It.
+        T_map_world: (4, 4) pose of its world in the map.
+        how: How that is known, in a few words.
+    """
+
+    run: Run
+    T_map_world: Transform
+    how: str
+
+    @property
+    def stays(self) -> bool:
+        """Whether its voxels are the map's, so that nothing has to be resampled."""
+        return np.array_equal(self.T_map_world, np.eye(4))
+
+
+def as_built(runs: Sequence[Run]) -> list[Placed]:
+    """Take every run's world for the map's: sessions of one chain, or logs that were mapped in one frame."""
+    return [Placed(run, np.eye(4), "as built") for run in runs]
+
+
+def by_truth(runs: Sequence[Run]) -> list[Placed]:
+    """Bring runs together by their truths, which share a frame, in the world of the first.
+
+    The first run is not moved, so the map is as level as it is, and as sharp.
+
+    Raises:
+        RunError: A run has no truth, or fewer than three poses with one.
+    """
+    T_truth_worlds, misses_m = zip(*(_fit_to_truth(run) for run in runs), strict=True)
+    T_map_truth = inverse(T_truth_worlds[0])
+    T_map_worlds = [np.eye(4), *(T_map_truth @ T_truth_world for T_truth_world in T_truth_worlds[1:])]
+    return [
+        Placed(run, T_map_world, f"by truth, RMS {miss_m:.2g} m")
+        for run, T_map_world, miss_m in zip(runs, T_map_worlds, misses_m, strict=True)
+    ]
+
+
+def by_poses(runs: Sequence[Run], path: Path) -> list[Placed]:
+    """Place runs as a file says: a line ``RUN tx ty tz qx qy qz qw``, the pose of its world, for each folder.
+
+    Raises:
+        DataError: The file cannot be read, a line is not like that, or a run has none or two.
+        RunError: Two runs have the same name.
+    """
+    poses = _read_poses(path)
+    names = Counter(run.path.name for run in runs)
+    for name, count in names.items():
+        if count > 1:
+            raise RunError(f"{name}: {count} runs are called so, and {path} tells them by name; rename one")
+        if name not in poses:
+            raise DataError(f"{path}: has no line for {name}; want {name} tx ty tz qx qy qz qw")
+    return [Placed(run, poses[run.path.name], f"by {path.name}") for run in runs]
+
+
+def doubts(placed: Sequence[Placed]) -> list[str]:
+    """Return what a user should know about the runs that are going to be added up, a line each."""
+    found = []
+    if len(placed) > 1 and all(item.stays for item in placed):
+        found.append(
+            "every run's world was taken for the map's; for runs mapped apart see --place and --poses"
+        )
+    for second, item in enumerate(placed):
+        for other in placed[:second]:
+            shared = _shared_frames(other.run, item.run)
+            if shared:
+                found.append(
+                    f"{other.run.path.name} and {item.run.path.name} were made from {shared} frames that are "
+                    "the same; these count twice"
+                )
+    return found
+
+
+def _shared_frames(first: Run, second: Run) -> int:
+    """Return how many frames of the same log two runs have used."""
+    logs = (
+        {log.fingerprint for log in (run.manifest.input, *run.manifest.input.appended)}
+        for run in (first, second)
+    )
+    if set.isdisjoint(*logs):
+        return 0
+    return len(np.intersect1d(first.trajectory().stamps_ns, second.trajectory().stamps_ns))
+
+
+def _fit_to_truth(run: Run) -> tuple[Transform, float]:
+    """Return T_truth_world, and the RMS distance in metres that it leaves."""
+    truth, trajectory = run.truth(), run.trajectory()
+    if truth is None:
+        raise RunError(f"{run.path}: has no truth to be placed by; tell its pose with --poses")
+    index, gap_ns = nearest(truth.stamps_ns, trajectory.stamps_ns)
+    near = np.abs(gap_ns) <= _MAX_GAP_NS
+    if np.count_nonzero(near) < 3:
+        raise RunError(
+            f"{run.path}: {np.count_nonzero(near)} poses have a truth within 20 ms, want 3; use --poses"
+        )
+    T_truth_body, T_world_body = truth.T_world_body[index[near]], trajectory.T_world_body[near]
+    T_truth_world, _ = fit_rigid(_with_axes(T_truth_body), _with_axes(T_world_body))
+    misses = (T_truth_world @ T_world_body)[:, :3, 3] - T_truth_body[:, :3, 3]
+    return T_truth_world, float(np.sqrt((misses**2).sum(axis=1).mean()))
+
+
+def _with_axes(T_a_body: Array) -> Array:
+    """Return (4 N, 3) positions, and the ends of the body's axes beside them."""
+    ends = T_a_body[:, :3, 3, np.newaxis] + _LEVER_M * T_a_body[:, :3, :3]
+    return np.concatenate([T_a_body[:, :3, 3], ends.transpose(0, 2, 1).reshape(-1, 3)])
+
+
+def _read_poses(path: Path) -> dict[str, Transform]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from None
+    poses: dict[str, Transform] = {}
+    for number, line in enumerate(text.splitlines(), start=1):
+        name, *words = line.replace(",", " ").split() or [""]
+        if not name or name.startswith("#"):
+            continue
+        try:
+            values = np.array([float(word) for word in words])
+            if values.shape != (7,) or not np.isfinite(values).all():
+                raise ValueError
+            pose = transform(rotation_from_quaternion(values[3:]), values[:3])
+        except (ValueError, DataError):
+            raise DataError(f"{path}:{number}: want RUN tx ty tz qx qy qz qw, all but RUN numbers") from None
+        if name in poses:
+            raise DataError(f"{path}:{number}: a second pose of {name}; remove one")
+        poses[name] = pose
+    return poses
