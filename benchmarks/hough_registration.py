@@ -33,6 +33,7 @@ from mapper.sources.synthetic.lidar import SyntheticLidarSource
 RIGHT_M, RIGHT_DEG = 0.3, 1.0
 NEAR_M = 10.0
 END_SCANS = 4
+MAP_VOXEL_M = 0.05
 COLUMNS = (
     *("scans", "method", "right", "wrong", "median cm", "95 % cm"),
     *("median °", "MPD cm (truth's)", "prepare ms", "align ms"),
@@ -123,7 +124,7 @@ def map_of_others(log: Log, *, without: int, T_world_map: Transform) -> Scan:
     """Return a dense map of all scans but one."""
     scans = [scan for i, scan in enumerate(log.scans) if i != without]
     poses = [inverse(T_world_map) @ T for i, T in enumerate(log.T_world_body) if i != without]
-    return merged(scans, poses)
+    return merged(scans, poses, voxel_m=MAP_VOXEL_M)
 
 
 def far_pairs(log: Log, *, count: int) -> Iterator[Pair]:

@@ -8,7 +8,6 @@ from mapper.frames import Scan
 from mapper.geometry import Transform, apply, inverse, transform
 from mapper.thinning import thin
 
-MAP_VOXEL_M = 0.05
 _RINGS, _KEPT_RINGS = 64, 16
 
 
@@ -48,12 +47,12 @@ def fewer_rings(scan: Scan) -> Scan:
     return Scan(stamp_ns=scan.stamp_ns, points_body=scan.points_body[keep], origin_body=scan.origin_body)
 
 
-def merged(scans: Sequence[Scan], T_map_body: Sequence[Transform]) -> Scan:
-    """Return a dense map of scans, one point per 5 cm voxel, told to have been seen from its origin."""
+def merged(scans: Sequence[Scan], T_map_body: Sequence[Transform], *, voxel_m: float) -> Scan:
+    """Return a map of scans, one point per voxel, told to have been seen from its origin."""
     points = np.concatenate(
         [
             apply(T, scan.points_body.astype(np.float64)).astype(np.float32)
             for scan, T in zip(scans, T_map_body, strict=True)
         ]
     )
-    return Scan(stamp_ns=0, points_body=points[thin(points, MAP_VOXEL_M)])
+    return Scan(stamp_ns=0, points_body=points[thin(points, voxel_m)])

@@ -1,4 +1,4 @@
-"""Tables of results: aligned text for a terminal, Markdown for a report, CSV for other programs."""
+"""Tables of results: aligned text for a terminal, Markdown and LaTeX for a report, CSV for other programs."""
 
 import csv
 import io
@@ -10,6 +10,29 @@ Record = Mapping[str, Value]
 """One row: name to value, with its unit in the name and every digit in the value; None is not known."""
 
 MISSING = "–"
+
+_LATEX = {
+    **{character: f"\\{character}" for character in "&%$#_{}"},
+    **{character: f"${character}$" for character in "<>|"},
+    **{character: f"{{{character}}}" for character in "[]*"},  # after a line's end these are its options
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    '"': "''",
+    "–": "--",
+    "…": r"\ldots{}",
+    "“": "``",
+    "”": "''",
+    "’": "'",
+    "°": r"$^\circ$",
+    "≥": r"$\geq$",
+    "≤": r"$\leq$",
+    "±": r"$\pm$",
+    "×": r"$\times$",
+    "→": r"$\rightarrow$",
+    "−": "$-$",
+    "·": r"$\cdot$",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +52,7 @@ class Column:
 
 def text_table(columns: Sequence[Column], records: Sequence[Record]) -> str:
     """Return aligned lines, two spaces between columns, the first one at the left."""
-    rows = [[column.title for column in columns], *_cells(columns, records)]
+    rows = [[column.title for column in columns], *shown_cells(columns, records)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return "\n".join(
         "  ".join(
@@ -45,9 +68,25 @@ def markdown_table(columns: Sequence[Column], records: Sequence[Record]) -> str:
     rows = [
         [column.title for column in columns],
         ["---" if k == 0 else "---:" for k in range(len(columns))],
-        *_cells(columns, records),
+        *shown_cells(columns, records),
     ]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in rows)
+
+
+def latex_table(columns: Sequence[Column], records: Sequence[Record]) -> str:
+    """Return a LaTeX ``tabular`` in the style of booktabs, whose package it needs."""
+    head, *rows = (
+        " & ".join(map(latex_text, row)) + r" \\"
+        for row in ([column.title for column in columns], *shown_cells(columns, records))
+    )
+    alignment = "l" + "r" * (len(columns) - 1)
+    lines = [rf"\begin{{tabular}}{{{alignment}}}", r"\toprule", head, r"\midrule", *rows, r"\bottomrule"]
+    return "\n".join([*lines, r"\end{tabular}"])
+
+
+def latex_text(text: str) -> str:
+    """Return plain text as LaTeX prints it; letters with accents need no more than UTF-8, its default."""
+    return "".join(_LATEX.get(character, character) for character in text)
 
 
 def csv_text(records: Sequence[Record]) -> str:
@@ -59,7 +98,8 @@ def csv_text(records: Sequence[Record]) -> str:
     return text.getvalue()
 
 
-def _cells(columns: Sequence[Column], records: Sequence[Record]) -> list[list[str]]:
+def shown_cells(columns: Sequence[Column], records: Sequence[Record]) -> list[list[str]]:
+    """Return what stands in the cells of every record."""
     return [[_cell(column, record[column.key]) for column in columns] for record in records]
 
 

@@ -111,7 +111,7 @@ class HoughTrial:
             error_m = float(np.linalg.norm(miss[:3, 3]))
             error_deg = float(np.degrees(angle_between(miss[:3, :3], np.eye(3))))
             within_m, within_deg = self.pair.within
-            is_right = alignment.converged and error_m < within_m and error_deg < within_deg
+            is_right = error_m < within_m and error_deg < within_deg
             told |= {"error_m": error_m, "error_deg": error_deg, "right": int(is_right)}
         return told
 

@@ -28,6 +28,8 @@ RIGHT_M, RIGHT_DEG = 0.3, 1.0
 SCANS_PER_LOG = 4
 MAP_SCANS = 20
 """So many scans before the one that is left out, and as many after it, make the map."""
+MAP_VOXEL_M = 0.02
+"""And one point of each voxel: MPD cannot fall much below half of it."""
 
 _VLP_POINTS = 30_000  # what a VLP-16 gives in a turn; a scan with no more is not thinned further
 _RELLIS_M, _RELLIS_DEG = 0.5, 2.5  # the extrinsics are themselves good to about 0.1 m and 1°
@@ -144,7 +146,7 @@ class LogPair:
 
     def identity(self) -> str:
         """Return the log's fingerprint, which scan it is, and how it is thinned."""
-        return f"{fingerprint(self.log)} {self.index} {self.sensor} {MAP_SCANS}"
+        return f"{fingerprint(self.log)} {self.index} {self.sensor} {MAP_SCANS} {MAP_VOXEL_M}"
 
     def clouds(self) -> Clouds:
         """Read the scans and join them."""
@@ -292,7 +294,8 @@ def _left_out(log: Path, index: int) -> Clouds:
     first, last = max(index - MAP_SCANS, 0), min(index + MAP_SCANS, len(posed) - 1)
     T_map_world = inverse(posed[(first + last) // 2][1])
     others = [posed[i] for i in range(first, last + 1) if i != index]
-    target = merged([entry.scan() for entry, _ in others], [T_map_world @ T for _, T in others])
+    scans, poses = [entry.scan() for entry, _ in others], [T_map_world @ T for _, T in others]
+    target = merged(scans, poses, voxel_m=MAP_VOXEL_M)
     entry, T_world_body = posed[index]
     return Clouds(target, entry.scan(), T_map_world @ T_world_body)
 

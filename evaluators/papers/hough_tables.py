@@ -6,11 +6,11 @@ it succeeds, how near it ends and how long it takes can be.
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from statistics import median
+from statistics import mean, median
 
 from evaluators.cells import CellResult
 from evaluators.papers.hough import DISTANCES, METHODS, OFFSET_M
-from evaluators.papers.hough_pairs import ALL_RINGS, FEW_RINGS
+from evaluators.papers.hough_pairs import ALL_RINGS, FEW_RINGS, MAP_VOXEL_M
 from evaluators.papers.model import PaperCell, PaperTable, Reproduction
 from evaluators.papers.published import published
 from evaluators.tables import Record, Value
@@ -59,8 +59,8 @@ def hough_reproduction(results: Sequence[CellResult], *, pictures: Path) -> Repr
             "our scenes are not the paper's, so only the summary compares; all rings stand beside its "
             "HDL-64E, 16 rings, every fourth of 64, beside its VLP-16",
             f"each seed turns a scan by any yaw and sets it off by up to {OFFSET_M:g} m",
-            "a log's map is made of the scans around the one left out, one point per 5 cm voxel: sparser "
-            "than the paper's mobile mapping, but of the same drive, with the same traffic",
+            "a log's map is made of the scans around the one left out, one point per "
+            f"{100 * MAP_VOXEL_M:g} cm voxel: sparser than the paper's mobile mapping, but of the same drive",
             "time: of the whole registration on this machine, the map's preparation included",
             *(f"failed: {result.label}: {result.failure}" for result in results if result.failure),
         ),
@@ -87,12 +87,14 @@ def _summary(trials: Trials) -> PaperTable:
             f"the truth's own MPD is in {floor}"
         )
     title = "theirs and ours over all scenes of a sensor"
-    return _table("Table 1, summary", title, cells, (f"printed as not right: {FAILED_SCENE}", *notes))
+    return _table(
+        "Table 1, summary", title, cells, (f"printed as wrong, with either sensor: {FAILED_SCENE}", *notes)
+    )
 
 
-def _not_right(trials: Trials) -> float | None:
-    right = _known(trials, "right")
-    return 100.0 * (1.0 - sum(right) / len(right)) if right else None
+def _share_without(key: str) -> Callable[[Trials], float | None]:
+    """Return how many percent of the trials, of those for which it is known, are not what the key says."""
+    return lambda trials: 100.0 * (1.0 - mean(known)) if (known := _known(trials, key)) else None
 
 
 def _not_near(trials: Trials) -> float | None:
@@ -105,7 +107,8 @@ def _median_of(key: str) -> Callable[[Trials], float | None]:
 
 
 _SUMS: Mapping[str, Callable[[Trials], float | None]] = {
-    "not right, %": _not_right,
+    "wrong, %": _share_without("right"),
+    "not trusted, %": _share_without("trusted"),
     f"final MPD ≥ {100 * NEAR_M:g} cm, %": _not_near,
     "median final MPD, m": _median_of("mpd_final_m"),
     "median time, s": _median_of("seconds"),
@@ -115,7 +118,11 @@ _SUMS: Mapping[str, Callable[[Trials], float | None]] = {
 def _printed_sums(sensor: str) -> dict[str, float | None]:
     """Return the same of the printed scenes, if the paper has such a sensor."""
     trials = [
-        {**dict(zip(_KEYS, figures, strict=True)), "right": int(not scene.startswith(FAILED_SCENE))}
+        {
+            **dict(zip(_KEYS, figures, strict=True)),
+            "right": not scene.startswith(FAILED_SCENE),
+            "trusted": None,
+        }
         for scene, figures in published()["hough_ndt"]["rows"].items()
         if scene.endswith(_PRINTED_AS.get(sensor, "no such sensor"))
     ]
@@ -145,14 +152,14 @@ def _against_truth(trials: Trials) -> PaperTable:
     """Return how far the answers are from the truth, where that is known; doubted answers are listed."""
     cells = []
     for group, of_pair in _grouped(trials, "pair", "sensor", "method").items():
-        if (not_right := _not_right(of_pair)) is None:
+        if not _known(of_pair, "right"):
             continue
         row = ", ".join(map(str, group))
         cells += [_cell(row, column, of_pair, key) for key, column in _ERRORS.items()]
-        doubts = [
-            f"seed {trial['seed']}: not trusted: {trial['reason']}" for trial in of_pair if trial["reason"]
-        ]
-        cells.append(PaperCell(row, "not right, %", None, (not_right,), tuple(doubts)))
+        doubts = tuple(f"seed {t['seed']}: not trusted: {t['reason']}" for t in of_pair if t["reason"])
+        for column, reasons in (("wrong, %", ()), ("not trusted, %", doubts)):
+            share = _SUMS[column](of_pair)
+            cells.append(PaperCell(row, column, None, () if share is None else (share,), reasons))
     return _table("Table 1, errors", "our answers against the truth", cells)
 
 
@@ -163,7 +170,7 @@ def _cell(row: str, column: str, trials: Trials, key: str) -> PaperCell:
 
 def _table(name: str, title: str, cells: Sequence[PaperCell], notes: Sequence[str] = ()) -> PaperTable:
     source = published()["hough_ndt"]["source"]
-    return PaperTable(name, title, source, "registration", "", tuple(cells), notes=tuple(notes))
+    return PaperTable(name, title, source, "", "", tuple(cells), notes=tuple(notes))
 
 
 def _grouped(trials: Trials, *keys: str) -> dict[tuple[Value, ...], list[Record]]:

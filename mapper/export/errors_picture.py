@@ -51,10 +51,7 @@ def write_errors(
     )
     path_axes.set_title("over the truth, seen from where it is widest", fontsize=9, color=INK)
     colored = draw_path(path_axes, positions, truth=truth, errors_m=errors_m)
-    place = path_axes.inset_axes((0.6, 0.95, 0.36, 0.025))
-    bar = figure.colorbar(colored, cax=place, orientation="horizontal")
-    bar.ax.tick_params(labelsize=7, colors=FAINT)
-    bar.set_label("distance from the truth, m", fontsize=7, color=FAINT)
+    add_color_bar(path_axes, colored)
     for axes, values, name in (
         (position_axes, errors_m, "distance from the truth, m"),
         (rotation_axes, np.degrees(errors_rad), "angle to the truth, °"),
@@ -82,7 +79,7 @@ def draw_path(
         most_m: Error of the strongest colour; None is the largest.
 
     Returns:
-        What a colour bar is made for.
+        What ``add_color_bar`` takes.
     """
     from matplotlib.collections import LineCollection
 
@@ -102,6 +99,14 @@ def draw_path(
     axes.set_xlabel("m", color=FAINT, fontsize=8)
     axes.set_ylabel("m", color=FAINT, fontsize=8)
     return colored
+
+
+def add_color_bar(axes: "Axes", colored: "LineCollection") -> None:
+    """Tell in a corner what the colours of ``draw_path`` mean."""
+    place = axes.inset_axes((0.6, 0.95, 0.36, 0.025))
+    bar = axes.figure.colorbar(colored, cax=place, orientation="horizontal")
+    bar.ax.tick_params(labelsize=7, colors=FAINT)
+    bar.set_label("distance from the truth, m", fontsize=7, color=FAINT)
 
 
 def _draw_over_time(axes: "Axes", elapsed: Array, values: Array, *, name: str) -> None:

@@ -50,3 +50,20 @@ def document(title: str, *, header: str, main: Iterable[str], scripts: Iterable[
 def section(title: str, body: str) -> str:
     """Return a part of a page under a headline, by which it can be linked to."""
     return f'<section id="{title.lower().replace(" ", "-")}"><h2>{escape(title)}</h2>{body}</section>'
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """Return a table of plain text, whose rows begin with what they are about."""
+    top = "".join(f"<th>{escape(text)}</th>" for text in head)
+    body = "".join(f"<tr>{''.join(map(_cell, range(len(row)), row))}</tr>" for row in map(list, rows))
+    return f'<div class="scroll"><table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def bullets(lines: Iterable[str]) -> str:
+    """Return a list of plain lines."""
+    return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
+
+
+def _cell(column: int, text: str) -> str:
+    tag = "td" if column else "th"
+    return f"<{tag}>{escape(text)}</{tag}>"

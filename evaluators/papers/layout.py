@@ -1,0 +1,146 @@
+"""How a paper's table is laid out: a line for each comparison, or as printed with our lines below theirs."""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from statistics import median
+
+from evaluators.papers.model import PaperCell, PaperTable, Reproduction
+from evaluators.tables import Column, Record
+
+_DIGITS = 3
+"""Of figures that have no printed one beside them to show how many make sense."""
+
+
+def compares(table: PaperTable) -> bool:
+    """Tell whether any figure of ours stands beside a printed one."""
+    return any(cell.published is not None and (cell.ours or cell.failures) for cell in table.cells)
+
+
+def headline(table: PaperTable) -> str:
+    """Return a table's name, title and quantity, in a line."""
+    quantity = ", ".join(filter(None, (table.metric, table.unit)))
+    return "; ".join(filter(None, (f"{table.name}: {table.title}", quantity)))
+
+
+def compared(table: PaperTable) -> tuple[list[Column], list[Record]]:
+    """Return a line for each figure: printed, ours, its spread over the seeds, ratio and verdict."""
+    decimals = _decimals(table)
+    records: list[Record] = [
+        {
+            "row": cell.row,
+            "column": cell.column,
+            **_figures(cell, decimals[cell.column]),
+            "verdict": cell.verdict,
+            "failures": len(cell.failures) or None,
+        }
+        for cell in table.cells
+    ]
+    always = {"row": "", "column": table.axis, "printed": "printed", "ours": "ours"}
+    often = {"spread": "spread", "ratio": "ratio", "verdict": "verdict", "failures": "failed"}
+    shown = {key: title for key, title in often.items() if any(record[key] is not None for record in records)}
+    return [Column(key, title) for key, title in {**always, **shown}.items()], records
+
+
+def as_printed(table: PaperTable, *, with_spread: bool) -> tuple[list[Column], list[Record]]:
+    """Return the printed layout, where a row's figures, ours, their spread and the ratios are lines.
+
+    Args:
+        table: The table.
+        with_spread: Tell the range over the seeds, where there are several.
+    """
+    decimals = _decimals(table)
+    records: list[Record] = []
+    for row in dict.fromkeys(cell.row for cell in table.cells):
+        figures = {
+            cell.column: _figures(cell, decimals[cell.column]) for cell in table.cells if cell.row == row
+        }
+        for line in ("printed", "ours", "spread", "ratio"):
+            texts = {column: of_cell[line] for column, of_cell in figures.items()}
+            if any(texts.values()) and (with_spread or line != "spread"):
+                records.append({"row": row, "line": line, **dict.fromkeys(decimals), **texts})
+    head = [Column("row", "")]
+    if len({record["line"] for record in records}) > 1:
+        head.append(Column("line", ""))
+    return [*head, *(Column(column, column) for column in decimals)], records
+
+
+def everything(reproduction: Reproduction) -> list[Record]:
+    """Return every cell of every table with all its digits."""
+    return [
+        {
+            "paper": reproduction.paper,
+            "table": table.name,
+            "row": cell.row,
+            "column": cell.column,
+            "metric": table.metric,
+            "unit": table.unit,
+            "published": cell.published,
+            "ours_median": cell.median,
+            "ours_low": cell.low,
+            "ours_high": cell.high,
+            "seeds": len(cell.ours),
+            "ratio": cell.ratio,
+            "verdict": cell.verdict,
+            "failures": "; ".join(cell.failures),
+        }
+        for table in reproduction.tables
+        for cell in table.cells
+    ]
+
+
+def counted(table: PaperTable) -> str:
+    """Return how often each verdict was given, in a line."""
+    verdicts = Counter(cell.verdict for cell in table.cells)
+    return ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items())
+
+
+def failures(table: PaperTable) -> list[str]:
+    """Return why figures are missing, a line for each reason and the cells it holds for."""
+    where: dict[str, list[str]] = {}
+    for cell in table.cells:
+        for reason in cell.failures:
+            where.setdefault(reason, []).append(f"{cell.row} {cell.column}")
+    return [
+        f"{cells[0]}{f' and {len(cells) - 1} more' if len(cells) > 1 else ''}: {reason}"
+        for reason, cells in where.items()
+    ]
+
+
+def _decimals(table: PaperTable) -> dict[str, int]:
+    """Return how many decimals the figures of each column have: all alike, or each column by itself."""
+    columns = list(dict.fromkeys(cell.column for cell in table.cells))
+    if table.unit:
+        return dict.fromkeys(columns, _usual_decimals(table.cells))
+    return {
+        column: _usual_decimals([cell for cell in table.cells if cell.column == column]) for column in columns
+    }
+
+
+def _usual_decimals(cells: Sequence[PaperCell]) -> int:
+    """Return as many as most of the printed figures have, or enough for a few digits of ours."""
+    printed = Counter(_own_decimals(cell.published) for cell in cells if cell.published is not None)
+    if printed:
+        return printed.most_common(1)[0][0]
+    typical = median([abs(figure) for cell in cells for figure in cell.ours] or [0.0])
+    return max(_DIGITS - 1 - math.floor(math.log10(typical)), 0) if typical else 0
+
+
+def _own_decimals(figure: float) -> int:
+    return len(f"{figure:.6f}".rstrip("0").partition(".")[2])
+
+
+def _figures(cell: PaperCell, decimals: int) -> dict[str, str | None]:
+    """Return what is shown of a cell; a printed figure keeps all its digits."""
+    printed = None
+    if cell.published is not None:
+        printed = f"{cell.published:.{max(decimals, _own_decimals(cell.published))}f}"
+    spread = None
+    if len(cell.ours) > 1:
+        spread = f"{cell.low:.{decimals}f}–{cell.high:.{decimals}f}"
+    return {
+        "printed": printed,
+        "ours": None if cell.median is None else f"{cell.median:.{decimals}f}",
+        "spread": spread,
+        "ratio": None if cell.ratio is None else f"{cell.ratio:.2f}",
+    }

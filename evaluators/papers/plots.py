@@ -1,0 +1,181 @@
+"""Plots of a paper's tables: our figures as curves or boxes beside the printed ones, and coloured paths."""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from evaluators.odometry_scores import position_errors_m
+from evaluators.papers.layout import compares, headline
+from evaluators.papers.model import PaperCell, PaperPath, PaperTable, Reproduction
+from evaluators.trajectory import associate
+from mapper.export.errors_picture import add_color_bar, draw_path
+from mapper.export.page import FAINT, INK, LINE, hex_of, save
+from mapper.export.palette import ESTIMATE, TRUTH
+from mapper.export.panels import draw_boxes, page, panel
+from mapper.geometry import Array
+from mapper.trajectory import read_tum
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+TRAJECTORIES, SCENES = "trajectories.png", "scenes.png"
+_COLUMNS = 3
+_WIDTH_IN, _HEIGHT_IN = 4.6, 3.4
+_PATH_IN = 4.6
+_BOX_IN = 0.3
+_NUMBER = re.compile(r"\d+")
+_LEGEND: dict[str, Any] = {"fontsize": 7, "framealpha": 0.9, "edgecolor": LINE}
+
+
+def write_plots(folder: Path, reproduction: Reproduction) -> list[Path]:
+    """Draw what can be drawn of a paper's tables and paths, a PNG file each.
+
+    Args:
+        folder: Existing folder.
+        reproduction: What was measured.
+
+    Returns:
+        The files, in the order of the tables.
+    """
+    drawn = []
+    for table in filter(compares, reproduction.tables):
+        path = folder / f"{_file_name(table.name)}.png"
+        if table.axis:
+            _write_curves(path, table)
+        elif table.unit:
+            _write_boxes(path, table)
+        else:
+            continue
+        drawn.append(path)
+    scenes = [table for table in reproduction.tables if table.cells and not compares(table)]
+    alike = [table for table in scenes if _columns(table) == _columns(scenes[0])]
+    if len(alike) > 1:
+        drawn.append(folder / SCENES)
+        _write_scenes(drawn[-1], alike, title=reproduction.paper)
+    if reproduction.paths:
+        drawn.append(folder / TRAJECTORIES)
+        _write_paths(drawn[-1], reproduction.paths)
+    return drawn
+
+
+def _write_curves(path: Path, table: PaperTable) -> None:
+    """Draw each row's figures over what the columns count; a column without a number is a level."""
+    rows = _by_row(table)
+    figure, across, down = _page(headline(table), len(rows))
+    for number, (row, cells) in enumerate(rows.items()):
+        axes = panel(figure, number, columns=across, rows=down)
+        printed = {cell.column: [cell.published] for cell in cells if cell.published is not None}
+        ours = {cell.column: cell.ours for cell in cells if cell.ours}
+        _draw_curve(axes, printed, color=hex_of(TRUTH), label="printed")
+        _draw_curve(axes, ours, color=hex_of(ESTIMATE), label="ours")
+        axes.set_title(row, fontsize=9, color=INK)
+        axes.set_xlabel(table.axis, color=FAINT, fontsize=8)
+        axes.set_ylabel(f"{table.metric}, {table.unit}", color=FAINT, fontsize=8)
+        axes.set_ylim(bottom=0.0)
+        axes.grid(color=LINE, linewidth=0.4)
+        axes.legend(**_LEGEND)
+    save(figure, path)
+
+
+def _draw_curve(axes: "Axes", figures: Mapping[str, Sequence[float]], *, color: str, label: str) -> None:
+    """Draw the medians as a line, and what lies between lowest and highest as a band."""
+    counted = {int(count[0]): some for name, some in figures.items() if (count := _NUMBER.search(name))}
+    low, middle, high = ([of(some) for some in counted.values()] for of in (min, median, max))
+    axes.plot(list(counted), middle, ".-", color=color, linewidth=1.3, label=label)
+    axes.fill_between(list(counted), low, high, color=color, alpha=0.18, linewidth=0.0)
+    for name in figures:
+        if not _NUMBER.search(name):
+            level = median(figures[name])
+            axes.axhline(level, color=color, linewidth=0.9, linestyle="dashed", label=f"{label}, {name}")
+
+
+def _write_boxes(path: Path, table: PaperTable) -> None:
+    """Draw each row's figures over the seeds, a box for each column, with the printed one as a mark."""
+    rows = _by_row(table)
+    most = max(len(cells) for cells in rows.values())
+    figure, across, down = _page(headline(table), len(rows), height_in=0.9 + _BOX_IN * most)
+    for number, (row, cells) in enumerate(rows.items()):
+        axes = panel(figure, number, columns=across, rows=down)
+        printed = {k: cell.published for k, cell in enumerate(cells, 1) if cell.published is not None}
+        axes.plot(list(printed.values()), list(printed), "D", color=hex_of(TRUTH), zorder=3, label="printed")
+        draw_boxes(axes, {cell.column: np.array(cell.ours) for cell in cells})
+        axes.set_xscale("linear")
+        axes.set_xlim(left=0.0)
+        axes.set_title(row, fontsize=9, color=INK)
+        axes.set_xlabel(f"{table.metric}, {table.unit}", color=FAINT, fontsize=8)
+        axes.legend(**_LEGEND)
+    save(figure, path)
+
+
+def _write_scenes(path: Path, tables: Sequence[PaperTable], *, title: str) -> None:
+    """Draw what the rows of each table come to, a panel for each column and a box for each table."""
+    columns = _columns(tables[0])
+    figure, across, down = _page(title, len(columns), height_in=0.9 + _BOX_IN * len(tables))
+    for number, column in enumerate(columns):
+        axes = panel(figure, number, columns=across, rows=down)
+        draw_boxes(axes, {_short(table): _figures_of(table, column) for table in tables})
+        axes.set_title(column, fontsize=9, color=INK)
+    save(figure, path)
+
+
+def _figures_of(table: PaperTable, column: str) -> Array:
+    """Return every scene's figure, ours or else the printed one."""
+    cells = [cell for cell in table.cells if cell.column == column]
+    figures = [cell.published if cell.median is None else cell.median for cell in cells]
+    return np.array([figure for figure in figures if figure])  # the scale is logarithmic
+
+
+def _short(table: PaperTable) -> str:
+    return table.name.partition(", ")[2] or "printed"
+
+
+def _write_paths(path: Path, paths: Sequence[PaperPath]) -> None:
+    """Draw every path over its truth, coloured by its error; those of one sequence by one scale."""
+    matched = [associate(read_tum(each.estimate), read_tum(each.truth)) for each in paths]
+    errors_m = [position_errors_m(pairs) for pairs in matched]
+    most_m: dict[str, float] = {}
+    for each, errors in zip(paths, errors_m, strict=True):
+        most_m[each.row] = max(most_m.get(each.row, 0.0), float(errors.max()))
+    title = "Paths over the truth, coloured by their error"
+    figure, across, down = _page(title, len(paths), height_in=_PATH_IN)
+    for number, (each, pairs, errors) in enumerate(zip(paths, matched, errors_m, strict=True)):
+        axes = panel(figure, number, columns=across, rows=down)
+        colored = draw_path(
+            axes,
+            pairs.T_map_body[:, :3, 3],
+            truth=pairs.T_truth_body[:, :3, 3],
+            errors_m=errors,
+            most_m=most_m[each.row],
+        )
+        add_color_bar(axes, colored)
+        axes.set_title(f"{each.row}, {each.method}: ATE {each.ate_m:.4f} m", fontsize=9, color=INK)
+    save(figure, path)
+
+
+def _page(title: str, panels: int, *, height_in: float = _HEIGHT_IN) -> tuple["Figure", int, int]:
+    """Return a page for so many panels, and how many are beside and below one another."""
+    across = min(_COLUMNS, panels)
+    down = -(-panels // across)
+    return page(title, columns=across, rows=down, width_in=_WIDTH_IN, height_in=height_in), across, down
+
+
+def _by_row(table: PaperTable) -> dict[str, list[PaperCell]]:
+    """Return the rows that have a figure of ours."""
+    rows: dict[str, list[PaperCell]] = {}
+    for cell in table.cells:
+        rows.setdefault(cell.row, []).append(cell)
+    return {row: cells for row, cells in rows.items() if any(cell.ours for cell in cells)}
+
+
+def _columns(table: PaperTable) -> list[str]:
+    return list(dict.fromkeys(cell.column for cell in table.cells))
+
+
+def _file_name(name: str) -> str:
+    return re.sub(r"[^\w.-]+", "_", name)
