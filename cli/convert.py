@@ -38,13 +38,15 @@ def convert(
     """
     from mapper.config import load_source_config
     from mapper.sources import open_source
-    from mapper.sources.writers import write_log
+    from mapper.sources.writers import left_out, write_log
 
     prepare_libraries()
     source = open_source(
         log, load_source_config(None, merged(selection(first, last, stride, require_truth), set_))
     )
     progress = progress_for(quiet=quiet)
+    for note in (*source.notes, *left_out(source, as_.value)):
+        progress.note(note)
     with progress.stage("convert") as report:
         skipped = write_log(source, out, kind=as_.value, on_progress=lambda done: report(done, len(source)))
     for skip in skipped:

@@ -67,13 +67,21 @@ def _log_rows(log: "LogFacts") -> list[tuple[str, str]]:
     if log.calibration is not None:
         rows.append(("camera", log.calibration))
     rows.append(("truth", log.truth or "none"))
+    if log.wheels is not None:
+        rows.append(
+            (
+                "wheels",
+                f"{log.wheels.count} poses over {log.wheels_path_m:.1f} m: {_timing_text(log.wheels)}",
+            )
+        )
     if log.readings:
         rows.append(("accelerations", f"{log.readings} readings"))
     return [*rows, *(("note", note) for note in log.notes)]
 
 
 def _timing_text(timing: "Timing") -> str:
-    gaps = f"{timing.gaps} gaps, the longest {timing.longest_gap_s:.2f} s" if timing.gaps else "no gaps"
+    count = "1 gap" if timing.gaps == 1 else f"{timing.gaps} gaps"
+    gaps = f"{count}, the longest {timing.longest_gap_s:.2f} s" if timing.gaps else "no gaps"
     return f"{timing.duration_s:.1f} s at {timing.rate_hz:.1f} Hz, {gaps}"
 
 

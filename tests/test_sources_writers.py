@@ -36,6 +36,7 @@ class MemorySource:
     kind: str = "memory"
     truth: object = None
     accelerations: object = None
+    wheels: object = None
     notes: list[str] = field(default_factory=list)
 
     def __len__(self) -> int:

@@ -36,7 +36,7 @@ class TopicsConfig(Config):
     truth: str | None = None
     """True poses (Odometry, PoseStamped, TransformStamped); None is /ground_truth, if there is one."""
     wheels: str | None = None
-    """Wheel odometry (Odometry, PoseStamped, TransformStamped); None uses none."""
+    """Wheel odometry (Odometry, PoseStamped, TransformStamped); None is /wheel_odometry, if there is one."""
 
 
 class WheelsConfig(Config):

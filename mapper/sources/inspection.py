@@ -67,6 +67,8 @@ class LogFacts:
         content: What the first frame that can be read is, in words.
         calibration: The camera, in words; None of a LiDAR.
         truth: What truth there is, in words; None without.
+        wheels: How the readings of its wheels follow each other; None without.
+        wheels_path_m: How far they drove.
         readings: How many accelerations there are.
         notes: What opening it had to leave out or assume.
     """
@@ -78,6 +80,8 @@ class LogFacts:
     content: str
     calibration: str | None
     truth: str | None
+    wheels: Timing | None
+    wheels_path_m: float
     readings: int
     notes: Sequence[str]
 
@@ -146,6 +150,8 @@ def _facts(source: FrameSource) -> LogFacts:
         content=content,
         calibration=calibration,
         truth=None if source.truth is None else _truth_text(source.truth, stamps_ns),
+        wheels=None if source.wheels is None else timing_of(source.wheels.stamps_ns),
+        wheels_path_m=0.0 if source.wheels is None else source.wheels.path_length_m,
         readings=0 if source.accelerations is None else len(source.accelerations.stamps_ns),
         notes=list(source.notes),
     )

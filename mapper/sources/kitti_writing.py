@@ -9,6 +9,7 @@ from mapper.atomic import write_text
 from mapper.errors import FrameError, SourceError
 from mapper.frames import Scan
 from mapper.sources.base import FrameSource, Skipped
+from mapper.sources.wheels import write_wheels
 from mapper.timebase import MAX_TRUTH_GAP_NS, Stamps, nearest, seconds_text_from_ns
 from mapper.trajectory import Trajectory, write_kitti
 
@@ -52,6 +53,8 @@ def write_kitti_log(
     truth = source.truth and _at(source.truth, np.array(stamps_ns, dtype=np.int64))
     if truth is not None:
         write_kitti(out / "poses.txt", truth)
+    if source.wheels is not None:
+        write_wheels(out, source.wheels, sensor=source.sensor)
     write_text(out / "times.txt", "".join(f"{seconds_text_from_ns(stamp_ns)}\n" for stamp_ns in stamps_ns))
     return skipped
 

@@ -104,14 +104,20 @@ def cloud_message(scan: Scan, *, frame: str) -> bytes:
 
 def pose_message(stamp_ns: int, T_frame_body: Transform, *, frame: str) -> bytes:
     """Return a geometry_msgs/msg/PoseStamped."""
-    x, y, z = T_frame_body[:3, 3].tolist()
-    qx, qy, qz, qw = quaternion_from_rotation(T_frame_body[:3, :3]).tolist()
-    pose = _made(
-        "geometry_msgs/msg/Pose",
-        position=_made("geometry_msgs/msg/Point", x=x, y=y, z=z),
-        orientation=_made("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+    return _encoded("geometry_msgs/msg/PoseStamped", _header(stamp_ns, frame), pose=_pose(T_frame_body))
+
+
+def odometry_message(stamp_ns: int, T_frame_child: Transform, *, frame: str, child: str) -> bytes:
+    """Return a nav_msgs/msg/Odometry of poses alone: nothing is told of velocities, nor of covariances."""
+    zero = _made("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+    still, unknown = _made("geometry_msgs/msg/Twist", linear=zero, angular=zero), np.zeros(36)
+    return _encoded(
+        "nav_msgs/msg/Odometry",
+        _header(stamp_ns, frame),
+        child_frame_id=child,
+        pose=_made("geometry_msgs/msg/PoseWithCovariance", pose=_pose(T_frame_child), covariance=unknown),
+        twist=_made("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=unknown),
     )
-    return _encoded("geometry_msgs/msg/PoseStamped", _header(stamp_ns, frame), pose=pose)
 
 
 def imu_message(stamp_ns: int, acceleration_mps2: Array, *, frame: str) -> bytes:
@@ -161,6 +167,16 @@ def bag_writer(path: Path) -> Iterator[BagWriter]:
 
 def _made(type_: str, **fields: Any) -> Any:
     return typestore("cdr").types[type_](**fields)
+
+
+def _pose(T_frame_body: Transform) -> Any:
+    x, y, z = T_frame_body[:3, 3].tolist()
+    qx, qy, qz, qw = quaternion_from_rotation(T_frame_body[:3, :3]).tolist()
+    return _made(
+        "geometry_msgs/msg/Pose",
+        position=_made("geometry_msgs/msg/Point", x=x, y=y, z=z),
+        orientation=_made("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+    )
 
 
 def _header(stamp_ns: int, frame: str) -> Any:

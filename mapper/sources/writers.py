@@ -18,6 +18,7 @@ from mapper.sources.images import FINE_UNITS_PER_M, bytes_of, encode_colour, enc
 from mapper.sources.kitti_writing import write_kitti_log
 from mapper.sources.mbag import HEADER
 from mapper.sources.ros.writing import write_recording
+from mapper.sources.wheels import write_wheels
 from mapper.timebase import MAX_TRUTH_GAP_NS, nearest, seconds_text_from_ns
 from mapper.trajectory import Trajectory, write_tum
 
@@ -63,6 +64,13 @@ def write_log(
     return _write_images_log(source, out, kind=kind, on_progress=on_progress)
 
 
+def left_out(source: FrameSource, kind: LogKind) -> list[str]:
+    """Return what of a log a format has no place for, a sentence each."""
+    has = {"wheel odometry": source.wheels is not None, "accelerations": source.accelerations is not None}
+    no_place: dict[LogKind, list[str]] = {"mbag": ["wheel odometry"], "kitti": ["accelerations"]}
+    return [f"{kind} has no place for {what}; left out" for what in no_place.get(kind, []) if has[what]]
+
+
 def _write_images_log(
     source: FrameSource,
     out: Path,
@@ -74,8 +82,8 @@ def _write_images_log(
 
     Image files are copied byte for byte under names that are their stamps; frames without files are encoded
     as PNG, depth at 0.2 mm. ``calibration.toml`` keeps the camera and depth units. TUM keeps the whole truth;
-    mbag has room for one pose a frame, the nearest within 20 ms. The lists, by which a log is recognised,
-    are written last.
+    mbag has room for one pose a frame, the nearest within 20 ms, and none for wheels. The lists, by which a
+    log is recognised, are written last.
     """
     camera = _camera_of(source)
     written: list[_Written] = []
@@ -96,6 +104,8 @@ def _write_images_log(
     else:
         if source.truth is not None:
             write_tum(out / "groundtruth.txt", source.truth)
+        if source.wheels is not None:
+            write_wheels(out, source.wheels, sensor=source.sensor)
         depth_files = {frame.depth_stamp_ns: frame.depth for frame in written}
         colour_files = {frame.stamp_ns: frame.colour for frame in written}
         write_text(out / "depth.txt", _list_text("depth maps", source.name, depth_files))

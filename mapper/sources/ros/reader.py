@@ -69,14 +69,16 @@ class RecordingReader:
     ) -> tuple[Trajectory | None, list[str]]:
         """Return T_odom_body of a topic of wheel odometry, and notes; tf ties the two unless the user does.
 
+        Poses of the body's own frame are taken as they are.
+
         Raises:
             SourceError: What the user set is no pose.
         """
         if series is None:
             return None, []
         wheels, child, notes = self._told(series)
-        if wheels is None:
-            return None, notes
+        if wheels is None or child == body:
+            return wheels, notes
         T_base_body = self.tree.find(child, body) if child and config.body_in_base is None else None
         if T_base_body is None:
             T_base_body = mounting(config, sensor)

@@ -15,13 +15,14 @@ from mapper.sources.ros.messages import (
     CLOUDS,
     IMAGES,
     IMUS,
+    ODOMETRY,
     POSES,
     ImageMessage,
     ImuMessage,
     Message,
 )
 
-TRUTH = "/ground_truth"
+TRUTH, WHEELS = "/ground_truth", "/wheel_odometry"
 
 _TRANSPORTS = ("/compressedDepth", "/compressed")  # what image_transport appends to an image's own topic
 _OWN_TYPES = "mapper/msg/"
@@ -53,7 +54,7 @@ class Choice:
         frames: What is mapped: images, or clouds.
         imu: Inertial readings, if there are any.
         truth: True poses, if there are any.
-        wheels: Wheel odometry, if it was asked for.
+        wheels: Wheel odometry, if it was asked for or is called so.
         notes: What was guessed, a sentence each.
     """
 
@@ -85,7 +86,7 @@ def choose(
     points = pick.one("points", config.points, CLOUDS, _cloud_rank, where=lambda name: len(series[name]) > 1)
     imu = pick.one("imu", config.imu, IMUS, _plain_rank, where=lambda name: _feels_gravity(firsts.get(name)))
     truth = pick.one("truth", config.truth, POSES, _plain_rank, where=lambda name: name == TRUTH)
-    wheels = pick.one("wheels", config.wheels, POSES, _plain_rank, where=set().__contains__)
+    wheels = pick.one("wheels", config.wheels, POSES, _plain_rank, where=lambda name: name == WHEELS)
     pick.refuse_own_runs()
     frames: CameraTopics | Series
     if color is not None and depth is not None and config.points is None:
@@ -106,6 +107,12 @@ def choose(
         notes = [_choice_note(f"point clouds {points.topic.name}", config.points, "points")]
     else:
         raise SourceError(f"{path}: nothing to map: {_what_there_is(color, depth, series.values())}")
+    if wheels is not None:
+        notes.append(_choice_note(f"wheel odometry {wheels.topic.name}", config.wheels, "wheels"))
+    elif odometry := [one.topic.name for one in pick.all({ODOMETRY}) if one is not truth]:
+        notes.append(
+            f"odometry {odometry[0]} is not used; if wheels tell it, source.topics.wheels={odometry[0]}"
+        )
     return Choice(frames, imu, truth, wheels, notes)
 
 

@@ -11,14 +11,15 @@ from mapper.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
 from mapper.sources.base import Entry, FrameSource, ImageFiles, Skipped
 from mapper.sources.images import bytes_of, read_colour, read_depth_m
 from mapper.sources.ros.images import MILLIMETRES_PER_M
-from mapper.sources.ros.topics import TRUTH
+from mapper.sources.ros.topics import TRUTH, WHEELS
 
 MessageKind = Literal["mcap", "bag"]
 
 COLOR, DEPTH = "/camera/color", "/camera/aligned_depth_to_color"
 POINTS, IMU = "/points", "/imu"
 
-_CAMERA_FRAME, _LIDAR_FRAME, _WORLD, _IMU_FRAME = "camera_color_optical_frame", "lidar", "world", "imu"
+_CAMERA_FRAME, _LIDAR_FRAME, _IMU_FRAME = "camera_color_optical_frame", "lidar", "imu"
+_WORLD, _ODOM = "world", "odom"
 _FORMATS = {".jpg": "jpeg", ".jpeg": "jpeg", ".png": "png"}
 _DEPTH_HEADER = bytes(12)  # compressedDepth's: no parameters are needed for 16 bits
 
@@ -47,7 +48,8 @@ def write_recording(
 
     Image files go in byte for byte where ROS has a message for them: colour as CompressedImage, 16-bit PNGs
     of millimetres as compressedDepth. Depth in other units goes in as float32 metres, which loses nothing.
-    Of scans their points, times and colours are kept. Truth is on /ground_truth, accelerations on /imu.
+    Of scans their points, times and colours are kept. Truth is on /ground_truth, wheel odometry, as poses of
+    the sensor's own frame, on /wheel_odometry, and accelerations are on /imu.
 
     Args:
         source: What to write.
@@ -67,7 +69,11 @@ def write_recording(
     with _writer(out, kind) as writer:
         frames = _frames(source, first, skipped, on_progress)
         for message in heapq.merge(
-            frames, _truth(source), _accelerations(source), key=lambda message: message.stamp_ns
+            frames,
+            _truth(source),
+            _wheels(source),
+            _accelerations(source),
+            key=lambda message: message.stamp_ns,
         ):
             writer.write(message)
     return skipped
@@ -186,6 +192,16 @@ def _truth(source: FrameSource) -> Iterator[Written]:
         for stamp_ns, T in zip(source.truth.stamps_ns.tolist(), source.truth.T_world_body, strict=True):
             cdr = pose_message(stamp_ns, T, frame=_WORLD)
             yield Written(stamp_ns, TRUTH, "geometry_msgs/msg/PoseStamped", cdr)
+
+
+def _wheels(source: FrameSource) -> Iterator[Written]:
+    from mapper.sources.rosbag_writing import odometry_message
+
+    if source.wheels is not None:
+        body = _LIDAR_FRAME if source.sensor == "lidar" else _CAMERA_FRAME
+        for stamp_ns, T in zip(source.wheels.stamps_ns.tolist(), source.wheels.T_world_body, strict=True):
+            cdr = odometry_message(stamp_ns, T, frame=_ODOM, child=body)
+            yield Written(stamp_ns, WHEELS, "nav_msgs/msg/Odometry", cdr)
 
 
 def _accelerations(source: FrameSource) -> Iterator[Written]:

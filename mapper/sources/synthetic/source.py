@@ -12,7 +12,7 @@ from mapper.config.sensors import Sensor
 from mapper.config.synthetic import SynthConfig
 from mapper.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
 from mapper.geometry import angle_between
-from mapper.sources.base import Accelerations
+from mapper.sources.base import Accelerations, ImageFiles
 from mapper.sources.synthetic.movers import Movers, make_movers
 from mapper.sources.synthetic.path import Motion, frame_stamps, make_motion, seconds_of
 from mapper.sources.synthetic.raycast import Rendering, render
@@ -45,6 +45,11 @@ class SyntheticEntry:
     def stamp_ns(self) -> int:
         """Time of the frame, nanoseconds."""
         return int(self.source.stamps_ns[self.index])
+
+    @property
+    def files(self) -> ImageFiles | None:
+        """None: there are none."""
+        return None
 
     def load(self, *, colour: bool = True) -> RgbdFrame:
         """Render the frame, with its own noise; the same whenever it is asked for."""
