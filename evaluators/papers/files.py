@@ -101,7 +101,7 @@ def _latex(reproduction: Reproduction) -> str:
     for each in _filled(reproduction):
         caption = latex_text(f"{headline(each)}. Printed: {each.source}.")
         parts.append(
-            "\\begin{table}\n\\centering\\footnotesize\n"
+            "\\begin{table}\n\\centering\\scriptsize\\setlength{\\tabcolsep}{3pt}\n"
             f"\\caption{{{caption}}}\n{latex_table(*as_printed(each, with_spread=True))}\n\\end{{table}}"
         )
     return "\n\n".join(parts) + "\n"

@@ -43,11 +43,11 @@ def compared(table: PaperTable) -> tuple[list[Column], list[Record]]:
 
 
 def as_printed(table: PaperTable, *, with_spread: bool) -> tuple[list[Column], list[Record]]:
-    """Return the printed layout, where a row's figures, ours, their spread and the ratios are lines.
+    """Return the printed layout, where a row's figures, ours, their range and the ratios are lines.
 
     Args:
         table: The table.
-        with_spread: Tell the range over the seeds, where there are several.
+        with_spread: Tell the lowest and the highest of the seeds, where there are several.
     """
     decimals = _decimals(table)
     records: list[Record] = []
@@ -55,10 +55,12 @@ def as_printed(table: PaperTable, *, with_spread: bool) -> tuple[list[Column], l
         figures = {
             cell.column: _figures(cell, decimals[cell.column]) for cell in table.cells if cell.row == row
         }
-        for line in ("printed", "ours", "spread", "ratio"):
+        name = row
+        for line in ("printed", "ours", *(("lowest", "highest") if with_spread else ()), "ratio"):
             texts = {column: of_cell[line] for column, of_cell in figures.items()}
-            if any(texts.values()) and (with_spread or line != "spread"):
-                records.append({"row": row, "line": line, **dict.fromkeys(decimals), **texts})
+            if any(texts.values()):
+                records.append({"row": name, "line": line, **dict.fromkeys(decimals), **texts})
+                name = ""
     head = [Column("row", "")]
     if len({record["line"] for record in records}) > 1:
         head.append(Column("line", ""))
@@ -100,9 +102,9 @@ def failures(table: PaperTable) -> list[str]:
     where: dict[str, list[str]] = {}
     for cell in table.cells:
         for reason in cell.failures:
-            where.setdefault(reason, []).append(f"{cell.row} {cell.column}")
+            where.setdefault(reason, []).append(f"{cell.row}, {cell.column}")
     return [
-        f"{cells[0]}{f' and {len(cells) - 1} more' if len(cells) > 1 else ''}: {reason}"
+        f"{cells[0]}{f' (and {len(cells) - 1} more)' if len(cells) > 1 else ''}: {reason}"
         for reason, cells in where.items()
     ]
 
@@ -135,12 +137,15 @@ def _figures(cell: PaperCell, decimals: int) -> dict[str, str | None]:
     printed = None
     if cell.published is not None:
         printed = f"{cell.published:.{max(decimals, _own_decimals(cell.published))}f}"
-    spread = None
+    lowest = highest = spread = None
     if len(cell.ours) > 1:
-        spread = f"{cell.low:.{decimals}f}–{cell.high:.{decimals}f}"
+        lowest, highest = f"{cell.low:.{decimals}f}", f"{cell.high:.{decimals}f}"
+        spread = f"{lowest}–{highest}"
     return {
         "printed": printed,
         "ours": None if cell.median is None else f"{cell.median:.{decimals}f}",
+        "lowest": lowest,
+        "highest": highest,
         "spread": spread,
         "ratio": None if cell.ratio is None else f"{cell.ratio:.2f}",
     }

@@ -29,6 +29,7 @@ _COLUMNS = 3
 _WIDTH_IN, _HEIGHT_IN = 4.6, 3.4
 _PATH_IN = 4.6
 _BOX_IN = 0.3
+_LETTER_IN = 0.062
 _NUMBER = re.compile(r"\d+")
 _LEGEND: dict[str, Any] = {"fontsize": 7, "framealpha": 0.9, "edgecolor": LINE}
 
@@ -99,9 +100,11 @@ def _write_boxes(path: Path, table: PaperTable) -> None:
     """Draw each row's figures over the seeds, a box for each column, with the printed one as a mark."""
     rows = _by_row(table)
     most = max(len(cells) for cells in rows.values())
-    figure, across, down = _page(headline(table), len(rows), height_in=0.9 + _BOX_IN * most)
+    title = f"{headline(table)}; boxes over our seeds"
+    figure, across, down = _page(title, len(rows), height_in=0.9 + _BOX_IN * most)
+    left_in = _label_in(_columns(table))
     for number, (row, cells) in enumerate(rows.items()):
-        axes = panel(figure, number, columns=across, rows=down)
+        axes = panel(figure, number, columns=across, rows=down, left_in=left_in)
         printed = {k: cell.published for k, cell in enumerate(cells, 1) if cell.published is not None}
         axes.plot(list(printed.values()), list(printed), "D", color=hex_of(TRUTH), zorder=3, label="printed")
         draw_boxes(axes, {cell.column: np.array(cell.ours) for cell in cells})
@@ -117,8 +120,9 @@ def _write_scenes(path: Path, tables: Sequence[PaperTable], *, title: str) -> No
     """Draw what the rows of each table come to, a panel for each column and a box for each table."""
     columns = _columns(tables[0])
     figure, across, down = _page(title, len(columns), height_in=0.9 + _BOX_IN * len(tables))
+    left_in = _label_in([_short(table) for table in tables])
     for number, column in enumerate(columns):
-        axes = panel(figure, number, columns=across, rows=down)
+        axes = panel(figure, number, columns=across, rows=down, left_in=left_in)
         draw_boxes(axes, {_short(table): _figures_of(table, column) for table in tables})
         axes.set_title(column, fontsize=9, color=INK)
     save(figure, path)
@@ -163,6 +167,11 @@ def _page(title: str, panels: int, *, height_in: float = _HEIGHT_IN) -> tuple["F
     across = min(_COLUMNS, panels)
     down = -(-panels // across)
     return page(title, columns=across, rows=down, width_in=_WIDTH_IN, height_in=height_in), across, down
+
+
+def _label_in(labels: Sequence[str]) -> float:
+    """Return how much room the longest label needs at a panel's left."""
+    return 0.3 + _LETTER_IN * max(map(len, labels))
 
 
 def _by_row(table: PaperTable) -> dict[str, list[PaperCell]]:

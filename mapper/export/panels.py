@@ -29,6 +29,7 @@ _COLORS: tuple[Rgb, ...] = (
 )
 _PANEL_IN = 3.0
 _HEAD_IN = 0.5
+_LEFT_IN = 0.85
 _MARGIN_RATIO = 0.15
 _WIDE = 1e3  # from here on ticks at 1, 2, 5 would be written over one another
 
@@ -54,12 +55,29 @@ def page(
     return figure
 
 
-def panel(figure: "Figure", number: int, *, columns: int, rows: int, beside_in: float = 0.0) -> "Axes":
-    """Return the axes of a panel; panels are numbered from the upper left."""
+def panel(
+    figure: "Figure",
+    number: int,
+    *,
+    columns: int,
+    rows: int,
+    beside_in: float = 0.0,
+    left_in: float = _LEFT_IN,
+) -> "Axes":
+    """Return the axes of a panel; panels are numbered from the upper left.
+
+    Args:
+        figure: What ``page`` returned for so many columns and rows.
+        number: Which panel.
+        columns: Of panels.
+        rows: Of panels.
+        beside_in: The page's room for a legend.
+        left_in: Each panel's room for what stands at its left.
+    """
     width_in, height_in = figure.get_size_inches()
     row, column = divmod(number, columns)
     cell_width_in, cell_height_in = (width_in - beside_in) / columns, (height_in - _HEAD_IN) / rows
-    left_in, below_in, above_in, right_in = 0.85, 0.45, 0.3, 0.15
+    below_in, above_in, right_in = 0.45, 0.3, 0.15
     axes = figure.add_axes(
         (
             (column * cell_width_in + left_in) / width_in,
