@@ -93,18 +93,25 @@ def run_cells(
         left = [cell for key, cell in wanted.items() if key not in results]
         if results:
             progress.note(f"{len(results)} of {len(wanted)} cells were finished before and are kept")
-        jobs = [_Job(cell, folder) for cell in left]
-        with progress.stage("cells") as report:
-            report(0, len(left))
-            for index, outcome in run_jobs(jobs, processes=processes, scheduler=scheduler, attempts=attempts):
-                cell = left[index]
-                if isinstance(outcome, Failure):
-                    outcome = CellResult(cell.key, cell.label, (), 0.0, outcome.reason)
-                    _write(folder, outcome)
-                    progress.note(f"{cell.label}: {outcome.failure}")
-                results[cell.key] = outcome
-                report(len(results) - len(wanted) + len(left), len(left))
+        if left:
+            with progress.stage("cells") as report:
+                report(0, len(left))
+                jobs = [_Job(cell, folder) for cell in left]
+                done = run_jobs(jobs, processes=processes, scheduler=scheduler, attempts=attempts)
+                for number, (index, outcome) in enumerate(done, start=1):
+                    results[left[index].key] = _settled(left[index], outcome, folder, progress)
+                    report(number, len(left))
     return [replace(results[cell.key], label=cell.label) for cell in cells]
+
+
+def _settled(cell: Cell, outcome: CellResult | Failure, folder: Path, progress: Progress) -> CellResult:
+    """Return what became of a cell, after a failure has been told and written down."""
+    if isinstance(outcome, CellResult):
+        return outcome
+    result = CellResult(cell.key, cell.label, (), 0.0, outcome.reason)
+    _write(folder, result)
+    progress.note(f"{cell.label}: {outcome.reason}")
+    return result
 
 
 @dataclass(frozen=True, slots=True)

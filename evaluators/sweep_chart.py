@@ -8,7 +8,7 @@ from statistics import median
 
 _WIDTH, _ROW, _LABELS, _BELOW, _EDGE = 620, 20, 230, 24, 24
 _COLOURS = 6
-_MOST_TICKS = 8
+_FEWEST_TICKS, _MOST_TICKS = 3, 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +71,14 @@ def _widened(low: float, high: float) -> tuple[float, float]:
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Return round numbers between two limits: 1, 2 and 5 of each power of ten, or every n-th power."""
+    """Return a few round numbers between two limits."""
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     fine = [m * 10.0**power for power in powers for m in (1, 2, 5) if low <= m * 10.0**power <= high]
+    if len(fine) < _FEWEST_TICKS:
+        rough = (high - low) / _FEWEST_TICKS
+        scale = 10.0 ** math.floor(math.log10(rough))
+        step = scale * max(m for m in (1, 2, 5) if m * scale <= rough)
+        return [n * step for n in range(math.ceil(low / step), math.floor(high / step) + 1)]
     if len(fine) <= _MOST_TICKS:
         return fine
     coarse = [10.0**power for power in powers if low <= 10.0**power <= high]

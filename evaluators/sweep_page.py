@@ -6,7 +6,16 @@ from html import escape
 from evaluators.sweep import Plan
 from evaluators.sweep_cell import environment
 from evaluators.sweep_chart import Line, dot_chart
-from evaluators.sweep_tables import QUANTITIES, Group, Quantity, Variant, best_of, grouped, troubles
+from evaluators.sweep_tables import (
+    COVERED_ALIKE,
+    QUANTITIES,
+    Group,
+    Quantity,
+    Variant,
+    best_of,
+    grouped,
+    troubles,
+)
 from evaluators.tables import MISSING, Record, Value
 from mapper.config.sweep import ConfigurationConfig
 from mapper.export.html import document, section
@@ -14,6 +23,11 @@ from mapper.run import SUMMARY
 
 _DRAWN = ("ate_m", "frames_per_s")
 _ELSEWHERE = frozenset({"run", "reason", "mapper_version"})
+_BOLD = {
+    False: "The best of a log is bold.",
+    True: f"The best of a log is bold, of those that track at least {COVERED_ALIKE:.0%} of the frames that "
+    "any tracks.",
+}
 
 Groups = Mapping[str, Mapping[Variant, Group]]
 
@@ -50,7 +64,7 @@ def _compared(groups: Groups, quantity: Quantity) -> str:
         rows.append(f"<tr><th>{escape(log)}</th>{cells}</tr>")
     table = f"<table><thead>{_head(variants)}</thead><tbody>{''.join(rows)}</tbody></table>"
     hint = "Median over the seeds, and the range. " if _has_range(groups) else ""
-    hint += "The best of a log is bold." if quantity.best else ""
+    hint += _BOLD[quantity.needs_coverage] if quantity.best else ""
     charts = ""
     if quantity.key in _DRAWN:
         figures = "".join(_chart(log, of_log, quantity) for log, of_log in groups.items())
@@ -114,7 +128,7 @@ def _builds(records: Sequence[Record]) -> str:
             run = record["run"]
             cells += f'<td><a href="{escape(str(run))}/{SUMMARY}">picture</a></td>' if run else "<td></td>"
         rows.append(f"<tr>{cells}</tr>")
-    table = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    table = f"<table class='wide'><thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
     return f'<div class="scroll">{table}</div>'
 
 

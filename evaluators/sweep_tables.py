@@ -8,6 +8,10 @@ from evaluators.cells import CellResult
 from evaluators.sweep import RUNS, Place, Plan
 from evaluators.tables import MISSING, Column, Record, Value, text_table
 
+_WHOLE = 0.995
+COVERED_ALIKE = 0.95
+"""Errors are compared of those who cover at least this share of what the best covers."""
+
 Variant = tuple[str, str]
 """Names of a method and of a configuration."""
 
@@ -21,17 +25,19 @@ class Quantity:
         title: With the unit.
         shown: Turns a number into text.
         best: Which one is marked, if any.
+        needs_coverage: It flatters whoever gives up where it is hard.
     """
 
     key: str
     title: str
     shown: Callable[[float], str]
     best: Callable[[Sequence[float]], float] | None = None
+    needs_coverage: bool = False
 
 
 QUANTITIES = (
-    Quantity("ate_m", "ATE RMSE m", "{:.4f}".format, min),
-    Quantity("rpe_1s_m", "RPE 1 s m", "{:.4f}".format, min),
+    Quantity("ate_m", "ATE RMSE m", "{:.4f}".format, min, needs_coverage=True),
+    Quantity("rpe_1s_m", "RPE 1 s m", "{:.4f}".format, min, needs_coverage=True),
     Quantity("coverage_ratio", "coverage %", lambda value: f"{100.0 * value:.0f}", max),
     Quantity("loops", "loops", "{:.0f}".format),
     Quantity("frames_per_s", "frames/s", "{:.1f}".format, max),
@@ -56,16 +62,24 @@ class Group:
         return sorted(float(value) for record in self.records if (value := record.get(key)) is not None)
 
     def text(self, quantity: Quantity) -> str:
-        """Return the median, with the range if there are several; or why there is none."""
+        """Return the median, with the range if it is one as shown, and what takes from its worth."""
         values = self.values(quantity.key)
         if not values:
             return MISSING
-        text = quantity.shown(median(values))
-        if len(values) > 1:
-            text += f" ({quantity.shown(values[0])}–{quantity.shown(values[-1])})"
+        text, least, most = map(quantity.shown, (median(values), values[0], values[-1]))
+        if least != most:
+            text += f" ({least}–{most})"
+        if quantity.needs_coverage and self.coverage < _WHOLE:
+            text += f" at {100.0 * self.coverage:.0f} %"
         if self.failures:
             text += f", {self.failures} failed"
         return text
+
+    @property
+    def coverage(self) -> float:
+        """Return the median share of the frames that have a pose."""
+        values = self.values("coverage_ratio")
+        return median(values) if values else 0.0
 
 
 def sweep_records(plan: Plan, results: Mapping[Place, CellResult]) -> list[Record]:
@@ -102,11 +116,17 @@ def grouped(records: Sequence[Record]) -> dict[str, dict[Variant, Group]]:
 
 
 def best_of(groups: Mapping[Variant, Group], quantity: Quantity) -> set[Variant]:
-    """Return who has the best median of one log, as it is shown; nobody where nothing is to choose."""
+    """Return who has the best median of one log, as it is shown; nobody where nothing is to choose.
+
+    Errors are compared of those alone who cover about as much of the log as any.
+    """
     if quantity.best is None:
         return set()
+    enough = COVERED_ALIKE * max(group.coverage for group in groups.values()) * quantity.needs_coverage
     medians = {
-        variant: median(found) for variant, group in groups.items() if (found := group.values(quantity.key))
+        variant: median(values)
+        for variant, group in groups.items()
+        if (values := group.values(quantity.key)) and group.coverage >= enough
     }
     if len(medians) < 2:
         return set()

@@ -1,5 +1,7 @@
 """Seconds per stage and peak memory of this process."""
 
+import ctypes
+import gc
 import resource
 import sys
 import time
@@ -36,8 +38,10 @@ class Stopwatch:
 
 
 def forget_peak_memory() -> None:
-    """Let ``peak_memory_mb`` begin anew from what the process holds now, where the system can (Linux)."""
-    with suppress(OSError):
+    """Let ``peak_memory_mb`` begin anew, after what is free went back to the system; where it can (Linux)."""
+    gc.collect()
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # see proc(5)
 
 
