@@ -22,6 +22,7 @@ from cli.merge import merge
 from cli.plan import WithPoints, plan
 from cli.register import register
 from cli.report import report
+from cli.reproduce import reproduce
 from cli.sensor import sensor
 from cli.show_config import show_config
 from cli.solve import solve
@@ -79,6 +80,7 @@ app.command("solve")(solve)
 app.command("register")(register)
 app.command("compare")(compare)
 app.command("sweep")(sweep)
+app.command("reproduce")(reproduce)
 app.command("inspect")(inspect)
 app.command("convert")(convert)
 app.command("synth")(synth)

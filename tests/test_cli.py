@@ -26,6 +26,7 @@ VERBS = [
     "solve",
     "compare",
     "sweep",
+    "reproduce",
     "register",
     "convert",
     "synth",

@@ -1,0 +1,108 @@
+"""``mapper reproduce``: the papers' tables, ours beside theirs."""
+
+import os
+from collections.abc import Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cli.console import progress_for
+from cli.environment import has_compiled_code, prepare_libraries
+from cli.options import First, Last, Quiet
+
+
+class Paper(StrEnum):
+    """Whose tables can be measured again."""
+
+    THESIS = "thesis"
+    ZHAO = "zhao"
+    HOUGH = "hough"
+
+
+def reproduce(
+    paper: Annotated[Paper, typer.Argument(metavar="PAPER", help="thesis, zhao or hough.")],
+    logs: Annotated[Path, typer.Option(help="Folder with the paper's logs, under their usual names.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder for tables and pictures; gone on with if it is there.  [default: PAPER]"),
+    ] = None,
+    log: Annotated[
+        list[str] | None,
+        typer.Option("--log", metavar="NAME=PATH", help="Where a log of another name lies: fr1/xyz=PATH."),
+    ] = None,
+    tables: Annotated[
+        str | None, typer.Option(help="Only these, e.g. 5.1,5.2; thesis has detectors, too.")
+    ] = None,
+    seeds: Annotated[int, typer.Option(help="Draws of RANSAC: median and spread are over them.")] = 3,
+    first: First = None,
+    last: Last = None,
+    processes: Annotated[
+        int | None,
+        typer.Option(
+            help="Measurements at a time; omit for one on every core, of zhao one, for it is timed."
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="tcp://HOST:PORT", help="Let the workers of this Dask scheduler measure."),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Measure a paper's tables again on those of its logs that are there, and print ours beside theirs.
+
+    What is finished is kept in OUT, so the same command goes on where it was killed.
+
+    Example: mapper reproduce thesis --logs logs --tables 5.1,5.2 --out runs/thesis
+    """
+    from evaluators.papers.book import Cut
+    from evaluators.papers.files import tables_text
+    from evaluators.papers.reproduce import Request
+    from evaluators.papers.reproduce import reproduce as reproduce_tables
+    from mapper.errors import ConfigError
+
+    if scheduler is not None and processes is not None:
+        raise ConfigError(f"--processes {processes}: has no meaning with --scheduler; leave it out")
+    prepare_libraries()
+    request = Request(
+        paper=paper.value,
+        logs=logs,
+        given=_given(log or ()),
+        tables=tuple(filter(None, (tables or "").replace(" ", "").split(","))),
+        seeds=seeds,
+        cut=Cut(first or 0, last),
+    )
+    progress = progress_for(quiet=quiet)
+    if not has_compiled_code():
+        progress.note("first run here: the kernels are compiled once, which takes about a minute")
+    out = out or Path(paper.value)
+    reproduction = reproduce_tables(
+        request,
+        out,
+        processes=processes or (1 if paper is Paper.ZHAO else os.cpu_count() or 1),
+        scheduler=scheduler,
+        progress=progress,
+    )
+    if not quiet:
+        print(tables_text(reproduction))
+        print(f"files  {', '.join(sorted(child.name for child in out.iterdir()))}\nin     {out}")
+
+
+def _given(assignments: Sequence[str]) -> dict[str, Path]:
+    """Return where logs of other names lie.
+
+    Raises:
+        ConfigError: One is no ``NAME=PATH``.
+    """
+    from mapper.errors import ConfigError
+
+    given = {}
+    for assignment in assignments:
+        name, equals, path = assignment.partition("=")
+        if not (name and equals and path):
+            raise ConfigError(
+                f"--log {assignment}: want NAME=PATH, for example fr1/xyz={assignment or 'PATH'}"
+            )
+        given[name] = Path(path)
+    return given
