@@ -29,13 +29,15 @@ class DepthNoiseConfig(Config):
         least = -2.0 * math.sqrt(self.constant_m * self.quadratic_per_m)
         some = max(self.constant_m, self.linear, self.quadratic_per_m) > 0.0
         if not some or self.linear < least or (self.linear == least and least < 0.0):
-            raise ValueError(f"σ_z = {self.text} is not > 0 at every depth; leave the noise out instead")
+            raise ValueError(f"σ_z = {self.text} m is not > 0 at every depth; leave the noise out instead")
         return self
 
     @property
     def text(self) -> str:
         """The formula, in metres."""
-        return f"{self.constant_m:.3g} + {self.linear:.3g}·z + {self.quadratic_per_m:.3g}·z² m"
+        terms = {"": self.constant_m, "·z": self.linear, "·z²": self.quadratic_per_m}
+        signed = [f"{'−' if value < 0.0 else '+'} {abs(value):.3g}{z}" for z, value in terms.items() if value]
+        return " ".join(signed).removeprefix("+ ") or "0"
 
     def sigma_m(self, depth_m: "Array") -> "Array":
         """Return the standard deviation of depths in metres."""
