@@ -158,7 +158,8 @@ def _parts(site: Site, octree: OctreeMap, T_map_world: Transform | None) -> Iter
 def _by_tile(tiling: Tiling, codes: NDArray[np.int64]) -> Iterator[tuple[int, slice]]:
     """Yield each tile and where its blocks stand in increasing codes."""
     tiles, starts = np.unique(tiling.tiles_of(codes), return_index=True)
-    for tile, start, end in zip(tiles.tolist(), starts, [*starts[1:], len(codes)], strict=True):
+    ends = np.append(starts, len(codes))[1:]
+    for tile, start, end in zip(tiles.tolist(), starts, ends, strict=True):
         yield tile, slice(start, end)
 
 
