@@ -5,7 +5,7 @@ from pathlib import Path
 from statistics import median
 from typing import Literal
 
-Verdict = Literal["better", "as published", "worse", "failed", "not run", "not printed"]
+Verdict = Literal["better", "as published", "worse", "in part", "failed", "not run", "not printed"]
 
 BETTER_RATIO, SAME_RATIO = 0.95, 1.10
 RULE = (
@@ -25,6 +25,7 @@ class PaperCell:
         published: As printed; None where the paper has no such cell.
         ours: One per seed, in the table's unit; a method without chance has one. Empty if every try failed.
         failures: Why the other seeds gave nothing, a line each.
+        in_part: Ours is of a part of what the printed figure is of, so the two do not compare.
     """
 
     row: str
@@ -32,6 +33,7 @@ class PaperCell:
     published: float | None
     ours: tuple[float, ...]
     failures: tuple[str, ...] = ()
+    in_part: bool = False
 
     @property
     def median(self) -> float | None:
@@ -50,20 +52,23 @@ class PaperCell:
 
     @property
     def ratio(self) -> float | None:
-        """Our median over the printed figure."""
-        return None if not self.ours or not self.published else median(self.ours) / self.published
+        """Our median over the printed figure, where the two compare."""
+        if not self.ours or not self.published or self.in_part:
+            return None
+        return median(self.ours) / self.published
 
     @property
     def verdict(self) -> Verdict:
         """By the ratio: up to 0.95 better, up to 1.10 as published, else worse.
 
         Without a ratio: "failed" if all seeds did, "not run" if nothing was tried, as where the log is the
-        author's own, and "not printed" if there is nothing to compare with.
+        author's own, "in part" if ours is of a part of the log, and "not printed" if there is nothing to
+        compare with.
         """
         if not self.ours:
             return "failed" if self.failures else "not run"
         if self.ratio is None:
-            return "not printed"
+            return "in part" if self.in_part and self.published else "not printed"
         if self.ratio <= BETTER_RATIO:
             return "better"
         return "as published" if self.ratio <= SAME_RATIO else "worse"

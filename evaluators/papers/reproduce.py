@@ -135,12 +135,16 @@ class _BookWork:
     ) -> Reproduction:
         jobs = [cell.run for cell in cells]
         cut = self._request.cut
-        cut_notes = () if cut.is_whole else (f"Only frames {cut} of each sequence were used.",)
+        cut_notes = () if cut.is_whole else (f"Only frames {cut} of each sequence were used: no ratio.",)
         tables = (self._book.table_of(name, jobs, results) for name in self._tables)
         return Reproduction(
             paper=self._book.title,
             tables=tuple(
-                replace(table, notes=(*cut_notes, *table.notes))
+                replace(
+                    table,
+                    cells=tuple(replace(cell, in_part=not cut.is_whole) for cell in table.cells),
+                    notes=(*cut_notes, *table.notes),
+                )
                 for table in tables
                 if any(cell.ours or cell.failures for cell in table.cells)
             ),
