@@ -264,17 +264,18 @@ def _of_log(folder: Path) -> list[Pair]:
     if not kitti.recognise(folder) and not clouds.recognise(folder):
         return []
     try:
-        posed = _posed(folder)
-    except MapperError:  # several sequences, or none that can be opened: the folders in it are asked next
+        log = open_source(folder).path  # the folder, or the only log in it
+        posed = _posed(log)
+    except MapperError:  # several logs, or none that can be opened: the folders in it are asked next
         return []
     if len(posed) < 3:
         return []
     chosen = np.linspace(0, len(posed) - 1, SCANS_PER_LOG + 2).astype(int)[1:-1]
     pairs: list[Pair] = []
     for index in dict.fromkeys(int(i) for i in chosen):
-        pairs.append(LogPair(folder, index, ALL_RINGS))
+        pairs.append(LogPair(log, index, ALL_RINGS))
         if len(posed[index][0].scan().points_body) > _VLP_POINTS:
-            pairs.append(LogPair(folder, index, FEW_RINGS))
+            pairs.append(LogPair(log, index, FEW_RINGS))
     return pairs
 
 
