@@ -1,6 +1,11 @@
 """Tiny recorded logs, made on the spot."""
 
-from collections.abc import Callable
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -75,3 +80,38 @@ def desk_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ),
     )
     return log
+
+
+@pytest.fixture(scope="session")
+def dask_scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of a Dask scheduler with two workers, which gives up a job whose worker has died once."""
+    folder = tmp_path_factory.mktemp("dask")
+    contact = folder / "scheduler.json"
+    settings = os.environ | {
+        "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0",
+        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), str(Path(__file__).parent)]),
+    }
+    roles = {
+        "scheduler": ["--port", "0"],
+        "worker": ["--nworkers", "2", "--nthreads", "1", "--local-directory", str(folder)],
+    }
+    common = ["--scheduler-file", str(contact), "--no-dashboard", "--host", "127.0.0.1"]
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-m", f"distributed.cli.dask_{role}", *options, *common],
+            env=settings,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for role, options in roles.items()
+    ]
+    try:
+        for _ in range(600):
+            if contact.exists() and contact.stat().st_size:
+                break
+            time.sleep(0.1)
+        yield json.loads(contact.read_text())["address"]
+    finally:
+        for process in reversed(processes):
+            process.terminate()
+            process.wait()
