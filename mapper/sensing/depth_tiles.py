@@ -1,6 +1,7 @@
 """A depth camera's noise from an ordinary log: whatever planes it happens to show, at whatever distance."""
 
 from dataclasses import dataclass
+from itertools import islice
 from statistics import median
 
 import numpy as np
@@ -55,7 +56,11 @@ class _Tile:
 
 
 def depth_of_planes(
-    source: FrameSource, *, patch: Patch | None = None, progress: Progress = SILENT
+    source: FrameSource,
+    *,
+    patch: Patch | None = None,
+    most_frames: int | None = None,
+    progress: Progress = SILENT,
 ) -> tuple[list[DepthLevel], ResidualMap]:
     """Measure a camera by the planes that a log shows.
 
@@ -68,6 +73,7 @@ def depth_of_planes(
     Args:
         source: RGB-D log.
         patch: Where in the image to look; None is everywhere.
+        most_frames: About so many, evenly chosen, are enough; None takes all.
         progress: Told how far it is.
 
     Returns:
@@ -91,23 +97,26 @@ def depth_of_planes(
         except FrameError:
             return None
 
+    stride = 1 if most_frames is None else -(-len(source) // most_frames)
+    chosen = len(range(0, len(source), stride))
+    entries = islice(enumerate(source.entries()), None, None, stride)
     tiles: list[_Tile] = []
     best, most, unread = None, 0, 0
     with progress.stage("planes") as report:
-        for done, found in enumerate(ordered_map(look, enumerate(source.entries()), workers=_DECODERS), 1):
+        for done, found in enumerate(ordered_map(look, entries, workers=_DECODERS), start=1):
             if found is None:
                 unread += 1
             else:
                 tiles += found[0]
                 if len(found[0]) > most:
                     best, most = found[1], len(found[0])
-            report(done, len(source))
+            report(done, chosen)
     if unread:
         progress.note(f"{source.path}: {unread} frames cannot be read")
     levels = _levels(source.name, tiles)
     if best is None or not levels:
         raise DataError(
-            f"{source.path}: {len(tiles)} tiles of {len(source)} frames show a plane, and no distance has "
+            f"{source.path}: {len(tiles)} tiles of {chosen} frames show a plane, and no distance has "
             f"{_MIN_TILES} of {_MIN_FRAMES} frames; want walls, floors or tables in view"
         )
     return levels, best

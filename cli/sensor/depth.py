@@ -1,0 +1,121 @@
+"""``mapper sensor depth``: a depth camera's errors and noise."""
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli.console import progress_for
+from cli.environment import prepare_libraries
+from cli.options import First, Last, Overrides, Quiet, Stride, merged, selection
+
+if TYPE_CHECKING:
+    from mapper.sensing.depth_accuracy import Patch
+
+_FITTED_FRAMES = 100
+
+
+def depth(
+    logs: Annotated[
+        list[Path], typer.Argument(metavar="LOG…", help="RGB-D logs that mapper build can read.")
+    ],
+    plane_at: Annotated[
+        list[float] | None,
+        typer.Option(
+            metavar="METRES", help="How far the plane is in each LOG; once for each, in their order."
+        ),
+    ] = None,
+    fit_plane: Annotated[
+        bool,
+        typer.Option("--fit-plane", help="Use whatever planes the logs show, at whatever distances."),
+    ] = False,
+    patch: Annotated[
+        str | None,
+        typer.Option(
+            metavar="COLUMN,ROW,WIDTH,HEIGHT",
+            help="Where in the image to look, pixels.  [default: the middle third; everywhere to fit planes]",
+        ),
+    ] = None,
+    keep_tilt: Annotated[
+        bool,
+        typer.Option(
+            "--keep-tilt", help="Count a plane that is not quite across the camera's axis as an error."
+        ),
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to create: sensor.toml, numbers and pictures.")
+    ] = None,
+    first: First = None,
+    last: Last = None,
+    stride: Stride = None,
+    set_: Overrides = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace OUT, once the new one is whole.")
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Measure a depth camera's largest error and noise on planes, before and after the depth filter DIF.
+
+    Example: mapper sensor depth wall-0.8 wall-1.6 --plane-at 0.8 --plane-at 1.6 --out kinect, or: mapper
+    sensor depth rgbd_dataset_freiburg1_xyz --fit-plane --out kinect, then: mapper build LOG --out RUN
+    --config kinect/sensor.toml
+    """
+    from evaluators.depth_accuracy import SENSOR, depth_text, study_depth, write_depth_study
+    from mapper.config import load_config
+    from mapper.sources import open_source
+    from mapper.staging import staged
+
+    distances_m = _distances(logs, plane_at, fit_plane=fit_plane, keep_tilt=keep_tilt)
+    where = None if patch is None else _patch(patch)
+    config = load_config(None, merged(selection(first, last, stride, None), set_)).source
+    prepare_libraries()
+    sources = [open_source(log, config) for log in logs]
+    with nullcontext() if out is None else staged(out, overwrite=overwrite) as folder:
+        study = study_depth(
+            sources,
+            distances_m,
+            patch=where,
+            keep_tilt=keep_tilt,
+            most_frames=_FITTED_FRAMES if stride is None else None,
+            progress=progress_for(quiet=quiet),
+        )
+        if folder is not None:
+            write_depth_study(folder, study)
+    if not quiet:
+        print(depth_text(study))
+        if out is not None:
+            print(f"\nin     {out}; use it with mapper build LOG --out RUN --config {out / SENSOR}")
+
+
+def _distances(
+    logs: Sequence[Path], plane_at: Sequence[float] | None, *, fit_plane: bool, keep_tilt: bool
+) -> Sequence[float] | None:
+    """Return the distance of each log's plane, or None where planes are to be fitted."""
+    from mapper.errors import ConfigError
+
+    if fit_plane:
+        if plane_at or keep_tilt:
+            raise ConfigError("--fit-plane: finds the distances itself; leave --plane-at and --keep-tilt out")
+        return None
+    if not plane_at:
+        raise ConfigError(
+            "tell the distance of each LOG's plane by --plane-at, or look for any by --fit-plane"
+        )
+    if len(plane_at) != len(logs):
+        raise ConfigError(f"{len(logs)} logs and {len(plane_at)} --plane-at; want one for each log")
+    if min(plane_at) <= 0.0:
+        raise ConfigError(f"--plane-at {min(plane_at):g}: want metres before the camera, more than 0")
+    return plane_at
+
+
+def _patch(text: str) -> "Patch":
+    from mapper.errors import ConfigError
+    from mapper.sensing.depth_accuracy import Patch
+
+    try:
+        column, row, width, height = (int(word) for word in text.split(","))
+    except ValueError:
+        raise ConfigError(f"--patch {text}: want four whole numbers: COLUMN,ROW,WIDTH,HEIGHT") from None
+    return Patch(column, row, width, height)
