@@ -47,7 +47,9 @@ class WithPoints(TyperCommand):
 
 
 def plan(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder that a build left.")],
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Run folder that a build left, or a merged map.")
+    ],
     from_: Annotated[str, typer.Option("--from", metavar="X Y [Z]", help="Where it starts, metres.")],
     to: Annotated[str, typer.Option("--to", metavar="X Y [Z]", help="Where it goes, metres.")],
     in_3d: Annotated[
@@ -62,28 +64,34 @@ def plan(
 ) -> None:
     """Plan the shortest collision-free path, and draw it into the run: plan.json, plan.png, run.mcap.
 
+    A merged map has no run.mcap to draw it into.
+
     Example: mapper plan runs/xyz --from 2.1 -0.3 --to 1.9 1.4 --radius 0.15
     """
     from mapper import run as files
     from mapper.config import overridden
     from mapper.config.navigation import PlanConfig
     from mapper.export.grid import read_grid
-    from mapper.export.plan import write_plan
+    from mapper.export.plan import draw_plan, write_plan
+    from mapper.merging.merged_map import is_map, open_map
     from mapper.navigation.planner import plan_2d, plan_3d
     from mapper.octree.octomap_file import read_map
-    from mapper.run import load_run
+    from mapper.run import Run, load_run
 
     start, goal = (
         _point(text, name, in_3d=in_3d) for text, name in zip((from_, to), _POINT_OPTIONS, strict=True)
     )
     config = overridden(PlanConfig(), assignments({"radius_m": radius, "unknown": unknown, "layer": layer}))
-    built = load_run(run)
+    built = open_map(run) if is_map(run) else load_run(run)
     grid = read_grid(run / f"{config.layer}.yaml")
     if in_3d:
         found = plan_3d(read_map(run / files.OCTREE_OT), start, goal, config=config)
     else:
         found = plan_2d(grid, start, goal, config=config)
-    write_plan(built, found, grid=grid)
+    if isinstance(built, Run):
+        write_plan(built, found, grid=grid)
+    else:
+        draw_plan(run, found, grid=grid)
     if not quiet:
         print(found.summary)
         for waypoint in found.waypoints_world:

@@ -28,6 +28,7 @@ from mapper.manifest import (
     read_manifest,
 )
 from mapper.measure import Stopwatch
+from mapper.merging.merged_map import is_map
 from mapper.records import FrameRecord, read_frame_ms, read_records
 from mapper.sources import open_source
 from mapper.sources.base import FrameSource
@@ -115,6 +116,10 @@ def load_run(path: Path) -> Run:
         if (partial / MANIFEST).is_file():
             raise RunError(f"{path}: not finished: {_ending(partial)}")
         raise RunError(f"{path}: no such run folder; make one with mapper build LOG --out {path}")
+    if is_map(path):
+        raise RunError(
+            f"{path}: is a merged map, not a run; its {OCTREE_BT}, {OCTREE_OT} and slice are in it"
+        )
     manifest = read_manifest(path / MANIFEST)
     if manifest.status != "complete":
         raise RunError(f"{path}: not finished: {_ending(path)}")

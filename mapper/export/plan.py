@@ -1,7 +1,8 @@
-"""A planned path in its run: as JSON, as a picture, and as channels of the run's MCAP log."""
+"""A planned path in its map's folder: as JSON, as a picture, and as channels of a run's MCAP log."""
 
 import json
 from math import isfinite
+from pathlib import Path
 
 import numpy as np
 
@@ -34,9 +35,20 @@ def write_plan(run: Run, plan: Plan, *, grid: OccupancyGrid) -> None:
     with McapLog(log_path) as log:
         log.copy(log_path, without=PLAN_TOPICS)
         log.plan(int(run.trajectory().stamps_ns[0]), _in_space(plan))
-    write_text(run.path / files.PLAN, plan_json(plan))
+    draw_plan(run.path, plan, grid=grid)
+
+
+def draw_plan(folder: Path, plan: Plan, *, grid: OccupancyGrid) -> None:
+    """Write ``plan.json`` and ``plan.png`` into a map's folder; an earlier plan gives way.
+
+    Args:
+        folder: Of a run, or of a merged map.
+        plan: The path.
+        grid: What it is drawn over.
+    """
+    write_text(folder / files.PLAN, plan_json(plan))
     write_path(
-        run.path / files.PLAN_VIEW,
+        folder / files.PLAN_VIEW,
         grid=grid,
         waypoints_world=plan.waypoints_world,
         radius_m=plan.config.radius_m,
