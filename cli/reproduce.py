@@ -41,7 +41,7 @@ def reproduce(
     processes: Annotated[
         int | None,
         typer.Option(
-            help="Measurements at a time; omit for one on every core, of zhao one, for it is timed."
+            help="Measurements at a time; omit for one on every core, or just one of what is timed: zhao, hough."
         ),
     ] = None,
     scheduler: Annotated[
@@ -80,7 +80,7 @@ def reproduce(
     reproduction = reproduce_tables(
         request,
         out,
-        processes=processes or (1 if paper is Paper.ZHAO else os.cpu_count() or 1),
+        processes=processes or (os.cpu_count() or 1 if paper is Paper.THESIS else 1),
         scheduler=scheduler,
         progress=progress,
     )
