@@ -136,3 +136,27 @@ def test_a_cloud_without_heights_is_refused():
     view = structured(memoryview(bytes(80)), XYZ[:2], point_bytes=8, shape=(1, 10))
     with pytest.raises(FrameError, match="m: points of x, y; want x, y and z"):
         scan_of(CloudMessage(STAMP_NS, "lidar", view))
+
+
+ORDERS = {
+    "side by side": [("x", 0, "<f4", 1), ("y", 4, "<f4", 1), ("z", 8, "<f4", 1)],
+    "after another": [("x", 4, "<f4", 1), ("y", 8, "<f4", 1), ("z", 12, "<f4", 1)],
+    "the other way round": [("x", 8, "<f4", 1), ("y", 4, "<f4", 1), ("z", 0, "<f4", 1)],
+    "apart": [("x", 0, "<f4", 1), ("y", 8, "<f4", 1), ("z", 12, "<f4", 1)],
+}
+
+
+@pytest.mark.parametrize("fields", ORDERS.values(), ids=ORDERS)
+@pytest.mark.parametrize("missing", [[], [0, 7, 49], range(50)])
+def test_returns_are_gathered_in_order_wherever_coordinates_lie(fields, missing):
+    points = some_points()
+    measured = np.delete(points, list(missing), axis=0)
+    for row, nothing in zip(missing, [np.nan, 0.0, np.inf, -6000.0, 1e30] * 10, strict=False):
+        points[row] = nothing
+    data = packed(points, fields, point_bytes=20)
+    message = bytearray(data.tobytes())
+    cloud = structured(memoryview(message), fields, point_bytes=20, shape=(5, 10))
+    again = scan_of(CloudMessage(STAMP_NS, "lidar", cloud)).points_body
+    np.testing.assert_array_equal(again, measured)
+    message[:] = bytes(len(message))  # what was read is no view of it
+    np.testing.assert_array_equal(again, measured)

@@ -33,6 +33,7 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _CHUNK = struct.Struct(
     "<QQQII"
 )  # first and last time, unpacked size and CRC, length of the compression's name
+_MOST_BY_LZ4 = 255  # a byte of LZ4 repeats no more
 
 
 def is_mcap(path: Path) -> bool:
@@ -123,7 +124,7 @@ class _Contents:
             type_ = ros2_name(type_)
         self._topics[channel.id] = Topic(channel.topic, type_, channel.message_encoding)
 
-    def split(self, data: bytes) -> Iterator[Part]:
+    def split(self, data: memoryview) -> Iterator[Part]:
         """Yield the messages of a chunk, or of a lone record outside of any."""
         for opcode, start, length in _records(data):
             if opcode == Opcode.MESSAGE:
@@ -133,7 +134,7 @@ class _Contents:
                 if channel in self._topics:  # else the chunk that names it is lost
                     yield Part(self._topics[channel], log_ns, start + _MESSAGE.size, length - _MESSAGE.size)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self.describe(opcode, data[start : start + length])
+                self.describe(opcode, bytes(data[start : start + length]))
 
     def describe(self, opcode: int, record: bytes) -> None:
         """Learn of a schema or a channel."""
@@ -193,37 +194,47 @@ def _walked(file: BinaryIO, path: Path) -> _Contents:
     return contents
 
 
-def _unpacked(stored: bytes) -> bytes:
+def _unpacked(stored: bytes) -> memoryview:
     """Return the records of a chunk; any other record is its own content."""
     if len(stored) < _RECORD.size:
         raise DataError("a chunk beyond the end of the file")
     opcode, length = _RECORD.unpack_from(stored)
     if opcode != Opcode.CHUNK:
-        return stored
+        return memoryview(stored)
     at = _RECORD.size
     if length < _CHUNK.size:
         raise DataError(f"a chunk of {length} bytes, want {_CHUNK.size} or more")
     _, _, size, crc, name_length = _CHUNK.unpack_from(stored, at)
     at += _CHUNK.size
     compression = stored[at : at + name_length]
-    at += name_length + 8  # the length of what follows: all of it
-    try:
-        if compression == b"":
-            data = stored[at:]
-        elif compression == b"zstd":
-            data = zstandard.decompress(stored[at:], max_output_size=size)
-        elif compression == b"lz4":
-            data = lz4.frame.decompress(stored[at:])
-        else:
-            raise DataError(f"a chunk compressed as {compression!r}; known are zstd and lz4")
-    except (zstandard.ZstdError, RuntimeError, MemoryError) as error:  # RuntimeError is lz4's
-        raise DataError(f"a chunk that cannot be decompressed: {error}") from None
+    packed = memoryview(stored)[at + name_length + 8 :]  # the length of what follows: all of it
+    data = _decompressed(packed, compression, size)
+    if len(data) != size:
+        raise DataError(f"a chunk of {len(data)} bytes, want {size}")
     if crc and isal_zlib.crc32(data) != crc:
         raise DataError("a chunk whose checksum is wrong")
     return data
 
 
-def _records(data: bytes) -> Iterator[tuple[int, int, int]]:
+def _decompressed(packed: memoryview, compression: bytes, size: int) -> memoryview:
+    """Return what a chunk unpacks to; of a damaged one hardly more than the size that it tells."""
+    try:
+        if compression == b"":
+            return packed
+        if compression == b"zstd":
+            if zstandard.frame_content_size(packed) not in (-1, size):  # -1: the frame does not say
+                raise DataError(f"a chunk of {size} bytes whose content is told to be of another size")
+            return memoryview(zstandard.decompress(packed, max_output_size=size))
+        if compression == b"lz4":
+            if size > _MOST_BY_LZ4 * len(packed):
+                raise DataError(f"a chunk of {len(packed)} bytes that LZ4 cannot have made of {size}")
+            return memoryview(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1))
+    except (zstandard.ZstdError, RuntimeError, MemoryError) as error:  # RuntimeError is lz4's
+        raise DataError(f"a chunk that cannot be decompressed: {error}") from None
+    raise DataError(f"a chunk compressed as {compression!r}; known are zstd and lz4")
+
+
+def _records(data: memoryview) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, start and length of every record's body."""
     at = 0
     while at < len(data):

@@ -49,11 +49,13 @@ def relative_times_s(values: NDArray[np.number], stamp_ns: int) -> NDArray[np.fl
         (N,) float32 seconds, negative before the stamp; None where the values tell nothing: none, all the
         same, not finite, or further apart than a sweep lasts.
     """
-    if len(values) == 0 or not np.isfinite(values).all():
+    if len(values) == 0:
         return None
-    first = values.min()
-    since_first = _less(values, first)
-    span = float(since_first.max())
+    values = np.ascontiguousarray(values)  # what is looked at thrice is worth gathering
+    first, last = values.min(), values.max()  # NaN is the least and the largest of all
+    if not (np.isfinite(first) and np.isfinite(last)):
+        return None
+    span = float(_less(last, first))
     units_per_s = next((unit for unit in _UNITS_PER_S if span <= MAX_SWEEP_S * unit), None)
     if span == 0.0 or units_per_s is None:
         return None
@@ -65,12 +67,14 @@ def relative_times_s(values: NDArray[np.number], stamp_ns: int) -> NDArray[np.fl
         first_after_stamp_ns = first_ns - stamp_ns
     else:
         first_after_stamp_ns = 0
-    after_stamp_s = since_first / units_per_s + first_after_stamp_ns / NS_PER_S
+    after_stamp_s = _less(values, first)
+    after_stamp_s /= units_per_s
+    after_stamp_s += first_after_stamp_ns / NS_PER_S
     times_s: NDArray[np.float32] = after_stamp_s.astype(np.float32)
     return times_s
 
 
-def _less(values: NDArray[np.number], first: np.number) -> Array:
+def _less(values: NDArray[np.number] | np.number, first: np.number) -> Array:
     """Subtract before rounding: nanoseconds of the epoch do not fit into a float64."""
     wide = values if values.dtype == np.uint64 else values.astype(np.result_type(values, np.int64))
     return np.subtract(wide, first, dtype=wide.dtype).astype(np.float64)

@@ -68,7 +68,7 @@ class _Contents:
         type_ = ros2_name(told[b"type"].decode())
         self._topics[fields[b"conn"]] = Topic(fields[b"topic"].decode(), type_, "ros1")
 
-    def split(self, data: bytes) -> Iterator[Part]:
+    def split(self, data: memoryview) -> Iterator[Part]:
         """Yield the messages of a chunk."""
         at = 0
         while at < len(data):
@@ -76,7 +76,7 @@ class _Contents:
             at = start + length
             try:
                 if fields[b"op"][0] == _CONNECTION:
-                    self.add_connection(fields, data[start:at])
+                    self.add_connection(fields, bytes(data[start:at]))
                 elif fields[b"op"][0] == _MESSAGE and fields[b"conn"] in self._topics:
                     sec, nsec = struct.unpack("<II", fields[b"time"])
                     yield Part(self._topics[fields[b"conn"]], sec * NS_PER_S + nsec, start, length)
@@ -128,18 +128,18 @@ def _walked(file: BinaryIO, path: Path) -> _Contents:
     return contents
 
 
-def _unpacked(stored: bytes) -> bytes:
-    """Return the records of a chunk."""
-    fields, start, length = _record(stored, 0)
-    data = stored[start : start + length]
+def _unpacked(stored: bytes) -> memoryview:
+    """Return the records of a chunk; those that are not compressed stay where they are."""
+    fields, start, length = _record(memoryview(stored), 0)
+    data = memoryview(stored)[start : start + length]
     compression = fields.get(b"compression")
     try:
         if compression == b"none":
             return data
         if compression == b"lz4":
-            return bytes(lz4.frame.decompress(data))
+            return memoryview(lz4.frame.decompress(data))
         if compression == b"bz2":
-            return bz2.decompress(data)
+            return memoryview(bz2.decompress(data))
     except (OSError, ValueError, RuntimeError, MemoryError) as error:  # RuntimeError is lz4's
         raise DataError(f"a chunk that cannot be decompressed: {error}") from None
     raise DataError(f"a chunk compressed as {compression!r}; known are none, lz4 and bz2")
@@ -159,7 +159,7 @@ def _record_at(file: BinaryIO, at: int, size: int) -> tuple[_Fields, int, int]:
     return fields, start, length
 
 
-def _record(data: bytes, at: int) -> tuple[_Fields, int, int]:
+def _record(data: memoryview, at: int) -> tuple[_Fields, int, int]:
     """Return a record's header, and where its data start in these bytes and how long they are."""
     try:
         (header_length,) = _LENGTH.unpack_from(data, at)
@@ -169,7 +169,7 @@ def _record(data: bytes, at: int) -> tuple[_Fields, int, int]:
         raise DataError("a chunk that ends within a record") from None
     if start + length > len(data):
         raise DataError("a chunk that ends within a record")
-    return _fields(data[at + _LENGTH.size : start - _LENGTH.size]), start, length
+    return _fields(bytes(data[at + _LENGTH.size : start - _LENGTH.size])), start, length
 
 
 def _fields(header: bytes) -> _Fields:

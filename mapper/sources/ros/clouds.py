@@ -1,6 +1,7 @@
 """Point clouds in messages as scans: structured views of the payload, and what of it was measured."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from mapper.frames import Scan
 from mapper.geometry import Transform, apply
 from mapper.sources.point_times import relative_times_s, time_field
 from mapper.sources.ros.messages import CloudMessage
+from mapper.sources.ros.returns import measured
 
 Field = tuple[str, int, str, int]
 """Name, offset in a point, numpy's name of its type with the byte order, and how many there are."""
@@ -75,14 +77,8 @@ def scan_from(message: CloudMessage, *, T_body_frame: Transform, with_colours: b
     names = points.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
         raise FrameError(f"{where}: points of {', '.join(names)}; want x, y and z")
-    points_body = np.empty((len(points), 3), np.float32)
-    for axis, name in enumerate("xyz"):
-        points_body[:, axis] = points[name]
-    with np.errstate(over="ignore", invalid="ignore"):
-        squared_m2 = np.einsum("ij,ij->i", points_body, points_body)
-    is_measured: NDArray[np.bool_] = (squared_m2 > 0.0) & (squared_m2 < _FARTHEST_M**2)
-    kept = slice(None) if is_measured.all() else np.flatnonzero(is_measured)
-    points_body = points_body[kept]
+    points_body, rows = measured(_coordinates(points), farthest_m=_FARTHEST_M)
+    kept = slice(None) if rows is None else rows
     T_body_points = T_body_frame @ message.T_frame_points
     if not np.array_equal(T_body_points, np.eye(4)):
         points_body = apply(T_body_points, points_body.astype(np.float64)).astype(np.float32)
@@ -94,6 +90,19 @@ def scan_from(message: CloudMessage, *, T_body_frame: Transform, with_colours: b
         colors=_colours(points, names, kept) if with_colours else None,
         times_s=None if times is None else relative_times_s(points[times][kept], message.stamp_ns),
     )
+
+
+def _coordinates(points: NDArray[np.void]) -> NDArray[np.float32]:
+    """Return (N, 3) x, y and z: a view of the message where they follow each other as float32."""
+    fields: Mapping[str, Any] = points.dtype.fields or {}
+    offsets = [fields[name][1] for name in "xyz"]
+    if np.diff(offsets).tolist() == [4, 4] and {fields[name][0] for name in "xyz"} == {np.dtype("<f4")}:
+        triples = np.dtype(
+            {"names": ["xyz"], "offsets": offsets[:1], "formats": ["3f4"], "itemsize": points.itemsize}
+        )
+        view: NDArray[np.float32] = points.view(triples)["xyz"]
+        return view
+    return np.column_stack([points[name].astype(np.float32) for name in "xyz"])
 
 
 def _colours(

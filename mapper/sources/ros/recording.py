@@ -106,8 +106,8 @@ class BlockRecording:
         *,
         kind: str,
         blocks: Sequence[Span],
-        unpack: Callable[[bytes], bytes],
-        split: Callable[[bytes], Iterator[Part]],
+        unpack: Callable[[bytes], memoryview],
+        split: Callable[[memoryview], Iterator[Part]],
         expected: int | None,
         notes: Sequence[str],
     ) -> None:
@@ -129,7 +129,7 @@ class BlockRecording:
         self._unpack = unpack
         self._split = split
         self._expected = expected
-        self._unpacked: OrderedDict[int, bytes] = OrderedDict()
+        self._unpacked: OrderedDict[int, memoryview] = OrderedDict()
         self._lock = threading.Lock()
 
     def messages(self) -> Iterator[Recorded]:
@@ -138,11 +138,10 @@ class BlockRecording:
         for number, span in enumerate(self._blocks):
             try:
                 data = self._load(number)
-                view = memoryview(data)
                 for topic, log_ns, offset, length in self._split(data):
                     count += 1
                     place = Place(number, offset, length)
-                    yield Recorded(topic, log_ns, place, view[offset : offset + length])
+                    yield Recorded(topic, log_ns, place, data[offset : offset + length])
             except DataError:
                 damaged += 1
                 damaged_bytes += span.length
@@ -165,9 +164,9 @@ class BlockRecording:
                 block = self._block(place.block)
         except DataError as error:
             raise FrameError(f"{self.path}: {error}") from None
-        return memoryview(block)[place.offset : place.offset + place.length]
+        return block[place.offset : place.offset + place.length]
 
-    def _block(self, number: int) -> bytes:
+    def _block(self, number: int) -> memoryview:
         if number not in self._unpacked:
             self._unpacked[number] = self._load(number)
             while len(self._unpacked) > 1 and sum(map(len, self._unpacked.values())) > _CACHE_BYTES:
@@ -175,7 +174,7 @@ class BlockRecording:
         self._unpacked.move_to_end(number)
         return self._unpacked[number]
 
-    def _load(self, number: int) -> bytes:
+    def _load(self, number: int) -> memoryview:
         start, length = self._blocks[number]
         try:
             with self.path.open("rb") as file:
