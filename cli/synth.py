@@ -16,6 +16,7 @@ class SensorKind(StrEnum):
 
     RGBD = "rgbd"
     LIDAR = "lidar"
+    LINE_LASER = "line-laser"
 
 
 class LidarScene(StrEnum):
@@ -28,7 +29,7 @@ class LidarScene(StrEnum):
 def synth(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Log folder to create.")],
     sensor: Annotated[
-        SensorKind, typer.Option(help="A camera in a flat, or a LiDAR outdoors.")
+        SensorKind, typer.Option(help="A camera in a flat, a LiDAR outdoors, or a line laser on a car.")
     ] = SensorKind.RGBD,
     seconds: Annotated[float | None, typer.Option(help="Length of the log.")] = None,
     path: Annotated[str | None, typer.Option(help="rgbd: loop, desk, spin or wall.")] = None,
@@ -57,6 +58,21 @@ def synth(
     Example: mapper synth logs/spin --path spin --seconds 10 --set sensor.exposure_s=0.01, or: mapper synth
     logs/yard --sensor lidar --scene courtyard --rings 16
     """
+    if sensor is SensorKind.LINE_LASER:
+        _refuse(
+            {
+                "--path": path,
+                "--rooms": rooms,
+                "--plane-at": plane_at,
+                "--scene": scene,
+                "--rings": rings,
+                "--wheels": wheels or None,
+            },
+            f"--sensor {sensor}",
+        )
+        _line_laser(out, assignments({"duration_s": seconds, "seed": seed}), noise, set_, quiet=quiet)
+        return
+
     from mapper.config import overridden
     from mapper.config.synthetic import SCENES, SynthConfig, SynthWheelsConfig
 
@@ -86,6 +102,27 @@ def synth(
     if not quiet:
         kind = "TUM" if sensor is SensorKind.RGBD else "KITTI"
         print(f"{out}: a {kind} log; map it with mapper build {out} --out RUN")
+
+
+def _line_laser(
+    out: Path, given: list[str], noise: float | None, set_: list[str] | None, *, quiet: bool
+) -> None:
+    from mapper.config import overridden
+    from mapper.config.line_laser import LineLaserSynthConfig
+    from mapper.sources.synthetic.line_laser.log import write_line_laser_log
+
+    usual = LineLaserSynthConfig()
+    if noise is not None:
+        given = [*given, f"noise_levels={noise * usual.noise_levels}"]
+    config = overridden(usual, merged(given, set_))
+    prepare_libraries()
+    write_line_laser_log(out, config, progress=progress_for(quiet=quiet))
+    if not quiet:
+        vehicle = f"--wheelbase {config.wheelbase_m:g} --sensor-x {config.sensor_x_m:g}"
+        print(
+            f"{out}: a drive with a line laser; calibrate with mapper sensor line-laser-calibrate "
+            f"{out}/shots --reach {config.reach_m:g} {vehicle} --out C.toml"
+        )
 
 
 def _refuse(options: dict[str, object], beside: str) -> None:

@@ -6,8 +6,8 @@ from statistics import median
 
 import numpy as np
 
-from evaluators.line_laser import TABLE_2_1, Counts, count_all, summed
-from evaluators.tables import Record, Value
+from evaluators.line_laser import TABLE_2_1, Counts, count_all, percent, summed
+from evaluators.tables import Column, Record, Value
 from mapper.config.line_laser import (
     LineLaserCalibration,
     LineLaserConfig,
@@ -55,8 +55,28 @@ class Study:
     measured_m: Mapping[float, Sequence[float]]
 
 
+STUDY_COLUMNS = (
+    Column("scene", "scene"),
+    Column("method", "method"),
+    Column("precision", "precision %", percent),
+    Column("recall", "recall %", percent),
+    Column("f_score", "F %", percent),
+    Column("f_score_low", "lowest F %", percent),
+    Column("f_score_high", "highest F %", percent),
+    Column("pixel_f_score", "pixels' F %", percent),
+)
+TABLE_COLUMNS = (
+    Column("range_m", "true m", "{:.2f}".format),
+    Column("measured_m", "measured m", "{:.3f}".format),
+    Column("error_ratio", "error %", percent),
+    Column("worst_error_ratio", "worst seed's %", percent),
+    Column("thesis_measured_m", "thesis m", "{:.2f}".format),
+    Column("thesis_error_ratio", "thesis %", percent),
+)
+
+
 def study(config: LineLaserConfig, seeds: Sequence[int], *, progress: Progress = SILENT) -> Study:
-    """Render every scene, and a wall at every range of Table 2.1, with every seed, calibrated by its own shots.
+    """Render every scene, and a wall at every range of Table 2.1, with every seed; shots calibrate.
 
     Args:
         config: How the stripe is found.
@@ -78,7 +98,7 @@ def study(config: LineLaserConfig, seeds: Sequence[int], *, progress: Progress =
     return Study(found, measured_m)
 
 
-def detection_study_records(study: Study) -> list[Record]:
+def detections(study: Study) -> list[Record]:
     """Return one record for each scene and method: medians over the seeds, and the spread of F."""
     return [
         {"scene": name, "method": method, **_spread([seed[method] for seed in seeds])}
@@ -87,7 +107,7 @@ def detection_study_records(study: Study) -> list[Record]:
     ]
 
 
-def range_study_records(study: Study) -> list[Record]:
+def table_2_1(study: Study) -> list[Record]:
     """Return Table 2.1: what was measured, in whole centimetres as printed there, and its relative error."""
     records: list[Record] = []
     for range_m, measured_m in study.measured_m.items():

@@ -55,6 +55,8 @@ class CalibrationShot:
     def __post_init__(self) -> None:
         if not self.range_m > 0.0 or not (self.width_m is None or self.width_m > 0.0):
             raise DataError(f"shot: range {self.range_m} m, width {self.width_m} m; want both > 0")
+        if self.width_m is not None and self.board.width_px is None:
+            raise DataError(f"shot: a board of {self.width_m} m, but the image does not show it whole")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

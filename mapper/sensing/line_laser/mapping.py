@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapper.config.line_laser import LineLaserMapConfig
 from mapper.errors import DataError, MapSizeError
-from mapper.geometry import Points, Transform
+from mapper.geometry import Array, Points
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.progress import SILENT, Progress
 from mapper.sensing.line_laser.ranging import LineScan
@@ -22,7 +22,7 @@ _SEEN_FREE, _SEEN_OCCUPIED = 1, 2
 
 def map_scans(
     scans: Sequence[LineScan],
-    T_world_sensor: Sequence[Transform],
+    T_world_sensor: Array,
     config: LineLaserMapConfig,
     *,
     progress: Progress = SILENT,
@@ -34,7 +34,7 @@ def map_scans(
 
     Args:
         scans: What each image told, in order.
-        T_world_sensor: Where the sensor was, x ahead, y left; only the plane counts.
+        T_world_sensor: (N, 4, 4) where the sensor was, x ahead, y left; only the plane counts.
         config: Size of a cell and the probabilities.
         progress: Told of every scan.
 
@@ -47,7 +47,7 @@ def map_scans(
     ]
     if not any(map(len, ends_world)):
         raise DataError("line laser: no image shows a stripe, so there is nothing to map")
-    seen = np.concatenate([*ends_world, *(T[None, :2, 3] for T in T_world_sensor)])
+    seen = np.concatenate([*ends_world, T_world_sensor[:, :2, 3]])
     low = np.floor(seen.min(axis=0) / config.resolution_m).astype(np.int64) - _MARGIN_CELLS
     size = np.floor(seen.max(axis=0) / config.resolution_m).astype(np.int64) + _MARGIN_CELLS + 1 - low
     if size.prod() > _MAX_CELLS:

@@ -15,13 +15,14 @@ from mapper.config.line_laser import LineLaserSynthConfig
 from mapper.frames import Image
 from mapper.geometry import Array, Transform
 from mapper.sources.synthetic.line_laser.room import Patch, Room
-from mapper.sources.synthetic.noise import fractal
+from mapper.sources.synthetic.noise import Field32, fractal
 
 _LENS_PX = 0.9
 _TEXTURE_PX_PER_M = 150.0
 _TEXTURE_GAIN = 0.08
 _LIGHT_FROM = np.array([0.8, 0.6])
 _FAR_M = 50.0
+_NOWHERE = 0.3  # what is beyond all walls returns of the room's light
 _BLOOM_PX, _BLOOM_RATIO = 7.0, 0.12
 _CROSSTALK = 0.1  # of the laser's light, in the pixels of the other colours
 _SPILL = 0.6  # of what is too bright for the red ones
@@ -70,19 +71,15 @@ def take(
     """Return an image from a pose of the sensor on the floor, x ahead."""
     view = _looked(room, config, T_world_sensor)
     light = _lit_by_room(room, config, view, T_world_sensor[:2, 3], rng=rng)
-    returned = np.where(view.wall >= 0, room.colors[view.wall, 0], 0.0)
     for patch in room.patches:
-        returned = _hang(light, returned, patch, view, config)
-    rows, ranges_m, levels = _stripe(config, view, returned, floor=room.floor[0])
+        _paint(light, patch, view, config)
     light = cv2.GaussianBlur(light, (0, 0), _LENS_PX)
-    light += _stripe_light(config, rows, ranges_m, levels, rng=rng)[:, :, None] * [
-        1.0,
-        _CROSSTALK,
-        _CROSSTALK,
-    ]
+    rows, ranges_m, levels = _stripe(room, config, view)
+    laser = _stripe_light(config, rows, ranges_m, levels, rng=rng)
+    light += laser[:, :, None] * np.array([1.0, _CROSSTALK, _CROSSTALK], np.float32)
     ghost_rows = (config.height_px - 1) - rows + 2.0 * config.focal_px * config.camera_height_m / ranges_m
     mirrored = _stripe_light(config, ghost_rows, ranges_m, config.gloss * levels, rng=rng)
-    light[:, :, 0] += np.where(view.up_m < 0.0, mirrored, 0.0)
+    light[:, :, 0] += np.where(view.up_m < 0.0, mirrored, np.float32(0.0))
     visible = (levels > 0.0) & (rows >= 0.0) & (rows <= config.height_px - 1)
     return Shot(
         _encoded(_developed(light, config, rng=rng), config),
@@ -121,7 +118,7 @@ def _cross(a: Array, b: Array) -> Array:
 
 def _lit_by_room(
     room: Room, config: LineLaserSynthConfig, view: _View, position: Array, *, rng: np.random.Generator
-) -> Array:
+) -> Field32:
     """Return (H, W, 3) levels of bare walls and floor."""
     height = config.height_px
     below = np.maximum(np.arange(height) - 0.5 * (height - 1), 0.5)[:, None]
@@ -136,65 +133,62 @@ def _lit_by_room(
     texture = 1.0 + _TEXTURE_GAIN * cv2.remap(tile, x, y, cv2.INTER_LINEAR)
     normals = (room.ends_world[:, 1] - room.ends_world[:, 0])[:, ::-1]
     facing = np.abs(normals @ _LIGHT_FROM) / np.linalg.norm(normals, axis=1)
-    walls = np.where(view.wall[:, None] >= 0, (room.colors * (0.7 + 0.3 * facing[:, None]))[view.wall], 0.3)
-    color = np.where(is_floor[:, :, None], room.floor, walls)
+    painted = (room.colors * (0.7 + 0.3 * facing[:, None])).astype(np.float32)
+    walls = np.where(view.wall[:, None] >= 0, painted[view.wall], np.float32(_NOWHERE))
+    color = np.where(is_floor[:, :, None], room.floor.astype(np.float32), walls)
     exposure = 255.0 * config.ambient * rng.uniform(0.9, 1.1)
-    light: Array = exposure * color * texture[:, :, None]
+    light: Field32 = exposure * color * texture[:, :, None]
     return light
 
 
-def _hang(light: Array, returned: Array, patch: Patch, view: _View, config: LineLaserSynthConfig) -> Array:
-    """Draw a patch into the levels, and return what the wall then returns of the laser at the stripe."""
-    columns = np.flatnonzero(
-        (view.wall == patch.wall) & (view.along_m >= patch.along_m[0]) & (view.along_m <= patch.along_m[1])
-    )
-    if not len(columns):
-        return returned
-    up_m = view.up_m[:, columns]
-    covered = (up_m >= patch.up_m[0]) & (up_m <= patch.up_m[1])
-    part = light[:, columns]
+def _paint(light: Field32, patch: Patch, view: _View, config: LineLaserSynthConfig) -> None:
+    """Draw a patch into the (H, W, 3) levels, which are written."""
+    columns = _columns_of(patch, view)
+    up_m, part = view.up_m[:, columns], light[:, columns]
+    bright = 255.0 * (1.0 if patch.kind == "lamp" else config.ambient) * np.array(patch.color)
+    part[(up_m >= patch.up_m[0]) & (up_m <= patch.up_m[1])] = bright
     if patch.kind == "lamp":
-        part[covered] = 255.0 * np.array(patch.color)
-        mirrored = (-up_m >= patch.up_m[0]) & (-up_m <= patch.up_m[1])
-        part[mirrored] += 255.0 * config.gloss * np.array(patch.color)
-    else:
-        part[covered] = 255.0 * config.ambient * np.array(patch.color)
+        part[(-up_m >= patch.up_m[0]) & (-up_m <= patch.up_m[1])] += config.gloss * bright
     light[:, columns] = part
-    stripe_m = config.laser_height_m * (1.0 - view.depth_m[columns] / config.reach_m)
-    on_it = (stripe_m >= patch.up_m[0]) & (stripe_m <= patch.up_m[1])
-    changed = returned.copy()
-    changed[columns[on_it]] = 0.0 if patch.kind == "dull" else min(patch.color[0], 1.0)
-    return changed
 
 
-def _stripe(
-    config: LineLaserSynthConfig, view: _View, returned: Array, *, floor: float
-) -> tuple[Array, Array, Array]:
+def _columns_of(patch: Patch, view: _View) -> NDArray[np.intp]:
+    begin_m, end_m = patch.along_m
+    return np.flatnonzero((view.wall == patch.wall) & (view.along_m >= begin_m) & (view.along_m <= end_m))
+
+
+def _stripe(room: Room, config: LineLaserSynthConfig, view: _View) -> tuple[Array, Array, Array]:
     """Return row, range and brightness of the stripe in each column: on the wall, or else on the floor."""
     on_floor = view.depth_m >= config.reach_m
     ranges_m = np.where(on_floor, config.reach_m, view.depth_m)
     height_m = config.laser_height_m * (1.0 - ranges_m / config.reach_m)
     rows = 0.5 * (config.height_px - 1) + config.focal_px * (config.camera_height_m - height_m) / ranges_m
+    returned = room.colors[view.wall, 0]
+    for patch in room.patches:
+        columns = _columns_of(patch, view)
+        lit = columns[(height_m[columns] >= patch.up_m[0]) & (height_m[columns] <= patch.up_m[1])]
+        returned[lit] = 0.0 if patch.kind == "dull" else min(patch.color[0], 1.0)
     grazing = config.laser_height_m / np.hypot(config.laser_height_m, config.reach_m)
-    share = np.where(on_floor, floor * grazing, returned * view.slant)
+    share = np.where(on_floor, room.floor[0] * grazing, returned * view.slant)
     return rows, ranges_m, config.laser_levels * share / ranges_m
 
 
 def _stripe_light(
     config: LineLaserSynthConfig, rows: Array, ranges_m: Array, levels: Array, *, rng: np.random.Generator
-) -> Array:
+) -> Field32:
     """Return (H, W) levels that the laser adds."""
     sigma_px = np.hypot(_LENS_PX, 0.25 * config.focal_px * config.stripe_m / ranges_m)
     noise = cv2.GaussianBlur(rng.standard_normal((1, config.width_px)), (0, 0), 1.0)[0]
     speckle = np.exp(_SPECKLE * noise / noise.std())
-    offset = (np.arange(config.height_px)[:, None] - rows) / sigma_px
-    light: Array = levels * speckle * np.exp(-0.5 * offset**2)
+    offset = np.arange(config.height_px)[:, None] - rows
+    falls = (-0.5 * (offset / sigma_px) ** 2).astype(np.float32)
+    light: Field32 = (levels * speckle).astype(np.float32) * np.exp(falls)
     return light
 
 
-def _developed(light: Array, config: LineLaserSynthConfig, *, rng: np.random.Generator) -> Image:
+def _developed(light: Field32, config: LineLaserSynthConfig, *, rng: np.random.Generator) -> Image:
     """Return the image of (H, W, 3) levels: spilt and bloomed where too bright, with noise, 8 bits."""
-    seen = light.astype(np.float32)
+    seen = light.copy()
     glare = cv2.GaussianBlur(np.maximum(seen - 255.0, 0.0), (0, 0), _BLOOM_PX)
     seen[:, :, 1:] += _SPILL * np.maximum(seen[:, :, :1] - 255.0, 0.0)
     seen += _BLOOM_RATIO * glare

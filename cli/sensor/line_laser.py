@@ -1,0 +1,208 @@
+"""``mapper sensor line-laser`` and its calibration and accuracy."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli.console import progress_for
+from cli.environment import prepare_libraries
+from cli.options import Quiet
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from mapper.config.line_laser import StripeConfig
+    from mapper.geometry import Array
+    from mapper.sensing.line_laser.calibration import CalibrationShot, Fit
+    from mapper.sensing.line_laser.ranging import LineScan
+
+_SHOWN = 3  # images whose detections are drawn
+
+Knobs = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY.PATH=VALUE", help="stripe.edge_threshold, map.resolution_m, …"),
+]
+
+
+def line_laser(
+    images: Annotated[Path, typer.Argument(metavar="IMAGES", help="Folder of images, stamped by name.")],
+    out: Annotated[Path, typer.Option(help="Folder to create for ranges, grids, map and pictures.")],
+    calibration: Annotated[
+        Path | None, typer.Option(help="Of line-laser-calibrate.  [default: the thesis's sensor]")
+    ] = None,
+    wheels: Annotated[
+        Path | None, typer.Option(help="encoders.txt or wheels.txt; without it there is no map.")
+    ] = None,
+    labels: Annotated[
+        Path | None, typer.Option(help="True stripes (image,column,row_px,range_m): print how right each is.")
+    ] = None,
+    times: Annotated[
+        Path | None, typer.Option(help="A stamp a line, if names and times.txt have none.")
+    ] = None,
+    set_: Knobs = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Find a laser's stripe in images, range what it falls on, and map that by the wheels.
+
+    Example: mapper sensor line-laser drive/images --calibration C.toml --wheels drive/encoders.txt --out seen
+    """
+    from evaluators.line_laser_labels import judge, read_labels
+    from mapper.config import overridden, read_config
+    from mapper.config.line_laser import THESIS, LineLaserCalibration, LineLaserConfig
+    from mapper.export.line_laser_files import write_drive, write_scans
+    from mapper.sensing.line_laser.files import find_images
+    from mapper.sensing.line_laser.survey import drive, scan_images
+    from mapper.staging import staged
+
+    prepare_libraries()
+    progress = progress_for(quiet=quiet)
+    config = overridden(LineLaserConfig(), set_ or [])
+    known = read_config(calibration, LineLaserCalibration) if calibration else THESIS
+    truth = read_labels(labels, width_px=known.width_px) if labels else {}
+    paths, stamps_ns, notes = find_images(images, times=times, rate_hz=config.rate_hz)
+    with staged(out, overwrite=overwrite) as folder:
+        scans, more = scan_images(paths, stamps_ns, known, config, progress=progress)
+        notes += more
+        if wheels is not None:
+            driven = drive(list(scans.values()), wheels, known, config, progress=progress)
+            notes += driven.notes
+            write_drive(folder, driven, title=out.resolve().name)
+        write_scans(folder, scans, calibration=known, config=config, notes=notes)
+        _draw(folder, list(scans), config.stripe, truth)
+        judged = judge(scans, truth, config.stripe) if truth else None
+        if judged is not None:
+            judged.write(folder)
+        files = ", ".join(sorted(child.name for child in folder.iterdir()))
+    for note in notes:
+        progress.note(note)
+    if not quiet:
+        if judged is not None:
+            print(f"{judged.text}\n")
+        print(f"{_summary(scans)}\nfiles    {files}\nin       {out}")
+
+
+def calibrate(
+    shots: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SHOTS", help="CSV of image,range_m,width_m, or a folder with such a shots.csv."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Calibration file (TOML) to create, and a picture beside it.")],
+    reach: Annotated[float, typer.Option(help="How far ahead the laser meets the floor, m.")] = 1.9,
+    wheelbase: Annotated[float | None, typer.Option(help="Between the vehicle's axles, m.")] = None,
+    sensor_x: Annotated[float, typer.Option(help="How far ahead of the rear axle ranges begin, m.")] = 0.0,
+    set_: Knobs = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Fit a line laser's range and lateral laws to images of a board at known distances.
+
+    Example: mapper sensor line-laser-calibrate drive/shots --wheelbase 0.26 --sensor-x 0.2 --out C.toml
+    """
+    from mapper.atomic import write_text
+    from mapper.config import overridden
+    from mapper.config.line_laser import LineLaserConfig, VehicleConfig
+    from mapper.errors import ConfigError, RunError
+    from mapper.export.line_laser_picture import write_calibration_picture
+    from mapper.sensing.line_laser.calibration import calibrate as fit_laws
+    from mapper.sensing.line_laser.calibration import calibration_text
+    from mapper.sensing.line_laser.files import read_shots
+
+    if out.exists() and not overwrite:
+        raise RunError(f"{out}: exists already; choose another --out, or pass --overwrite to replace it")
+    for name, value in {"--reach": reach, "--wheelbase": wheelbase}.items():
+        if value is not None and not value > 0.0:
+            raise ConfigError(f"{name} {value}: want > 0 m")
+    prepare_libraries()
+    progress = progress_for(quiet=quiet)
+    config = overridden(LineLaserConfig(), set_ or [])
+    seen, size_px, notes = read_shots(shots, config.stripe, progress=progress)
+    for note in notes:
+        progress.note(note)
+    vehicle = VehicleConfig(wheelbase_m=wheelbase, sensor_x_m=sensor_x)
+    fit = fit_laws(seen, size_px=size_px, reach_m=reach, vehicle=vehicle)
+    write_text(out, calibration_text(fit.calibration))
+    write_calibration_picture(out.with_suffix(".png"), fit, seen)
+    if not quiet:
+        print(_laws(fit, seen))
+        print(f"in       {out}, {out.with_suffix('.png').name}")
+
+
+def accuracy(
+    seeds: Annotated[int, typer.Option(min=1, help="How many rooms to render.")] = 3,
+    out: Annotated[Path | None, typer.Option(help="Folder to create for both tables as CSV.")] = None,
+    set_: Knobs = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Render rooms with lamps, red things and noise; print who finds the stripe, and the thesis's Table 2.1.
+
+    Example: mapper sensor line-laser-accuracy --seeds 5 --set stripe.edge_threshold=100
+    """
+    from contextlib import nullcontext
+
+    from evaluators.line_laser_study import STUDY_COLUMNS, TABLE_COLUMNS, detections, study, table_2_1
+    from evaluators.tables import csv_text, text_table
+    from mapper.atomic import write_text
+    from mapper.config import overridden
+    from mapper.config.line_laser import LineLaserConfig
+    from mapper.staging import MARK, staged
+
+    prepare_libraries()
+    config = overridden(LineLaserConfig(), set_ or [])
+    with staged(out, overwrite=overwrite) if out else nullcontext() as folder:
+        found = study(config, range(seeds), progress=progress_for(quiet=quiet))
+        scenes, ranges = detections(found), table_2_1(found)
+        if folder is not None:
+            write_text(folder / "detections.csv", csv_text(scenes))
+            write_text(folder / "table_2.1.csv", csv_text(ranges))
+            write_text(folder / MARK, config.model_dump_json(indent=1) + "\n")
+    if not quiet:
+        print(f"{text_table(STUDY_COLUMNS, scenes)}\n\n{text_table(TABLE_COLUMNS, ranges)}")
+
+
+def _draw(
+    folder: Path,
+    paths: "Sequence[Path]",
+    config: "StripeConfig",
+    labels: "Mapping[str, tuple[Array, Array]]",
+) -> None:
+    """Draw the detections in the first image, in the last, and between."""
+    from mapper.export.line_laser_picture import write_detections
+    from mapper.sources.images import read_colour
+
+    for place in sorted({k * (len(paths) - 1) // (_SHOWN - 1) for k in range(_SHOWN)}):
+        path = paths[place]
+        true_rows, _ = labels.get(path.name, (None, None))
+        picture = folder / f"detection_{path.stem}.png"
+        write_detections(picture, read_colour(path), config, title=path.name, true_rows=true_rows)
+
+
+def _summary(scans: "Mapping[Path, LineScan]") -> str:
+    found = sum(len(scan.columns) for scan in scans.values())
+    floor = sum(int(scan.is_floor.sum()) for scan in scans.values())
+    return f"stripe   {len(scans)} images, {found} columns with a stripe, {floor} of them on the floor"
+
+
+def _laws(fit: "Fit", shots: "Sequence[CalibrationShot]") -> str:
+    import numpy as np
+
+    law, lateral = fit.calibration.range, fit.calibration.lateral
+    sigmas = [np.sqrt(np.diag(c)) if c else np.full(2, np.nan) for c in (law.covariance, lateral.covariance)]
+    lines = [
+        f"range    {law.scale_mm:.0f} · p^{law.exponent:.4f} mm, "
+        f"σ {law.scale_mm * sigmas[0][0]:.0f} mm and {sigmas[0][1]:.4f}",
+        f"lateral  x / ({lateral.slope:.5f} y {lateral.offset:+.4f}) cm, "
+        f"σ {sigmas[1][0]:.5f} and {sigmas[1][1]:.4f}",
+        "",
+        "range m   row px   off by mm",
+    ]
+    lines += [
+        f"{shot.range_m:7.3f} {shot.board.row_px:8.2f} {1e3 * error_m:+11.1f}"
+        for shot, error_m in zip(shots, fit.range_errors_m, strict=True)
+    ]
+    widths_mm = 1e3 * fit.width_errors_m
+    return "\n".join([*lines, "", f"widths   off by {np.sqrt((widths_mm**2).mean()):.1f} mm (RMS)"])
