@@ -99,22 +99,21 @@ class RegistrationScore:
 
 
 def pairs_of(stamps_ns: Stamps, truth: Trajectory, *, count: int, frames_apart: Sequence[int]) -> list[Pair]:
-    """Return pairs of frames spread evenly over a log, as many of each distance as of the others.
+    """Return pairs of frames spread evenly over a log, as many of each distance as of the others if it can.
 
     Args:
         stamps_ns: (N,) stamps of all frames.
         truth: Frames that it does not cover are left out.
-        count: How many pairs, where the log has as many.
-        frames_apart: The distances; those longer than the log are left out.
+        count: How many pairs; all that there are, where the log has fewer.
+        frames_apart: The distances; those of which the log has too few pairs leave their share to others.
     """
     index, gap_ns = nearest(truth.stamps_ns, stamps_ns)
     known = gap_ns <= MAX_TRUTH_GAP_NS
     T_truth_body = truth.T_world_body[index]
     starts = {gap: np.flatnonzero(known[:-gap] & known[gap:]) for gap in frames_apart}
-    gaps = [gap for gap in frames_apart if len(starts[gap])]
     pairs: list[Pair] = []
-    for wanted, gap in zip(_shares(count, len(gaps)), gaps, strict=True):
-        spread = np.linspace(0, len(starts[gap]) - 1, min(wanted, len(starts[gap]))).round().astype(int)
+    for wanted, gap in zip(_shares(count, [len(found) for found in starts.values()]), starts, strict=True):
+        spread = np.linspace(0, len(starts[gap]) - 1, wanted).round().astype(int)
         for i in starts[gap][spread].tolist():
             pairs.append(Pair(len(pairs), i, i + gap, inverse(T_truth_body[i]) @ T_truth_body[i + gap]))
     return pairs
@@ -249,6 +248,10 @@ def _middle_and_tail(errors: Sequence[float]) -> tuple[float, float] | None:
     return float(median), float(tail)
 
 
-def _shares(total: int, parts: int) -> list[int]:
-    """Return a total in whole parts that differ by one at most, the larger first."""
-    return [total // parts + (part < total % parts) for part in range(parts)]
+def _shares(count: int, limits: Sequence[int]) -> list[int]:
+    """Share a number out evenly, the first get what is left over, and none gets more than its limit."""
+    shares = [0] * len(limits)
+    for _ in range(min(count, sum(limits))):
+        _, least = min((share, k) for k, share in enumerate(shares) if share < limits[k])
+        shares[least] += 1
+    return shares

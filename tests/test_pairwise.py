@@ -46,7 +46,17 @@ def test_pairs_are_spread_over_the_log_and_shared_among_distances():
 def test_distances_longer_than_the_log_leave_their_share_to_others():
     truth = straight(6)
     pairs = pairs_of(truth.stamps_ns, truth, count=6, frames_apart=(1, 5, 10))
-    assert [pair.source - pair.target for pair in pairs] == [1, 1, 1, 5]
+    assert [(pair.target, pair.source) for pair in pairs] == [*((k, k + 1) for k in range(5)), (0, 5)]
+    assert len(pairs_of(truth.stamps_ns, truth, count=5, frames_apart=(1, 5, 10))) == 5
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 7, 12])
+@pytest.mark.parametrize("count", [1, 4, 13, 1000])
+def test_as_many_different_pairs_as_there_are_up_to_what_was_asked(frames, count):
+    truth, gaps = straight(frames), (10, 3, 1, 3)
+    pairs = pairs_of(truth.stamps_ns, truth, count=count, frames_apart=gaps)
+    there_are = sum(max(frames - gap, 0) for gap in set(gaps))
+    assert len({(pair.target, pair.source) for pair in pairs}) == len(pairs) == min(count, there_are)
 
 
 def test_frames_that_the_truth_does_not_cover_are_in_no_pair():
