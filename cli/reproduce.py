@@ -41,7 +41,7 @@ def reproduce(
     processes: Annotated[
         int | None,
         typer.Option(
-            help="Measurements at a time; omit for one on every core, or just one of what is timed: zhao, hough."
+            help="Measurements at a time; omit for one on every core, of zhao and hough one: they are timed."
         ),
     ] = None,
     scheduler: Annotated[

@@ -4,7 +4,7 @@ Their clouds are not public, so ours are other scenes. Scene by scene there is n
 it succeeds, how near it ends and how long it takes can be.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from statistics import mean, median
 
@@ -61,7 +61,7 @@ def hough_reproduction(results: Sequence[CellResult], *, pictures: Path) -> Repr
             f"each seed turns a scan by any yaw and sets it off by up to {OFFSET_M:g} m",
             "a log's map is made of the scans around the one left out, one point per "
             f"{100 * MAP_VOXEL_M:g} cm voxel: sparser than the paper's mobile mapping, but of the same drive",
-            "time: of the whole registration on this machine, the map's preparation included",
+            "time: CPU time of the whole registration on this machine, the map's preparation included",
             *(f"failed: {result.label}: {result.failure}" for result in results if result.failure),
         ),
         pictures=tuple(sorted(pictures.glob("*.png"))),
@@ -78,18 +78,20 @@ def _summary(trials: Trials) -> PaperTable:
             ours = tuple(figure for figure in known if figure is not None)
             cells.append(PaperCell(row, column, printed.get(column), ours))
         pairs = _grouped(of_both, "pair").values()
-        near, floor = (
-            sum(median(_known(of_pair, key) or [NEAR_M]) < NEAR_M for of_pair in pairs)
-            for key in ("mpd_final_m", "mpd_truth_m")
-        )
+        final, at_truth = (_near_of(pairs, key) for key in ("mpd_final_m", "mpd_truth_m"))
         notes.append(
-            f"{row}: final MPD below {100 * NEAR_M:g} cm in {near} of {len(pairs)} pairs; "
-            f"the truth's own MPD is in {floor}"
+            f"{row}: MPD below {100 * NEAR_M:g} cm in {final} pairs, at the truth itself in {at_truth}"
         )
     title = "theirs and ours over all scenes of a sensor"
     return _table(
         "Table 1, summary", title, cells, (f"printed as wrong, with either sensor: {FAILED_SCENE}", *notes)
     )
+
+
+def _near_of(pairs: Collection[Trials], key: str) -> str:
+    """Return in how many of the pairs for which a distance is known its median is small."""
+    medians = [median(known) for pair in pairs if (known := _known(pair, key))]
+    return f"{sum(distance_m < NEAR_M for distance_m in medians)} of {len(medians)}"
 
 
 def _share_without(key: str) -> Callable[[Trials], float | None]:
