@@ -57,7 +57,7 @@ class GicpOdometryConfig(ScanOdometryConfig):
     cell_m: PositiveFloat = 0.5
     """The map keeps one Gaussian in each such cell."""
     coarse_cell_m: PositiveFloat = 2.0
-    """The same in a second map, for scans whose motion was not foreseen."""
+    """The same in a second map, in which scans are placed first."""
     map_keyframes: PositiveInt = 100
     """Cells that as many keyframes in a row have not touched are forgotten."""
     max_iterations: PositiveInt = 30

@@ -10,9 +10,11 @@ _STEP_RAD = 0.002
 
 
 class GicpMatcher:
-    """Two maps of Gaussians: fine cells for precision, coarse ones for scans whose motion was not foreseen.
+    """Two maps of Gaussians: a scan is placed in coarse cells first, then in fine ones.
 
-    Only keyframes enter them: a vehicle that waits must not outvote the place it waits in.
+    Coarse cells reach as far as a hand's turns are unforeseen; on a bare yard the overlap would not tell that
+    fine ones alone ended beside the truth. Only keyframes enter the maps: a vehicle that waits must not outvote
+    the place it waits in.
     """
 
     def __init__(self, config: GicpOdometryConfig) -> None:
@@ -21,12 +23,10 @@ class GicpMatcher:
 
     def match(self, sweep: Sweep, T_world_body: Transform, *, reach: Reach) -> Transform | None:
         """Return the T_world_body of a scan from a guess; None if the method cannot say."""
-        if reach == "far":
-            coarse = self._aligned(self._coarse, sweep, T_world_body)
-            if coarse is None:
-                return None
-            T_world_body = coarse
-        return self._aligned(self._fine, sweep, T_world_body)
+        if reach == "far":  # it always reaches as far as it can
+            return None
+        coarse = self._aligned(self._coarse, sweep, T_world_body)
+        return None if coarse is None else self._aligned(self._fine, sweep, coarse)
 
     def add(self, sweep: Sweep, T_world_body: Transform, *, is_keyframe: bool) -> None:
         """Take a keyframe into the maps."""
