@@ -13,8 +13,8 @@ class GicpMatcher:
     """Two maps of Gaussians: a scan is placed in coarse cells first, then in fine ones.
 
     Coarse cells reach as far as a hand's turns are unforeseen; on a bare yard the overlap would not tell that
-    fine ones alone ended beside the truth. Only keyframes enter the maps: a vehicle that waits must not outvote
-    the place it waits in.
+    fine ones alone ended beside the truth. Only keyframes enter the maps: who waits must not outvote
+    the place where they wait.
     """
 
     def __init__(self, config: GicpOdometryConfig) -> None:
