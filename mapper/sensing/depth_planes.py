@@ -7,6 +7,9 @@ from numpy.typing import NDArray
 
 from mapper.geometry import Array
 
+MAX_NOISE_RATIO = 0.05
+"""What scatters by a larger share of its distance is no plane."""
+
 _ROUNDS = 4
 _OUTLIER_SIGMAS = 4.0
 _LEAST_SIGMA_M = 1e-6

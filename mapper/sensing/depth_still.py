@@ -23,11 +23,11 @@ from mapper.sensing.depth_accuracy import (
     typical,
 )
 from mapper.sensing.depth_filter import dif
-from mapper.sensing.depth_planes import fit_planes
+from mapper.sensing.depth_planes import MAX_NOISE_RATIO, fit_planes
 from mapper.sources.base import Entry, FrameSource
 
 _MIN_MEASURED_RATIO = 0.5
-_MIN_PLANE_RATIO = 0.9
+_MAX_TILT_RAD = np.radians(30.0)
 _MAX_DISTANCE_RATIO = 0.2
 _DECODERS = 2
 
@@ -152,9 +152,17 @@ def _see(frame: RgbdFrame, distance_m: float, patch: Patch, *, keep_tilt: bool) 
         raise DataError(f"frame {frame.stamp_ns}: {measured.mean():.0%} of the patch {patch} has depth")
     rays = ray_table(frame.camera)[patch.slices].astype(np.float64)
     plane = fit_planes(depth_m.reshape(1, -1), rays.reshape(1, -1, 2))
-    share = float(plane.used.sum() / measured.sum())
-    if share < _MIN_PLANE_RATIO:
-        raise DataError(f"frame {frame.stamp_ns}: {1 - share:.0%} of the patch {patch} lies off its plane")
+    sigma_ratio = float(plane.sigma_m[0] / abs(plane.distance_m[0]))
+    if sigma_ratio > MAX_NOISE_RATIO:
+        raise DataError(
+            f"frame {frame.stamp_ns}: depths in the patch {patch} lie {sigma_ratio:.0%} off any plane, "
+            f"want at most {MAX_NOISE_RATIO:.0%}"
+        )
+    if plane.tilt_rad[0] > _MAX_TILT_RAD:
+        raise DataError(
+            f"frame {frame.stamp_ns}: the plane in the patch {patch} is {np.degrees(plane.tilt_rad[0]):.0f}° "
+            f"from lying across the camera's axis, want at most {np.degrees(_MAX_TILT_RAD):.0f}°"
+        )
     on_plane_m = plane.depth_m.reshape(depth_m.shape)
     reference_m = distance_m if keep_tilt else on_plane_m * (distance_m / plane.distance_m[0])
     figures = _Figures(

@@ -24,7 +24,7 @@ from mapper.sensing.depth_accuracy import (
     typical,
 )
 from mapper.sensing.depth_filter import dif
-from mapper.sensing.depth_planes import Planes, fit_planes
+from mapper.sensing.depth_planes import MAX_NOISE_RATIO, Planes, fit_planes
 from mapper.sources.base import Entry, FrameSource
 
 _TILES_ACROSS = 16
@@ -34,7 +34,6 @@ _MIN_MEASURED_RATIO = 0.95
 _MIN_PLANE_RATIO = 0.98
 _MAX_TILT_RAD = np.radians(60.0)
 """Up to here a Kinect's axial noise does not depend on the angle (Nguyen et al. 2012, §4)."""
-_MAX_NOISE_RATIO = 0.05
 _MAX_SHAPE_RATIO = 0.6
 _MAX_SHAPE_STEPS = 0.5
 _BIN_RATIO = 1.1
@@ -173,7 +172,7 @@ def _are_planes(planes: Planes, depth_m: Array, steps_m: list[float | None]) -> 
     flat: NDArray[np.bool_] = (
         (share >= _MIN_PLANE_RATIO)
         & (planes.tilt_rad <= _MAX_TILT_RAD)
-        & (planes.sigma_m <= _MAX_NOISE_RATIO * np.abs(planes.distance_m))
+        & (planes.sigma_m <= MAX_NOISE_RATIO * np.abs(planes.distance_m))
         & (shape_m <= np.maximum(_MAX_SHAPE_RATIO * planes.sigma_m, _MAX_SHAPE_STEPS * step_m))
     )
     return flat
