@@ -69,8 +69,8 @@ def register(
     opening = overridden(register_config(method, "lidar"), [o for o in overrides if o.startswith("source.")])
     target_frame, target_sensor = _load(target, opening.source)
     source_frame, source_sensor = _load(source, opening.source)
-    sensor: Sensor = "lidar" if "lidar" in (target_sensor, source_sensor) else "rgbd"
-    config = overridden(register_config(method, sensor), overrides)
+    seen_by: Sensor = "rgbd" if "rgbd" in (target_sensor, source_sensor) else "lidar"
+    config = overridden(register_config(method, seen_by), overrides)
     registered = register_frames(target_frame, source_frame, config.registration, T_target_source)
     if not quiet:
         print(registration_text(registered))
@@ -82,14 +82,15 @@ def register(
                 target=target_frame.scan(),
                 source=source_frame.scan(),
                 names=(target, source),
-                sensor=sensor,
+                sensor=target_sensor,
                 config=config,
             )
             files = ", ".join(sorted(child.name for child in folder.iterdir()))
         if not quiet:
             print(f"files    {files}\nin       {out}")
     if rerun is not None:
-        _shown(rerun, registered, target_frame.scan(), source_frame.scan(), f"{source} on {target}", sensor)
+        name = f"{source} on {target}"
+        _shown(rerun, registered, target_frame.scan(), source_frame.scan(), name, target_sensor)
     if not registered.alignment.converged:
         raise RegistrationError(f"{source} on {target}: not trusted: {registered.alignment.reason}")
 
@@ -115,7 +116,7 @@ def _shown(
 
 
 def _load(name: str, config: "SourceConfig") -> "tuple[Frame, Sensor]":
-    """Return the frame that a name stands for, and what took it."""
+    """Return the frame that a name stands for, and what took it: a file counts as a LiDAR's, with z up."""
     from mapper.errors import SourceError
     from mapper.sources import open_source
     from mapper.sources.clouds import read_scan

@@ -20,6 +20,7 @@ from mapper.frames import Scan
 from mapper.geometry import apply, exp, inverse
 from mapper.registration.guess import parse_guess
 from mapper.rotations import rotation_from_euler
+from mapper.sources import open_source
 from mapper.sources.clouds import read_scan
 from mapper.sources.synthetic.lidar import SyntheticLidarSource
 
@@ -137,6 +138,18 @@ def test_frames_of_a_log_are_named_by_their_number(desk_log):
         result = mapper(f"{desk_log}@2", f"{desk_log}@0", "--method", method)
         assert result.exit_code == 0, result.output
         assert f"method   {method}" in result.stdout
+
+
+def test_a_cameras_frame_beside_a_cloud_file_is_a_cameras_still(desk_log, tmp_path):
+    cloud, out = tmp_path / "cloud.npy", tmp_path / "registered"
+    first = next(open_source(desk_log).entries()).scan()
+    np.save(cloud, first.points_body)
+    for source, target in ((f"{desk_log}@1", cloud), (cloud, f"{desk_log}@1")):
+        result = mapper(source, target, "--method", "gicp", "--out", out, "--overwrite")
+        assert result.exit_code == 0, result.output
+        record = json.loads((out / "manifest.json").read_text())
+        assert record["config"]["registration"]["voxel_m"] == 0.05
+        assert "a camera's frame has it ahead" in mapper(source, target).stderr
 
 
 def test_clouds_in_other_units_are_scaled_as_told(clouds, tmp_path):

@@ -5,11 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
+from mapper.config.registration import VOXEL_M
 from mapper.config.sensors import Sensor
 from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure, save
-from mapper.export.palette import ESTIMATE, TRUTH
+from mapper.export.palette import END, ESTIMATE, TRUTH
 from mapper.frames import Points32
 from mapper.geometry import Array, Transform, apply
+from mapper.registration.kd_tree import kd_tree
 
 _DRAWN = 60_000
 _COLUMN_IN = 5.0
@@ -39,7 +41,9 @@ def write_before_and_after(
     sensor: Sensor,
     title: str,
 ) -> None:
-    """Draw the target blue and the source red: a column for each stage, all at one scale.
+    """Draw the target blue, the source red, and dark what of it lies on the target.
+
+    There is a column for each stage, all at one scale.
 
     Args:
         path: PNG file to write.
@@ -51,6 +55,8 @@ def write_before_and_after(
     """
     target, source = _thinned(points_target), _thinned(points_source)
     moved = [apply(T, source) for _, T in stages]
+    tree, near_m = kd_tree(points_target), VOXEL_M[sensor]
+    on_target = [tree.nearest(cloud)[1] <= near_m for cloud in moved]
     views = _VIEWS[sensor]
     windows = [_window(moved[-1] @ axes_of.T) for axes_of in views.values()]
     heights_in = [
@@ -60,15 +66,16 @@ def write_before_and_after(
     grid = figure.add_gridspec(len(views), len(stages), height_ratios=heights_in)
     for row, (view, axes_of) in enumerate(views.items()):
         low, high = windows[row]
-        for column, ((name, _), cloud) in enumerate(zip(stages, moved, strict=True)):
+        for column, ((name, _), cloud, on) in enumerate(zip(stages, moved, on_target, strict=True)):
             axes = figure.add_subplot(grid[row, column])
-            for points, color in ((target, TRUTH), (cloud, ESTIMATE)):
+            for points, color in ((target, TRUTH), (cloud[~on], ESTIMATE), (cloud[on], END)):
                 right, up = (points @ axes_of.T).T
                 axes.plot(right, up, ",", color=hex_of(color), alpha=0.5)
             axes.set_xlim(low[0], high[0])
             axes.set_ylim(low[1], high[1])
             axes.set_aspect("equal")
-            axes.set_title(f"{name}, {view}", fontsize=9, color=FAINT)
+            share = f", {on.mean():.0%} within {near_m:g} m (dark)" if row == 0 else ""
+            axes.set_title(f"{name}, {view}{share}", fontsize=9, color=FAINT)
             axes.tick_params(labelsize=7, colors=FAINT)
             for spine in axes.spines.values():
                 spine.set_color(LINE)
