@@ -2,7 +2,7 @@
 
 import base64
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from textwrap import fill
@@ -107,33 +107,28 @@ def _latex(reproduction: Reproduction) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _page(folder: Path, reproduction: Reproduction, plots: Sequence[Path]) -> str:
-    header = f"<h1>{escape(reproduction.paper)}</h1>"
-    return document(
-        f"{reproduction.paper} – mapper reproduce",
-        header=header,
-        main=[*_sections(reproduction), _pictures(folder, reproduction, plots)],
-    )
+def _page(folder: Path, reproduction: Reproduction, plots: Mapping[str, Path]) -> str:
+    main = [_section(each, plots.get(each.name)) for each in _filled(reproduction)]
+    of_tables = {each.name for each in reproduction.tables}
+    main += [section(name, _image(path)) for name, path in plots.items() if name not in of_tables]
+    if reproduction.pictures:  # they can be many, so they stay beside the page
+        links = (
+            f'<li><a href="{escape(os.path.relpath(path, folder))}">{escape(path.stem)}</a></li>'
+            for path in reproduction.pictures
+        )
+        main.append(section("Pictures", f"<ul>{''.join(links)}</ul>"))
+    main.append(section("Notes", bullets(_closing(reproduction))))
+    title = reproduction.paper
+    return document(f"{title} – mapper reproduce", header=f"<h1>{escape(title)}</h1>", main=main)
 
 
-def _sections(reproduction: Reproduction) -> Iterator[str]:
-    for each in _filled(reproduction):
-        columns, records = _laid_out(each, with_spread=True)
-        shown = table([column.title for column in columns], shown_cells(columns, records))
-        told = bullets([each.source, *_remarks(each), *failures(each)])
-        yield section(headline(each), shown + told)
-    yield section("Notes", bullets(_closing(reproduction)))
+def _section(each: PaperTable, plot: Path | None) -> str:
+    columns, records = _laid_out(each, with_spread=True)
+    shown = table([column.title for column in columns], shown_cells(columns, records))
+    told = bullets([each.source, *_remarks(each), *failures(each)])
+    return section(headline(each), shown + told + (_image(plot) if plot else ""))
 
 
-def _pictures(folder: Path, reproduction: Reproduction, plots: Sequence[Path]) -> str:
-    """Return the plots, and links to the pictures that were drawn before, for those can be many."""
-    images = "".join(
-        f'<p><img alt="{escape(path.stem)}" src="data:image/png;base64,'
-        f'{base64.b64encode(path.read_bytes()).decode()}"></p>'
-        for path in plots
-    )
-    links = "".join(
-        f'<li><a href="{escape(os.path.relpath(path, folder))}">{escape(path.stem)}</a></li>'
-        for path in reproduction.pictures
-    )
-    return section("Pictures", images + (f"<ul>{links}</ul>" if links else ""))
+def _image(path: Path) -> str:
+    data = base64.b64encode(path.read_bytes()).decode()
+    return f'<p><img alt="{escape(path.stem)}" src="data:image/png;base64,{data}"></p>'

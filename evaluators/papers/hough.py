@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import re
 import time
 import zlib
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import numpy as np
 from evaluators.cells import Cell
 from evaluators.cloud_distance import DistanceTo
 from evaluators.papers.hough_pairs import Clouds, Pair, find_pairs
+from evaluators.papers.layout import file_name
 from evaluators.register import Registered, register
 from evaluators.scan_pairs import perturbed
 from evaluators.sweep_cell import environment
@@ -141,7 +141,7 @@ def hough_cells(logs: Path, *, seeds: int, pictures: Path) -> list[Cell]:
         for method in METHODS:
             for seed in range(seeds):
                 name = f"{pair.name}, {pair.sensor}, {method}"
-                picture = pictures.resolve() / f"{_file_name(name)}.png" if seed == 0 else None
+                picture = pictures.resolve() / f"{file_name(name)}.png" if seed == 0 else None
                 trial = HoughTrial(pair, method, seed, picture)
                 cells.append(Cell(_key(trial, identity), f"{name}, seed {seed}", trial))
     return cells
@@ -152,7 +152,3 @@ def _key(trial: HoughTrial, identity: str) -> str:
     config = METHODS[trial.method].model_dump_json()
     told = json.dumps([environment(), identity, names, config], sort_keys=True)
     return f"{trial.method}.seed{trial.seed}.{hashlib.sha256(told.encode()).hexdigest()[:12]}"
-
-
-def _file_name(name: str) -> str:
-    return re.sub(r"[^\w-]+", "_", name)

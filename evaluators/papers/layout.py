@@ -1,6 +1,7 @@
 """How a paper's table is laid out: a line for each comparison, or as printed with our lines below theirs."""
 
 import math
+import re
 from collections import Counter
 from collections.abc import Sequence
 from statistics import median
@@ -107,6 +108,11 @@ def failures(table: PaperTable) -> list[str]:
         f"{cells[0]}{f' (and {len(cells) - 1} more)' if len(cells) > 1 else ''}: {reason}"
         for reason, cells in where.items()
     ]
+
+
+def file_name(name: str) -> str:
+    """Return what a file about something is called, without its ending."""
+    return re.sub(r"[^\w.-]+", "_", name)
 
 
 def _decimals(table: PaperTable) -> dict[str, int]:

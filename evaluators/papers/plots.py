@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evaluators.odometry_scores import position_errors_m
-from evaluators.papers.layout import compares, headline
+from evaluators.papers.layout import compares, file_name, headline
 from evaluators.papers.model import PaperCell, PaperPath, PaperTable, Reproduction
 from evaluators.trajectory import associate
 from mapper.export.errors_picture import add_color_bar, draw_path
@@ -34,7 +34,7 @@ _NUMBER = re.compile(r"\d+")
 _LEGEND: dict[str, Any] = {"fontsize": 7, "framealpha": 0.9, "edgecolor": LINE}
 
 
-def write_plots(folder: Path, reproduction: Reproduction) -> list[Path]:
+def write_plots(folder: Path, reproduction: Reproduction) -> dict[str, Path]:
     """Draw what can be drawn of a paper's tables and paths, a PNG file each.
 
     Args:
@@ -42,26 +42,26 @@ def write_plots(folder: Path, reproduction: Reproduction) -> list[Path]:
         reproduction: What was measured.
 
     Returns:
-        The files, in the order of the tables.
+        The files, by the table that they show or by what they are.
     """
-    drawn = []
+    drawn: dict[str, Path] = {}
     for table in filter(compares, reproduction.tables):
-        path = folder / f"{_file_name(table.name)}.png"
+        path = folder / f"{file_name(table.name)}.png"
         if table.axis:
             _write_curves(path, table)
         elif table.unit:
             _write_boxes(path, table)
         else:
             continue
-        drawn.append(path)
+        drawn[table.name] = path
     scenes = [table for table in reproduction.tables if table.cells and not compares(table)]
     alike = [table for table in scenes if _columns(table) == _columns(scenes[0])]
     if len(alike) > 1:
-        drawn.append(folder / SCENES)
-        _write_scenes(drawn[-1], alike, title=reproduction.paper)
+        drawn["Scenes"] = folder / SCENES
+        _write_scenes(folder / SCENES, alike, title=reproduction.paper)
     if reproduction.paths:
-        drawn.append(folder / TRAJECTORIES)
-        _write_paths(drawn[-1], reproduction.paths)
+        drawn["Paths"] = folder / TRAJECTORIES
+        _write_paths(folder / TRAJECTORIES, reproduction.paths)
     return drawn
 
 
@@ -184,7 +184,3 @@ def _by_row(table: PaperTable) -> dict[str, list[PaperCell]]:
 
 def _columns(table: PaperTable) -> list[str]:
     return list(dict.fromkeys(cell.column for cell in table.cells))
-
-
-def _file_name(name: str) -> str:
-    return re.sub(r"[^\w.-]+", "_", name)
