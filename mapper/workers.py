@@ -12,7 +12,7 @@ import threading
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context, parent_process
@@ -53,6 +53,7 @@ def run_jobs(
     processes: int = 1,
     scheduler: str | None = None,
     attempts: int = 2,
+    crew: "Crew | None" = None,
 ) -> Iterator[tuple[int, R | Failure]]:
     """Yield the index of each job and its result as they finish, in any order.
 
@@ -66,16 +67,17 @@ def run_jobs(
         scheduler: Address of a Dask scheduler, ``tcp://host:8786``; replaces ``processes``.
         attempts: How often a job is begun before it is given up. Dask itself begins a job whose worker died
             again on others, as its ``allowed-failures`` says.
+        crew: Workers that were hired before and stay for more; replaces ``processes`` and ``scheduler``.
 
     Raises:
         ConfigError: A number is not positive, or the scheduler does not answer, has no workers or went away.
         DependencyError: There is a scheduler, but Dask's ``distributed`` is not installed.
     """
-    if processes < 1 or attempts < 1:
-        raise ConfigError(f"processes and attempts: {processes} and {attempts}, want at least 1 each")
+    if attempts < 1:
+        raise ConfigError(f"attempts: {attempts}, want at least 1")
     if not jobs:
         return
-    with _crew(scheduler, min(processes, len(jobs))) as crew:
+    with hired(scheduler, min(processes, len(jobs))) if crew is None else nullcontext(crew) as crew:
         waiting, begun = deque(range(len(jobs))), Counter[int]()
         in_hand = 0
         while waiting or in_hand:
@@ -94,18 +96,29 @@ def run_jobs(
             yield index, outcome
 
 
-class _Crew(Protocol):
-    """Whoever does the work; takes no more jobs at once than its size."""
+class Crew(Protocol):
+    """Whoever does the work; takes no more jobs at once than its size. Leaving it ends the work."""
 
     def __enter__(self) -> Self: ...
     def __exit__(self, *_: object) -> None: ...
 
-    def size(self) -> int: ...
-    def begin(self, index: int, job: Job) -> None: ...
-    def next_done(self) -> tuple[int, Any]: ...
+    def size(self) -> int:
+        """Return how many jobs can be in hand at once."""
+        ...
+
+    def begin(self, index: int, job: Job) -> None:
+        """Begin a job."""
+        ...
+
+    def next_done(self) -> tuple[int, Any]:
+        """Wait for a job, and return its index and its result or Failure."""
+        ...
 
 
-def _crew(scheduler: str | None, processes: int) -> _Crew:
+def hired(scheduler: str | None, processes: int) -> Crew:
+    """Return workers for several lists of jobs, one after the other; see ``run_jobs``."""
+    if processes < 1:
+        raise ConfigError(f"processes: {processes}, want at least 1")
     if scheduler is not None:
         return _Cluster(scheduler)
     return _Processes(processes) if processes > 1 else _Here()

@@ -90,12 +90,8 @@ def test_the_bytes_are_the_same_for_one_process_two_processes_and_any_order(
     assert bytes_of(tmp_path / "shuffled") == bytes_of(merged.path)
 
 
-def test_a_dask_cluster_writes_the_same_bytes(runs, merged, tmp_path):
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
-    ) as cluster:
-        MERGE(as_built(runs), tmp_path / "map", scheduler=cluster.scheduler_address)
+def test_a_dask_cluster_writes_the_same_bytes(runs, merged, tmp_path, dask_scheduler):
+    MERGE(as_built(runs), tmp_path / "map", scheduler=dask_scheduler)
 
     assert bytes_of(tmp_path / "map") == bytes_of(merged.path)
 

@@ -115,7 +115,7 @@ def test_workers_do_not_outlive_a_parent_that_is_killed(diary, tmp_path):
 
 @pytest.mark.parametrize("wrong", [{"processes": 0}, {"attempts": 0}])
 def test_numbers_of_nothing_are_refused(diary, wrong):
-    with pytest.raises(ConfigError, match="want at least 1 each"):
+    with pytest.raises(ConfigError, match="want at least 1"):
         list(run_jobs([Work(diary, "1")], **wrong))
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mapper.errors import DataError
 from mapper.export.picture import write_merged
 from mapper.geometry import apply
-from mapper.merging.jobs import Crew
+from mapper.merging.jobs import Foreman
 from mapper.merging.merged_map import MapManifest
 from mapper.merging.placing import Placed
 from mapper.merging.steps import JoinedTile, SeenColumn, Site, save_ground, see_column
@@ -24,7 +24,7 @@ _MAX_TILT = np.cos(np.deg2rad(5.0))
 
 def look_from_above(
     site: Site,
-    crew: Crew,
+    foreman: Foreman,
     joined: Mapping[int, JoinedTile],
     manifest: MapManifest,
     placed: Sequence[Placed],
@@ -52,7 +52,7 @@ def look_from_above(
         )
         for tiles in columns.values()
     }
-    done = [seen for _, seen in crew.run("slice", jobs, SeenColumn)]
+    done = [seen for _, seen in foreman.run("slice", jobs, SeenColumn)]
     if any(item.T_map_world[2, 2] < _MAX_TILT for item in placed):
         return done, None, ["no slice: a run is tilted by more than 5°, so z is not up in the map"]
     seen = np.zeros(shape, np.uint8)

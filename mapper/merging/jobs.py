@@ -9,25 +9,23 @@ from mapper.atomic import write_text
 from mapper.config.base import Config
 from mapper.errors import RunError
 from mapper.progress import Progress
-from mapper.workers import Failure, run_jobs
+from mapper.workers import Crew, Failure, run_jobs
 
 Result = TypeVar("Result", bound=Config)
 
 
 @dataclass(frozen=True, slots=True)
-class Crew:
-    """Who does the jobs.
+class Foreman:
+    """Gives out jobs and keeps what became of them.
 
     Attributes:
         folder: Where results are kept.
-        processes: Workers on this machine; 1 is this process.
-        scheduler: Address of a Dask scheduler instead, whose workers see the same files.
+        crew: Who does the jobs.
         progress: Who watches.
     """
 
     folder: Path
-    processes: int
-    scheduler: str | None
+    crew: Crew
     progress: Progress
 
     def run(
@@ -51,9 +49,7 @@ class Crew:
             for count, name in enumerate(done, start=1):
                 report(count, len(jobs))
                 yield name, kind.model_validate_json(kept[name].read_bytes())
-            outcomes = run_jobs(
-                [jobs[name] for name in begun], processes=self.processes, scheduler=self.scheduler
-            )
+            outcomes = run_jobs([jobs[name] for name in begun], crew=self.crew)
             for count, (index, outcome) in enumerate(outcomes, start=len(done) + 1):
                 report(count, len(jobs))
                 if isinstance(outcome, Failure):

@@ -17,7 +17,7 @@ from mapper.fingerprint import fingerprint
 from mapper.geometry import apply
 from mapper.merging.assembling import write_whole_bt, write_whole_ot
 from mapper.merging.from_above import draw, look_from_above
-from mapper.merging.jobs import Crew
+from mapper.merging.jobs import Foreman
 from mapper.merging.merged_map import TILES, MapManifest, MergedMap, RunInMap, Tile, open_map
 from mapper.merging.placing import Placed, doubts
 from mapper.merging.steps import (
@@ -32,6 +32,7 @@ from mapper.merging.steps import (
 from mapper.merging.tiling import tiling_for
 from mapper.progress import SILENT, Progress
 from mapper.staging import MARK, staged
+from mapper.workers import hired
 
 DEFAULT_TILE_M = 50.0
 
@@ -104,16 +105,19 @@ def merge(
         floor_z_m=_floor_z_m(placed[0]),
         runs=tuple(_described(item) for item in placed),
     )
-    with staged(out, overwrite=overwrite, keeps=lambda partial: _begun_alike(partial, manifest)) as folder:
+    with (
+        hired(scheduler, processes) as crew,
+        staged(out, overwrite=overwrite, keeps=lambda partial: _begun_alike(partial, manifest)) as folder,
+    ):
         manifest.save(folder)
         site = Site(folder, folder / _SCRATCH, tiling, config)
-        crew = Crew(site.scratch / "done", processes, scheduler, progress)
-        split = _split(site, crew, placed)
-        joined = _join(site, crew, split, follows_ground=manifest.slice.above == "ground")
+        foreman = Foreman(site.scratch / "done", crew, progress)
+        split = _split(site, foreman, placed)
+        joined = _join(site, foreman, split, follows_ground=manifest.slice.above == "ground")
         has_colors = any(part.has_colors for part in split)
         write_whole_ot(folder / files.OCTREE_OT, site, joined, has_colors=has_colors)
         write_whole_bt(folder / files.OCTREE_BT, site, joined)
-        seen, grid, missing = look_from_above(site, crew, joined, manifest, placed)
+        seen, grid, missing = look_from_above(site, foreman, joined, manifest, placed)
         notes = [*doubts(placed), *missing]
         manifest = _completed(manifest, site, split, joined, seen, notes)
         if grid is not None:
@@ -180,7 +184,7 @@ def _begun_alike(partial: Path, manifest: MapManifest) -> bool:
         return False
 
 
-def _split(site: Site, crew: Crew, placed: Sequence[Placed]) -> list[SplitRun]:
+def _split(site: Site, foreman: Foreman, placed: Sequence[Placed]) -> list[SplitRun]:
     jobs = {
         f"{index:04d}": partial(
             split_run,
@@ -191,12 +195,12 @@ def _split(site: Site, crew: Crew, placed: Sequence[Placed]) -> list[SplitRun]:
         )
         for index, item in enumerate(placed)
     }
-    done = dict(crew.run("split", jobs, SplitRun))
+    done = dict(foreman.run("split", jobs, SplitRun))
     return [done[name] for name in jobs]
 
 
 def _join(
-    site: Site, crew: Crew, split: Sequence[SplitRun], *, follows_ground: bool
+    site: Site, foreman: Foreman, split: Sequence[SplitRun], *, follows_ground: bool
 ) -> dict[int, JoinedTile]:
     """Return what became of every tile, in Morton order."""
     tiles = sorted({tile for part in split for tile in part.part_bytes})
@@ -215,7 +219,7 @@ def _join(
     }
     tile_of = dict(zip(jobs, tiles, strict=True))
     done = {}
-    for name, joined in crew.run("join", jobs, JoinedTile):
+    for name, joined in foreman.run("join", jobs, JoinedTile):
         done[tile_of[name]] = joined
         shutil.rmtree(site.parts(tile_of[name]), ignore_errors=True)
     return {tile: done[tile] for tile in tiles}
