@@ -1,6 +1,6 @@
-"""ISVD with several settings on one log, in lockstep: each frame is read, looked at and matched once."""
+"""ISVD with several settings on one log, in lockstep: nothing is done twice that they have in common."""
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -13,7 +13,9 @@ from mapper.features.matching import Pairs
 from mapper.frames import Frame, Image
 from mapper.graph.model import PoseGraph
 from mapper.odometry.base import Track
-from mapper.odometry.isvd import IsvdObservation, IsvdOdometry, matched_pairs
+from mapper.odometry.isvd import Compare, IsvdObservation, IsvdOdometry, matched_pairs, shared_points
+from mapper.registration.base import Alignment
+from mapper.registration.isvd import Isvd
 from mapper.solving import solve
 from mapper.sources.base import FrameSource
 from mapper.tracking import Tracking, refuse_a_fragment
@@ -43,16 +45,21 @@ class Followed:
 def follow(source: FrameSource, variants: Mapping[str, BuildConfig]) -> dict[str, Followed]:
     """Return what every setting makes of a log.
 
+    Each frame is read once, each detector looks at it once, and frames are matched and registered once by
+    all that do so alike.
+
     Raises:
         ConfigError: An odometry is not ISVD.
     """
     eyes: dict[DetectorConfig, _Eyes] = {}
-    followers = {}
+    followers: dict[BuildConfig, _Follower] = {}
     for name, config in variants.items():
         if not isinstance(config.odometry, IsvdOdometryConfig):
             raise ConfigError(f"{name}: odometry.kind is {config.odometry.kind}, want isvd")
-        detector = config.odometry.detector
-        followers[name] = _Follower(config, config.odometry, eyes.setdefault(detector, _Eyes(detector)))
+        if config not in followers:
+            detector = config.odometry.detector
+            seeing = eyes.setdefault(detector, _Eyes(detector))
+            followers[config] = _Follower(config, config.odometry, seeing)
     for entry in source.entries():
         try:
             frame = entry.load(colour=False)
@@ -60,16 +67,18 @@ def follow(source: FrameSource, variants: Mapping[str, BuildConfig]) -> dict[str
             continue  # as a build does
         for follower in followers.values():
             follower.add(frame)
-    return {name: follower.followed() for name, follower in followers.items()}
+    followed = {config: follower.followed() for config, follower in followers.items()}
+    return {name: followed[config] for name, config in variants.items()}
 
 
 class _Eyes:
-    """A detector and a matcher that look at a frame once, however many odometries ask."""
+    """A detector, and what was found of its features in the newest frame, however many odometries ask."""
 
     def __init__(self, config: DetectorConfig) -> None:
         self._detector = build_detector(config)
         self._gray: Image | None = None
         self._pairs: dict[tuple[int, MatchConfig], Pairs] = {}
+        self._compared: dict[tuple[int, MatchConfig, Hashable], tuple[Alignment, float, int]] = {}
 
     @property
     def scale_factor(self) -> float:
@@ -81,10 +90,27 @@ class _Eyes:
         if gray is not self._gray:
             self._gray, self._features = gray, self._detector.detect(gray)
             self._pairs.clear()
+            self._compared.clear()
         return self._features
 
-    def match(self, target: IsvdObservation, source: IsvdObservation, match: MatchConfig) -> Pairs:
-        """Return the pairs of an earlier frame and the newest."""
+    def comparing(self, config: IsvdOdometryConfig) -> Compare:
+        """Return what compares an earlier frame and the newest as an odometry does."""
+        isvd = Isvd(config.registration)
+        how = (config.registration, config.depth_filter, config.undistort, config.max_depth_m)
+
+        def compare(
+            target: IsvdObservation, source: IsvdObservation, match: MatchConfig
+        ) -> tuple[Alignment, float, int]:
+            key = (target.stamp_ns, match, how)
+            if key not in self._compared:
+                pairs = self._match(target, source, match)
+                fitted = isvd.fit_weighted(*shared_points(target, source, pairs))
+                self._compared[key] = (*fitted, len(pairs))
+            return self._compared[key]
+
+        return compare
+
+    def _match(self, target: IsvdObservation, source: IsvdObservation, match: MatchConfig) -> Pairs:
         key = (target.stamp_ns, match)
         if key not in self._pairs:
             self._pairs[key] = matched_pairs(target, source, match)
@@ -96,7 +122,7 @@ class _Follower:
 
     def __init__(self, config: BuildConfig, odometry: IsvdOdometryConfig, eyes: _Eyes) -> None:
         self._config = config
-        self._odometry = IsvdOdometry(odometry, detector=eyes, find_pairs=eyes.match)
+        self._odometry = IsvdOdometry(odometry, detector=eyes, compare=eyes.comparing(odometry))
         self._closer = config.loops.build(config.graph.solve)
         self._graph = PoseGraph()
         self._tracks: list[Track] = []

@@ -10,7 +10,7 @@ from evaluators.papers.book import Book, Cut
 from evaluators.papers.measured import Place, cells_of, failed, measured, notes_of
 from evaluators.papers.model import PaperCell, PaperPath, PaperTable
 from evaluators.papers.sequences import slug
-from evaluators.papers.thesis_tables import Ablation, tables
+from evaluators.papers.thesis_tables import Setting, tables
 from evaluators.tables import Record
 from evaluators.trajectory import align, associate, ate
 from mapper.config import BuildConfig
@@ -22,10 +22,10 @@ from mapper.trajectory import Trajectory, read_tum, write_tum
 
 @dataclass(frozen=True, slots=True)
 class ThesisJob:
-    """One table's settings on one sequence with one seed.
+    """All settings of some tables on one sequence with one seed.
 
     Attributes:
-        table: Of ``tables()``.
+        tables: Of ``thesis_tables.tables()``; they use the same frames of the sequence.
         sequence: As the thesis calls it.
         log: Where it lies.
         seed: Of RANSAC.
@@ -33,7 +33,7 @@ class ThesisJob:
         paths: Folder for the trajectories.
     """
 
-    table: str
+    tables: tuple[str, ...]
     sequence: str
     log: Path
     seed: int
@@ -43,18 +43,20 @@ class ThesisJob:
     @property
     def name(self) -> str:
         """What is measured."""
-        return f"thesis-{self.table}-{slug(self.sequence)}"
+        return f"thesis-{slug(self.sequence)}-{'-'.join(self.tables)}"
 
     @property
     def places(self) -> list[Place]:
         """Which figures it gives."""
-        return [place for setting in self._ablation.settings for place in self._places(setting)]
+        return [place for variant in self._variants() for place in self._places(*variant)]
 
     def configs(self) -> dict[str, BuildConfig]:
         """Return the settings with the seed and the frames in use."""
-        cut = self.cut.overrides(self._ablation.sequences[self.sequence])
         return {
-            name: seeded(setting.config(*cut), self.seed) for name, setting in self._ablation.settings.items()
+            f"{table} {name}": seeded(
+                setting.config(*self.cut.overrides(tables()[table].sequences[self.sequence])), self.seed
+            )
+            for (table, name), setting in self._variants().items()
         }
 
     def __call__(self) -> list[Record]:
@@ -63,28 +65,34 @@ class ThesisJob:
         source = open_source(self.log, next(iter(configs.values())).source)
         if source.truth is None:
             raise DataError(f"{self.log}: has no ground truth, so there is no error to tell")
+        followed = follow(source, configs)
         records: list[Record] = []
-        for setting, followed in follow(source, configs).items():
-            records += self._judged(setting, followed, source.truth)
+        for table, name in self._variants():
+            records += self._judged(table, name, followed[f"{table} {name}"], source.truth)
         return records
 
-    @property
-    def _ablation(self) -> Ablation:
-        return tables()[self.table]
+    def _variants(self) -> dict[tuple[str, str], Setting]:
+        """Return the settings by table and what they are called there."""
+        return {
+            (table, name): setting
+            for table in self.tables
+            for name, setting in tables()[table].settings.items()
+        }
 
-    def _places(self, setting: str) -> list[Place]:
-        rows = self._ablation.places(self._ablation.row(self.sequence), setting)
-        return [Place(self.table, row, column) for row, column in rows]
+    def _places(self, table: str, setting: str) -> list[Place]:
+        ablation = tables()[table]
+        rows = ablation.places(ablation.row(self.sequence), setting)
+        return [Place(table, row, column) for row, column in rows]
 
-    def _judged(self, setting: str, followed: Followed, truth: Trajectory) -> list[Record]:
-        places = self._places(setting)
+    def _judged(self, table: str, setting: str, followed: Followed, truth: Trajectory) -> list[Record]:
+        places = self._places(table, setting)
         if followed.estimate is None:
             return [failed(place, followed.failure) for place in places]
         try:
-            values = self._ablation.judge(followed.estimate, truth)
+            values = tables()[table].judge(followed.estimate, truth)
         except DataError as error:
             return [failed(place, str(error)) for place in places]
-        if self._has_pictures:
+        if self._is_drawn(table):
             self._keep(setting, followed.estimate, truth)
         note = (
             f"{self.sequence}, {setting}, seed {self.seed}: "
@@ -94,9 +102,8 @@ class ThesisJob:
         )
         return [measured(place, float(value), note) for place, value in zip(places, values, strict=True)]
 
-    @property
-    def _has_pictures(self) -> bool:
-        return self.table == "5.5" and self.seed == 0
+    def _is_drawn(self, table: str) -> bool:
+        return table == "5.5" and self.seed == 0
 
     def _keep(self, setting: str, estimate: Trajectory, truth: Trajectory) -> None:
         """Write both trajectories, the estimate laid over the truth."""
@@ -112,19 +119,18 @@ class ThesisJob:
 
     def drawn(self) -> list[PaperPath]:
         """Return the trajectories that were kept."""
-        if not self._has_pictures:
-            return []
-        kept = [setting for setting in self._ablation.settings if self._path(setting).is_file()]
+        kept = [name for table, name in self._variants() if self._is_drawn(table)]
         truth = self._path("truth")
         return [
             PaperPath(
                 self.sequence,
-                setting,
-                ate(associate(read_tum(self._path(setting)), read_tum(truth))).rmse,
-                self._path(setting),
+                name,
+                ate(associate(read_tum(self._path(name)), read_tum(truth))).rmse,
+                self._path(name),
                 truth,
             )
-            for setting in kept
+            for name in kept
+            if self._path(name).is_file()
         ]
 
 
@@ -151,11 +157,13 @@ def table_of(name: str, jobs: Sequence[ThesisJob], results: Sequence[CellResult]
 def _jobs(
     names: Sequence[str], sequence: str, log: Path, seed: int, cut: Cut, paths: Path
 ) -> Sequence[ThesisJob]:
-    return [
-        ThesisJob(name, sequence, log, seed, cut, paths)
-        for name in names
-        if sequence in tables()[name].sequences
-    ]
+    """Return one job for all tables that use the same frames and share most of the work."""
+    alike: dict[tuple[int | None, bool], list[str]] = {}
+    for name in names:
+        ablation = tables()[name]
+        if sequence in ablation.sequences:
+            alike.setdefault((ablation.sequences[sequence], ablation.alone), []).append(name)
+    return [ThesisJob(tuple(group), sequence, log, seed, cut, paths) for group in alike.values()]
 
 
 BOOK = Book(

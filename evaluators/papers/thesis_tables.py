@@ -52,6 +52,7 @@ class Ablation:
         places: Where figures belong.
         judge: How they are worked out.
         axis: What the settings count.
+        alone: It shares too little work with the others to be measured with them.
         own: The thesis's figures of a log that nobody else has.
         notes: What a reader has to know.
     """
@@ -67,6 +68,7 @@ class Ablation:
     places: Places = lambda row, setting: [(row, setting)]
     judge: Judge = lambda estimate, truth: [ate_rmse_m(estimate, truth)]
     axis: str = ""
+    alone: bool = False
     own: Figures = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
@@ -206,5 +208,6 @@ def _detectors(test_logs: Figures) -> Ablation:
         sequences={POZNAN: 300, **dict.fromkeys(test_logs)},
         settings={name: Setting("ISVD", overrides) for name, overrides in detectors.items()},
         judge=lambda estimate, truth: [rpe(associate(estimate, truth)).translation_m.rmse],
+        alone=True,
         notes=("The thesis draws Poznań's trajectory1: ORB is the worst, SURF with MP 4 and 8 the best.",),
     )

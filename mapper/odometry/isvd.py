@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -43,7 +44,8 @@ class IsvdObservation:
     T_body_camera: Transform
 
 
-FindPairs = Callable[[IsvdObservation, IsvdObservation, MatchConfig], Pairs]
+Compare = Callable[[IsvdObservation, IsvdObservation, MatchConfig], tuple[Alignment, float, int]]
+"""What ``compared`` does, by an ISVD of its own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,7 +89,7 @@ class IsvdOdometry:
         config: IsvdOdometryConfig,
         *,
         detector: Detector | None = None,
-        find_pairs: FindPairs | None = None,
+        compare: Compare | None = None,
     ) -> None:
         """Start before the first frame.
 
@@ -95,12 +97,11 @@ class IsvdOdometry:
             config: Every knob.
             detector: Stands in for the configured one, so that odometries that look at the same frames
                 need not detect again.
-            find_pairs: Stands in for ``matched_pairs``, so that they need not match again.
+            compare: Stands in for ``compared``, so that those that register alike need not register again.
         """
         self._config = config
         self._detector = detector or build_detector(config.detector)
-        self._find_pairs = find_pairs or matched_pairs
-        self._isvd = Isvd(config.registration)
+        self._compare = compare or partial(compared, Isvd(config.registration))
         self._recent: deque[Placed] = deque(maxlen=max(config.previous_frames, config.keyframe_interval))
         self._keyframes: list[Placed] = []
         self._sharpest = SharpestKeyframes(config.keyframe_interval)
@@ -179,13 +180,10 @@ class IsvdOdometry:
         """Return the registrations that succeeded, in the order of the earlier frames."""
         candidates = []
         for placed in earlier:
-            pairs = self._find_pairs(placed.observation, observation, match)
-            alignment, weight = self._isvd.fit_weighted(
-                *shared_points(placed.observation, observation, pairs)
-            )
+            alignment, weight, matches = self._compare(placed.observation, observation, match)
             if alignment.converged:
                 T_world_body = placed.T_world_body @ alignment.T_target_source
-                candidates.append(Candidate(placed, alignment, weight, len(pairs), T_world_body))
+                candidates.append(Candidate(placed, alignment, weight, matches, T_world_body))
         return candidates
 
     def _combine(self, candidates: Sequence[Candidate]) -> Transform:
@@ -259,6 +257,14 @@ class IsvdOdometry:
             factors=factors,
             links=factors,
         )
+
+
+def compared(
+    isvd: Isvd, target: IsvdObservation, source: IsvdObservation, match: MatchConfig
+) -> tuple[Alignment, float, int]:
+    """Return the source's motion to the target, its quality W (eq. 4.1), and how many features matched."""
+    pairs = matched_pairs(target, source, match)
+    return *isvd.fit_weighted(*shared_points(target, source, pairs)), len(pairs)
 
 
 def matched_pairs(target: IsvdObservation, source: IsvdObservation, match: MatchConfig) -> Pairs:
