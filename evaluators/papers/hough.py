@@ -141,10 +141,15 @@ def hough_cells(logs: Path, *, seeds: int, pictures: Path) -> list[Cell]:
         for method in METHODS:
             for seed in range(seeds):
                 name = f"{pair.name}, {pair.sensor}, {method}"
-                picture = pictures.resolve() / f"{file_name(name)}.png" if seed == 0 else None
+                picture = picture_of(pictures.resolve(), name) if seed == 0 else None
                 trial = HoughTrial(pair, method, seed, picture)
                 cells.append(Cell(_key(trial, identity), f"{name}, seed {seed}", trial))
     return cells
+
+
+def picture_of(pictures: Path, name: str) -> Path:
+    """Return the file that shows a pair and a method, called by pair, sensor and method."""
+    return pictures / f"{file_name(name)}.png"
 
 
 def _key(trial: HoughTrial, identity: str) -> str:

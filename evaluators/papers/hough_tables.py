@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import mean, median
 
 from evaluators.cells import CellResult
-from evaluators.papers.hough import DISTANCES, METHODS, OFFSET_M
+from evaluators.papers.hough import DISTANCES, METHODS, OFFSET_M, picture_of
 from evaluators.papers.hough_pairs import ALL_RINGS, FEW_RINGS, MAP_VOXEL_M
 from evaluators.papers.model import PaperCell, PaperTable, Reproduction
 from evaluators.papers.published import published
@@ -64,7 +64,11 @@ def hough_reproduction(results: Sequence[CellResult], *, pictures: Path) -> Repr
             "time: CPU time of the whole registration on this machine, the map's preparation included",
             *(f"failed: {result.label}: {result.failure}" for result in results if result.failure),
         ),
-        pictures=tuple(sorted(pictures.glob("*.png"))),
+        pictures=tuple(
+            path
+            for group in _grouped(trials, "pair", "sensor", "method")
+            if (path := picture_of(pictures, ", ".join(map(str, group)))).is_file()
+        ),
     )
 
 
