@@ -1,6 +1,6 @@
 """A line-laser sensor's images against labels: every method's stripe, and the ranges."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from evaluators.line_laser import (
 from evaluators.tables import Column, Record, csv_text, text_table
 from mapper.atomic import write_text
 from mapper.config.line_laser import StripeConfig
-from mapper.errors import DataError, SourceError
+from mapper.errors import SourceError
 from mapper.geometry import Array
 from mapper.sensing.line_laser.detection import Method
 from mapper.sensing.line_laser.ranging import LineScan
@@ -75,15 +75,9 @@ def judge(
         config: How a stripe is found.
 
     Raises:
-        DataError: No image has labels.
-        SourceError: An image can no longer be read.
+        FrameError: An image can no longer be read.
     """
     labelled = {path: scan for path, scan in scans.items() if path.name in labels}
-    if not labelled:
-        raise DataError(
-            f"labels are of {next(iter(labels))} and others, images are {next(iter(scans)).name} and others: "
-            "none has labels; do the names agree?"
-        )
     counts = summed(count_all(read_colour(path), labels[path.name][0], config) for path in labelled)
     true_m = np.concatenate([labels[path.name][1][scan.columns] for path, scan in labelled.items()])
     found_m = np.concatenate([scan.points_sensor[:, 0] for scan in labelled.values()])
@@ -114,15 +108,16 @@ def range_records(true_m: Array, found_m: Array) -> list[Record]:
     return records
 
 
-def read_labels(path: Path, *, width_px: int) -> dict[str, tuple[Array, Array]]:
+def read_labels(path: Path, *, images: Sequence[Path], width_px: int) -> dict[str, tuple[Array, Array]]:
     """Return (W,) true rows and (W,) true ranges, NaN where there is no stripe, by the name of the image.
 
     Args:
         path: Lines ``image,column,row_px,range_m``; an image without a stripe has none.
+        images: Of which one at least has to have labels.
         width_px: W.
 
     Raises:
-        SourceError: The file is missing or malformed.
+        SourceError: The file is missing or malformed, or tells of other images.
     """
     labels: dict[str, tuple[Array, Array]] = {}
     for number, words in rows(path, separator=","):
@@ -140,4 +135,9 @@ def read_labels(path: Path, *, width_px: int) -> dict[str, tuple[Array, Array]]:
         true_rows[int(column)], ranges_m[int(column)] = row_px, range_m
     if not labels:
         raise SourceError(f"{path}: no labels; want lines of image,column,row_px,range_m")
+    if labels.keys().isdisjoint(image.name for image in images):
+        raise SourceError(
+            f"{path}: of {next(iter(labels))} and others, but images are {images[0].name} and others: "
+            "none has labels; do the names agree?"
+        )
     return labels

@@ -64,6 +64,7 @@ STUDY_COLUMNS = (
     Column("f_score_low", "lowest F %", percent),
     Column("f_score_high", "highest F %", percent),
     Column("pixel_f_score", "pixels' F %", percent),
+    Column("best_in_seeds", "best in seeds"),
 )
 TABLE_COLUMNS = (
     Column("range_m", "true m", "{:.2f}".format),
@@ -99,12 +100,14 @@ def study(config: LineLaserConfig, seeds: Sequence[int], *, progress: Progress =
 
 
 def detections(study: Study) -> list[Record]:
-    """Return one record for each scene and method: medians over the seeds, and the spread of F."""
-    return [
-        {"scene": name, "method": method, **_spread([seed[method] for seed in seeds])}
-        for name, seeds in study.found.items()
-        for method in METHODS
-    ]
+    """Return one record for each scene and method: medians and spread over the seeds."""
+    records: list[Record] = []
+    for name, seeds in study.found.items():
+        best = [max(METHODS, key=lambda method: seed[method].columns[2]) for seed in seeds]
+        for method in METHODS:
+            spread = _spread([seed[method] for seed in seeds])
+            records.append({"scene": name, "method": method, **spread, "best_in_seeds": best.count(method)})
+    return records
 
 
 def table_2_1(study: Study) -> list[Record]:

@@ -53,20 +53,24 @@ def line_laser(
     from mapper.config.line_laser import THESIS, LineLaserCalibration, LineLaserConfig
     from mapper.export.line_laser_files import write_drive, write_scans
     from mapper.sensing.line_laser.files import find_images
-    from mapper.sensing.line_laser.survey import drive, scan_images
+    from mapper.sensing.line_laser.survey import drive, scan_images, sensor_poses
     from mapper.staging import staged
 
     prepare_libraries()
     progress = progress_for(quiet=quiet)
     config = overridden(LineLaserConfig(), set_ or [])
     known = read_config(calibration, LineLaserCalibration) if calibration else THESIS
-    truth = read_labels(labels, width_px=known.width_px) if labels else {}
     paths, stamps_ns, notes = find_images(images, times=times, rate_hz=config.rate_hz)
+    truth = read_labels(labels, images=paths, width_px=known.width_px) if labels else {}
+    T_world_sensor = None
+    if wheels is not None:
+        T_world_sensor, told = sensor_poses(wheels, known)
+        notes += told
     with staged(out, overwrite=overwrite) as folder:
         scans, more = scan_images(paths, stamps_ns, known, config, progress=progress)
         notes += more
-        if wheels is not None:
-            driven = drive(list(scans.values()), wheels, known, config, progress=progress)
+        if T_world_sensor is not None:
+            driven = drive(list(scans.values()), T_world_sensor, config.map, progress=progress)
             notes += driven.notes
             write_drive(folder, driven, title=out.resolve().name)
         write_scans(folder, scans, calibration=known, config=config, notes=notes)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mapper.config.line_laser import LineLaserCalibration, LineLaserConfig
+from mapper.config.line_laser import LineLaserCalibration, LineLaserConfig, LineLaserMapConfig
 from mapper.config.sources import WheelsConfig
 from mapper.errors import DataError, FrameError, SourceError
 from mapper.octree.slice import OccupancyGrid
@@ -27,9 +27,9 @@ class Drive:
 
     Attributes:
         scans: Those whose place is known.
-        trajectory: T_world_sensor of each; the world is where the wheels begin.
+        trajectory: T_world_sensor of each.
         grid: The map.
-        notes: What was left out or assumed.
+        notes: What was left out.
     """
 
     scans: Sequence[LineScan]
@@ -79,11 +79,27 @@ def scan_images(
     return scans, notes
 
 
+def sensor_poses(wheels: Path, calibration: LineLaserCalibration) -> tuple[Trajectory, list[str]]:
+    """Return T_world_sensor as wheels tell it, and notes; the world is where the rear axle begins.
+
+    Args:
+        wheels: ``encoders.txt`` or ``wheels.txt``, or a file of either kind.
+        calibration: Tells what carries the sensor.
+
+    Raises:
+        SourceError: The file is malformed, or the wheelbase is needed and unknown.
+    """
+    vehicle = calibration.vehicle
+    mounted = WheelsConfig(
+        wheelbase_m=vehicle.wheelbase_m, body_in_base=(vehicle.sensor_x_m, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    )
+    return read_wheels_file(wheels, mounted, sensor="lidar")
+
+
 def drive(
     scans: Sequence[LineScan],
-    wheels: Path,
-    calibration: LineLaserCalibration,
-    config: LineLaserConfig,
+    T_world_sensor: Trajectory,
+    config: LineLaserMapConfig,
     *,
     progress: Progress = SILENT,
 ) -> Drive:
@@ -91,32 +107,24 @@ def drive(
 
     Args:
         scans: In time order.
-        wheels: ``encoders.txt`` or ``wheels.txt``, or a file of either kind.
-        calibration: Tells what carries the sensor.
+        T_world_sensor: As wheels tell.
         config: Of the map.
         progress: Told of every scan.
 
     Raises:
-        SourceError: The file is malformed, or the wheelbase is needed and unknown.
         DataError: No image was taken while the wheels were read, or none shows a stripe.
     """
-    vehicle = calibration.vehicle
-    mounted = WheelsConfig(
-        wheelbase_m=vehicle.wheelbase_m, body_in_base=(vehicle.sensor_x_m, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    )
-    T_world_sensor, notes = read_wheels_file(wheels, mounted, sensor="lidar")
-    gap_ns = int(config.map.max_wheel_gap_s * NS_PER_S)
+    gap_ns = int(config.max_wheel_gap_s * NS_PER_S)
     placed = [(scan, pose_at(T_world_sensor, scan.stamp_ns, max_gap_ns=gap_ns)) for scan in scans]
     known = [(scan, T) for scan, T in placed if T is not None]
     if not known:
         raise DataError(
-            f"{wheels}: no image was taken between two of its readings; images begin at "
+            "wheels: no image was taken between two of their readings; images begin at "
             f"{seconds_text_from_ns(scans[0].stamp_ns)} s, readings at "
             f"{seconds_text_from_ns(int(T_world_sensor.stamps_ns[0]))} s: are they of one clock?"
         )
-    if len(known) < len(scans):
-        notes = [*notes, f"{wheels.name}: tells no place of {len(scans) - len(known)} images; not in the map"]
+    lost = len(scans) - len(known)
+    notes = [f"wheels tell no place of {lost} images; these are not in the map"] if lost else []
     trajectory = trajectory_from((scan.stamp_ns, T) for scan, T in known)
     kept = [scan for scan, _ in known]
-    grid = map_scans(kept, trajectory.T_world_body, config.map, progress=progress)
-    return Drive(kept, trajectory, grid, notes)
+    return Drive(kept, trajectory, map_scans(kept, trajectory.T_world_body, config, progress=progress), notes)

@@ -24,7 +24,7 @@ BOARD_M = 0.4
 _BOARD_STEP_M = 0.2  # as the thesis calibrated: every 20 cm nearer
 _NEAREST_M = 0.5
 _START_NS = 1_000 * NS_PER_S
-_READING_NS, _FINE_NS = 50_000_000, 5_000_000
+_READING_NS, _FINE_NS = 50_000_000, 20_000_000
 _WORKERS = 2
 
 
