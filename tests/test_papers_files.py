@@ -181,3 +181,14 @@ def test_the_same_figures_give_the_same_bytes(reproduction, written):
     write_reproduction(written, reproduction)
 
     assert {path.name: path.read_bytes() for path in written.iterdir() if path.is_file()} == once
+
+
+def test_small_figures_beside_large_ones_keep_their_digits():
+    sizes = PaperTable(
+        "Table 5", "sizes", "a paper", "file size", "MB",
+        (PaperCell("fr1/xyz", "cloud", 7.7, (0.4,)), PaperCell("fr1/xyz", "octree", 0.216, (0.0213,))),
+    )  # fmt: skip
+
+    columns, records = compared(sizes)
+
+    assert [row[3] for row in shown_cells(columns, records)] == ["0.4", "0.021"]

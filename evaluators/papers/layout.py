@@ -116,13 +116,12 @@ def file_name(name: str) -> str:
 
 
 def _decimals(table: PaperTable) -> dict[str, int]:
-    """Return how many decimals the figures of each column have: all alike, or each column by itself."""
-    columns = list(dict.fromkeys(cell.column for cell in table.cells))
-    if table.unit:
-        return dict.fromkeys(columns, _usual_decimals(table.cells))
-    return {
-        column: _usual_decimals([cell for cell in table.cells if cell.column == column]) for column in columns
-    }
+    """Return how many decimals each column has: as usual in it, or in a table that has one unit."""
+    of_column: dict[str, list[PaperCell]] = {}
+    for cell in table.cells:
+        of_column.setdefault(cell.column, []).append(cell)
+    least = _usual_decimals(table.cells) if table.unit else 0
+    return {column: max(_usual_decimals(cells), least) for column, cells in of_column.items()}
 
 
 def _usual_decimals(cells: Sequence[PaperCell]) -> int:
@@ -139,10 +138,11 @@ def _own_decimals(figure: float) -> int:
 
 
 def _figures(cell: PaperCell, decimals: int) -> dict[str, str | None]:
-    """Return what is shown of a cell; a printed figure keeps all its digits."""
+    """Return what is shown of a cell; a printed figure keeps all its digits, and ours has as many."""
     printed = None
     if cell.published is not None:
-        printed = f"{cell.published:.{max(decimals, _own_decimals(cell.published))}f}"
+        decimals = max(decimals, _own_decimals(cell.published))
+        printed = f"{cell.published:.{decimals}f}"
     lowest = highest = spread = None
     if len(cell.ours) > 1:
         lowest, highest = f"{cell.low:.{decimals}f}", f"{cell.high:.{decimals}f}"

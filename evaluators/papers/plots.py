@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evaluators.odometry_scores import position_errors_m
-from evaluators.papers.layout import compares, file_name, headline
+from evaluators.papers.layout import compares, file_name
 from evaluators.papers.model import PaperCell, PaperPath, PaperTable, Reproduction
 from evaluators.trajectory import associate
 from mapper.export.errors_picture import add_color_bar, draw_path
@@ -45,7 +45,9 @@ def write_plots(folder: Path, reproduction: Reproduction) -> dict[str, Path]:
         The files, by the table that they show or by what they are.
     """
     drawn: dict[str, Path] = {}
-    for table in filter(compares, reproduction.tables):
+    for table in reproduction.tables:
+        if not compares(table) or not _by_row(table):
+            continue
         path = folder / f"{file_name(table.name)}.png"
         if table.axis:
             _write_curves(path, table)
@@ -68,7 +70,7 @@ def write_plots(folder: Path, reproduction: Reproduction) -> dict[str, Path]:
 def _write_curves(path: Path, table: PaperTable) -> None:
     """Draw each row's figures over what the columns count; a column without a number is a level."""
     rows = _by_row(table)
-    figure, across, down = _page(headline(table), len(rows))
+    figure, across, down = _page(_title(table), len(rows))
     for number, (row, cells) in enumerate(rows.items()):
         axes = panel(figure, number, columns=across, rows=down)
         printed = {cell.column: [cell.published] for cell in cells if cell.published is not None}
@@ -100,13 +102,14 @@ def _write_boxes(path: Path, table: PaperTable) -> None:
     """Draw each row's figures over the seeds, a box for each column, with the printed one as a mark."""
     rows = _by_row(table)
     most = max(len(cells) for cells in rows.values())
-    title = f"{headline(table)}; boxes over our seeds"
-    figure, across, down = _page(title, len(rows), height_in=0.9 + _BOX_IN * most)
+    figure, across, down = _page(_title(table), len(rows), height_in=0.9 + _BOX_IN * most)
     left_in = _label_in(_columns(table))
     for number, (row, cells) in enumerate(rows.items()):
         axes = panel(figure, number, columns=across, rows=down, left_in=left_in)
         printed = {k: cell.published for k, cell in enumerate(cells, 1) if cell.published is not None}
         axes.plot(list(printed.values()), list(printed), "D", color=hex_of(TRUTH), zorder=3, label="printed")
+        ours = [(figure, k) for k, cell in enumerate(cells, 1) for figure in cell.ours]
+        axes.plot(*zip(*ours, strict=True), "o", color=INK, markersize=4, zorder=3, label="ours, each seed")
         draw_boxes(axes, {cell.column: np.array(cell.ours) for cell in cells})
         axes.set_xscale("linear")
         axes.set_xlim(left=0.0)
@@ -167,6 +170,11 @@ def _page(title: str, panels: int, *, height_in: float = _HEIGHT_IN) -> tuple["F
     across = min(_COLUMNS, panels)
     down = -(-panels // across)
     return page(title, columns=across, rows=down, width_in=_WIDTH_IN, height_in=height_in), across, down
+
+
+def _title(table: PaperTable) -> str:
+    """Return what fits above a single panel."""
+    return f"{table.name}: {table.metric}, {table.unit}"
 
 
 def _label_in(labels: Sequence[str]) -> float:
