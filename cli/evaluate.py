@@ -1,4 +1,4 @@
-"""``mapper eval``: how far a trajectory is from the truth."""
+"""``mapper eval``: how far a trajectory is from the truth, and what a map is worth."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -6,12 +6,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cli.console import progress_for
+from cli.environment import prepare_libraries
+
 if TYPE_CHECKING:
     from evaluators.evaluate import Judged
+    from evaluators.map_quality import MapQuality
     from evaluators.metric import Metric
     from mapper.run import Run
     from mapper.timebase import Stamps
     from mapper.trajectory import Trajectory
+
+_TOLERANCE = 1
 
 
 class Align(StrEnum):
@@ -21,6 +27,13 @@ class Align(StrEnum):
     YAW = "yaw"
     SE3 = "se3"
     SIM3 = "sim3"
+
+
+class World(StrEnum):
+    """In which world a map's reference lies."""
+
+    TRUTH = "truth"
+    MAP = "map"
 
 
 class Format(StrEnum):
@@ -43,7 +56,10 @@ def evaluate(
         Path | None, typer.Option(help="Seconds, one a line, of poses in KITTI text; else they pair by line.")
     ] = None,
     log: Annotated[
-        Path | None, typer.Option(help="Log of a bare trajectory, to tell which of its frames have a pose.")
+        Path | None,
+        typer.Option(
+            help="Log of a bare trajectory, to tell which frames have a pose; with --sharpness, a moved one."
+        ),
     ] = None,
     align: Annotated[
         Align, typer.Option(help="How the estimate is laid over the truth; yaw is for worlds with z up.")
@@ -52,6 +68,29 @@ def evaluate(
         str | None,
         typer.Option(metavar="M,M…", help="Lengths of the relative errors' segments; omit to suit the path."),
     ] = None,
+    map_: Annotated[
+        Path | None,
+        typer.Option(
+            "--map",
+            metavar="REFERENCE",
+            help="Hold the run's map against a cloud, an octree, another run or a synthetic log.",
+        ),
+    ] = None,
+    map_world: Annotated[
+        World | None,
+        typer.Option(
+            help="World that REFERENCE lies in; omit for truth with synthetic logs, map with others."
+        ),
+    ] = None,
+    register: Annotated[
+        bool, typer.Option("--register", help="Register REFERENCE to the run's cloud before it is compared.")
+    ] = False,
+    tolerance: Annotated[
+        int, typer.Option(metavar="VOXELS", min=0, help="How far surfaces of the two maps may be apart.")
+    ] = _TOLERANCE,
+    sharpness: Annotated[
+        bool, typer.Option("--sharpness", help="Tell how thick walls are where the log's scans overlap.")
+    ] = False,
     plot: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder to draw the errors into.")] = None,
     format_: Annotated[
         Format,
@@ -59,28 +98,47 @@ def evaluate(
     ] = Format.TEXT,
     json: Annotated[bool, typer.Option("--json", help="Short for --format json.")] = False,
 ) -> None:
-    """Print ATE, RPE and relative errors as the benchmarks define them, coverage, and which loops are right.
+    """Print ATE, RPE, relative errors and coverage of a path, which loops are right, and what a map is worth.
 
-    Example: mapper eval runs/xyz --align yaw --plot plots, or: mapper eval 00.txt --truth poses/00.txt
+    Example: mapper eval runs/xyz --align yaw --plot plots, or: mapper eval 00.txt --truth poses/00.txt, or:
+    mapper eval runs/flat --map logs/flat --sharpness
     """
     from evaluators.evaluate import ALIGNED, judged
+    from mapper.errors import DataError
 
+    prepare_libraries()
     run, trajectory, known = _loaded(estimate, truth, times)
     found = judged(
         trajectory,
         known,
         alignment=align.value,
-        frames_ns=_frames_ns(run, log),
+        frames_ns=_frames_ns(run, log, used=sharpness),
         lengths_m=None if lengths is None else _numbers(lengths),
         names=(str(estimate), str(truth) if truth else "its truth"),
     )
     metrics = list(found.metrics)
     if run is not None and known is not None:
         metrics += _loops_of(run, known)
+    name = estimate.resolve().name
+    held = None
+    if map_ is not None:
+        held = _held_against(
+            _needed(run, estimate, "--map"), map_, world=map_world, register=register, tolerance=tolerance
+        )
+        metrics += held.metrics
+    elif map_world or register or tolerance != _TOLERANCE:
+        raise DataError(
+            "--map-world, --register and --tolerance tell how to compare with --map, which is missing"
+        )
+    if sharpness:
+        metrics += _sharpness_of(_needed(run, estimate, "--sharpness"), log)
     if plot is not None:
-        from evaluators.plots import write_trajectory_errors
+        from evaluators.plots import write_map_errors, write_trajectory_errors
 
-        write_trajectory_errors(plot, found, title=f"{estimate.resolve().name}, {ALIGNED[align.value]}")
+        if held is None or found.matched is not None:
+            write_trajectory_errors(plot, found, title=f"{name}, {ALIGNED[align.value]}")
+        if held is not None and map_ is not None:
+            write_map_errors(plot, held.verdict, title=f"{name} against {map_.resolve().name}")
     print(_text(metrics, found, Format.JSON if json else format_))
 
 
@@ -103,7 +161,36 @@ def _loaded(
     return run, run.trajectory(), known or run.truth()
 
 
-def _frames_ns(run: "Run | None", log: Path | None) -> "Stamps | None":
+def _needed(run: "Run | None", path: Path, option: str) -> "Run":
+    from mapper.errors import DataError
+
+    if run is None:
+        raise DataError(f"{path}: a bare trajectory has no map; {option} wants a run folder")
+    return run
+
+
+def _held_against(
+    run: "Run", path: Path, *, world: World | None, register: bool, tolerance: int
+) -> "MapQuality":
+    from evaluators.map_quality import map_quality
+    from evaluators.map_reference import read_reference
+
+    reference = read_reference(path, voxel_m=run.config.octree.resolution_m)
+    return map_quality(
+        run, reference, world=world.value if world else None, voxels=tolerance, register=register
+    )
+
+
+def _sharpness_of(run: "Run", log: Path | None) -> "list[Metric]":
+    from evaluators.sharpness import RADIUS_M, sharpness_metrics, views_of
+    from mapper.run import moved_log, open_log
+
+    source = open_log(run if log is None else moved_log(run, log))
+    views = views_of(source, run.trajectory(), progress=progress_for(quiet=False))
+    return sharpness_metrics(views, radius_m=RADIUS_M[source.sensor])
+
+
+def _frames_ns(run: "Run | None", log: Path | None, *, used: bool) -> "Stamps | None":
     import numpy as np
 
     from mapper.config import load_source_config
@@ -111,7 +198,7 @@ def _frames_ns(run: "Run | None", log: Path | None) -> "Stamps | None":
     from mapper.sources import open_source
 
     if run is not None:
-        if log is not None:
+        if log is not None and not used:
             raise DataError(f"{log}: --log is for bare trajectories; {run.path} knows the frames of its log")
         return np.array([record.stamp_ns for record in run.records()], dtype=np.int64)
     if log is None:

@@ -5,12 +5,14 @@ from pathlib import Path
 import numpy as np
 
 from evaluators.evaluate import Judged, have_clock
+from evaluators.occupancy import Verdict
 from evaluators.odometry_scores import position_errors_m, rotation_errors_rad
 from mapper.errors import DataError
+from mapper.export.agreement_picture import write_agreement
 from mapper.export.errors_picture import write_errors
 from mapper.timebase import NS_PER_S
 
-TRAJECTORY = "trajectory.png"
+TRAJECTORY, MAP = "trajectory.png", "map.png"
 
 
 def write_trajectory_errors(folder: Path, found: Judged, *, title: str) -> Path:
@@ -44,6 +46,25 @@ def write_trajectory_errors(folder: Path, found: Judged, *, title: str) -> Path:
             if len(length)
         },
         title=title,
+    )
+    return picture
+
+
+def write_map_errors(folder: Path, verdict: Verdict, *, title: str) -> Path:
+    """Draw where a map and its reference agree, and where not; return the picture.
+
+    Args:
+        folder: Gets ``map.png``; made if it is not there.
+        verdict: Of the map.
+        title: Headline.
+
+    Raises:
+        DataError: The folder cannot be made.
+    """
+    picture = _made(folder) / MAP
+    agreed, extra, missing = verdict.centres_world
+    write_agreement(
+        picture, agreed=agreed, extra=extra, missing=missing, edge_m=verdict.resolution_m, title=title
     )
     return picture
 

@@ -1,4 +1,6 @@
+import csv
 import inspect
+import io
 import json
 import shutil
 import subprocess
@@ -136,6 +138,11 @@ def test_spelled_out_overrides_win(desk_log, tmp_path):
         (["export", "RUN", "--as", "ply", "--out", "a.obj"], "mapper: a.obj: ply files end with .ply"),
         (["export", "RUN", "--as", "tum", "--set", "a.b=1"], "mapper: overrides: a: Extra inputs"),
         (["eval", "nowhere"], "mapper: nowhere: no such run folder"),
+        (["eval", "RUN", "--map", "nowhere"], "mapper: nowhere: no such reference for a map"),
+        (["eval", "RUN", "--tolerance", "2"], "mapper: --map-world, --register and --tolerance tell how"),
+        (["eval", "RUN", "--lengths", "1;2"], "mapper: --lengths 1;2: want metres with commas"),
+        (["eval", "RUN", "--log", "nowhere"], "mapper: nowhere: --log is for bare trajectories"),
+        (["eval", "RUN", "--times", "nowhere"], "mapper: nowhere: --times is for poses in KITTI text"),
         (["eval", "RUN", "--truth", "nowhere"], "mapper: nowhere: cannot be read"),
         (["convert", "nowhere", "--out", "log", "--as", "tum"], "mapper: nowhere: no such file or folder"),
         (["synth", "log", "--rooms", "5"], "mapper: overrides: rooms: Input should be a multiple of 2"),
@@ -219,6 +226,38 @@ def test_eval_states_the_alignment_and_agrees_with_the_library(run_folder, desk_
     assert "ATE RMSE, Sim(3)-aligned" in mapper("eval", run_folder, "--align", "sim3").stdout
     assert "ATE RMSE, not aligned" in mapper("eval", run_folder, "--align", "none").stdout
     assert "ATE" not in mapper("eval", estimate).stdout
+
+
+def test_eval_holds_the_map_against_the_world_of_a_synthetic_log(run_folder, desk_log, tmp_path):
+    plots = tmp_path / "plots"
+    printed = mapper("eval", run_folder, "--map", desk_log, "--sharpness", "--plot", plots, "--format", "csv")
+    values = {row["name"]: float(row["value"]) for row in csv.DictReader(io.StringIO(printed.stdout))}
+    assert values["occupied F-score, within 1 voxel"] > 0.9
+    assert 0.0 < values["wall thickness median, radius 0.2 m"] < 0.1
+    assert sorted(path.name for path in plots.iterdir()) == ["map.png", "trajectory.png"]
+
+    of_itself = mapper(
+        "eval", run_folder, "--map", run_folder, "--tolerance", 0, "--format", "markdown"
+    ).stdout
+    assert "| occupied F-score, within 0 voxels | 1 | ratio |" in of_itself
+    lost = json.loads(mapper("eval", run_folder, "--map", desk_log, "--map-world", "map", "--json").stdout)
+    scores = {row["name"]: row["value"] for row in lost}
+    assert scores["occupied F-score, within 1 voxel"] < 0.7
+
+
+def test_eval_reads_kitti_text_with_and_without_times(run_folder, tmp_path):
+    poses, times = tmp_path / "poses.txt", tmp_path / "times.txt"
+    mapper("export", run_folder, "--as", "kitti", "--out", poses)
+    times.write_text(
+        "\n".join((run_folder / "trajectory.tum").read_text().split("\n")[1:])
+    )
+    by_line = json.loads(mapper("eval", poses, "--truth", poses, "--json").stdout)
+    by_time = json.loads(
+        mapper("eval", poses, "--truth", run_folder / "truth.tum", "--times", times, "--json").stdout
+    )
+    of_run = json.loads(mapper("eval", run_folder, "--json").stdout)
+    assert by_line[1]["value"] < 1e-9
+    assert by_time[1] == pytest.approx(of_run[1])
 
 
 def test_eval_has_the_library_s_default():
