@@ -38,6 +38,22 @@ def lit(*stripes, image=GREY):
     return painted
 
 
+@pytest.mark.parametrize(
+    ("rgb", "between_deg", "kept"),
+    [
+        ((200, 20, 20), (355.0, 10.0), 200),
+        ((200, 20, 50), (355.0, 10.0), 0),  # 350°
+        ((200, 60, 20), (355.0, 10.0), 0),  # 13°
+        ((200, 190, 190), (355.0, 10.0), 0),  # of hardly any hue
+        ((20, 200, 20), (100.0, 140.0), 200),
+        ((200, 20, 20), (100.0, 140.0), 0),
+    ],
+)
+def test_hue_keeps_a_part_of_the_circle(rgb, between_deg, kept):
+    image = np.array([[rgb]], np.uint8)
+    assert detection.hue(image, from_deg=between_deg[0], to_deg=between_deg[1], saturation=64) == kept
+
+
 def test_intensity_keeps_what_reaches_the_threshold():
     red = np.array([[0, 249, 250, 255]], np.uint8)
     assert detection.intensity(red, threshold=250).tolist() == [[0, 0, 250, 255]]

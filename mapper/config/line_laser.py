@@ -72,9 +72,17 @@ THESIS = LineLaserCalibration(
 """The sensor of the thesis, eq. 2.44 and 2.45, and the farthest point it could measure."""
 
 
+Degrees = Annotated[float, Field(ge=0.0, lt=360.0)]
+
+
 class StripeConfig(Config):
     """When a pixel shows the stripe."""
 
+    hue_from_deg: Degrees = 355.0
+    hue_to_deg: Degrees = 10.0
+    """The hues of the laser (figure 2.2); they may pass through 0."""
+    saturation_threshold: Level = 64
+    """Of what has a hue worth the name; the thesis gives none."""
     intensity_threshold: Level = 250
     """Of the red channel (eq. 2.39; figure 2.3)."""
     weight_threshold: Level = 40

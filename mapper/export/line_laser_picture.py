@@ -17,9 +17,10 @@ from mapper.sensing.line_laser.detection import Method, responses, stripe_rows
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_PANEL_IN = 4.2
+_PANEL_IN, _COLUMNS = 3.5, 4
 _CAPTION_IN, _HEAD_IN = 0.3, 0.4
 _TITLES: Mapping[Method, str] = {
+    "hue": "hue (figure 2.2)",
     "intensity": "intensity (2.39)",
     "weight": "2R − G − B (2.41)",
     "union": "maximum of both (2.42)",
@@ -44,7 +45,7 @@ def write_detections(
     rows = {method: stripe_rows(response, join_px=config.join_px) for method, response in kept.items()}
     height_in = _PANEL_IN * image.shape[0] / image.shape[1]
     page_in = 2 * (height_in + _CAPTION_IN) + _HEAD_IN
-    figure = new_figure(3 * _PANEL_IN, page_in)
+    figure = new_figure(_COLUMNS * _PANEL_IN, page_in)
     colors = "orange: the row found" + ("" if true_rows is None else "; blue: the true one")
     figure.text(0.012, 1.0 - 0.1 / page_in, title, fontsize=13, fontweight="bold", color=INK, va="top")
     figure.text(0.988, 1.0 - 0.12 / page_in, colors, fontsize=9.5, color=FAINT, va="top", ha="right")
@@ -55,10 +56,10 @@ def write_detections(
         for method, response in kept.items()
     ]
     for number, (name, pixels, found) in enumerate(panels):
-        row, column = divmod(number, 3)
+        row, column = divmod(number, _COLUMNS)
         bottom_in = (1 - row) * (height_in + _CAPTION_IN)
         axes = figure.add_axes(
-            (0.006 + column / 3.0, bottom_in / page_in, 0.321, 0.965 * height_in / page_in)
+            ((column + 0.015) / _COLUMNS, bottom_in / page_in, 0.97 / _COLUMNS, 0.97 * height_in / page_in)
         )
         # What is kept must be seen, however dark it is.
         shown = pixels if pixels.ndim == 3 else np.where(pixels > 0, 110 + pixels * (145.0 / 255.0), 0.0)

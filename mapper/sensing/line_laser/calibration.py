@@ -16,7 +16,7 @@ from mapper.config.line_laser import (
 from mapper.errors import DataError
 from mapper.frames import Image
 from mapper.geometry import Array
-from mapper.sensing.line_laser.detection import responses, stripe_rows
+from mapper.sensing.line_laser.detection import combined, stripe_rows
 
 _CM = 0.01
 _MIN_RANGES, _MIN_WIDTHS = 3, 2
@@ -99,7 +99,7 @@ def right_m(calibration: LineLaserCalibration, columns_px: Array, rows_px: Array
 
 def find_board(image: Image, config: StripeConfig) -> Board | None:
     """Return the stripe on the board in the middle of an (H, W, 3) RGB image; None without a level one."""
-    found = stripe_rows(responses(image, config)["combined"], join_px=config.join_px)
+    found = stripe_rows(combined(image, config), join_px=config.join_px)
     middle, half = len(found) // 2, max(int(len(found) * _CENTRE_RATIO), 1)
     centre = found[middle - half : middle + half]
     centre = centre[np.isfinite(centre)]

@@ -14,13 +14,30 @@ from mapper.config.line_laser import StripeConfig
 from mapper.frames import Image
 from mapper.geometry import Array
 
-Method = Literal["intensity", "weight", "union", "edges", "combined"]
+Method = Literal["hue", "intensity", "weight", "union", "edges", "combined"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
 Response = NDArray[np.uint8]
 
 _LOG_APERTURE = 5
 _TWO_RED = np.array([[2.0, -1.0, -1.0]])
+
+
+def hue(image: Image, *, from_deg: float, to_deg: float, saturation: int) -> Response:
+    """Return the brightness of pixels of some hues (figure 2.2).
+
+    Args:
+        image: (H, W, 3) RGB.
+        from_deg: First of the hues, 0 to 360°.
+        to_deg: Last of them; less than the first if they pass through 0.
+        saturation: Less is grey.
+    """
+    hues, saturations, values = cv2.split(cv2.cvtColor(image, cv2.COLOR_RGB2HSV))
+    degrees = 2.0 * hues
+    after, before = degrees >= from_deg, degrees <= to_deg
+    kept = (after & before if from_deg <= to_deg else after | before) & (saturations >= saturation)
+    found: Response = values * kept
+    return found
 
 
 def intensity(red: Response, *, threshold: int) -> Response:
@@ -55,15 +72,26 @@ def edges(red: Response, *, sigma_px: float, threshold: int) -> Response:
     return _at_least(cv2.convertScaleAbs(cv2.Laplacian(smooth, cv2.CV_32F, ksize=_LOG_APERTURE)), threshold)
 
 
+def combined(image: Image, config: StripeConfig) -> Response:
+    """Return what :func:`responses` does by that name, without the methods that it does not need."""
+    return _of_red(image, config)["combined"]
+
+
 def responses(image: Image, config: StripeConfig) -> Mapping[Method, Response]:
     """Return what every method makes of an (H, W, 3) RGB image."""
+    first, last = config.hue_from_deg, config.hue_to_deg
+    hues = hue(image, from_deg=first, to_deg=last, saturation=config.saturation_threshold)
+    return {"hue": hues, **_of_red(image, config)}
+
+
+def _of_red(image: Image, config: StripeConfig) -> dict[Method, Response]:
     red = np.ascontiguousarray(image[:, :, 0])
     bright = intensity(red, threshold=config.intensity_threshold)
     reddish = weight(image, threshold=config.weight_threshold)
     union = np.maximum(reddish, bright)  # eq. 2.42
     edge = edges(red, sigma_px=config.edge_sigma_px, threshold=config.edge_threshold)
-    combined = cv2.bitwise_and(union, union, mask=edge)  # eq. 2.43
-    return {"intensity": bright, "weight": reddish, "union": union, "edges": edge, "combined": combined}
+    both = cv2.bitwise_and(union, union, mask=edge)  # eq. 2.43
+    return {"intensity": bright, "weight": reddish, "union": union, "edges": edge, "combined": both}
 
 
 def stripe_rows(response: Response, *, join_px: int) -> Array:

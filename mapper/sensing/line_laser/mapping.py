@@ -30,7 +30,8 @@ def map_scans(
     """Return what scans say together: occupied where the stripe lay, free between there and the sensor.
 
     Each scan changes a cell once, and a hit goes before a miss; the log-odds are clamped (Hornung et al.
-    2013, §3.4), so that the map follows what changes.
+    2013, §3.4), so that the map follows what changes. Free is where nothing reaches up to the sheet of light:
+    what is low is seen from afar only, where the sheet is low too.
 
     Args:
         scans: What each image told, in order.

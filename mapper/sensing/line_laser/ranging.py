@@ -10,7 +10,7 @@ from mapper.errors import DataError
 from mapper.frames import Image
 from mapper.geometry import Array, Points
 from mapper.sensing.line_laser.calibration import ahead_m, right_m, row_px
-from mapper.sensing.line_laser.detection import responses, stripe_rows
+from mapper.sensing.line_laser.detection import combined, stripe_rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +46,7 @@ def scan_image(
             f"image of {image.shape[1]}×{image.shape[0]} px, but the calibration is for {want[1]}×{want[0]}; "
             "calibrate for these images"
         )
-    found = responses(image, config.stripe)["combined"]
+    found = combined(image, config.stripe)
     # What is seen below the floor's stripe can only be its mirror image, or no stripe at all.
     lowest = round(row_px(calibration, calibration.reach_m + config.map.floor_margin_m))
     rows = stripe_rows(found[: lowest + 1], join_px=config.stripe.join_px)
