@@ -136,7 +136,7 @@ def track_log(
             frame_ms[track.stamp_ns] = 1e3 * (observed_s + time.perf_counter() - began)
             graph.add_factors(track.factors)
             tracks.append(track)
-            watcher.stepped(Step(entry, track, view, closer))
+            watcher.stepped(Step(entry, track, view, odometry.matches, closer))
     graph.add_factors(odometry.finish())
     if config.odometry.kind != "wheels":  # else they have had their say
         graph.add_factors(wheel_factors(graph.stamps_ns, source.wheels, config.graph.wheels))

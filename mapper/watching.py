@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from mapper.geometry import Transform
 from mapper.loops.closer import Closer
-from mapper.odometry.base import Seen, Track
+from mapper.odometry.base import Matches, Seen, Track
 from mapper.sources.base import Entry
 
 if TYPE_CHECKING:
@@ -23,12 +23,14 @@ class Step:
         entry: The frame; who wants its image loads it again.
         track: What tracking made of it.
         view: Gives the features that it was tracked by; costs something, so not to be asked without need.
+        matches: Gives those that hold its pose, and where they were before; the same.
         closer: The loops so far, and where nodes are believed to be with them.
     """
 
     entry: Entry
     track: Track
     view: Callable[[], Seen]
+    matches: Callable[[], Matches | None]
     closer: Closer
 
 

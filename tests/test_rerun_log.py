@@ -70,6 +70,16 @@ def told(run):
     return Told(path)
 
 
+def test_two_recordings_of_a_run_say_the_same(run, tmp_path):
+    paths = [tmp_path / "one.rrd", tmp_path / "other.rrd"]
+    for path in paths:
+        show_run(run, str(path))
+    compared = subprocess.run(
+        [RERUN, "rrd", "compare", "--unordered", *paths], capture_output=True, text=True
+    )
+    assert compared.returncode == 0, compared.stderr
+
+
 def test_the_paths_are_the_run_s(run, told):
     estimate = told.one("/world/path/estimate", "LineStrips3D:strips")[0]
     np.testing.assert_allclose(estimate, run.trajectory().positions_world, atol=1e-6)
@@ -256,6 +266,12 @@ def test_images_come_with_the_features_that_were_found_and_those_that_agreed(liv
         assert record.diagnostics.inliers in counts
         assert np.min(positions) >= 0
         assert np.max(positions) <= 320
+    ways = told.values("/world/live/body/camera/matches", "LineStrips2D:strips")
+    assert [stamp for stamp, _ in ways] == [record.stamp_ns for record in records]
+    for record, (_, positions), (_, lines) in zip(records, dots, ways, strict=True):
+        assert (record is records[0]) == (len(lines) == 0)
+        assert len(lines) <= record.diagnostics.inliers
+        assert {tuple(end) for _, end in lines} <= {tuple(position) for position in positions}
     assert len(told.values("/world/live/body/cloud", "Points3D:positions")) == len(records)
 
 
@@ -306,7 +322,7 @@ def test_a_scan_is_a_cloud_without_an_image(tmp_path):
     with recorded(str(path), name="scan", has_images=False, body="world/live/body") as log:
         watcher = LiveRerun(log, "lidar", RerunConfig(cloud_points=10_000))
         track = Track(7, 0, np.eye(4), np.eye(4), True, diagnostics)
-        watcher.stepped(Step(Entry(), track, lambda: None, Closer()))
+        watcher.stepped(Step(Entry(), track, lambda: None, lambda: None, Closer()))
     told = Told(path)
     assert len(told.values("/world/live/body/cloud", "Points3D:positions")[0][1]) == 10_000
     assert "/world/live/body/camera" not in told.chunks

@@ -11,7 +11,7 @@ from mapper.deskew import Twist
 from mapper.features.scan_view import ScanView
 from mapper.features.view import View
 from mapper.frames import Frame
-from mapper.geometry import Transform
+from mapper.geometry import Array, Transform
 from mapper.graph.model import BetweenFactor
 from mapper.sources.base import Entry
 
@@ -53,7 +53,6 @@ class Track:
         diagnostics: How it went.
         links: Where the new node lies from earlier ones, as far as is known now; ``factors`` may come later
             and better, but until then this is what ties the node to the path.
-        agreeing: (N,) which of the view's features agree with the pose; None where that is not told.
         twist: How the body is taken to have moved while a scan was swept; None where nothing was deskewed.
         is_sharp: False of what nobody should recognise a place by: a scan swept in unknown motion.
     """
@@ -66,9 +65,22 @@ class Track:
     diagnostics: Diagnostics
     factors: Sequence[BetweenFactor] = field(default_factory=tuple)
     links: Sequence[BetweenFactor] = field(default_factory=tuple)
-    agreeing: NDArray[np.bool_] | None = None
     twist: Twist | None = None
     is_sharp: bool = True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matches:
+    """How the features of a frame's view hold its pose.
+
+    Attributes:
+        agreeing: (N,) which agree with it.
+        before_px: (N, 2) undistorted pixels: where they were in the frame before, or in a keyframe; NaN where
+            neither showed them.
+    """
+
+    agreeing: NDArray[np.bool_]
+    before_px: Array
 
 
 Observation = TypeVar("Observation")
@@ -101,6 +113,13 @@ class Odometry(Protocol[Observation]):
 
         Raises:
             FrameError: The frame was not needed before, and cannot be read.
+        """
+        ...
+
+    def matches(self) -> Matches | None:
+        """Return what holds the frame that was tracked last; None if it was lost, or is held by no features.
+
+        It is for looking, and so made when it is asked for.
         """
         ...
 

@@ -17,7 +17,7 @@ from mapper.frames import Frame, PinholeCamera, RgbdFrame
 from mapper.geometry import Array, Points, Transform, apply, inverse, mean_rotation, transform
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
-from mapper.odometry.base import Diagnostics, Track
+from mapper.odometry.base import Diagnostics, Matches, Track
 from mapper.odometry.keyframes import SharpestKeyframes
 from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
@@ -107,6 +107,7 @@ class IsvdOdometry:
         self._sharpest = SharpestKeyframes(config.keyframe_interval)
         self._next_node = 0
         self._turn = 0
+        self._held: tuple[IsvdObservation, Candidate, MatchConfig] | None = None
 
     def read(self, entry: Entry) -> IsvdObservation:
         """Observe a frame of a log, without its colours. Pure.
@@ -130,15 +131,18 @@ class IsvdOdometry:
 
     def track(self, observation: IsvdObservation) -> Track:
         """Place the next observation, in time order."""
+        self._held = None
         if not self._recent:
             return self._place(observation, np.eye(4), [], method="start")
         recent = list(self._recent)[-self._config.previous_frames :][::-1]
         for match, method in ((self._config.match, "isvd"), (self._config.fallback, "fallback")):
             candidates = self._register(observation, recent, match)
             if candidates:
+                self._held = observation, candidates[0], match
                 return self._place(observation, self._combine(candidates), candidates, method=method)
         candidates = self._relocalise(observation)
         if candidates:
+            self._held = observation, candidates[0], self._config.match
             return self._place(observation, self._combine(candidates), candidates, method="relocalised")
         diagnostics = Diagnostics(len(observation.features), 0, 0, 0.0, "m", "lost")
         return Track(observation.stamp_ns, None, np.eye(4), self._recent[-1].T_world_body, False, diagnostics)
@@ -146,10 +150,9 @@ class IsvdOdometry:
     def view(self, observation: IsvdObservation, _twist: Twist | None = None, /) -> View:
         """Return what a place is recognised by. Pure."""
         features, camera = observation.features, observation.camera
-        pixels: Array = features.pixels.astype(np.float64)
         return View(
             stamp_ns=observation.stamp_ns,
-            pixels=camera.undistort(pixels) if self._config.undistort else pixels,
+            pixels=self._pixels(observation),
             sigma_px=self._detector.scale_factor ** features.octave.astype(np.float64),
             descriptors=features.descriptors,
             points_camera=apply(inverse(observation.T_body_camera), observation.points_body),
@@ -157,9 +160,28 @@ class IsvdOdometry:
             T_body_camera=observation.T_body_camera,
         )
 
+    def matches(self) -> Matches | None:
+        """Match the last frame once more with the nearest that it was registered against."""
+        if self._held is None:
+            return None
+        observation, candidate, match = self._held
+        earlier = candidate.earlier.observation
+        then, now = matched_pairs(earlier, observation, match).T
+        moved = apply(candidate.alignment.T_target_source, observation.points_body[now])
+        miss_m = np.linalg.norm(earlier.points_body[then] - moved, axis=1)
+        agreeing = miss_m <= self._config.registration.agreement_mm / 1e3  # what has no depth does not
+        now, then = now[agreeing], then[agreeing]
+        before_px = np.full((len(observation.features), 2), np.nan)
+        before_px[now] = self._pixels(earlier)[then]
+        return Matches(np.isfinite(before_px[:, 0]), before_px)
+
     def finish(self) -> Sequence[BetweenFactor]:
         """Return nothing: every measurement was final when its frame was tracked."""
         return ()
+
+    def _pixels(self, observation: IsvdObservation) -> Array:
+        pixels: Array = observation.features.pixels.astype(np.float64)
+        return observation.camera.undistort(pixels) if self._config.undistort else pixels
 
     def _points_body(self, frame: RgbdFrame, features: Features) -> Points:
         config, camera = self._config, frame.camera

@@ -6,7 +6,7 @@ from typing import Generic
 
 from mapper.deskew import Twist
 from mapper.graph.model import BetweenFactor
-from mapper.odometry.base import Observation, Odometry, Seen, Track
+from mapper.odometry.base import Matches, Observation, Odometry, Seen, Track
 from mapper.sources.base import Entry
 
 
@@ -34,6 +34,10 @@ class Renumbered(Generic[Observation]):
     def view(self, observation: Observation, twist: Twist | None = None, /) -> Seen:
         """Return what a place is recognised by. Pure."""
         return self._odometry.view(observation, twist)
+
+    def matches(self) -> Matches | None:
+        """Return what holds the frame that was tracked last."""
+        return self._odometry.matches()
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return the measurements that were still being refined when the log ended."""

@@ -95,6 +95,9 @@ class WheelsOdometry:
         eyes = self._scan_eyes if isinstance(frame, Scan) else self._image_eyes
         return eyes.view(eyes.observe(frame), twist)
 
+    def matches(self) -> None:
+        """Return nothing: no features hold the pose."""
+
     def finish(self) -> Sequence[BetweenFactor]:
         """Return nothing: every measurement was final when its frame was tracked."""
         return ()

@@ -5,7 +5,7 @@ solved and levelled, that entity is laid into the levelled world. The body stays
 Rerun would not show poses that are logged anew at the same stamps.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
@@ -22,7 +22,7 @@ from mapper.features.view import View
 from mapper.frames import RgbdFrame, Scan
 from mapper.fusion import Maps
 from mapper.geometry import Array, Transform, inverse
-from mapper.odometry.base import Track
+from mapper.odometry.base import Matches, Track
 from mapper.run import Run
 from mapper.sources.base import FrameSource
 from mapper.story import Story
@@ -112,18 +112,27 @@ class LiveRerun:
         jpeg = encode_jpeg(frame.image, width_px=width_px, quality=80)
         image = rr.EncodedImage(contents=jpeg, media_type="image/jpeg")
         self._log.log(self._log.camera, image, stamp_ns=frame.stamp_ns)
-        view, agreeing = step.view(), step.track.agreeing
-        if not isinstance(view, View):
-            return
-        if agreeing is None:
-            agreeing = np.zeros(len(view), np.bool_)
-        scale = camera.width_px / frame.camera.width_px
+        view = step.view()
+        if isinstance(view, View):
+            scale = camera.width_px / frame.camera.width_px
+            self._show_features(view, step.matches(), lambda px: (frame.camera.distort(px) + 0.5) * scale)
+
+    def _show_features(self, view: View, matches: Matches | None, drawn: Callable[[Array], Array]) -> None:
+        """Log the features, those that hold the pose in another colour, and the ways that these came."""
+        nothing = Matches(np.zeros(len(view), np.bool_), np.full((len(view), 2), np.nan))
+        held = matches or nothing
         dots = rr.Points2D(
-            (frame.camera.distort(view.pixels) + 0.5) * scale,
-            colors=np.where(agreeing[:, None], np.array(_MATCHED, np.uint8), np.array(_UNMATCHED, np.uint8)),
+            drawn(view.pixels),
+            colors=np.where(
+                held.agreeing[:, None], np.array(_MATCHED, np.uint8), np.array(_UNMATCHED, np.uint8)
+            ),
             radii=rr.Radius.ui_points(1.5),
         )
-        self._log.log(f"{self._log.camera}/features", dots, stamp_ns=frame.stamp_ns)
+        moved = np.isfinite(held.before_px[:, 0])
+        ways = np.stack([drawn(held.before_px[moved]), drawn(view.pixels[moved])], axis=1)
+        lines = rr.LineStrips2D(ways, colors=[_MATCHED], radii=rr.Radius.ui_points(0.7))
+        self._log.log(f"{self._log.camera}/features", dots, stamp_ns=view.stamp_ns)
+        self._log.log(f"{self._log.camera}/matches", lines, stamp_ns=view.stamp_ns)
 
     def _show_cloud(self, scan: Scan) -> None:
         kept = slice(None, None, _stride(len(scan.points_body), self._config.cloud_points, power=1))

@@ -5,6 +5,8 @@ entity                      archetype                what it is
 ==========================  =======================  ====================================================
 /world/body                 Transform3D              pose of every frame; /world/live/body while building
 /world/body/camera          Pinhole, EncodedImage    images, and where they were taken
+/…/camera/features          Points2D                 while building: features, and which hold the pose
+/…/camera/matches           LineStrips2D             from where these were before
 /world/path/NAME            LineStrips3D             a trajectory: estimate, truth
 /world/graph/nodes          Points3D                 the solved keyframes
 /world/graph/ORIGIN         LineStrips3D             factors by origin
@@ -20,8 +22,8 @@ entity                      archetype                what it is
 ==========================  =======================  ====================================================
 
 All that changes has its place on one timeline, "stamp", the log's own clock in exact nanoseconds; what
-belongs to the whole log is static. Two recordings of a run are alike but not equal in bytes: Rerun numbers
-its chunks by time and chance.
+belongs to the whole log is static. Two recordings of a run hold the same data, but not the same bytes: Rerun
+numbers rows and chunks by time and chance, and writes chunks in the order in which its threads have them.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence

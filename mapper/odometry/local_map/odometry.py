@@ -14,7 +14,7 @@ from mapper.frames import Frame
 from mapper.geometry import Transform, inverse
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
-from mapper.odometry.base import Diagnostics, Track
+from mapper.odometry.base import Diagnostics, Matches, Track
 from mapper.odometry.local_map.landmarks import LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
 from mapper.odometry.local_map.observation import Observation, observe
@@ -84,6 +84,20 @@ class KeyframeOdometry:
     def view(self, observation: Observation, _twist: Twist | None = None, /) -> View:
         """Return what a place is recognised by. Pure."""
         return observation.view()
+
+    def matches(self) -> Matches | None:
+        """Return which features show landmarks, and where the last frame, or else a keyframe, had them."""
+        here = self._last
+        if here is None or self._lost_frames:
+            return None
+        landmarks = here.landmark_of_feature
+        before_px = np.full((len(landmarks), 2), np.nan)
+        for seen in (self._map.keyframes[here.reference], self._before_last):
+            if seen is not None and seen.observation is not here.observation:
+                common, now, then = np.intersect1d(landmarks, seen.landmark_of_feature, return_indices=True)
+                now, then = now[common >= 0], then[common >= 0]
+                before_px[now] = seen.observation.pixels[then]
+        return Matches(landmarks >= 0, before_px)
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return a factor from every keyframe to those earlier ones that share most landmarks with it.
@@ -210,7 +224,6 @@ class KeyframeOdometry:
             is_keyframe=is_keyframe,
             diagnostics=diagnostics,
             links=links,
-            agreeing=placement.landmark_of_feature >= 0,
         )
 
     def _lost(self, observation: Observation) -> Track:

@@ -114,6 +114,9 @@ class ScanOdometry:
         """Return what a place is recognised by. Pure."""
         return ScanView(observation.scan.stamp_ns, observation.points_at_stamp(twist or STILL))
 
+    def matches(self) -> None:
+        """Return nothing: no features hold the pose."""
+
     def finish(self) -> Sequence[BetweenFactor]:
         """Return nothing: every measurement was final when its scan was tracked."""
         return ()

@@ -1,0 +1,82 @@
+"""What holds a frame: which of its features agree with its pose, and where these were before."""
+
+import numpy as np
+import pytest
+
+from mapper.config.features import OrbConfig
+from mapper.config.odometry import IsvdOdometryConfig, LocalMapConfig, WheelsOdometryConfig
+from mapper.odometry.renumbered import Renumbered
+from mapper.sources import open_source
+
+CONFIGS = {"local-map": LocalMapConfig(), "isvd": IsvdOdometryConfig(detector=OrbConfig())}
+
+
+def followed(config, log, count=8):
+    """Odometry, track, view and matches after each frame."""
+    odometry = config.build()
+    for entry in list(open_source(log).entries())[:count]:
+        observation = odometry.read(entry)
+        track = odometry.track(observation)
+        yield track, odometry.view(observation), odometry.matches()
+
+
+def rows(pixels):
+    return {tuple(row) for row in pixels.tolist()}
+
+
+@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
+def test_features_that_hold_the_pose_were_seen_where_they_are_said_to_have_been(config, desk_log):
+    seen, told = [], 0
+    for track, view, matches in followed(config, desk_log):
+        if seen:
+            assert matches.agreeing.sum() == track.diagnostics.inliers or track.is_keyframe
+            has_way = np.isfinite(matches.before_px[:, 0])
+            assert not (has_way & ~matches.agreeing).any()
+            before = matches.before_px[has_way]
+            assert rows(before) <= set().union(*map(rows, seen))
+            assert len(before) > 0.3 * matches.agreeing.sum()
+            steps_px = np.linalg.norm(view.pixels[has_way] - before, axis=1)
+            assert np.median(steps_px) < 20.0  # of a hand that sways; features at random are 100 px apart
+            told += len(before)
+        seen.append(view.pixels)
+    assert told > 300
+
+
+def test_isvd_matches_with_the_frame_just_before(desk_log):
+    (_, before, _), (track, _, matches) = followed(CONFIGS["isvd"], desk_log, count=2)
+    assert matches.agreeing.sum() == track.diagnostics.inliers
+    assert rows(matches.before_px[matches.agreeing]) <= rows(before.pixels)
+
+
+@pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
+def test_the_first_frame_came_from_nowhere_and_a_lost_one_is_held_by_nothing(config, desk_log):
+    ((_, _, matches),) = followed(config, desk_log, count=1)
+    assert matches is None or np.isnan(matches.before_px).all()
+    odometry = Renumbered(config.build(), first_node=7)
+    entries = list(open_source(desk_log).entries())
+    odometry.track(odometry.read(entries[0]))
+    assert odometry.track(odometry.read(entries[1])).node >= 7
+    assert len(odometry.matches().agreeing) > 0
+    dark = DarkEntry(entries[2])
+    assert odometry.track(odometry.read(dark)).node is None
+    assert odometry.matches() is None
+
+
+class DarkEntry:
+    """A frame taken with the lens covered."""
+
+    def __init__(self, entry):
+        self.entry, self.stamp_ns = entry, entry.stamp_ns
+
+    def load(self, *, colour=True):
+        frame = self.entry.load(colour=colour)
+        return type(frame)(
+            frame.stamp_ns, np.zeros_like(frame.image), np.zeros_like(frame.depth_m), frame.camera
+        )
+
+
+def test_no_features_hold_what_wheels_tell(desk_log):
+    source = open_source(desk_log)
+    odometry = WheelsOdometryConfig().build(source.truth)
+    assert odometry.track(odometry.read(next(source.entries()))).node == 0
+    assert odometry.matches() is None
