@@ -113,6 +113,8 @@ def load_run(path: Path) -> Run:
     """
     if not path.is_dir():
         partial = partial_of(path)
+        if is_map(partial):
+            raise RunError(f"{path}: not finished; the mapper merge that began it goes on where it was")
         if (partial / MANIFEST).is_file():
             raise RunError(f"{path}: not finished: {_ending(partial)}")
         raise RunError(f"{path}: no such run folder; make one with mapper build LOG --out {path}")

@@ -176,6 +176,8 @@ def test_a_merge_that_was_stopped_goes_on_where_it_was(runs, merged, tmp_path, m
     assert not out.exists()
     with pytest.raises(RunError, match="not finished"):
         open_map(out)
+    with pytest.raises(RunError, match="not finished; the mapper merge that began it goes on"):
+        load_run(out)
     lost = joined[3:5]
     joined.clear()
     joined.extend([0] * 5)
@@ -307,6 +309,24 @@ def test_runs_that_do_not_fit_together_are_refused(runs, maps, tmp_path):
         merge(as_built(runs), tmp_path / "map", tile_m=0.1)
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_a_path_is_planned_on_a_merged_map(tmp_path, capsys):
+    octree = OctreeMap(CONFIG)
+    sides = np.linspace(-1.95, 1.95, 40).astype(np.float32)
+    ring = [(x, y, 0.05) for x in sides for y in sides if max(abs(x), abs(y)) > 1.9]
+    octree.insert_points(np.array(ring, np.float32), np.array([0.05, 0.05, 0.05]))
+    MERGE(as_built([make_run(tmp_path / "run", octree)]), tmp_path / "map")
+
+    app(
+        ["plan", str(tmp_path / "map"), "--from", "-1", "0", "--to", "1", "0.5", "--radius", "0.1"],
+        standalone_mode=False,
+    )
+
+    assert capsys.readouterr().out.startswith("2.06 m in the slice")
+    assert (tmp_path / "map/plan.png").stat().st_size > 10_000
+    assert '"map": "slice"' in (tmp_path / "map/plan.json").read_text()
+
+
 def test_a_user_is_told_what_to_doubt(runs, maps, merged, tmp_path):
     assert merged.manifest.notes[0].startswith("every run's world was taken for the map's")
     again = make_run(tmp_path / "again", maps[0], log="sha256:1")
@@ -331,3 +351,5 @@ def test_the_verb_says_what_it_made(runs, tmp_path, capsys):
     assert lines[2].split()[:3] == ["run1", "as", "built"]
     assert lines[-1] == str(tmp_path / "map")
     assert open_map(tmp_path / "map").manifest.status == "complete"
+    with pytest.raises(RunError, match=r"is a merged map, not a run"):
+        load_run(tmp_path / "map")
