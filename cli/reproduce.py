@@ -33,7 +33,10 @@ def reproduce(
         typer.Option("--log", metavar="NAME=PATH", help="Where a log of another name lies: fr1/xyz=PATH."),
     ] = None,
     tables: Annotated[
-        str | None, typer.Option(help="Only these, e.g. 5.1,5.2; thesis has detectors, too.")
+        str | None,
+        typer.Option(
+            help="Only these, e.g. 5.1,5.2; thesis has detectors, too. Another choice is measured anew."
+        ),
     ] = None,
     seeds: Annotated[int, typer.Option(help="Draws of RANSAC: median and spread are over them.")] = 3,
     first: First = None,

@@ -10,7 +10,8 @@ Verdict = Literal["better", "as published", "worse", "in part", "failed", "not r
 BETTER_RATIO, SAME_RATIO = 0.95, 1.10
 RULE = (
     f"Ratio: the median of ours over the printed figure, less is better. Up to {BETTER_RATIO:.2f} is better, "
-    f"up to {SAME_RATIO:.2f} as published, above that worse; failed: no seed gave a figure."
+    f"up to {SAME_RATIO:.2f} as published, above that worse; failed: no seed gave a figure; in part: "
+    "ours is of a part of the log, so there is no ratio."
 )
 """How verdicts are given, in words for a page."""
 
