@@ -242,6 +242,7 @@ def test_looking_on_changes_nothing(run, live):
 
 def test_a_build_is_told_frame_by_frame(live):
     run, told = live
+    assert {name for chunks in told.chunks.values() for c in chunks for name in c.timeline_names} == {"stamp"}
     records, trajectory = run.records(), run.trajectory()
     inliers = told.values("/diagnostics/inliers", "Scalars:scalars")
     assert [(stamp, value[0]) for stamp, value in inliers] == [

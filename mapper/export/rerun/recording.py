@@ -257,11 +257,18 @@ def recorded(
         body: The entity that is to move with the body.
         looking_at: (2, 3) lower and upper corner of what to look at first, metres; None leaves it to Rerun.
     """
-    stream = rr.RecordingStream(APPLICATION)
+    stream = new_recording()
     log = RerunLog(stream, body, has_images=has_images)
     with streaming(stream, target, log.blueprint(looking_at), keeps=lambda: log.keeps):
         stream.send_recording_name(name)
         yield log
+
+
+def new_recording() -> rr.RecordingStream:
+    """Return a recording that knows the log's clock only, not when it was told."""
+    recording = rr.RecordingStream(APPLICATION)
+    recording.set_log_time_enabled(False)
+    return recording
 
 
 def transform_of(T_parent_child: Transform) -> rr.Transform3D:

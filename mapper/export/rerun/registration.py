@@ -8,7 +8,7 @@ import rerun.blueprint as rrb
 
 from mapper.config.sensors import Sensor
 from mapper.export.palette import ESTIMATE, TRUTH
-from mapper.export.rerun.recording import APPLICATION, transform_of
+from mapper.export.rerun.recording import new_recording, transform_of
 from mapper.export.rerun.target import streaming
 from mapper.frames import Points32
 from mapper.geometry import Transform
@@ -41,7 +41,7 @@ def record_registration(
         ConfigError: The target is none.
         ViewerError: No viewer can be started or reached.
     """
-    recording = rr.RecordingStream(APPLICATION)
+    recording = new_recording()
     with streaming(recording, target, _blueprint(), keeps=lambda: False):
         recording.send_recording_name(name)
         recording.log("world", _UP[sensor], static=True)
