@@ -25,6 +25,8 @@ from mapper.sources.clouds import read_scan
 GIVEN = "pairs.toml"
 ALL_RINGS, FEW_RINGS = "all rings", "16 rings"
 RIGHT_M, RIGHT_DEG = 0.3, 1.0
+EXTRINSIC_M, EXTRINSIC_DEG = 0.5, 2.5
+"""RELLIS-3D's extrinsic calibration is itself good to about 0.1 m and 1° only."""
 SCANS_PER_LOG = 4
 MAP_SCANS = 20
 """So many scans before the one that is left out, and as many after it, make the map."""
@@ -32,7 +34,6 @@ MAP_VOXEL_M = 0.02
 """And one point of each voxel: MPD cannot fall much below half of it."""
 
 _VLP_POINTS = 30_000  # what a VLP-16 gives in a turn; a scan with no more is not thinned further
-_RELLIS_M, _RELLIS_DEG = 0.5, 2.5  # the extrinsics are themselves good to about 0.1 m and 1°
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,7 +223,7 @@ def _cross_sensor(folder: Path) -> list[Pair]:
                     scans[number],
                     maps[number],
                     T_target_source,
-                    (_RELLIS_M, _RELLIS_DEG),
+                    (EXTRINSIC_M, EXTRINSIC_DEG),
                 )
                 for number in sorted(scans.keys() & maps.keys())
             ]
