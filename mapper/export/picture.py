@@ -160,9 +160,13 @@ def _draw_over(axes: "Axes", image: NDArray[np.uint8], grid: OccupancyGrid) -> N
 
 
 def _finish_map(axes: "Axes", low: Array, high: Array) -> None:
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(low[1], high[1])
-    axes.set_aspect("equal", adjustable="datalim")
+    box = axes.get_window_extent()
+    # Limits of the shape of the page: left to fit them itself, matplotlib warns of a map that is higher.
+    reach = 0.5 * np.array([box.width, box.height]) * float(np.max((high - low) / [box.width, box.height]))
+    lowest, highest = 0.5 * (low + high) - reach, 0.5 * (low + high) + reach
+    axes.set_xlim(lowest[0], highest[0])
+    axes.set_ylim(lowest[1], highest[1])
+    axes.set_aspect("equal")
     _scale_bar(axes, low, high, color=INK)
     axes.legend(loc="best", fontsize=8, framealpha=0.92, edgecolor=LINE)
 
