@@ -79,13 +79,14 @@ def study_depth(
             level, picture = depth_at(source, distance_m, patch=patch, keep_tilt=keep_tilt, progress=progress)
             levels.append(level)
             maps.append((distance_m, picture))
-    levels.sort(key=lambda level: level.distance_m)
+    levels.sort(key=lambda level: level.typical.distance_m)
     return DepthStudy(
         logs=[source.name for source in sources],
         is_known=distances_m is not None,
         levels=levels,
         fit=fit_noise(
-            np.array([level.distance_m for level in levels]), np.array([level.raw.std_m for level in levels])
+            np.array([level.typical.distance_m for level in levels]),
+            np.array([level.typical.raw.std_m for level in levels]),
         ),
         maps=[picture for _, picture in sorted(maps, key=lambda pair: pair[0])],
     )
@@ -96,23 +97,24 @@ def records_of(study: DepthStudy) -> list[Record]:
     return [
         {
             "log": level.name,
-            "distance_m": level.distance_m,
+            "distance_m": seen.distance_m,
             "frames": level.frames,
-            "planes": level.patches,
-            "measured_ratio": level.measured_ratio,
-            "tilt_rad": level.tilt_rad,
-            "max_error_m": level.raw.max_error_m,
-            "max_error_99_m": level.raw.max_error_99_m,
-            "std_m": level.raw.std_m,
-            "dif_max_error_m": level.filtered.max_error_m,
-            "dif_max_error_99_m": level.filtered.max_error_99_m,
-            "dif_std_m": level.filtered.std_m,
-            "mean_error_m": level.raw.mean_error_m if study.is_known else None,
+            "planes": level.planes,
+            "measured_ratio": seen.measured_ratio,
+            "tilt_rad": seen.tilt_rad,
+            "max_error_m": seen.raw.max_error_m,
+            "max_error_99_m": seen.raw.max_error_99_m,
+            "std_m": seen.raw.std_m,
+            "dif_max_error_m": seen.filtered.max_error_m,
+            "dif_max_error_99_m": seen.filtered.max_error_99_m,
+            "dif_std_m": seen.filtered.std_m,
+            "mean_error_m": seen.raw.mean_error_m if study.is_known else None,
             "temporal_m": level.temporal_m,
             "fixed_m": level.fixed_m,
-            "step_m": level.step_m,
+            "step_m": seen.step_m,
         }
         for level in study.levels
+        for seen in [level.typical]
     ]
 
 

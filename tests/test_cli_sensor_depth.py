@@ -58,7 +58,7 @@ def test_the_numbers_are_kept(measured):
         assert float(row["temporal_m"]) == pytest.approx(float(row["std_m"]), rel=0.2)
     record = json.loads((out / "manifest.json").read_text(encoding="utf-8"))
     assert record["distances"] == "given"
-    assert record["levels"][0]["raw"]["std_m"] == float(rows[0]["std_m"])
+    assert record["levels"][0]["typical"]["raw"]["std_m"] == float(rows[0]["std_m"])
 
 
 def test_a_build_reads_the_noise(measured):

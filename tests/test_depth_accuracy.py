@@ -121,13 +121,15 @@ def test_a_plane_is_found_exactly_and_its_tilt_told():
 def test_errors_and_noise_of_a_wall():
     level, picture = depth_at(wall(1.0, frames=20, fixed_m=0.002), 0.99)
     sigma_m = A + B + C
-    assert level.raw.std_m == pytest.approx(np.hypot(sigma_m, 0.002), rel=0.03)
-    assert level.filtered.std_m == pytest.approx(level.raw.std_m / 3.0, rel=0.05), "nine pixels, white noise"
-    assert level.raw.mean_error_m == pytest.approx(0.01, abs=2e-4)
+    assert level.typical.raw.std_m == pytest.approx(np.hypot(sigma_m, 0.002), rel=0.03)
+    assert level.typical.filtered.std_m == pytest.approx(level.typical.raw.std_m / 3.0, rel=0.05), (
+        "nine pixels, white noise"
+    )
+    assert level.typical.raw.mean_error_m == pytest.approx(0.01, abs=2e-4)
     assert level.temporal_m == pytest.approx(sigma_m, rel=0.02)
     assert level.fixed_m == pytest.approx(0.002, rel=0.05)
-    assert level.raw.max_error_m > level.raw.max_error_99_m > 0.01 + 2 * sigma_m
-    assert (level.frames, level.measured_ratio) == (20, 1.0)
+    assert level.typical.raw.max_error_m > level.typical.raw.max_error_99_m > 0.01 + 2 * sigma_m
+    assert (level.frames, level.typical.measured_ratio) == (20, 1.0)
     assert np.isnan(picture.error_m[0, 0])
     assert abs(picture.error_m[120, 160]) < 0.01
 
@@ -136,12 +138,12 @@ def test_errors_and_noise_of_a_wall():
 def test_a_wall_that_is_not_quite_across_the_axis_is_no_error(tilt_deg):
     log = wall(1.0, tilt_rad=np.radians(tilt_deg), sigma_m=0.002)
     level, _ = depth_at(log, 1.0)
-    assert np.degrees(level.tilt_rad) == pytest.approx(tilt_deg, abs=0.1)
-    assert level.raw.std_m == pytest.approx(0.002, rel=0.03)
-    assert abs(level.raw.mean_error_m) < 2e-4
+    assert np.degrees(level.typical.tilt_rad) == pytest.approx(tilt_deg, abs=0.1)
+    assert level.typical.raw.std_m == pytest.approx(0.002, rel=0.03)
+    assert abs(level.typical.raw.mean_error_m) < 2e-4
     kept, _ = depth_at(log, 1.0, keep_tilt=True)
     ramp_m = plane_m(1.0, tilt_rad=np.radians(tilt_deg))[80:160, 107:213].std()
-    assert kept.raw.std_m == pytest.approx(np.hypot(0.002, ramp_m), rel=0.05)
+    assert kept.typical.raw.std_m == pytest.approx(np.hypot(0.002, ramp_m), rel=0.05)
 
 
 def test_one_frame_tells_nothing_of_time():
@@ -155,7 +157,7 @@ def test_the_patch_decides_what_is_seen():
     for frame in log.frames:
         frame.depth_m[:, 200:] = 0.7
     level, _ = depth_at(log, 1.0, patch=Patch(0, 0, 200, 240))
-    assert level.raw.max_error_m < 0.03
+    assert level.typical.raw.max_error_m < 0.03
     with pytest.raises(DataError, match=r"none of 4 frames shows a plane; the first: .* lie \d+% off any"):
         depth_at(log, 1.0, patch=Patch(150, 0, 80, 240))
 
@@ -205,7 +207,7 @@ DISTANCES_M = (0.6, 0.9, 1.3, 1.8, 2.4, 3.0)
 def test_a_known_noise_is_recovered_from_walls():
     study = study_depth([wall(d, frames=6) for d in DISTANCES_M[::-1]], DISTANCES_M[::-1])
     noise, z = study.fit.noise, np.array(DISTANCES_M)
-    assert [level.distance_m for level in study.levels] == list(DISTANCES_M)
+    assert [level.typical.distance_m for level in study.levels] == list(DISTANCES_M)
     assert study.fit.form == "parabola"
     for value, true, error in zip(
         (noise.constant_m, noise.linear, noise.quadratic_per_m), (A, B, C), study.fit.uncertainty, strict=True
@@ -259,14 +261,14 @@ def corner(distance_m, *, seed=0):
 def test_noise_is_recovered_from_whatever_planes_there_are():
     log = Log([corner(d, seed=k) for k, d in enumerate(np.linspace(0.9, 3.0, 14))])
     levels, _ = depth_of_planes(log)
-    z = np.array([level.distance_m for level in levels])
+    z = np.array([level.typical.distance_m for level in levels])
     assert z[0] < 1.1
     assert z[-1] > 2.3
-    np.testing.assert_allclose([level.raw.std_m for level in levels], A + B * z + C * z**2, rtol=0.06)
+    np.testing.assert_allclose([level.typical.raw.std_m for level in levels], A + B * z + C * z**2, rtol=0.06)
     np.testing.assert_allclose(
-        [level.filtered.std_m / level.raw.std_m for level in levels], 1.0 / 3.0, rtol=0.1
+        [level.typical.filtered.std_m / level.typical.raw.std_m for level in levels], 1.0 / 3.0, rtol=0.1
     )
-    fit = fit_noise(z, np.array([level.raw.std_m for level in levels]))
+    fit = fit_noise(z, np.array([level.typical.raw.std_m for level in levels]))
     np.testing.assert_allclose(fit.noise.sigma_m(z), A + B * z + C * z**2, rtol=0.05)
 
 
@@ -306,9 +308,9 @@ def test_the_synthetic_kinect_is_as_noisy_as_nguyen_et_al_measured():
     for distance_m in (0.8, 2.5):
         log = SyntheticSource(BARE.model_copy(update={"wall_distance_m": distance_m}))
         level, _ = depth_at(log, distance_m)
-        assert level.raw.std_m == pytest.approx(0.0012 + 0.0019 * (distance_m - 0.4) ** 2, rel=0.05)
-        assert level.filtered.std_m > 0.5 * level.raw.std_m, "half of its noise is in patches"
-        assert abs(level.raw.mean_error_m) < 0.1 * level.raw.std_m
+        assert level.typical.raw.std_m == pytest.approx(0.0012 + 0.0019 * (distance_m - 0.4) ** 2, rel=0.05)
+        assert level.typical.filtered.std_m > 0.5 * level.typical.raw.std_m, "half of its noise is in patches"
+        assert abs(level.typical.raw.mean_error_m) < 0.1 * level.typical.raw.std_m
 
 
 def test_a_wall_beyond_the_room_is_refused():

@@ -35,7 +35,7 @@ def write_accuracy(path: Path, levels: Sequence[DepthLevel], fit: NoiseFit, *, t
         title: Headline.
     """
     figure = page(title, columns=2, rows=1, width_in=5.6, height_in=4.4)
-    distance_m = [level.distance_m for level in levels]
+    distance_m = [level.typical.distance_m for level in levels]
     axes = panel(figure, 0, columns=2, rows=1)
     for label, color, accuracies in _kinds(levels):
         largest = [_MM * one.max_error_m for one in accuracies]
@@ -56,25 +56,28 @@ def write_accuracy(path: Path, levels: Sequence[DepthLevel], fit: NoiseFit, *, t
     for label, color, accuracies in _kinds(levels):
         spread = [_MM * one.std_m for one in accuracies]
         axes.plot(distance_m, spread, "o", color=hex_of(color), markersize=5, label=label)
-    _draw_known(axes, levels, "temporal_m", "^", "of a pixel over time")
-    _draw_known(axes, levels, "fixed_m", "v", "that stays over time")
-    _draw_known(axes, levels, "step_m", "_", "a step of quantisation")
+    for marker, label, known_m in (
+        ("^", "of a pixel over time", [level.temporal_m for level in levels]),
+        ("v", "that stays over time", [level.fixed_m for level in levels]),
+        ("_", "a step of quantisation", [level.typical.step_m for level in levels]),
+    ):
+        _draw_known(axes, distance_m, known_m, marker=marker, label=label)
     _finish(axes, "standard deviation s, mm")
     save(figure, path)
 
 
 def _kinds(levels: Sequence[DepthLevel]) -> tuple[tuple[str, Rgb, list[Accuracy]], ...]:
     return (
-        ("before DIF", _RAW, [level.raw for level in levels]),
-        ("after DIF", _FILTERED, [level.filtered for level in levels]),
+        ("before DIF", _RAW, [level.typical.raw for level in levels]),
+        ("after DIF", _FILTERED, [level.typical.filtered for level in levels]),
     )
 
 
-def _draw_known(axes: "Axes", levels: Sequence[DepthLevel], name: str, marker: str, label: str) -> None:
-    """Mark a figure that not every level knows."""
-    known = [
-        (level.distance_m, _MM * value) for level in levels if (value := getattr(level, name)) is not None
-    ]
+def _draw_known(
+    axes: "Axes", distance_m: Sequence[float], values_m: Sequence[float | None], *, marker: str, label: str
+) -> None:
+    """Mark a figure that not every distance tells."""
+    known = [(x, _MM * value) for x, value in zip(distance_m, values_m, strict=True) if value is not None]
     if known:
         axes.plot(*np.array(known).T, marker, color=FAINT, markersize=5, label=label, fillstyle="none")
 

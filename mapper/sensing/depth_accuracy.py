@@ -95,11 +95,6 @@ def accuracy_of(depth_m: Array, reference_m: Array | float) -> Accuracy:
     )
 
 
-def typical(many: Sequence[Accuracy]) -> Accuracy:
-    """Return the median of each figure: a largest error grows with the number of frames, this does not."""
-    return Accuracy(**{f.name: median(getattr(one, f.name) for one in many) for f in fields(Accuracy)})
-
-
 def quantisation_step_m(depth_m: Array) -> float | None:
     """Return the median gap between neighbouring depths that occur; None if fewer than three do."""
     values = np.unique(depth_m[depth_m > 0.0])
@@ -107,34 +102,63 @@ def quantisation_step_m(depth_m: Array) -> float | None:
 
 
 @dataclass(frozen=True, slots=True)
+class SeenPlane:
+    """What a plane in one frame showed.
+
+    Attributes:
+        distance_m: How far away it was measured.
+        tilt_rad: Between its normal and the optical axis.
+        measured_ratio: Share of its pixels that had a depth.
+        raw: Of the depth image as it is.
+        filtered: After DIF.
+        step_m: Of quantisation, where the depths that occur tell it.
+    """
+
+    distance_m: float
+    tilt_rad: float
+    measured_ratio: float
+    raw: Accuracy
+    filtered: Accuracy
+    step_m: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class DepthLevel:
     """What one distance showed.
 
     Attributes:
-        name: Which log, or which distances.
-        distance_m: Of the plane, along the optical axis.
-        frames: How many showed it.
-        patches: Planes in them.
-        measured_ratio: Share of their pixels that had a depth.
-        tilt_rad: Between the plane's normal and the optical axis.
-        raw: Of the depth image as it is.
-        filtered: After DIF.
-        step_m: Of quantisation, where the depths that occur tell it.
+        name: Of the log.
+        frames: How many showed planes there.
+        planes: So many.
+        typical: The median of each of their figures, Δd among them: the largest of all would grow with their
+            number. Its distance is the true one where that is known.
         temporal_m: Standard deviation of a pixel from frame to frame; None where pixels cannot be compared.
         fixed_m: Standard deviation of the pixels' means: what averaging over time leaves.
     """
 
     name: str
-    distance_m: float
     frames: int
-    patches: int
-    measured_ratio: float
-    tilt_rad: float
-    raw: Accuracy
-    filtered: Accuracy
-    step_m: float | None = None
+    planes: int
+    typical: SeenPlane
     temporal_m: float | None = None
     fixed_m: float | None = None
+
+
+def typical_of(planes: Sequence[SeenPlane]) -> SeenPlane:
+    """Return the median of every figure."""
+    steps_m = [plane.step_m for plane in planes if plane.step_m is not None]
+    return SeenPlane(
+        distance_m=median(plane.distance_m for plane in planes),
+        tilt_rad=median(plane.tilt_rad for plane in planes),
+        measured_ratio=median(plane.measured_ratio for plane in planes),
+        raw=_typical_accuracy([plane.raw for plane in planes]),
+        filtered=_typical_accuracy([plane.filtered for plane in planes]),
+        step_m=median(steps_m) if steps_m else None,
+    )
+
+
+def _typical_accuracy(many: Sequence[Accuracy]) -> Accuracy:
+    return Accuracy(**{f.name: median(getattr(one, f.name) for one in many) for f in fields(Accuracy)})
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,7 +1,6 @@
 """A depth camera that stands still before a plane at a known distance (thesis 2.6.1, 2.6.2)."""
 
-from dataclasses import dataclass
-from statistics import median
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,16 +10,16 @@ from mapper.geometry import Array
 from mapper.parallel import ordered_map
 from mapper.progress import SILENT, Progress
 from mapper.sensing.depth_accuracy import (
-    Accuracy,
     DepthLevel,
     Patch,
     ResidualMap,
+    SeenPlane,
     accuracy_of,
     central_patch,
     depth_frame,
     first_frame,
     quantisation_step_m,
-    typical,
+    typical_of,
 )
 from mapper.sensing.depth_filter import dif
 from mapper.sensing.depth_planes import MAX_NOISE_RATIO, fit_planes
@@ -30,18 +29,6 @@ _MIN_MEASURED_RATIO = 0.5
 _MAX_TILT_RAD = np.radians(30.0)
 _MAX_DISTANCE_RATIO = 0.2
 _DECODERS = 2
-
-
-@dataclass(frozen=True, slots=True)
-class _Figures:
-    """What one frame's patch says."""
-
-    distance_m: float
-    tilt_rad: float
-    measured_ratio: float
-    raw: Accuracy
-    filtered: Accuracy
-    step_m: float | None
 
 
 class _Pixels:
@@ -110,37 +97,41 @@ def depth_at(
     where = central_patch(first.camera) if patch is None else patch
     where.refuse_outside(first.camera)
 
-    def seen(entry: Entry) -> tuple[_Figures, Array] | str:
+    def seen(entry: Entry) -> tuple[SeenPlane, Array] | str:
         try:
             return _see(depth_frame(entry), distance_m, where, keep_tilt=keep_tilt)
         except (DataError, FrameError) as error:
             return str(error)
 
     pixels = _Pixels((where.height, where.width))
-    frames: list[_Figures] = []
+    planes: list[SeenPlane] = []
     reasons: list[str] = []
     with progress.stage(f"{distance_m:g} m") as report:
         for done, result in enumerate(ordered_map(seen, source.entries(), workers=_DECODERS), start=1):
             if isinstance(result, str):
                 reasons.append(result)
             else:
-                frames.append(result[0])
+                planes.append(result[0])
                 pixels.add(result[1])
             report(done, len(source))
-    if not frames:
+    if not planes:
         raise DataError(
             f"{source.path}: none of {len(reasons)} frames shows a plane; the first: {reasons[0]}"
         )
     if reasons:
         progress.note(f"{source.path}: {len(reasons)} frames left out; the first: {reasons[0]}")
-    _refuse_elsewhere(source, frames, distance_m)
+    typical = typical_of(planes)
+    _refuse_elsewhere(source, typical.distance_m, distance_m)
     error_m = np.full(first.depth_m.shape, np.nan)
     error_m[where.slices] = pixels.mean_m
-    caption = f"{distance_m:g} m, mean of {len(frames)} frames"
-    return _level(source.name, distance_m, frames, pixels), ResidualMap(first.gray, error_m, caption)
+    caption = f"{distance_m:g} m, mean of {len(planes)} frames"
+    level = DepthLevel(
+        source.name, len(planes), len(planes), replace(typical, distance_m=distance_m), *pixels.noise_m()
+    )
+    return level, ResidualMap(first.gray, error_m, caption)
 
 
-def _see(frame: RgbdFrame, distance_m: float, patch: Patch, *, keep_tilt: bool) -> tuple[_Figures, Array]:
+def _see(frame: RgbdFrame, distance_m: float, patch: Patch, *, keep_tilt: bool) -> tuple[SeenPlane, Array]:
     """Return what one frame's patch says, and each pixel's error from its plane, NaN without depth.
 
     Raises:
@@ -165,7 +156,7 @@ def _see(frame: RgbdFrame, distance_m: float, patch: Patch, *, keep_tilt: bool) 
         )
     on_plane_m = plane.depth_m.reshape(depth_m.shape)
     reference_m = distance_m if keep_tilt else on_plane_m * (distance_m / plane.distance_m[0])
-    figures = _Figures(
+    seen = SeenPlane(
         distance_m=float(plane.distance_m[0]),
         tilt_rad=float(plane.tilt_rad[0]),
         measured_ratio=float(measured.mean()),
@@ -173,31 +164,12 @@ def _see(frame: RgbdFrame, distance_m: float, patch: Patch, *, keep_tilt: bool) 
         filtered=accuracy_of(dif(frame.depth_m)[patch.slices].astype(np.float64), reference_m),
         step_m=quantisation_step_m(depth_m),
     )
-    return figures, np.where(measured, depth_m - on_plane_m, np.nan)
+    return seen, np.where(measured, depth_m - on_plane_m, np.nan)
 
 
-def _refuse_elsewhere(source: FrameSource, frames: list[_Figures], distance_m: float) -> None:
-    shown_m = median(frame.distance_m for frame in frames)
+def _refuse_elsewhere(source: FrameSource, shown_m: float, distance_m: float) -> None:
     if abs(shown_m - distance_m) > _MAX_DISTANCE_RATIO * distance_m:
         raise DataError(
             f"{source.path}: shows a plane at {shown_m:.3g} m, not at {distance_m:g} m; are the distances "
             "in the order of the logs, and the log's depth units right (source.camera.depth_factor)?"
         )
-
-
-def _level(name: str, distance_m: float, frames: list[_Figures], pixels: _Pixels) -> DepthLevel:
-    steps_m = [frame.step_m for frame in frames if frame.step_m is not None]
-    temporal_m, fixed_m = pixels.noise_m()
-    return DepthLevel(
-        name=name,
-        distance_m=distance_m,
-        frames=len(frames),
-        patches=len(frames),
-        measured_ratio=median(frame.measured_ratio for frame in frames),
-        tilt_rad=median(frame.tilt_rad for frame in frames),
-        raw=typical([frame.raw for frame in frames]),
-        filtered=typical([frame.filtered for frame in frames]),
-        step_m=median(steps_m) if steps_m else None,
-        temporal_m=temporal_m,
-        fixed_m=fixed_m,
-    )

@@ -1,8 +1,6 @@
 """A depth camera's noise from an ordinary log: whatever planes it happens to show, at whatever distance."""
 
-from dataclasses import dataclass
 from itertools import islice
-from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,15 +11,15 @@ from mapper.geometry import Array
 from mapper.parallel import ordered_map
 from mapper.progress import SILENT, Progress
 from mapper.sensing.depth_accuracy import (
-    Accuracy,
     DepthLevel,
     Patch,
     ResidualMap,
+    SeenPlane,
     accuracy_of,
     depth_frame,
     first_frame,
     quantisation_step_m,
-    typical,
+    typical_of,
 )
 from mapper.sensing.depth_filter import dif
 from mapper.sensing.depth_planes import MAX_NOISE_RATIO, Planes, fit_planes
@@ -39,19 +37,6 @@ _MAX_SHAPE_STEPS = 0.5
 _BIN_RATIO = 1.1
 _MIN_TILES, _MIN_FRAMES = 30, 3
 _DECODERS = 2
-
-
-@dataclass(frozen=True, slots=True)
-class _Tile:
-    """One plane that one frame showed."""
-
-    frame: int
-    distance_m: float
-    tilt_rad: float
-    measured_ratio: float
-    raw: Accuracy
-    filtered: Accuracy
-    step_m: float | None
 
 
 def depth_of_planes(
@@ -89,70 +74,66 @@ def depth_of_planes(
     if min(where.width, where.height) < side:
         raise DataError(f"patch {where}: want at least one tile of {side}×{side} px")
 
-    def look(numbered: tuple[int, Entry]) -> tuple[list[_Tile], ResidualMap] | None:
+    def look(numbered: tuple[int, Entry]) -> tuple[int, list[SeenPlane], ResidualMap] | None:
         number, entry = numbered
         try:
-            return _tiles(depth_frame(entry), number, where, side)
+            return number, *_planes(depth_frame(entry), where, side, number=number)
         except FrameError:
             return None
 
     stride = 1 if most_frames is None else -(-len(source) // most_frames)
     chosen = len(range(0, len(source), stride))
     entries = islice(enumerate(source.entries()), None, None, stride)
-    tiles: list[_Tile] = []
+    planes: list[tuple[int, SeenPlane]] = []
     best, most, unread = None, 0, 0
     with progress.stage("planes") as report:
-        for done, found in enumerate(ordered_map(look, entries, workers=_DECODERS), start=1):
-            if found is None:
+        for done, looked in enumerate(ordered_map(look, entries, workers=_DECODERS), start=1):
+            if looked is None:
                 unread += 1
             else:
-                tiles += found[0]
-                if len(found[0]) > most:
-                    best, most = found[1], len(found[0])
+                number, found, picture = looked
+                planes += [(number, plane) for plane in found]
+                if len(found) > most:
+                    best, most = picture, len(found)
             report(done, chosen)
     if unread:
         progress.note(f"{source.path}: {unread} frames cannot be read")
-    levels = _levels(source.name, tiles)
+    levels = _levels(source.name, planes)
     if best is None or not levels:
         raise DataError(
-            f"{source.path}: {len(tiles)} tiles of {chosen} frames show a plane, and no distance has "
+            f"{source.path}: {len(planes)} tiles of {chosen} frames show a plane, and no distance has "
             f"{_MIN_TILES} of {_MIN_FRAMES} frames; want walls, floors or tables in view"
         )
     return levels, best
 
 
-def _tiles(frame: RgbdFrame, number: int, where: Patch, side: int) -> tuple[list[_Tile], ResidualMap]:
-    """Return the tiles of a frame that show a plane, and a picture of them."""
+def _planes(frame: RgbdFrame, where: Patch, side: int, *, number: int) -> tuple[list[SeenPlane], ResidualMap]:
+    """Return what the tiles of a frame show that show a plane, and a picture of them."""
     depth_m = _cut(frame.depth_m[where.slices], side)
     rays = _cut(ray_table(frame.camera)[where.slices], side)
     filtered_m = _cut(dif(frame.depth_m)[where.slices], side)
-    whole = (depth_m > 0.0).mean(axis=1) >= _MIN_MEASURED_RATIO
+    whole = np.flatnonzero((depth_m > 0.0).mean(axis=1) >= _MIN_MEASURED_RATIO)
     planes = fit_planes(depth_m[whole], rays[whole])
     steps_m = [quantisation_step_m(tile) for tile in depth_m[whole]]
-    flat = _are_planes(planes, depth_m[whole], steps_m)
-    at = np.flatnonzero(whole)
-    tiles = [
-        _Tile(
-            frame=number,
-            distance_m=float(np.median(planes.depth_m[k])),
-            tilt_rad=float(planes.tilt_rad[k]),
-            measured_ratio=float((depth_m[at[k]] > 0.0).mean()),
-            raw=accuracy_of(depth_m[at[k]], planes.depth_m[k]),
-            filtered=accuracy_of(filtered_m[at[k]], planes.depth_m[k]),
-            step_m=steps_m[k],
+    seen = []
+    tiles_m = np.full(depth_m.shape, np.nan)
+    for k in np.flatnonzero(_are_planes(planes, depth_m[whole], steps_m)):
+        tile_m, on_plane_m = depth_m[whole[k]], planes.depth_m[k]
+        tiles_m[whole[k]] = np.where(tile_m > 0.0, tile_m - on_plane_m, np.nan)
+        seen.append(
+            SeenPlane(
+                distance_m=float(np.median(on_plane_m)),
+                tilt_rad=float(planes.tilt_rad[k]),
+                measured_ratio=float((tile_m > 0.0).mean()),
+                raw=accuracy_of(tile_m, on_plane_m),
+                filtered=accuracy_of(filtered_m[whole[k]], on_plane_m),
+                step_m=steps_m[k],
+            )
         )
-        for k in np.flatnonzero(flat)
-    ]
     error_m = np.full(frame.depth_m.shape, np.nan)
-    inside = error_m[where.slices]
-    across = where.width // side
-    for k in np.flatnonzero(flat):
-        row, column = divmod(int(at[k]), across)
-        miss_m = np.where(depth_m[at[k]] > 0.0, depth_m[at[k]] - planes.depth_m[k], np.nan)
-        inside[row * side : (row + 1) * side, column * side : (column + 1) * side] = miss_m.reshape(
-            side, side
-        )
-    return tiles, ResidualMap(frame.gray, error_m, f"frame {number}: {len(tiles)} tiles show a plane")
+    together = _joined(tiles_m, side, across=where.width // side)
+    error_m[where.slices][: together.shape[0], : together.shape[1]] = together
+    return seen, ResidualMap(frame.gray, error_m, f"frame {number}: {len(seen)} tiles show a plane")
 
 
 def _cut(image: NDArray[np.floating], side: int) -> Array:
@@ -161,6 +142,11 @@ def _cut(image: NDArray[np.floating], side: int) -> Array:
     rest = image.shape[2:]
     whole = image[: rows * side, : columns * side].reshape(rows, side, columns, side, *rest)
     return whole.swapaxes(1, 2).reshape(rows * columns, side * side, *rest).astype(np.float64)
+
+
+def _joined(tiles: Array, side: int, *, across: int) -> Array:
+    """Return the image of (T, side²) tiles, so many across."""
+    return tiles.reshape(-1, across, side, side).swapaxes(1, 2).reshape(-1, across * side)
 
 
 def _are_planes(planes: Planes, depth_m: Array, steps_m: list[float | None]) -> NDArray[np.bool_]:
@@ -189,28 +175,15 @@ def _shape_m(error_m: Array) -> Array:
     return np.asarray(np.sqrt((means**2).mean(axis=(1, 2))))
 
 
-def _levels(name: str, tiles: list[_Tile]) -> list[DepthLevel]:
-    """Return the distances at which there are enough planes."""
-    bins: dict[int, list[_Tile]] = {}
-    for tile in tiles:
-        bins.setdefault(int(np.floor(np.log(tile.distance_m) / np.log(_BIN_RATIO))), []).append(tile)
+def _levels(name: str, planes: list[tuple[int, SeenPlane]]) -> list[DepthLevel]:
+    """Return the distances at which enough frames show enough planes."""
+    bins: dict[int, list[tuple[int, SeenPlane]]] = {}
+    for numbered in planes:
+        step = int(np.floor(np.log(numbered[1].distance_m) / np.log(_BIN_RATIO)))
+        bins.setdefault(step, []).append(numbered)
     levels = []
     for _, inside in sorted(bins.items()):
-        frames = len({tile.frame for tile in inside})
-        if len(inside) < _MIN_TILES or frames < _MIN_FRAMES:
-            continue
-        steps_m = [tile.step_m for tile in inside if tile.step_m is not None]
-        levels.append(
-            DepthLevel(
-                name=name,
-                distance_m=median(tile.distance_m for tile in inside),
-                frames=frames,
-                patches=len(inside),
-                measured_ratio=median(tile.measured_ratio for tile in inside),
-                tilt_rad=median(tile.tilt_rad for tile in inside),
-                raw=typical([tile.raw for tile in inside]),
-                filtered=typical([tile.filtered for tile in inside]),
-                step_m=median(steps_m) if steps_m else None,
-            )
-        )
+        frames = len({number for number, _ in inside})
+        if len(inside) >= _MIN_TILES and frames >= _MIN_FRAMES:
+            levels.append(DepthLevel(name, frames, len(inside), typical_of([plane for _, plane in inside])))
     return levels
