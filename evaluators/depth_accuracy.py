@@ -161,11 +161,10 @@ def sensor_toml(study: DepthStudy) -> str:
     """Return the noise as a configuration that ``mapper build`` reads."""
     fit = study.fit
     a, b, c = fit.noise.constant_m, fit.noise.linear, fit.noise.quadratic_per_m
-    numbers = f"constant_m = {a!r}\nlinear = {b!r}\nquadratic_per_m = {c!r}\n"
     return (
         f"# mapper sensor depth: σ_z = {fit.noise.text} m,\n"
         f"# measured at {fit.low_m:.2f} … {fit.high_m:.2f} m in {', '.join(study.logs)}\n"
-        f"\n[odometry.depth_noise]\n{numbers}\n[loops.verification.depth_noise]\n{numbers}"
+        f"\n[odometry.depth_noise]\nconstant_m = {a!r}\nlinear = {b!r}\nquadratic_per_m = {c!r}\n"
     )
 
 

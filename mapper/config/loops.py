@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from mapper.config.base import Config, Ratio
-from mapper.config.depth_noise import DepthNoiseConfig
 from mapper.config.hough import ConstellationConfig, GroundConfig, VotingConfig
 from mapper.config.odometry import IsvdConfig, MatchConfig
 from mapper.config.places import PlacesConfig, ScanContextConfig
@@ -37,8 +36,6 @@ class VerificationConfig(Config):
     """A smaller share of the pairs that agrees is no loop."""
     virtual_baseline_px_m: PositiveFloat = 40.0
     """bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017)."""
-    depth_noise: DepthNoiseConfig | None = None
-    """The sensor's own; None takes bf / z to be as noisy as a pixel."""
     max_sigma_m: PositiveFloat = 0.05
     """A motion whose translation is less certain in any direction is no loop: far scenes hold it loosely."""
     measure: Literal["reprojection", "isvd"] = "reprojection"

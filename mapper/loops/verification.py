@@ -16,7 +16,6 @@ from mapper.odometry.local_map.p3p import ransac_p3p
 from mapper.odometry.local_map.pose import normal_matrix, refine_pose
 from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
-from mapper.sensing.depth_noise import pixel_weights
 
 _LM_ROUNDS, _LM_ITERATIONS = 4, 10
 _MAX_HAMMING = 64
@@ -103,7 +102,7 @@ class ImageVerifier:
         """Refine ISVD's motion in j's image, and count who agrees."""
         config = self._config
         points = i.points_camera[pairs[:, 0]]
-        measured, weights, intrinsics = _measurements(j, pairs[:, 1], config)
+        measured, weights, intrinsics = _measurements(j, pairs[:, 1], config.virtual_baseline_px_m)
         T_j_i, agree, _ = refine_pose(
             inverse(alignment.T_target_source),
             points,
@@ -141,20 +140,12 @@ class ImageVerifier:
         return Verification(matches, "", inliers, alignment.inlier_rmse_m, residual_px, T_i_j, information)
 
 
-def _measurements(
-    view: View, features: NDArray[np.intp], config: VerificationConfig
-) -> tuple[Array, Array, Array]:
+def _measurements(view: View, features: NDArray[np.intp], bf: float) -> tuple[Array, Array, Array]:
     """Return (M, 3) u, v, bf/z, their (M, 3) inverse variances, and (5,) intrinsics."""
-    bf = config.virtual_baseline_px_m
     depth_m = view.points_camera[features, 2]
+    sigma_px = np.repeat(view.sigma_px[features, None], 3, axis=1)
     return (
         np.column_stack([view.pixels[features], bf / depth_m]),
-        pixel_weights(
-            view.sigma_px[features],
-            depth_m,
-            virtual_baseline_px_m=bf,
-            disparity_sigma_px=1.0,
-            depth_noise=config.depth_noise,
-        ),
+        sigma_px**-2.0,
         np.append(view.intrinsics, bf),
     )

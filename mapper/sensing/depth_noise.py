@@ -1,32 +1,46 @@
-"""What the noise of a depth says in pixels."""
+"""How well the depth of a feature is known."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.config.depth_noise import DepthNoiseConfig
+from mapper.frames import DepthImage
 from mapper.geometry import Array
+from mapper.sensing.depth_filter import dif
 
 
-def pixel_weights(
-    sigma_px: Array,
-    depth_m: Array,
+def feature_depth_sigma_m(
+    depth_m: DepthImage,
+    columns: NDArray[np.intp],
+    rows: NDArray[np.intp],
     *,
-    virtual_baseline_px_m: float,
-    disparity_sigma_px: float,
-    depth_noise: DepthNoiseConfig | None,
+    sigma_px: Array,
+    noise: DepthNoiseConfig,
 ) -> Array:
-    """Return (N, 3) inverse variances, px⁻², of features' u, v and virtual disparity bf / z.
+    """Return (N,) standard deviations of the depths of features: the sensor's noise, and the slope.
+
+    A depth is read where a feature was found. By what the feature misses its place in the image, the
+    depth is that of another point: on a slope, or beside an edge, this is more than the noise. How
+    the depth varies within one σ along either axis is looked up in the image after DIF, so that
+    noise is not counted twice.
 
     Args:
-        sigma_px: (N,) standard deviation of a feature's pixel.
-        depth_m: (N,) its depth, NaN where there is none.
-        virtual_baseline_px_m: bf.
-        disparity_sigma_px: σ of the virtual disparity relative to that of the pixel, for a sensor whose
-            noise is not known.
-        depth_noise: The sensor's, where it is: then σ is bf / z² · σ_z.
+        depth_m: (H, W) depth image, 0 is no measurement.
+        columns: (N,) pixels of the features.
+        rows: (N,).
+        sigma_px: (N,) standard deviation of a feature's place, along both axes.
+        noise: The sensor's.
     """
-    sigma_disparity_px = sigma_px * disparity_sigma_px
-    if depth_noise is not None:
-        measured = virtual_baseline_px_m / depth_m**2 * depth_noise.sigma_m(depth_m)
-        sigma_disparity_px = np.where(np.isnan(depth_m), sigma_disparity_px, measured)
-    weights: Array = np.column_stack([sigma_px, sigma_px, sigma_disparity_px]) ** -2.0
-    return weights
+    smooth_m = dif(depth_m)
+    height, width = depth_m.shape
+    here_m = smooth_m[rows, columns].astype(np.float64)
+    reach_px = np.maximum(np.rint(sigma_px), 1.0).astype(np.intp)
+    squares = np.zeros(len(here_m))
+    for across, down in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        row = np.clip(rows + down * reach_px, 0, height - 1)
+        column = np.clip(columns + across * reach_px, 0, width - 1)
+        there_m = smooth_m[row, column].astype(np.float64)
+        squares += np.where(there_m > 0.0, (there_m - here_m) ** 2, 0.0)
+    slope_m = np.sqrt(0.5 * squares) * sigma_px / reach_px  # two looks along each axis; the axes add up
+    sigma_m: Array = np.hypot(noise.sigma_m(depth_m[rows, columns].astype(np.float64)), slope_m)
+    return sigma_m

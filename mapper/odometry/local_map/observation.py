@@ -13,7 +13,7 @@ from mapper.features.windowed import FeatureGrid, Words, pack, sort_into_grid
 from mapper.frames import Frame, RgbdFrame
 from mapper.geometry import Array, Points, Transform
 from mapper.places.vocabulary import Vocabulary
-from mapper.sensing.depth_noise import pixel_weights
+from mapper.sensing.depth_noise import feature_depth_sigma_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,6 +102,14 @@ def observe(frame: Frame, detector: Detector, vocabulary: Vocabulary, config: Ke
         disparity_px[:] = np.nan
     bits = pack(features.descriptors[order])
     sigma_px = detector.scale_factor ** octave.astype(np.float64)
+    disparity_sigma_px = sigma_px * config.disparity_sigma_px
+    if config.depth_noise is not None:
+        sigma_m = feature_depth_sigma_m(
+            frame.depth_m, column, row, sigma_px=sigma_px, noise=config.depth_noise
+        )
+        # Without a depth the weight is not used, but enters sums as a factor.
+        known_px = config.virtual_baseline_px_m / depth_m**2 * sigma_m
+        disparity_sigma_px = np.where(np.isnan(depth_m), disparity_sigma_px, known_px)
     rays = (pixels - intrinsics[2:4]) / intrinsics[:2]
     return Observation(
         stamp_ns=frame.stamp_ns,
@@ -110,13 +118,7 @@ def observe(frame: Frame, detector: Detector, vocabulary: Vocabulary, config: Ke
         bits=bits,
         words=vocabulary.words_of(bits),
         measured=np.column_stack([pixels, disparity_px]),
-        weights=pixel_weights(
-            sigma_px,
-            depth_m,
-            virtual_baseline_px_m=config.virtual_baseline_px_m,
-            disparity_sigma_px=config.disparity_sigma_px,
-            depth_noise=config.depth_noise,
-        ),
+        weights=np.column_stack([sigma_px, sigma_px, disparity_sigma_px]) ** -2.0,
         points_camera=np.column_stack([rays * depth_m[:, None], depth_m]),
         grid=grid,
         intrinsics=intrinsics,
