@@ -38,7 +38,9 @@ def reproduce(
             help="Only these, e.g. 5.1,5.2; thesis has detectors, too. Another choice is measured anew."
         ),
     ] = None,
-    seeds: Annotated[int, typer.Option(help="Draws of RANSAC: median and spread are over them.")] = 3,
+    seeds: Annotated[
+        int, typer.Option(help="Draws of all that is random; median and spread are over them.")
+    ] = 3,
     first: First = None,
     last: Last = None,
     processes: Annotated[
