@@ -236,7 +236,12 @@ def test_a_calibration_is_not_overwritten_unasked(driven):
     folder, _ = driven
     arguments = ("sensor", "line-laser-calibrate", folder / "drive/shots", "--out", folder / "C.toml")
     assert "exists already" in run(*arguments).stderr
-    assert "--wheelbase -1.0: want > 0 m" in run(*arguments, "--overwrite", "--wheelbase", -1).stderr
+    beyond = run(*arguments, "--overwrite", "--reach", 1.5).stderr
+    assert "a board at 1.7 m, but the laser meets the floor at 1.5 m" in beyond
+    assert (
+        "wheelbase_m: Input should be greater than 0"
+        in run(*arguments, "--overwrite", "--wheelbase", -1).stderr
+    )
 
 
 def test_labels_that_fit_nothing_are_refused(tmp_path):

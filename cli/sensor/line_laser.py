@@ -7,7 +7,7 @@ import typer
 
 from cli.console import progress_for
 from cli.environment import prepare_libraries
-from cli.options import Quiet
+from cli.options import Quiet, assignments
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -109,7 +109,7 @@ def calibrate(
     from mapper.atomic import write_text
     from mapper.config import overridden
     from mapper.config.line_laser import LineLaserConfig, VehicleConfig
-    from mapper.errors import ConfigError, RunError
+    from mapper.errors import RunError
     from mapper.export.line_laser_picture import write_calibration_picture
     from mapper.sensing.line_laser.calibration import calibrate as fit_laws
     from mapper.sensing.line_laser.calibration import calibration_text
@@ -117,16 +117,13 @@ def calibrate(
 
     if out.exists() and not overwrite:
         raise RunError(f"{out}: exists already; choose another --out, or pass --overwrite to replace it")
-    for name, value in {"--reach": reach, "--wheelbase": wheelbase}.items():
-        if value is not None and not value > 0.0:
-            raise ConfigError(f"{name} {value}: want > 0 m")
+    vehicle = overridden(VehicleConfig(), assignments({"wheelbase_m": wheelbase, "sensor_x_m": sensor_x}))
     prepare_libraries()
     progress = progress_for(quiet=quiet)
     config = overridden(LineLaserConfig(), set_ or [])
     seen, size_px, notes = read_shots(shots, config.stripe, progress=progress)
     for note in notes:
         progress.note(note)
-    vehicle = VehicleConfig(wheelbase_m=wheelbase, sensor_x_m=sensor_x)
     fit = fit_laws(seen, size_px=size_px, reach_m=reach, vehicle=vehicle)
     write_text(out, calibration_text(fit.calibration))
     write_calibration_picture(out.with_suffix(".png"), fit, seen)

@@ -124,8 +124,14 @@ def calibrate(
         vehicle: What carries the sensor.
 
     Raises:
-        DataError: Too few shots, or no law of this kind suits them.
+        DataError: Too few shots, one beyond the reach, or no law of this kind suits them.
     """
+    farthest_m = max((shot.range_m for shot in shots), default=0.0)
+    if not farthest_m <= reach_m:
+        raise DataError(
+            f"calibration: a board at {farthest_m:g} m, but the laser meets the floor at {reach_m:g} m; "
+            "is the reach right?"
+        )
     wide = [(s.range_m, s.board.row_px, s.board.width_px, s.width_m) for s in shots if s.width_m is not None]
     for ranges, fewest, what in (
         ({shot.range_m for shot in shots}, _MIN_RANGES, "ranges"),

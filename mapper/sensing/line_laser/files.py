@@ -37,7 +37,8 @@ def find_images(
         raise SourceError(f"{folder}: no such folder; want a folder of images")
     images = in_order(path for path in folder.iterdir() if path.suffix.lower() in _ENDINGS)
     if not images:
-        raise SourceError(f"{folder}: no images; want files ending in {' '.join(sorted(_ENDINGS))}")
+        inside = "; those in images/?" if (folder / "images").is_dir() else ""
+        raise SourceError(f"{folder}: no images; want files ending in {' '.join(sorted(_ENDINGS))}{inside}")
     lists = (folder / _TIMES, folder.parent / _TIMES)
     beside = next((path for path in lists if path.is_file()), None)
     stamps_ns, notes = scan_stamps(images, chosen=times, beside=beside, rate_hz=rate_hz)
