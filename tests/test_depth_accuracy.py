@@ -1,9 +1,12 @@
 """A depth camera's accuracy: the definitions on arrays by hand, and planes whose noise is known."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from evaluators.depth_accuracy import study_depth
+from mapper.config.sources import SourceConfig
 from mapper.config.synthetic import SensorConfig, SynthConfig
 from mapper.errors import DataError, SourceError
 from mapper.frames import PinholeCamera, RgbdFrame, Scan, ray_table
@@ -12,8 +15,10 @@ from mapper.sensing.depth_fit import fit_noise
 from mapper.sensing.depth_planes import fit_planes
 from mapper.sensing.depth_still import depth_at
 from mapper.sensing.depth_tiles import depth_of_planes
+from mapper.sources import open_source
 from mapper.sources.synthetic.source import SyntheticSource
 
+FR1_XYZ = Path(__file__).parents[2] / "shared/data/tum_fr1_xyz"
 CAMERA = PinholeCamera(320, 240, 262.5, 262.5, 159.5, 119.5)
 A, B, C = 0.0012, 0.0008, 0.0015
 
@@ -285,6 +290,25 @@ def test_a_log_without_planes_is_refused():
     rough = [1.5 + 0.3 * rng.standard_normal((240, 320)).cumsum(axis=1) / 10.0 for _ in range(3)]
     with pytest.raises(DataError, match="no distance has 30 of 3 frames; want walls, floors or tables"):
         depth_of_planes(Log(np.maximum(rough, 0.2)))
+
+
+@pytest.mark.skipif(not FR1_XYZ.is_dir(), reason=f"no {FR1_XYZ}")
+def test_a_real_kinect_is_as_noisy_as_was_published():
+    log = open_source(FR1_XYZ, SourceConfig(first_frame=20, last_frame=400, stride=60))
+    levels, picture = depth_of_planes(log)
+    z = np.array([level.typical.distance_m for level in levels])
+    assert len(z) >= 3
+    assert 0.6 < z[0] < z[-1] < 3.5
+    std_m = np.array([level.typical.raw.std_m for level in levels])
+    # Khoshelham & Elberink (2012) found 1.43 mm/m², Nguyen et al. (2012) 1.2 mm + 1.9 mm/m² · (z − 0.4 m)².
+    assert (std_m > 0.9 * 0.00143 * z**2).all()
+    assert (std_m < 1.3 * (0.0012 + 0.0019 * (z - 0.4) ** 2)).all()
+    ratio = np.array([level.typical.filtered.std_m for level in levels]) / std_m
+    assert ((ratio > 0.6) & (ratio < 0.9)).all(), "neighbours share noise, so DIF takes less than two thirds"
+    steps_m = np.array([level.typical.step_m for level in levels])
+    # An eighth of a pixel at bf = 43.5 px m; the files are rounded to whole millimetres.
+    np.testing.assert_allclose(steps_m, 0.125 / 43.5 * z**2, atol=0.001)
+    assert 0.05 < (~np.isnan(picture.error_m)).mean() < 0.9
 
 
 # The synthetic Kinect
