@@ -1,7 +1,7 @@
 """Which settings the tables of Somlyai's PhD thesis (Óbuda University) compare, and on which sequences."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import NamedTuple
 
@@ -83,61 +83,69 @@ def tables() -> Mapping[str, Ablation]:
     """Return the tables that can be measured again, by what they are called on the command line."""
     iterations = figures("isvd_iterations", rows="the columns")
     previous = figures("isvd_previous_frames")
-    loops = figures("isvd_loop_dif")
-    long_loop = figures("loop_2100_frames")
     return {
         "4.1": _icp_or_svd(iterations),
-        "4.2": Ablation(
-            name="Table 4.2",
-            title="Loop closure on a long log",
-            source=published()["loop_2100_frames"]["source"],
-            metric="ATE RMSE",
-            unit="m",
-            printed=long_loop,
+        "4.2": replace(
+            _errors(
+                "Table 4.2",
+                "Loop closure on a long log",
+                "loop_2100_frames",
+                {"ISVD+DIF": Setting("ISVD+DIF"), "ISVD+DIF+LC": Setting("ISVD+LC+DIF")},
+            ),
             sequences={"fr3/long_office": 2100},
-            settings={"ISVD+DIF": Setting("ISVD+DIF"), "ISVD+DIF+LC": Setting("ISVD+LC+DIF")},
         ),
-        "5.1": Ablation(
-            name="Table 5.1",
-            title="ISVD by the number of its iterations",
-            source=published()["isvd_iterations"]["source"],
-            metric="ATE RMSE",
-            unit="m",
+        "5.1": replace(
+            _errors(
+                "Table 5.1",
+                "ISVD by the number of its iterations",
+                "isvd_iterations",
+                {count: _iterations(count) for count in next(iter(iterations.values()))},
+            ),
             printed=iterations,
             sequences=dict.fromkeys(iterations),
-            settings={count: _iterations(count) for count in next(iter(iterations.values()))},
             axis="iterations",
         ),
-        "5.2": Ablation(
-            name="Table 5.2",
-            title="ISVD by the number of previous frames (MP) that each frame is registered against",
-            source=published()["isvd_previous_frames"]["source"],
-            metric="ATE RMSE",
-            unit="m",
-            printed=previous,
-            sequences=dict.fromkeys(previous),
-            settings={mp: Setting(mp) for mp in next(iter(previous.values()))},
+        "5.2": replace(
+            _errors(
+                "Table 5.2",
+                "ISVD by the number of previous frames (MP) that each frame is registered against",
+                "isvd_previous_frames",
+                {mp: Setting(mp) for mp in next(iter(previous.values()))},
+            ),
             axis="MP",
         ),
-        "5.5": Ablation(
-            name="Table 5.5",
-            title="ISVD alone, with loop closure (LC) and with the depth image filter (DIF)",
-            source=published()["isvd_loop_dif"]["source"],
-            metric="ATE RMSE",
-            unit="m",
-            printed=loops,
-            sequences=dict.fromkeys(loops),
-            settings={
-                "ISVD": Setting("ISVD"),
-                "ISVD+LC": Setting("ISVD+LC"),
-                "ISVD+LC+DIF": Setting("ISVD+LC+DIF"),
-                "ISVD+LC, graph": Setting("ISVD+LC", ("graph.solve=batch",)),
-                "ISVD+LC+DIF, graph": Setting("ISVD+LC+DIF", ("graph.solve=batch",)),
-            },
+        "5.5": replace(
+            _errors(
+                "Table 5.5",
+                "ISVD alone, with loop closure (LC) and with the depth image filter (DIF)",
+                "isvd_loop_dif",
+                {
+                    "ISVD": Setting("ISVD"),
+                    "ISVD+LC": Setting("ISVD+LC"),
+                    "ISVD+LC+DIF": Setting("ISVD+LC+DIF"),
+                    "ISVD+LC, graph": Setting("ISVD+LC", ("graph.solve=batch",)),
+                    "ISVD+LC+DIF, graph": Setting("ISVD+LC+DIF", ("graph.solve=batch",)),
+                },
+            ),
             notes=("“graph” is ours: the same loops as constraints of a pose graph.",),
         ),
         "detectors": _detectors(iterations),
     }
+
+
+def _errors(name: str, title: str, key: str, settings: Mapping[str, Setting]) -> Ablation:
+    """Return a table of ATE RMSE whose rows are sequences."""
+    printed = figures(key)
+    return Ablation(
+        name=name,
+        title=title,
+        source=published()[key]["source"],
+        metric="ATE RMSE",
+        unit="m",
+        printed=printed,
+        sequences=dict.fromkeys(printed),
+        settings=settings,
+    )
 
 
 def _iterations(count: str) -> Setting:
