@@ -6,7 +6,7 @@ import pytest
 from mapper.config.octree import OctreeConfig, SliceConfig
 from mapper.errors import DataError
 from mapper.octree.map import OctreeMap
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, cut_slice
+from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, cut_slice, shrunk
 
 CELL = 0.05
 
@@ -137,3 +137,15 @@ def test_a_band_thinner_than_a_voxel_is_refused():
 def test_a_grid_checks_itself_at_birth(cells, origin, resolution_m, message):
     with pytest.raises(DataError, match=message):
         OccupancyGrid(cells, origin, resolution_m)
+
+
+def test_a_shrunk_grid_shows_what_matters_most():
+    cells = np.full((5, 7), UNKNOWN, np.int8)
+    cells[0, :4], cells[1, 1], cells[4, 6] = FREE, OCCUPIED, OCCUPIED
+
+    small = shrunk(OccupancyGrid(cells, np.array([1.0, -2.0]), 0.5), 4)
+
+    np.testing.assert_array_equal(small.cells, [[OCCUPIED, FREE, -1, -1], [-1] * 4, [-1, -1, -1, OCCUPIED]])
+    assert small.resolution_m == 1.0
+    np.testing.assert_array_equal(small.origin_world_m, [1.0, -2.0])
+    assert shrunk(small, 4) is small

@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 from mapper.atomic import replacing, write_bytes, write_text
 from mapper.errors import DataError, MapFileError
 from mapper.export.palette import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, shrunk
 
 FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
 OCCUPIED_THRESHOLD = 0.65
 FREE_THRESHOLD = 0.196  # 0.25, often seen, would load pixel 205 (0.19608) as free
 
 _PICTURE_PX = 800
+_MOST_PX = 4000
 
 
 def write_grid(folder: Path, stem: str, grid: OccupancyGrid) -> None:
@@ -86,6 +87,7 @@ def grid_image(grid: OccupancyGrid) -> NDArray[np.uint8]:
 
 
 def _write_picture(path: Path, grid: OccupancyGrid) -> None:
+    grid = shrunk(grid, _MOST_PX)
     enlargement = -(-_PICTURE_PX // max(grid.cells.shape))
     image = grid_image(grid)[::-1].repeat(enlargement, axis=0).repeat(enlargement, axis=1)
     with replacing(path) as part:

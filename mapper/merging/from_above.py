@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,9 @@ from mapper.merging.merged_map import MapManifest
 from mapper.merging.placing import Placed
 from mapper.merging.steps import JoinedTile, SeenColumn, Site, save_ground, see_column
 from mapper.octree.ground import NOTHING, find_ground
-from mapper.octree.slice import OccupancyGrid, grid_of
+from mapper.octree.slice import OccupancyGrid, grid_of, shrunk
 
+_MOST_CELLS = 2000  # more than a page has pixels
 _MAX_TILT = np.cos(np.deg2rad(5.0))
 
 
@@ -33,16 +35,18 @@ def look_from_above(
     first = np.min([tile.first for tile in joined.values()], axis=0)
     last = np.max([tile.last for tile in joined.values()], axis=0)
     shape = int(last[1] - first[1]), int(last[0] - first[0])
-    columns = defaultdict(list)
+    columns, rows = defaultdict(list), defaultdict(list)
     for tile in joined:
-        columns[tuple(site.window(tile)[0].tolist())].append(tile)
+        x, y = site.window(tile)[0].tolist()
+        columns[x, y].append(tile)
+        rows[y].append(tile)
     ground_path = None
     if manifest.slice.above == "ground":
-        lowest = np.full(shape, NOTHING, np.int32)
-        for tile in joined:
-            _over(np.minimum, lowest, first, site, tile, "lowest")
         ground = find_ground(
-            lowest, first=first, resolution_m=manifest.octree.resolution_m, floor_z_m=manifest.floor_z_m
+            _Lowest(site, rows, first, shape),
+            first=first,
+            resolution_m=manifest.octree.resolution_m,
+            floor_z_m=manifest.floor_z_m,
         )
         ground_path = site.scratch / "ground.npz"
         save_ground(ground_path, ground)
@@ -71,11 +75,37 @@ def look_from_above(
     return done, grid, []
 
 
+@dataclass(frozen=True, slots=True)
+class _Lowest:
+    """The tops of the lowest occupied voxels in all columns of the map, read when they are asked for.
+
+    Attributes:
+        site: Where the tiles' pieces are.
+        tiles: By the y key of their first row.
+        first: (2,) x and y keys of the map's first column.
+        shape: H, W.
+    """
+
+    site: Site
+    tiles: Mapping[int, Sequence[int]]
+    first: NDArray[np.int64]
+    shape: tuple[int, int]
+
+    def __getitem__(self, rows: slice) -> NDArray[np.int32]:
+        x, y = int(self.first[0]), int(self.first[1]) + rows.start
+        band = np.full((min(rows.stop, self.shape[0]) - rows.start, self.shape[1]), NOTHING, np.int32)
+        voxels = self.site.tiling.voxels
+        for row in range(y // voxels * voxels, y + len(band), voxels):
+            for tile in self.tiles.get(row, ()):
+                _over(np.minimum, band, np.array([x, y]), self.site, tile, "lowest")
+        return band
+
+
 def _over(
     join: np.ufunc, whole: NDArray[Any], first: NDArray[np.int64], site: Site, tile: int, piece: str
 ) -> None:
-    """Join a tile's piece into the raster of the whole, whose first column has these keys."""
-    array = np.load(site.piece(tile, piece))
+    """Join a tile's piece into a raster whose first column has these keys."""
+    array = np.load(site.piece(tile, piece), mmap_mode="r")
     x, y = site.window(tile)[0] - first
     rows, columns = (slice(max(at, 0), at + size) for at, size in zip((y, x), array.shape, strict=True))
     into = whole[rows, columns]
@@ -86,7 +116,7 @@ def draw(path: Path, grid: OccupancyGrid, placed: Sequence[Placed], manifest: Ma
     """Draw the runs' paths over the slice."""
     write_merged(
         path,
-        grid=grid,
+        grid=shrunk(grid, _MOST_CELLS),
         paths_world={
             item.run.path.name: apply(item.T_map_world, item.run.trajectory().positions_world)
             for item in placed

@@ -18,7 +18,7 @@ from mapper.geometry import apply
 from mapper.merging.assembling import write_whole_bt, write_whole_ot
 from mapper.merging.from_above import draw, look_from_above
 from mapper.merging.jobs import Foreman
-from mapper.merging.merged_map import TILES, MapManifest, MergedMap, RunInMap, Tile, open_map
+from mapper.merging.merged_map import TILES, MapManifest, MergedMap, RunInMap, Tile, is_map, open_map
 from mapper.merging.placing import Placed, doubts
 from mapper.merging.steps import (
     Effort,
@@ -95,6 +95,8 @@ def merge(
         ConfigError: The runs do not agree in resolution or sensor model, or the tiles' edge is impossible.
         RunError: OUT is there already, a run comes twice or lacks its map, or a job failed.
     """
+    if overwrite and out.exists() and not is_map(out):
+        raise RunError(f"{out}: is no merged map, so --overwrite will not replace it; choose another --out")
     config = _common_config(placed)
     tiling = tiling_for(config.resolution_m, tile_m)
     manifest = MapManifest(

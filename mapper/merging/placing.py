@@ -84,9 +84,10 @@ def doubts(placed: Sequence[Placed]) -> list[str]:
         found.append(
             "every run's world was taken for the map's; for runs mapped apart see --place and --poses"
         )
+    used = [_frames_used(item.run) for item in placed]
     for second, item in enumerate(placed):
-        for other in placed[:second]:
-            shared = _shared_frames(other.run, item.run)
+        for first, other in enumerate(placed[:second]):
+            shared = sum(len(stamps & used[first].get(log, set())) for log, stamps in used[second].items())
             if shared:
                 found.append(
                     f"{other.run.path.name} and {item.run.path.name} were made from {shared} frames that are "
@@ -95,15 +96,17 @@ def doubts(placed: Sequence[Placed]) -> list[str]:
     return found
 
 
-def _shared_frames(first: Run, second: Run) -> int:
-    """Return how many frames of the same log two runs have used."""
-    logs = (
-        {log.fingerprint for log in (run.manifest.input, *run.manifest.input.appended)}
-        for run in (first, second)
-    )
-    if set.isdisjoint(*logs):
-        return 0
-    return len(np.intersect1d(first.trajectory().stamps_ns, second.trajectory().stamps_ns))
+def _frames_used(run: Run) -> dict[str, set[int]]:
+    """Return the stamps of the frames that a run has used of each log, by the log's fingerprint."""
+    stamps_ns = run.trajectory().stamps_ns
+    logs = (run.manifest.input, *run.manifest.input.appended)
+    begins = np.searchsorted(stamps_ns, [log.begins_ns for log in run.manifest.input.appended])
+    sessions = np.split(stamps_ns, begins)
+    shifts_ns = (0, *(log.shift_ns for log in run.manifest.input.appended))
+    return {
+        log.fingerprint: set((session - shift_ns).tolist())
+        for log, session, shift_ns in zip(logs, sessions, shifts_ns, strict=True)
+    }
 
 
 def _fit_to_truth(run: Run) -> tuple[Transform, float]:

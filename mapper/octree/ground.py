@@ -2,6 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numba import njit
@@ -18,6 +19,19 @@ _START_M = 0.5
 _MIN_COLUMNS = 4
 NOTHING = np.iinfo(np.int32).max
 """Top of the lowest occupied voxel of a column that has none."""
+
+
+class Rows(Protocol):
+    """An (H, W) int32 raster of which some rows are asked for at a time, so it need not be in memory."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """H, W."""
+        ...
+
+    def __getitem__(self, rows: slice, /) -> NDArray[np.int32]:
+        """Return some rows."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,9 +98,7 @@ def lowest_occupied(
     return lowest
 
 
-def find_ground(
-    lowest: NDArray[np.int32], *, first: NDArray[np.int64], resolution_m: float, floor_z_m: float
-) -> Ground:
+def find_ground(lowest: Rows, *, first: NDArray[np.int64], resolution_m: float, floor_z_m: float) -> Ground:
     """Return the ground below what ``lowest_occupied`` found; see ``ground_heights``."""
     columns = max(1, round(_CELL_M / resolution_m))
     low_m = _cells(lowest, columns) * resolution_m
@@ -108,7 +120,7 @@ def _lowest_occupied(codes, slots, values, threshold, first, lowest):
                     lowest[row, column] = min(lowest[row, column], top)
 
 
-def _cells(lowest: NDArray[np.int32], columns: int) -> Array:
+def _cells(lowest: Rows, columns: int) -> Array:
     """Return a low percentile of the lowest voxels in squares of so many columns; NaN where few are seen."""
     rows_of, columns_of = (-(-size // columns) for size in lowest.shape)
     cells = np.full((rows_of, columns_of), np.nan)

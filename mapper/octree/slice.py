@@ -49,6 +49,18 @@ class OccupancyGrid:
             raise DataError(f"grid: resolution {self.resolution_m} m, want > 0")
 
 
+def shrunk(grid: OccupancyGrid, most_cells: int) -> OccupancyGrid:
+    """Return a grid of no more cells along an edge, for a picture: a cell shows what matters most in it."""
+    factor = -(-max(grid.cells.shape) // most_cells)
+    if factor == 1:
+        return grid
+    padding = [(0, -size % factor) for size in grid.cells.shape]
+    cells = np.pad(grid.cells, padding, constant_values=UNKNOWN)
+    rows, columns = (size // factor for size in cells.shape)
+    cells = cells.reshape(rows, factor, columns, factor).max(axis=(1, 3))
+    return OccupancyGrid(cells, grid.origin_world_m, factor * grid.resolution_m)
+
+
 def cut_slice(octree: OctreeMap, config: SliceConfig, *, floor_z_m: float = 0.0) -> OccupancyGrid:
     """Return the band between two heights above the floor as a grid just large enough for it.
 
@@ -180,6 +192,8 @@ def _flatten(codes, slots, values, threshold, first, lowest, highest, bases, see
 
 def _without_speckles(seen: NDArray[np.uint8], *, min_cells: int) -> NDArray[np.uint8]:
     """Return ``seen`` without the occupied flag of 8-connected groups smaller than ``min_cells``."""
+    if min_cells == 1:
+        return seen
     occupied = (seen & _SEEN_OCCUPIED).astype(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(occupied, connectivity=8)
     small = stats[:, cv2.CC_STAT_AREA] < min_cells
