@@ -12,7 +12,7 @@ from evaluators.scan_pairs import fewer_rings, merged, perturbed
 from mapper.errors import ConfigError, SourceError
 from mapper.frames import Scan
 from mapper.geometry import apply, rotation_exp, transform
-from mapper.trajectory import trajectory_from, write_kitti
+from mapper.trajectory import read_kitti, trajectory_from, write_kitti
 
 RELLIS = Path(__file__).parents[2] / "shared/data/rellis_cross_sensor"
 SCANS = 6
@@ -41,6 +41,8 @@ def test_every_log_gives_scans_and_the_map_of_the_others(logs):
     assert [pair.name for pair in pairs] == [f"drive scan {k}" for k in (1, 2, 3, 4)]
     assert {pair.sensor for pair in pairs} == {ALL_RINGS}  # too few points to be thinned further
     clouds = pairs[1].clouds()
+    true = read_kitti(logs / "drive/poses.txt").T_world_body[2]
+    assert np.allclose(clouds.T_target_source[:3, :3], true[:3, :3], atol=1e-6)  # as level as the world
     in_map = apply(clouds.T_target_source, clouds.source.points_body.astype(np.float64))
     nearest_m = [np.abs(clouds.target.points_body - point).max(axis=1).min() for point in in_map[::500]]
     assert np.median(nearest_m) < 0.3

@@ -291,13 +291,11 @@ def _posed(log: Path) -> list[tuple[Entry, Transform]]:
 
 @lru_cache(maxsize=1)
 def _left_out(log: Path, index: int) -> Clouds:
-    """Return a scan, and the map of those around it: level as the log's world is, from where the middle was."""
+    """Return a scan, and the map of those around it, with the world's axes, from where the middle one was."""
     posed = _posed(log)
     first, last = max(index - MAP_SCANS, 0), min(index + MAP_SCANS, len(posed) - 1)
-    middle = posed[(first + last) // 2][1][:3, 3]
-    T_map_world = inverse(
-        transform(np.eye(3), middle)
-    )  # a scan in the hand leans, and yaw is not about its z
+    # Not in the middle one's own frame: a scanner in the hand leans, and a yaw is not about its z.
+    T_map_world = inverse(transform(np.eye(3), posed[(first + last) // 2][1][:3, 3]))
     others = [posed[i] for i in range(first, last + 1) if i != index]
     scans, poses = [entry.scan() for entry, _ in others], [T_map_world @ T for _, T in others]
     target = merged(scans, poses, voxel_m=MAP_VOXEL_M)
