@@ -19,7 +19,7 @@ _FITTED_FRAMES = 100
 
 def depth(
     logs: Annotated[
-        list[Path], typer.Argument(metavar="LOG…", help="RGB-D logs that mapper build can read.")
+        list[Path], typer.Argument(metavar="LOG", help="RGB-D logs of one camera that mapper build can read.")
     ],
     plane_at: Annotated[
         list[float] | None,
@@ -29,7 +29,7 @@ def depth(
     ] = None,
     fit_plane: Annotated[
         bool,
-        typer.Option("--fit-plane", help="Use whatever planes the logs show, at whatever distances."),
+        typer.Option("--fit-plane", help="Use whatever planes the logs show, in about 100 frames of each."),
     ] = False,
     patch: Annotated[
         str | None,
