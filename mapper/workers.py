@@ -4,6 +4,7 @@ Every local worker is a process of its own with one job at a time, so it is know
 cluster has to run the same version of this package on the same files: its workers see a shared file system.
 """
 
+import logging
 import os
 import pickle
 import re
@@ -257,6 +258,7 @@ class _Cluster(AbstractContextManager["_Cluster"]):
                 "a Dask scheduler needs an extra that is not installed: pip install 'mapper[cluster]'"
             ) from None
         self._scheduler, self._killed = scheduler, distributed.KilledWorker
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what matters is raised here
         try:
             self._client = distributed.Client(scheduler, timeout=_ANSWER_S, set_as_default=False)
         except OSError:
@@ -278,7 +280,10 @@ class _Cluster(AbstractContextManager["_Cluster"]):
             self._client.close(timeout=_ANSWER_S)
 
     def size(self) -> int:
-        threads: dict[str, int] = self._client.nthreads()
+        try:
+            threads: dict[str, int] = self._client.nthreads()
+        except OSError:
+            raise self._gone() from None
         return max(sum(threads.values()), 1)
 
     def begin(self, index: int, job: Job) -> None:
@@ -290,14 +295,20 @@ class _Cluster(AbstractContextManager["_Cluster"]):
         future = next(self._done)
         index = self._index_of.pop(future)
         if future.cancelled():
-            raise ConfigError(f"{self._scheduler}: the Dask scheduler went away before all jobs were done")
-        error = future.exception()
-        if error is None:
-            return index, future.result()
+            raise self._gone()
+        try:
+            error = future.exception()
+            if error is None:
+                return index, future.result()
+        except OSError:
+            raise self._gone() from None
         if isinstance(error, self._killed):
             begun = error.allowed_failures + 1
             return index, Failure(f"its worker died, {begun} of {begun} times; its log may say why", begun)
         return index, Failure(_reason(error), 1)
+
+    def _gone(self) -> ConfigError:
+        return ConfigError(f"{self._scheduler}: the Dask scheduler went away before all jobs were done")
 
 
 def _attempt_with_limits(job: Job) -> Any:
