@@ -37,6 +37,7 @@ class MemorySource:
     truth: object = None
     accelerations: object = None
     wheels: object = None
+    sensor: str = "rgbd"
     notes: list[str] = field(default_factory=list)
 
     def __len__(self) -> int:
@@ -146,16 +147,25 @@ def test_scans_and_empty_logs_are_refused_before_anything_is_written(tmp_path):
 def test_an_existing_log_is_not_overwritten(tiny_tum_log, tmp_path):
     source = open_source(tiny_tum_log(2))
     write_log(source, tmp_path / "out", kind="tum")
-    with pytest.raises(SourceError, match="out: already there"):
+    with pytest.raises(SourceError, match="out: exists already"):
         write_log(source, tmp_path / "out", kind="tum")
 
 
-def test_a_log_without_its_lists_is_not_recognised(tiny_tum_log, tmp_path):
+@pytest.mark.parametrize("kind", ["tum", "mbag"])
+def test_a_log_that_was_interrupted_leaves_nothing(tiny_tum_log, tmp_path, kind):
     def interrupt(done):
         if done == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_log(open_source(tiny_tum_log(3)), tmp_path / "out", kind="tum", on_progress=interrupt)
-    with pytest.raises(SourceError, match="not a log of a known format"):
-        open_source(tmp_path / "out")
+        write_log(open_source(tiny_tum_log(3)), tmp_path / "new/out", kind=kind, on_progress=interrupt)
+    assert list((tmp_path / "new").iterdir()) == []
+    (tmp_path / "new/out").mkdir()
+    write_log(open_source(tiny_tum_log(3)), tmp_path / "new/out", kind=kind)
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["out"]
+
+
+def test_a_lidars_log_is_refused_before_its_scans_are_read(tmp_path):
+    source = MemorySource([InMemory(5, FrameError("was read"))], sensor="lidar")
+    with pytest.raises(SourceError, match="memory: scans without images; .* --as kitti"):
+        write_log(source, tmp_path / "out", kind="tum")

@@ -12,6 +12,7 @@ from mapper.atomic import write_bytes, write_text
 from mapper.errors import FrameError, SourceError
 from mapper.frames import PinholeCamera, RgbdFrame
 from mapper.rotations import quaternion_from_rotation
+from mapper.sources.appearing import appearing
 from mapper.sources.base import Accelerations, Entry, FrameSource, Skipped
 from mapper.sources.calibration_file import calibration_text
 from mapper.sources.images import FINE_UNITS_PER_M, bytes_of, encode_colour, encode_depth
@@ -57,11 +58,11 @@ def write_log(
     """
     if kind == "mcap" or kind == "bag":
         return write_recording(source, out, kind=kind, on_progress=on_progress)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise SourceError(f"{out}: already there; give a folder that does not exist yet")
-    if kind == "kitti":
-        return write_kitti_log(source, out, on_progress=on_progress)
-    return _write_images_log(source, out, kind=kind, on_progress=on_progress)
+    with appearing(out) as folder:
+        if kind == "kitti":
+            return write_kitti_log(source, folder, on_progress=on_progress)
+        mbag = f"{out.resolve().name}.mbag" if kind == "mbag" else None
+        return _write_images_log(source, folder, mbag=mbag, on_progress=on_progress)
 
 
 def left_out(source: FrameSource, kind: LogKind) -> list[str]:
@@ -75,15 +76,14 @@ def _write_images_log(
     source: FrameSource,
     out: Path,
     *,
-    kind: Literal["tum", "mbag"],
+    mbag: str | None,
     on_progress: Callable[[int], None] | None,
 ) -> list[Skipped]:
-    """Write an RGB-D log as a folder of image files.
+    """Write an RGB-D log as a folder of image files, TUM's, or the mbag of a name.
 
     Image files are copied byte for byte under names that are their stamps; frames without files are encoded
     as PNG, depth at 0.2 mm. ``calibration.toml`` keeps the camera and depth units. TUM keeps the whole truth;
-    mbag has room for one pose a frame, the nearest within 20 ms, and none for wheels. The lists, by which a
-    log is recognised, are written last.
+    mbag has room for one pose a frame, the nearest within 20 ms, and none for wheels.
     """
     camera = _camera_of(source)
     written: list[_Written] = []
@@ -99,8 +99,8 @@ def _write_images_log(
     write_text(out / "calibration.toml", calibration_text(camera, depth_units_per_m=units_per_m))
     if source.accelerations is not None:
         write_text(out / "accelerometer.txt", _accelerations_text(source.accelerations, source.name))
-    if kind == "mbag":
-        write_text(out / f"{out.resolve().name}.mbag", _mbag_text(written, source))
+    if mbag is not None:
+        write_text(out / mbag, _mbag_text(written, source))
     else:
         if source.truth is not None:
             write_tum(out / "groundtruth.txt", source.truth)
@@ -115,6 +115,8 @@ def _write_images_log(
 
 def _camera_of(source: FrameSource) -> PinholeCamera:
     """Return the camera of the first readable frame: one without any is no RGB-D log."""
+    if source.sensor == "lidar":
+        raise SourceError(f"{source.path}: scans without images; TUM and mbag hold RGB-D frames: --as kitti")
     reason = "it has no frames"
     for entry in source.entries():
         try:

@@ -1,18 +1,15 @@
 """A synthetic log on disk: a TUM RGB-D folder with exact truth beside it."""
 
-import os
-import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from mapper.config.synthetic import SynthConfig
-from mapper.errors import SourceError
 from mapper.frames import PinholeCamera, RgbdFrame
 from mapper.parallel import ordered_map
+from mapper.sources.appearing import appearing
 from mapper.sources.synthetic.boxes import write_scene
 from mapper.sources.synthetic.path import seconds_of
 from mapper.sources.synthetic.source import SyntheticEntry, SyntheticSource
@@ -54,28 +51,6 @@ def write_tum_log(
         for name in ("rgb", "depth"):
             (folder / name).mkdir()
         _write(folder, SyntheticSource(config), on_progress or (lambda _done, _total: None))
-
-
-@contextmanager
-def appearing(out: Path) -> Iterator[Path]:
-    """Yield a folder to fill; it takes ``out``'s place when it is complete, and is gone if it never is.
-
-    Raises:
-        SourceError: ``out`` exists, or cannot be written.
-    """
-    if out.exists():
-        raise SourceError(f"{out}: exists already; give a folder that does not, or remove it")
-    partial = out.with_name(f"{out.name}.{os.getpid()}.partial")
-    try:
-        partial.mkdir(parents=True, exist_ok=True)
-        yield partial
-        partial.rename(out)
-    except OSError as error:
-        raise SourceError(
-            f"{out}: cannot be written: {error.strerror}; is there space and permission?"
-        ) from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _write(folder: Path, source: SyntheticSource, on_progress: Callable[[int, int], None]) -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from mapper.config.synthetic import LidarSynthConfig
 from mapper.parallel import ordered_map
+from mapper.sources.appearing import appearing
 from mapper.sources.kitti_writing import save_scan
 from mapper.sources.synthetic.lidar.source import SyntheticLidarEntry, SyntheticLidarSource
-from mapper.sources.synthetic.log import appearing
 from mapper.sources.wheels import write_wheels
 from mapper.timebase import seconds_text_from_ns
 from mapper.trajectory import write_kitti
