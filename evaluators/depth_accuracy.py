@@ -148,7 +148,8 @@ def depth_text(study: DepthStudy) -> str:
 
 
 def _mm(metres: float) -> str:
-    return f"{_MM * metres:.2f}" if metres < 0.01 else f"{_MM * metres:.1f}"
+    digits = 2 if abs(metres) < 0.01 else 1
+    return f"{round(_MM * metres, digits) + 0.0:.{digits}f}"  # no -0.00
 
 
 def _uncertainty_text(uncertainty: Array) -> str:
