@@ -239,10 +239,10 @@ def _text(metrics: "list[Metric]", found: "Judged", format_: Format) -> str:
         if format_ is Format.JSON:
             return metric.json_text(metrics)
         return tables.csv_text([asdict(one) for one in metrics]).rstrip("\n")
-    of_metrics, of_records = (
-        (metric.text_table, tables.text_table)
-        if format_ is Format.TEXT
-        else (metric.markdown_table, tables.markdown_table)
-    )
     records = length_records(found.lengths)
-    return "\n\n".join([of_metrics(metrics), *([of_records(LENGTH_COLUMNS, records)] if records else [])])
+    if format_ is Format.MARKDOWN:
+        shown = [metric.markdown_table(metrics), tables.markdown_table(LENGTH_COLUMNS, records)]
+    else:
+        lengths = tables.text_table(LENGTH_COLUMNS, records).replace("\n", "\n  ")
+        shown = [metric.text_table(metrics), f"  {lengths}"]
+    return "\n\n".join(shown if records else shown[:1])

@@ -46,7 +46,9 @@ def _names(runs: Sequence[Path]) -> list[str]:
 
 
 def _figures(run: "Run") -> "list[Figure]":
-    from evaluators.evaluate import evaluate
+    import numpy as np
+
+    from evaluators.evaluate import judged
     from evaluators.loops import loop_metrics
     from evaluators.metric import shown
     from mapper.export.report.data import Figure
@@ -54,7 +56,8 @@ def _figures(run: "Run") -> "list[Figure]":
     from mapper.trajectory import read_tum
 
     counts, truth = run.manifest.counts, run.truth()
-    metrics = evaluate(run.trajectory(), truth)
+    frames_ns = np.array([record.stamp_ns for record in run.records()], dtype=np.int64)
+    metrics = list(judged(run.trajectory(), truth, frames_ns=frames_ns).metrics)
     if truth is not None:
         metrics += loop_metrics(run.loops(), read_tum(run.path / KEYFRAMES).stamps_ns, truth)
     return [

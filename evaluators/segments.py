@@ -91,13 +91,13 @@ def segment_metrics(errors: Sequence[LengthErrors]) -> list[Metric]:
         return []
     translation = statistics(np.concatenate([length.translation_ratio for length in known]))
     rotation = statistics(np.concatenate([length.rotation_radpm for length in known]))
-    over = "–".join(f"{length_m:g}" for length_m in dict.fromkeys((known[0].length_m, known[-1].length_m)))
+    over = "all lengths" if len(errors) > 1 else f"{known[0].length_m:g} m"
     return [
-        Metric(f"segments of {over} m", sum(map(len, known)), "segments"),
-        Metric(f"relative translation mean, {over} m", 100.0 * translation.mean, "%"),
-        Metric(f"relative translation median, {over} m", 100.0 * translation.median, "%"),
-        Metric(f"relative rotation mean, {over} m", rotation.mean, "rad/m"),
-        Metric(f"relative rotation median, {over} m", rotation.median, "rad/m"),
+        Metric(f"segments, {over}", sum(map(len, known)), "segments"),
+        Metric(f"relative translation mean, {over}", 100.0 * translation.mean, "%"),
+        Metric(f"relative translation median, {over}", 100.0 * translation.median, "%"),
+        Metric(f"relative rotation mean, {over}", rotation.mean, "rad/m"),
+        Metric(f"relative rotation median, {over}", rotation.median, "rad/m"),
     ]
 
 
