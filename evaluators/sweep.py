@@ -8,29 +8,26 @@ from contextlib import suppress
 from dataclasses import dataclass
 from glob import glob, has_magic
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from evaluators.cells import Cell, CellResult, run_cells
 from evaluators.sweep_cell import BuildCell, environment
 from mapper.atomic import write_text
 from mapper.config import BuildConfig, load_config, load_source_config, read_config
-from mapper.config.base import Config
 from mapper.config.loops import PlaceLoopsConfig, ScanLoopsConfig, ThesisLoopsConfig
 from mapper.config.odometry import IsvdOdometryConfig, KeyframeConfig
 from mapper.config.scan_odometry import ScanOdometryConfig
+from mapper.config.seeds import seeded
 from mapper.config.sources import SourceConfig
 from mapper.config.sweep import ConfigurationConfig, MethodConfig, SweepConfig
-from mapper.errors import ConfigError, RunError
+from mapper.errors import ConfigError
 from mapper.fingerprint import fingerprint
 from mapper.progress import SILENT, Progress
 from mapper.sources import open_source
 from mapper.sources.base import FrameSource
-from mapper.staging import locked
-
-AnyConfig = TypeVar("AnyConfig", bound=Config)
+from mapper.staging import resumed
 
 CELLS, RUNS, SCRATCH, PLAN = "cells", "runs", "scratch", "sweep.json"
-_SEEDS = frozenset({"seed", "ransac_seed"})
 _IMAGE_LOOPS = (PlaceLoopsConfig, ThesisLoopsConfig)
 
 
@@ -122,10 +119,7 @@ def run_sweep(
         RunError: OUT holds something else, or another sweep is at work there.
     """
     out, cells = plan.out, plan.cells
-    if out.exists() and not (out.is_dir() and ((out / PLAN).is_file() or not any(out.iterdir()))):
-        raise RunError(f"{out}: is not the folder of a sweep (no {PLAN}); choose another --out")
-    out.mkdir(parents=True, exist_ok=True)
-    with locked(out):
+    with resumed(out, mark=PLAN):
         shutil.rmtree(out / SCRATCH, ignore_errors=True)  # what a killed sweep left
         write_text(out / PLAN, json.dumps(_described(plan), indent=1, ensure_ascii=False) + "\n")
         results = run_cells(
@@ -194,21 +188,11 @@ def _misfit(config: BuildConfig, source: FrameSource) -> str:
 
 def _repeats(config: BuildConfig, seeds: tuple[int, ...]) -> Iterator[tuple[int | None, BuildConfig]]:
     """Yield the configuration with each seed; as it is, and once, where there is no seed in it."""
-    if not seeds or _seeded(config, 0) == _seeded(config, 1):
+    if not seeds or seeded(config, 0) == seeded(config, 1):
         yield None, config
         return
     for seed in dict.fromkeys(seeds):
-        yield seed, _seeded(config, seed)
-
-
-def _seeded(config: AnyConfig, seed: int) -> AnyConfig:
-    changed: dict[str, Any] = {}
-    for name, value in config:
-        if isinstance(value, Config):
-            changed[name] = _seeded(value, seed)
-        elif name in _SEEDS:
-            changed[name] = seed
-    return config.model_copy(update=changed)
+        yield seed, seeded(config, seed)
 
 
 def _key(log: str, config: BuildConfig, keep: str, versions: dict[str, str]) -> str:

@@ -292,7 +292,7 @@ def test_another_folder_is_not_filled(swept, desk_log, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").touch()
     plan = plan_sweep(swept(f"logs = ['{desk_log}']", method("a")), tmp_path / "out")
-    with pytest.raises(RunError, match="is not the folder of a sweep"):
+    with pytest.raises(RunError, match="holds something else"):
         run_sweep(plan)
 
 
