@@ -77,7 +77,7 @@ def _ticks(low: float, high: float) -> list[float]:
     if len(fine) < _FEWEST_TICKS:
         rough = (high - low) / _FEWEST_TICKS
         scale = 10.0 ** math.floor(math.log10(rough))
-        step = scale * max(m for m in (1, 2, 5) if m * scale <= rough)
+        step = scale * min(m for m in (1, 2, 5, 10) if m * scale >= rough)
         return [n * step for n in range(math.ceil(low / step), math.floor(high / step) + 1)]
     if len(fine) <= _MOST_TICKS:
         return fine
