@@ -167,5 +167,5 @@ def test_a_log_that_was_interrupted_leaves_nothing(tiny_tum_log, tmp_path, kind)
 
 def test_a_lidars_log_is_refused_before_its_scans_are_read(tmp_path):
     source = MemorySource([InMemory(5, FrameError("was read"))], sensor="lidar")
-    with pytest.raises(SourceError, match="memory: scans without images; .* --as kitti"):
+    with pytest.raises(SourceError, match=r"memory: scans without images; .* --as kitti"):
         write_log(source, tmp_path / "out", kind="tum")

@@ -230,7 +230,7 @@ def test_a_written_log_reads_back_as_it_was(tmp_path, motion_distortion):
 
 
 def test_a_log_is_not_written_over_another_and_leaves_nothing_half_done(tmp_path):
-    (tmp_path / "log").mkdir()
+    (tmp_path / "log/mine").mkdir(parents=True)
     with pytest.raises(SourceError, match="exists already"):
         write_lidar_log(tmp_path / "log", COURTYARD)
 
