@@ -75,7 +75,7 @@ def _ticks(low: float, high: float) -> list[float]:
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     fine = [m * 10.0**power for power in powers for m in (1, 2, 5) if low <= m * 10.0**power <= high]
     if len(fine) < _FEWEST_TICKS:
-        rough = (high - low) / _FEWEST_TICKS
+        rough = (high - low) / (_FEWEST_TICKS + 1)
         scale = 10.0 ** math.floor(math.log10(rough))
         step = scale * min(m for m in (1, 2, 5, 10) if m * scale >= rough)
         return [n * step for n in range(math.ceil(low / step), math.floor(high / step) + 1)]
