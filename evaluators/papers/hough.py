@@ -4,7 +4,9 @@ import hashlib
 import json
 import time
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -13,24 +15,20 @@ from evaluators.cells import Cell
 from evaluators.cloud_distance import DistanceTo
 from evaluators.papers.hough_pairs import Clouds, Pair, find_pairs
 from evaluators.papers.layout import file_name
-from evaluators.register import Registered, register
+from evaluators.register import thinned
 from evaluators.scan_pairs import perturbed
 from evaluators.sweep_cell import environment
 from evaluators.tables import Record, Value
-from mapper.config.hough import HoughGicpConfig, HoughNdtConfig
+from mapper.config.hough import HoughConfig, HoughGicpConfig, HoughNdtConfig
 from mapper.export.registration_picture import write_before_and_after
-from mapper.geometry import angle_between, inverse
-from mapper.registration.hough import Hough
+from mapper.frames import Scan
+from mapper.geometry import Transform, angle_between, inverse
+from mapper.registration.hough import Hough, Stages
 from mapper.rotations import euler_from_rotation
 
 OFFSET_M = 10.0
-METHODS: dict[str, HoughNdtConfig | HoughGicpConfig] = {
-    "hough-ndt": HoughNdtConfig(),
-    "hough-gicp": HoughGicpConfig(),
-}
+METHODS: dict[str, HoughConfig] = {"hough-ndt": HoughNdtConfig(), "hough-gicp": HoughGicpConfig()}
 DISTANCES = tuple(f"{kind}_{stage}_m" for kind in ("mhd", "mpd") for stage in ("input", "hough", "final"))
-_STAGES = {"before": "input", "Hough": "hough", "refined": "final"}
-"""What ``register`` calls the paper's stages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,17 +55,14 @@ class HoughTrial:
             MapperError: A cloud cannot be read, or is empty.
         """
         clouds = self._perturbed(self.pair.clouds())
-        config = METHODS[self.method]
-        registered = register(clouds.target, clouds.source, config, np.eye(4))
-        began = time.process_time()  # once more: the clock on the wall tells of other programs, too
-        Hough(config).prepare(clouds.target).stages(clouds.source)
-        seconds = time.process_time() - began
+        course, seconds = _timed(clouds, METHODS[self.method])
+        motions = _motions(course)
         if self.picture is not None:
             write_before_and_after(
                 self.picture,
                 clouds.target.points_body,
                 clouds.source.points_body,
-                [(stage.name, stage.T_target_source) for stage in registered.stages],
+                list(motions.items()),
                 sensor="lidar",
                 title=f"{self.pair.name}, {self.pair.sensor} (red) in its map (blue): {self.method}",
             )
@@ -76,19 +71,16 @@ class HoughTrial:
             "sensor": self.pair.sensor,
             "method": self.method,
             "seed": self.seed,
-            **dict.fromkeys(("offset_m", "yaw_deg")),
-            **dict.fromkeys(
-                f"{measure}_{stage}_m" for measure in ("mhd", "mpd") for stage in _STAGES.values()
-            ),
+            **dict.fromkeys(("offset_m", "yaw_deg", *DISTANCES)),
             "seconds": seconds,
             **dict.fromkeys(("error_m", "error_deg", "mpd_truth_m", "right")),
-            "trusted": int(registered.alignment.converged),
-            "reason": registered.alignment.reason,
+            "trusted": int(course.alignment.converged),
+            "reason": course.alignment.reason,
         }
-        for stage in registered.stages:
-            record[f"mhd_{_STAGES[stage.name]}_m"] = stage.distance.mhd_m
-            record[f"mpd_{_STAGES[stage.name]}_m"] = stage.distance.mpd_m
-        return [record | self._against_truth(clouds, registered)]
+        for stage, T_target_source in motions.items():
+            distance = _distance_to(clouds.target).of(clouds.source.points_body, T_target_source)
+            record[f"mhd_{stage}_m"], record[f"mpd_{stage}_m"] = distance.mhd_m, distance.mpd_m
+        return [record | self._against_truth(clouds, motions, is_trusted=course.alignment.converged)]
 
     def _perturbed(self, clouds: Clouds) -> Clouds:
         # Whichever the method, a pair is perturbed alike.
@@ -101,26 +93,51 @@ class HoughTrial:
         )
         return Clouds(clouds.target, source, T_target_source)
 
-    def _against_truth(self, clouds: Clouds, registered: Registered) -> dict[str, Value]:
+    def _against_truth(
+        self, clouds: Clouds, motions: Mapping[str, Transform], *, is_trusted: bool
+    ) -> dict[str, Value]:
         """Return where the scan was, by the truth or else by a trusted answer, and how far that is off."""
-        alignment, truth = registered.alignment, clouds.T_target_source
-        T_target_source = alignment.T_target_source if truth is None else truth
+        final, truth = motions.get("final"), clouds.T_target_source
         told: dict[str, Value] = {}
-        if truth is not None or alignment.converged:
-            told["offset_m"] = float(np.linalg.norm(T_target_source[:3, 3]))
-            told["yaw_deg"] = abs(float(np.degrees(euler_from_rotation(T_target_source[:3, :3])[2])))
+        known = final if truth is None and is_trusted else truth
+        if known is not None:
+            told["offset_m"] = float(np.linalg.norm(known[:3, 3]))
+            told["yaw_deg"] = abs(float(np.degrees(euler_from_rotation(known[:3, :3])[2])))
         if truth is None:
             return told
-        distance = DistanceTo(clouds.target.points_body).of(clouds.source.points_body, truth)
+        distance = _distance_to(clouds.target).of(clouds.source.points_body, truth)
         told |= {"mpd_truth_m": distance.mpd_m, "right": 0}
-        if registered.stages[-1].name == "refined":
-            miss = inverse(truth) @ alignment.T_target_source
+        if final is not None:
+            miss = inverse(truth) @ final
             error_m = float(np.linalg.norm(miss[:3, 3]))
             error_deg = float(np.degrees(angle_between(miss[:3, :3], np.eye(3))))
             within_m, within_deg = self.pair.within
             is_right = error_m < within_m and error_deg < within_deg
             told |= {"error_m": error_m, "error_deg": error_deg, "right": int(is_right)}
         return told
+
+
+def _timed(clouds: Clouds, config: HoughConfig) -> tuple[Stages, float]:
+    """Return the registration step by step, and its CPU time: a wall clock sees other programs, too."""
+    Hough(config).prepare(thinned(clouds.target)).stages(thinned(clouds.source))
+    began = time.process_time()
+    course = Hough(config).prepare(clouds.target).stages(clouds.source)
+    return course, time.process_time() - began
+
+
+def _motions(course: Stages) -> dict[str, Transform]:
+    """Return the motion at each of the paper's stages, as far as it came."""
+    motions: dict[str, Transform] = {"input": np.eye(4)}
+    if course.hough is not None:
+        motions["hough"] = course.hough.T_target_source
+    if course.alignment.converged or course.alignment.information is not None:
+        motions["final"] = course.alignment.T_target_source
+    return motions
+
+
+@lru_cache(maxsize=1)
+def _distance_to(target: Scan) -> DistanceTo:
+    return DistanceTo(target.points_body)
 
 
 def hough_cells(logs: Path, *, seeds: int, pictures: Path) -> list[Cell]:
