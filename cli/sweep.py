@@ -48,7 +48,7 @@ def sweep(
         progress.note("first run here: the kernels are compiled once, which takes about a minute")
     results = run_sweep(
         plan,
-        processes=processes or os.cpu_count() or 1,
+        processes=(os.cpu_count() or 1) if processes is None else processes,
         scheduler=scheduler,
         progress=progress,
     )
