@@ -112,6 +112,9 @@ def merge(
         staged(out, overwrite=overwrite, keeps=lambda partial: _begun_alike(partial, manifest)) as folder,
     ):
         manifest.save(folder)
+        doubtful = doubts(placed)
+        for note in doubtful:
+            progress.note(note)
         site = Site(folder, folder / _SCRATCH, tiling, config)
         foreman = Foreman(site.scratch / "done", crew, progress)
         split = _split(site, foreman, placed)
@@ -120,13 +123,12 @@ def merge(
         write_whole_ot(folder / files.OCTREE_OT, site, joined, has_colors=has_colors)
         write_whole_bt(folder / files.OCTREE_BT, site, joined)
         seen, grid, missing = look_from_above(site, foreman, joined, manifest, placed)
-        notes = [*doubts(placed), *missing]
-        manifest = _completed(manifest, site, split, joined, seen, notes)
+        for note in missing:
+            progress.note(note)
+        manifest = _completed(manifest, site, split, joined, seen, [*doubtful, *missing])
         if grid is not None:
             write_grid(folder, files.SLICE, grid)
             draw(folder / files.SUMMARY, grid, placed, manifest)
-        for note in manifest.notes:
-            progress.note(note)
         _clean(site, joined)
         manifest.save(folder)
     return Merged(
