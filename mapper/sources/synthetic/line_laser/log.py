@@ -13,9 +13,9 @@ from mapper.parallel import ordered_map
 from mapper.progress import SILENT, Progress
 from mapper.sensing.line_laser.files import SHOTS
 from mapper.sensing.wheels import driven, pose_at
+from mapper.sources.appearing import appearing
 from mapper.sources.synthetic.line_laser.render import Shot, take
 from mapper.sources.synthetic.line_laser.room import Room, curvature_at, lap_m, make_board, make_room
-from mapper.sources.synthetic.log import appearing
 from mapper.sources.synthetic.streams import Stream, rng_of
 from mapper.timebase import NS_PER_S, Stamps, seconds_text_from_ns
 from mapper.trajectory import Trajectory, trajectory_from, write_tum
