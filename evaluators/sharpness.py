@@ -26,8 +26,6 @@ _FRAMES, _POINTS, _PATCHES = 100, 200_000, 5_000
 _MIN_NEIGHBOURS = 15
 _BREADTH_RATIO = 0.2
 """A patch's second variance against its largest: below, it is a line, for instance one LiDAR ring."""
-_FLATNESS_RATIO = 0.25
-"""A patch's least variance against its second: above, it is no surface."""
 _SHEETS_APART, _SHEET_SHARE = 5.0, 0.2
 """Two sheets are so many of their spreads apart, and hold so many of the points: of one sheet with normal
 noise the parts are 2.7 apart, of an evenly filled one 3.5."""
@@ -91,9 +89,9 @@ def sharpness_metrics(views: Views, *, radius_m: float) -> list[Metric]:
     Patches are the points within a radius of one in each voxel half as wide, seen from the same side, in two
     frames or more. A patch is as thick as the standard deviation across its best plane, unless it is a line.
     Corners and clutter are patches too, so what counts is the median, and maps compare that show the same; to
-    leave them out would leave out the walls that are blurred most. Double walls are flat patches whose points
-    lie in two sheets. Entropy is ½ ln |2πe Σ| of a patch's covariance (Droeschel, Stückler & Behnke 2014),
-    plane variance its least eigenvalue (Razlaw et al. 2015).
+    leave them out would leave out the walls blurred most. Double walls are the share of patches whose
+    points lie in two sheets, steps and edges among them. Entropy is ½ ln |2πe Σ| of a patch's covariance
+    (Droeschel, Stückler & Behnke 2014), plane variance its least eigenvalue (Razlaw et al. 2015).
 
     Args:
         views: The scans, laid out.
@@ -119,9 +117,8 @@ def sharpness_metrics(views: Views, *, radius_m: float) -> list[Metric]:
     if not broad.any():
         raise DataError(f"sharpness: all patches of {radius_m:g} m are lines; choose a larger radius")
     thickness_m = np.sqrt(variances[broad, 0])
-    flat = broad & (variances[:, 0] <= _FLATNESS_RATIO * variances[:, 1])
-    normals = np.ascontiguousarray(axes[flat, :, 0])
-    apart, shares = gaps(points, towards, codes, patches[enough][flat], normals, radius_m)
+    normals = np.ascontiguousarray(axes[broad, :, 0])
+    apart, shares = gaps(points, towards, codes, patches[enough][broad], normals, radius_m)
     double = (apart >= _SHEETS_APART) & (shares >= _SHEET_SHARE)
     entropy = 0.5 * (3.0 * np.log(2.0 * np.pi * np.e) + np.log(variances).sum(axis=1))
     about = f"radius {radius_m:g} m"
@@ -129,8 +126,7 @@ def sharpness_metrics(views: Views, *, radius_m: float) -> list[Metric]:
         Metric(f"patches seen in several frames, {about}", int(enough.sum()), "patches"),
         Metric(f"wall thickness median, {about}", float(np.median(thickness_m)), "m"),
         Metric(f"wall thickness quartile, {about}", float(np.percentile(thickness_m, 25.0)), "m"),
-        Metric("flat patches", 100.0 * float(flat.mean()), "%"),
-        Metric("double walls, share of patches", 100.0 * float(double.sum()) / len(flat), "%"),
+        Metric(f"double walls, {about}", 100.0 * float(double.mean()), "%"),
         Metric(f"mean map entropy, {about}", float(entropy.mean()), "nats"),
         Metric(f"mean plane variance, {about}", float(variances[:, 0].mean()), "m²"),
     ]
