@@ -144,7 +144,7 @@ def _logs(path: Path, config: SweepConfig) -> dict[str, Path]:
         if not logs:
             raise ConfigError(f"{path}: logs: nothing fits {pattern!r}")
         found += [log for log in logs if log not in found]
-    names = [log.resolve().name for log in found]
+    names = [log.absolute().name for log in found]
     return {str(log) if names.count(name) > 1 else name: log for name, log in zip(names, found, strict=True)}
 
 
