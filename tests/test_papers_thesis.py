@@ -281,7 +281,7 @@ def test_verdicts_follow_the_median(ours, published, in_part, verdict):
 
 @pytest.mark.skipif(not FR1_XYZ.is_dir(), reason=f"{FR1_XYZ} is not here")
 def test_isvd_as_published_follows_the_first_second_of_a_real_log(tmp_path):
-    records = ThesisJob(("5.1", "5.2"), "fr1/xyz", FR1_XYZ, 0, Cut(0, 5), tmp_path)()
+    records = ThesisJob(("5.1", "5.2"), "fr1/xyz", FR1_XYZ, 0, Cut(0, 11), tmp_path)()
 
     ours_m = {f"{record['table']} {record['column']}": record["value"] for record in records}
     assert len(ours_m) == 17

@@ -197,6 +197,15 @@ def numpy(_folder: Path) -> None:
     _expect_near(np.linalg.solve(2.0 * np.eye(3), np.ones(3)), np.full(3, 0.5))
 
 
+def pyarrow(folder: Path) -> None:
+    """Write a table and read it back."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    parquet.write_table(pa.table({"n": [1, 2]}), folder / "table.parquet")
+    _expect(parquet.read_table(folder / "table.parquet").num_rows == 2, "the table has other rows")
+
+
 def pydantic(_folder: Path) -> None:
     """Parse a number from text."""
     from pydantic import TypeAdapter
@@ -233,6 +242,7 @@ SELF_TESTS: dict[str, Callable[[Path], None]] = {
     "numpy": numpy,
     "open3d": open3d,
     "opencv-contrib-python-headless": opencv,
+    "pyarrow": pyarrow,
     "pydantic": pydantic,
     "pypcd4": pypcd4,
     "rerun-sdk": rerun,
