@@ -13,7 +13,7 @@ from mapper.atomic import write_text
 from mapper.export.depth_accuracy_picture import write_accuracy, write_residuals
 from mapper.geometry import Array
 from mapper.progress import SILENT, Progress
-from mapper.sensing.depth_accuracy import DepthLevel, Patch, ResidualMap
+from mapper.sensing.depth_accuracy import DepthLevel, Patch, ResidualMap, refuse_scans
 from mapper.sensing.depth_fit import NoiseFit, fit_noise
 from mapper.sensing.depth_still import depth_at
 from mapper.sensing.depth_tiles import depth_of_planes
@@ -67,6 +67,8 @@ def study_depth(
         DataError: A log does not show what it should, or depths that do not scatter.
         SourceError: A log has no depth images that can be read.
     """
+    for source in sources:
+        refuse_scans(source)
     levels: list[DepthLevel] = []
     maps: list[tuple[float, ResidualMap]] = []
     if distances_m is None:

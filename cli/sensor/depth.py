@@ -1,5 +1,6 @@
 """``mapper sensor depth``: a depth camera's errors and noise."""
 
+import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -56,7 +57,9 @@ def depth(
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Measure a depth camera's largest error and noise on planes, before and after the depth filter DIF.
+    """Measure a depth camera's errors and noise on planes.
+
+    Largest error and noise, before and after the depth filter DIF, and a noise model for mapper build.
 
     Example: mapper sensor depth wall-0.8 wall-1.6 --plane-at 0.8 --plane-at 1.6 --out kinect, or: mapper
     sensor depth rgbd_dataset_freiburg1_xyz --fit-plane --out kinect, then: mapper build LOG --out RUN
@@ -105,8 +108,9 @@ def _distances(
         )
     if len(plane_at) != len(logs):
         raise ConfigError(f"{len(logs)} logs and {len(plane_at)} --plane-at; want one for each log")
-    if min(plane_at) <= 0.0:
-        raise ConfigError(f"--plane-at {min(plane_at):g}: want metres before the camera, more than 0")
+    for distance_m in plane_at:
+        if not 0.0 < distance_m < math.inf:
+            raise ConfigError(f"--plane-at {distance_m:g}: want metres before the camera, more than 0")
     return plane_at
 
 

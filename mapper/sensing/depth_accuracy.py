@@ -176,14 +176,23 @@ class ResidualMap:
     caption: str
 
 
+def refuse_scans(source: FrameSource) -> None:
+    """Refuse a log without depth images.
+
+    Raises:
+        SourceError: It is a LiDAR's.
+    """
+    if source.sensor != "rgbd":
+        raise SourceError(f"{source.path}: a log of scans; this measures depth images, so want an RGB-D log")
+
+
 def first_frame(source: FrameSource) -> RgbdFrame:
     """Return the first frame of a log that can be read.
 
     Raises:
         SourceError: None can, or they are scans.
     """
-    if source.sensor != "rgbd":
-        raise SourceError(f"{source.path}: a log of scans; this measures depth images, so want an RGB-D log")
+    refuse_scans(source)
     reason = "it has no frames"
     for entry in source.entries():
         try:
