@@ -318,6 +318,9 @@ def test_images_come_with_the_stamps_of_their_names_or_of_a_list(folder):
     assert images[0].name == "1003.500000.png"
     assert stamps_ns[0] == 10**9
     assert "out of time order" in notes[0]
+    (folder / "list.txt").write_text("4\n3\n")
+    with pytest.raises(SourceError, match=r"2 stamps for 4 images; .* \(--times names another list\)"):
+        find_images(folder / "images", times=folder / "list.txt")
     with pytest.raises(SourceError, match=r"no images; want files ending in .*; those in images/\?"):
         find_images(folder)
     with pytest.raises(SourceError, match="no such folder"):

@@ -212,7 +212,10 @@ def test_the_same_drive_gives_the_same_map(driven):
             ("images", "--labels", "encoders.txt"),
             "encoders.txt:2: 1 columns, want 4: image,column,row_px,range_m",
         ),
-        (("shots", "--wheels", "encoders.txt"), "the wheelbase is unknown"),
+        (
+            ("shots", "--wheels", "encoders.txt"),
+            "encoders.txt: the wheelbase is unknown; calibrate with --wheelbase, or",
+        ),
         (("nowhere",), "nowhere: no such folder"),
         (("images", "--set", "stripe.edge=1"), "stripe.edge: Extra inputs are not permitted"),
         (
@@ -235,7 +238,11 @@ def test_mistakes_are_told_in_one_line(driven, monkeypatch, arguments, why):
 def test_a_calibration_is_not_overwritten_unasked(driven):
     folder, _ = driven
     arguments = ("sensor", "line-laser-calibrate", folder / "drive/shots", "--out", folder / "C.toml")
-    assert "exists already" in run(*arguments).stderr
+    assert "C.toml: exists already" in run(*arguments).stderr
+    (folder / "D.png").touch()
+    assert "D.png: exists already" in run(*arguments[:-1], folder / "D.toml").stderr
+    assert "D.png: the picture's place" in run(*arguments[:-1], folder / "D.png", "--overwrite").stderr
+    assert not (folder / "D.png").stat().st_size
     beyond = run(*arguments, "--overwrite", "--reach", 1.5).stderr
     assert "a board at 1.7 m, but the laser meets the floor at 1.5 m" in beyond
     assert (

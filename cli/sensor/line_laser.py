@@ -38,13 +38,15 @@ def line_laser(
         Path | None, typer.Option(help="True stripes (image,column,row_px,range_m): print how right each is.")
     ] = None,
     times: Annotated[
-        Path | None, typer.Option(help="A stamp a line, if names and times.txt have none.")
+        Path | None, typer.Option(help="A stamp a line, for each image; else names or times.txt tell.")
     ] = None,
     set_: Knobs = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Find a laser's stripe in images, range what it falls on, and map that by the wheels.
+    """Range what a laser's stripe falls on in images.
+
+    With the wheels' readings, map it too.
 
     Example: mapper sensor line-laser drive/images --calibration C.toml --wheels drive/encoders.txt --out seen
     """
@@ -102,7 +104,9 @@ def calibrate(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Fit a line laser's range and lateral laws to images of a board at known distances.
+    """Fit a line laser's laws to images of boards.
+
+    The boards face the sensor at known distances; two or more have known widths.
 
     Example: mapper sensor line-laser-calibrate drive/shots --wheelbase 0.26 --sensor-x 0.2 --out C.toml
     """
@@ -115,8 +119,12 @@ def calibrate(
     from mapper.sensing.line_laser.calibration import calibration_text
     from mapper.sensing.line_laser.files import read_shots
 
-    if out.exists() and not overwrite:
-        raise RunError(f"{out}: exists already; choose another --out, or pass --overwrite to replace it")
+    picture = out.with_suffix(".png")
+    if picture == out:
+        raise RunError(f"{out}: the picture's place; want an --out that ends in .toml")
+    for path in (out, picture):
+        if path.exists() and not overwrite:
+            raise RunError(f"{path}: exists already; choose another --out, or pass --overwrite to replace it")
     vehicle = overridden(VehicleConfig(), assignments({"wheelbase_m": wheelbase, "sensor_x_m": sensor_x}))
     prepare_libraries()
     progress = progress_for(quiet=quiet)
@@ -126,10 +134,10 @@ def calibrate(
         progress.note(note)
     fit = fit_laws(seen, size_px=size_px, reach_m=reach, vehicle=vehicle)
     write_text(out, calibration_text(fit.calibration))
-    write_calibration_picture(out.with_suffix(".png"), fit, seen)
+    write_calibration_picture(picture, fit, seen)
     if not quiet:
         print(_laws(fit, seen))
-        print(f"in       {out}, {out.with_suffix('.png').name}")
+        print(f"in       {out}, {picture.name}")
 
 
 def accuracy(
@@ -139,7 +147,9 @@ def accuracy(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Render rooms with lamps, red things and noise; print who finds the stripe, and the thesis's Table 2.1.
+    """Print who finds the stripe in rendered rooms.
+
+    The rooms have lamps, red things and noise. The thesis's Table 2.1 is measured again, too.
 
     Example: mapper sensor line-laser-accuracy --seeds 5 --set stripe.edge_threshold=100
     """

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -31,8 +32,22 @@ def in_order(paths: Iterable[Path]) -> list[Path]:
     return [by_name[i] for i in np.argsort(stamps_ns, kind="stable")]
 
 
+@dataclass(frozen=True, slots=True)
+class Wording:
+    """What the files are called in what is said of their stamps, and what would settle these."""
+
+    files: str = "scans"
+    rate: str = "source.rate_hz"
+    stamps_file: str = "source.stamps_file"
+
+
 def scan_stamps(
-    files: Sequence[Path], *, chosen: Path | None, beside: Path | None, rate_hz: float | None
+    files: Sequence[Path],
+    *,
+    chosen: Path | None,
+    beside: Path | None,
+    rate_hz: float | None,
+    wording: Wording = Wording(),
 ) -> tuple[Stamps, list[str]]:
     """Return when each cloud was taken, nanoseconds, and a note where that is assumed.
 
@@ -41,6 +56,7 @@ def scan_stamps(
         chosen: List of stamps that the user named; it goes before the stamps in names.
         beside: List of stamps found by its own name; it comes after them.
         rate_hz: Scans a second without any stamps; None is 10.
+        wording: For files that are no clouds.
 
     Raises:
         SourceError: The list is malformed, or has not one stamp for every cloud.
@@ -49,11 +65,14 @@ def scan_stamps(
     if named is not None:
         return named, []
     if listed := chosen or beside:
-        return _listed(listed, files), []
+        return _listed(listed, files, wording), []
     rate_hz = rate_hz or RATE_HZ
     numbers = numbers_of(files)
     counts = range(len(files)) if numbers is None else numbers.tolist()
-    note = f"neither names nor a times.txt tell stamps; {rate_hz:g} scans a second assumed (source.rate_hz)"
+    note = (
+        f"neither names nor a times.txt tell stamps; {rate_hz:g} {wording.files} a second assumed "
+        f"({wording.rate})"
+    )
     return np.array([stamp_at(count, rate_hz=rate_hz) for count in counts], dtype=np.int64), [note]
 
 
@@ -74,7 +93,7 @@ def line_of_each(files: Sequence[Path], total: int) -> NDArray[np.int64] | None:
     return np.arange(total) if total == len(files) else numbers_of(files)
 
 
-def _listed(path: Path, files: Sequence[Path]) -> Stamps:
+def _listed(path: Path, files: Sequence[Path], wording: Wording) -> Stamps:
     stamps_ns = []
     for number, words in rows(path):
         where = f"{path}:{number}"
@@ -84,8 +103,8 @@ def _listed(path: Path, files: Sequence[Path]) -> Stamps:
     lines = line_of_each(files, len(stamps_ns))
     if lines is None or lines.max() >= len(stamps_ns):
         raise SourceError(
-            f"{path}: {len(stamps_ns)} stamps for {len(files)} scans; want a line for each, "
-            "or for each number in their names from 0 on (source.stamps_file names another list)"
+            f"{path}: {len(stamps_ns)} stamps for {len(files)} {wording.files}; want a line for each, "
+            f"or for each number in their names from 0 on ({wording.stamps_file} names another list)"
         )
     return np.array(stamps_ns, dtype=np.int64)[lines]
 

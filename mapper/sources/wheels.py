@@ -54,8 +54,20 @@ def read_wheels(folder: Path, config: WheelsConfig, *, sensor: Sensor) -> tuple[
     return (None, []) if path is None else read_wheels_file(path, config, sensor=sensor)
 
 
-def read_wheels_file(path: Path, config: WheelsConfig, *, sensor: Sensor) -> tuple[Trajectory, list[str]]:
+def read_wheels_file(
+    path: Path,
+    config: WheelsConfig,
+    *,
+    sensor: Sensor,
+    wheelbase_by: str = "--set source.wheels.wheelbase_m=…",
+) -> tuple[Trajectory, list[str]]:
     """Return T_odom_body and notes as above of one file: poses if it is ``wheels.txt`` or has eight columns.
+
+    Args:
+        path: The file.
+        config: As above.
+        sensor: As above.
+        wheelbase_by: How a user tells the wheelbase.
 
     Raises:
         SourceError: As above.
@@ -67,7 +79,7 @@ def read_wheels_file(path: Path, config: WheelsConfig, *, sensor: Sensor) -> tup
         except DataError as error:
             raise SourceError(str(error)) from None
     else:
-        T_odom_base, notes = _integrated(path, config.wheelbase_m)
+        T_odom_base, notes = _integrated(path, config.wheelbase_m, wheelbase_by)
     wheels = replace(T_odom_base, T_world_body=T_odom_base.T_world_body @ mounting(config, sensor))
     return wheels, [*notes, f"{path.name}: wheel odometry, {len(wheels)} poses"]
 
@@ -81,9 +93,9 @@ def write_wheels(folder: Path, wheels: Trajectory, *, sensor: Sensor) -> None:
     write_tum(folder / POSES, replace(wheels, T_world_body=T_odom_base))
 
 
-def _integrated(path: Path, wheelbase_m: float | None) -> tuple[Trajectory, list[str]]:
+def _integrated(path: Path, wheelbase_m: float | None, wheelbase_by: str) -> tuple[Trajectory, list[str]]:
     if wheelbase_m is None:
-        raise SourceError(f"{path}: the wheelbase is unknown; --set source.wheels.wheelbase_m=…")
+        raise SourceError(f"{path}: the wheelbase is unknown; {wheelbase_by}")
     stamps_ns, readings = [], []
     for number, words in rows(path):
         where = f"{path}:{number}"

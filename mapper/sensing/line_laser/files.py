@@ -11,12 +11,13 @@ from mapper.frames import Image
 from mapper.progress import SILENT, Progress
 from mapper.sensing.line_laser.calibration import CalibrationShot, find_board
 from mapper.sources.images import read_colour
-from mapper.sources.scan_stamps import in_order, scan_stamps
+from mapper.sources.scan_stamps import Wording, in_order, scan_stamps
 from mapper.sources.text import parse_numbers, rows, time_order
 from mapper.timebase import Stamps
 
 SHOTS = "shots.csv"
 _TIMES = "times.txt"
+_IMAGES = Wording("images", rate="--set rate_hz", stamps_file="--times")
 _ENDINGS = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".tif", ".tiff"})
 
 
@@ -41,7 +42,7 @@ def find_images(
         raise SourceError(f"{folder}: no images; want files ending in {' '.join(sorted(_ENDINGS))}{inside}")
     lists = (folder / _TIMES, folder.parent / _TIMES)
     beside = next((path for path in lists if path.is_file()), None)
-    stamps_ns, notes = scan_stamps(images, chosen=times, beside=beside, rate_hz=rate_hz)
+    stamps_ns, notes = scan_stamps(images, chosen=times, beside=beside, rate_hz=rate_hz, wording=_IMAGES)
     order, more = time_order(stamps_ns, what="images")
     return [images[i] for i in order], stamps_ns[order], [*notes, *more]
 

@@ -93,7 +93,12 @@ def sensor_poses(wheels: Path, calibration: LineLaserCalibration) -> tuple[Traje
     mounted = WheelsConfig(
         wheelbase_m=vehicle.wheelbase_m, body_in_base=(vehicle.sensor_x_m, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     )
-    return read_wheels_file(wheels, mounted, sensor="lidar")
+    return read_wheels_file(
+        wheels,
+        mounted,
+        sensor="lidar",
+        wheelbase_by="calibrate with --wheelbase, or tell wheelbase_m under [vehicle] in the calibration",
+    )
 
 
 def drive(
