@@ -108,6 +108,8 @@ def evaluate(
 
     prepare_libraries()
     run, trajectory, known = _loaded(estimate, truth, times)
+    if lengths is not None and known is None:
+        raise DataError(f"--lengths {lengths}: relative errors need a truth; tell one with --truth")
     found = judged(
         trajectory,
         known,
@@ -132,6 +134,7 @@ def evaluate(
         )
     if sharpness:
         metrics += _sharpness_of(_needed(run, estimate, "--sharpness"), log)
+    print(_text(metrics, found, Format.JSON if json else format_))
     if plot is not None:
         from evaluators.plots import write_map_errors, write_trajectory_errors
 
@@ -139,7 +142,6 @@ def evaluate(
             write_trajectory_errors(plot, found, title=f"{name}, {ALIGNED[align.value]}")
         if held is not None and map_ is not None:
             write_map_errors(plot, held.verdict, title=f"{name} against {map_.resolve().name}")
-    print(_text(metrics, found, Format.JSON if json else format_))
 
 
 def _loaded(

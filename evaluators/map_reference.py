@@ -56,7 +56,10 @@ def read_reference(path: Path, *, voxel_m: float) -> Reference:
     if not path.exists():
         raise DataError(f"{path}: no such reference for a map; {_WANTED}")
     if path.is_dir():
-        path = path / (OCTREE_MAP if (path / OCTREE_MAP).is_file() else SCENE)
+        inside = [path / name for name in (OCTREE_MAP, SCENE) if (path / name).is_file()]
+        if not inside:
+            raise DataError(f"{path}: has neither {OCTREE_MAP} nor {SCENE}; {_WANTED}")
+        path = inside[0]
     ending = path.suffix.lower()
     if ending == ".json":
         return Reference("synthetic world", signed_distance_m=scene_distance(path), in_truth=True)

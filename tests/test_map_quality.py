@@ -115,7 +115,9 @@ def test_a_doubled_map_scores_lower_and_its_picture_shows_the_copy(tmp_path):
 def test_what_is_no_reference_is_named(tmp_path):
     (tmp_path / "notes.md").write_text("a map\n")
     (tmp_path / "scene.json").write_text("{}\n")
+    (tmp_path / "empty").mkdir()
     for path, message in (
+        (tmp_path / "empty", "empty: has neither map.octree nor scene.json"),
         (tmp_path / "nowhere.ply", "no such reference"),
         (tmp_path / "notes.md", "want a cloud"),
         (tmp_path, "not a scene of `mapper synth`"),
