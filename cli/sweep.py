@@ -35,7 +35,7 @@ def sweep(
     Example: mapper sweep sweep.toml --out sweeps/first --processes 4
     """
     from evaluators.sweep import plan_sweep, run_sweep
-    from evaluators.sweep_files import files_of, write_sweep
+    from evaluators.sweep_files import FILES, write_sweep
     from evaluators.sweep_tables import summary_text
     from mapper.errors import ConfigError
 
@@ -55,4 +55,4 @@ def sweep(
     records = write_sweep(plan, results, title=file.stem)
     if not quiet:
         print(summary_text(records))
-        print(*files_of(plan), sep="\n")
+        print(f"files  {', '.join(FILES)}\nin     {out}")

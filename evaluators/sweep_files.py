@@ -1,7 +1,6 @@
 """A sweep as files: the table for programs, and the page for people."""
 
 from collections.abc import Mapping
-from pathlib import Path
 
 from evaluators.cells import CellResult
 from evaluators.parquet import write_parquet
@@ -11,7 +10,7 @@ from evaluators.sweep_tables import sweep_records
 from evaluators.tables import Record, csv_text
 from mapper.atomic import write_text
 
-CSV, PARQUET, PAGE = "results.csv", "results.parquet", "summary.html"
+FILES = CSV, PARQUET, PAGE = "results.csv", "results.parquet", "summary.html"
 
 
 def write_sweep(plan: Plan, results: Mapping[Place, CellResult], *, title: str) -> list[Record]:
@@ -27,8 +26,3 @@ def write_sweep(plan: Plan, results: Mapping[Place, CellResult], *, title: str) 
     write_parquet(plan.out / PARQUET, records)
     write_text(plan.out / PAGE, page_of(plan, records, title=title))
     return records
-
-
-def files_of(plan: Plan) -> list[Path]:
-    """Return what was written for people and programs, the page last."""
-    return [plan.out / name for name in (CSV, PARQUET, PAGE)]
