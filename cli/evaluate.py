@@ -86,7 +86,8 @@ def evaluate(
         bool, typer.Option("--register", help="Register REFERENCE to the run's cloud before it is compared.")
     ] = False,
     tolerance: Annotated[
-        int, typer.Option(metavar="VOXELS", min=0, help="How far surfaces of the two maps may be apart.")
+        int,
+        typer.Option(metavar="VOXELS", min=0, max=10, help="How far surfaces of the two maps may be apart."),
     ] = _TOLERANCE,
     sharpness: Annotated[
         bool, typer.Option("--sharpness", help="Tell how thick walls are where the log's scans overlap.")

@@ -23,6 +23,7 @@ Codes = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 _BITS, _MARGIN = 20, 1 << 10  # keys take 16 bits; a step beyond the first or the last must not borrow
+_MOST_SPREAD = 1 << 24
 _SQRT3 = float(np.sqrt(3.0))
 
 
@@ -216,9 +217,12 @@ def _near(keys: Keys, others: Keys, *, voxels: int) -> Mask:
     wanted, codes = _codes(keys), _codes(others)
     reach = np.arange(-voxels, voxels + 1)
     steps = (reach[:, None, None] + (reach[:, None] << _BITS) + (reach << (2 * _BITS))).ravel()
-    if len(codes) < len(wanted):  # rather spread the few than look around the many
-        return _among(wanted, (codes[:, None] + steps).ravel())
     near = np.zeros(len(wanted), dtype=np.bool_)
+    if len(codes) < len(wanted):  # rather spread the few than look around the many
+        at_once = max(1, _MOST_SPREAD // max(len(codes), 1))
+        for first in range(0, len(steps), at_once):
+            near |= _among(wanted, (codes[:, None] + steps[first : first + at_once]).ravel())
+        return near
     for step in steps:
         near |= _among(wanted + step, codes)
     return near
