@@ -29,7 +29,7 @@ def merge(
     place: Annotated[
         Place,
         typer.Option(
-            help="built: every run's world is the map's, as in a chain of --onto. "
+            help="built: every run's world is the map's already. "
             "truth: the runs' truths share a frame; the first run's world is the map's."
         ),
     ] = Place.BUILT,
@@ -40,7 +40,9 @@ def merge(
     tile_m: Annotated[
         float, typer.Option(help="About how long a tile's edge is: a power of two in voxels.")
     ] = 50.0,
-    processes: Annotated[int, typer.Option(help="Workers on this machine.")] = 1,
+    processes: Annotated[
+        int | None, typer.Option(help="Workers on this machine.  [default: 1]", show_default=False)
+    ] = None,
     scheduler: Annotated[
         str | None,
         typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler whose workers see the same files."),
@@ -59,6 +61,8 @@ def merge(
     from mapper.merging.merge import merge as merge_runs
     from mapper.run import load_run
 
+    if scheduler is not None and processes is not None:
+        raise ConfigError(f"--processes {processes}: has no meaning with --scheduler; leave it out")
     prepare_libraries()
     if poses is not None and place is not Place.BUILT:
         raise ConfigError(f"--place {place} and --poses {poses}: both say where the runs lie; give one")
@@ -66,7 +70,7 @@ def merge(
         _placed([load_run(run) for run in runs], place, poses),
         out,
         tile_m=tile_m,
-        processes=processes,
+        processes=1 if processes is None else processes,
         scheduler=scheduler,
         progress=progress_for(quiet=quiet),
         overwrite=overwrite,

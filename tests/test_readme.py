@@ -20,6 +20,7 @@ QUICKER = {"compare": ["--last", "6", "--pairs", "1"]}
 """What is added to a command that takes minutes; its rows are the same."""
 
 BLOCK = re.compile(r"<!-- run[^>]*-->\n```(console|python)\n(.*?)```", re.DOTALL)
+FILES = re.findall(r"<!-- file: (\S+) -->\n```\w+\n(.*?)```", README, re.DOTALL)
 CONSOLE = [text for kind, text in BLOCK.findall(README) if kind == "console"]
 PYTHON = [text for kind, text in BLOCK.findall(README) if kind == "python"]
 
@@ -44,6 +45,8 @@ def place(desk_log, tmp_path_factory):
     write_lidar_log(place / SCANS, STREET.model_copy(update={"duration_s": 1.2, "sensor": sensor}))
     (place / SCANS / "times.txt").unlink()  # the real one tells no stamps either
     (place / "configs").symlink_to(ROOT / "configs")
+    for name, text in FILES:
+        (place / name).write_text(text)
     return place
 
 
