@@ -82,10 +82,12 @@ def reproduce(
     if not has_compiled_code():
         progress.note("first run here: the kernels are compiled once, which takes about a minute")
     out = out or Path(paper.value)
+    if processes is None:
+        processes = os.cpu_count() or 1 if paper is Paper.THESIS else 1
     reproduction = reproduce_tables(
         request,
         out,
-        processes=processes or (os.cpu_count() or 1 if paper is Paper.THESIS else 1),
+        processes=processes,
         scheduler=scheduler,
         progress=progress,
     )
@@ -98,7 +100,7 @@ def _given(assignments: Sequence[str]) -> dict[str, Path]:
     """Return where logs of other names lie.
 
     Raises:
-        ConfigError: One is no ``NAME=PATH``.
+        ConfigError: One is no ``NAME=PATH``, or two have the same name.
     """
     from mapper.errors import ConfigError
 
@@ -109,5 +111,7 @@ def _given(assignments: Sequence[str]) -> dict[str, Path]:
             raise ConfigError(
                 f"--log {assignment}: want NAME=PATH, for example fr1/xyz={assignment or 'PATH'}"
             )
+        if name in given:
+            raise ConfigError(f"--log {assignment}: {name} is {given[name]} already; give one of them")
         given[name] = Path(path)
     return given

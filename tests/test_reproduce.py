@@ -115,6 +115,7 @@ def test_zhaos_settings_are_as_published(desk_log):
         (("--tables", "5.1,9.9"), "--tables 9.9: thesis has 4.1, 4.2, 5.1, 5.2, 5.5, detectors"),
         (("--log", "fr1"), "--log fr1: want NAME=PATH"),
         (("--log", "fr1/none=x"), "no sequence of the paper"),
+        (("--log", "fr1/xyz=a", "--log", "fr1/xyz=b"), "fr1/xyz is a already"),
         (("--seeds", "0"), "want at least 1"),
         (("--first", "5", "--last", "3"), "want 0 ≤ first ≤ last"),
         (("--scheduler", "tcp://x", "--processes", "2"), "has no meaning with --scheduler"),
@@ -133,6 +134,8 @@ def test_a_folder_without_logs_is_one_line_and_leaves_nothing(tmp_path):
 
     with pytest.raises(SourceError, match=r"none of the sequences.*fr1/desk2, fr1/xyz, fr1/room"):
         reproduce(Request("zhao", tmp_path / "empty"), tmp_path / "out")
+    with pytest.raises(SourceError, match=r"no pairs\.toml"):
+        reproduce(Request("hough", tmp_path / "empty"), tmp_path / "out")
     assert not (tmp_path / "out").exists()
     with pytest.raises(ConfigError, match="hough has one table"):
         Request("hough", tmp_path, tables=("1",))

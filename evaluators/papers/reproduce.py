@@ -84,8 +84,8 @@ def reproduce(
         RunError: OUT holds something else, or another process is filling it.
     """
     work = _HoughWork(request) if request.paper == "hough" else _BookWork(request, _BOOKS[request.paper])
+    cells = work.cells(out.resolve())
     with resumed(out, mark=PLAN) as folder:
-        cells = work.cells(folder)
         write_text(folder / PLAN, _described(request, cells))
         results = run_cells(
             cells, folder / CELLS, processes=processes, scheduler=scheduler, progress=progress

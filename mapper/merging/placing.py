@@ -68,13 +68,13 @@ def by_poses(runs: Sequence[Run], path: Path) -> list[Placed]:
         RunError: Two runs have the same name.
     """
     poses = _read_poses(path)
-    names = Counter(run.path.name for run in runs)
+    names = Counter(_name(run) for run in runs)
     for name, count in names.items():
         if count > 1:
             raise RunError(f"{name}: {count} runs are called so, and {path} tells them by name; rename one")
         if name not in poses:
             raise DataError(f"{path}: has no line for {name}; want {name} tx ty tz qx qy qz qw")
-    return [Placed(run, poses[run.path.name], f"by {path.name}") for run in runs]
+    return [Placed(run, poses[_name(run)], f"by {path.name}") for run in runs]
 
 
 def doubts(placed: Sequence[Placed]) -> list[str]:
@@ -90,10 +90,14 @@ def doubts(placed: Sequence[Placed]) -> list[str]:
             shared = sum(len(stamps & used[first].get(log, set())) for log, stamps in used[second].items())
             if shared:
                 found.append(
-                    f"{other.run.path.name} and {item.run.path.name} were made from {shared} frames that are "
-                    "the same; these count twice"
+                    f"{_name(other.run)} and {_name(item.run)} were made from {shared} frames that are the "
+                    "same; these count twice"
                 )
     return found
+
+
+def _name(run: Run) -> str:
+    return run.path.resolve().name  # the path may be a dot
 
 
 def _frames_used(run: Run) -> dict[str, set[int]]:
