@@ -11,7 +11,7 @@ from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure, save
 from mapper.export.palette import ESTIMATE, TRUTH
 from mapper.frames import Image
 from mapper.geometry import Array
-from mapper.sensing.line_laser.calibration import CalibrationShot, Fit, ahead_m, row_px
+from mapper.sensing.line_laser.calibration import CalibrationShot, Fit, ahead_m, row_px, up_px
 from mapper.sensing.line_laser.detection import Method, responses, stripe_rows
 
 if TYPE_CHECKING:
@@ -89,10 +89,10 @@ def write_calibration_picture(path: Path, fit: Fit, shots: Sequence[CalibrationS
     far_px = row_px(calibration, calibration.reach_m)
     rows = np.linspace(min(shot.board.row_px for shot in shots), far_px, 200)
     axes = figure.add_axes((0.065, 0.13, 0.4, 0.68))
-    _law(axes, _heights(calibration.height_px, rows), ahead_m(calibration, rows))
-    for shot, error_m in zip(shots, fit.range_errors_m, strict=True):
-        height = _heights(calibration.height_px, np.array([shot.board.row_px]))
-        _shot(axes, float(height[0]), shot.range_m, f"{1e3 * error_m:+.1f} mm")
+    above_px, percent = up_px(calibration.height_px, rows), 100.0 / calibration.height_px
+    _law(axes, percent * above_px, ahead_m(calibration, rows))
+    for shot, shot_px, error_m in zip(shots, _above_px(fit, shots), fit.range_errors_m, strict=True):
+        _shot(axes, percent * shot_px, shot.range_m, f"{1e3 * error_m:+.1f} mm")
     axes.set_xlabel("height of the stripe in the image, p (0 bottom … 100 top)", fontsize=9, color=FAINT)
     axes.set_title(
         f"range: {law.scale_mm:.0f} · p$^{{{law.exponent:.4f}}}$ mm", fontsize=10.5, color=INK, loc="left"
@@ -100,11 +100,10 @@ def write_calibration_picture(path: Path, fit: Fit, shots: Sequence[CalibrationS
     axes.set_ylabel("range (m)", fontsize=9, color=FAINT)
     wide = [shot for shot in shots if shot.width_m is not None and shot.board.width_px is not None]
     axes = figure.add_axes((0.56, 0.13, 0.4, 0.68))
-    up_px = calibration.height_px - 0.5 - rows
-    _law(axes, up_px, lateral.slope * up_px + lateral.offset)
-    for shot, error_m in zip(wide, fit.width_errors_m, strict=True):
+    _law(axes, above_px, lateral.slope * above_px + lateral.offset)
+    for shot, shot_px, error_m in zip(wide, _above_px(fit, wide), fit.width_errors_m, strict=True):
         px_per_cm = (shot.board.width_px or 0) / (100.0 * (shot.width_m or 1.0))
-        _shot(axes, calibration.height_px - 0.5 - shot.board.row_px, px_per_cm, f"{1e3 * error_m:+.1f} mm")
+        _shot(axes, shot_px, px_per_cm, f"{1e3 * error_m:+.1f} mm")
     axes.set_xlabel("height of the stripe in the image, y (px)", fontsize=9, color=FAINT)
     axes.set_ylabel("px per cm", fontsize=9, color=FAINT)
     axes.set_title(
@@ -113,9 +112,10 @@ def write_calibration_picture(path: Path, fit: Fit, shots: Sequence[CalibrationS
     save(figure, path)
 
 
-def _heights(height_px: int, rows: Array) -> Array:
-    heights: Array = 100.0 * (height_px - 0.5 - rows) / height_px
-    return heights
+def _above_px(fit: Fit, shots: Sequence[CalibrationShot]) -> list[float]:
+    rows_px = np.array([shot.board.row_px for shot in shots])
+    above_px: list[float] = up_px(fit.calibration.height_px, rows_px).tolist()
+    return above_px
 
 
 def _law(axes: "Axes", x: Array, y: Array) -> None:

@@ -74,10 +74,16 @@ class Fit:
     width_errors_m: Array
 
 
+def up_px(height_px: int, rows_px: Array) -> Array:
+    """Return how many pixels above the image's lower edge rows lie."""
+    above_px: Array = height_px - 0.5 - rows_px
+    return above_px
+
+
 def ahead_m(calibration: LineLaserCalibration, rows_px: Array) -> Array:
     """Return how far ahead the stripe lies that is seen in these rows (eq. 2.44)."""
     law = calibration.range
-    height = 100.0 * _up_px(calibration.height_px, rows_px) / calibration.height_px
+    height = 100.0 * up_px(calibration.height_px, rows_px) / calibration.height_px
     result: Array = 1e-3 * law.scale_mm * height**law.exponent
     return result
 
@@ -93,7 +99,7 @@ def right_m(calibration: LineLaserCalibration, columns_px: Array, rows_px: Array
     """Return how far to the right it lies (eq. 2.45); x counts from the image's middle, as in Algorithm 2."""
     law = calibration.lateral
     x = columns_px - 0.5 * (calibration.width_px - 1)
-    result: Array = _CM * x / (law.slope * _up_px(calibration.height_px, rows_px) + law.offset)
+    result: Array = _CM * x / (law.slope * up_px(calibration.height_px, rows_px) + law.offset)
     return result
 
 
@@ -141,10 +147,10 @@ def calibrate(
             raise DataError(f"calibration: {len(ranges)} different {what}, want {fewest} or more")
     width_px, height_px = size_px
     rows_px, ranges_m = np.array([(shot.board.row_px, shot.range_m) for shot in shots]).T
-    heights = 100.0 * _up_px(height_px, rows_px) / height_px
+    heights = 100.0 * up_px(height_px, rows_px) / height_px
     (ln_scale, exponent), range_covariance = _line(np.log(heights), np.log(1e3 * ranges_m))
     _, wide_rows_px, widths_px, widths_m = np.array(wide, np.float64).T
-    wide_up_px = _up_px(height_px, wide_rows_px)
+    wide_up_px = up_px(height_px, wide_rows_px)
     (offset, slope), ((d, b), (_, a)) = _line(wide_up_px, widths_px / (widths_m / _CM))
     if exponent >= 0.0 or slope <= 0.0:
         raise DataError(
@@ -180,12 +186,6 @@ def calibration_text(calibration: LineLaserCalibration) -> str:
 
 def _toml(value: float | Covariance) -> str:
     return repr([list(row) for row in value]) if isinstance(value, tuple) else repr(value)
-
-
-def _up_px(height_px: int, rows_px: Array) -> Array:
-    """Return pixels above the image's lower edge."""
-    up_px: Array = height_px - 0.5 - rows_px
-    return up_px
 
 
 def _line(x: Array, y: Array) -> tuple[tuple[float, float], Covariance]:
