@@ -25,6 +25,7 @@ from mapper.sources.synthetic.line_laser.render import take
 from mapper.sources.synthetic.line_laser.room import Patch, Room, make_board, make_room
 
 SYNTH = LineLaserSynthConfig(seed=2)
+HALF = ("rate_hz=1", "width_px=320", "height_px=180", "focal_px=275")
 PLAIN = SYNTH.model_copy(update={"lamps": 0.0, "red_things": 0.0, "dull_things": 0.0})
 
 
@@ -131,19 +132,9 @@ def run(*arguments):
 @pytest.fixture(scope="module")
 def driven(tmp_path_factory):
     folder = tmp_path_factory.mktemp("line_laser")
+    half = [word for knob in HALF for word in ("--set", knob)]
     steps = [
-        (
-            "synth",
-            folder / "drive",
-            "--sensor",
-            "line-laser",
-            "--seconds",
-            4,
-            "--set",
-            "rate_hz=1",
-            "--seed",
-            1,
-        ),
+        ("synth", folder / "drive", "--sensor", "line-laser", "--seconds", 4, "--seed", 1, *half),
         ("sensor", "line-laser-calibrate", folder / "drive/shots", "--wheelbase", 0.26, "--sensor-x", 0.2),
         ("sensor", "line-laser", folder / "drive/images", "--calibration", folder / "C.toml"),
     ]
