@@ -119,6 +119,8 @@ def evaluate(
         lengths_m=None if lengths is None else _numbers(lengths),
         names=(str(estimate), str(truth) if truth else "its truth"),
     )
+    if lengths is not None and not any(map(len, found.lengths)):
+        raise DataError(f"--lengths {lengths}: the true path, where there are poses, has no stretch so long")
     metrics = list(found.metrics)
     if run is not None and known is not None:
         metrics += _loops_of(run, known)

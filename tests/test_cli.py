@@ -141,6 +141,7 @@ def test_spelled_out_overrides_win(desk_log, tmp_path):
         (["eval", "RUN", "--map", "nowhere"], "mapper: nowhere: no such reference for a map"),
         (["eval", "RUN", "--tolerance", "2"], "mapper: --map-world, --register and --tolerance tell how"),
         (["eval", "RUN", "--lengths", "1;2"], "mapper: --lengths 1;2: want metres with commas"),
+        (["eval", "RUN", "--lengths", "99"], "mapper: --lengths 99: the true path, where there are poses"),
         (["eval", "RUN", "--log", "nowhere"], "mapper: nowhere: --log is for bare trajectories"),
         (["eval", "RUN", "--times", "nowhere"], "mapper: nowhere: --times is for poses in KITTI text"),
         (["eval", "RUN", "--truth", "nowhere"], "mapper: nowhere: cannot be read"),
@@ -248,9 +249,7 @@ def test_eval_holds_the_map_against_the_world_of_a_synthetic_log(run_folder, des
 def test_eval_reads_kitti_text_with_and_without_times(run_folder, tmp_path):
     poses, times = tmp_path / "poses.txt", tmp_path / "times.txt"
     mapper("export", run_folder, "--as", "kitti", "--out", poses)
-    times.write_text(
-        "\n".join((run_folder / "trajectory.tum").read_text().split("\n")[1:])
-    )
+    times.write_text("\n".join((run_folder / "trajectory.tum").read_text().split("\n")[1:]))
     by_line = json.loads(mapper("eval", poses, "--truth", poses, "--json").stdout)
     by_time = json.loads(
         mapper("eval", poses, "--truth", run_folder / "truth.tum", "--times", times, "--json").stdout
