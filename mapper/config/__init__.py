@@ -127,13 +127,14 @@ def read_config(path: Path, model: type[AnyConfig]) -> AnyConfig:
 
 
 def _read(path: Path) -> dict[str, Any]:
+    is_json = path.suffix == ".json"
     try:
         text = path.read_text(encoding="utf-8")
-        tree: dict[str, Any] = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+        tree: dict[str, Any] = json.loads(text) if is_json else tomllib.loads(text)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:  # what either parser raises, and text that is not UTF-8
-        raise ConfigError(f"{path}: not valid {path.suffix.upper()[1:] or 'TOML'}: {error}") from None
+        raise ConfigError(f"{path}: not valid {'JSON' if is_json else 'TOML'}: {error}") from None
     return tree
 
 
