@@ -1,5 +1,6 @@
 """Local views joined by the wheels' poses into one map of log-odds (Moravec & Elfes 1985)."""
 
+import math
 from collections.abc import Iterator, Sequence
 from itertools import pairwise, starmap
 
@@ -51,7 +52,7 @@ def map_scans(
     seen = np.concatenate([*ends_world, T_world_sensor[:, :2, 3]])
     low = np.floor(seen.min(axis=0) / config.resolution_m).astype(np.int64) - _MARGIN_CELLS
     size = np.floor(seen.max(axis=0) / config.resolution_m).astype(np.int64) + _MARGIN_CELLS + 1 - low
-    if size.prod() > _MAX_CELLS:
+    if math.prod(size.tolist()) > _MAX_CELLS:
         raise MapSizeError(
             f"line laser: a map of {size[0]} × {size[1]} cells, want {_MAX_CELLS} at most; "
             "are the wheels right? else raise map.resolution_m"
