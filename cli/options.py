@@ -50,3 +50,20 @@ def assignments(given: Mapping[str, object]) -> list[str]:
 def merged(sugar: Sequence[str], overrides: Sequence[str] | None) -> list[str]:
     """Return all overrides in the order in which they win: what is spelled out by --set comes last."""
     return [*sugar, *(overrides or ())]
+
+
+def workers_here(processes: int | None, scheduler: str | None, *, default: int) -> int:
+    """Return how many workers there are on this machine, if no scheduler has others.
+
+    Raises:
+        ConfigError: There are none, or both are given.
+    """
+    from mapper.errors import ConfigError
+
+    if processes is None:
+        return default
+    if scheduler is not None:
+        raise ConfigError(f"--processes {processes}: has no meaning with --scheduler; leave it out")
+    if processes < 1:
+        raise ConfigError(f"--processes {processes}: want at least 1")
+    return processes

@@ -10,7 +10,7 @@ import typer
 
 from cli.console import progress_for
 from cli.environment import has_compiled_code, prepare_libraries
-from cli.options import First, Last, Quiet
+from cli.options import First, Last, Quiet, workers_here
 
 
 class Paper(StrEnum):
@@ -65,10 +65,9 @@ def reproduce(
     from evaluators.papers.files import tables_text
     from evaluators.papers.reproduce import Request
     from evaluators.papers.reproduce import reproduce as reproduce_tables
-    from mapper.errors import ConfigError
 
-    if scheduler is not None and processes is not None:
-        raise ConfigError(f"--processes {processes}: has no meaning with --scheduler; leave it out")
+    every_core = os.cpu_count() or 1
+    workers = workers_here(processes, scheduler, default=every_core if paper is Paper.THESIS else 1)
     prepare_libraries()
     request = Request(
         paper=paper.value,
@@ -82,12 +81,10 @@ def reproduce(
     if not has_compiled_code():
         progress.note("first run here: the kernels are compiled once, which takes about a minute")
     out = out or Path(paper.value)
-    if processes is None:
-        processes = os.cpu_count() or 1 if paper is Paper.THESIS else 1
     reproduction = reproduce_tables(
         request,
         out,
-        processes=processes,
+        processes=workers,
         scheduler=scheduler,
         progress=progress,
     )
@@ -104,7 +101,7 @@ def _given(assignments: Sequence[str]) -> dict[str, Path]:
     """
     from mapper.errors import ConfigError
 
-    given = {}
+    given: dict[str, Path] = {}
     for assignment in assignments:
         name, equals, path = assignment.partition("=")
         if not (name and equals and path):

@@ -8,7 +8,7 @@ import typer
 
 from cli.console import progress_for
 from cli.environment import has_compiled_code, prepare_libraries
-from cli.options import Quiet
+from cli.options import Quiet, workers_here
 
 
 def sweep(
@@ -37,10 +37,8 @@ def sweep(
     from evaluators.sweep import plan_sweep, run_sweep
     from evaluators.sweep_files import FILES, write_sweep
     from evaluators.sweep_tables import summary_text
-    from mapper.errors import ConfigError
 
-    if scheduler is not None and processes is not None:
-        raise ConfigError(f"--processes {processes}: has no meaning with --scheduler; leave it out")
+    workers = workers_here(processes, scheduler, default=os.cpu_count() or 1)
     prepare_libraries()
     progress = progress_for(quiet=quiet)
     plan = plan_sweep(file, out)
@@ -48,7 +46,7 @@ def sweep(
         progress.note("first run here: the kernels are compiled once, which takes about a minute")
     results = run_sweep(
         plan,
-        processes=(os.cpu_count() or 1) if processes is None else processes,
+        processes=workers,
         scheduler=scheduler,
         progress=progress,
     )

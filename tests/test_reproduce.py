@@ -118,6 +118,7 @@ def test_zhaos_settings_are_as_published(desk_log):
         (("--log", "fr1/xyz=a", "--log", "fr1/xyz=b"), "fr1/xyz is a already"),
         (("--seeds", "0"), "want at least 1"),
         (("--first", "5", "--last", "3"), "want 0 ≤ first ≤ last"),
+        (("--processes", "0"), "--processes 0: want at least 1"),
         (("--scheduler", "tcp://x", "--processes", "2"), "has no meaning with --scheduler"),
     ],
 )
