@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from mapper.linear import solve_positive, twist_exp
-from mapper.registration.kd_tree import search
+from mapper.registration.kd_tree import STACK, search
 
 POINT, PLANE, GAUSSIAN = 0, 1, 2
 """What is made small: distances between points, to planes (Chen & Medioni 1992), between Gaussians."""
@@ -39,7 +39,7 @@ def descend_on_points(  # type: ignore[no-untyped-def]
         iterations: At most so many.
         steps: (2,) radians and metres of the step that ends it.
     """
-    branches, offsets = np.empty((64, 3), np.int64), np.empty((64, 4))
+    branches, offsets = np.empty((STACK, 3), np.int64), np.empty((STACK, 4))
     index, squared = np.zeros(1, np.int64), np.empty(1)
     p, m, n = np.empty(3), np.empty(3), np.empty(3)
     for _ in range(iterations):

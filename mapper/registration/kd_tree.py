@@ -15,7 +15,7 @@ from mapper.frames import Points32
 from mapper.geometry import Array, Points
 
 _LEAF_POINTS = 8
-_STACK = 64
+STACK = 64
 """Deeper than any tree: each of its levels leaves one branch to come back to."""
 
 
@@ -124,7 +124,7 @@ def neighbours_of(points, axes, cuts, queries, count):  # type: ignore[no-untype
     """Return (Q, count) indices and squared distances, ascending, of the points nearest to the queries."""
     indices = np.zeros((len(queries), count), np.int64)
     squared = np.full((len(queries), count), np.inf)
-    branches, offsets = np.empty((_STACK, 3), np.int64), np.empty((_STACK, 4))
+    branches, offsets = np.empty((STACK, 3), np.int64), np.empty((STACK, 4))
     query = np.empty(3)
     for q in range(len(queries)):
         for k in range(3):
