@@ -19,6 +19,7 @@ MAP_ENDINGS = (".bt", ".ot", ".octree")
 _WANTED = (
     f"want a cloud ({' '.join(ENDINGS)}), an octree ({' '.join(MAP_ENDINGS)}), a run, or a synthetic log"
 )
+_MOST_POINTS = 50_000_000  # 1.2 GB
 _THINNED_RATIO = 0.25  # of a voxel: a cloud so thin still fills every voxel that it filled
 
 
@@ -103,6 +104,11 @@ def _octree(octree: OctreeMap, voxel_m: float) -> Reference:
         raise DataError("reference: no voxel of the map is occupied, so it has no surface")
     # A large voxel is as many points as it has of the other map's voxels.
     pieces = max(1, int(np.ceil(octree.resolution_m / voxel_m)))
+    if len(centres) * pieces**3 > _MOST_POINTS:
+        raise DataError(
+            f"reference: {len(centres)} voxels of {octree.resolution_m:g} m are too coarse for a map of "
+            f"{voxel_m:g} m: {len(centres) * pieces**3} points, over {_MOST_POINTS}; compare a coarser map"
+        )
     steps = ((np.arange(pieces) + 0.5) / pieces - 0.5) * octree.resolution_m
     offsets = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
     points = (centres[:, None] + offsets).reshape(-1, 3)

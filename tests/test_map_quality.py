@@ -77,6 +77,13 @@ def test_a_map_meets_itself_at_any_resolution(resolution_m, tmp_path):
     assert min(values[RECALL], values["free recall"]) > 0.99
 
 
+def test_a_map_too_coarse_to_be_cut_up_is_refused(tmp_path, monkeypatch):
+    write_bt(tmp_path / "coarse.bt", mapped(wall(2.02), resolution_m=0.1))
+    monkeypatch.setattr("evaluators.map_reference._MOST_POINTS", 1000)
+    with pytest.raises(DataError, match=r"voxels of 0.1 m are too coarse for a map of 0.05 m"):
+        read_reference(tmp_path / "coarse.bt", voxel_m=EDGE_M)
+
+
 def test_free_space_that_another_map_fills_counts_against_both():
     octree, reference = mapped(wall(2.02)), mapped(wall(1.02), wall(2.02, along=ROW[ROW > 0.5]))
     occupied = reference.leaves().centres_world[reference.leaves().log_odds > 0.0]

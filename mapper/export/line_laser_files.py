@@ -1,13 +1,13 @@
 """What a line-laser sensor saw, as files: ranges, local grids, the map, points and pictures."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from mapper.atomic import write_bytes, write_text
+from mapper.atomic import replacing, write_bytes, write_text
 from mapper.config.line_laser import LineLaserCalibration, LineLaserConfig
 from mapper.export.grid import write_grid
 from mapper.export.palette import ESTIMATE
@@ -44,27 +44,29 @@ def write_scans(
         config: Likewise.
         notes: What was left out or assumed.
     """
-    lines = ["image,stamp_s,column,row_px,x_m,y_m,is_floor"]
     (folder / LOCAL).mkdir()
-    for path, scan in scans.items():
-        stamp = seconds_text_from_ns(scan.stamp_ns)
-        told = zip(
-            scan.columns.tolist(),
-            scan.rows_px.tolist(),
-            scan.points_sensor.tolist(),
-            scan.is_floor.tolist(),
-            strict=True,
-        )
-        lines += [
-            f"{path.name},{stamp},{column},{row:.3f},{x:.4f},{y:.4f},{int(floor)}"
-            for column, row, (x, y), floor in told
-        ]
-        _, png = cv2.imencode(".png", 255 * local_grid(scan, config.map)[::-1])
-        write_bytes(folder / LOCAL / f"{path.stem}.png", png.tobytes())
-    write_text(folder / RANGES, "\n".join(lines) + "\n")
+    with replacing(folder / RANGES) as partial, partial.open("w", encoding="utf-8") as ranges:
+        ranges.write("image,stamp_s,column,row_px,x_m,y_m,is_floor\n")
+        for path, scan in scans.items():
+            ranges.writelines(_lines(path.name, scan))
+            _, png = cv2.imencode(".png", 255 * local_grid(scan, config.map)[::-1])
+            write_bytes(folder / LOCAL / f"{path.stem}.png", png.tobytes())
     write_text(folder / CALIBRATION, calibration_text(calibration))
     manifest = {"images": len(scans), "config": config.model_dump(mode="json"), "notes": list(notes)}
     write_text(folder / MARK, json.dumps(manifest, indent=1, ensure_ascii=False) + "\n")
+
+
+def _lines(image: str, scan: LineScan) -> Iterator[str]:
+    stamp = seconds_text_from_ns(scan.stamp_ns)
+    told = zip(
+        scan.columns.tolist(),
+        scan.rows_px.tolist(),
+        scan.points_sensor.tolist(),
+        scan.is_floor.tolist(),
+        strict=True,
+    )
+    for column, row, (x, y), is_floor in told:
+        yield f"{image},{stamp},{column},{row:.3f},{x:.4f},{y:.4f},{int(is_floor)}\n"
 
 
 def write_drive(folder: Path, drive: Drive, *, title: str) -> None:
