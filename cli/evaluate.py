@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from evaluators.map_quality import MapQuality
     from evaluators.metric import Metric
     from mapper.run import Run
+    from mapper.sources.base import FrameSource
     from mapper.timebase import Stamps
     from mapper.trajectory import Trajectory
 
@@ -125,6 +126,7 @@ def evaluate(
     if run is not None and known is not None:
         metrics += _loops_of(run, known)
     name = estimate.resolve().name
+    sharp_log = _log_of(_needed(run, estimate, "--sharpness"), log) if sharpness else None
     held = None
     if map_ is not None:
         held = _held_against(
@@ -135,8 +137,8 @@ def evaluate(
         raise DataError(
             "--map-world, --register and --tolerance tell how to compare with --map, which is missing"
         )
-    if sharpness:
-        metrics += _sharpness_of(_needed(run, estimate, "--sharpness"), log)
+    if sharp_log is not None:
+        metrics += _sharpness_of(sharp_log, trajectory)
     print(_text(metrics, found, Format.JSON if json else format_))
     if plot is not None:
         from evaluators.plots import write_map_errors, write_trajectory_errors
@@ -186,12 +188,16 @@ def _held_against(
     )
 
 
-def _sharpness_of(run: "Run", log: Path | None) -> "list[Metric]":
-    from evaluators.sharpness import RADIUS_M, sharpness_metrics, views_of
+def _log_of(run: "Run", log: Path | None) -> "FrameSource":
     from mapper.run import moved_log, open_log
 
-    source = open_log(run if log is None else moved_log(run, log))
-    views = views_of(source, run.trajectory(), progress=progress_for(quiet=False))
+    return open_log(run if log is None else moved_log(run, log))
+
+
+def _sharpness_of(source: "FrameSource", trajectory: "Trajectory") -> "list[Metric]":
+    from evaluators.sharpness import RADIUS_M, sharpness_metrics, views_of
+
+    views = views_of(source, trajectory, progress=progress_for(quiet=False))
     return sharpness_metrics(views, radius_m=RADIUS_M[source.sensor])
 
 

@@ -11,9 +11,8 @@ from mapper.errors import DataError, RunError
 from mapper.geometry import Array, Transform, fit_rigid, inverse, transform
 from mapper.rotations import rotation_from_quaternion
 from mapper.run import Run
-from mapper.timebase import NS_PER_S, nearest
+from mapper.timebase import MAX_TRUTH_GAP_NS, nearest
 
-_MAX_GAP_NS = NS_PER_S // 50
 _LEVER_M = 1.0
 """A straight path alone would not tell how a run is turned about it; the body's axes, so long, do."""
 
@@ -119,7 +118,7 @@ def _fit_to_truth(run: Run) -> tuple[Transform, float]:
     if truth is None:
         raise RunError(f"{run.path}: has no truth to be placed by; tell its pose with --poses")
     index, gap_ns = nearest(truth.stamps_ns, trajectory.stamps_ns)
-    near = np.abs(gap_ns) <= _MAX_GAP_NS
+    near = gap_ns <= MAX_TRUTH_GAP_NS
     if np.count_nonzero(near) < 3:
         raise RunError(
             f"{run.path}: {np.count_nonzero(near)} poses have a truth within 20 ms, want 3; use --poses"
