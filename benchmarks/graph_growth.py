@@ -15,8 +15,8 @@ from time import process_time
 
 import numpy as np
 
-from mapper.config.graph import GraphConfig
-from mapper.geometry import Transform, apply, exp, fit_rigid, inverse, rotation_exp, transform
+from mapper.core.geometry import Transform, apply, exp, fit_rigid, inverse, rotation_exp, transform
+from mapper.graph.config import GraphConfig
 from mapper.graph.incremental import IncrementalSolver
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.graph.optimize import optimize

@@ -20,15 +20,15 @@ import numpy as np
 
 from evaluators.cloud_distance import DistanceTo
 from evaluators.scan_pairs import fewer_rings, merged, perturbed
-from mapper.config.hough import HoughConfig, HoughGicpConfig, HoughNdtConfig
-from mapper.config.registration import KissMatcherConfig
-from mapper.config.sources import SourceConfig
-from mapper.config.synthetic import COURTYARD, STREET, LidarSynthConfig
-from mapper.frames import Scan
-from mapper.geometry import Transform, angle_between, inverse
+from mapper.core.frames import Scan
+from mapper.core.geometry import Transform, angle_between, inverse
 from mapper.registration.base import Registration
+from mapper.registration.config import KissMatcherConfig
+from mapper.registration.hough_config import HoughConfig, HoughGicpConfig, HoughNdtConfig
+from mapper.simulation.config import COURTYARD, STREET, LidarSynthConfig
+from mapper.simulation.lidar import SyntheticLidarSource
 from mapper.sources import open_source
-from mapper.sources.synthetic.lidar import SyntheticLidarSource
+from mapper.sources.config import SourceConfig
 
 RIGHT_M, RIGHT_DEG = 0.3, 1.0
 NEAR_M = 10.0

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from evaluators.trajectory import align, associate, ate
-from mapper.config import load_config
-from mapper.frames import Scan
-from mapper.geometry import Transform
+from mapper.config.loading import load_config
+from mapper.core.frames import Scan
+from mapper.core.geometry import Transform
+from mapper.core.trajectory import Trajectory
 from mapper.sources import open_source
-from mapper.trajectory import Trajectory
 
 Follow = Callable[[Scan], Transform | None]
 

@@ -23,21 +23,22 @@ from time import perf_counter, process_time
 import numpy as np
 import pyoctomap
 
-from mapper.config import load_config
-from mapper.config.synthetic import SCENES
-from mapper.deskew import deskewed, twist_at
-from mapper.manifest import Input, Manifest
+from mapper.config.loading import load_config
+from mapper.core.deskew import deskewed, twist_at
+from mapper.core.timebase import nearest
+from mapper.core.trajectory import Trajectory
 from mapper.merging.merge import merge
 from mapper.merging.placing import as_built
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import read_map
-from mapper.run import Run, drafting, load_run
+from mapper.run.folder import Run, load_run, write_run
+from mapper.run.manifest import Input, Manifest
+from mapper.simulation.config import SCENES
+from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source
 from mapper.sources.base import FrameSource
-from mapper.sources.synthetic.lidar import write_lidar_log
-from mapper.timebase import nearest
-from mapper.trajectory import Trajectory, write_tum
+from mapper.sources.trajectory_files import write_tum
 
 RUNS = 8
 SHARE = 1.4  # a run is so much longer than its step along the log: neighbours overlap
@@ -70,11 +71,11 @@ def make_runs(source: FrameSource, resolution_m: float, *, stride: int, folder: 
             octree.insert(scan, truth.T_world_body[indices[frame]])
         found = Input(path=str(source.path), kind=source.kind, fingerprint=f"sha256:{number}")
         path = folder / f"run{number}"
-        with drafting(path, Manifest(status="building", input=found), config, overwrite=True) as draft:
-            write_map(draft.folder / "map.octree", octree)
+        with write_run(path, Manifest(status="building", input=found), config, overwrite=True) as writer:
+            write_map(writer.folder / "map.octree", octree)
             poses = truth.T_world_body[indices[list(piece)]]
             write_tum(
-                draft.folder / "trajectory.tum", Trajectory(truth.stamps_ns[indices[list(piece)]], poses)
+                writer.folder / "trajectory.tum", Trajectory(truth.stamps_ns[indices[list(piece)]], poses)
             )
         runs.append(load_run(path))
     return runs

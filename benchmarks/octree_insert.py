@@ -18,16 +18,16 @@ from typing import Any
 import numpy as np
 import pyoctomap
 
-from mapper.config.octree import OctreeConfig
-from mapper.config.sources import SourceConfig
-from mapper.frames import Scan
-from mapper.geometry import Transform, apply, inverse
+from mapper.core.frames import Scan
+from mapper.core.geometry import Transform, apply, inverse
+from mapper.core.timebase import nearest
 from mapper.octree import kernels
+from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import read_map, write_bt, write_ot
 from mapper.sources import open_source
-from mapper.timebase import nearest
-from mapper.trajectory import read_kitti
+from mapper.sources.config import SourceConfig
+from mapper.sources.trajectory_files import read_kitti
 
 Scans = list[tuple[Scan, Transform]]
 MAX_QUERIES = 1_000_000

@@ -15,17 +15,17 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.config.features import UniformOrbConfig
-from mapper.config.places import PlacesConfig
-from mapper.config.sources import SourceConfig
-from mapper.config.synthetic import SynthConfig
+from mapper.features.config import UniformOrbConfig
 from mapper.features.windowed import match_everywhere, pack
+from mapper.places.config import PlacesConfig
 from mapper.places.guided import match_by_word
 from mapper.places.index import PlaceIndex
 from mapper.places.tree import Bits
 from mapper.places.vocabulary import Vocabulary, WordVector, load_vocabulary, similarity
+from mapper.simulation import SyntheticSource
+from mapper.simulation.config import SynthConfig
 from mapper.sources import open_source
-from mapper.sources.synthetic import SyntheticSource
+from mapper.sources.config import SourceConfig
 
 QUERIES = 20
 SEEN_AGAIN_RATIO = 0.5  # of a revisit's words, as measured on synthetic revisits

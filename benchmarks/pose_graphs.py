@@ -14,7 +14,7 @@ from time import process_time
 
 import gtsam
 
-from mapper.config.graph import GraphConfig
+from mapper.graph.config import GraphConfig
 from mapper.graph.g2o import read_g2o
 from mapper.graph.optimize import optimize
 

@@ -16,18 +16,18 @@ import cv2
 import numpy as np
 
 from evaluators.trajectory import align, associate, ate
-from mapper.config import load_config
-from mapper.config.synthetic import SensorConfig, SynthConfig
-from mapper.frames import RgbdFrame, Scan
-from mapper.geometry import angle_between
-from mapper.progress import SILENT
-from mapper.solving import solve
-from mapper.sources.base import Accelerations, Entry
-from mapper.sources.synthetic.path import START_NS
-from mapper.sources.synthetic.source import SyntheticSource
-from mapper.timebase import NS_PER_S
-from mapper.tracking import track_log
-from mapper.trajectory import Trajectory
+from mapper.config.loading import load_config
+from mapper.core.frames import RgbdFrame, Scan
+from mapper.core.geometry import angle_between
+from mapper.core.timebase import NS_PER_S
+from mapper.core.trajectory import Trajectory
+from mapper.pipeline.solve import solve
+from mapper.pipeline.track import track_log
+from mapper.runtime.progress import SILENT
+from mapper.simulation.config import SensorConfig, SynthConfig
+from mapper.simulation.path import START_NS
+from mapper.simulation.source import SyntheticSource
+from mapper.sources.base import Accelerations, FrameRef
 
 KINDS = ("local-map", "pnp")
 SEEDS = 4
@@ -65,12 +65,14 @@ class RenderedSource:
         self.truth: Trajectory | None = source.truth
         self.accelerations: Accelerations | None = None
         self.notes: Sequence[str] = ()
-        self.rendered: list[Entry] = [RenderedEntry(entry.load(colour=False)) for entry in source.entries()]
+        self.rendered: list[FrameRef] = [
+            RenderedEntry(entry.load(colour=False)) for entry in source.entries()
+        ]
 
     def __len__(self) -> int:
         return len(self.rendered)
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[FrameRef]:
         """Yield every frame in time order."""
         return iter(self.rendered)
 

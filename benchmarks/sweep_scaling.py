@@ -25,8 +25,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from resource import RUSAGE_CHILDREN, getrusage
 
-from mapper.config.synthetic import SynthConfig
-from mapper.sources.synthetic import write_tum_log
+from mapper.simulation import write_tum_log
+from mapper.simulation.config import SynthConfig
 
 SWEEP = """
 logs = ["logs/*"]

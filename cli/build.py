@@ -25,12 +25,12 @@ from cli.stepping import Stepping
 
 if TYPE_CHECKING:
     from evaluators.metric import Metric
-    from mapper.config import BuildConfig
-    from mapper.run import Run
+    from mapper.config.build import BuildConfig
+    from mapper.run.folder import Run
+    from mapper.run.observers import Observer
     from mapper.sources.base import FrameSource
-    from mapper.watching import Watcher
 
-    Onlooker = Callable[[FrameSource, BuildConfig], AbstractContextManager[Watcher]]
+    Onlooker = Callable[[FrameSource, BuildConfig], AbstractContextManager[Observer]]
 
 
 def build(
@@ -101,10 +101,10 @@ def built(
 ) -> "tuple[Run, list[Metric]]":
     """Build a run and judge its trajectory by the truth, if the log has any."""
     from evaluators.evaluate import evaluate
-    from mapper.config import load_config, load_source_config
-    from mapper.pipeline import build as build_run
+    from mapper.config.loading import load_config, load_source_config
+    from mapper.pipeline.build import build as build_run
+    from mapper.run.observers import NULL_OBSERVER
     from mapper.sources import open_source
-    from mapper.watching import NOBODY
 
     prepare_libraries()
     source = open_source(log, load_source_config(config_file, overrides))
@@ -114,14 +114,14 @@ def built(
         progress.note("first run here: the kernels are compiled once, which takes about a minute")
     for note in source.notes:
         progress.note(note)
-    with nullcontext(NOBODY) if onlooker is None else onlooker(source, config) as watcher:
-        run = build_run(source, config, out, progress=progress, watcher=watcher, overwrite=overwrite)
+    with nullcontext(NULL_OBSERVER) if onlooker is None else onlooker(source, config) as observer:
+        run = build_run(source, config, out, progress=progress, observer=observer, overwrite=overwrite)
     return run, evaluate(run.trajectory(), run.truth())
 
 
 def _onlooker(rerun: str | None, *, step: bool, overwrite: bool) -> "Onlooker | None":
     """Return who looks on at a build, refusing at once what would fail at its end."""
-    from mapper.errors import ConfigError, RunError, ViewerError
+    from mapper.core.errors import ConfigError, RunError, ViewerError
 
     if rerun is None:
         if step:
@@ -134,13 +134,13 @@ def _onlooker(rerun: str | None, *, step: bool, overwrite: bool) -> "Onlooker | 
         raise RunError(f"{target}: exists already; choose another, or pass --overwrite to replace it")
 
     @contextmanager
-    def onlooker(source: "FrameSource", config: "BuildConfig") -> "Iterator[Watcher]":
+    def onlooker(source: "FrameSource", config: "BuildConfig") -> "Iterator[Observer]":
         from mapper.export.rerun.live import watching
 
         is_built = False
         try:
-            with watching(target, source, config.rerun) as watcher:
-                yield Stepping(watcher) if step else watcher
+            with watching(target, source, config.rerun) as observer:
+                yield Stepping(observer) if step else observer
                 is_built = True
         except ViewerError as error:
             if not is_built:
@@ -155,11 +155,11 @@ def appended(
 ) -> "tuple[Run, list[Metric]]":
     """Build a run from a run and a later log of the same place, by the run's configuration."""
     from evaluators.evaluate import evaluate
-    from mapper.appending import append
-    from mapper.config import overridden
-    from mapper.config.sources import SourceConfig
-    from mapper.run import load_run
+    from mapper.config.loading import overridden
+    from mapper.pipeline.append import append
+    from mapper.run.folder import load_run
     from mapper.sources import open_source
+    from mapper.sources.config import SourceConfig
 
     prepare_libraries()
     first = load_run(onto)
@@ -170,7 +170,7 @@ def appended(
 
 
 def _refuse_both(config: Path | None, onto: Path, rerun: str | None) -> None:
-    from mapper.errors import ConfigError
+    from mapper.core.errors import ConfigError
 
     if rerun is not None:
         raise ConfigError(f"--rerun {rerun}: not with --onto; look at the new run with mapper view")

@@ -39,10 +39,10 @@ def compare(
     from evaluators.compare import compare as compare_methods
     from evaluators.compare_files import write_comparison
     from evaluators.compare_tables import tables_text
-    from mapper.config import overridden
     from mapper.config.compare import CompareConfig
+    from mapper.config.loading import overridden
+    from mapper.runtime.atomic import atomic_folder
     from mapper.sources import open_source
-    from mapper.staging import staged
 
     prepare_libraries()
     given = CompareConfig(methods=tuple(method or ()))
@@ -50,7 +50,7 @@ def compare(
     config = overridden(given, merged(sugar, set_))
     source = open_source(log, config.source)
     progress = progress_for(quiet=quiet)
-    with staged(out, overwrite=overwrite) as folder:
+    with atomic_folder(out, overwrite=overwrite) as folder:
         comparison = compare_methods(source, config, progress=progress)
         write_comparison(folder, comparison)
         files = ", ".join(sorted(child.name for child in folder.iterdir()))

@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from mapper.progress import SILENT, Progress, Report
+from mapper.runtime.progress import SILENT, Progress, Report
 
 _SECONDS_BETWEEN_LINES = 10.0
 _MOST_NOTES = 5

@@ -36,7 +36,7 @@ def convert(
 
     Example: mapper convert rgbd_dataset_freiburg1_xyz --as mcap --out xyz.mcap
     """
-    from mapper.config import load_source_config
+    from mapper.config.loading import load_source_config
     from mapper.sources import open_source
     from mapper.sources.writers import left_out, write_log
 

@@ -12,7 +12,7 @@ from cli.environment import prepare_libraries
 from cli.options import Overrides, Quiet
 
 if TYPE_CHECKING:
-    from mapper.config.synthetic import SynthConfig
+    from mapper.simulation.config import SynthConfig
 
 DEMO_LOG = ("path=loop", "width_px=320", "height_px=240")
 
@@ -29,10 +29,10 @@ def demo(
     """
     from cli.options import assignments
     from cli.summary import summary_text
-    from mapper import run as files
-    from mapper.config import load_config, overridden
-    from mapper.config.synthetic import SynthConfig
-    from mapper.sources.synthetic import write_tum_log
+    from mapper.config.loading import load_config, overridden
+    from mapper.run import files
+    from mapper.simulation import write_tum_log
+    from mapper.simulation.config import SynthConfig
 
     prepare_libraries()
     load_config(None, set_ or ())  # what is wrong with it is better known before the log is made

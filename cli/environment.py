@@ -7,7 +7,7 @@ from pathlib import Path
 def prepare_environment() -> None:
     """Leave the threads to us, and give compiled code a place where it may be kept."""
     import mapper
-    from mapper.threads import one_thread_per_library
+    from mapper.runtime.threads import one_thread_per_library
 
     one_thread_per_library()
     package = Path(mapper.__file__).parent

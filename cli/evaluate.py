@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from evaluators.evaluate import Judged
     from evaluators.map_quality import MapQuality
     from evaluators.metric import Metric
-    from mapper.run import Run
+    from mapper.core.timebase import Stamps
+    from mapper.core.trajectory import Trajectory
+    from mapper.run.folder import Run
     from mapper.sources.base import FrameSource
-    from mapper.timebase import Stamps
-    from mapper.trajectory import Trajectory
 
 _TOLERANCE = 1
 
@@ -106,7 +106,7 @@ def evaluate(
     mapper eval runs/flat --map logs/flat --sharpness
     """
     from evaluators.evaluate import ALIGNED, judged
-    from mapper.errors import DataError
+    from mapper.core.errors import DataError
 
     prepare_libraries()
     run, trajectory, known = _loaded(estimate, truth, times)
@@ -153,8 +153,8 @@ def _loaded(
     estimate: Path, truth: Path | None, times: Path | None
 ) -> "tuple[Run | None, Trajectory, Trajectory | None]":
     from evaluators.poses import is_kitti, read_poses
-    from mapper.errors import DataError
-    from mapper.run import load_run
+    from mapper.core.errors import DataError
+    from mapper.run.folder import load_run
 
     untimed = [path for path in (estimate, truth) if path and path.is_file() and is_kitti(path)]
     if times is not None and not untimed:
@@ -169,7 +169,7 @@ def _loaded(
 
 
 def _needed(run: "Run | None", path: Path, option: str) -> "Run":
-    from mapper.errors import DataError
+    from mapper.core.errors import DataError
 
     if run is None:
         raise DataError(f"{path}: a bare trajectory has no map; {option} wants a run folder")
@@ -189,7 +189,7 @@ def _held_against(
 
 
 def _log_of(run: "Run", log: Path | None) -> "FrameSource":
-    from mapper.run import moved_log, open_log
+    from mapper.run.folder import moved_log, open_log
 
     return open_log(run if log is None else moved_log(run, log))
 
@@ -204,8 +204,8 @@ def _sharpness_of(source: "FrameSource", trajectory: "Trajectory") -> "list[Metr
 def _frames_ns(run: "Run | None", log: Path | None, *, used: bool) -> "Stamps | None":
     import numpy as np
 
-    from mapper.config import load_source_config
-    from mapper.errors import DataError
+    from mapper.config.loading import load_source_config
+    from mapper.core.errors import DataError
     from mapper.sources import open_source
 
     if run is not None:
@@ -219,7 +219,7 @@ def _frames_ns(run: "Run | None", log: Path | None, *, used: bool) -> "Stamps | 
 
 
 def _numbers(text: str) -> list[float]:
-    from mapper.errors import DataError
+    from mapper.core.errors import DataError
 
     try:
         return [float(word) for word in text.split(",")]
@@ -229,8 +229,8 @@ def _numbers(text: str) -> list[float]:
 
 def _loops_of(run: "Run", truth: "Trajectory") -> "list[Metric]":
     from evaluators.loops import loop_metrics
-    from mapper.run import KEYFRAMES
-    from mapper.trajectory import read_tum
+    from mapper.run.files import KEYFRAMES
+    from mapper.sources.trajectory_files import read_tum
 
     loops = run.config.loops
     looked_every_m = loops.min_motion_m if loops.kind == "scans" else 0.0

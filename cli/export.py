@@ -28,9 +28,9 @@ def export(
 
     Example: mapper export runs/xyz --as octomap --out xyz.ot, or: mapper export runs/xyz --as mesh
     """
-    from mapper.config import overridden
+    from mapper.config.loading import overridden
     from mapper.export.exporters import export as export_run
-    from mapper.run import load_run, moved_log
+    from mapper.run.folder import load_run, moved_log
 
     prepare_libraries()
     built = load_run(run)

@@ -27,10 +27,10 @@ def fuse(
     """
     from cli.summary import summary_text
     from evaluators.evaluate import evaluate
-    from mapper.config import overridden
-    from mapper.pipeline import fuse as fuse_run
-    from mapper.run import load_run, moved_log, open_log
-    from mapper.trajectory import read_tum
+    from mapper.config.loading import overridden
+    from mapper.pipeline.fuse import fuse as fuse_run
+    from mapper.run.folder import load_run, moved_log, open_log
+    from mapper.sources.trajectory_files import read_tum
 
     prepare_libraries()
     built = load_run(run)

@@ -25,7 +25,7 @@ def inspect(
     import dataclasses
     import json
 
-    from mapper.config import load_config, load_source_config
+    from mapper.config.loading import load_config, load_source_config
     from mapper.sources.inspection import inspect_log
 
     prepare_libraries()

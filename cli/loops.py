@@ -46,13 +46,13 @@ def loops(
 
     Example: mapper loops runs/xyz, or: mapper loops runs/xyz --add 3 71 --remove 17 40
     """
-    from mapper.run import load_run, moved_log, open_log
+    from mapper.run.folder import load_run, moved_log, open_log
 
     built = load_run(run)
     if add or remove:
         from cli.summary import summary_text
         from evaluators.evaluate import evaluate
-        from mapper.loops_by_hand import edit_loops
+        from mapper.pipeline.edit_loops import edit_loops
 
         prepare_libraries()
         if log:
@@ -105,7 +105,7 @@ def _miss_text(miss: "Discrepancy | None") -> str:
 
 
 def _pair(option: str, text: str) -> tuple[int, int]:
-    from mapper.errors import ConfigError
+    from mapper.core.errors import ConfigError
 
     try:
         i, j = (int(word) for word in text.split())

@@ -31,7 +31,7 @@ from cli.synth import synth
 from cli.view import view
 from cli.vocabulary import vocabulary
 from mapper import __version__
-from mapper.errors import MapperError
+from mapper.core.errors import MapperError
 
 _INTERRUPTED = 130  # 128 + SIGINT, as shells count
 _USER_CAN_HELP = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS}

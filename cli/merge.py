@@ -13,7 +13,7 @@ from cli.options import Quiet, workers_here
 if TYPE_CHECKING:
     from mapper.merging.merge import Merged
     from mapper.merging.placing import Placed
-    from mapper.run import Run
+    from mapper.run.folder import Run
 
 
 class Place(StrEnum):
@@ -57,9 +57,9 @@ def merge(
     Example: mapper merge runs/monday runs/tuesday --out maps/campus --processes 2, or: mapper merge runs/*
     --out maps/city --place truth --scheduler tcp://10.0.0.1:8786
     """
-    from mapper.errors import ConfigError
+    from mapper.core.errors import ConfigError
     from mapper.merging.merge import merge as merge_runs
-    from mapper.run import load_run
+    from mapper.run.folder import load_run
 
     workers = workers_here(processes, scheduler, default=1)
     prepare_libraries()

@@ -58,7 +58,7 @@ def workers_here(processes: int | None, scheduler: str | None, *, default: int) 
     Raises:
         ConfigError: There are none, or both are given.
     """
-    from mapper.errors import ConfigError
+    from mapper.core.errors import ConfigError
 
     if processes is None:
         return default

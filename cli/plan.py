@@ -11,7 +11,7 @@ from typer.core import TyperCommand
 from cli.options import Quiet, assignments
 
 if TYPE_CHECKING:
-    from mapper.geometry import Array
+    from mapper.core.geometry import Array
 
 _POINT_OPTIONS = ("--from", "--to")
 
@@ -68,21 +68,22 @@ def plan(
 
     Example: mapper plan runs/xyz --from 2.1 -0.3 --to 1.9 1.4 --radius 0.15
     """
-    from mapper import run as files
-    from mapper.config import overridden
-    from mapper.config.navigation import PlanConfig
+    from mapper.config.loading import overridden
     from mapper.export.grid import read_grid
     from mapper.export.plan import draw_plan, write_plan
-    from mapper.merging.merged_map import is_map, open_map
+    from mapper.merging.merged_map import open_map
+    from mapper.navigation.config import PlanConfig
     from mapper.navigation.planner import plan_2d, plan_3d
     from mapper.octree.octomap_file import read_map
-    from mapper.run import Run, load_run
+    from mapper.run import files
+    from mapper.run.folder import Run, load_run
+    from mapper.run.manifest import is_merged_map
 
     start, goal = (
         _point(text, name, in_3d=in_3d) for text, name in zip((from_, to), _POINT_OPTIONS, strict=True)
     )
     config = overridden(PlanConfig(), assignments({"radius_m": radius, "unknown": unknown, "layer": layer}))
-    built = open_map(run) if is_map(run) else load_run(run)
+    built = open_map(run) if is_merged_map(run) else load_run(run)
     grid = read_grid(run / f"{config.layer}.yaml")
     if in_3d:
         found = plan_3d(read_map(run / files.OCTREE_OT), start, goal, config=config)
@@ -102,7 +103,7 @@ def plan(
 def _point(text: str, name: str, *, in_3d: bool) -> "Array":
     import numpy as np
 
-    from mapper.errors import ConfigError
+    from mapper.core.errors import ConfigError
 
     words = text.replace(",", " ").split()
     wanted = 3 if in_3d else 2

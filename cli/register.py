@@ -10,9 +10,8 @@ from cli.options import Overrides, Quiet
 
 if TYPE_CHECKING:
     from evaluators.register import Registered
-    from mapper.config.sensors import Sensor
-    from mapper.config.sources import SourceConfig
-    from mapper.frames import Frame, Scan
+    from mapper.core.frames import Frame, Scan, Sensor
+    from mapper.sources.config import SourceConfig
 
 _CLOUD = "A cloud (.bin .pcd .ply .xyz .npy .las .laz), or LOG@N: the n-th frame of a log, from 0."
 
@@ -54,11 +53,11 @@ def register(
     """
     from evaluators.register import register as register_frames
     from evaluators.register_files import registration_text, write_registration
-    from mapper.config import overridden
+    from mapper.config.loading import overridden
     from mapper.config.register import check_method, register_config
-    from mapper.errors import RegistrationError
+    from mapper.core.errors import RegistrationError
     from mapper.registration.guess import parse_guess
-    from mapper.staging import staged
+    from mapper.runtime.atomic import atomic_folder
 
     prepare_libraries()
     if rerun is not None:
@@ -75,7 +74,7 @@ def register(
     if not quiet:
         print(registration_text(registered))
     if out is not None:
-        with staged(out, overwrite=overwrite) as folder:
+        with atomic_folder(out, overwrite=overwrite) as folder:
             write_registration(
                 folder,
                 registered,
@@ -96,7 +95,7 @@ def register(
 
 
 def _refuse_to_lose(rerun: str, *, overwrite: bool) -> None:
-    from mapper.errors import RunError
+    from mapper.core.errors import RunError
     from mapper.export.rerun.target import check_target
 
     if Path(check_target(rerun)).exists() and not overwrite:
@@ -117,7 +116,7 @@ def _shown(
 
 def _load(name: str, config: "SourceConfig") -> "tuple[Frame, Sensor]":
     """Return the frame that a name stands for, and what took it: a file counts as a LiDAR's, with z up."""
-    from mapper.errors import SourceError
+    from mapper.core.errors import SourceError
     from mapper.sources import open_source
     from mapper.sources.clouds import read_scan
 

@@ -11,7 +11,7 @@ from cli.options import Quiet
 
 if TYPE_CHECKING:
     from mapper.export.report.data import Figure
-    from mapper.run import Run
+    from mapper.run.folder import Run
 
 
 def report(
@@ -24,10 +24,10 @@ def report(
 
     Example: mapper report runs/xyz runs/xyz-isvd --out report.html
     """
-    from mapper.errors import RunError
+    from mapper.core.errors import RunError
     from mapper.export.report.data import chapter_of
     from mapper.export.report.page import write_report
-    from mapper.run import load_run
+    from mapper.run.folder import load_run
 
     if out.exists() and not overwrite:
         raise RunError(f"{out}: exists already; choose another --out, or pass --overwrite to replace it")
@@ -52,8 +52,8 @@ def _figures(run: "Run") -> "list[Figure]":
     from evaluators.loops import loop_metrics
     from evaluators.metric import shown
     from mapper.export.report.data import Figure
-    from mapper.run import KEYFRAMES
-    from mapper.trajectory import read_tum
+    from mapper.run.files import KEYFRAMES
+    from mapper.sources.trajectory_files import read_tum
 
     counts, truth = run.manifest.counts, run.truth()
     frames_ns = np.array([record.stamp_ns for record in run.records()], dtype=np.int64)

@@ -99,7 +99,7 @@ def _given(assignments: Sequence[str]) -> dict[str, Path]:
     Raises:
         ConfigError: One is no ``NAME=PATH``, or two have the same name.
     """
-    from mapper.errors import ConfigError
+    from mapper.core.errors import ConfigError
 
     given: dict[str, Path] = {}
     for assignment in assignments:

@@ -24,6 +24,6 @@ def show_config(
 
     Example: mapper config --set odometry.kind=isvd > isvd.json, then: mapper build LOG --config isvd.json
     """
-    from mapper.config import load_config
+    from mapper.config.loading import load_config
 
     print(load_config(config, set_ or (), sensor=sensor.value).model_dump_json(indent=2))

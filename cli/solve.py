@@ -50,9 +50,9 @@ def solve(
     """
     import time
 
-    from mapper.config import overridden
-    from mapper.config.graph import GraphConfig
+    from mapper.config.loading import overridden
     from mapper.export.solved_graph import SolvedGraph, write_solved_graph
+    from mapper.graph.config import GraphConfig
     from mapper.graph.g2o import read_g2o
     from mapper.graph.optimize import optimize
 

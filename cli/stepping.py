@@ -4,23 +4,23 @@ import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from mapper.fusion import Maps
-    from mapper.geometry import Transform
-    from mapper.run import Run
-    from mapper.story import Story
-    from mapper.watching import Step, Watcher
+    from mapper.core.geometry import Transform
+    from mapper.mapping.fusion import Maps
+    from mapper.run.folder import Run
+    from mapper.run.observers import Observer, Step
+    from mapper.run.results import RunResults
 
 
 class Stepping:
     """Looks on together with another, and lets the build go on when a key says so."""
 
-    def __init__(self, other: "Watcher") -> None:
+    def __init__(self, other: "Observer") -> None:
         """Refuse to wait for somebody who is not there.
 
         Raises:
             ConfigError: Standard input is no terminal.
         """
-        from mapper.errors import ConfigError
+        from mapper.core.errors import ConfigError
 
         if not sys.stdin.isatty():
             raise ConfigError("--step: waits for Enter after each frame, but standard input is no terminal")
@@ -29,9 +29,9 @@ class Stepping:
         self._waits = True
         _say("stepping: Enter for the next frame, c and Enter to run on")
 
-    def stepped(self, step: "Step", /) -> None:
+    def on_frame(self, step: "Step", /) -> None:
         """Tell how the frame went, and wait."""
-        self._other.stepped(step)
+        self._other.on_frame(step)
         self._frames += 1
         if not self._waits:
             return
@@ -43,13 +43,13 @@ class Stepping:
         answer = sys.stdin.readline()
         self._waits = answer.strip() != "c" and bool(answer)
 
-    def levelled(self, T_level_world: "Transform", /) -> None:
+    def on_levelled(self, T_level_world: "Transform", /) -> None:
         """Pass on."""
-        self._other.levelled(T_level_world)
+        self._other.on_levelled(T_level_world)
 
-    def mapped(self, run: "Run", story: "Story", maps: "Maps", /) -> None:
+    def on_mapped(self, run: "Run", results: "RunResults", maps: "Maps", /) -> None:
         """Pass on."""
-        self._other.mapped(run, story, maps)
+        self._other.on_mapped(run, results, maps)
 
 
 def _say(text: str, *, end: str = "\n") -> None:

@@ -9,8 +9,8 @@ from textwrap import wrap
 
 from evaluators.metric import Metric
 from mapper.loops.closure import LoopClosure
-from mapper.records import FrameRecord
-from mapper.run import Run
+from mapper.run.folder import Run
+from mapper.run.frame_records import FrameRecord
 
 _LINE_WIDTH = 110
 _SHOWN = ("ATE RMSE", "RPE translation RMSE", "RPE rotation RMSE", "path length", "start-to-end offset")

@@ -73,13 +73,13 @@ def synth(
         _line_laser(out, assignments({"duration_s": seconds, "seed": seed}), noise, set_, quiet=quiet)
         return
 
-    from mapper.config import overridden
-    from mapper.config.synthetic import SCENES, SynthConfig, SynthWheelsConfig
+    from mapper.config.loading import overridden
+    from mapper.simulation.config import SCENES, SynthConfig, SynthWheelsConfig
 
     common = {"duration_s": seconds, "seed": seed}
     carried = {"wheels": SynthWheelsConfig() if wheels else None}
     if sensor is SensorKind.RGBD:
-        from mapper.sources.synthetic import write_tum_log
+        from mapper.simulation import write_tum_log
 
         _refuse({"--scene": scene, "--rings": rings}, f"--sensor {sensor}")
         if plane_at is not None:
@@ -90,7 +90,7 @@ def synth(
         with progress_for(quiet=quiet).stage("render") as report:
             write_tum_log(out, flat, on_progress=report)
     else:
-        from mapper.sources.synthetic.lidar import write_lidar_log
+        from mapper.simulation.lidar import write_lidar_log
 
         _refuse({"--path": path, "--rooms": rooms, "--plane-at": plane_at}, f"--sensor {sensor}")
         given = common | {"sensor.rings": rings} | _lidar_noise(noise)
@@ -107,9 +107,9 @@ def synth(
 def _line_laser(
     out: Path, given: list[str], noise: float | None, set_: list[str] | None, *, quiet: bool
 ) -> None:
-    from mapper.config import overridden
-    from mapper.config.line_laser import LineLaserSynthConfig
-    from mapper.sources.synthetic.line_laser.log import write_line_laser_log
+    from mapper.config.loading import overridden
+    from mapper.line_laser.config import LineLaserSynthConfig
+    from mapper.line_laser.simulation.log import write_line_laser_log
 
     usual = LineLaserSynthConfig()
     if noise is not None:
@@ -126,7 +126,7 @@ def _line_laser(
 
 
 def _refuse(options: dict[str, object], beside: str) -> None:
-    from mapper.errors import ConfigError
+    from mapper.core.errors import ConfigError
 
     for name, value in options.items():
         if value is not None:
@@ -135,7 +135,7 @@ def _refuse(options: dict[str, object], beside: str) -> None:
 
 def _at_wall(distance_m: float | None) -> dict[str, object]:
     """Return the knobs of a tripod before a wall on which nothing hangs."""
-    from mapper.config.synthetic import SynthConfig
+    from mapper.simulation.config import SynthConfig
 
     if distance_m is None:
         return {}
@@ -152,7 +152,7 @@ def _at_wall(distance_m: float | None) -> dict[str, object]:
 
 def _camera_noise(noise: float | None) -> dict[str, object]:
     """Return every knob of the camera's noise, scaled from its default."""
-    from mapper.config.synthetic import SensorConfig
+    from mapper.simulation.config import SensorConfig
 
     if noise is None:
         return {}
@@ -168,7 +168,7 @@ def _camera_noise(noise: float | None) -> dict[str, object]:
 
 def _lidar_noise(noise: float | None) -> dict[str, object]:
     """Return every knob of the LiDAR's noise, scaled from its default."""
-    from mapper.config.synthetic import LidarSensorConfig
+    from mapper.simulation.config import LidarSensorConfig
 
     if noise is None:
         return {}

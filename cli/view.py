@@ -25,9 +25,10 @@ def view(
 
     Example: mapper view runs/xyz --spawn, or: mapper view runs/xyz --rrd xyz.rrd
     """
-    from mapper.errors import ConfigError, RunError
+    from mapper.core.errors import ConfigError, RunError
     from mapper.export.rerun.finished import show_run
-    from mapper.run import RERUN, load_run
+    from mapper.run.files import RERUN
+    from mapper.run.folder import load_run
 
     if (rrd is not None) + spawn + (connect is not None) > 1:
         raise ConfigError("--rrd, --spawn and --connect: choose one")

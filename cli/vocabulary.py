@@ -37,9 +37,9 @@ def train(
     """
     import numpy as np
 
-    from mapper.config import overridden
-    from mapper.config.places import VocabularyConfig
-    from mapper.errors import VocabularyError
+    from mapper.config.loading import overridden
+    from mapper.core.errors import VocabularyError
+    from mapper.places.config import VocabularyConfig
     from mapper.places.images import descriptors_of
     from mapper.places.training import train as train_words
     from mapper.sources import open_source

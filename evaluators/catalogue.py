@@ -3,10 +3,10 @@
 from evaluators.methods import AnyRegistration, Method, odometry_method, registration_method
 from evaluators.scales import kiss_icp, registrations_for
 from mapper.config.compare import CompareConfig
-from mapper.config.odometry import IsvdOdometryConfig, LocalMapConfig, PnpConfig
-from mapper.config.registration import NEED_NO_GUESS
-from mapper.config.sensors import Sensor
-from mapper.errors import ConfigError
+from mapper.core.errors import ConfigError
+from mapper.core.frames import Sensor
+from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig, PnpConfig
+from mapper.registration.config import NEED_NO_GUESS
 from mapper.sources.base import FrameSource
 
 

@@ -9,11 +9,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from evaluators.tables import Record
-from mapper.atomic import write_text
-from mapper.errors import DataError
-from mapper.progress import SILENT, Progress
-from mapper.staging import locked
-from mapper.workers import Failure, run_jobs
+from mapper.core.errors import DataError
+from mapper.runtime.atomic import locked, write_text
+from mapper.runtime.executor import Failure, run_jobs
+from mapper.runtime.progress import SILENT, Progress
 
 _FORMAT = "mapper cell 1"
 _KEY = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
@@ -27,7 +26,7 @@ class Cell:
         key: The same for the same result, in other sessions too, so hashes of all that decides it; the file's
             name.
         label: What to call it when it fails.
-        run: Does the work, and can be pickled; ``mapper.workers`` says how. None stands for an unknown value.
+        run: Does the work, and can be pickled; ``mapper.runtime.executor`` says how. None stands for an unknown value.
     """
 
     key: str

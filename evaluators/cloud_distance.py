@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.errors import DataError
-from mapper.frames import Points32
-from mapper.geometry import Transform, apply
+from mapper.core.errors import DataError
+from mapper.core.frames import Points32
+from mapper.core.geometry import Transform, apply
 from mapper.registration.kd_tree import kd_tree
 
 

@@ -15,13 +15,13 @@ from evaluators.moments import Moment, Reader
 from evaluators.odometry_scores import OdometryRun, Step, judged_run, step_for
 from evaluators.pairwise import Trial, guesses_for, pairs_of, trials_of
 from mapper.config.compare import CompareConfig, TrialsConfig
-from mapper.config.sensors import Sensor
-from mapper.errors import DataError, FrameError
-from mapper.geometry import inverse
-from mapper.progress import SILENT, Progress
+from mapper.core.errors import DataError, FrameError
+from mapper.core.frames import Sensor
+from mapper.core.geometry import inverse
+from mapper.core.timebase import MAX_TRUTH_GAP_NS, Stamps
+from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import FrameSource, Skipped
-from mapper.timebase import MAX_TRUTH_GAP_NS, Stamps
-from mapper.trajectory import Trajectory, trajectory_from
 
 _WARM_UP_FRAMES = 2
 

@@ -23,14 +23,13 @@ from evaluators.odometry_scores import OdometryRun, position_errors_m, rotation_
 from evaluators.pairwise import NO_GUESS, Trial
 from evaluators.tables import Record, csv_text, markdown_table
 from evaluators.trajectory import Matched
-from mapper.atomic import write_text
+from mapper.core.geometry import Array
 from mapper.export.compare_log import PathErrors, write_comparison_log
 from mapper.export.compare_picture import write_path_errors, write_paths, write_registration_errors
 from mapper.export.ros2 import Value
-from mapper.geometry import Array
-from mapper.manifest import library_versions
-from mapper.staging import MARK
-from mapper.trajectory import write_tum
+from mapper.run.manifest import library_versions
+from mapper.runtime.atomic import MANIFEST_NAME, write_text
+from mapper.sources.trajectory_files import write_tum
 
 TABLES, REPORT = "tables.md", "comparison.json"
 ODOMETRY, REGISTRATION, TRIALS = "odometry.csv", "registration.csv", "trials.csv"
@@ -40,7 +39,7 @@ TRAJECTORIES = "trajectories"
 
 
 def write_comparison(folder: Path, comparison: Comparison) -> None:
-    """Fill a folder; :func:`mapper.staging.staged` makes it appear as a whole.
+    """Fill a folder; :func:`mapper.runtime.atomic.staged` makes it appear as a whole.
 
     Apart from times, the same comparison gives the same bytes.
     """
@@ -63,7 +62,7 @@ def write_comparison(folder: Path, comparison: Comparison) -> None:
         errors={run.method: _errors(run.matched) for run in comparison.runs if run.matched is not None},
         trials=[_logged(comparison, trial) for trial in comparison.trials],
     )
-    write_text(folder / MARK, _json(_manifest(comparison)))
+    write_text(folder / MANIFEST_NAME, _json(_manifest(comparison)))
 
 
 def _markdown(comparison: Comparison, odometry: Sequence[Record], registration: Sequence[Record]) -> str:

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluators.metric import Metric
-from mapper.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
+from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
 
 _GAP_INTERVALS = 3.0
 """A pause longer than so many usual intervals is a gap, as in ``mapper inspect``."""

@@ -9,16 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from evaluators.tables import Column, Record, csv_text, text_table
-from mapper.atomic import write_text
+from mapper.core.geometry import Array
 from mapper.export.depth_accuracy_picture import write_accuracy, write_residuals
-from mapper.geometry import Array
-from mapper.progress import SILENT, Progress
+from mapper.runtime.atomic import MANIFEST_NAME, write_text
+from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.depth_accuracy import DepthLevel, Patch, ResidualMap, refuse_scans
 from mapper.sensing.depth_fit import NoiseFit, fit_noise
 from mapper.sensing.depth_still import depth_at
 from mapper.sensing.depth_tiles import depth_of_planes
 from mapper.sources.base import FrameSource
-from mapper.staging import MARK
 
 SENSOR, NUMBERS, ACCURACY, RESIDUALS = "sensor.toml", "depth.csv", "accuracy.png", "residuals.png"
 
@@ -190,4 +189,4 @@ def write_depth_study(folder: Path, study: DepthStudy) -> None:
         "between_m": [fit.low_m, fit.high_m],
         "levels": [asdict(level) for level in study.levels],
     }
-    write_text(folder / MARK, json.dumps(record, indent=2, ensure_ascii=False) + "\n")
+    write_text(folder / MANIFEST_NAME, json.dumps(record, indent=2, ensure_ascii=False) + "\n")

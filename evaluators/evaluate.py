@@ -18,8 +18,8 @@ from evaluators.trajectory import (
     rpe,
     start_end_offset,
 )
-from mapper.timebase import Stamps
-from mapper.trajectory import Trajectory
+from mapper.core.timebase import Stamps
+from mapper.core.trajectory import Trajectory
 
 ALIGNED = {
     "none": "not aligned",

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluators.tables import Column, Record
-from mapper.config.line_laser import StripeConfig
-from mapper.frames import Image
-from mapper.geometry import Array
-from mapper.sensing.line_laser.detection import METHODS, Method, Response, responses, stripe_rows
+from mapper.core.frames import Image
+from mapper.core.geometry import Array
+from mapper.line_laser.config import StripeConfig
+from mapper.line_laser.detection import METHODS, Method, Response, responses, stripe_rows
 
 TABLE_2_1: Mapping[float, float] = {0.5: 0.50, 1.0: 0.99, 1.5: 1.45, 1.7: 1.65}
 """Metres: what was true, and what the thesis's sensor measured."""

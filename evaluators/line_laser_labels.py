@@ -16,12 +16,12 @@ from evaluators.line_laser import (
     summed,
 )
 from evaluators.tables import Column, Record, csv_text, text_table
-from mapper.atomic import write_text
-from mapper.config.line_laser import StripeConfig
-from mapper.errors import SourceError
-from mapper.geometry import Array
-from mapper.sensing.line_laser.detection import Method
-from mapper.sensing.line_laser.ranging import LineScan
+from mapper.core.errors import SourceError
+from mapper.core.geometry import Array
+from mapper.line_laser.config import StripeConfig
+from mapper.line_laser.detection import Method
+from mapper.line_laser.ranging import LineScan
+from mapper.runtime.atomic import write_text
 from mapper.sources.images import read_colour
 from mapper.sources.text import parse_numbers, rows
 

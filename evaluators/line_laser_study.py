@@ -8,23 +8,23 @@ import numpy as np
 
 from evaluators.line_laser import TABLE_2_1, Counts, count_all, percent, summed
 from evaluators.tables import Column, Record, Value
-from mapper.config.line_laser import (
+from mapper.core.frames import Image
+from mapper.core.geometry import Array, Transform
+from mapper.line_laser.calibration import CalibrationShot, calibrate, find_board
+from mapper.line_laser.config import (
     LineLaserCalibration,
     LineLaserConfig,
     LineLaserSynthConfig,
     VehicleConfig,
 )
-from mapper.frames import Image
-from mapper.geometry import Array, Transform
-from mapper.progress import SILENT, Progress
-from mapper.sensing.line_laser.calibration import CalibrationShot, calibrate, find_board
-from mapper.sensing.line_laser.detection import METHODS, Method
-from mapper.sensing.line_laser.ranging import scan_image
+from mapper.line_laser.detection import METHODS, Method
+from mapper.line_laser.ranging import scan_image
+from mapper.line_laser.simulation.log import BOARD_M, calibration_boards, sensor_poses
+from mapper.line_laser.simulation.render import take
+from mapper.line_laser.simulation.room import Room, make_board, make_room
+from mapper.runtime.progress import SILENT, Progress
+from mapper.simulation.streams import Stream, rng_of
 from mapper.sources.images import decode_colour
-from mapper.sources.synthetic.line_laser.log import BOARD_M, calibration_boards, sensor_poses
-from mapper.sources.synthetic.line_laser.render import take
-from mapper.sources.synthetic.line_laser.room import Room, make_board, make_room
-from mapper.sources.synthetic.streams import Stream, rng_of
 
 SCENES: Mapping[str, Mapping[str, float]] = {
     "bare": {"lamps": 0.0, "red_things": 0.0, "dull_things": 0.0},

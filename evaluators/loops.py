@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluators.metric import Metric
-from mapper.geometry import Array
+from mapper.core.geometry import Array
+from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
+from mapper.core.trajectory import Trajectory
 from mapper.loops.closure import LoopClosure, discrepancy
-from mapper.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
-from mapper.trajectory import Trajectory
 
 MAX_ERROR_M, MAX_ERROR_RAD = 0.2, 0.1
 """A loop that is farther from the truth is wrong."""

@@ -10,14 +10,14 @@ from evaluators.map_reference import Reference, held_against
 from evaluators.metric import Metric
 from evaluators.occupancy import Verdict, verdict_metrics
 from evaluators.trajectory import associate
-from mapper import run as files
-from mapper.errors import DataError
-from mapper.frames import Points32
-from mapper.geometry import Transform, apply, inverse, mean_rotation, transform
+from mapper.core.errors import DataError
+from mapper.core.frames import Points32
+from mapper.core.geometry import Transform, apply, inverse, mean_rotation, transform
 from mapper.octree.octomap_file import read_map
 from mapper.registration.refining import refined_motion
 from mapper.registration.surfaces import prepared
-from mapper.run import Run
+from mapper.run import files
+from mapper.run.folder import Run
 from mapper.sources.cloud_files import read_cloud
 
 _PAIR_VOXELS = 3.0

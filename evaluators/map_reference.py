@@ -7,13 +7,13 @@ import numpy as np
 
 from evaluators.occupancy import LogOddsAt, SignedDistance, Verdict, judged_by_distance, judged_by_points
 from evaluators.scenes import SCENE, scene_distance
-from mapper.errors import DataError
-from mapper.geometry import Points, Transform, apply, inverse
+from mapper.core.errors import DataError
+from mapper.core.geometry import Points, Transform, apply, inverse
+from mapper.core.voxel_grid import thin
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import read_map
-from mapper.run import OCTREE_MAP
+from mapper.run.files import OCTREE_MAP
 from mapper.sources.cloud_files import ENDINGS, read_cloud
-from mapper.thinning import thin
 
 MAP_ENDINGS = (".bt", ".ot", ".octree")
 _WANTED = (

@@ -7,16 +7,16 @@ from typing import Any, Protocol
 import numpy as np
 
 from evaluators.moments import Moment
-from mapper.errors import FrameError
-from mapper.frames import Frame, RgbdFrame, Scan
-from mapper.geometry import Transform, apply, interpolate, inverse, nearest_rotation, transform
+from mapper.core.errors import FrameError
+from mapper.core.frames import Frame, RgbdFrame, Scan
+from mapper.core.geometry import Transform, apply, interpolate, inverse, nearest_rotation, transform
+from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.graph.model import PoseGraph
-from mapper.odometry.base import FrameOdometry, Track
-from mapper.parts import largest_part
-from mapper.progress import SILENT
+from mapper.odometry.base import FrameOdometry, FrameResult
+from mapper.pipeline.components import largest_component
+from mapper.pipeline.track import TrackingResult
 from mapper.registration.base import Alignment, failed
-from mapper.tracking import Tracking
-from mapper.trajectory import Trajectory, trajectory_from
+from mapper.runtime.progress import SILENT
 
 
 class AnyAligner(Protocol):
@@ -104,7 +104,7 @@ class OdometryTracker:
 
     def __init__(self, odometry: FrameOdometry[Any]) -> None:
         self._odometry = odometry
-        self._tracks: list[Track] = []
+        self._tracks: list[FrameResult] = []
 
     def add(self, frame: Frame) -> bool:
         """Observe and track the frame; one that cannot be used is lost."""
@@ -124,8 +124,8 @@ class OdometryTracker:
                 graph.add_node(track.node, track.stamp_ns, track.T_world_body)
         graph.add_factors(factor for track in self._tracks for factor in track.factors)
         graph.add_factors(self._odometry.finish())
-        tracking = Tracking(tuple(self._tracks), (), graph, (), {})
-        return largest_part(tracking, progress=SILENT).trajectory()
+        tracking = TrackingResult(tuple(self._tracks), (), graph, (), {})
+        return largest_component(tracking, progress=SILENT).trajectory()
 
 
 class OdometryPairs:

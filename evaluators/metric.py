@@ -5,7 +5,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
 
 _DEGREES = {"rad": "°", "rad/m": "°/m"}
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapper.config.compare import RgbdCompareConfig
-from mapper.frames import Frame, RgbdFrame, Scan
-from mapper.geometry import Transform, inverse
-from mapper.sources.base import Entry
+from mapper.core.frames import Frame, RgbdFrame, Scan
+from mapper.core.geometry import Transform, inverse
+from mapper.sources.base import FrameRef
 
 # An optical frame looks along z with y down; methods for scans expect x ahead and z up.
 _T_OPTICAL_UPRIGHT = np.array(
@@ -55,7 +55,7 @@ class Reader:
         self.frames = 0
         self.read_s = self.scan_s = 0.0
 
-    def read(self, entry: Entry) -> Moment:
+    def read(self, entry: FrameRef) -> Moment:
         """Return a frame of the log.
 
         Raises:

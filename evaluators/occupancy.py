@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluators.metric import Metric
-from mapper.errors import DataError
-from mapper.geometry import Array, Points
+from mapper.core.errors import DataError
+from mapper.core.geometry import Array, Points
 from mapper.octree.keys import KEY_COUNT, KEY_ZERO
 from mapper.octree.map import Leaves, OctreeMap
 

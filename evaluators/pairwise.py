@@ -10,10 +10,10 @@ import numpy as np
 from evaluators.methods import Method, reason_of
 from evaluators.moments import Moment
 from mapper.config.compare import GuessConfig, TrialsConfig
-from mapper.geometry import Transform, angle_between, inverse, rotation_exp, transform
+from mapper.core.geometry import Transform, angle_between, inverse, rotation_exp, transform
+from mapper.core.timebase import MAX_TRUTH_GAP_NS, Stamps, nearest
+from mapper.core.trajectory import Trajectory
 from mapper.registration.base import Alignment, failed
-from mapper.timebase import MAX_TRUTH_GAP_NS, Stamps, nearest
-from mapper.trajectory import Trajectory
 
 Outcome = Literal["right", "wrong", "none"]
 """What became of a registration: right, wrong but trusted, or no answer."""

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from evaluators.tables import Record
-from mapper.atomic import replacing
+from mapper.runtime.atomic import atomic_file
 
 
 def write_parquet(path: Path, records: Sequence[Record]) -> None:
@@ -30,5 +30,5 @@ def write_parquet(path: Path, records: Sequence[Record]) -> None:
         else:
             kind = pa.float64()
         columns[name] = pa.array(values, kind)
-    with replacing(path) as part:
+    with atomic_file(path) as part:
         parquet.write_table(pa.table(columns), part)

@@ -7,10 +7,10 @@ import numpy as np
 from evaluators.evaluate import Judged, have_clock
 from evaluators.occupancy import Verdict
 from evaluators.odometry_scores import position_errors_m, rotation_errors_rad
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.core.timebase import NS_PER_S
 from mapper.export.agreement_picture import write_agreement
 from mapper.export.errors_picture import write_errors
-from mapper.timebase import NS_PER_S
 
 TRAJECTORY, MAP = "trajectory.png", "map.png"
 

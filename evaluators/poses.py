@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+from mapper.core.trajectory import Trajectory
 from mapper.sources.text import parse_stamp, rows
-from mapper.trajectory import Trajectory, read_kitti, read_tum
+from mapper.sources.trajectory_files import read_kitti, read_tum
 
 _KITTI_COLUMNS = 12
 

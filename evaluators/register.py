@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from evaluators.cloud_distance import CloudDistance, DistanceTo
-from mapper.config.hough import HoughGicpConfig, HoughNdtConfig
-from mapper.config.odometry import IsvdOdometryConfig
-from mapper.config.registration import AnyRegistration
-from mapper.errors import ConfigError
-from mapper.frames import Frame, RgbdFrame, Scan
-from mapper.geometry import Transform
+from mapper.core.errors import ConfigError
+from mapper.core.frames import Frame, RgbdFrame, Scan
+from mapper.core.geometry import Transform
+from mapper.odometry.config import IsvdOdometryConfig
 from mapper.registration.base import Alignment
+from mapper.registration.config import AnyRegistration
+from mapper.registration.hough_config import HoughGicpConfig, HoughNdtConfig
 
 _WARM_UP_STRIDE = 10
 
@@ -139,6 +139,6 @@ def _by_features(
 
 def xyz_rpy(T_a_b: Transform) -> tuple[list[float], list[float]]:
     """Return a pose as metres and as roll, pitch, yaw in degrees, for a screen or a file."""
-    from mapper.rotations import euler_from_rotation
+    from mapper.core.rotations import euler_from_rotation
 
     return T_a_b[:3, 3].tolist(), np.degrees(euler_from_rotation(T_a_b[:3, :3])).tolist()

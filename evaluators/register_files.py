@@ -7,16 +7,14 @@ from typing import Any
 import numpy as np
 
 from evaluators.register import Registered, xyz_rpy
-from mapper.atomic import write_text
 from mapper.config.register import RegisterConfig
-from mapper.config.sensors import Sensor
+from mapper.core.frames import Scan, Sensor
+from mapper.core.geometry import apply
 from mapper.export.palette import ESTIMATE
 from mapper.export.ply import write_ply
 from mapper.export.registration_log import write_registration_log
 from mapper.export.registration_picture import write_before_and_after
-from mapper.frames import Scan
-from mapper.geometry import apply
-from mapper.staging import MARK
+from mapper.runtime.atomic import MANIFEST_NAME, write_text
 
 ALIGNED, PICTURE, RECORDING = "aligned.ply", "registration.png", "registration.mcap"
 
@@ -94,7 +92,7 @@ def write_registration(
         "source": names[1],
         "config": config.model_dump(mode="json"),
     }
-    write_text(folder / MARK, json.dumps(record, indent=2, ensure_ascii=False) + "\n")
+    write_text(folder / MANIFEST_NAME, json.dumps(record, indent=2, ensure_ascii=False) + "\n")
 
 
 def _record(registered: Registered) -> dict[str, Any]:

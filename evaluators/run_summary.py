@@ -15,9 +15,9 @@ from evaluators.trajectory import (
     statistics,
     step_errors,
 )
-from mapper.errors import DataError
-from mapper.run import Run
-from mapper.trajectory import Trajectory
+from mapper.core.errors import DataError
+from mapper.core.trajectory import Trajectory
+from mapper.run.folder import Run
 
 
 def summary(run: Run, *, alignment: AlignmentKind = "se3") -> dict[str, Value]:

@@ -2,11 +2,11 @@
 
 from typing import Any, TypeVar, get_args
 
-from mapper.config.base import Config
-from mapper.config.hough import HoughConfig
-from mapper.config.registration import VOXEL_M, RegistrationConfig
-from mapper.config.scan_odometry import KissOdometryConfig
-from mapper.config.sensors import Sensor
+from mapper.core.config import Config
+from mapper.core.frames import Sensor
+from mapper.odometry.scan_to_map.config import KissOdometryConfig
+from mapper.registration.config import VOXEL_M, RegistrationConfig
+from mapper.registration.hough_config import HoughConfig
 
 AnyConfig = TypeVar("AnyConfig", bound=Config)
 

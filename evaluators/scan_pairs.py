@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mapper.frames import Scan
-from mapper.geometry import Transform, apply, inverse, transform
-from mapper.thinning import thin
+from mapper.core.frames import Scan
+from mapper.core.geometry import Transform, apply, inverse, transform
+from mapper.core.voxel_grid import thin
 
 _RINGS, _KEPT_RINGS = 64, 16
 

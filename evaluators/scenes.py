@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 
 from evaluators.occupancy import SignedDistance
-from mapper.config.synthetic import LidarSynthConfig
-from mapper.errors import DataError
-from mapper.geometry import Array, Points
-from mapper.sources.synthetic import read_scene
-from mapper.sources.synthetic.lidar import OutdoorScene, make_outdoor_scene
-from mapper.sources.synthetic.lidar.solids import Shape
+from mapper.core.errors import DataError
+from mapper.core.geometry import Array, Points
+from mapper.simulation import read_scene
+from mapper.simulation.config import LidarSynthConfig
+from mapper.simulation.lidar import OutdoorScene, make_outdoor_scene
+from mapper.simulation.lidar.solids import Shape
 
 SCENE = "scene.json"
 _BATCH = 1 << 12  # points at once; those of a map lie together, so that most solids are out of reach

@@ -9,8 +9,8 @@ import numpy as np
 from evaluators.metric import Metric
 from evaluators.tables import Column, Record
 from evaluators.trajectory import Matched, motion_errors, progress_of, statistics
-from mapper.errors import DataError
-from mapper.geometry import Array
+from mapper.core.errors import DataError
+from mapper.core.geometry import Array
 
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 EVERY_FRAMES = 10

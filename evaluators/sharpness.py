@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from evaluators.metric import Metric
 from evaluators.patches import cell_codes, gaps, spreads
-from mapper.config.sensors import Sensor
-from mapper.deskew import STILL, deskewed, twist_at
-from mapper.errors import DataError
-from mapper.geometry import Array, Points, apply
-from mapper.progress import SILENT, Progress
+from mapper.core.deskew import STILL, deskewed, twist_at
+from mapper.core.errors import DataError
+from mapper.core.frames import Sensor
+from mapper.core.geometry import Array, Points, apply
+from mapper.core.trajectory import Trajectory
+from mapper.core.voxel_grid import thin
+from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import FrameSource
-from mapper.thinning import thin
-from mapper.trajectory import Trajectory
 
 RADIUS_M: dict[Sensor, float] = {"rgbd": 0.2, "lidar": 0.5}
 """Of the patches: small enough for walls to be flat, large against what scans are laid wrong by."""

@@ -12,20 +12,20 @@ from typing import Any
 
 from evaluators.cells import Cell, CellResult, run_cells
 from evaluators.sweep_cell import BuildCell, environment
-from mapper.atomic import write_text
-from mapper.config import BuildConfig, load_config, load_source_config, read_config
-from mapper.config.loops import PlaceLoopsConfig, ScanLoopsConfig, ThesisLoopsConfig
-from mapper.config.odometry import IsvdOdometryConfig, KeyframeConfig
-from mapper.config.scan_odometry import ScanOdometryConfig
+from mapper.config.build import BuildConfig
+from mapper.config.loading import load_config, load_source_config, read_config
 from mapper.config.seeds import seeded
-from mapper.config.sources import SourceConfig
 from mapper.config.sweep import ConfigurationConfig, MethodConfig, SweepConfig
-from mapper.errors import ConfigError
-from mapper.fingerprint import fingerprint
-from mapper.progress import SILENT, Progress
+from mapper.core.errors import ConfigError
+from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig, ThesisLoopsConfig
+from mapper.odometry.config import IsvdOdometryConfig, KeyframeConfig
+from mapper.odometry.scan_to_map.config import ScanOdometryConfig
+from mapper.run.fingerprint import fingerprint
+from mapper.runtime.atomic import resumable_folder, write_text
+from mapper.runtime.progress import SILENT, Progress
 from mapper.sources import open_source
 from mapper.sources.base import FrameSource
-from mapper.staging import resumed
+from mapper.sources.config import SourceConfig
 
 CELLS, RUNS, SCRATCH, PLAN = "cells", "runs", "scratch", "sweep.json"
 _IMAGE_LOOPS = (PlaceLoopsConfig, ThesisLoopsConfig)
@@ -119,7 +119,7 @@ def run_sweep(
         RunError: OUT holds something else, or another sweep is at work there.
     """
     out, cells = plan.out, plan.cells
-    with resumed(out, mark=PLAN):
+    with resumable_folder(out, mark=PLAN):
         shutil.rmtree(out / SCRATCH, ignore_errors=True)  # what a killed sweep left
         write_text(out / PLAN, json.dumps(_described(plan), indent=1, ensure_ascii=False) + "\n")
         results = run_cells(

@@ -11,12 +11,13 @@ from typing import Literal
 import mapper
 from evaluators.run_summary import summary
 from evaluators.tables import Record
-from mapper.config import BuildConfig
-from mapper.errors import ConfigError, MapperError
-from mapper.manifest import library_versions
-from mapper.measure import forget_peak_memory
-from mapper.pipeline import build
-from mapper.run import CONFIG, MANIFEST, OCTREE_MAP, SUMMARY, TRAJECTORY, TRUTH, Run
+from mapper.config.build import BuildConfig
+from mapper.core.errors import ConfigError, MapperError
+from mapper.pipeline.build import build
+from mapper.run.files import CONFIG, MANIFEST, OCTREE_MAP, SUMMARY, TRAJECTORY, TRUTH
+from mapper.run.folder import Run
+from mapper.run.manifest import library_versions
+from mapper.runtime.timing import forget_peak_memory
 from mapper.sources import open_source
 
 Keep = Literal["nothing", "trajectory", "run"]

@@ -8,7 +8,7 @@ from evaluators.sweep import Place, Plan
 from evaluators.sweep_page import page_of
 from evaluators.sweep_tables import sweep_records
 from evaluators.tables import Record, csv_text
-from mapper.atomic import write_text
+from mapper.runtime.atomic import write_text
 
 FILES = CSV, PARQUET, PAGE = "results.csv", "results.parquet", "summary.html"
 

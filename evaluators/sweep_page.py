@@ -19,7 +19,7 @@ from evaluators.sweep_tables import (
 from evaluators.tables import MISSING, Record, Value
 from mapper.config.sweep import ConfigurationConfig
 from mapper.export.html import document, section
-from mapper.run import SUMMARY
+from mapper.run.files import SUMMARY
 
 _DRAWN = ("ate_m", "frames_per_s")
 _ELSEWHERE = frozenset({"run", "reason", "mapper_version"})

@@ -6,10 +6,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import DataError
-from mapper.geometry import Array, Points, Transform, angle_between, fit_rigid, rotation_exp, transform
-from mapper.timebase import NS_PER_S, Stamps, nearest
-from mapper.trajectory import Trajectory, start_to_end
+from mapper.core.errors import DataError
+from mapper.core.geometry import Array, Points, Transform, angle_between, fit_rigid, rotation_exp, transform
+from mapper.core.timebase import NS_PER_S, Stamps, nearest
+from mapper.core.trajectory import Trajectory, start_to_end
 
 AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 DeltaUnit = Literal["frames", "m", "s"]

@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 
 from cli.console import progress_for
-from mapper.config.places import VocabularyConfig
-from mapper.config.synthetic import SensorConfig, SynthConfig
+from mapper.places.config import VocabularyConfig
 from mapper.places.images import descriptors_of
 from mapper.places.training import train
 from mapper.places.vocabulary import SHIPPED
-from mapper.sources.synthetic import SyntheticSource, make_scene
+from mapper.simulation import SyntheticSource, make_scene
+from mapper.simulation.config import SensorConfig, SynthConfig
 
 FIRST_SEED = 1000  # far from the seeds that tests and examples use
 FLATS = 12

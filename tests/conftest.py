@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
-from mapper.config.synthetic import SynthConfig
-from mapper.sources.synthetic import write_tum_log
-from mapper.timebase import seconds_text_from_ns
+from mapper.core.timebase import seconds_text_from_ns
+from mapper.simulation import write_tum_log
+from mapper.simulation.config import SynthConfig
 
 FIRST_NS = 1_305_031_102_175_304_000
 PERIOD_NS = 33_333_000

@@ -7,7 +7,7 @@ import numpy as np
 from conftest import FIRST_NS, PERIOD_NS, picture
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from mapper.frames import PinholeCamera
+from mapper.core.frames import PinholeCamera
 from mapper.sources.mcap_log import mcap_writer
 from mapper.sources.ros.writing import Written
 from mapper.sources.rosbag_writing import bag_writer, camera_info_message, image_message

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pyoctomap
 
-from mapper.frames import PinholeCamera, RgbdFrame
-from mapper.geometry import apply, inverse
+from mapper.core.frames import PinholeCamera, RgbdFrame
+from mapper.core.geometry import apply, inverse
 
 DATA = Path(__file__).parents[2] / "shared/data"
 FR1_XYZ = DATA / "tum_fr1_xyz"

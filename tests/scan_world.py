@@ -4,10 +4,10 @@ from functools import cache
 
 import numpy as np
 
-from mapper.config.synthetic import STREET, LidarSensorConfig
+from mapper.core.geometry import Transform, rotation_exp, transform
 from mapper.features.scan_view import ScanView
-from mapper.geometry import Transform, rotation_exp, transform
-from mapper.sources.synthetic.lidar import OutdoorScene, make_outdoor_scene, render_scan
+from mapper.simulation.config import STREET, LidarSensorConfig
+from mapper.simulation.lidar import OutdoorScene, make_outdoor_scene, render_scan
 
 MOUNT_M = 1.7
 SENSOR = LidarSensorConfig(rings=32, azimuth_steps=360)

@@ -9,17 +9,18 @@ from test_cli_loops import mapper
 
 from cli.summary import summary_text
 from evaluators.trajectory import align, associate, ate
-from mapper.appending import append
-from mapper.config import load_config, overridden
-from mapper.config.loops import NoLoopsConfig
-from mapper.config.sources import SourceConfig
-from mapper.config.synthetic import SynthConfig
-from mapper.errors import ConfigError, RunError
-from mapper.pipeline import build, fuse
-from mapper.run import load_run, moved_log, open_log
+from mapper.config.loading import load_config, overridden
+from mapper.core.errors import ConfigError, RunError
+from mapper.loops.config import NoLoopsConfig
+from mapper.pipeline.append import append
+from mapper.pipeline.build import build
+from mapper.pipeline.fuse import fuse
+from mapper.run.folder import load_run, moved_log, open_log
+from mapper.simulation import write_tum_log
+from mapper.simulation.config import SynthConfig
 from mapper.sources import open_source
 from mapper.sources.chained import sessions_of
-from mapper.sources.synthetic import write_tum_log
+from mapper.sources.config import SourceConfig
 
 # A keyframe every few frames, so that a second of walking leaves enough of them to tie.
 SETTINGS = ("odometry.max_keyframe_gap=3", "loops.min_motion_m=0.0")
@@ -112,7 +113,7 @@ def test_the_table_names_both_logs(first, joined):
 
 def test_the_maps_are_those_of_fusing_from_scratch(joined, tmp_path):
     again = shutil.copytree(joined.path, tmp_path / "again")
-    (again / "sights.bin").unlink()
+    (again / "scan_updates.bin").unlink()
     mapper("fuse", again, "--quiet")
     for name in ("map.ot", "cloud.ply", "slice.pgm"):
         assert (again / name).read_bytes() == (joined.path / name).read_bytes()

@@ -1,6 +1,6 @@
 import pytest
 
-from mapper.atomic import replacing, write_bytes, write_text
+from mapper.runtime.atomic import atomic_file, write_bytes, write_text
 
 
 def test_a_file_appears_whole_with_its_folders(tmp_path):
@@ -20,7 +20,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
         part.write_text("ha")
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt), replacing(path) as part:
+    with pytest.raises(KeyboardInterrupt), atomic_file(path) as part:
         write_half(part)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
@@ -29,7 +29,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path):
 def test_the_old_file_stays_readable_until_the_new_one_is_whole(tmp_path):
     path = tmp_path / "map.png"
     path.write_text("old")
-    with replacing(path) as part:
+    with atomic_file(path) as part:
         assert part.suffix == ".png", "writers choose the format by the ending"
         part.write_text("new")
         assert path.read_text() == "old"

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from mapper.back_projection import back_project
-from mapper.frames import PinholeCamera, RgbdFrame, ray_table
-from mapper.geometry import apply, exp
+from mapper.core.back_projection import back_project
+from mapper.core.frames import PinholeCamera, RgbdFrame, ray_table
+from mapper.core.geometry import apply, exp
 
 CAMERA = PinholeCamera(7, 5, 6.0, 6.5, 3.1, 2.2, (0.1, -0.05, 0.001, 0.002, 0.0))
 T_BODY_CAMERA = exp(np.array([0.1, -0.4, 0.3]), np.array([1.0, -2.0, 0.5]))

@@ -8,8 +8,8 @@ import pytest
 from workers_made import Work, told, until
 
 from evaluators.cells import Cell, run_cells
-from mapper.errors import DataError, RunError
-from mapper.staging import locked
+from mapper.core.errors import DataError, RunError
+from mapper.runtime.atomic import locked
 
 
 class Notes:
@@ -53,12 +53,12 @@ def test_results_come_in_order_and_are_not_worked_out_again(diary, tmp_path):
 
 def test_more_cells_leave_the_finished_ones_alone(diary, tmp_path):
     run_cells([cell(diary, 1), cell(diary, 2)], tmp_path / "cells")
-    watcher = Notes()
-    run_cells([cell(diary, n) for n in (1, 2, 3, 4)], tmp_path / "cells", progress=watcher)
+    observer = Notes()
+    run_cells([cell(diary, n) for n in (1, 2, 3, 4)], tmp_path / "cells", progress=observer)
 
     assert told(diary) == {"1": 1, "2": 1, "3": 1, "4": 1}
-    assert watcher.notes == ["2 of 4 cells were finished before and are kept"]
-    assert watcher.reports == [(0, 2), (1, 2), (2, 2)]
+    assert observer.notes == ["2 of 4 cells were finished before and are kept"]
+    assert observer.reports == [(0, 2), (1, 2), (2, 2)]
 
 
 def test_a_cluster_comes_to_the_same(diary, tmp_path, dask_scheduler):
@@ -69,14 +69,14 @@ def test_a_cluster_comes_to_the_same(diary, tmp_path, dask_scheduler):
 
 
 def test_a_failed_cell_is_told_written_and_tried_again(diary, tmp_path):
-    watcher = Notes()
+    observer = Notes()
     cells = [cell(diary, 1, "refuse"), cell(diary, 2), cell(diary, 3, "nan")]
-    failed, fine, nan = run_cells(cells, tmp_path / "cells", progress=watcher, attempts=1)
+    failed, fine, nan = run_cells(cells, tmp_path / "cells", progress=observer, attempts=1)
 
     assert (failed.failure, failed.records) == ("1.png: is black", ())
     assert fine.failure == ""
     assert nan.failure == "ratio is nan; want text, a finite number or None"
-    assert watcher.notes[0] == "the cell 1: 1.png: is black"
+    assert observer.notes[0] == "the cell 1: 1.png: is black"
     assert json.loads((tmp_path / "cells/cell-1.json").read_text())["failure"] == "1.png: is black"
 
     (again,) = run_cells([cell(diary, 1)], tmp_path / "cells")
@@ -91,11 +91,11 @@ def test_a_file_that_is_no_cell_is_worked_out_again(diary, tmp_path, text):
     good = file.read_text()
     file.write_text(good.replace("cell-1", "cell-2") if text is None else text)
 
-    watcher = Notes()
-    (again,) = run_cells([cell(diary, 1)], tmp_path / "cells", progress=watcher)
+    observer = Notes()
+    (again,) = run_cells([cell(diary, 1)], tmp_path / "cells", progress=observer)
     assert again.records == result.records
     assert told(diary)["1"] == 2
-    assert watcher.notes == [f"{file}: is no finished cell, or a damaged one; it is worked out again"]
+    assert observer.notes == [f"{file}: is no finished cell, or a damaged one; it is worked out again"]
     assert json.loads(file.read_text())["records"] == json.loads(good)["records"]
 
 

@@ -14,8 +14,8 @@ from cli.console import Bars, Lines
 from cli.evaluate import evaluate as evaluate_verb
 from cli.main import app
 from evaluators.evaluate import judged
-from mapper.run import load_run
-from mapper.trajectory import read_tum
+from mapper.run.folder import load_run
+from mapper.sources.trajectory_files import read_tum
 
 VERBS = [
     "build",
@@ -169,7 +169,7 @@ def test_ctrl_c_ends_with_130_and_one_line(desk_log, tmp_path, monkeypatch):
     def interrupt(*_arguments, **_options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mapper.pipeline.build", interrupt)
+    monkeypatch.setattr("mapper.pipeline.build.build", interrupt)
     result = mapper("build", desk_log, "--out", tmp_path / "run", status=130)
     assert result.stderr == "mapper: interrupted\n"
 
@@ -178,7 +178,7 @@ def test_a_bug_keeps_its_traceback(desk_log, tmp_path, monkeypatch):
     def stumble(*_arguments, **_options):
         raise ZeroDivisionError
 
-    monkeypatch.setattr("mapper.pipeline.build", stumble)
+    monkeypatch.setattr("mapper.pipeline.build.build", stumble)
     with pytest.raises(ZeroDivisionError):
         mapper("build", desk_log, "--out", tmp_path / "run")
 

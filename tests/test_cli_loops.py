@@ -8,14 +8,14 @@ import pytest
 from typer.testing import CliRunner
 
 from cli.main import app
-from mapper.config import load_config
-from mapper.errors import ConfigError
-from mapper.geometry import exp
+from mapper.config.loading import load_config
+from mapper.core.errors import ConfigError
+from mapper.core.geometry import exp
 from mapper.graph.chain import by_odometry
 from mapper.graph.model import BetweenFactor, PoseGraph
-from mapper.loops_by_hand import edit_loops
-from mapper.pipeline import build
-from mapper.run import load_run, open_log
+from mapper.pipeline.build import build
+from mapper.pipeline.edit_loops import edit_loops
+from mapper.run.folder import load_run, open_log
 from mapper.sources import open_source
 
 # A keyframe every few frames, so that two seconds give enough of them to tie.
@@ -109,7 +109,7 @@ def test_several_edits_are_one_solve(run):
 def test_the_maps_are_those_of_fusing_from_scratch(run):
     mapper("loops", run, "--add", *untied(run), "--quiet")
     edited = (run / "map.ot").read_bytes()
-    (run / "sights.bin").unlink()
+    (run / "scan_updates.bin").unlink()
     mapper("fuse", run, "--quiet")
     assert (run / "map.ot").read_bytes() == edited
 

@@ -7,11 +7,12 @@ import pytest
 from typer.testing import CliRunner
 
 from cli.main import app
+from mapper.core.geometry import exp
+from mapper.core.trajectory import Trajectory
 from mapper.export.grid import read_grid
-from mapper.geometry import exp
 from mapper.navigation.distance import distance_2d
-from mapper.run import load_run
-from mapper.trajectory import Trajectory, read_tum, write_tum
+from mapper.run.folder import load_run
+from mapper.sources.trajectory_files import read_tum, write_tum
 
 
 def mapper(*arguments):

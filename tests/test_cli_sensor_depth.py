@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cli.main import app
-from mapper.config import load_config
+from mapper.config.loading import load_config
 from mapper.sources.images import read_grey
 
 SMALL = ["--seconds", "0.1", "--set", "width_px=160", "--set", "height_px=120", "--set", "texture_px_per_m=8"]

@@ -7,10 +7,10 @@ import pytest
 from typer.testing import CliRunner
 
 from cli.main import app
-from mapper.geometry import exp, inverse, transform
+from mapper.core.geometry import exp, inverse, transform
 from mapper.graph.g2o import read_g2o, write_g2o
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
-from mapper.trajectory import read_tum
+from mapper.sources.trajectory_files import read_tum
 
 INFORMATION = PoseSigmas(rotation_rad=0.01, translation_m=0.02).information
 

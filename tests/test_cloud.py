@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from mapper.cloud import CloudBuilder
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.mapping.cloud import CloudBuilder
 
 
 def random_cloud(n, *, seed=0, extent_m=2.0):

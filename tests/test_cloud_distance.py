@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from evaluators.cloud_distance import DistanceTo
-from mapper.errors import DataError
-from mapper.geometry import exp, inverse
+from mapper.core.errors import DataError
+from mapper.core.geometry import exp, inverse
 
 
 def test_mean_and_median_are_those_of_every_distance_told_by_brute_force():

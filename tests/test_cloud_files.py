@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 from pypcd4 import Encoding, PointCloud
 
-from mapper.errors import FrameError
+from mapper.core.errors import FrameError
 from mapper.sources.cloud_files import ENDINGS, read_cloud
 from mapper.sources.cloud_files.ply import read_ply
 from mapper.sources.clouds import read_scan

@@ -1,12 +1,13 @@
 import numpy as np
 import pytest
 
-from mapper.config.sources import SourceConfig
-from mapper.errors import FrameError, SourceError
-from mapper.geometry import exp
+from mapper.core.errors import FrameError, SourceError
+from mapper.core.geometry import exp
+from mapper.core.timebase import NS_PER_S
+from mapper.core.trajectory import Trajectory
 from mapper.sources import open_source
-from mapper.timebase import NS_PER_S
-from mapper.trajectory import Trajectory, write_kitti, write_tum
+from mapper.sources.config import SourceConfig
+from mapper.sources.trajectory_files import write_kitti, write_tum
 
 FIRST_NS = 1_544_676_777_123_456_789
 PERIOD_NS = 100_000_000

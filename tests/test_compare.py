@@ -18,12 +18,12 @@ from evaluators.compare_files import write_comparison
 from evaluators.compare_tables import odometry_records, registration_records, tables_text, trial_records
 from evaluators.methods import registration_method
 from mapper.config.compare import CompareConfig, LidarCompareConfig
-from mapper.config.sources import SourceConfig
-from mapper.config.synthetic import STREET, LidarSensorConfig
-from mapper.errors import ConfigError, DataError, FrameError
+from mapper.core.errors import ConfigError, DataError, FrameError
+from mapper.simulation.config import STREET, LidarSensorConfig
+from mapper.simulation.lidar import SyntheticLidarSource
 from mapper.sources import open_source
-from mapper.sources.synthetic.lidar import SyntheticLidarSource
-from mapper.trajectory import read_tum
+from mapper.sources.config import SourceConfig
+from mapper.sources.trajectory_files import read_tum
 
 KITTI = Path(__file__).parents[2] / "shared/data/kitti_00"
 RGBD = CompareConfig(methods=("pnp", "rgbd", "gicp", "kiss-icp"), pairs=3)

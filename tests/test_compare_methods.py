@@ -10,19 +10,19 @@ from evaluators.methods import FrameToFrame, OdometryPairs
 from evaluators.moments import Reader
 from evaluators.scales import kiss_icp, registrations_for
 from mapper.config.compare import CompareConfig, RgbdCompareConfig
-from mapper.config.hough import HoughGicpConfig
-from mapper.config.odometry import IsvdOdometryConfig
-from mapper.config.registration import VOXEL_M
-from mapper.config.scan_odometry import KissOdometryConfig
-from mapper.config.sources import SourceConfig
-from mapper.errors import FrameError
+from mapper.core.errors import FrameError
+from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
+from mapper.core.geometry import angle_between, apply, exp, inverse
 from mapper.features.scan_view import ScanView
-from mapper.frames import PinholeCamera, RgbdFrame, Scan
-from mapper.geometry import angle_between, apply, exp, inverse
-from mapper.odometry.base import Diagnostics, Track
+from mapper.odometry.base import Diagnostics, FrameResult
+from mapper.odometry.config import IsvdOdometryConfig
+from mapper.odometry.scan_to_map.config import KissOdometryConfig
 from mapper.registration.base import Alignment, failed
+from mapper.registration.config import VOXEL_M
+from mapper.registration.hough_config import HoughGicpConfig
 from mapper.registration.rgbd import HybridRgbd
 from mapper.sources import open_source
+from mapper.sources.config import SourceConfig
 
 STEP_NS = 100_000_000
 
@@ -98,7 +98,7 @@ class Centred:
         T = np.eye(4)
         T[:3, 3] = self.first - middle
         node = None if len(frame.points_body) == 1 else 0
-        return Track(frame.stamp_ns, node, np.eye(4), T, False, Diagnostics(0, 0, 0, 0.0, "m", "map"))
+        return FrameResult(frame.stamp_ns, node, np.eye(4), T, False, Diagnostics(0, 0, 0, 0.0, "m", "map"))
 
     def view(self, frame):
         return ScanView(frame.stamp_ns, frame.points_body)

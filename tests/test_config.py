@@ -2,11 +2,12 @@ from pathlib import Path
 
 import pytest
 
-from mapper.config import BuildConfig, load_config, overridden
-from mapper.config.features import SurfConfig
-from mapper.config.odometry import IsvdOdometryConfig, LocalMapConfig
-from mapper.config.synthetic import SynthConfig
-from mapper.errors import ConfigError
+from mapper.config.build import BuildConfig
+from mapper.config.loading import load_config, overridden
+from mapper.core.errors import ConfigError
+from mapper.features.config import SurfConfig
+from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig
+from mapper.simulation.config import SynthConfig
 
 
 @pytest.fixture

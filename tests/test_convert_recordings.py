@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 from conftest import CALIBRATION, FIRST_NS
 
-from mapper.config import load_config
-from mapper.config.sources import SourceConfig
-from mapper.errors import SourceError
-from mapper.frames import Scan
-from mapper.progress import SILENT
+from mapper.config.loading import load_config
+from mapper.core.errors import SourceError
+from mapper.core.frames import Scan
+from mapper.pipeline.track import track_log
+from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
+from mapper.sources.config import SourceConfig
 from mapper.sources.ros.writing import Written
 from mapper.sources.rosbag_writing import cloud_message
 from mapper.sources.writers import write_log
-from mapper.tracking import track_log
 
 KINDS = ["mcap", "bag"]
 

@@ -5,8 +5,8 @@ import pytest
 
 from evaluators.coverage import frame_coverage, time_coverage
 from evaluators.evaluate import judged
-from mapper.geometry import transform
-from mapper.trajectory import Trajectory
+from mapper.core.geometry import transform
+from mapper.core.trajectory import Trajectory
 
 MS = 1_000_000
 FRAMES_NS = 7_000_000_000 + np.arange(100, dtype=np.int64) * 33 * MS

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from mapper.errors import DataError
-from mapper.geometry import apply, exp, transform
-from mapper.registration.degeneracy import degeneracy_of, loosened
+from mapper.core.errors import DataError
+from mapper.core.geometry import apply, exp, transform
+from mapper.registration.degeneracy import degeneracy_of, projected
 from mapper.registration.refining import measured
 from mapper.registration.surfaces import prepared
 
@@ -102,7 +102,7 @@ def test_unseen_motions_move_the_cloud_by_a_metre_and_no_surface_notices():
 @pytest.mark.parametrize("scene", [corridor, plain, tunnel])
 def test_the_noise_grows_along_what_was_open_and_only_there(scene):
     information, degeneracy = seen(scene)
-    open_ = loosened(information, degeneracy)
+    open_ = projected(information, degeneracy)
 
     assert np.linalg.eigvalsh(open_)[0] > 0.0
     for k, motion in enumerate(degeneracy.motions):
@@ -115,7 +115,7 @@ def test_the_noise_grows_along_what_was_open_and_only_there(scene):
 
 def test_a_room_keeps_its_information():
     information, degeneracy = seen(room)
-    assert np.allclose(loosened(information, degeneracy), information)
+    assert np.allclose(projected(information, degeneracy), information)
 
 
 def test_information_of_nothing_is_an_error():

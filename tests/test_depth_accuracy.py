@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 
 from evaluators.depth_accuracy import study_depth
-from mapper.config.sources import SourceConfig
-from mapper.config.synthetic import SensorConfig, SynthConfig
-from mapper.errors import DataError, SourceError
-from mapper.frames import PinholeCamera, RgbdFrame, Scan, ray_table
+from mapper.core.errors import DataError, SourceError
+from mapper.core.frames import PinholeCamera, RgbdFrame, Scan, ray_table
 from mapper.sensing.depth_accuracy import Patch, accuracy_of, quantisation_step_m
 from mapper.sensing.depth_fit import fit_noise
 from mapper.sensing.depth_planes import fit_planes
 from mapper.sensing.depth_still import depth_at
 from mapper.sensing.depth_tiles import depth_of_planes
+from mapper.simulation.config import SensorConfig, SynthConfig
+from mapper.simulation.source import SyntheticSource
 from mapper.sources import open_source
-from mapper.sources.synthetic.source import SyntheticSource
+from mapper.sources.config import SourceConfig
 
 FR1_XYZ = Path(__file__).parents[2] / "shared/data/tum_fr1_xyz"
 CAMERA = PinholeCamera(320, 240, 262.5, 262.5, 159.5, 119.5)
 A, B, C = 0.0012, 0.0008, 0.0015
 
 
-class Entry:
+class FrameRef:
     files = None
 
     def __init__(self, frame):
@@ -49,7 +49,7 @@ class Log:
         return len(self.frames)
 
     def entries(self):
-        return map(Entry, self.frames)
+        return map(FrameRef, self.frames)
 
 
 def plane_m(distance_m, *, tilt_rad=0.0):

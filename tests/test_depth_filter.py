@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
 from mapper.sensing.depth_filter import dif
 
 DEPTHS = arrays(

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from mapper.config import load_config
-from mapper.config.depth_noise import DepthNoiseConfig
-from mapper.config.odometry import LocalMapConfig
-from mapper.config.synthetic import SynthConfig
-from mapper.errors import ConfigError
-from mapper.frames import RgbdFrame
+from mapper.config.loading import load_config
+from mapper.core.errors import ConfigError
+from mapper.core.frames import RgbdFrame
+from mapper.odometry.config import LocalMapConfig
+from mapper.sensing.config import DepthNoiseConfig
 from mapper.sensing.depth_noise import feature_depth_sigma_m
-from mapper.sources.synthetic.source import SyntheticSource
+from mapper.simulation.config import SynthConfig
+from mapper.simulation.source import SyntheticSource
 
 NOISE = DepthNoiseConfig(constant_m=0.002, linear=-0.001, quadratic_per_m=0.003)
 TINY = DepthNoiseConfig(constant_m=1e-9)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from mapper.deskew import STILL, Twist, deskewed, twist_at, twist_between
-from mapper.frames import Scan
-from mapper.geometry import apply, exp
-from mapper.trajectory import Trajectory
+from mapper.core.deskew import STILL, Twist, deskewed, twist_at, twist_between
+from mapper.core.frames import Scan
+from mapper.core.geometry import apply, exp
+from mapper.core.trajectory import Trajectory
 
 TWIST = Twist(np.array([0.3, -0.2, 0.9]), np.array([8.0, 0.5, -0.1]))
 

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from mapper.config.features import DetectorConfig, OrbConfig, SurfConfig, UniformOrbConfig
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.features.config import DetectorConfig, OrbConfig, SurfConfig, UniformOrbConfig
 from mapper.features.detectors import Features, build_detector
 from mapper.features.fast import corners, fast_scores, orientations
 from mapper.features.hessian import interest_points

@@ -8,12 +8,12 @@ import pytest
 from typer.testing import CliRunner
 
 from cli.main import app
+from mapper.core.errors import DataError
 from mapper.doctor import libraries, machine
 from mapper.doctor.finding import Finding
 from mapper.doctor.libraries import look_at_library, tried
 from mapper.doctor.self_tests import SELF_TESTS, WrongAnswerError, _expect_near
 from mapper.doctor.system_libraries import apt_line, look_at_system_libraries
-from mapper.errors import DataError
 
 PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
 AGAIN = "install it again"

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mapper.geometry import adjoint, exp, inverse, transform
+from mapper.core.geometry import adjoint, exp, inverse, transform
 from mapper.graph.drift import innovations
 from mapper.graph.model import BetweenFactor, PoseSigmas
 

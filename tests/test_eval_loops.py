@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from evaluators.loops import loop_metrics, revisits_of
-from mapper.geometry import exp
+from mapper.core.geometry import exp
+from mapper.core.timebase import NS_PER_S
+from mapper.core.trajectory import Trajectory
 from mapper.loops.closure import LoopClosure
-from mapper.timebase import NS_PER_S
-from mapper.trajectory import Trajectory
 
 
 def pose(x: float, yaw: float = 0.0) -> np.ndarray:

@@ -8,9 +8,10 @@ from evo.core.trajectory import PoseTrajectory3D
 
 from evaluators.evaluate import evaluate
 from evaluators.trajectory import Matched, align, associate, ate, rpe, start_end_offset
-from mapper.errors import DataError
-from mapper.geometry import exp, inverse, rotation_exp, transform
-from mapper.trajectory import Trajectory, read_kitti, read_tum, write_tum
+from mapper.core.errors import DataError
+from mapper.core.geometry import exp, inverse, rotation_exp, transform
+from mapper.core.trajectory import Trajectory
+from mapper.sources.trajectory_files import read_kitti, read_tum, write_tum
 
 SHARED = Path(__file__).parents[2] / "shared"
 TRAJECTORIES = SHARED / "data/trajectories"

@@ -9,17 +9,17 @@ import pyoctomap
 import pytest
 from plyfile import PlyData
 
-from mapper.config import load_config, overridden
-from mapper.errors import ConfigError, DependencyError, MapSizeError, RunError
+from mapper.config.loading import load_config, overridden
+from mapper.core.errors import ConfigError, DependencyError, MapSizeError, RunError
 from mapper.export.exporters import EXPORTERS, export
 from mapper.export.grid import read_grid
 from mapper.graph.g2o import read_g2o
 from mapper.octree.octomap_file import read_map
 from mapper.octree.slice import OCCUPIED, UNKNOWN
-from mapper.pipeline import build
-from mapper.run import load_run, moved_log
+from mapper.pipeline.build import build
+from mapper.run.folder import load_run, moved_log
 from mapper.sources import open_source
-from mapper.trajectory import read_kitti, read_tum
+from mapper.sources.trajectory_files import read_kitti, read_tum
 
 KINDS = list(EXPORTERS)
 COARSE_MESH = ["mesh.voxel_m=0.04", "mesh.frame_stride=2", "mesh.min_observations=1"]
@@ -251,7 +251,7 @@ def test_a_run_with_a_hole_says_which_file(run, tmp_path, name):
     (broken.path / name).unlink()
     with pytest.raises(Exception, match=name) as caught:
         export(broken, kind, out_of(tmp_path / "out", kind))
-    assert type(caught.value).__module__ == "mapper.errors"
+    assert type(caught.value).__module__ == "mapper.core.errors"
 
 
 def test_settings_that_a_kind_does_not_read_are_refused(untouched):

@@ -3,10 +3,10 @@ import json
 import pytest
 from mcap.reader import make_reader
 
-from mapper.config import BuildConfig
+from mapper.config.build import BuildConfig
 from mapper.export.exporters import export
 from mapper.export.mcap_log import PLAN_TOPICS
-from mapper.pipeline import build
+from mapper.pipeline.build import build
 from mapper.sources import open_source
 
 

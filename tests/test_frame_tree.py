@@ -1,7 +1,7 @@
 import numpy as np
 
-from mapper.geometry import Transform, exp, inverse
-from mapper.rotations import quaternion_from_rotation
+from mapper.core.geometry import Transform, exp, inverse
+from mapper.core.rotations import quaternion_from_rotation
 from mapper.sources.ros.frame_tree import FrameTree
 from mapper.sources.ros.messages import PoseMessage
 

@@ -2,9 +2,9 @@ import cv2
 import numpy as np
 import pytest
 
-from mapper.errors import DataError
-from mapper.frames import PinholeCamera, RgbdFrame, Scan, ray_table
-from mapper.geometry import apply, exp
+from mapper.core.errors import DataError
+from mapper.core.frames import PinholeCamera, RgbdFrame, Scan, ray_table
+from mapper.core.geometry import apply, exp
 from mapper.sources.calibration import FREIBURG
 
 PLAIN = PinholeCamera(64, 48, 60.0, 61.0, 31.5, 23.5)

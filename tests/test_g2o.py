@@ -4,9 +4,9 @@ import gtsam
 import numpy as np
 import pytest
 
-from mapper.config.graph import GraphConfig
-from mapper.errors import GraphError
-from mapper.geometry import angle_between, exp
+from mapper.core.errors import GraphError
+from mapper.core.geometry import angle_between, exp
+from mapper.graph.config import GraphConfig
 from mapper.graph.g2o import read_g2o, write_g2o
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.graph.optimize import optimize

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapper import geometry as g
-from mapper.errors import DataError
+from mapper.core import geometry as g
+from mapper.core.errors import DataError
 
 COORDINATE = st.floats(-10.0, 10.0)
 VECTORS = st.tuples(COORDINATE, COORDINATE, COORDINATE).map(np.array)

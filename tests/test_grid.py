@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mapper.errors import MapFileError
+from mapper.core.errors import MapFileError
 from mapper.export.grid import read_grid, write_grid
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 

@@ -1,10 +1,16 @@
 import numpy as np
 import pytest
 
-from mapper.config.hough import CellsConfig, ConstellationConfig, GroundConfig, LevellingConfig, ObjectsConfig
-from mapper.geometry import angle_between, apply, rotation_exp, transform
-from mapper.registration.ground import find_ground, find_obstacles, surroundings
-from mapper.registration.levelling import level
+from mapper.core.geometry import angle_between, apply, rotation_exp, transform
+from mapper.registration.ground_plane import level
+from mapper.registration.ground_removal import find_ground, find_obstacles, surroundings
+from mapper.registration.hough_config import (
+    CellsConfig,
+    ConstellationConfig,
+    GroundConfig,
+    LevellingConfig,
+    ObjectsConfig,
+)
 from mapper.registration.objects import centres_of, constellation
 
 HEIGHT_M = 1.7

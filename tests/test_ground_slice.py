@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from mapper.config.octree import OctreeConfig, SliceConfig
-from mapper.frames import Scan
-from mapper.octree.ground import ground_heights
+from mapper.core.frames import Scan
+from mapper.octree.config import OctreeConfig, SliceConfig
+from mapper.octree.ground_height import ground_heights
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import FREE, OCCUPIED, cut_slice

@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
-from mapper.config.hough import HoughGicpConfig, HoughNdtConfig, HoughTrustConfig
-from mapper.config.synthetic import COURTYARD, STREET
-from mapper.frames import Scan
-from mapper.geometry import angle_between, apply, inverse, rotation_exp, transform
+from mapper.core.frames import Scan
+from mapper.core.geometry import angle_between, apply, inverse, rotation_exp, transform
 from mapper.registration.hough import Hough
-from mapper.sources.synthetic.lidar import SyntheticLidarSource
+from mapper.registration.hough_config import HoughGicpConfig, HoughNdtConfig, HoughTrustConfig
+from mapper.simulation.config import COURTYARD, STREET
+from mapper.simulation.lidar import SyntheticLidarSource
 
 UP = np.array([0.0, 0.0, 1.0])
 

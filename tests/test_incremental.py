@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from mapper.config.graph import GraphConfig
-from mapper.errors import GraphError
-from mapper.geometry import exp, inverse, transform
+from mapper.core.errors import GraphError
+from mapper.core.geometry import exp, inverse, transform
+from mapper.graph.config import GraphConfig
 from mapper.graph.incremental import IncrementalSolver
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.graph.optimize import optimize

@@ -7,9 +7,9 @@ from messages_made import CAMERA, COLOR, DEPTH, shots, write
 from typer.testing import CliRunner
 
 from cli.main import app
-from mapper.config.sources import SourceConfig
-from mapper.errors import SourceError
+from mapper.core.errors import SourceError
 from mapper.export.mcap_log import McapLog
+from mapper.sources.config import SourceConfig
 from mapper.sources.inspection import inspect_log, timing_of
 
 MS = 1_000_000

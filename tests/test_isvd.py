@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mapper.config.odometry import IsvdConfig
-from mapper.geometry import angle_between, apply, exp, fit_rigid, inverse, log
+from mapper.core.geometry import angle_between, apply, exp, fit_rigid, inverse, log
+from mapper.registration.config import IsvdConfig
 from mapper.registration.isvd import Isvd, rigid_fit_information
 
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from mapper.config.features import OrbConfig
-from mapper.config.odometry import IsvdOdometryConfig
-from mapper.errors import FrameError
+from mapper.core.errors import FrameError
+from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
+from mapper.core.geometry import apply, exp, inverse, mean_rotation
+from mapper.features.config import OrbConfig
 from mapper.features.detectors import Features
-from mapper.frames import PinholeCamera, RgbdFrame, Scan
-from mapper.geometry import apply, exp, inverse, mean_rotation
+from mapper.odometry.config import IsvdOdometryConfig
 from mapper.odometry.isvd import IsvdObservation, IsvdOdometry
 
 CAMERA = PinholeCamera(640, 480, 500.0, 500.0, 320.0, 240.0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
 from mapper.registration.kd_tree import kd_tree
 
 RNG = np.random.default_rng(0)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from mapper.errors import ConfigError
+from mapper.core.errors import ConfigError
 from mapper.odometry.keyframes import SharpestKeyframes
 
 

@@ -3,12 +3,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapper.config.sources import SourceConfig
-from mapper.errors import DataError, SourceError
-from mapper.geometry import apply, exp, inverse
+from mapper.core.errors import DataError, SourceError
+from mapper.core.geometry import apply, exp, inverse
+from mapper.core.timebase import NS_PER_S
+from mapper.core.trajectory import Trajectory
 from mapper.sources import open_source
-from mapper.timebase import NS_PER_S
-from mapper.trajectory import Trajectory, write_kitti
+from mapper.sources.config import SourceConfig
+from mapper.sources.trajectory_files import write_kitti
 
 DATA = Path(__file__).parents[2] / "shared/data"
 N = 5

@@ -7,12 +7,12 @@ import pytest
 from test_loop_closer import LAP, LINK, PLACES, walked
 from view_world import Room, track
 
-from mapper.config.loops import PlaceLoopsConfig
-from mapper.errors import ConfigError
-from mapper.geometry import exp, inverse
+from mapper.core.errors import ConfigError
+from mapper.core.geometry import exp, inverse
+from mapper.core.timebase import NS_PER_S
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.loops.closure import discrepancy
-from mapper.timebase import NS_PER_S
+from mapper.loops.config import PlaceLoopsConfig
 
 T_OTHER_WORLD = exp(np.array([0.2, 0.1, 2.0]), np.array([7.0, -4.0, 0.5]))
 CLOSE_IN_TIME_NS = NS_PER_S // 100
@@ -27,12 +27,12 @@ def knowing(config, room):
     truth = walked()[:LAP]
     graph = PoseGraph(dict(enumerate(truth)), {k: k * CLOSE_IN_TIME_NS for k in range(LAP)})
     graph.add_factors(link(k, k + 1, truth[k], truth[k + 1]) for k in range(LAP - 1))
-    closer = config.build("batch")
-    closer.know(graph, {k: room.view(T, graph.stamps_ns[k]) for k, T in graph.T_world_node.items()})
-    return closer
+    detector = config.build("batch")
+    detector.preload(graph, {k: room.view(T, graph.stamps_ns[k]) for k, T in graph.T_world_node.items()})
+    return detector
 
 
-def come_back(closer, room):
+def come_back(detector, room):
     """Walk the lap again, as seen from a world of its own that begins where the camera is."""
     truth = walked()[:LAP]
     told = [T_OTHER_WORLD @ T for T in truth]
@@ -40,14 +40,14 @@ def come_back(closer, room):
         node, stamp_ns = LAP + k, (LAP + k) * CLOSE_IN_TIME_NS
         links = [link(node - 1, node, told[k - 1], told[k])] if k else []
         view = partial(room.view, truth[k], stamp_ns)
-        closer.add(node, track(node, stamp_ns, told[k], links), view)
+        detector.add(node, track(node, stamp_ns, told[k], links), view)
 
 
 def test_what_was_seen_before_is_recognised_however_little_time_lies_between():
     truth, room = walked(), Room(1)
-    closer = knowing(PlaceLoopsConfig(places=PLACES, min_motion_m=0.0), room)
-    come_back(closer, room)
-    held = [loop for loop in closer.closures() if loop.verdict == "accepted"]
+    detector = knowing(PlaceLoopsConfig(places=PLACES, min_motion_m=0.0), room)
+    come_back(detector, room)
+    held = [loop for loop in detector.closures() if loop.verdict == "accepted"]
     assert len(held) >= 0.8 * LAP
     assert all(loop.i < LAP <= loop.j for loop in held)
     for loop in held:
@@ -57,18 +57,18 @@ def test_what_was_seen_before_is_recognised_however_little_time_lies_between():
 
 def test_the_later_session_is_believed_in_the_earlier_one_s_world():
     room = Room(1)
-    closer = knowing(PlaceLoopsConfig(places=PLACES), room)
-    come_back(closer, room)
+    detector = knowing(PlaceLoopsConfig(places=PLACES), room)
+    come_back(detector, room)
     for k, T_world_body in enumerate(walked()[:LAP]):
-        np.testing.assert_allclose(closer.believed(k), T_world_body, atol=0.05)
-        np.testing.assert_allclose(closer.believed(LAP + k), T_world_body, atol=0.1)
+        np.testing.assert_allclose(detector.current_estimate(k), T_world_body, atol=0.05)
+        np.testing.assert_allclose(detector.current_estimate(LAP + k), T_world_body, atol=0.1)
 
 
 def test_nothing_is_proposed_by_pose_before_a_loop_ties_the_sessions():
-    closer = knowing(PlaceLoopsConfig(places=PLACES, max_distance_m=100.0, max_angle_rad=3.1), Room(1))
-    come_back(closer, Room(2))
-    assert not any(loop.proposed_by == "nearby" for loop in closer.closures() if loop.i < LAP)
-    assert not any(loop.verdict == "accepted" for loop in closer.closures())
+    detector = knowing(PlaceLoopsConfig(places=PLACES, max_distance_m=100.0, max_angle_rad=3.1), Room(1))
+    come_back(detector, Room(2))
+    assert not any(loop.proposed_by == "nearby" for loop in detector.closures() if loop.i < LAP)
+    assert not any(loop.verdict == "accepted" for loop in detector.closures())
 
 
 def test_pose_alone_recognises_no_other_session():

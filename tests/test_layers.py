@@ -27,7 +27,7 @@ HOMES = {
     "pyoctomap": (),
     "evo": (),
     "rerun": ("mapper/export/rerun/",),
-    "distributed": ("mapper/workers.py",),
+    "distributed": ("mapper/runtime/executor.py",),
     "pyarrow": ("evaluators/parquet.py",),
 }
 

@@ -5,14 +5,15 @@ import cv2
 import numpy as np
 import pytest
 
-from mapper.config.octree import LevelConfig
-from mapper.errors import DataError
-from mapper.frames import PinholeCamera, RgbdFrame, Scan, ray_table
-from mapper.geometry import apply, exp, inverse, rotation_exp, transform
-from mapper.levelling import AXES, find_level
+from mapper.core.errors import DataError
+from mapper.core.frames import PinholeCamera, RgbdFrame, Scan, ray_table
+from mapper.core.geometry import apply, exp, inverse, rotation_exp, transform
+from mapper.core.timebase import nearest, ns_from_seconds_text
+from mapper.core.trajectory import Trajectory
+from mapper.mapping.config import LevelConfig
+from mapper.mapping.levelling import AXES, find_level
 from mapper.sources.base import Accelerations
-from mapper.timebase import nearest, ns_from_seconds_text
-from mapper.trajectory import Trajectory, read_tum
+from mapper.sources.trajectory_files import read_tum
 
 FR1_XYZ = Path(__file__).parents[2] / "shared/data/tum_fr1_xyz"
 CAMERA = PinholeCamera(width_px=160, height_px=120, fx_px=130.0, fy_px=130.0, cx_px=79.5, cy_px=59.5)

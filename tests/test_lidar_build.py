@@ -8,15 +8,16 @@ from mcap.reader import make_reader
 
 from cli.summary import summary_text
 from evaluators.evaluate import evaluate
-from mapper.config import load_config, overridden
-from mapper.config.synthetic import STREET, LidarSensorConfig
-from mapper.errors import TrackingError
+from mapper.config.loading import load_config, overridden
+from mapper.core.errors import TrackingError
 from mapper.export.grid import read_grid
 from mapper.octree.slice import FREE
-from mapper.pipeline import build, fuse
-from mapper.run import load_run, open_log
+from mapper.pipeline.build import build
+from mapper.pipeline.fuse import fuse
+from mapper.run.folder import load_run, open_log
+from mapper.simulation.config import STREET, LidarSensorConfig
+from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source
-from mapper.sources.synthetic.lidar import write_lidar_log
 
 DATA = Path(__file__).parents[2] / "shared/data"
 REPEATABLE = ("mcap.frame_times=false",)

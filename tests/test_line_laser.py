@@ -4,14 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
-from mapper.config import read_config
-from mapper.config.line_laser import THESIS, LineLaserCalibration, LineLaserConfig, VehicleConfig
-from mapper.errors import ConfigError, DataError, MapSizeError, SourceError
-from mapper.geometry import transform
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN
-from mapper.rotations import rotation_from_euler
-from mapper.sensing.line_laser import detection
-from mapper.sensing.line_laser.calibration import (
+from mapper.config.loading import read_config
+from mapper.core.errors import ConfigError, DataError, MapSizeError, SourceError
+from mapper.core.geometry import transform
+from mapper.core.rotations import rotation_from_euler
+from mapper.line_laser import detection
+from mapper.line_laser.calibration import (
     Board,
     CalibrationShot,
     ahead_m,
@@ -21,10 +19,12 @@ from mapper.sensing.line_laser.calibration import (
     right_m,
     row_px,
 )
-from mapper.sensing.line_laser.files import find_images, read_shots
-from mapper.sensing.line_laser.mapping import map_scans
-from mapper.sensing.line_laser.ranging import line_scan, local_grid, scan_image
-from mapper.sensing.line_laser.survey import drive, scan_images, sensor_poses
+from mapper.line_laser.config import THESIS, LineLaserCalibration, LineLaserConfig, VehicleConfig
+from mapper.line_laser.files import find_images, read_shots
+from mapper.line_laser.mapping import map_scans
+from mapper.line_laser.ranging import line_scan, local_grid, scan_image
+from mapper.line_laser.survey import drive, scan_images, sensor_poses
+from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN
 
 CONFIG = LineLaserConfig()
 GREY = np.full((360, 640, 3), 90, np.uint8)

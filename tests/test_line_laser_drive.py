@@ -10,19 +10,19 @@ from cli.main import app
 from evaluators import line_laser_study
 from evaluators.line_laser import TABLE_2_1, count
 from evaluators.line_laser_labels import range_records, read_labels
-from mapper.config import read_config
-from mapper.config.line_laser import THESIS, LineLaserCalibration, LineLaserConfig, LineLaserSynthConfig
-from mapper.errors import SourceError
+from mapper.config.loading import read_config
+from mapper.core.errors import SourceError
 from mapper.export.grid import read_grid
+from mapper.line_laser.calibration import ahead_m
+from mapper.line_laser.config import THESIS, LineLaserCalibration, LineLaserConfig, LineLaserSynthConfig
+from mapper.line_laser.files import find_images
+from mapper.line_laser.simulation.log import sensor_poses
+from mapper.line_laser.simulation.render import take
+from mapper.line_laser.simulation.room import Patch, Room, make_board, make_room
+from mapper.line_laser.survey import drive, scan_images
+from mapper.line_laser.survey import sensor_poses as drive_poses
 from mapper.octree.slice import OCCUPIED
-from mapper.sensing.line_laser.calibration import ahead_m
-from mapper.sensing.line_laser.files import find_images
-from mapper.sensing.line_laser.survey import drive, scan_images
-from mapper.sensing.line_laser.survey import sensor_poses as drive_poses
 from mapper.sources.images import decode_colour
-from mapper.sources.synthetic.line_laser.log import sensor_poses
-from mapper.sources.synthetic.line_laser.render import take
-from mapper.sources.synthetic.line_laser.room import Patch, Room, make_board, make_room
 
 SYNTH = LineLaserSynthConfig(seed=2)
 HALF = ("rate_hz=1", "width_px=320", "height_px=180", "focal_px=275")

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 from evaluators.trajectory import align, associate, ate
-from mapper.config.features import OrbConfig
-from mapper.config.graph import GraphConfig
-from mapper.config.odometry import LocalMapConfig
-from mapper.config.synthetic import SynthConfig
-from mapper.errors import FrameError
-from mapper.frames import PinholeCamera, RgbdFrame, Scan
-from mapper.geometry import exp, inverse
+from mapper.core.errors import FrameError
+from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
+from mapper.core.geometry import exp, inverse
+from mapper.core.trajectory import trajectory_from
+from mapper.features.config import OrbConfig
+from mapper.graph.config import GraphConfig
 from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
-from mapper.sources.synthetic.source import SyntheticSource
-from mapper.trajectory import trajectory_from
+from mapper.odometry.config import LocalMapConfig
+from mapper.simulation.config import SynthConfig
+from mapper.simulation.source import SyntheticSource
 
 
 @pytest.fixture(scope="module")

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from view_world import Room, track
 
-from mapper.config import load_config
-from mapper.config.loops import GateConfig, NoLoopsConfig, PlaceLoopsConfig, ThesisLoopsConfig
-from mapper.config.places import PlacesConfig
-from mapper.errors import DataError
+from mapper.config.loading import load_config
+from mapper.core.errors import DataError
+from mapper.core.geometry import Transform, exp, inverse
+from mapper.core.timebase import NS_PER_S
 from mapper.features.view import View
-from mapper.geometry import Transform, exp, inverse
 from mapper.graph.model import BetweenFactor, PoseSigmas
-from mapper.loops.closer import Closer
 from mapper.loops.closure import LoopClosure, discrepancy
-from mapper.timebase import NS_PER_S
+from mapper.loops.config import GateConfig, NoLoopsConfig, PlaceLoopsConfig, ThesisLoopsConfig
+from mapper.loops.detector import LoopDetector
+from mapper.places.config import PlacesConfig
 
 NODES, LAP = 60, 40
 LINK = PoseSigmas(rotation_rad=0.02, translation_m=0.02).information
@@ -45,7 +45,9 @@ def drifting(truth: Sequence[Transform]) -> list[Transform]:
     return poses
 
 
-def walk(closer: Closer, room: Room, *, told: Sequence[Transform] | None = None, features=None) -> list[View]:
+def walk(
+    detector: LoopDetector, room: Room, *, told: Sequence[Transform] | None = None, features=None
+) -> list[View]:
     """Feed a closer with the walk; ``told`` is what the odometry says of it."""
     truth = walked()
     told = drifting(truth) if told is None else told
@@ -53,14 +55,14 @@ def walk(closer: Closer, room: Room, *, told: Sequence[Transform] | None = None,
     for k, T_world_body in enumerate(told):
         links = [BetweenFactor(k - 1, k, inverse(told[k - 1]) @ T_world_body, LINK)] if k else []
         count = 500 if features is None else features[k]
-        closer.add(
+        detector.add(
             k, track(k, views[k].stamp_ns, T_world_body, links, features=count), partial(views.__getitem__, k)
         )
     return views
 
 
-def accepted(closer: Closer) -> list[LoopClosure]:
-    return [loop for loop in closer.closures() if loop.verdict == "accepted"]
+def accepted(detector: LoopDetector) -> list[LoopClosure]:
+    return [loop for loop in detector.closures() if loop.verdict == "accepted"]
 
 
 def worst_m(loops: Sequence[LoopClosure]) -> float:
@@ -70,28 +72,28 @@ def worst_m(loops: Sequence[LoopClosure]) -> float:
 
 @pytest.mark.parametrize("propose", ["places", "nearby"])
 def test_the_second_lap_closes_on_the_first(propose):
-    closer = PlaceLoopsConfig(propose=propose, places=PLACES).build("batch")
-    walk(closer, Room(1))
-    found = accepted(closer)
+    detector = PlaceLoopsConfig(propose=propose, places=PLACES).build("batch")
+    walk(detector, Room(1))
+    found = accepted(detector)
     assert len({loop.j for loop in found}) >= 0.8 * (NODES - LAP)
     assert worst_m(found) < 0.05
     assert {loop.proposed_by for loop in found} == {propose}
 
 
 def test_loops_correct_what_is_believed():
-    closer = PlaceLoopsConfig(places=PLACES).build("batch")
-    walk(closer, Room(1))
+    detector = PlaceLoopsConfig(places=PLACES).build("batch")
+    walk(detector, Room(1))
     truth = walked()
     drifted = drifting(truth)
-    end = closer.believed(NODES - 1)
+    end = detector.current_estimate(NODES - 1)
     assert np.linalg.norm(drifted[-1][:3, 3] - truth[-1][:3, 3]) > 0.1
     assert np.linalg.norm(end[:3, 3] - truth[-1][:3, 3]) < 0.05
 
 
 def test_every_candidate_gets_a_verdict():
-    closer = PlaceLoopsConfig(places=PLACES).build("batch")
-    walk(closer, Room(1))
-    for loop in closer.closures():
+    detector = PlaceLoopsConfig(places=PLACES).build("batch")
+    walk(detector, Room(1))
+    for loop in detector.closures():
         assert (loop.verdict == "rejected") == bool(loop.reason)
         assert loop.stamp_j_ns - loop.stamp_i_ns >= 5 * NS_PER_S
 
@@ -99,9 +101,9 @@ def test_every_candidate_gets_a_verdict():
 def test_two_runs_tell_the_same():
     runs = []
     for _ in range(2):
-        closer = PlaceLoopsConfig(places=PLACES).build("batch")
-        walk(closer, Room(1))
-        runs.append([(loop.i, loop.j, loop.reason, loop.similarity) for loop in closer.closures()])
+        detector = PlaceLoopsConfig(places=PLACES).build("batch")
+        walk(detector, Room(1))
+        runs.append([(loop.i, loop.j, loop.reason, loop.similarity) for loop in detector.closures()])
     assert runs[0] == runs[1]
 
 
@@ -109,27 +111,27 @@ def test_the_gate_refuses_what_odometry_rules_out():
     gate = GateConfig(
         slack_m=0.01, slack_rad=0.01, drift_ratio=0.0, drift_rad_per_m=0.0, drift_rad_per_rad=0.0
     )
-    closer = PlaceLoopsConfig(places=PLACES, gate=gate).build("batch")
-    walk(closer, Room(1))
-    assert not accepted(closer)
-    assert any(loop.reason.startswith("gate: ") for loop in closer.closures())
+    detector = PlaceLoopsConfig(places=PLACES, gate=gate).build("batch")
+    walk(detector, Room(1))
+    assert not accepted(detector)
+    assert any(loop.reason.startswith("gate: ") for loop in detector.closures())
 
 
 def test_a_loop_without_company_is_not_believed():
-    closer = PlaceLoopsConfig(places=PLACES, min_agreeing=NODES).build("batch")
-    walk(closer, Room(1))
-    assert not accepted(closer)
-    assert any(loop.reason.startswith("alone: ") for loop in closer.closures())
+    detector = PlaceLoopsConfig(places=PLACES, min_agreeing=NODES).build("batch")
+    walk(detector, Room(1))
+    assert not accepted(detector)
+    assert any(loop.reason.startswith("alone: ") for loop in detector.closures())
 
 
 def test_a_look_needs_motion():
-    closer = PlaceLoopsConfig(places=PLACES, min_motion_m=10.0, min_motion_rad=10.0).build("batch")
-    walk(closer, Room(1))
-    assert not closer.closures()
+    detector = PlaceLoopsConfig(places=PLACES, min_motion_m=10.0, min_motion_rad=10.0).build("batch")
+    walk(detector, Room(1))
+    assert not detector.closures()
 
 
 def test_words_need_orb_descriptors():
-    closer = PlaceLoopsConfig(propose="places").build("batch")
+    detector = PlaceLoopsConfig(propose="places").build("batch")
     view = Room(1).view(np.eye(4), 0)
     numbers = View(
         0,
@@ -141,38 +143,38 @@ def test_words_need_orb_descriptors():
         view.T_body_camera,
     )
     with pytest.raises(DataError, match="want 256 bits; choose detector 'orb' or 'uniform-orb'"):
-        closer.add(0, track(0, 0, np.eye(4)), lambda: numbers)
+        detector.add(0, track(0, 0, np.eye(4)), lambda: numbers)
 
 
 def test_the_thesis_looks_only_from_sharp_frames():
     sharp = [800 if k % 10 == 5 else 500 for k in range(NODES)]
-    closer = ThesisLoopsConfig(keyframe_interval=5).build("proportional")
-    walk(closer, Room(1), features=sharp)
-    assert closer.closures()
-    assert {loop.j % 10 for loop in closer.closures()} == {5}
-    assert worst_m(accepted(closer)) < 0.05
+    detector = ThesisLoopsConfig(keyframe_interval=5).build("proportional")
+    walk(detector, Room(1), features=sharp)
+    assert detector.closures()
+    assert {loop.j % 10 for loop in detector.closures()} == {5}
+    assert worst_m(accepted(detector)) < 0.05
 
 
 def test_the_thesis_finds_nothing_when_no_frame_is_sharp():
-    closer = ThesisLoopsConfig().build("proportional")
-    walk(closer, Room(1))
-    assert not closer.closures()
+    detector = ThesisLoopsConfig().build("proportional")
+    walk(detector, Room(1))
+    assert not detector.closures()
 
 
 def test_proportional_correction_puts_the_newest_node_where_its_loop_wants_it():
     sharp = [800 if k == 50 else 500 for k in range(NODES)]
-    closer = ThesisLoopsConfig(keyframe_interval=5).build("proportional")
-    walk(closer, Room(1), features=sharp)
-    (closed,) = accepted(closer)
+    detector = ThesisLoopsConfig(keyframe_interval=5).build("proportional")
+    walk(detector, Room(1), features=sharp)
+    (closed,) = accepted(detector)
     assert closed.j == 50
-    miss = discrepancy(closed.T_i_j, closer.believed(closed.i), closer.believed(closed.j))
+    miss = discrepancy(closed.T_i_j, detector.current_estimate(closed.i), detector.current_estimate(closed.j))
     assert miss.translation_m == pytest.approx(0.0, abs=1e-9)
 
 
 def test_no_loops_finds_nothing():
-    closer = NoLoopsConfig().build("batch")
-    walk(closer, Room(1))
-    assert closer.closures() == ()
+    detector = NoLoopsConfig().build("batch")
+    walk(detector, Room(1))
+    assert detector.closures() == ()
 
 
 def test_the_configuration_names_the_kind():

@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 from view_world import Room
 
-from mapper.config.loops import GateConfig, VerificationConfig
-from mapper.config.odometry import MatchConfig
-from mapper.errors import DataError, RunError
-from mapper.geometry import exp, inverse, log, transform
+from mapper.core.errors import DataError, RunError
+from mapper.core.geometry import exp, inverse, log, transform
 from mapper.graph.model import BetweenFactor, PoseSigmas, Solution
 from mapper.graph.noise import with_model_error
-from mapper.loops.agreement import Agreement
 from mapper.loops.closure import (
     Discrepancy,
     LoopClosure,
+    apply_solution,
     discrepancy,
     exceeds,
     read_closures,
-    settled,
     write_closures,
 )
-from mapper.loops.drift import Ways, allowed
+from mapper.loops.config import GateConfig, VerificationConfig
+from mapper.loops.consistency_check import ConsistencyCheck
+from mapper.loops.odometry_chain import OdometryChain, allowed
 from mapper.loops.verification import ImageVerifier
+from mapper.odometry.config import MatchConfig
 
 SURE = PoseSigmas(rotation_rad=0.01, translation_m=0.01).information
 
@@ -127,39 +127,39 @@ def chain(length: int) -> list[BetweenFactor]:
 
 
 def test_the_way_between_two_nodes_is_as_long_as_the_path():
-    ways = Ways()
-    ways.add(chain(10))
-    way = ways.between(2, 9)
-    assert way.path_m == pytest.approx(7.0)
-    assert way.turned_rad == pytest.approx(0.7)
-    assert ways.between(9, 2) == way
+    chain = OdometryChain()
+    chain.add(chain(10))
+    path = chain.between(2, 9)
+    assert path.path_m == pytest.approx(7.0)
+    assert path.turned_rad == pytest.approx(0.7)
+    assert chain.between(9, 2) == path
 
 
 def test_a_loop_shortens_every_way_over_it():
-    ways = Ways()
-    ways.add(chain(10))
-    ways.add([BetweenFactor(0, 10, at(0.1), SURE, "loop")])
-    assert ways.between(1, 9).path_m == pytest.approx(2.1)
+    chain = OdometryChain()
+    chain.add(chain(10))
+    chain.add([BetweenFactor(0, 10, at(0.1), SURE, "loop")])
+    assert chain.between(1, 9).path_m == pytest.approx(2.1)
 
 
 def test_what_nothing_ties_has_no_way():
-    ways = Ways()
-    ways.add(chain(3))
-    ways.add([BetweenFactor(20, 21, at(1.0), SURE)])
-    assert ways.between(0, 21) is None
+    chain = OdometryChain()
+    chain.add(chain(3))
+    chain.add([BetweenFactor(20, 21, at(1.0), SURE)])
+    assert chain.between(0, 21) is None
 
 
 def test_around_a_node_lie_those_within_reach():
-    ways = Ways()
-    ways.add(chain(10))
-    assert sorted(ways.around(5, within_m=2.0)) == [3, 4, 5, 6, 7]
+    chain = OdometryChain()
+    chain.add(chain(10))
+    assert sorted(chain.around(5, within_m=2.0)) == [3, 4, 5, 6, 7]
 
 
 def test_the_gate_widens_with_the_way():
-    ways = Ways()
-    ways.add(chain(40))
+    chain = OdometryChain()
+    chain.add(chain(40))
     gate = GateConfig()
-    near, far = (allowed(gate, ways.between(0, node)) for node in (1, 40))
+    near, far = (allowed(gate, chain.between(0, node)) for node in (1, 40))
     assert far.translation_m == pytest.approx(gate.slack_m + gate.drift_ratio * 40.0)
     assert far.rotation_rad > near.rotation_rad
     assert exceeds(Discrepancy(1.0, 0.0), near)
@@ -183,10 +183,10 @@ class Still:
 @pytest.fixture
 def agreement():
     """Nodes 0 … 40 on a line, a metre apart; one other must agree."""
-    ways = Ways()
-    ways.add([BetweenFactor(k, k + 1, at(1.0), SURE) for k in range(40)])
-    belief = Still({k: at(float(k)) for k in range(41)})
-    return Agreement(ways, belief, GateConfig(), min_agreeing=1, within_m=3.0)
+    chain = OdometryChain()
+    chain.add([BetweenFactor(k, k + 1, at(1.0), SURE) for k in range(40)])
+    estimator = Still({k: at(float(k)) for k in range(41)})
+    return ConsistencyCheck(chain, estimator, GateConfig(), min_agreeing=1, within_m=3.0)
 
 
 def test_a_lone_loop_waits_until_another_tells_the_same(agreement):
@@ -272,7 +272,7 @@ def test_loops_that_the_solver_lets_go_are_rejected():
         loop(0, 2, at(5.0)),
     ]
     solved = Solution({0: at(0.0), 1: at(1.1), 2: at(2.0)}, 1, (0.0,) * 3, (0.0,) * 3, (1.0, 0.9, 0.02))
-    kept, alone, refused = settled(loops, before, solved, min_weight=0.5)
+    kept, alone, refused = apply_solution(loops, before, solved, min_weight=0.5)
     assert kept.verdict == "accepted"
     assert kept.before.translation_m == pytest.approx(0.1)
     assert kept.after.translation_m == pytest.approx(0.0, abs=1e-9)

@@ -5,10 +5,10 @@ import zlib
 import numpy as np
 import pytest
 
-from mapper.config.octree import OctreeConfig
-from mapper.errors import MapFileError, MapSizeError
-from mapper.frames import Scan
+from mapper.core.errors import MapFileError, MapSizeError
+from mapper.core.frames import Scan
 from mapper.octree import blocks
+from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import MAGIC, write_map
 from mapper.octree.octomap_file import read_map

@@ -10,15 +10,15 @@ from evaluators.occupancy import judged_by_points, verdict_metrics
 from evaluators.plots import write_map_errors
 from evaluators.scenes import outdoor_distance_m, scene_distance
 from evaluators.sharpness import Views, sharpness_metrics
-from mapper.config.octree import OctreeConfig
-from mapper.config.synthetic import LidarSynthConfig
-from mapper.errors import DataError, MapperError
+from mapper.core.errors import DataError, MapperError
+from mapper.core.geometry import exp, inverse, transform
 from mapper.export.ply import write_ply
-from mapper.geometry import exp, inverse, transform
+from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import write_bt
-from mapper.sources.synthetic.boxes import Boxes, write_scene
-from mapper.sources.synthetic.lidar import make_outdoor_scene, sample_map
+from mapper.simulation.boxes import Boxes, write_scene
+from mapper.simulation.config import LidarSynthConfig
+from mapper.simulation.lidar import make_outdoor_scene, sample_map
 
 EDGE_M = 0.05
 ROW = np.arange(-1.0, 1.0, 0.02) + 0.01

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from mapper.config.features import OrbConfig
-from mapper.config.odometry import IsvdOdometryConfig, LocalMapConfig, WheelsOdometryConfig
-from mapper.odometry.renumbered import Renumbered
+from mapper.features.config import OrbConfig
+from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig, WheelsOdometryConfig
+from mapper.odometry.node_offset import NodeOffset
 from mapper.sources import open_source
 
 CONFIGS = {"local-map": LocalMapConfig(), "isvd": IsvdOdometryConfig(detector=OrbConfig())}
@@ -52,7 +52,7 @@ def test_isvd_matches_with_the_frame_just_before(desk_log):
 def test_the_first_frame_came_from_nowhere_and_a_lost_one_is_held_by_nothing(config, desk_log):
     ((_, _, matches),) = followed(config, desk_log, count=1)
     assert matches is None or np.isnan(matches.before_px).all()
-    odometry = Renumbered(config.build(), first_node=7)
+    odometry = NodeOffset(config.build(), first_node=7)
     entries = list(open_source(desk_log).entries())
     odometry.track(odometry.read(entries[0]))
     assert odometry.track(odometry.read(entries[1])).node >= 7

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
 from mapper.features.detectors import Features
 from mapper.features.matching import homography_inliers, match_mutual
 

@@ -6,7 +6,7 @@ import lz4.frame
 import pytest
 import zstandard
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
 from mapper.sources.mcap_log import _unpacked
 
 CONTENT = bytes(range(256)) * 400

@@ -10,16 +10,16 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.core.frames import PinholeCamera
+from mapper.core.geometry import exp, inverse
+from mapper.core.rotations import rotation_from_quaternion
+from mapper.core.trajectory import Trajectory
 from mapper.export.foxglove_parts import dotted
-from mapper.export.jpeg import encode_jpeg, shrunk_camera
 from mapper.export.mcap_log import McapLog
-from mapper.frames import PinholeCamera
-from mapper.geometry import exp, inverse
 from mapper.graph.model import BetweenFactor, PoseSigmas
+from mapper.mapping.thumbnails import encode_jpeg, shrunk_camera
 from mapper.octree.slice import OccupancyGrid
-from mapper.rotations import rotation_from_quaternion
-from mapper.trajectory import Trajectory
 
 FIRST_NS = 1305031102175304001  # not a multiple of what float seconds can hold
 PERIOD_NS = 33_333_337

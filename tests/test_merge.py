@@ -8,25 +8,27 @@ import pytest
 from test_summing import COLORED, CONFIG, as_dict, mapped, total
 
 from cli.main import app
-from mapper.config import BuildConfig
-from mapper.config.octree import SliceConfig
-from mapper.errors import ConfigError, DataError, RunError
+from mapper.config.build import BuildConfig
+from mapper.core.errors import ConfigError, DataError, RunError
+from mapper.core.geometry import exp, inverse
+from mapper.core.trajectory import Trajectory
 from mapper.export.grid import read_grid
-from mapper.geometry import exp, inverse
-from mapper.manifest import Input, Manifest
 from mapper.merging import jobs as merging_jobs
 from mapper.merging import steps
 from mapper.merging.merge import merge
 from mapper.merging.merged_map import open_map
 from mapper.merging.placing import Placed, as_built, by_poses, by_truth
+from mapper.octree.config import SliceConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.resampling import blocks_reached, resampled
 from mapper.octree.slice import cut_slice
-from mapper.run import SUMMARY, drafting, load_run
-from mapper.trajectory import Trajectory, write_tum
-from mapper.workers import run_jobs
+from mapper.run.files import SUMMARY
+from mapper.run.folder import load_run, write_run
+from mapper.run.manifest import Input, Manifest
+from mapper.runtime.executor import run_jobs
+from mapper.sources.trajectory_files import write_tum
 
 BAND = SliceConfig(min_height_m=-0.5, max_height_m=0.8)
 MERGE = partial(merge, tile_m=3.2)
@@ -39,11 +41,11 @@ def make_run(path, octree, *, band=BAND, log="sha256:0", T_truth_world=None):
     rng = np.random.default_rng(len(path.name))
     poses = np.array([exp(rng.normal(0, 0.3, 3), rng.normal(0, 1.0, 3)) for _ in range(9)])
     trajectory = Trajectory(np.arange(9) * 100_000_000 + 1, poses)
-    with drafting(path, manifest, config, overwrite=True) as draft:
-        write_map(draft.folder / "map.octree", octree)
-        write_tum(draft.folder / "trajectory.tum", trajectory)
+    with write_run(path, manifest, config, overwrite=True) as writer:
+        write_map(writer.folder / "map.octree", octree)
+        write_tum(writer.folder / "trajectory.tum", trajectory)
         if T_truth_world is not None:
-            write_tum(draft.folder / "truth.tum", trajectory.moved(T_truth_world))
+            write_tum(writer.folder / "truth.tum", trajectory.moved(T_truth_world))
     return load_run(path)
 
 

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from mapper.config.export import MeshConfig
+from mapper.core.frames import PinholeCamera, RgbdFrame, ray_table
+from mapper.core.geometry import apply, inverse, transform
+from mapper.core.rotations import rotation_from_euler
 from mapper.export.mesh import _in_order, _rectified, _Volume
-from mapper.frames import PinholeCamera, RgbdFrame, ray_table
-from mapper.geometry import apply, inverse, transform
-from mapper.rotations import rotation_from_euler
 
 FR1 = (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)
 NORMAL_WORLD, OFFSET_M = np.array([0.28, 0.0, 0.96]), 1.0

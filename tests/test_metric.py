@@ -3,7 +3,7 @@ import json
 import pytest
 
 from evaluators.metric import Metric, json_text, markdown_table, text_table
-from mapper.errors import DataError
+from mapper.core.errors import DataError
 
 METRICS = [
     Metric("matched poses", 786, "pairs"),

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
 from mapper.navigation.costmap import FREE_SPACE, INSCRIBED, LETHAL, NO_INFORMATION, inflate
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 

@@ -4,16 +4,17 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from mapper.config import BuildConfig
-from mapper.config.navigation import PlanConfig
-from mapper.errors import DataError, RunError
+from mapper.config.build import BuildConfig
+from mapper.core.errors import DataError, RunError
+from mapper.core.trajectory import Trajectory
 from mapper.export.mcap_log import McapLog
 from mapper.export.plan import write_plan
-from mapper.manifest import Input, Manifest
+from mapper.navigation.config import PlanConfig
 from mapper.navigation.planner import plan_2d
 from mapper.octree.slice import FREE, OccupancyGrid
-from mapper.run import Run
-from mapper.trajectory import Trajectory, write_tum
+from mapper.run.folder import Run
+from mapper.run.manifest import Input, Manifest
+from mapper.sources.trajectory_files import write_tum
 
 START_NS = 1_700_000_000_000_000_000
 

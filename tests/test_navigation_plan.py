@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 
-from mapper.config.navigation import PlanConfig
-from mapper.config.octree import OctreeConfig
-from mapper.errors import MapSizeError, PlanError
+from mapper.core.errors import MapSizeError, PlanError
+from mapper.navigation.config import PlanConfig
 from mapper.navigation.distance import distance_2d
+from mapper.navigation.line_of_sight import path_length
 from mapper.navigation.planner import plan_2d, plan_3d
 from mapper.navigation.search import shortest_path
-from mapper.navigation.sight import path_length
+from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from mapper.config.navigation import TraversableConfig
-from mapper.config.octree import OctreeConfig
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.navigation.config import TraversableConfig
 from mapper.navigation.traversable import traversable
+from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import read_map, write_ot
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN

@@ -5,17 +5,17 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapper.config.navigation import PlanConfig, TraversableConfig
-from mapper.config.octree import OctreeConfig, SliceConfig
-from mapper.config.synthetic import IDEAL_SENSOR, SynthConfig
 from mapper.export.grid import read_grid, write_grid
+from mapper.navigation.config import PlanConfig, TraversableConfig
 from mapper.navigation.distance import distance_3d
 from mapper.navigation.planner import plan_2d, plan_3d
 from mapper.navigation.traversable import traversable
 from mapper.navigation.voxels import known_box
+from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import FREE, OCCUPIED, cut_slice
-from mapper.sources.synthetic import Boxes, SyntheticSource
+from mapper.simulation import Boxes, SyntheticSource
+from mapper.simulation.config import IDEAL_SENSOR, SynthConfig
 
 CELL = 0.05
 BAND = SliceConfig(min_height_m=0.1, max_height_m=1.2)

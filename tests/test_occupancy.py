@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from evaluators.occupancy import ghosts, occupancy_metrics
-from mapper.config.octree import OctreeConfig
-from mapper.config.synthetic import IDEAL_SENSOR, SynthConfig
-from mapper.errors import DataError
+from mapper.core.errors import DataError
 from mapper.octree.casting import Caster
+from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
-from mapper.octree.sight import pack
-from mapper.sources.synthetic import Boxes, SyntheticSource, read_scene, write_tum_log
+from mapper.octree.scan_update import pack
+from mapper.simulation import Boxes, SyntheticSource, read_scene, write_tum_log
+from mapper.simulation.config import IDEAL_SENSOR, SynthConfig
 
 PLAIN = SynthConfig(
     furniture_per_room=3,

@@ -5,9 +5,9 @@ import pyoctomap
 import pytest
 from octomap_oracle import DATA, FR1_XYZ, fr1_xyz_scans, fuse, voxels
 
-from mapper.config.octree import OctreeConfig
-from mapper.errors import MapFileError, MapSizeError
+from mapper.core.errors import MapFileError, MapSizeError
 from mapper.octree import blocks
+from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap, log_odds
 from mapper.octree.octomap_file import read_map, write_bt, write_ot
 

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from octomap_oracle import FR1_XYZ, KITTI, fr1_xyz_scans, fuse, kitti_scans, voxels
 
-from mapper.config.octree import OctreeConfig
-from mapper.errors import DataError, MapSizeError
-from mapper.frames import Scan
-from mapper.geometry import exp
+from mapper.core.errors import DataError, MapSizeError
+from mapper.core.frames import Scan
+from mapper.core.geometry import exp
 from mapper.octree import blocks, kernels
+from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap, log_odds
 from mapper.octree.octomap_file import write_ot
 

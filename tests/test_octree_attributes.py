@@ -2,12 +2,12 @@ import numpy as np
 import pyoctomap
 import pytest
 
-from mapper.config.octree import OctreeConfig
-from mapper.errors import MapSizeError
-from mapper.frames import Scan
-from mapper.geometry import exp
+from mapper.core.errors import MapSizeError
+from mapper.core.frames import Scan
+from mapper.core.geometry import exp
 from mapper.octree import attributes as layer_module
 from mapper.octree.attributes import NEVER_SEEN
+from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap, log_odds
 from mapper.octree.octomap_file import read_map, write_bt, write_ot
 

@@ -3,8 +3,8 @@ import pytest
 from octomap_oracle import fuse
 from scipy.spatial import cKDTree
 
-from mapper.config.octree import OctreeConfig
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 
 ALL_DEPTHS = pytest.mark.parametrize("depth", range(17))

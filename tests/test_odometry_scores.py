@@ -12,8 +12,8 @@ from evaluators.odometry_scores import (
     rotation_errors_rad,
     step_for,
 )
-from mapper.geometry import exp
-from mapper.trajectory import Trajectory
+from mapper.core.geometry import exp
+from mapper.core.trajectory import Trajectory
 
 FRAME_NS = 100_000_000
 

@@ -4,12 +4,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapper.config.graph import GraphConfig
-from mapper.errors import GraphError
-from mapper.geometry import exp, inverse, transform
+from mapper.core.errors import GraphError
+from mapper.core.geometry import exp, inverse, transform
+from mapper.graph.components import components
+from mapper.graph.config import GraphConfig
 from mapper.graph.g2o import read_g2o
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
-from mapper.graph.optimize import components, optimize
+from mapper.graph.optimize import optimize
 
 POSEGRAPHS = Path(__file__).parents[2] / "shared/data/posegraph"
 needs_posegraphs = pytest.mark.skipif(not POSEGRAPHS.is_dir(), reason=f"{POSEGRAPHS} is not here")

@@ -13,9 +13,9 @@ from evaluators.pairwise import (
     registration_scores,
 )
 from mapper.config.compare import GuessConfig, LidarCompareConfig, RgbdCompareConfig
-from mapper.geometry import exp, inverse, rotation_log
+from mapper.core.geometry import exp, inverse, rotation_log
+from mapper.core.trajectory import Trajectory
 from mapper.registration.base import Alignment, failed
-from mapper.trajectory import Trajectory
 
 FRAME_NS = 100_000_000
 GUESSES = (

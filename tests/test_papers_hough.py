@@ -9,10 +9,11 @@ from evaluators.papers.hough import METHODS, HoughTrial, hough_cells
 from evaluators.papers.hough_pairs import ALL_RINGS, FEW_RINGS, Clouds, LogPair, find_pairs
 from evaluators.papers.hough_tables import hough_reproduction
 from evaluators.scan_pairs import fewer_rings, merged, perturbed
-from mapper.errors import ConfigError, SourceError
-from mapper.frames import Scan
-from mapper.geometry import apply, rotation_exp, transform
-from mapper.trajectory import read_kitti, trajectory_from, write_kitti
+from mapper.core.errors import ConfigError, SourceError
+from mapper.core.frames import Scan
+from mapper.core.geometry import apply, rotation_exp, transform
+from mapper.core.trajectory import trajectory_from
+from mapper.sources.trajectory_files import read_kitti, write_kitti
 
 RELLIS = Path(__file__).parents[2] / "shared/data/rellis_cross_sensor"
 SCANS = 6

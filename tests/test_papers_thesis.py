@@ -13,16 +13,17 @@ from evaluators.papers.measured import CONFIGS, cell_for, cells_of
 from evaluators.papers.model import PaperCell
 from evaluators.papers.thesis import BOOK, ThesisJob, table_of
 from evaluators.papers.thesis_tables import tables
-from mapper.config import load_config
-from mapper.config.odometry import IsvdOdometryConfig
+from mapper.config.loading import load_config
 from mapper.config.seeds import seeded
-from mapper.errors import ConfigError, DataError
-from mapper.geometry import exp
-from mapper.progress import SILENT
-from mapper.solving import solve
+from mapper.core.errors import ConfigError, DataError
+from mapper.core.geometry import exp
+from mapper.core.trajectory import trajectory_from
+from mapper.odometry.config import IsvdOdometryConfig
+from mapper.pipeline.solve import solve
+from mapper.pipeline.track import TrackingResult, track_log
+from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
-from mapper.tracking import Tracking, track_log
-from mapper.trajectory import read_tum, trajectory_from
+from mapper.sources.trajectory_files import read_tum
 
 FR1_XYZ = Path(__file__).parents[2] / "shared/data/tum_fr1_xyz"
 THESIS = sorted((CONFIGS / "thesis").glob("*.toml"))
@@ -112,7 +113,7 @@ def test_settings_followed_together_are_as_each_alone(desk_log):
     for name, config in variants.items():
         tracking = track_log(source, config, progress=SILENT)
         solved = solve(tracking.graph, tracking.loops, config.graph)
-        alone = Tracking(tracking.tracks, (), solved.graph, solved.loops, {}).trajectory()
+        alone = TrackingResult(tracking.tracks, (), solved.graph, solved.loops, {}).trajectory()
         assert together[name].estimate.T_world_body.tobytes() == alone.T_world_body.tobytes(), name
         assert together[name].frames == 10
         assert together[name].lost == 0

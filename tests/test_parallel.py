@@ -2,7 +2,7 @@ import threading
 
 import pytest
 
-from mapper.parallel import ordered_map
+from mapper.runtime.ordered_map import ordered_map
 
 
 @pytest.mark.parametrize("workers", [0, 1, 3])

@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 from view_world import track
 
-from mapper.config.graph import GraphConfig
-from mapper.geometry import exp, inverse
+from mapper.core.geometry import exp, inverse
+from mapper.graph.components import align_components
+from mapper.graph.config import GraphConfig
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.loops.closure import LoopClosure
-from mapper.parts import UNTIED, laid_together, largest_part
-from mapper.progress import SILENT
-from mapper.solving import solve
-from mapper.tracking import Tracking
+from mapper.pipeline.components import DISCONNECTED, largest_component
+from mapper.pipeline.solve import solve
+from mapper.pipeline.track import TrackingResult
+from mapper.runtime.progress import SILENT
 
 SURE = PoseSigmas(rotation_rad=0.01, translation_m=0.01).information
 
@@ -34,7 +35,7 @@ class Listener:
         self.notes.append(message)
 
 
-def two_parts(*, tied: bool) -> Tracking:
+def two_parts(*, tied: bool) -> TrackingResult:
     """Nodes 0 to 2 and, begun anew and turned round, 3 to 7; truly all a metre apart on a line."""
     truth = {node: at(float(node)) for node in range(8)}
     turned = at(2.0, 2.5)
@@ -49,15 +50,15 @@ def two_parts(*, tied: bool) -> Tracking:
     outer = LoopClosure(1, 5, 10, 50, "places", "accepted", T_i_j=at(4.0), information=SURE)
     loops = (inner, outer) if tied else (inner,)
     graph.add_factors(loop.factor for loop in loops)
-    return Tracking(tuple(tracks), (), graph, loops, {})
+    return TrackingResult(tuple(tracks), (), graph, loops, {})
 
 
 def test_only_the_largest_part_is_kept_and_it_is_said():
     listener = Listener()
-    kept = largest_part(two_parts(tied=False), progress=listener)
+    kept = largest_component(two_parts(tied=False), progress=listener)
     assert sorted(kept.graph.T_world_node) == [3, 4, 5, 6, 7]
     assert [t.node for t in kept.tracks] == [None, None, None, 3, 4, 5, 6, 7]
-    assert kept.tracks[0].diagnostics.method == UNTIED
+    assert kept.tracks[0].diagnostics.method == DISCONNECTED
     assert [(loop.verdict, loop.reason.split(":")[0]) for loop in kept.loops] == [("rejected", "untied")]
     assert {(f.i, f.j) for f in kept.graph.factors} == {(3, 4), (4, 5), (5, 6), (6, 7)}
     assert len(kept.trajectory()) == 5
@@ -68,12 +69,12 @@ def test_only_the_largest_part_is_kept_and_it_is_said():
 def test_what_a_loop_ties_is_kept_whole():
     listener = Listener()
     tracking = two_parts(tied=True)
-    assert largest_part(tracking, progress=listener) is tracking
+    assert largest_component(tracking, progress=listener) is tracking
     assert listener.notes == []
 
 
 def test_a_part_is_laid_where_the_loop_wants_it():
-    laid = laid_together(two_parts(tied=True).graph)
+    laid = align_components(two_parts(tied=True).graph)
     for node, T in laid.T_world_node.items():
         np.testing.assert_allclose(T, at(float(node)), atol=1e-9)
     assert list(laid.T_world_node) == list(range(8))
@@ -81,7 +82,7 @@ def test_a_part_is_laid_where_the_loop_wants_it():
 
 def test_a_part_without_a_tie_stays():
     graph = two_parts(tied=False).graph
-    laid = laid_together(graph)
+    laid = align_components(graph)
     for node, T in laid.T_world_node.items():
         np.testing.assert_array_equal(T, graph.T_world_node[node])
 

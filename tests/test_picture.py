@@ -4,10 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from mapper.export.palette import ESTIMATE, FACTORS, TRUTH, height_colors
+from mapper.core.trajectory import Trajectory
+from mapper.export.palette import ESTIMATE, FACTORS, TRUTH
 from mapper.export.picture import splat, write_cloud_views, write_summary
+from mapper.mapping.cloud import height_colors
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from mapper.trajectory import Trajectory
 
 
 def room():

@@ -7,13 +7,14 @@ import pytest
 from mcap.reader import make_reader
 
 from evaluators.trajectory import align, associate, ate
-from mapper.config import load_config, overridden
-from mapper.errors import ConfigError, RunError, TrackingError
+from mapper.config.loading import load_config, overridden
+from mapper.core.errors import ConfigError, RunError, TrackingError
 from mapper.export.grid import read_grid
-from mapper.manifest import read_manifest
 from mapper.octree.octomap_file import read_map
-from mapper.pipeline import build, fuse
-from mapper.run import load_run
+from mapper.pipeline.build import build
+from mapper.pipeline.fuse import fuse
+from mapper.run.folder import load_run
+from mapper.run.manifest import read_manifest
 from mapper.sources import open_source
 
 REPEATABLE = "mcap.frame_times=false"
@@ -38,7 +39,7 @@ def files_of(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-class Watcher:
+class Observer:
     """Interrupts a stage, or remembers what it was told."""
 
     def __init__(self, interrupt=None):
@@ -181,16 +182,16 @@ def test_bad_frames_are_skipped_counted_and_reported(damaged_log, tmp_path):
     images[5].write_bytes(images[5].read_bytes()[:500])
     depths = sorted((damaged_log / "depth").iterdir())
     depths[9].write_bytes(b"")
-    watcher = Watcher()
+    observer = Observer()
 
-    run = build_run(damaged_log, tmp_path / "run", progress=watcher)
+    run = build_run(damaged_log, tmp_path / "run", progress=observer)
 
     assert run.manifest.counts.skipped == len(run.manifest.skipped) == 2
     assert run.manifest.counts.tracked == 29
     assert images[5].name in run.manifest.skipped[0].reason
     assert [record.outcome for record in run.records()].count("skipped") == 2
-    assert sum(note.startswith("skipped: ") for note in watcher.notes) == 2
-    assert watcher.reached == {"track": (31, 31), "fuse": (29, 29)}
+    assert sum(note.startswith("skipped: ") for note in observer.notes) == 2
+    assert observer.reached == {"track": (31, 31), "fuse": (29, 29)}
 
 
 def test_a_log_without_texture_ends_in_an_error_and_leaves_what_there_is(damaged_log, tmp_path):
@@ -220,7 +221,7 @@ def test_an_interrupted_build_says_so_and_spares_the_old_run(run, desk_log, tmp_
     before = files_of(old)
 
     with pytest.raises(KeyboardInterrupt):
-        build_run(desk_log, old, progress=Watcher(interrupt=stage), overwrite=True)
+        build_run(desk_log, old, progress=Observer(interrupt=stage), overwrite=True)
 
     assert files_of(old) == before
     assert json.loads((tmp_path / "run.partial" / "manifest.json").read_text())["status"] == "interrupted"

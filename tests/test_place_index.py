@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from mapper.config.features import UniformOrbConfig
-from mapper.config.places import PlacesConfig, VocabularyConfig
-from mapper.config.synthetic import SynthConfig
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.features.config import UniformOrbConfig
 from mapper.features.windowed import match_everywhere, pack
+from mapper.places.config import PlacesConfig, VocabularyConfig
 from mapper.places.guided import match_by_word
 from mapper.places.index import PlaceIndex
 from mapper.places.training import train
 from mapper.places.vocabulary import ONE, WordVector, load_vocabulary, similarity
-from mapper.sources.synthetic import SyntheticSource
+from mapper.simulation import SyntheticSource
+from mapper.simulation.config import SynthConfig
 
 MATCHING = {"max_hamming": 64, "max_ratio": 0.85}
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
 from mapper.export.ply import write_ply
 
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from evaluators.trajectory import align, associate, ate
-from mapper.config import load_config
-from mapper.config.odometry import PnpConfig
-from mapper.config.synthetic import SynthConfig
-from mapper.geometry import angle_between, apply, exp, inverse
+from mapper.config.loading import load_config
+from mapper.core.geometry import angle_between, apply, exp, inverse
+from mapper.core.trajectory import trajectory_from
+from mapper.odometry.config import PnpConfig
 from mapper.odometry.local_map.p3p import ransac_p3p
-from mapper.sources.synthetic.source import SyntheticSource
-from mapper.trajectory import trajectory_from
+from mapper.simulation.config import SynthConfig
+from mapper.simulation.source import SyntheticSource
 
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5])
 PAPER = Path(__file__).parents[1] / "configs" / "zhao.toml"

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mapper.geometry import angle_between, apply, exp, inverse
-from mapper.linear import twist_exp
+from mapper.core.geometry import angle_between, apply, exp, inverse
+from mapper.core.linear import twist_exp
 from mapper.odometry.local_map.bundle import adjust
 from mapper.odometry.local_map.pose import normal_matrix, refine_pose
 

@@ -3,9 +3,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapper.config.graph import GraphConfig
-from mapper.errors import GraphError
-from mapper.geometry import exp, inverse, is_rigid, rotation_exp, rotation_log, transform
+from mapper.core.errors import GraphError
+from mapper.core.geometry import exp, inverse, is_rigid, rotation_exp, rotation_log, transform
+from mapper.graph.config import GraphConfig
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.graph.optimize import optimize
 from mapper.graph.proportional import distribute, spread

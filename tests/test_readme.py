@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from mapper.config.synthetic import STREET, LidarSensorConfig
-from mapper.sources.synthetic.lidar import write_lidar_log
+from mapper.simulation.config import STREET, LidarSensorConfig
+from mapper.simulation.lidar import write_lidar_log
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

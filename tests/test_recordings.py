@@ -13,9 +13,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as FolderWriter
 
-from mapper.errors import FrameError, SourceError
-from mapper.frames import PinholeCamera
-from mapper.parallel import ordered_map
+from mapper.core.errors import FrameError, SourceError
+from mapper.core.frames import PinholeCamera
+from mapper.runtime.ordered_map import ordered_map
 from mapper.sources import open_source
 
 KINDS = ["log.mcap", "log.bag", "log"]

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from messages_made import write
 
-from mapper.config import load_config
-from mapper.progress import SILENT
+from mapper.config.loading import load_config
+from mapper.core.timebase import NS_PER_S
+from mapper.pipeline.track import track_log
+from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
 from mapper.sources.mcap_log import open_mcap
 from mapper.sources.ros.writing import COLOR, DEPTH, Written
 from mapper.sources.writers import write_log
-from mapper.timebase import NS_PER_S
-from mapper.tracking import track_log
 
 Messages = Sequence[Written]
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from kiss_icp.datasets.rosbag import RosbagDataset
 
-from mapper.config import load_config
-from mapper.config.sources import SourceConfig
-from mapper.progress import SILENT
+from mapper.config.loading import load_config
+from mapper.pipeline.track import track_log
+from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
+from mapper.sources.config import SourceConfig
 from mapper.sources.writers import write_log
-from mapper.tracking import track_log
 
 DATA = Path(__file__).parents[2] / "shared/data"
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import small_gicp
 
-from mapper.geometry import apply, exp, inverse
+from mapper.core.geometry import apply, exp, inverse
 from mapper.registration.refining import measured, refine
 from mapper.registration.surfaces import prepared
 

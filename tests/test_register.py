@@ -10,19 +10,19 @@ from typer.testing import CliRunner
 from cli.main import app
 from evaluators.register import register
 from evaluators.register_files import registration_text
-from mapper.config.hough import HoughGicpConfig
-from mapper.config.odometry import IsvdOdometryConfig
 from mapper.config.register import register_config
-from mapper.config.registration import GicpConfig
-from mapper.config.synthetic import STREET, LidarSensorConfig
-from mapper.errors import ConfigError
-from mapper.frames import Scan
-from mapper.geometry import apply, exp, inverse
+from mapper.core.errors import ConfigError
+from mapper.core.frames import Scan
+from mapper.core.geometry import apply, exp, inverse
+from mapper.core.rotations import rotation_from_euler
+from mapper.odometry.config import IsvdOdometryConfig
+from mapper.registration.config import GicpConfig
 from mapper.registration.guess import parse_guess
-from mapper.rotations import rotation_from_euler
+from mapper.registration.hough_config import HoughGicpConfig
+from mapper.simulation.config import STREET, LidarSensorConfig
+from mapper.simulation.lidar import SyntheticLidarSource
 from mapper.sources import open_source
 from mapper.sources.clouds import read_scan
-from mapper.sources.synthetic.lidar import SyntheticLidarSource
 
 T_TURNED = exp(np.array([0.0, 0.0, 1.2]), np.array([3.0, -2.0, 0.0]))
 

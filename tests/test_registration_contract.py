@@ -5,11 +5,11 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from mapper.config.registration import RegistrationConfig
-from mapper.config.synthetic import STREET, LidarSensorConfig
-from mapper.frames import Scan
-from mapper.geometry import angle_between, apply, exp, inverse
-from mapper.sources.synthetic.lidar import SyntheticLidarSource
+from mapper.core.frames import Scan
+from mapper.core.geometry import angle_between, apply, exp, inverse
+from mapper.registration.config import RegistrationConfig
+from mapper.simulation.config import STREET, LidarSensorConfig
+from mapper.simulation.lidar import SyntheticLidarSource
 
 EVERY_METHOD = [member() for member in get_args(get_args(RegistrationConfig)[0])]
 NEEDS_NO_GUESS = [

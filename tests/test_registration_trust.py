@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from mapper.config.registration import KissMatcherConfig, NdtConfig, TrustConfig
-from mapper.frames import Scan
-from mapper.geometry import apply, exp
+from mapper.core.frames import Scan
+from mapper.core.geometry import apply, exp
+from mapper.registration.acceptance import assess
+from mapper.registration.config import KissMatcherConfig, NdtConfig, TrustConfig
 from mapper.registration.kiss_matcher import KissMatcher
 from mapper.registration.ndt import Ndt, refine_by_cells
 from mapper.registration.refining import measured
 from mapper.registration.surfaces import prepared
-from mapper.registration.trust import judged
 
 VOXEL_M = 0.3
 
@@ -36,7 +36,7 @@ def clouds():
 
 
 def test_the_right_motion_is_believed(clouds):
-    alignment = judged(*clouds, np.eye(4), TrustConfig())
+    alignment = assess(*clouds, np.eye(4), TrustConfig())
     assert alignment.converged, alignment.reason
     assert alignment.inlier_ratio > 0.9
 
@@ -46,7 +46,7 @@ def test_a_wrong_motion_over_the_same_floor_is_not(clouds, turn_rad):
     wrong = exp(np.array([0.0, 0.0, turn_rad]), np.array([3.0, -2.0, 0.0]))
     assert measured(*clouds, wrong, max_pair_distance_m=1.0).inlier_ratio > 0.75
 
-    alignment = judged(*clouds, wrong, TrustConfig())
+    alignment = assess(*clouds, wrong, TrustConfig())
 
     assert not alignment.converged
     assert "surfaces that face" in alignment.reason
@@ -59,7 +59,7 @@ def test_a_floor_alone_is_degenerate_and_the_reason_says_along_what():
         prepared(np.column_stack([*rng.uniform(-20.0, 20.0, (2, 50_000)), np.zeros(50_000)]), voxel_m=VOXEL_M)
         for _ in range(2)
     ]
-    alignment = judged(*floors, np.eye(4), TrustConfig())
+    alignment = assess(*floors, np.eye(4), TrustConfig())
     assert not alignment.converged
     assert alignment.reason == "degenerate: no surface shows translation along x and y, rotation about z"
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from mapper.config.odometry import LocalMapConfig, PnpConfig
-from mapper.config.synthetic import SynthConfig
-from mapper.frames import RgbdFrame
-from mapper.geometry import angle_between, inverse
+from mapper.core.frames import RgbdFrame
+from mapper.core.geometry import angle_between, inverse
+from mapper.graph.components import components
 from mapper.graph.model import PoseGraph
-from mapper.graph.optimize import components
-from mapper.sources.synthetic.source import SyntheticSource
+from mapper.odometry.config import LocalMapConfig, PnpConfig
+from mapper.simulation.config import SynthConfig
+from mapper.simulation.source import SyntheticSource
 
 RATE_HZ = 15.0
 BOTH = pytest.mark.parametrize("config", [LocalMapConfig(), PnpConfig()], ids=lambda config: config.kind)
@@ -125,11 +125,11 @@ def test_the_better_of_two_weak_placements_wins(frames, order):
     config = LocalMapConfig(weak_inliers=10_000)
     odometry = config.build()
     tracked(frames[:12], odometry)
-    recall, observation = odometry._recall, odometry.observe(frames[12])
+    relocalizer, observation = odometry._relocalizer, odometry.observe(frames[12])
     keyframes = range(len(odometry._map.keyframes))[::order]
-    alone = [recall.among([k], observation, method="alone") for k in keyframes]
+    alone = [relocalizer.among([k], observation, method="alone") for k in keyframes]
 
-    best = recall.among(keyframes, observation, method="all")
+    best = relocalizer.among(keyframes, observation, method="all")
 
-    assert sum(placement is not None for placement in alone) > 1
-    assert best.inliers == max(placement.inliers for placement in alone if placement is not None)
+    assert sum(tracked_pose is not None for tracked_pose in alone) > 1
+    assert best.inliers == max(tracked_pose.inliers for tracked_pose in alone if tracked_pose is not None)

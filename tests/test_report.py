@@ -10,12 +10,12 @@ from typer.testing import CliRunner
 
 from cli.main import app
 from evaluators.evaluate import evaluate
-from mapper.config import BuildConfig
-from mapper.errors import ConfigError
+from mapper.config.build import BuildConfig
+from mapper.core.errors import ConfigError
 from mapper.export.report.data import Figure, chapter_of, drawn
 from mapper.export.report.page import page_of, write_report
-from mapper.pipeline import build
-from mapper.run import load_run
+from mapper.pipeline.build import build
+from mapper.run.folder import load_run
 from mapper.sources import open_source
 
 HOSTILE = "</script><img src=x onerror=alert(1)>&\"'"
@@ -214,11 +214,11 @@ def test_the_loops_table_sorts_and_sifts(runs, tmp_path):
     chapter = chapter_of(runs[0], "desk", [])
     rejected = [
         replace(loop, verdict="rejected", reason="isvd: too few", i=k)
-        for k, loop in enumerate(chapter.story.loops[:3] or _some_loops(chapter))
+        for k, loop in enumerate(chapter.results.loops[:3] or _some_loops(chapter))
     ]
     path = tmp_path / "report.html"
     write_report(
-        path, [replace(chapter, story=replace(chapter.story, loops=(*rejected, *_some_loops(chapter))))]
+        path, [replace(chapter, results=replace(chapter.results, loops=(*rejected, *_some_loops(chapter))))]
     )
     first = "[...document.querySelectorAll('.loops tbody tr')].map(e => Number(e.firstChild.textContent))"
     with Page(path) as browser:
@@ -237,7 +237,7 @@ def test_the_loops_table_sorts_and_sifts(runs, tmp_path):
 def _some_loops(chapter):
     from mapper.loops.closure import LoopClosure
 
-    graph = chapter.story.graph
+    graph = chapter.results.graph
     nodes = list(graph.T_world_node)
     return [
         LoopClosure(

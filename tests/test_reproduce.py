@@ -13,7 +13,7 @@ from evaluators.papers.book import Cut
 from evaluators.papers.reproduce import Request, reproduce
 from evaluators.papers.thesis import ThesisJob
 from evaluators.papers.zhao import TABLES, ZhaoJob
-from mapper.errors import ConfigError, DataError, RunError, SourceError
+from mapper.core.errors import ConfigError, DataError, RunError, SourceError
 
 
 @pytest.fixture

@@ -10,19 +10,20 @@ from typer.testing import CliRunner
 
 from cli.build import _onlooker, built
 from cli.main import app
-from mapper.config import BuildConfig, RerunConfig
-from mapper.errors import ConfigError, DataError, ViewerError
+from mapper.config.build import BuildConfig
+from mapper.config.export import RerunConfig
+from mapper.core.errors import ConfigError, DataError, ViewerError
+from mapper.core.frames import Scan
 from mapper.export.rerun.finished import show_run
 from mapper.export.rerun.live import LiveRerun
 from mapper.export.rerun.recording import recorded
 from mapper.export.rerun.target import check_target
 from mapper.export.run_maps import maps_of, snapshots_of
-from mapper.frames import Scan
-from mapper.odometry.base import Diagnostics, Track
-from mapper.pipeline import build
-from mapper.run import load_run
+from mapper.odometry.base import Diagnostics, FrameResult
+from mapper.pipeline.build import build
+from mapper.run.folder import load_run
+from mapper.run.observers import Step
 from mapper.sources import open_source
-from mapper.watching import Step
 
 RERUN = Path(sys.executable).with_name("rerun")
 
@@ -284,8 +285,8 @@ def test_what_was_believed_ends_up_in_the_levelled_world(live):
     positions = np.array(
         [value[0] for _, value in told.values("/world/live/body", "Transform3D:translation")]
     )
-    levelled = positions @ T[:3, :3].T + T[:3, 3]
-    assert np.abs(levelled - run.trajectory().positions_world).max() < 0.03  # what loops have moved
+    on_levelled = positions @ T[:3, :3].T + T[:3, 3]
+    assert np.abs(on_levelled - run.trajectory().positions_world).max() < 0.03  # what loops have moved
 
     paths = [value for _, value in told.values("/world/live/believed", "LineStrips3D:strips") if value]
     assert len(paths[-1][0]) > 0.9 * run.manifest.counts.nodes
@@ -307,11 +308,11 @@ def test_the_results_follow(live):
 
 
 def test_a_scan_is_a_cloud_without_an_image(tmp_path):
-    class Entry:
+    class FrameRef:
         def load(self):
             return Scan(7, np.zeros((50_000, 3), np.float32))
 
-    class Closer:
+    class LoopDetector:
         def closures(self):
             return ()
 
@@ -321,9 +322,9 @@ def test_a_scan_is_a_cloud_without_an_image(tmp_path):
     path = tmp_path / "scan.rrd"
     diagnostics = Diagnostics(50_000, 100, 90, 0.1, "m", "icp")
     with recorded(str(path), name="scan", has_images=False, body="world/live/body") as log:
-        watcher = LiveRerun(log, "lidar", RerunConfig(cloud_points=10_000))
-        track = Track(7, 0, np.eye(4), np.eye(4), True, diagnostics)
-        watcher.stepped(Step(Entry(), track, lambda: None, lambda: None, Closer()))
+        observer = LiveRerun(log, "lidar", RerunConfig(cloud_points=10_000))
+        track = FrameResult(7, 0, np.eye(4), np.eye(4), True, diagnostics)
+        observer.on_frame(Step(FrameRef(), track, lambda: None, lambda: None, LoopDetector()))
     told = Told(path)
     assert len(told.values("/world/live/body/cloud", "Points3D:positions")[0][1]) == 10_000
     assert "/world/live/body/camera" not in told.chunks

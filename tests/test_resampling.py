@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from test_summing import COLORED, CONFIG, as_dict, mapped
 
-from mapper.errors import MapSizeError
-from mapper.geometry import apply, exp, inverse
+from mapper.core.errors import MapSizeError
+from mapper.core.geometry import apply, exp, inverse
 from mapper.octree.map import OctreeMap
 from mapper.octree.resampling import blocks_reached, resampled
 

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from mapper.errors import DataError, FrameError
-from mapper.frames import Scan
-from mapper.geometry import exp
+from mapper.core.errors import DataError, FrameError
+from mapper.core.frames import Scan
+from mapper.core.geometry import exp
 from mapper.sources.ros.clouds import scan_from, structured
 from mapper.sources.ros.messages import CloudMessage
 from mapper.sources.ros.recording import Topic

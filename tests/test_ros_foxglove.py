@@ -10,12 +10,12 @@ from foxglove import messages
 from foxglove.messages import PackedElementFieldNumericType as NumericType
 from mcap.writer import Writer
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.core.timebase import NS_PER_S
 from mapper.sources import open_source
 from mapper.sources.ros.foxglove import decode_foxglove, stamp_of
 from mapper.sources.ros.messages import decode
 from mapper.sources.ros.recording import Topic
-from mapper.timebase import NS_PER_S
 
 STAMP = messages.Timestamp(sec=FIRST_NS // NS_PER_S, nsec=FIRST_NS % NS_PER_S)
 JSON_STAMP = {"sec": FIRST_NS // NS_PER_S, "nsec": FIRST_NS % NS_PER_S}

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from conftest import picture
 
-from mapper.errors import FrameError
+from mapper.core.errors import FrameError
 from mapper.sources.ros.images import depth_m_of, image_of, is_depth, size_of
 from mapper.sources.ros.messages import FileMessage, PixelsMessage
 

@@ -6,12 +6,12 @@ from conftest import FIRST_NS, PERIOD_NS, picture
 from messages_made import CAMERA, COLOR, DEPTH, camera_info, image, shots, write
 from rosbags.typesys import Stores, get_typestore
 
-from mapper.config.sources import CameraConfig, SourceConfig, TopicsConfig
-from mapper.errors import FrameError, SourceError
-from mapper.frames import PinholeCamera, Scan
-from mapper.geometry import exp
-from mapper.rotations import quaternion_from_rotation
+from mapper.core.errors import FrameError, SourceError
+from mapper.core.frames import PinholeCamera, Scan
+from mapper.core.geometry import exp
+from mapper.core.rotations import quaternion_from_rotation
 from mapper.sources import open_source
+from mapper.sources.config import CameraConfig, SourceConfig, TopicsConfig
 from mapper.sources.ros.writing import Written
 from mapper.sources.rosbag_writing import cloud_message, imu_message, pose_message
 from mapper.sources.writers import write_log

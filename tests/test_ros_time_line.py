@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from mapper.errors import SourceError
+from mapper.core.errors import SourceError
+from mapper.core.timebase import NS_PER_S
 from mapper.sources.ros.index import Series
 from mapper.sources.ros.recording import Topic
 from mapper.sources.ros.time_line import ordered, paired
-from mapper.timebase import NS_PER_S
 
 MS = 1_000_000
 

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapper.errors import DataError
-from mapper.rotations import (
+from mapper.core.errors import DataError
+from mapper.core.rotations import (
     euler_from_rotation,
     quaternion_from_rotation,
     rotation_from_euler,

@@ -3,25 +3,25 @@ import os
 
 import pytest
 
-from mapper.config import BuildConfig
-from mapper.errors import RunError, TrackingError
-from mapper.fingerprint import fingerprint
-from mapper.manifest import Input, Manifest, read_manifest
+from mapper.config.build import BuildConfig
+from mapper.core.errors import RunError, TrackingError
 from mapper.odometry.base import Diagnostics
-from mapper.records import FrameRecord, read_frame_ms, read_records, write_frame_ms, write_records
-from mapper.run import drafting, load_run
-from mapper.staging import partial_of, staged
+from mapper.run.fingerprint import fingerprint
+from mapper.run.folder import load_run, write_run
+from mapper.run.frame_records import FrameRecord, read_frame_ms, read_records, write_frame_ms, write_records
+from mapper.run.manifest import Input, Manifest, read_manifest
+from mapper.runtime.atomic import atomic_folder, partial_of
 
 MANIFEST = Manifest(status="building", input=Input(path="/log", kind="tum", fingerprint="sha256:0"))
 
 
 def draft_of(out, *, overwrite=False):
-    return drafting(out, MANIFEST, BuildConfig(workers=1), overwrite=overwrite)
+    return write_run(out, MANIFEST, BuildConfig(workers=1), overwrite=overwrite)
 
 
 def make_run(out, text, *, overwrite=False, error=None):
-    with draft_of(out, overwrite=overwrite) as draft:
-        (draft.folder / "trajectory.tum").write_text(text)
+    with draft_of(out, overwrite=overwrite) as writer:
+        (writer.folder / "trajectory.tum").write_text(text)
         if error is not None:
             raise error
 
@@ -29,9 +29,9 @@ def make_run(out, text, *, overwrite=False, error=None):
 def test_a_run_appears_only_when_it_is_whole(tmp_path):
     out = tmp_path / "runs" / "lab"
 
-    with draft_of(out) as draft:
+    with draft_of(out) as writer:
         assert not out.exists()
-        assert read_manifest(draft.folder / "manifest.json").status == "building"
+        assert read_manifest(writer.folder / "manifest.json").status == "building"
 
     run = load_run(out)
     assert run.manifest.status == "complete"
@@ -101,17 +101,17 @@ def test_folders_that_are_not_ours_are_never_replaced(tmp_path, place):
     precious.parent.mkdir()
     precious.write_text("years")
 
-    with pytest.raises(RunError), staged(tmp_path / "lab", overwrite=True):
+    with pytest.raises(RunError), atomic_folder(tmp_path / "lab", overwrite=True):
         pytest.fail("the body must not run")
     assert precious.read_text() == "years"
 
 
 def test_two_builds_of_one_run_do_not_mix(tmp_path):
-    with staged(tmp_path / "lab") as partial:
+    with atomic_folder(tmp_path / "lab") as partial:
         handle = os.open(partial, os.O_RDONLY)
         with pytest.raises(BlockingIOError):
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        with pytest.raises(RunError, match="another process"), staged(tmp_path / "lab"):
+        with pytest.raises(RunError, match="another process"), atomic_folder(tmp_path / "lab"):
             pytest.fail("the body must not run")
         os.close(handle)
 

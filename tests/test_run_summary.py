@@ -6,13 +6,14 @@ import pytest
 from evaluators.evaluate import judged
 from evaluators.plots import write_trajectory_errors
 from evaluators.run_summary import summary
-from mapper import run as files
-from mapper.config import BuildConfig
-from mapper.errors import DataError
-from mapper.geometry import exp, transform
-from mapper.manifest import Counts, Input, Manifest
-from mapper.run import Run
-from mapper.trajectory import Trajectory, write_tum
+from mapper.config.build import BuildConfig
+from mapper.core.errors import DataError
+from mapper.core.geometry import exp, transform
+from mapper.core.trajectory import Trajectory
+from mapper.run import files
+from mapper.run.folder import Run
+from mapper.run.manifest import Counts, Input, Manifest
+from mapper.sources.trajectory_files import write_tum
 
 STAMPS_NS = 1_305_031_102_000_000_000 + np.arange(120, dtype=np.int64) * 100_000_000
 ERRORS = ("ate_m", "rpe_1s_m", "rpe_1s_rad", "relative_translation_ratio", "relative_rotation_radpm")

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scan_world import MOUNT_M, on_street, street, view
 
-from mapper.config.places import ScanContextConfig
-from mapper.errors import DataError
-from mapper.geometry import apply, rotation_exp, transform
+from mapper.core.errors import DataError
+from mapper.core.geometry import apply, rotation_exp, transform
+from mapper.places.config import ScanContextConfig
 from mapper.places.scan_context import ScanContexts, scan_context
 
 CONFIG = ScanContextConfig()

@@ -9,15 +9,15 @@ import pytest
 from scan_world import on_street, street, view
 from view_world import Room, track
 
-from mapper.config import load_config
-from mapper.config.loops import PlaceLoopsConfig, ScanLoopsConfig, ScanVerificationConfig, ThesisLoopsConfig
-from mapper.errors import ConfigError
+from mapper.config.loading import load_config
+from mapper.core.errors import ConfigError
+from mapper.core.geometry import Transform, exp, inverse
+from mapper.core.timebase import NS_PER_S
 from mapper.features.scan_view import ScanView
-from mapper.geometry import Transform, exp, inverse
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
-from mapper.loops.closer import KeyframeLoops
 from mapper.loops.closure import LoopClosure, discrepancy
-from mapper.timebase import NS_PER_S
+from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig, ScanVerificationConfig, ThesisLoopsConfig
+from mapper.loops.detector import KeyframeLoopDetector
 
 STEP_M = 3.0
 LINK = PoseSigmas(rotation_rad=0.002, translation_m=0.05).information
@@ -47,24 +47,24 @@ def drifting(truth: Sequence[Transform]) -> list[Transform]:
 
 
 def feed(
-    closer: KeyframeLoops, told: Sequence[Transform], views: Sequence[ScanView], *, first: int = 0
+    detector: KeyframeLoopDetector, told: Sequence[Transform], views: Sequence[ScanView], *, first: int = 0
 ) -> None:
     """Add keyframes, two a second."""
     for k, (T, seen) in enumerate(zip(told, views, strict=True)):
         node, stamp_ns = first + k, (first + k) * NS_PER_S // 2
         links = [BetweenFactor(node - 1, node, inverse(told[k - 1]) @ T, LINK)] if k else []
         timed = ScanView(stamp_ns, seen.points_body)
-        closer.add(node, track(node, stamp_ns, T, links), lambda timed=timed: timed)
+        detector.add(node, track(node, stamp_ns, T, links), lambda timed=timed: timed)
 
 
-def driven(truth: Sequence[Transform], views: Sequence[ScanView], **config) -> KeyframeLoops:
-    closer = ScanLoopsConfig(min_motion_m=1.0, **config).build("batch")
-    feed(closer, drifting(truth), views)
-    return closer
+def driven(truth: Sequence[Transform], views: Sequence[ScanView], **config) -> KeyframeLoopDetector:
+    detector = ScanLoopsConfig(min_motion_m=1.0, **config).build("batch")
+    feed(detector, drifting(truth), views)
+    return detector
 
 
-def accepted(closer: KeyframeLoops) -> list[LoopClosure]:
-    return [loop for loop in closer.closures() if loop.verdict == "accepted"]
+def accepted(detector: KeyframeLoopDetector) -> list[LoopClosure]:
+    return [loop for loop in detector.closures() if loop.verdict == "accepted"]
 
 
 def worst_m(loops: Sequence[LoopClosure], truth: Sequence[Transform]) -> float:
@@ -73,14 +73,14 @@ def worst_m(loops: Sequence[LoopClosure], truth: Sequence[Transform]) -> float:
 
 def test_a_lap_closes_on_its_beginning():
     truth, views = drive(1, 0, 180)
-    closer = driven(truth, views)
+    detector = driven(truth, views)
     again = range(round(street(1).route.length_m / STEP_M) + 1, len(truth))
-    found = accepted(closer)
+    found = accepted(detector)
     assert {loop.j for loop in found} >= set(again)
     assert worst_m(found, truth) < 0.15
     told = drifting(truth)
     assert discrepancy(truth[-1], np.eye(4), told[-1]).translation_m > 1.0
-    assert discrepancy(truth[-1], np.eye(4), closer.believed(len(truth) - 1)).translation_m < 0.5
+    assert discrepancy(truth[-1], np.eye(4), detector.current_estimate(len(truth) - 1)).translation_m < 0.5
 
 
 def test_a_street_driven_back_on_the_other_lane_is_the_same_street():
@@ -97,15 +97,15 @@ def test_a_street_driven_back_on_the_other_lane_is_the_same_street():
 @pytest.mark.parametrize("tied", [True, False])
 def test_another_street_is_another_street(tied):
     (one, views_one), (other, views_other) = drive(1, 0, 60), drive(2, 0, 60)
-    closer = ScanLoopsConfig(min_motion_m=1.0).build("batch")
-    feed(closer, one, views_one)
+    detector = ScanLoopsConfig(min_motion_m=1.0).build("batch")
+    feed(detector, one, views_one)
     told = [one[0] @ inverse(other[0]) @ T for T in other]
     if tied:
-        closer._ways.add([BetweenFactor(len(one) - 1, len(one), inverse(one[-1]) @ told[0], LINK)])
-    feed(closer, told, views_other, first=len(one))
-    assert closer.closures(), "streets look alike"
-    assert not accepted(closer)
-    assert {loop.reason.split(":")[0] for loop in closer.closures()} <= {"vote", "overlap", "sight", "gate"}
+        detector._chain.add([BetweenFactor(len(one) - 1, len(one), inverse(one[-1]) @ told[0], LINK)])
+    feed(detector, told, views_other, first=len(one))
+    assert detector.closures(), "streets look alike"
+    assert not accepted(detector)
+    assert {loop.reason.split(":")[0] for loop in detector.closures()} <= {"vote", "overlap", "sight", "gate"}
 
 
 def test_an_empty_field_closes_nothing_and_says_why():
@@ -115,10 +115,10 @@ def test_an_empty_field_closes_nothing_and_says_why():
         ground = rng.normal([0.0, 0.0, -1.7], [20.0, 20.0, 0.02], (8000, 3)).astype(np.float32)
         views.append(ScanView(k, ground))
     there_and_back = [exp(np.zeros(3), np.array([3.0 * min(k, 30 - k), 0.0, 0.0])) for k in range(30)]
-    closer = driven(there_and_back, views)
-    assert not accepted(closer)
-    assert closer.closures()
-    assert all(loop.reason.startswith("vote: ") for loop in closer.closures())
+    detector = driven(there_and_back, views)
+    assert not accepted(detector)
+    assert detector.closures()
+    assert all(loop.reason.startswith("vote: ") for loop in detector.closures())
 
 
 def test_two_runs_tell_the_same():
@@ -136,26 +136,26 @@ def test_two_runs_tell_the_same():
 
 def test_a_drive_along_new_streets_compares_hardly_anything():
     truth, views = drive(1, 0, 120)
-    closer = driven(truth, views)
-    assert len(closer.closures()) <= 0.2 * len(truth)
-    assert not accepted(closer)
+    detector = driven(truth, views)
+    assert len(detector.closures()) <= 0.2 * len(truth)
+    assert not accepted(detector)
 
 
 def test_an_earlier_drive_is_recognised_wherever_its_world_lies():
-    (first, views_first), (again, views_again) = drive(1, 0, 60), drive(1, 0, 60, back=True)
+    (first, views_first), (again, reobserve) = drive(1, 0, 60), drive(1, 0, 60, back=True)
     graph = PoseGraph(dict(enumerate(first)), {k: k for k in range(len(first))})
     graph.add_factors(
         BetweenFactor(k, k + 1, inverse(first[k]) @ first[k + 1], LINK) for k in range(len(first) - 1)
     )
-    closer = ScanLoopsConfig(min_motion_m=1.0).build("batch")
-    closer.know(graph, dict(enumerate(views_first)))
+    detector = ScanLoopsConfig(min_motion_m=1.0).build("batch")
+    detector.preload(graph, dict(enumerate(views_first)))
     T_other_world = exp(np.array([0.0, 0.0, 1.0]), np.array([500.0, -300.0, 20.0]))
-    feed(closer, [T_other_world @ T for T in again], views_again, first=len(first))
-    found = accepted(closer)
+    feed(detector, [T_other_world @ T for T in again], reobserve, first=len(first))
+    found = accepted(detector)
     assert len({loop.j for loop in found}) >= 0.8 * len(again)
     assert worst_m(found, [*first, *again]) < 0.15
     for k, T in enumerate(again):
-        assert discrepancy(T, np.eye(4), closer.believed(len(first) + k)).translation_m < 0.5
+        assert discrepancy(T, np.eye(4), detector.current_estimate(len(first) + k)).translation_m < 0.5
 
 
 # Verification
@@ -164,7 +164,7 @@ def test_an_earlier_drive_is_recognised_wherever_its_world_lies():
 def verified(T_i: Transform, T_j: Transform, *, seeds=(1, 1), **config):
     verifier = ScanVerificationConfig(**config).build()
     i, j = (
-        verifier.digest(view(street(seed), T, seed=seed)) for seed, T in zip(seeds, (T_i, T_j), strict=True)
+        verifier.describe(view(street(seed), T, seed=seed)) for seed, T in zip(seeds, (T_i, T_j), strict=True)
     )
     return verifier.verify(i, j)
 
@@ -213,7 +213,7 @@ def test_a_square_yard_looks_the_same_four_ways():
     floor = np.column_stack([rng.uniform(-12.0, 12.0, (12000, 2)), np.full(12000, -1.7)])
     yard = ScanView(0, np.vstack([floor, *(wall @ R.T for R in turns)]).astype(np.float32))
     verifier = ScanVerificationConfig().build()
-    found = verifier.verify(verifier.digest(yard), verifier.digest(yard))
+    found = verifier.verify(verifier.describe(yard), verifier.describe(yard))
     assert found.T_i_j is None
     assert found.reason.startswith("rival: ")
 
@@ -225,13 +225,13 @@ def test_a_corridor_does_not_say_how_far_along_it_one_is():
     floor = np.column_stack([along, rng.uniform(-4.0, 4.0, 8000), np.full(8000, -1.7)])
     corridor = ScanView(0, np.vstack([*walls, floor]).astype(np.float32))
     verifier = ScanVerificationConfig(min_lead=0.0).build()
-    found = verifier.verify(verifier.digest(corridor), verifier.digest(corridor))
+    found = verifier.verify(verifier.describe(corridor), verifier.describe(corridor))
     assert found.T_i_j is None
     assert found.reason.startswith("degenerate: no surface shows translation along x")
 
 
 def test_a_place_is_kept_small():
-    place = ScanVerificationConfig().build().digest(view(street(1), on_street(street(1), 0.0)))
+    place = ScanVerificationConfig().build().describe(view(street(1), on_street(street(1), 0.0)))
     assert place.points_body.nbytes <= 100_000
     assert place.points_body.dtype == np.float32
 

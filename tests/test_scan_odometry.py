@@ -6,19 +6,19 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapper.config.scan_odometry import (
+from mapper.core.deskew import Twist, deskewed
+from mapper.core.errors import FrameError
+from mapper.core.frames import Scan
+from mapper.core.geometry import angle_between, exp, inverse
+from mapper.odometry.scan_to_map.config import (
     GicpOdometryConfig,
     HoughOdometryConfig,
     IcpOdometryConfig,
     KissOdometryConfig,
 )
-from mapper.config.synthetic import STREET, LidarSensorConfig
-from mapper.deskew import Twist, deskewed
-from mapper.errors import FrameError
-from mapper.frames import Scan
-from mapper.geometry import angle_between, exp, inverse
 from mapper.odometry.scan_to_map.odometry import ScanOdometry
-from mapper.sources.synthetic.lidar import SyntheticLidarSource
+from mapper.simulation.config import STREET, LidarSensorConfig
+from mapper.simulation.lidar import SyntheticLidarSource
 
 EVERY_KIND = [GicpOdometryConfig(), IcpOdometryConfig(), KissOdometryConfig(), HoughOdometryConfig()]
 LIMITS = {"gicp": (0.03, 0.1), "icp": (0.03, 0.1), "kiss-icp": (0.25, 0.5), "hough-ndt": (0.15, 1.5)}

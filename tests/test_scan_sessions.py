@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from evaluators.trajectory import align, associate, ate
-from mapper.appending import append
-from mapper.config import load_config, overridden
-from mapper.config.synthetic import STREET, LidarSensorConfig
-from mapper.errors import ConfigError, LoopError
+from mapper.config.loading import load_config, overridden
+from mapper.core.errors import ConfigError, LoopError
 from mapper.loops.closure import discrepancy
-from mapper.loops_by_hand import edit_loops
-from mapper.pipeline import build
-from mapper.run import load_run, open_log
+from mapper.pipeline.append import append
+from mapper.pipeline.build import build
+from mapper.pipeline.edit_loops import edit_loops
+from mapper.run.folder import load_run, open_log
+from mapper.simulation.config import STREET, LidarSensorConfig
+from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source
-from mapper.sources.synthetic.lidar import write_lidar_log
 
 SETTINGS = ("octree.resolution_m=0.5", "octree.max_range_m=30", "loops.kind=none")
 DRIVE = STREET.model_copy(

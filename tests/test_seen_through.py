@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mapper.config.octree import OctreeConfig
+from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 
 ORIGIN = np.array([0.025, 0.025, 0.025])

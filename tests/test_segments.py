@@ -9,9 +9,10 @@ import pytest
 from evaluators.evaluate import judged
 from evaluators.segments import KITTI_LENGTHS_M, length_records, lengths_for, segment_errors, segment_metrics
 from evaluators.trajectory import Matched, associate
-from mapper.errors import DataError
-from mapper.geometry import angle_between, exp, inverse, transform
-from mapper.trajectory import Trajectory, read_kitti
+from mapper.core.errors import DataError
+from mapper.core.geometry import angle_between, exp, inverse, transform
+from mapper.core.trajectory import Trajectory
+from mapper.sources.trajectory_files import read_kitti
 
 TRAJECTORIES = Path(__file__).parents[2] / "shared/data/trajectories"
 needs_trajectories = pytest.mark.skipif(not TRAJECTORIES.is_dir(), reason=f"{TRAJECTORIES} is not here")

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from mapper.config import load_config, load_source_config
-from mapper.errors import ConfigError
+from mapper.config.loading import load_config, load_source_config
+from mapper.core.errors import ConfigError
 
 
 def test_an_rgbd_log_has_the_plain_defaults():

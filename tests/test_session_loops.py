@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from mapper.config.graph import GraphConfig
-from mapper.geometry import exp, inverse, transform
+from mapper.core.geometry import exp, inverse, transform
+from mapper.graph.components import align_components
+from mapper.graph.config import GraphConfig
 from mapper.graph.drift import innovations
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.graph.optimize import optimize
-from mapper.parts import laid_together
 
 NODES, LAP = 120, 40
 SPLIT = 2 * LAP
@@ -65,7 +65,7 @@ def test_loops_between_sessions_are_judged_by_the_drift_that_loops_show(seed, fa
     right = true_loops(range(LAP + 3, SPLIT, 5), rng) + true_loops(range(SPLIT, NODES, 2), rng)
     graph.add_factors([*wrong, *right])
 
-    solution = optimize(laid_together(graph), GraphConfig())
+    solution = optimize(align_components(graph), GraphConfig())
 
     weights = np.array(solution.weights[-len(wrong) - len(right) :])
     np.testing.assert_array_equal(weights[:false], 0.0)

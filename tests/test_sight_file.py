@@ -3,20 +3,21 @@
 import numpy as np
 import pytest
 
-from mapper.config import BuildConfig, overridden
-from mapper.config.octree import OctreeConfig
-from mapper.config.synthetic import SynthConfig
-from mapper.errors import DataError, MapFileError
-from mapper.frames import Scan
-from mapper.fusion import fuse_log
-from mapper.geometry import exp
+from mapper.config.build import BuildConfig
+from mapper.config.loading import overridden
+from mapper.core.errors import DataError, MapFileError
+from mapper.core.frames import Scan
+from mapper.core.geometry import exp
+from mapper.core.trajectory import Trajectory
+from mapper.mapping.fusion import fuse_log
 from mapper.octree.casting import Caster
+from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
-from mapper.octree.sight import decompressed, pack
-from mapper.octree.sight_file import SightWriter, displacement_m, open_sights
-from mapper.progress import SILENT
-from mapper.sources.synthetic import SyntheticSource
-from mapper.trajectory import Trajectory
+from mapper.octree.scan_update import decompressed, pack
+from mapper.octree.scan_update_file import ScanUpdateWriter, displacement_m, open_scan_updates
+from mapper.runtime.progress import SILENT
+from mapper.simulation import SyntheticSource
+from mapper.simulation.config import SynthConfig
 
 FRAMES = 16
 CONFIG = overridden(BuildConfig(), ["cloud.frame_stride=1000", "mcap.image_stride=0", "workers=0"])
@@ -70,7 +71,7 @@ def first(source, tmp_path_factory):
 
 
 def fused(source, trajectory, path, *, before=None, config=CONFIG):
-    with SightWriter(path, config.octree) as after:
+    with ScanUpdateWriter(path, config.octree) as after:
         maps = fuse_log(
             source,
             trajectory,
@@ -108,7 +109,7 @@ def test_only_frames_that_moved_are_read_and_the_bits_are_those_of_fusing_from_s
     config = overridden(CONFIG, [f"octree.dynamic={dynamic}"])
     trajectory, counted = moved(source.truth, indices), Counted(source)
 
-    with open_sights(first) as before:
+    with open_scan_updates(first) as before:
         again = fused(counted, trajectory, tmp_path / "again.bin", before=before, config=config)
 
     scratch = fused(source, trajectory, tmp_path / "scratch.bin", config=config)
@@ -122,11 +123,11 @@ def test_frames_that_left_and_frames_that_came_are_right_too(source, first, tmp_
     fewer = Trajectory(truth.stamps_ns[3:], truth.T_world_body[3:])
     counted = Counted(source)
 
-    with open_sights(first) as before:
+    with open_scan_updates(first) as before:
         assert_same_bits(
             fused(counted, fewer, tmp_path / "fewer.bin", before=before), fused(source, fewer, tmp_path / "a")
         )
-    with open_sights(tmp_path / "fewer.bin") as before:
+    with open_scan_updates(tmp_path / "fewer.bin") as before:
         assert_same_bits(
             fused(counted, truth, tmp_path / "more.bin", before=before), fused(source, truth, tmp_path / "b")
         )
@@ -137,7 +138,7 @@ def test_frames_that_left_and_frames_that_came_are_right_too(source, first, tmp_
 def test_another_sensor_model_needs_no_frame_and_another_resolution_needs_all(source, first, tmp_path):
     for override, reads in (("octree.hit_probability=0.6", 0), ("octree.resolution_m=0.1", FRAMES - 1)):
         config, counted = overridden(CONFIG, [override]), Counted(source)
-        with open_sights(first) as before:
+        with open_scan_updates(first) as before:
             again = fused(counted, source.truth, tmp_path / "again.bin", before=before, config=config)
         assert len(counted.read) == reads
         assert_same_bits(again, fused(source, source.truth, tmp_path / "scratch.bin", config=config))
@@ -150,12 +151,12 @@ def test_within_the_tolerance_frames_stay_as_they_were_fused_and_do_not_drift(so
     nudged_again = moved(nudged, [2], step)
     counted = Counted(source)
 
-    with open_sights(first) as before:
+    with open_scan_updates(first) as before:
         stayed = fused(counted, nudged, tmp_path / "stayed.bin", before=before, config=config)
     assert counted.read == []
     assert_same_bits(stayed, fused(source, source.truth, tmp_path / "scratch.bin"))
 
-    with open_sights(tmp_path / "stayed.bin") as before:
+    with open_scan_updates(tmp_path / "stayed.bin") as before:
         went = fused(counted, nudged_again, tmp_path / "went.bin", before=before, config=config)
     assert counted.read == [int(source.truth.stamps_ns[2])]
     assert_same_bits(went, fused(source, nudged_again, tmp_path / "scratch.bin"))
@@ -185,8 +186,8 @@ def test_merging_a_sight_is_inserting_its_scan(discretize):
         scan = Scan(0, rng.normal(0.0, 2.0, (200, 3)).astype(np.float32))
         T_world_body = exp(rng.normal(0.0, 1.0, 3), rng.normal(0.0, 3.0, 3))
         inserted.insert(scan, T_world_body)
-        sight = pack(caster.cast(scan, T_world_body))
-        merged.merge(decompressed(sight.compressed(), blocks=len(sight)))
+        update = pack(caster.cast(scan, T_world_body))
+        merged.merge(decompressed(update.compressed(), blocks=len(update)))
 
     assert len(inserted) == len(merged)
     assert_same_bits(inserted, merged)
@@ -201,9 +202,9 @@ def test_damaged_files_are_refused_in_one_line(first, tmp_path):
     ):
         damaged.write_bytes(content)
         with pytest.raises(MapFileError, match=fault):
-            open_sights(damaged)
+            open_scan_updates(damaged)
     with pytest.raises(MapFileError, match="cannot be read"):
-        open_sights(tmp_path / "missing.bin")
+        open_scan_updates(tmp_path / "missing.bin")
     for garbled in (b"garbled", b"x\x9c\x03\x00\x00\x00\x00\x01"):
         with pytest.raises(DataError, match="sight of 3 blocks: damaged"):
             decompressed(garbled, blocks=3)

@@ -3,8 +3,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapper.config.octree import OctreeConfig, SliceConfig
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, cut_slice, shrunk
 

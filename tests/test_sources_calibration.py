@@ -1,7 +1,7 @@
 import pytest
 
-from mapper.errors import SourceError
-from mapper.frames import PinholeCamera
+from mapper.core.errors import SourceError
+from mapper.core.frames import PinholeCamera
 from mapper.sources.calibration import FREIBURG, freiburg_camera
 from mapper.sources.calibration_file import calibration_text, read_calibration
 

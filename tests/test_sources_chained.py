@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from conftest import FIRST_NS, PERIOD_NS
 
-from mapper.config.sources import SourceConfig
+from mapper.core.timebase import NS_PER_S
 from mapper.sources import open_source
 from mapper.sources.chained import chained, last_session, sessions_of
-from mapper.timebase import NS_PER_S
+from mapper.sources.config import SourceConfig
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mapper.errors import DataError, FrameError
+from mapper.core.errors import DataError, FrameError
 from mapper.sources import png
 from mapper.sources.images import read_colour, read_depth_m, read_grey
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mapper.errors import SourceError
+from mapper.core.errors import SourceError
 from mapper.sources import open_source
 from mapper.sources.writers import write_log
 

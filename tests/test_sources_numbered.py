@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from conftest import CALIBRATION, write_picture
 
-from mapper.config.sources import SourceConfig
-from mapper.errors import SourceError
-from mapper.geometry import exp
+from mapper.core.errors import SourceError
+from mapper.core.geometry import exp
 from mapper.sources import open_source
+from mapper.sources.config import SourceConfig
 
 POSES = [exp(np.array([0.1 * i, -0.2, 0.3 * i]), np.array([i, 2.0, -0.5 * i])) for i in range(4)]
 

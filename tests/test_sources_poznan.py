@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from conftest import CALIBRATION, write_picture
 
-from mapper.errors import SourceError
-from mapper.rotations import rotation_from_euler
+from mapper.core.errors import SourceError
+from mapper.core.rotations import rotation_from_euler
 from mapper.sources import open_source
 
 ROWS = [

@@ -2,9 +2,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mapper.config.sources import SourceConfig
-from mapper.errors import SourceError
+from mapper.core.errors import SourceError
 from mapper.sources import open_source
+from mapper.sources.config import SourceConfig
 
 
 def indices_of(source, everything):

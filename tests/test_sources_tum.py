@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from conftest import DEPTH_LEAD_NS, FIRST_NS, PERIOD_NS, picture, write_picture
 
-from mapper.config.sources import CameraConfig, SourceConfig
-from mapper.errors import FrameError, SourceError
+from mapper.core.errors import FrameError, SourceError
+from mapper.core.timebase import nearest
 from mapper.sources import open_source
 from mapper.sources.calibration import FREIBURG
-from mapper.timebase import nearest
+from mapper.sources.config import CameraConfig, SourceConfig
 
 FR1_XYZ = Path(__file__).parents[2] / "shared/data/tum_fr1_xyz"
 

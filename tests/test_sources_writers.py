@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from conftest import FIRST_NS, PERIOD_NS, picture
 
-from mapper.errors import FrameError, SourceError
-from mapper.frames import PinholeCamera, RgbdFrame, Scan
+from mapper.core.errors import FrameError, SourceError
+from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.sources import open_source
 from mapper.sources.writers import write_log
 

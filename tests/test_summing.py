@@ -5,9 +5,9 @@ import pyoctomap
 import pytest
 from octomap_oracle import voxels
 
-from mapper.config.octree import OctreeConfig
-from mapper.frames import Scan
+from mapper.core.frames import Scan
 from mapper.octree.attributes import NEVER_SEEN
+from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import read_map

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import small_gicp
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
 from mapper.registration.surfaces import prepared
 
 VOXEL_M = 0.3

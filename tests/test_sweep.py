@@ -15,7 +15,7 @@ from evaluators.sweep import plan_sweep, run_sweep
 from evaluators.sweep_chart import Line, dot_chart
 from evaluators.sweep_files import write_sweep
 from evaluators.sweep_tables import QUANTITIES, best_of, grouped, summary_text, sweep_records
-from mapper.errors import ConfigError, RunError, SourceError
+from mapper.core.errors import ConfigError, RunError, SourceError
 
 FEW = "source.last_frame=11"
 TIMES = {"cell_s", "track_s", "solve_s", "level_s", "fuse_s", "write_s", "total_s", "frames_per_s"}
@@ -244,7 +244,7 @@ def interrupted(desk_log, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def resumed(interrupted):
+def resumable_folder(interrupted):
     """The same sweep, begun again: what it said, and whether the finished cell was left as it was."""
     file, out, cell = interrupted
     before = cell.read_bytes(), cell.stat().st_mtime_ns
@@ -252,9 +252,9 @@ def resumed(interrupted):
     return result, (cell.read_bytes(), cell.stat().st_mtime_ns) == before
 
 
-def test_a_sweep_goes_on_where_it_was_ended(interrupted, resumed):
+def test_a_sweep_goes_on_where_it_was_ended(interrupted, resumable_folder):
     _, out, _ = interrupted
-    result, is_as_it_was = resumed
+    result, is_as_it_was = resumable_folder
     assert is_as_it_was
     assert "1 of 2 cells were finished before" in result.stderr
     assert not (out / "scratch").exists()
@@ -279,8 +279,8 @@ def test_a_sweep_goes_on_where_it_was_ended(interrupted, resumed):
     assert {child.name for child in (out / table[0]["run"]).iterdir()} == kept
 
 
-def test_builds_in_other_processes_come_to_the_same(interrupted, resumed, tmp_path, dask_scheduler):
-    assert resumed
+def test_builds_in_other_processes_come_to_the_same(interrupted, resumable_folder, tmp_path, dask_scheduler):
+    assert resumable_folder
     file, out, _ = interrupted
     plan = plan_sweep(file, tmp_path / "out")
     write_sweep(plan, run_sweep(plan, scheduler=dask_scheduler), title="again")

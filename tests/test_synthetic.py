@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from mapper.config.synthetic import IDEAL_SENSOR, SynthConfig
-from mapper.errors import DataError
-from mapper.frames import PinholeCamera, ray_table
-from mapper.geometry import angle_between, apply, inverse, transform
-from mapper.sources.synthetic import (
+from mapper.core.errors import DataError
+from mapper.core.frames import PinholeCamera, ray_table
+from mapper.core.geometry import angle_between, apply, inverse, transform
+from mapper.core.timebase import NS_PER_S
+from mapper.simulation import (
     Boxes,
     Scene,
     SyntheticSource,
@@ -18,10 +18,10 @@ from mapper.sources.synthetic import (
     read_scene,
     render,
 )
-from mapper.sources.synthetic.atlas import build_atlas
-from mapper.sources.synthetic.builder import ORIGIN, Builder, Skin
-from mapper.sources.synthetic.path import START_NS, make_motion, seconds_of
-from mapper.timebase import NS_PER_S
+from mapper.simulation.atlas import build_atlas
+from mapper.simulation.builder import ORIGIN, Builder, Skin
+from mapper.simulation.config import IDEAL_SENSOR, SynthConfig
+from mapper.simulation.path import START_NS, make_motion, seconds_of
 
 SMALL = SynthConfig(texture_px_per_m=64, width_px=160, height_px=120, sensor=IDEAL_SENSOR)
 PLAIN = SMALL.model_copy(update={"texture_px_per_m": 16})

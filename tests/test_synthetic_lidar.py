@@ -5,11 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from mapper.config.synthetic import COURTYARD, IDEAL_LIDAR, STREET, LidarSensorConfig, LidarSynthConfig
-from mapper.errors import DataError, SourceError
-from mapper.geometry import angle_between, apply, inverse
-from mapper.sources import open_source
-from mapper.sources.synthetic.lidar import (
+from mapper.core.errors import DataError, SourceError
+from mapper.core.geometry import angle_between, apply, inverse
+from mapper.simulation.config import COURTYARD, IDEAL_LIDAR, STREET, LidarSensorConfig, LidarSynthConfig
+from mapper.simulation.lidar import (
     SyntheticLidarSource,
     make_outdoor_scene,
     render_scan,
@@ -17,8 +16,9 @@ from mapper.sources.synthetic.lidar import (
     sample_map,
     write_lidar_log,
 )
-from mapper.sources.synthetic.lidar.solids import Shape
-from mapper.sources.synthetic.path import seconds_of
+from mapper.simulation.lidar.solids import Shape
+from mapper.simulation.path import seconds_of
+from mapper.sources import open_source
 
 SMALL = {"rings": 16, "lowest_ring_rad": -0.35, "highest_ring_rad": 0.25, "azimuth_steps": 180}
 EXACT = IDEAL_LIDAR.model_copy(update=SMALL)

@@ -6,13 +6,13 @@ import tomllib
 import numpy as np
 import pytest
 
-from mapper.config.synthetic import IDEAL_SENSOR, SensorConfig, SynthConfig
-from mapper.errors import SourceError
+from mapper.core.errors import SourceError
+from mapper.simulation import Rendering, SyntheticSource, observe, read_scene, write_tum_log
+from mapper.simulation.config import IDEAL_SENSOR, SensorConfig, SynthConfig
+from mapper.simulation.path import seconds_of
+from mapper.simulation.sensor import BASELINE_M, DISPARITY_FOCAL_PX, axial_sigma_m
 from mapper.sources import open_source
-from mapper.sources.synthetic import Rendering, SyntheticSource, observe, read_scene, write_tum_log
-from mapper.sources.synthetic.path import seconds_of
-from mapper.sources.synthetic.sensor import BASELINE_M, DISPARITY_FOCAL_PX, axial_sigma_m
-from mapper.trajectory import read_tum
+from mapper.sources.trajectory_files import read_tum
 
 PLAIN = SynthConfig(
     furniture_per_room=2,

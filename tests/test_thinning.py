@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapper.thinning import thin
+from mapper.core.voxel_grid import thin
 
 
 @given(seed=st.integers(0, 1000), voxel_m=st.sampled_from([0.1, 0.5, 2.0]))

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapper.errors import DataError
-from mapper.timebase import nearest, ns_from_seconds_text, seconds_text_from_ns
+from mapper.core.errors import DataError
+from mapper.core.timebase import nearest, ns_from_seconds_text, seconds_text_from_ns
 
 STAMPS = st.integers(-(10**18), 9 * 10**18)
 

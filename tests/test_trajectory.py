@@ -1,17 +1,10 @@
 import numpy as np
 import pytest
 
-from mapper.errors import DataError
-from mapper.geometry import exp, inverse
-from mapper.trajectory import (
-    Trajectory,
-    read_kitti,
-    read_tum,
-    start_to_end,
-    trajectory_from,
-    write_kitti,
-    write_tum,
-)
+from mapper.core.errors import DataError
+from mapper.core.geometry import exp, inverse
+from mapper.core.trajectory import Trajectory, start_to_end, trajectory_from
+from mapper.sources.trajectory_files import read_kitti, read_tum, write_kitti, write_tum
 
 EPOCH_NS = 1_305_031_102_175_304_001
 

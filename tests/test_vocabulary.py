@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapper.config.places import VocabularyConfig
-from mapper.errors import DataError, VocabularyError
+from mapper.core.errors import DataError, VocabularyError
+from mapper.core.frames import Scan
 from mapper.features.windowed import pack
-from mapper.frames import Scan
+from mapper.places.config import VocabularyConfig
 from mapper.places.images import descriptors_of
 from mapper.places.training import grow, train
 from mapper.places.tree import WordTree

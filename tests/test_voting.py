@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from mapper.config.hough import VotingConfig
-from mapper.geometry import apply
+from mapper.core.geometry import apply
+from mapper.registration.hough_config import VotingConfig
 from mapper.registration.voting import vote
 
 

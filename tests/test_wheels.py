@@ -6,21 +6,23 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapper.config import BuildConfig, load_config
-from mapper.config.graph import WheelFactorsConfig
-from mapper.config.sources import SourceConfig, WheelsConfig
-from mapper.config.synthetic import SynthConfig
-from mapper.errors import SourceError
-from mapper.geometry import angle_between, exp, inverse, transform
-from mapper.graph.wheels import wheel_factors
-from mapper.parts import largest_part
-from mapper.progress import SILENT
-from mapper.sensing.wheels import driven, pose_at
-from mapper.solving import solve
+from mapper.config.build import BuildConfig
+from mapper.config.loading import load_config
+from mapper.core.errors import SourceError
+from mapper.core.geometry import angle_between, exp, inverse, transform
+from mapper.core.trajectory import Trajectory
+from mapper.graph.config import WheelFactorsConfig
+from mapper.graph.wheel_factors import wheel_factors
+from mapper.pipeline.components import largest_component
+from mapper.pipeline.solve import solve
+from mapper.pipeline.track import track_log
+from mapper.runtime.progress import SILENT
+from mapper.sensing.wheel_kinematics import driven, pose_at
+from mapper.simulation.config import SynthConfig
+from mapper.simulation.source import SyntheticSource
 from mapper.sources import open_source
-from mapper.sources.synthetic.source import SyntheticSource
-from mapper.tracking import track_log
-from mapper.trajectory import Trajectory, write_tum
+from mapper.sources.config import SourceConfig, WheelsConfig
+from mapper.sources.trajectory_files import write_tum
 
 S = 1_000_000_000
 R_BASE_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -170,7 +172,7 @@ def interrupted():
 
 
 def mapped(source, config):
-    tracking = largest_part(track_log(source, config, progress=SILENT), progress=SILENT)
+    tracking = largest_component(track_log(source, config, progress=SILENT), progress=SILENT)
     solved = solve(tracking.graph, tracking.loops, config.graph)
     return replace(tracking, graph=solved.graph).trajectory()
 

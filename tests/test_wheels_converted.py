@@ -8,14 +8,14 @@ from test_wheels_odometry import EXACT, FLAT, STREET_ON_WHEELS
 from typer.testing import CliRunner
 
 from cli.main import app
-from mapper.config import load_config
-from mapper.config.sources import SourceConfig, TopicsConfig, WheelsConfig
-from mapper.progress import SILENT
+from mapper.config.loading import load_config
+from mapper.pipeline.track import track_log
+from mapper.runtime.progress import SILENT
+from mapper.simulation import SyntheticSource, write_tum_log
+from mapper.simulation.lidar import SyntheticLidarSource
 from mapper.sources import open_source
-from mapper.sources.synthetic import SyntheticSource, write_tum_log
-from mapper.sources.synthetic.lidar import SyntheticLidarSource
+from mapper.sources.config import SourceConfig, TopicsConfig, WheelsConfig
 from mapper.sources.writers import left_out, write_log
-from mapper.tracking import track_log
 
 SHORT = FLAT.model_copy(update={"duration_s": 2.0, "wheels": EXACT.model_copy(update={"rate_hz": 20.0})})
 

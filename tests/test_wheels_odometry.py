@@ -7,30 +7,24 @@ import numpy as np
 import pytest
 
 from evaluators.occupancy import occupancy_metrics
-from mapper.config import load_config
-from mapper.config.octree import OctreeConfig
-from mapper.config.odometry import WheelsOdometryConfig
-from mapper.config.synthetic import (
-    IDEAL_LIDAR,
-    IDEAL_SENSOR,
-    STREET,
-    SynthConfig,
-    SynthWheelsConfig,
-)
-from mapper.deskew import twist_at
-from mapper.errors import ConfigError, FrameError, TrackingError
+from mapper.config.loading import load_config
+from mapper.core.deskew import twist_at
+from mapper.core.errors import ConfigError, FrameError, TrackingError
+from mapper.core.geometry import angle_between, inverse
+from mapper.core.timebase import NS_PER_S
 from mapper.features.scan_view import ScanView
 from mapper.features.view import View
-from mapper.geometry import angle_between, inverse
+from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
-from mapper.parallel import ordered_map
-from mapper.progress import SILENT
+from mapper.odometry.config import WheelsOdometryConfig
+from mapper.pipeline.track import refuse_a_fragment, track_log
+from mapper.runtime.ordered_map import ordered_map
+from mapper.runtime.progress import SILENT
+from mapper.simulation import SyntheticSource, write_tum_log
+from mapper.simulation.config import IDEAL_LIDAR, IDEAL_SENSOR, STREET, SynthConfig, SynthWheelsConfig
+from mapper.simulation.lidar import SyntheticLidarSource
 from mapper.sources import open_source
 from mapper.sources.chained import chained, last_session
-from mapper.sources.synthetic import SyntheticSource, write_tum_log
-from mapper.sources.synthetic.lidar import SyntheticLidarSource
-from mapper.timebase import NS_PER_S
-from mapper.tracking import refuse_a_fragment, track_log
 
 EXACT = SynthWheelsConfig(path_sigma=0.0, turn_sigma=0.0, heading_rad_per_sqrt_m=0.0)
 FLAT = SynthConfig(

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from workers_made import Work, alive, told, until
 
-from mapper import workers
-from mapper.errors import ConfigError, DependencyError
-from mapper.workers import Failure, run_jobs
+from mapper.core.errors import ConfigError, DependencyError
+from mapper.runtime import executor as workers
+from mapper.runtime.executor import Failure, run_jobs
 
 
 @pytest.fixture(params=["here", "processes", "dask"])
@@ -97,7 +97,7 @@ def test_workers_do_not_outlive_a_parent_that_is_killed(diary, tmp_path):
     script = tmp_path / "sweep.py"
     script.write_text(
         "from pathlib import Path\n"
-        "from mapper.workers import run_jobs\n"
+        "from mapper.runtime.executor import run_jobs\n"
         "from workers_made import Work\n"
         "if __name__ == '__main__':\n"
         f"    diary = Path({str(diary)!r})\n"

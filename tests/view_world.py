@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from mapper.core.geometry import Transform, apply, inverse
 from mapper.features.view import View
-from mapper.geometry import Transform, apply, inverse
-from mapper.odometry.base import Diagnostics, Track
+from mapper.odometry.base import Diagnostics, FrameResult
 
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5])
 BODY_CAMERA = np.array(
@@ -44,9 +44,9 @@ class Room:
         )
 
 
-def track(node: int, stamp_ns: int, T_world_body: Transform, links=(), *, features: int = 500) -> Track:
+def track(node: int, stamp_ns: int, T_world_body: Transform, links=(), *, features: int = 500) -> FrameResult:
     """Return the track of a frame that became a node."""
-    return Track(
+    return FrameResult(
         stamp_ns=stamp_ns,
         node=node,
         T_node_body=np.eye(4),

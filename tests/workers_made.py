@@ -7,7 +7,7 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from mapper.errors import SourceError
+from mapper.core.errors import SourceError
 
 
 def told(diary: Path) -> Counter[str]:

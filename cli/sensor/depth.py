@@ -66,16 +66,16 @@ def depth(
     --config kinect/sensor.toml
     """
     from evaluators.depth_accuracy import SENSOR, depth_text, study_depth, write_depth_study
-    from mapper.config import load_config
+    from mapper.config.loading import load_config
+    from mapper.runtime.atomic import atomic_folder
     from mapper.sources import open_source
-    from mapper.staging import staged
 
     distances_m = _distances(logs, plane_at, fit_plane=fit_plane, keep_tilt=keep_tilt)
     where = None if patch is None else _patch(patch)
     config = load_config(None, merged(selection(first, last, stride, None), set_)).source
     prepare_libraries()
     sources = [open_source(log, config) for log in logs]
-    with nullcontext() if out is None else staged(out, overwrite=overwrite) as folder:
+    with nullcontext() if out is None else atomic_folder(out, overwrite=overwrite) as folder:
         study = study_depth(
             sources,
             distances_m,
@@ -96,7 +96,7 @@ def _distances(
     logs: Sequence[Path], plane_at: Sequence[float] | None, *, fit_plane: bool, keep_tilt: bool
 ) -> Sequence[float] | None:
     """Return the distance of each log's plane, or None where planes are to be fitted."""
-    from mapper.errors import ConfigError
+    from mapper.core.errors import ConfigError
 
     if fit_plane:
         if plane_at or keep_tilt:
@@ -115,7 +115,7 @@ def _distances(
 
 
 def _patch(text: str) -> "Patch":
-    from mapper.errors import ConfigError
+    from mapper.core.errors import ConfigError
     from mapper.sensing.depth_accuracy import Patch
 
     try:

@@ -12,10 +12,10 @@ from cli.options import Quiet, assignments
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from mapper.config.line_laser import StripeConfig
-    from mapper.geometry import Array
-    from mapper.sensing.line_laser.calibration import CalibrationShot, Fit
-    from mapper.sensing.line_laser.ranging import LineScan
+    from mapper.core.geometry import Array
+    from mapper.line_laser.calibration import CalibrationShot, Fit
+    from mapper.line_laser.config import StripeConfig
+    from mapper.line_laser.ranging import LineScan
 
 _SHOWN = 3  # images whose detections are drawn
 
@@ -51,12 +51,12 @@ def line_laser(
     Example: mapper sensor line-laser drive/images --calibration C.toml --wheels drive/encoders.txt --out seen
     """
     from evaluators.line_laser_labels import judge, read_labels
-    from mapper.config import overridden, read_config
-    from mapper.config.line_laser import THESIS, LineLaserCalibration, LineLaserConfig
-    from mapper.export.line_laser_files import write_drive, write_scans
-    from mapper.sensing.line_laser.files import find_images
-    from mapper.sensing.line_laser.survey import drive, scan_images, sensor_poses
-    from mapper.staging import staged
+    from mapper.config.loading import overridden, read_config
+    from mapper.line_laser.config import THESIS, LineLaserCalibration, LineLaserConfig
+    from mapper.line_laser.files import find_images
+    from mapper.line_laser.products import write_drive, write_scans
+    from mapper.line_laser.survey import drive, scan_images, sensor_poses
+    from mapper.runtime.atomic import atomic_folder
 
     prepare_libraries()
     progress = progress_for(quiet=quiet)
@@ -68,7 +68,7 @@ def line_laser(
     if wheels is not None:
         T_world_sensor, told = sensor_poses(wheels, known)
         notes += told
-    with staged(out, overwrite=overwrite) as folder:
+    with atomic_folder(out, overwrite=overwrite) as folder:
         scans, more = scan_images(paths, stamps_ns, known, config, progress=progress)
         notes += more
         if T_world_sensor is not None:
@@ -110,14 +110,14 @@ def calibrate(
 
     Example: mapper sensor line-laser-calibrate drive/shots --wheelbase 0.26 --sensor-x 0.2 --out C.toml
     """
-    from mapper.atomic import write_text
-    from mapper.config import overridden
-    from mapper.config.line_laser import LineLaserConfig, VehicleConfig
-    from mapper.errors import RunError
+    from mapper.config.loading import overridden
+    from mapper.core.errors import RunError
     from mapper.export.line_laser_picture import write_calibration_picture
-    from mapper.sensing.line_laser.calibration import calibrate as fit_laws
-    from mapper.sensing.line_laser.calibration import calibration_text
-    from mapper.sensing.line_laser.files import read_shots
+    from mapper.line_laser.calibration import calibrate as fit_laws
+    from mapper.line_laser.calibration import calibration_text
+    from mapper.line_laser.config import LineLaserConfig, VehicleConfig
+    from mapper.line_laser.files import read_shots
+    from mapper.runtime.atomic import write_text
 
     picture = out.with_suffix(".png")
     if picture == out:
@@ -157,20 +157,19 @@ def accuracy(
 
     from evaluators.line_laser_study import STUDY_COLUMNS, TABLE_COLUMNS, detections, study, table_2_1
     from evaluators.tables import csv_text, text_table
-    from mapper.atomic import write_text
-    from mapper.config import overridden
-    from mapper.config.line_laser import LineLaserConfig
-    from mapper.staging import MARK, staged
+    from mapper.config.loading import overridden
+    from mapper.line_laser.config import LineLaserConfig
+    from mapper.runtime.atomic import MANIFEST_NAME, atomic_folder, write_text
 
     prepare_libraries()
     config = overridden(LineLaserConfig(), set_ or [])
-    with staged(out, overwrite=overwrite) if out else nullcontext() as folder:
+    with atomic_folder(out, overwrite=overwrite) if out else nullcontext() as folder:
         found = study(config, range(seeds), progress=progress_for(quiet=quiet))
         scenes, ranges = detections(found), table_2_1(found)
         if folder is not None:
             write_text(folder / "detections.csv", csv_text(scenes))
             write_text(folder / "table_2.1.csv", csv_text(ranges))
-            write_text(folder / MARK, config.model_dump_json(indent=1) + "\n")
+            write_text(folder / MANIFEST_NAME, config.model_dump_json(indent=1) + "\n")
     if not quiet:
         print(f"{text_table(STUDY_COLUMNS, scenes)}\n\n{text_table(TABLE_COLUMNS, ranges)}")
 

@@ -4,22 +4,22 @@ from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
-from mapper.config import BuildConfig
-from mapper.config.features import DetectorConfig
-from mapper.config.odometry import IsvdOdometryConfig, MatchConfig
-from mapper.errors import ConfigError, FrameError, MapperError
+from mapper.config.build import BuildConfig
+from mapper.core.errors import ConfigError, FrameError, MapperError
+from mapper.core.frames import Frame, Image
+from mapper.core.trajectory import Trajectory
+from mapper.features.config import DetectorConfig
 from mapper.features.detectors import Features, build_detector
 from mapper.features.matching import Pairs
-from mapper.frames import Frame, Image
 from mapper.graph.model import PoseGraph
-from mapper.odometry.base import Track
+from mapper.odometry.base import FrameResult
+from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
 from mapper.odometry.isvd import Compare, IsvdObservation, IsvdOdometry, matched_pairs, shared_points
+from mapper.pipeline.solve import solve
+from mapper.pipeline.track import TrackingResult, refuse_a_fragment
 from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
-from mapper.solving import solve
 from mapper.sources.base import FrameSource
-from mapper.tracking import Tracking, refuse_a_fragment
-from mapper.trajectory import Trajectory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +125,7 @@ class _Follower:
         self._odometry = IsvdOdometry(odometry, detector=eyes, compare=eyes.comparing(odometry))
         self._closer = config.loops.build(config.graph.solve)
         self._graph = PoseGraph()
-        self._tracks: list[Track] = []
+        self._tracks: list[FrameResult] = []
 
     def add(self, frame: Frame) -> None:
         """Track the next frame, and look for loops from it."""
@@ -142,7 +142,7 @@ class _Follower:
         """Return the poses with the loops' correction."""
         loops = tuple(self._closer.closures())
         self._graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")
-        tracking = Tracking(tuple(self._tracks), (), self._graph, loops, {})
+        tracking = TrackingResult(tuple(self._tracks), (), self._graph, loops, {})
         try:
             refuse_a_fragment(tracking, self._config, sensor="rgbd")
             solved = solve(self._graph, loops, self._config.graph)

@@ -8,7 +8,7 @@ from typing import Any
 from evaluators.cells import CellResult
 from evaluators.papers.measured import Measurement
 from evaluators.papers.model import PaperPath, PaperTable
-from mapper.errors import ConfigError
+from mapper.core.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,8 +20,8 @@ from evaluators.tables import (
     shown_cells,
     text_table,
 )
-from mapper.atomic import write_text
 from mapper.export.html import bullets, document, section, table
+from mapper.runtime.atomic import write_text
 
 MARKDOWN, CSV, LATEX, PAGE = "tables.md", "tables.csv", "tables.tex", "index.html"
 _LINE_WIDTH = 110

@@ -19,12 +19,12 @@ from evaluators.register import thinned
 from evaluators.scan_pairs import perturbed
 from evaluators.sweep_cell import environment
 from evaluators.tables import Record, Value
-from mapper.config.hough import HoughConfig, HoughGicpConfig, HoughNdtConfig
+from mapper.core.frames import Scan
+from mapper.core.geometry import Transform, angle_between, inverse
+from mapper.core.rotations import euler_from_rotation
 from mapper.export.registration_picture import write_before_and_after
-from mapper.frames import Scan
-from mapper.geometry import Transform, angle_between, inverse
 from mapper.registration.hough import Hough, Stages
-from mapper.rotations import euler_from_rotation
+from mapper.registration.hough_config import HoughConfig, HoughGicpConfig, HoughNdtConfig
 
 OFFSET_M = 10.0
 METHODS: dict[str, HoughConfig] = {"hough-ndt": HoughNdtConfig(), "hough-gicp": HoughGicpConfig()}

@@ -10,15 +10,15 @@ import numpy as np
 from pydantic import Field, PositiveFloat
 
 from evaluators.scan_pairs import fewer_rings, merged, moved
-from mapper.config import read_config
-from mapper.config.base import Config
-from mapper.errors import MapperError, SourceError
-from mapper.fingerprint import fingerprint
-from mapper.frames import Scan
-from mapper.geometry import Transform, inverse, transform
-from mapper.rotations import rotation_from_euler, rotation_from_quaternion
+from mapper.config.loading import read_config
+from mapper.core.config import Config
+from mapper.core.errors import MapperError, SourceError
+from mapper.core.frames import Scan
+from mapper.core.geometry import Transform, inverse, transform
+from mapper.core.rotations import rotation_from_euler, rotation_from_quaternion
+from mapper.run.fingerprint import fingerprint
 from mapper.sources import clouds, kitti, open_source
-from mapper.sources.base import Entry
+from mapper.sources.base import FrameRef
 from mapper.sources.cloud_files import ENDINGS
 from mapper.sources.clouds import read_scan
 
@@ -280,7 +280,7 @@ def _of_log(folder: Path) -> list[Pair]:
     return pairs
 
 
-def _posed(log: Path) -> list[tuple[Entry, Transform]]:
+def _posed(log: Path) -> list[tuple[FrameRef, Transform]]:
     """Return the scans of a log whose pose is known."""
     source = open_source(log)
     if source.truth is None or source.sensor != "lidar":

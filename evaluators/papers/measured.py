@@ -14,9 +14,9 @@ from evaluators.papers.published import Figures
 from evaluators.sweep_cell import environment
 from evaluators.tables import Record
 from evaluators.trajectory import align, associate, ate
-from mapper.config import BuildConfig
-from mapper.fingerprint import fingerprint
-from mapper.trajectory import Trajectory
+from mapper.config.build import BuildConfig
+from mapper.core.trajectory import Trajectory
+from mapper.run.fingerprint import fingerprint
 
 CONFIGS = Path(__file__).with_name("configs")
 """The settings of the papers' methods: ``thesis/*.toml`` and ``zhao.toml``."""

@@ -12,12 +12,12 @@ from evaluators.odometry_scores import position_errors_m
 from evaluators.papers.layout import compares, file_name
 from evaluators.papers.model import PaperCell, PaperPath, PaperTable, Reproduction
 from evaluators.trajectory import associate
+from mapper.core.geometry import Array
 from mapper.export.errors_picture import add_color_bar, draw_path
 from mapper.export.page import FAINT, INK, LINE, hex_of, save
 from mapper.export.palette import ESTIMATE, TRUTH
 from mapper.export.panels import draw_boxes, page, panel
-from mapper.geometry import Array
-from mapper.trajectory import read_tum
+from mapper.sources.trajectory_files import read_tum
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

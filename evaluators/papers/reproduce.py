@@ -15,10 +15,9 @@ from evaluators.papers.hough_tables import hough_reproduction
 from evaluators.papers.measured import cell_for
 from evaluators.papers.model import Reproduction
 from evaluators.papers.sequences import Found, find_sequences
-from mapper.atomic import write_text
-from mapper.errors import ConfigError, DataError
-from mapper.progress import SILENT, Progress
-from mapper.staging import resumed
+from mapper.core.errors import ConfigError, DataError
+from mapper.runtime.atomic import resumable_folder, write_text
+from mapper.runtime.progress import SILENT, Progress
 
 Paper = Literal["thesis", "zhao", "hough"]
 
@@ -85,7 +84,7 @@ def reproduce(
     """
     work = _HoughWork(request) if request.paper == "hough" else _BookWork(request, _BOOKS[request.paper])
     cells = work.cells(out.resolve())
-    with resumed(out, mark=PLAN) as folder:
+    with resumable_folder(out, mark=PLAN) as folder:
         write_text(folder / PLAN, _described(request, cells))
         results = run_cells(
             cells, folder / CELLS, processes=processes, scheduler=scheduler, progress=progress

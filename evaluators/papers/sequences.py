@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mapper.errors import ConfigError, SourceError
+from mapper.core.errors import ConfigError, SourceError
 
 _RECORDINGS = frozenset({".bag", ".mcap", ".mbag"})
 _WRAPPING = re.compile(r"^(rgbd_dataset_|tum_)+")

@@ -13,11 +13,12 @@ from evaluators.papers.sequences import slug
 from evaluators.papers.thesis_tables import Setting, tables
 from evaluators.tables import Record
 from evaluators.trajectory import align, associate, ate
-from mapper.config import BuildConfig
+from mapper.config.build import BuildConfig
 from mapper.config.seeds import seeded
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.core.trajectory import Trajectory
 from mapper.sources import open_source
-from mapper.trajectory import Trajectory, read_tum, write_tum
+from mapper.sources.trajectory_files import read_tum, write_tum
 
 
 @dataclass(frozen=True, slots=True)

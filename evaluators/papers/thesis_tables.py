@@ -10,9 +10,10 @@ import numpy as np
 from evaluators.papers.measured import CONFIGS, ate_rmse_m
 from evaluators.papers.published import Figures, figures, published
 from evaluators.trajectory import associate, rpe
-from mapper.config import BuildConfig, load_config
-from mapper.geometry import inverse, rotation_log
-from mapper.trajectory import Trajectory
+from mapper.config.build import BuildConfig
+from mapper.config.loading import load_config
+from mapper.core.geometry import inverse, rotation_log
+from mapper.core.trajectory import Trajectory
 
 POZNAN = "Poznań/trajectory1"
 _OWN_LOG = "the thesis's own log"

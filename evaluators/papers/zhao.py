@@ -14,11 +14,12 @@ from evaluators.papers.model import PaperCell, PaperTable
 from evaluators.papers.published import figures, published
 from evaluators.papers.sequences import slug
 from evaluators.tables import Record
-from mapper.config import BuildConfig, load_config
+from mapper.config.build import BuildConfig
+from mapper.config.loading import load_config
 from mapper.config.seeds import seeded
-from mapper.errors import DataError
-from mapper.pipeline import build
-from mapper.run import CLOUD, OCTREE_BT
+from mapper.core.errors import DataError
+from mapper.pipeline.build import build
+from mapper.run.files import CLOUD, OCTREE_BT
 from mapper.sources import open_source
 
 _OURS, _CLOUD, _OCTREE = "Zhao", "dense cloud", "octree 0.05 m"

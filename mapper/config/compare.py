@@ -5,8 +5,8 @@ from typing import Annotated
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from mapper.config.base import Config
-from mapper.config.sources import SourceConfig
+from mapper.core.config import Config
+from mapper.sources.config import SourceConfig
 
 
 class GuessConfig(Config):

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field, PositiveFloat, PositiveInt
 
-from mapper.config.base import Config
+from mapper.core.config import Config
 
 
 class MeshConfig(Config):
@@ -19,3 +19,14 @@ class MeshConfig(Config):
     """Every n-th tracked frame is fused."""
     min_observations: PositiveInt = 3
     """Surface seen in fewer fused frames is left out."""
+
+
+class RerunConfig(Config):
+    """What a viewer is shown while a map is built."""
+
+    image_stride: PositiveInt = 3
+    """Every n-th frame is shown with its image and cloud, which costs reading it again."""
+    image_width_px: PositiveInt = 480
+    """Wider images are shrunk."""
+    cloud_points: PositiveInt = 20_000
+    """A frame's cloud is thinned to about so many points."""

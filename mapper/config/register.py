@@ -4,13 +4,13 @@ from typing import Any, get_args
 
 from pydantic import Field
 
-from mapper.config.base import Config
-from mapper.config.hough import HoughConfig, HoughGicpConfig
-from mapper.config.odometry import IsvdOdometryConfig
-from mapper.config.registration import NEED_NO_GUESS, VOXEL_M, AnyRegistration
-from mapper.config.sensors import Sensor
-from mapper.config.sources import SourceConfig
-from mapper.errors import ConfigError
+from mapper.core.config import Config
+from mapper.core.errors import ConfigError
+from mapper.core.frames import Sensor
+from mapper.odometry.config import IsvdOdometryConfig
+from mapper.registration.config import NEED_NO_GUESS, VOXEL_M, AnyRegistration
+from mapper.registration.hough_config import HoughConfig, HoughGicpConfig
+from mapper.sources.config import SourceConfig
 
 _METHODS: dict[str, type[Config]] = {
     member.model_fields["kind"].default: member for member in (*get_args(AnyRegistration), IsvdOdometryConfig)

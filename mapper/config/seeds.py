@@ -2,7 +2,7 @@
 
 from typing import Any, TypeVar
 
-from mapper.config.base import Config
+from mapper.core.config import Config
 
 AnyConfig = TypeVar("AnyConfig", bound=Config)
 

@@ -1,10 +1,9 @@
 """What a sensor's logs begin with, where that differs from the classes' own defaults."""
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
-Sensor = Literal["rgbd", "lidar"]
-"""What took a log's frames: RGB-D frames whose body is an optical frame, or scans with z roughly up."""
+from mapper.core.frames import Sensor
 
 DEFAULTS: Mapping[Sensor, Mapping[str, Any]] = {
     "rgbd": {},

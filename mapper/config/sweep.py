@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, NonNegativeInt, model_validator
 
-from mapper.config.base import Config
+from mapper.core.config import Config
 
 
 def _assignments(given: Any) -> Any:

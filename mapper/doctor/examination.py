@@ -7,8 +7,8 @@ from mapper.doctor.finding import Finding
 from mapper.doctor.libraries import look_at_library, requirements
 from mapper.doctor.self_tests import SELF_TESTS
 from mapper.doctor.system_libraries import look_at_system_libraries
-from mapper.parallel import ordered_map
-from mapper.progress import SILENT, Progress
+from mapper.runtime.ordered_map import ordered_map
+from mapper.runtime.progress import SILENT, Progress
 
 _MACHINE: tuple[Callable[[], Finding], ...] = (
     machine.look_at_python,

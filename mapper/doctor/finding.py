@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
 
 Verdict = Literal["well", "warning", "failed"]
 

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.geometry import Array, Points
 from mapper.export.page import FAINT, INK, hex_of, save
 from mapper.export.palette import ESTIMATE, OCCUPIED_CELL, TRUTH, UNKNOWN_CELL, Rgb
 from mapper.export.panels import page, panel
-from mapper.geometry import Array, Points
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

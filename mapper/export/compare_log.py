@@ -4,13 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from mapper.core.geometry import Array
+from mapper.core.timebase import Stamps
+from mapper.core.trajectory import Trajectory
 from mapper.export.mcap_log import McapLog
 from mapper.export.palette import TRUTH
 from mapper.export.panels import color_of
 from mapper.export.ros2 import Value
-from mapper.geometry import Array
-from mapper.timebase import Stamps
-from mapper.trajectory import Trajectory
 
 
 @dataclass(frozen=True, slots=True, eq=False)

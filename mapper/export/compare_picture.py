@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mapper.core.geometry import Array
+from mapper.core.trajectory import Trajectory
 from mapper.export.page import FAINT, INK, LINE, hex_of, save
 from mapper.export.palette import END, START, TRUTH
 from mapper.export.panels import by_logarithm, color_of, draw_boxes, extent, page, panel, widest_axes
-from mapper.geometry import Array
-from mapper.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper import run as files
-from mapper.atomic import write_bytes, write_text
 from mapper.export.grid import read_grid
 from mapper.export.palette import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
 from mapper.navigation.costmap import INSCRIBED, LETHAL, NO_INFORMATION, Costmap, inflate
-from mapper.progress import Progress
-from mapper.run import Run
+from mapper.run import files
+from mapper.run.folder import Run
+from mapper.runtime.atomic import write_bytes, write_text
+from mapper.runtime.progress import Progress
 
 _MOST_INFLATED = 98
 _INSCRIBED, _LETHAL, _UNKNOWN = 99, 100, 255

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mapper.core.geometry import Array
 from mapper.export.page import FAINT, INK, LINE, hex_of, save
 from mapper.export.palette import END, ESTIMATE, START, TRUTH
 from mapper.export.panels import draw_boxes, extent, page, panel, widest_axes
-from mapper.geometry import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

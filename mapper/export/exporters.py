@@ -6,12 +6,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mapper.errors import ConfigError, RunError
-from mapper.progress import SILENT, Progress
+from mapper.core.errors import ConfigError, RunError
+from mapper.runtime.progress import SILENT, Progress
 
 if TYPE_CHECKING:
-    from mapper.config import BuildConfig
-    from mapper.run import Run
+    from mapper.config.build import BuildConfig
+    from mapper.run.folder import Run
 
 Write = Callable[["Run", Path, Progress], None]
 """Writes one file of a run, whole or not at all; a job of seconds tells how far it is."""

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import foxglove.layouts as fl
 
-from mapper.atomic import write_text
 from mapper.export.foxglove_parts import WORLD
 from mapper.export.palette import ESTIMATE, PLAN, TRUTH, Rgb
-from mapper.progress import Progress
-from mapper.run import Run
-from mapper.run_log import BODY
+from mapper.export.run_mcap import BODY
+from mapper.run.folder import Run
+from mapper.runtime.atomic import write_text
+from mapper.runtime.progress import Progress
 
 _CURVES = (
     ("features", ("features", "matches", "inliers")),

@@ -3,11 +3,11 @@
 import numpy as np
 from foxglove import messages
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.core.geometry import Points, Transform
+from mapper.core.rotations import quaternion_from_rotation
+from mapper.core.timebase import NS_PER_S
 from mapper.export.palette import Rgb
-from mapper.geometry import Points, Transform
-from mapper.rotations import quaternion_from_rotation
-from mapper.timebase import NS_PER_S
 
 _DOT_SPACING_M = 0.01
 _MOST_DOTS = 100_000

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.atomic import replacing, write_bytes, write_text
-from mapper.errors import DataError, MapFileError
+from mapper.core.errors import DataError, MapFileError
 from mapper.export.palette import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, shrunk
+from mapper.runtime.atomic import atomic_file, write_bytes, write_text
 
 FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
 OCCUPIED_THRESHOLD = 0.65
@@ -90,7 +90,7 @@ def _write_picture(path: Path, grid: OccupancyGrid) -> None:
     grid = shrunk(grid, _MOST_PX)
     enlargement = -(-_PICTURE_PX // max(grid.cells.shape))
     image = grid_image(grid)[::-1].repeat(enlargement, axis=0).repeat(enlargement, axis=1)
-    with replacing(path) as part:
+    with atomic_file(path) as part:
         if not cv2.imwrite(str(part), image[:, :, ::-1]):
             raise DataError(f"{path}: a grid of {grid.cells.shape} cells cannot be written as PNG")
 

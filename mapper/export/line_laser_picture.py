@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mapper.config.line_laser import StripeConfig
+from mapper.core.frames import Image
+from mapper.core.geometry import Array
 from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure, save
 from mapper.export.palette import ESTIMATE, TRUTH
-from mapper.frames import Image
-from mapper.geometry import Array
-from mapper.sensing.line_laser.calibration import CalibrationShot, Fit, ahead_m, row_px, up_px
-from mapper.sensing.line_laser.detection import Method, responses, stripe_rows
+from mapper.line_laser.calibration import CalibrationShot, Fit, ahead_m, row_px, up_px
+from mapper.line_laser.config import StripeConfig
+from mapper.line_laser.detection import Method, responses, stripe_rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

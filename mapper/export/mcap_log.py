@@ -54,8 +54,10 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 from zstandard import ZstdError
 
-from mapper.atomic import replacing
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.core.frames import PinholeCamera
+from mapper.core.geometry import Points, Transform
+from mapper.core.trajectory import Trajectory
 from mapper.export import ros2
 from mapper.export.foxglove_parts import (
     WORLD,
@@ -68,11 +70,9 @@ from mapper.export.foxglove_parts import (
     vector_of,
 )
 from mapper.export.palette import ESTIMATE, FACTORS, PLAN, Rgb
-from mapper.frames import PinholeCamera
-from mapper.geometry import Points, Transform
 from mapper.graph.model import BetweenFactor
 from mapper.octree.slice import OccupancyGrid
-from mapper.trajectory import Trajectory
+from mapper.runtime.atomic import atomic_file
 
 PLAN_TOPICS = ("/plan", "/plan/dots")
 
@@ -109,7 +109,7 @@ class McapLog:
 
     @contextmanager
     def _open(self, path: Path) -> Iterator[None]:
-        with replacing(path) as part, part.open("wb") as file:
+        with atomic_file(path) as part, part.open("wb") as file:
             self._writer = Writer(file, compression=CompressionType.ZSTD, enable_data_crcs=True)
             self._writer.start(profile="", library=_LIBRARY)
             yield
@@ -130,7 +130,7 @@ class McapLog:
         )
 
     def image(self, stamp_ns: int, jpeg: bytes, *, frame: str) -> None:
-        """Log a JPEG on /camera/image, as :func:`mapper.export.jpeg.encode_jpeg` makes it."""
+        """Log a JPEG on /camera/image, as :func:`mapper.mapping.thumbnails.encode_jpeg` makes it."""
         self._publish(
             "/camera/image",
             messages.CompressedImage(

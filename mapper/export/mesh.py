@@ -11,19 +11,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper import run as files
-from mapper.cloud import Colors
 from mapper.config.export import MeshConfig
-from mapper.errors import DependencyError, FrameError, RunError
+from mapper.core.errors import DependencyError, FrameError, RunError
+from mapper.core.frames import NO_DISTORTION, DepthImage, PinholeCamera, Points32, RgbdFrame
+from mapper.core.geometry import Transform, inverse
 from mapper.export.mesh_files import Triangles, write_mesh
-from mapper.frames import NO_DISTORTION, DepthImage, PinholeCamera, Points32, RgbdFrame
-from mapper.geometry import Transform, inverse
+from mapper.mapping.cloud import Colors
 from mapper.octree.blocks import check_memory
 from mapper.octree.octomap_file import read_map
-from mapper.parallel import ordered_map
-from mapper.progress import Progress
-from mapper.run import Run, open_log
-from mapper.sources.base import Entry
+from mapper.run import files
+from mapper.run.folder import Run, open_log
+from mapper.runtime.ordered_map import ordered_map
+from mapper.runtime.progress import Progress
+from mapper.sources.base import FrameRef
 
 _BLOCK_VOXELS = 8
 """Edge of a block. Of Open3D's usual 16 two thirds would lie beyond the truncation, and be computed."""
@@ -142,7 +142,7 @@ def _views(run: Run, progress: Progress) -> Iterator[_View]:
     source = open_log(run)
     entries = (entry for entry in source.entries() if entry.stamp_ns in T_world_body)
 
-    def prepare(entry: Entry) -> _View | str:
+    def prepare(entry: FrameRef) -> _View | str:
         try:
             frame = entry.load()
         except FrameError as error:

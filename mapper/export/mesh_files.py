@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.atomic import write_bytes, write_text
-from mapper.cloud import Colors
+from mapper.core.frames import Points32
 from mapper.export.ply import write_ply
-from mapper.frames import Points32
+from mapper.mapping.cloud import Colors
+from mapper.runtime.atomic import write_bytes, write_text
 
 Triangles = NDArray[np.int32]
 Write = Callable[[Path, Points32, Colors, Triangles], None]

@@ -6,8 +6,8 @@ Matplotlib is driven through its objects: pyplot would keep global state and pic
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mapper.atomic import replacing
 from mapper.export.palette import Rgb
+from mapper.runtime.atomic import atomic_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,7 +31,7 @@ def new_figure(width_in: float, height_in: float, *, background: Rgb = (255, 255
 
 def save(figure: "Figure", path: Path) -> None:
     """Write a page as PNG, atomically."""
-    with replacing(path) as part:
+    with atomic_file(path) as part:
         # Matplotlib would sign with its version: the same run must give the same bytes.
         figure.savefig(part, format="png", metadata={"Software": None})
 

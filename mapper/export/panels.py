@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mapper.core.geometry import Array
 from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure
 from mapper.export.palette import Rgb
-from mapper.geometry import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,15 +8,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.frames import Points32
+from mapper.core.geometry import Array
+from mapper.core.trajectory import Trajectory
 from mapper.export.grid import grid_image
 from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure, save
 from mapper.export.palette import END, ESTIMATE, FACTORS, PLAN, START, TRUTH, UNKNOWN_CELL, Rgb
 from mapper.export.panels import color_of
-from mapper.frames import Points32
-from mapper.geometry import Array
 from mapper.graph.model import PoseGraph, Solution
 from mapper.octree.slice import FREE, OCCUPIED, OccupancyGrid
-from mapper.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

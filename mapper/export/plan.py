@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper import run as files
-from mapper.atomic import write_text
-from mapper.errors import RunError
+from mapper.core.errors import RunError
+from mapper.core.geometry import Points
 from mapper.export.mcap_log import PLAN_TOPICS, McapLog
 from mapper.export.picture import write_path
-from mapper.geometry import Points
 from mapper.navigation.planner import Plan, point_text
 from mapper.octree.slice import OccupancyGrid
-from mapper.run import Run
+from mapper.run import files
+from mapper.run.folder import Run
+from mapper.runtime.atomic import write_text
 
 
 def write_plan(run: Run, plan: Plan, *, grid: OccupancyGrid) -> None:

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.atomic import replacing
-from mapper.errors import DataError
-from mapper.frames import Points32
+from mapper.core.errors import DataError
+from mapper.core.frames import Points32
+from mapper.runtime.atomic import atomic_file
 
 _VERTEX = np.dtype([("position", "<f4", 3), ("color", "u1", 3)])
 _TRIANGLE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
@@ -43,7 +43,7 @@ def write_ply(
     ]
     if triangles is not None:
         header += [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
-    with replacing(path) as part, part.open("wb") as file:
+    with atomic_file(path) as part, part.open("wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
         vertices = np.empty(len(points), _VERTEX)
         vertices["position"] = points

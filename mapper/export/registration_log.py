@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
+from mapper.core.frames import Points32
+from mapper.core.geometry import Transform, apply
+from mapper.core.timebase import NS_PER_S
 from mapper.export.mcap_log import McapLog
 from mapper.export.palette import ESTIMATE, TRUTH
 from mapper.export.ros2 import Value
-from mapper.frames import Points32
-from mapper.geometry import Transform, apply
-from mapper.timebase import NS_PER_S
 
 
 def write_registration_log(

@@ -5,12 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.config.registration import VOXEL_M
-from mapper.config.sensors import Sensor
+from mapper.core.frames import Points32, Sensor
+from mapper.core.geometry import Array, Transform, apply
 from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure, save
 from mapper.export.palette import END, ESTIMATE, TRUTH
-from mapper.frames import Points32
-from mapper.geometry import Array, Transform, apply
+from mapper.registration.config import VOXEL_M
 from mapper.registration.kd_tree import kd_tree
 
 _DRAWN = 60_000

@@ -7,9 +7,9 @@ aligned to its own size counted from the end of the four-byte header.
 import struct
 from collections.abc import Mapping
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.core.timebase import NS_PER_S
 from mapper.octree.slice import OccupancyGrid
-from mapper.timebase import NS_PER_S
 
 Value = int | float | str
 

@@ -3,13 +3,13 @@
 import shutil
 from pathlib import Path
 
-from mapper import run as files
-from mapper.atomic import replacing
-from mapper.errors import RunError
+from mapper.core.errors import RunError
 from mapper.export.grid import read_grid, write_grid
-from mapper.progress import Progress
-from mapper.run import Run
-from mapper.trajectory import write_kitti
+from mapper.run import files
+from mapper.run.folder import Run
+from mapper.runtime.atomic import atomic_file
+from mapper.runtime.progress import Progress
+from mapper.sources.trajectory_files import write_kitti
 
 
 def octomap(run: Run, path: Path, _progress: Progress) -> None:
@@ -55,7 +55,7 @@ def _copy(run: Run, name: str, path: Path) -> None:
     if not source.is_file():
         raise RunError(f"{source}: is missing from the run; build it again")
     if not _is_same(source, path):
-        with replacing(path) as part:
+        with atomic_file(path) as part:
             shutil.copyfile(source, part)
 
 

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper import run as files
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.core.frames import PinholeCamera
 from mapper.export.grid import read_grid
-from mapper.frames import PinholeCamera
-from mapper.fusion import Maps, Snapshot
+from mapper.export.run_mcap import BODY, CAMERA
+from mapper.mapping.fusion import Maps, Snapshot
 from mapper.octree.octomap_file import read_map
-from mapper.run import Run
-from mapper.run_log import BODY, CAMERA
+from mapper.run import files
+from mapper.run.folder import Run
 from mapper.sources.cloud_files.ply import read_ply
 from mapper.sources.mcap_log import open_mcap
 from mapper.sources.ros.frame_tree import FrameTree
@@ -47,7 +47,7 @@ def snapshots_of(run: Run) -> Iterator[Snapshot]:
 
 
 def read_snapshots(path: Path) -> Iterator[Snapshot]:
-    """Yield the images of an MCAP log that :mod:`mapper.run_log` wrote, each with its own camera.
+    """Yield the images of an MCAP log that :mod:`mapper.export.run_mcap` wrote, each with its own camera.
 
     Raises:
         DataError: The log cannot be read, or an image comes without a camera.

@@ -4,15 +4,15 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from mapper.atomic import write_text
-from mapper.config.graph import GraphConfig
-from mapper.errors import RunError
+from mapper.core.errors import RunError
+from mapper.core.trajectory import trajectory_from
 from mapper.export.picture import write_graph_views
+from mapper.graph.components import components
+from mapper.graph.config import GraphConfig
 from mapper.graph.g2o import write_g2o
 from mapper.graph.model import PoseGraph, Solution
-from mapper.graph.optimize import components
-from mapper.staging import staged
-from mapper.trajectory import trajectory_from, write_tum
+from mapper.runtime.atomic import atomic_folder, write_text
+from mapper.sources.trajectory_files import write_tum
 
 GRAPH, KEYFRAMES, PICTURE, REPORT = "graph.g2o", "keyframes.tum", "graph.png", "solve.json"
 BELIEVED = 0.5
@@ -70,7 +70,7 @@ def write_solved_graph(out: Path, solved: SolvedGraph) -> None:
         return
     if out.exists():
         raise RunError(f"{out}: exists already; choose another --out, or a file that ends in .g2o")
-    with staged(out) as folder:
+    with atomic_folder(out) as folder:
         write_g2o(folder / GRAPH, solved.solved)
         by_time = sorted((stamp, node) for node, stamp in solved.graph.stamps_ns.items())
         poses = ((stamp, solved.solution.T_world_node[node]) for stamp, node in by_time)

@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper import run as files
-from mapper.errors import RunError
+from mapper.core.errors import RunError
 from mapper.export.mesh_files import Triangles, write_mesh
-from mapper.export.palette import height_colors
 from mapper.export.ply import write_ply
+from mapper.mapping.cloud import height_colors
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import Leaves
 from mapper.octree.octomap_file import read_map
-from mapper.progress import Progress
-from mapper.run import Run
+from mapper.run import files
+from mapper.run.folder import Run
+from mapper.runtime.progress import Progress
 
 Corners = NDArray[np.int64]
 _AXIS_BITS = 17  # keys take 16; the corners of the last voxel and the neighbours of the first need room

@@ -6,9 +6,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.features import DetectorConfig
-from mapper.errors import DataError
-from mapper.frames import Image
+from mapper.core.errors import DataError
+from mapper.core.frames import Image
+from mapper.features.config import DetectorConfig
 
 Descriptors = NDArray[np.uint8] | NDArray[np.float32]
 """(N, D) bits, compared by Hamming distance, or numbers, compared by Euclidean distance."""

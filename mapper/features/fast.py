@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.frames import Image
+from mapper.core.frames import Image
 
 Pixels = NDArray[np.int32]
 """(N, 2) column and row."""

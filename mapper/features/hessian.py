@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.frames import Image
+from mapper.core.frames import Image
 
 LAYERS = 4  # filter sizes per octave; extrema are sought in the middle two
 _DXY_WEIGHT = 0.81  # 0.9², how far box filters misjudge the mixed derivative (Bay et al. 2008, eq. 3)

@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
 from mapper.features.bits import popcount
 from mapper.features.detectors import Descriptors
 

@@ -7,9 +7,9 @@ from operator import attrgetter
 import cv2
 import numpy as np
 
-from mapper.config.features import AkazeConfig, OrbConfig, SiftConfig
+from mapper.core.frames import Image
+from mapper.features.config import AkazeConfig, OrbConfig, SiftConfig
 from mapper.features.detectors import Descriptors, Features
-from mapper.frames import Image
 
 _OCTAVE, _ANGLE, _RESPONSE = (attrgetter(name) for name in ("octave", "angle", "response"))
 

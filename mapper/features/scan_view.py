@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from mapper.frames import Points32
+from mapper.core.frames import Points32
 
 
 @dataclass(frozen=True, slots=True, eq=False)

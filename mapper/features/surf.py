@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.features import SurfConfig
+from mapper.core.frames import Image
+from mapper.features.config import SurfConfig
 from mapper.features.detectors import Features
 from mapper.features.hessian import interest_points
-from mapper.frames import Image
 
 _DIMENSIONS = 64
 _SCALE_OF_OCTAVE_0 = 2.4  # of its two layers' filters, 15 and 21 px, the middle one's σ

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.features import UniformOrbConfig
+from mapper.core.frames import Image
+from mapper.features.config import UniformOrbConfig
 from mapper.features.detectors import Features
 from mapper.features.fast import Pixels, corners, fast_scores, orientations
 from mapper.features.quadtree import spread
-from mapper.frames import Image
 
 _MARGIN_PX = 19  # the rotated descriptor's tests reach this far
 _PATCH_PX = 31

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.core.geometry import Array, Points, Transform
 from mapper.features.detectors import Descriptors
 from mapper.features.windowed import Words, pack
-from mapper.geometry import Array, Points, Transform
 
 _ORB_BYTES = 32
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mapper.errors import GraphError
+from mapper.core.errors import GraphError
 from mapper.graph.model import BetweenFactor
-from mapper.progress import Report
+from mapper.runtime.progress import Report
 
 if TYPE_CHECKING:
     import gtsam

@@ -1,6 +1,6 @@
 """Where odometry alone puts the nodes of a graph that has been solved since."""
 
-from mapper.geometry import Transform, inverse
+from mapper.core.geometry import Transform, inverse
 from mapper.graph.model import PoseGraph
 
 

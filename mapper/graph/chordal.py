@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mapper.config.graph import GraphConfig
-from mapper.errors import GraphError
-from mapper.geometry import Array, nearest_rotation
+from mapper.core.errors import GraphError
+from mapper.core.geometry import Array, nearest_rotation
 from mapper.graph.batch import Part, problem_of
+from mapper.graph.config import GraphConfig
 from mapper.graph.terms import between
 
 if TYPE_CHECKING:

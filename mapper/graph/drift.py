@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.geometry import Array, Transform, adjoint, inverse, log
+from mapper.core.geometry import Array, Transform, adjoint, inverse, log
 from mapper.graph.model import BetweenFactor
 
 _MOST_TRIED = 5

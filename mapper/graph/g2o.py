@@ -8,13 +8,13 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.atomic import write_text
-from mapper.errors import GraphError, MapperError
-from mapper.geometry import Array
+from mapper.core.errors import GraphError, MapperError
+from mapper.core.geometry import Array
+from mapper.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from mapper.graph.information import as_gtsam_takes, lifted, swapped, symmetric
 from mapper.graph.model import BetweenFactor, Origin, PoseGraph
-from mapper.progress import SILENT, Progress
-from mapper.rotations import quaternion_from_rotation, rotation_from_quaternion
+from mapper.runtime.atomic import write_text
+from mapper.runtime.progress import SILENT, Progress
 
 _ORIGINS: tuple[Origin, ...] = get_args(Origin)
 _SHORTEST = 1e-9

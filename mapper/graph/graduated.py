@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.geometry import Array
+from mapper.core.geometry import Array
 from mapper.graph.batch import Effort, Part, solve
 from mapper.graph.drift import innovations
 from mapper.graph.model import BetweenFactor

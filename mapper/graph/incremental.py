@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from mapper.config.graph import GraphConfig
-from mapper.errors import GraphError
-from mapper.geometry import Transform, inverse, is_rigid
+from mapper.core.errors import GraphError
+from mapper.core.geometry import Transform, inverse, is_rigid
+from mapper.graph.config import GraphConfig
 from mapper.graph.model import BetweenFactor
 from mapper.graph.terms import Kernel, anchor, between, poses_of, values_of
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.geometry import Array
+from mapper.core.geometry import Array
 
 # g2o orders a pose's tangent (translation, rotation); ours is (rotation, translation).
 _SWAPPED = np.array([3, 4, 5, 0, 1, 2])

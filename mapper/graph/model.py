@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from mapper.errors import GraphError
-from mapper.geometry import Array, Transform, is_rigid
+from mapper.core.errors import GraphError
+from mapper.core.geometry import Array, Transform, is_rigid
 
 Origin = Literal["odometry", "loop", "wheel"]
 

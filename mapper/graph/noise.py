@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mapper.geometry import Array, Transform, rotation_log
+from mapper.core.geometry import Array, Transform, rotation_log
 
 _SHARE = 0.02
 """Of distance and angle: what calibration and depth distortion leave wrong, however many pixels agree."""
@@ -22,14 +22,14 @@ def with_model_error(information: Array, T_i_j: Transform) -> Array:
     """
     angle_rad = float(np.linalg.norm(rotation_log(T_i_j[:3, :3])))
     distance_m = float(np.linalg.norm(T_i_j[:3, 3]))
-    return softened(
+    return inflated(
         information,
         sigma_rad=_LEAST_RAD + _SHARE * angle_rad,
         sigma_m=_LEAST_M + _SHARE * distance_m,
     )
 
 
-def softened(information: Array, *, sigma_rad: float, sigma_m: float) -> Array:
+def inflated(information: Array, *, sigma_rad: float, sigma_m: float) -> Array:
     """Return the (6, 6) information of a relative pose with another error on top, the same each way."""
     variances = np.square([sigma_rad] * 3 + [sigma_m] * 3)
     known = np.linalg.inv(np.linalg.inv(information) + np.diag(variances))

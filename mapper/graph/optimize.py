@@ -6,16 +6,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mapper.config.graph import GraphConfig
-from mapper.errors import GraphError
-from mapper.geometry import is_rigid
+from mapper.core.errors import GraphError
+from mapper.core.geometry import is_rigid
 from mapper.graph.batch import Part
 from mapper.graph.chordal import start_of
+from mapper.graph.components import components
+from mapper.graph.config import GraphConfig
 from mapper.graph.model import PoseGraph, Solution
 from mapper.graph.proportional import distribute
 from mapper.graph.robust import solve_part
 from mapper.graph.terms import anchor, between, poses_of, values_of
-from mapper.progress import SILENT, Progress
+from mapper.runtime.progress import SILENT, Progress
 
 if TYPE_CHECKING:
     import gtsam
@@ -75,24 +76,6 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
     return Solution(T_world_node, iterations, before, after, tuple(weights))
 
 
-def components(graph: PoseGraph) -> list[list[int]]:
-    """Return the nodes of every connected component; the graph's order holds between and within them."""
-    parent = {node: node for node in graph.T_world_node}
-
-    def root(node: int) -> int:
-        while parent[node] != node:
-            parent[node] = parent[parent[node]]
-            node = parent[node]
-        return node
-
-    for factor in graph.factors:
-        parent[root(factor.j)] = root(factor.i)
-    members: dict[int, list[int]] = {}
-    for node in graph.T_world_node:
-        members.setdefault(root(node), []).append(node)
-    return list(members.values())
-
-
 def _errors(terms: Sequence["gtsam.NonlinearFactor"], values: "gtsam.Values") -> tuple[float, ...]:
     return tuple(term.error(values) for term in terms)
 
@@ -100,10 +83,10 @@ def _errors(terms: Sequence["gtsam.NonlinearFactor"], values: "gtsam.Values") ->
 def _tied_components(graph: PoseGraph) -> list[tuple[list[int], list[int]]]:
     """Return (nodes, indices of their factors) of every component that has any factor."""
     parts = components(graph)
-    part_of = {node: part for part, nodes in enumerate(parts) for node in nodes}
+    component_of = {node: part for part, nodes in enumerate(parts) for node in nodes}
     factors: list[list[int]] = [[] for _ in parts]
     for k, factor in enumerate(graph.factors):
-        factors[part_of[factor.i]].append(k)
+        factors[component_of[factor.i]].append(k)
     return [(nodes, indices) for nodes, indices in zip(parts, factors, strict=True) if indices]
 
 

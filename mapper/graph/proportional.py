@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from mapper.errors import GraphError
-from mapper.geometry import Array, Transform, inverse, nearest_rotation, rotation_log, skew
+from mapper.core.errors import GraphError
+from mapper.core.geometry import Array, Transform, inverse, nearest_rotation, rotation_log, skew
 from mapper.graph.model import BetweenFactor, PoseGraph
 
 

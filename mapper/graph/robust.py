@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mapper.config.graph import GraphConfig
-from mapper.geometry import Array
+from mapper.core.geometry import Array
 from mapper.graph.batch import Effort, Part, solve
+from mapper.graph.config import GraphConfig
 from mapper.graph.graduated import chi2_of, graduate, weighted
 from mapper.graph.terms import Kernel, between
-from mapper.progress import Report
+from mapper.runtime.progress import Report
 
 if TYPE_CHECKING:
     import gtsam

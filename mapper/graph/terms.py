@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mapper.config.graph import KernelKind
-from mapper.geometry import Array, Transform
+from mapper.core.geometry import Array, Transform
+from mapper.graph.config import KernelKind
 from mapper.graph.model import BetweenFactor, PoseSigmas
 
 if TYPE_CHECKING:

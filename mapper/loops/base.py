@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-from mapper.geometry import Array, Transform
+from mapper.core.geometry import Array, Transform
 from mapper.loops.closure import LoopClosure, ProposedBy
 from mapper.odometry.base import Seen
 
@@ -45,7 +45,7 @@ class Proposer(Protocol[Known]):
         """Return the likeliest of the first ``before`` places that were remembered, the likeliest first."""
         ...
 
-    def remember(self, node: int, seen: Known) -> None:
+    def add(self, node: int, seen: Known) -> None:
         """Take a place in; nodes come in time order."""
         ...
 
@@ -76,7 +76,7 @@ class Verification:
 class Verifier(Protocol[Place]):
     """Tells whether two places are one."""
 
-    def digest(self, seen: Seen, /) -> Place:
+    def describe(self, seen: Seen, /) -> Place:
         """Return what is to be remembered of a keyframe.
 
         Raises:

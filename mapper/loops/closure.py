@@ -8,11 +8,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mapper.atomic import write_text
-from mapper.errors import DataError, RunError
-from mapper.geometry import Array, Transform, inverse, rotation_log, transform
+from mapper.core.errors import DataError, RunError
+from mapper.core.geometry import Array, Transform, inverse, rotation_log, transform
+from mapper.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from mapper.graph.model import BetweenFactor, Solution
-from mapper.rotations import quaternion_from_rotation, rotation_from_quaternion
+from mapper.runtime.atomic import write_text
 
 ProposedBy = Literal["places", "scans", "nearby", "hand"]
 Verdict = Literal["accepted", "rejected"]
@@ -100,7 +100,7 @@ def exceeds(miss: Discrepancy, limit: Discrepancy) -> bool:
     return miss.translation_m > limit.translation_m or miss.rotation_rad > limit.rotation_rad
 
 
-def settled(
+def apply_solution(
     loops: Sequence[LoopClosure],
     T_world_before: Mapping[int, Transform],
     solution: Solution,
@@ -118,14 +118,14 @@ def settled(
     accepted = sum(loop.verdict == "accepted" for loop in loops)
     weights = iter(solution.weights[len(solution.weights) - accepted :])
     return tuple(
-        _settled(loop, next(weights), T_world_before, solution.T_world_node, min_weight)
+        _apply_solution(loop, next(weights), T_world_before, solution.T_world_node, min_weight)
         if loop.verdict == "accepted" and loop.T_i_j is not None
         else loop
         for loop in loops
     )
 
 
-def _settled(
+def _apply_solution(
     loop: LoopClosure,
     weight: float,
     T_world_before: Mapping[int, Transform],

@@ -6,9 +6,9 @@ from typing import Generic
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.geometry import Array, Transform
+from mapper.core.geometry import Array, Transform
 from mapper.loops.base import Place, Proposal, Proposer
-from mapper.loops.belief import Belief
+from mapper.loops.online_poses import OnlinePoseEstimator
 
 
 class ByPose(Generic[Place]):
@@ -16,7 +16,7 @@ class ByPose(Generic[Place]):
 
     def __init__(
         self,
-        belief: Belief,
+        estimator: OnlinePoseEstimator,
         pose_of_sensor: Callable[[Place], Transform],
         *,
         max_distance_m: float,
@@ -26,13 +26,13 @@ class ByPose(Generic[Place]):
         """Start without places.
 
         Args:
-            belief: Where the nodes are.
+            estimator: Where the nodes are.
             pose_of_sensor: Returns T_body_sensor, of which z is the axis that the sensor looks along.
             max_distance_m: Largest distance between two positions.
             max_angle_rad: Largest angle between two viewing directions.
             drift_ratio: How much farther to look per metre travelled since.
         """
-        self._belief = belief
+        self._estimator = estimator
         self._pose_of_sensor = pose_of_sensor
         self._max_distance_m = max_distance_m
         self._max_angle_rad = max_angle_rad
@@ -55,11 +55,11 @@ class ByPose(Generic[Place]):
         nearest = candidates[np.argsort(apart, kind="stable")[:limit]]
         return [Proposal(self._nodes[k], "nearby") for k in nearest.tolist()]
 
-    def remember(self, node: int, seen: Place) -> None:
+    def add(self, node: int, seen: Place) -> None:
         """Take a place in."""
         travelled_m = 0.0
         if self._nodes:
-            step = self._belief.pose_of(node)[:3, 3] - self._belief.pose_of(self._nodes[-1])[:3, 3]
+            step = self._estimator.pose_of(node)[:3, 3] - self._estimator.pose_of(self._nodes[-1])[:3, 3]
             travelled_m = self._travelled_m[-1] + float(np.linalg.norm(step))
         self._nodes.append(node)
         self._T_body_sensor.append(self._pose_of_sensor(seen))
@@ -69,8 +69,8 @@ class ByPose(Generic[Place]):
         """Return how far the places are believed to lie from a node's, and the angles between their views."""
         if before == 0:
             return np.empty(0), np.empty(0)
-        T_world_here = self._belief.pose_of(node) @ self._pose_of_sensor(seen)
-        T_world_body = np.array([self._belief.pose_of(place) for place in self._nodes[:before]])
+        T_world_here = self._estimator.pose_of(node) @ self._pose_of_sensor(seen)
+        T_world_body = np.array([self._estimator.pose_of(place) for place in self._nodes[:before]])
         T_world_place = T_world_body @ np.array(self._T_body_sensor[:before])
         distance_m = np.linalg.norm(T_world_place[:, :3, 3] - T_world_here[:3, 3], axis=1)
         angle_rad = np.arccos(np.clip(T_world_place[:, :3, 2] @ T_world_here[:3, 2], -1.0, 1.0))
@@ -96,7 +96,7 @@ class ByBoth(Generic[Place]):
                 proposals.setdefault(proposal.node, proposal)
         return list(proposals.values())[:limit]
 
-    def remember(self, node: int, seen: Place) -> None:
+    def add(self, node: int, seen: Place) -> None:
         """Take a place in."""
         for proposer in self._proposers:
-            proposer.remember(node, seen)
+            proposer.add(node, seen)

@@ -6,20 +6,20 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.loops import ScanVerificationConfig
-from mapper.errors import ConfigError
+from mapper.core.errors import ConfigError
+from mapper.core.geometry import Array, Points, Transform, apply, inverse
 from mapper.features.scan_view import ScanView
-from mapper.geometry import Array, Points, Transform, apply, inverse
-from mapper.graph.noise import softened
+from mapper.graph.noise import inflated
 from mapper.loops.base import Verification
 from mapper.loops.closure import Discrepancy, discrepancy, exceeds
+from mapper.loops.config import ScanVerificationConfig
 from mapper.loops.scans import ScanPlace
 from mapper.odometry.base import Seen
 from mapper.registration.base import Alignment
 from mapper.registration.degeneracy import degeneracy_of
-from mapper.registration.ground import find_ground, find_obstacles
+from mapper.registration.ground_plane import level
+from mapper.registration.ground_removal import find_ground, find_obstacles
 from mapper.registration.kernels import thin
-from mapper.registration.levelling import level
 from mapper.registration.objects import centres_of
 from mapper.registration.overlap_kernels import look, range_picture
 from mapper.registration.refining import refine
@@ -88,7 +88,7 @@ class ScanVerifier:
         self._outlook = lru_cache(config.remembered)(partial(_outlook_of, config=config))
         self._cloud = lru_cache(config.remembered)(partial(_cloud_of, config=config))
 
-    def digest(self, seen: Seen, /) -> ScanPlace:
+    def describe(self, seen: Seen, /) -> ScanPlace:
         """Return the scan, thin.
 
         Raises:
@@ -203,7 +203,7 @@ class ScanVerifier:
         degeneracy = degeneracy_of(alignment.information, points=source.points)
         if degeneracy.is_degenerate:
             return replace(told, reason=f"degenerate: no surface shows {degeneracy.text}")
-        information = softened(alignment.information, sigma_rad=config.sigma_rad, sigma_m=config.sigma_m)
+        information = inflated(alignment.information, sigma_rad=config.sigma_rad, sigma_m=config.sigma_m)
         return replace(told, T_i_j=alignment.T_target_source, information=information)
 
 

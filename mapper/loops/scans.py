@@ -4,14 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.config.loops import ScanLoopsConfig
-from mapper.config.places import ScanContextConfig
-from mapper.frames import Points32
-from mapper.geometry import Transform, apply
+from mapper.core.frames import Points32
+from mapper.core.geometry import Transform, apply
 from mapper.loops.base import Proposal, Proposer
-from mapper.loops.belief import Belief
-from mapper.loops.drift import Ways
+from mapper.loops.config import ScanLoopsConfig
+from mapper.loops.odometry_chain import OdometryChain
+from mapper.loops.online_poses import OnlinePoseEstimator
 from mapper.loops.proposals import ByBoth, ByPose
+from mapper.places.config import ScanContextConfig
 from mapper.places.scan_context import ScanContext, ScanContexts, scan_context
 
 
@@ -38,35 +38,37 @@ class ByContext:
     """
 
     def __init__(
-        self, config: ScanContextConfig, by_pose: ByPose[ScanPlace], ways: Ways, *, most: int
+        self, config: ScanContextConfig, by_pose: ByPose[ScanPlace], chain: OdometryChain, *, most: int
     ) -> None:
         """Start without places.
 
         Args:
             config: What looks alike.
             by_pose: Tells how near is near; it has to remember the same places.
-            ways: Which nodes are tied to which.
+            chain: Which nodes are tied to which.
             most: How many it proposes at most, to leave room.
         """
         self._most = most
         self._config = config
         self._by_pose = by_pose
-        self._ways = ways
+        self._chain = chain
         self._index = ScanContexts(config)
         self._nodes: list[int] = []
         self._described: tuple[ScanPlace, ScanContext] | None = None
 
     def propose(self, node: int, seen: ScanPlace, /, *, before: int, limit: int) -> list[Proposal]:
         """Return the most similar places, the most similar first."""
-        part = self._ways.part_of(node)
-        untied = np.array([self._ways.part_of(place) != part for place in self._nodes[:before]], np.bool_)
+        part = self._chain.component_of(node)
+        untied = np.array(
+            [self._chain.component_of(place) != part for place in self._nodes[:before]], np.bool_
+        )
         among = untied | self._by_pose.within_reach(node, seen, before=before)
         if not among.any():
             return []
         found = self._index.query(self._context(seen), among, limit=min(limit, self._most))
         return [Proposal(other, "scans", similarity) for other, similarity in found]
 
-    def remember(self, node: int, seen: ScanPlace) -> None:
+    def add(self, node: int, seen: ScanPlace) -> None:
         """Take a place in."""
         self._index.add(node, self._context(seen))
         self._nodes.append(node)
@@ -80,14 +82,14 @@ class ByContext:
 
 
 def scan_proposer(
-    config: ScanLoopsConfig, _first: ScanPlace, belief: Belief, ways: Ways, /
+    config: ScanLoopsConfig, _first: ScanPlace, estimator: OnlinePoseEstimator, chain: OdometryChain, /
 ) -> Proposer[ScanPlace]:
     """Return the proposer of scans: by looks, which leave room, and by pose."""
     by_pose: ByPose[ScanPlace] = ByPose(
-        belief,
+        estimator,
         lambda _: np.eye(4),  # a scanner looks all round: its heading is nothing, its upright axis is all
         max_distance_m=config.max_distance_m,
         max_angle_rad=config.max_tilt_rad,
         drift_ratio=config.gate.drift_ratio,
     )
-    return ByBoth(ByContext(config.context, by_pose, ways, most=config.max_lookalikes), by_pose)
+    return ByBoth(ByContext(config.context, by_pose, chain, most=config.max_lookalikes), by_pose)

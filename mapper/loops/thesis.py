@@ -5,28 +5,28 @@ from collections import deque
 from collections.abc import Sequence
 from statistics import median
 
-from mapper.config.loops import ThesisLoopsConfig
+from mapper.core.geometry import Transform
+from mapper.core.timebase import NS_PER_S
 from mapper.features.view import View
-from mapper.geometry import Transform
 from mapper.loops.base import measured
-from mapper.loops.belief import Correction, belief_for
-from mapper.loops.closer import ViewOf
 from mapper.loops.closure import LoopClosure
+from mapper.loops.config import ThesisLoopsConfig
+from mapper.loops.detector import ViewOf
+from mapper.loops.online_poses import Correction, build_pose_estimator
 from mapper.loops.proposals import ByPose
-from mapper.odometry.base import Track
+from mapper.odometry.base import FrameResult
 from mapper.odometry.keyframes import SharpestKeyframes
-from mapper.timebase import NS_PER_S
 
 
-class ThesisLoops:
+class ThesisLoopDetector:
     """Compares sharp frames with the keyframes that lie near their estimate."""
 
     def __init__(self, config: ThesisLoopsConfig, *, correction: Correction) -> None:
         self._config = config
-        self._belief = belief_for(correction)
+        self._estimator = build_pose_estimator(correction)
         self._verifier = config.verification.build()
         self._proposer: ByPose[View] = ByPose(
-            self._belief,
+            self._estimator,
             lambda view: view.T_body_camera,
             max_distance_m=config.max_distance_m,
             max_angle_rad=config.max_angle_rad,
@@ -38,10 +38,10 @@ class ThesisLoops:
         self._views: dict[int, View] = {}
         self._closures: list[LoopClosure] = []
 
-    def add(self, node: int, track: Track, view: ViewOf, /) -> None:
+    def add(self, node: int, track: FrameResult, view: ViewOf, /) -> None:
         """Look for a loop if the frame is sharp, and remember the sharpest of every so many."""
-        self._belief.add(node, track)
-        seen, features = self._verifier.digest(view()), track.diagnostics.features
+        self._estimator.add(node, track)
+        seen, features = self._verifier.describe(view()), track.diagnostics.features
         self._features.append(features)
         self._recent.append((node, seen))
         if features > self._config.sharp_ratio * median(self._features):
@@ -50,15 +50,15 @@ class ThesisLoops:
         for recent, recent_view in self._recent:
             if recent == keyframe:
                 self._views[recent] = recent_view
-                self._proposer.remember(recent, recent_view)
+                self._proposer.add(recent, recent_view)
 
     def closures(self) -> Sequence[LoopClosure]:
         """Return every candidate so far."""
         return tuple(self._closures)
 
-    def believed(self, node: int) -> Transform:
+    def current_estimate(self, node: int) -> Transform:
         """Return where a node is believed to be now (4, 4), with the loops so far."""
-        return self._belief.pose_of(node)
+        return self._estimator.pose_of(node)
 
     def _look(self, node: int, seen: View) -> None:
         min_gap_ns = round(self._config.min_gap_s * NS_PER_S)
@@ -69,5 +69,5 @@ class ThesisLoops:
             closure = measured(proposal, node, self._views[proposal.node], seen, self._verifier)
             self._closures.append(closure)
             if closure.verdict == "accepted":
-                self._belief.close(closure)
+                self._estimator.close(closure)
                 return

@@ -3,14 +3,14 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.loops import VerificationConfig
-from mapper.errors import ConfigError
+from mapper.core.errors import ConfigError
+from mapper.core.geometry import Array, adjoint, apply, inverse
 from mapper.features.matching import Pairs, homography_inliers, match_mutual
 from mapper.features.view import View
 from mapper.features.windowed import match_everywhere
-from mapper.geometry import Array, adjoint, apply, inverse
 from mapper.graph.noise import with_model_error
 from mapper.loops.base import Verification
+from mapper.loops.config import VerificationConfig
 from mapper.odometry.base import Seen
 from mapper.odometry.local_map.p3p import ransac_p3p
 from mapper.odometry.local_map.pose import normal_matrix, refine_pose
@@ -34,7 +34,7 @@ class ImageVerifier:
         self._config = config
         self._isvd = Isvd(config.registration)
 
-    def digest(self, seen: Seen, /) -> View:
+    def describe(self, seen: Seen, /) -> View:
         """Return the view as it is.
 
         Raises:

@@ -1,12 +1,12 @@
 """Which known images look like one: by a bag of words, and by where they are believed to be."""
 
-from mapper.config.loops import PlaceLoopsConfig
-from mapper.config.places import PlacesConfig
 from mapper.features.view import View
 from mapper.loops.base import Proposal, Proposer
-from mapper.loops.belief import Belief
-from mapper.loops.drift import Ways
+from mapper.loops.config import PlaceLoopsConfig
+from mapper.loops.odometry_chain import OdometryChain
+from mapper.loops.online_poses import OnlinePoseEstimator
 from mapper.loops.proposals import ByBoth, ByPose
+from mapper.places.config import PlacesConfig
 from mapper.places.index import PlaceIndex
 from mapper.places.vocabulary import WordVector, load_vocabulary
 
@@ -36,7 +36,7 @@ class ByWords:
         )
         return [Proposal(other, "places", similarity) for other, similarity in found]
 
-    def remember(self, node: int, seen: View) -> None:
+    def add(self, node: int, seen: View) -> None:
         """Take a place in."""
         self._index.add(node, self._vector(seen))
 
@@ -47,10 +47,12 @@ class ByWords:
         return self._described[1]
 
 
-def image_proposer(config: PlaceLoopsConfig, first: View, belief: Belief, _ways: Ways, /) -> Proposer[View]:
+def image_proposer(
+    config: PlaceLoopsConfig, first: View, estimator: OnlinePoseEstimator, _chain: OdometryChain, /
+) -> Proposer[View]:
     """Return the proposer of a log whose first keyframe looks so: only ORB's descriptors have words."""
     by_pose: ByPose[View] = ByPose(
-        belief,
+        estimator,
         lambda view: view.T_body_camera,
         max_distance_m=config.max_distance_m,
         max_angle_rad=config.max_angle_rad,

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.core.geometry import apply
 from mapper.export.picture import write_merged
-from mapper.geometry import apply
 from mapper.merging.jobs import Foreman
 from mapper.merging.merged_map import MapManifest
 from mapper.merging.placing import Placed
 from mapper.merging.steps import JoinedTile, SeenColumn, Site, save_ground, see_column
-from mapper.octree.ground import NOTHING, find_ground
+from mapper.octree.ground_height import NOTHING, find_ground
 from mapper.octree.slice import OccupancyGrid, grid_of, shrunk
 
 _MOST_CELLS = 2000  # more than a page has pixels

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from mapper.atomic import write_text
-from mapper.config.base import Config
-from mapper.errors import RunError
-from mapper.progress import Progress
-from mapper.workers import Crew, Failure, run_jobs
+from mapper.core.config import Config
+from mapper.core.errors import RunError
+from mapper.runtime.atomic import write_text
+from mapper.runtime.executor import Crew, Failure, run_jobs
+from mapper.runtime.progress import Progress
 
 Result = TypeVar("Result", bound=Config)
 

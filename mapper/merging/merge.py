@@ -9,30 +9,23 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from mapper import run as files
-from mapper.config.octree import OctreeConfig
-from mapper.errors import ConfigError, RunError
+from mapper.core.errors import ConfigError, RunError
+from mapper.core.geometry import apply
 from mapper.export.grid import write_grid
-from mapper.fingerprint import fingerprint
-from mapper.geometry import apply
 from mapper.merging.assembling import write_whole_bt, write_whole_ot
 from mapper.merging.from_above import draw, look_from_above
 from mapper.merging.jobs import Foreman
-from mapper.merging.merged_map import TILES, MapManifest, MergedMap, RunInMap, Tile, is_map, open_map
+from mapper.merging.merged_map import TILES, MapManifest, MergedMap, RunInMap, Tile, open_map
 from mapper.merging.placing import Placed, doubts
-from mapper.merging.steps import (
-    Effort,
-    JoinedTile,
-    SeenColumn,
-    Site,
-    SplitRun,
-    join_tile,
-    split_run,
-)
+from mapper.merging.steps import Effort, JoinedTile, SeenColumn, Site, SplitRun, join_tile, split_run
 from mapper.merging.tiling import tiling_for
-from mapper.progress import SILENT, Progress
-from mapper.staging import MARK, staged
-from mapper.workers import hired
+from mapper.octree.config import OctreeConfig
+from mapper.run import files
+from mapper.run.fingerprint import fingerprint
+from mapper.run.manifest import is_merged_map
+from mapper.runtime.atomic import MANIFEST_NAME, atomic_folder
+from mapper.runtime.executor import hired
+from mapper.runtime.progress import SILENT, Progress
 
 DEFAULT_TILE_M = 50.0
 
@@ -95,7 +88,7 @@ def merge(
         ConfigError: The runs do not agree in resolution or sensor model, or the tiles' edge is impossible.
         RunError: OUT is there already, a run comes twice or lacks its map, or a job failed.
     """
-    if overwrite and out.exists() and not is_map(out):
+    if overwrite and out.exists() and not is_merged_map(out):
         raise RunError(f"{out}: is no merged map, so --overwrite will not replace it; choose another --out")
     config = _common_config(placed)
     tiling = tiling_for(config.resolution_m, tile_m)
@@ -109,7 +102,9 @@ def merge(
     )
     with (
         hired(scheduler, processes) as crew,
-        staged(out, overwrite=overwrite, keeps=lambda partial: _begun_alike(partial, manifest)) as folder,
+        atomic_folder(
+            out, overwrite=overwrite, keeps=lambda partial: _begun_alike(partial, manifest)
+        ) as folder,
     ):
         manifest.save(folder)
         doubtful = doubts(placed)
@@ -183,7 +178,7 @@ def _floor_z_m(first: Placed) -> float:
 def _begun_alike(partial: Path, manifest: MapManifest) -> bool:
     """Tell whether what was left behind is the beginning of this very merge."""
     try:
-        return MapManifest.model_validate_json((partial / MARK).read_bytes()) == manifest
+        return MapManifest.model_validate_json((partial / MANIFEST_NAME).read_bytes()) == manifest
     except (OSError, ValidationError):
         return False
 

@@ -8,14 +8,14 @@ import numpy as np
 from pydantic import ValidationError
 
 import mapper
-from mapper.atomic import write_text
-from mapper.config.base import Config
-from mapper.config.octree import OctreeConfig, SliceConfig
-from mapper.errors import RunError
-from mapper.geometry import Array
+from mapper.core.config import Config
+from mapper.core.errors import RunError
+from mapper.core.geometry import Array
+from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import read_map
-from mapper.staging import MARK, partial_of
+from mapper.run.manifest import is_merged_map
+from mapper.runtime.atomic import MANIFEST_NAME, partial_of, write_text
 
 TILES = "tiles"
 
@@ -81,7 +81,7 @@ class MapManifest(Config):
 
     def save(self, folder: Path) -> None:
         """Write the manifest atomically."""
-        write_text(folder / MARK, self.model_dump_json(indent=2) + "\n")
+        write_text(folder / MANIFEST_NAME, self.model_dump_json(indent=2) + "\n")
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,27 +118,21 @@ class MergedMap:
         return octree
 
 
-def is_map(folder: Path) -> bool:
-    """Tell whether a folder holds a merged map."""
-    try:
-        return '"kind": "merged map"' in (folder / MARK).read_text(encoding="utf-8")[:200]
-    except (OSError, UnicodeDecodeError):
-        return False
-
-
 def open_map(folder: Path) -> MergedMap:
     """Return a finished merged map.
 
     Raises:
         RunError: The folder is missing, holds no merged map, or one that is not finished.
     """
-    if not is_map(folder):
-        if is_map(partial_of(folder)):
+    if not is_merged_map(folder):
+        if is_merged_map(partial_of(folder)):
             raise RunError(f"{folder}: not finished; the command that began it goes on where it stopped")
         raise RunError(f"{folder}: no merged map; make one with mapper merge RUN… --out {folder}")
     try:
-        manifest = MapManifest.model_validate_json((folder / MARK).read_bytes())
+        manifest = MapManifest.model_validate_json((folder / MANIFEST_NAME).read_bytes())
     except ValidationError as error:
         first = error.errors()[0]
-        raise RunError(f"{folder / MARK}: {first['loc']}: {first['msg']}; by another version?") from None
+        raise RunError(
+            f"{folder / MANIFEST_NAME}: {first['loc']}: {first['msg']}; by another version?"
+        ) from None
     return MergedMap(folder, manifest)

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.errors import DataError, RunError
-from mapper.geometry import Array, Transform, fit_rigid, inverse, transform
-from mapper.rotations import rotation_from_quaternion
-from mapper.run import Run
-from mapper.timebase import MAX_TRUTH_GAP_NS, nearest
+from mapper.core.errors import DataError, RunError
+from mapper.core.geometry import Array, Transform, fit_rigid, inverse, transform
+from mapper.core.rotations import rotation_from_quaternion
+from mapper.core.timebase import MAX_TRUTH_GAP_NS, nearest
+from mapper.run.folder import Run
 
 _LEVER_M = 1.0
 """A straight path alone would not tell how a run is turned about it; the body's axes, so long, do."""

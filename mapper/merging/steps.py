@@ -12,16 +12,14 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.atomic import replacing, write_bytes
-from mapper.config.base import Config
-from mapper.config.octree import OctreeConfig, SliceConfig
-from mapper.geometry import Transform, inverse
-from mapper.measure import peak_memory_mb
+from mapper.core.config import Config
+from mapper.core.geometry import Transform, inverse
 from mapper.merging.merged_map import TILES
 from mapper.merging.tiling import Tiling
 from mapper.octree.attributes import UNSET
 from mapper.octree.color_tree import colored
-from mapper.octree.ground import Ground, lowest_occupied
+from mapper.octree.config import OctreeConfig, SliceConfig
+from mapper.octree.ground_height import Ground, lowest_occupied
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import read_map
@@ -29,6 +27,8 @@ from mapper.octree.resampling import blocks_reached, resampled
 from mapper.octree.slice import block_extent, see_band
 from mapper.octree.summing import Overlap
 from mapper.octree.tree import children_in, nodes_in_preorder, words_in_preorder
+from mapper.runtime.atomic import atomic_file, write_bytes
+from mapper.runtime.timing import peak_memory_mb
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +234,7 @@ def see_column(
 
 def save_ground(path: Path, ground: Ground) -> None:
     """Write the ground for the jobs that follow it."""
-    with replacing(path) as part, part.open("wb") as file:
+    with atomic_file(path) as part, part.open("wb") as file:
         np.savez(file, heights_m=ground.heights_m, first=ground.first, columns=ground.columns)
 
 
@@ -245,7 +245,7 @@ def load_ground(path: Path) -> Ground:
 
 
 def _save(path: Path, array: NDArray[np.generic]) -> None:
-    with replacing(path) as part, part.open("wb") as file:
+    with atomic_file(path) as part, part.open("wb") as file:
         np.save(file, array)
 
 

@@ -6,8 +6,8 @@ from math import log2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import ConfigError
-from mapper.geometry import Array
+from mapper.core.errors import ConfigError
+from mapper.core.geometry import Array
 from mapper.octree.keys import BLOCK_BITS, KEY_BITS, KEY_ZERO, gather
 
 

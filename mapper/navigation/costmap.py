@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import DataError
-from mapper.geometry import Array
+from mapper.core.errors import DataError
+from mapper.core.geometry import Array
 from mapper.navigation.transform import NONE, squares_to_centres
 from mapper.octree.slice import OCCUPIED, UNKNOWN, OccupancyGrid
 

@@ -6,8 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.errors import DataError
-from mapper.geometry import Array, Points
+from mapper.core.errors import DataError
+from mapper.core.geometry import Array, Points
 from mapper.navigation.transform import NONE, squares_to_boxes
 from mapper.navigation.voxels import LIMIT_BYTES, Box, VoxelGrid, cut_box, layer
 from mapper.octree.map import OctreeMap

@@ -6,12 +6,12 @@ from itertools import pairwise, product
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.navigation import PlanConfig
-from mapper.errors import PlanError
-from mapper.geometry import Array
+from mapper.core.errors import PlanError
+from mapper.core.geometry import Array
+from mapper.navigation.config import PlanConfig
 from mapper.navigation.distance import DistanceField, distance_field
+from mapper.navigation.line_of_sight import in_sight, path_length, shortened
 from mapper.navigation.search import Cell, shortest_path
-from mapper.navigation.sight import in_sight, path_length, shortened
 from mapper.navigation.voxels import LIMIT_BYTES, VoxelGrid, cut_box, known_box, layer
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import UNKNOWN, OccupancyGrid

@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.geometry import Array
+from mapper.core.geometry import Array
 
 Cell = tuple[int, int, int]
 Cells = NDArray[np.int64]

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.errors import MapSizeError
+from mapper.core.errors import MapSizeError
 
 Squares = NDArray[np.int32]
 Line = NDArray[np.int64]

@@ -8,9 +8,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.config.navigation import TraversableConfig
-from mapper.errors import DataError
-from mapper.geometry import Array
+from mapper.core.errors import DataError
+from mapper.core.geometry import Array
+from mapper.navigation.config import TraversableConfig
 from mapper.navigation.transform import NONE, squares_to_boxes
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_MASK, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap

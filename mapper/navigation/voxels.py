@@ -6,8 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.errors import DataError, MapSizeError
-from mapper.geometry import Array
+from mapper.core.errors import DataError, MapSizeError
+from mapper.core.geometry import Array
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_COUNT, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid

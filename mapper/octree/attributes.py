@@ -13,10 +13,10 @@ from numba import njit
 from numpy import float32, float64, int64, uint32
 from numpy.typing import NDArray
 
-from mapper.config.octree import OctreeConfig
-from mapper.frames import Points32
-from mapper.geometry import Array, Points, Transform
+from mapper.core.frames import Points32
+from mapper.core.geometry import Array, Points, Transform
 from mapper.octree.blocks import BlockStore, check_memory, find_slots, slot_of
+from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import (
     BLOCK_BITS,
     BLOCK_VOXELS,

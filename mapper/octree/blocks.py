@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.errors import MapSizeError
+from mapper.core.errors import MapSizeError
 from mapper.octree.keys import BLOCK_VOXELS
 
 BLOCK_BYTES = BLOCK_VOXELS * 4

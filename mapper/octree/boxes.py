@@ -7,8 +7,8 @@ from numba import njit
 from numpy import int64
 from numpy.typing import NDArray
 
-from mapper.errors import DataError
-from mapper.geometry import Points
+from mapper.core.errors import DataError
+from mapper.core.geometry import Points
 from mapper.octree.blocks import BlockStore, slot_of
 from mapper.octree.keys import BLOCK_BITS, KEY_ZERO, gather, morton
 

@@ -5,11 +5,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.octree import OctreeConfig
-from mapper.errors import DataError
-from mapper.frames import Points32, Scan
-from mapper.geometry import Array, Transform, apply
+from mapper.core.errors import DataError
+from mapper.core.frames import Points32, Scan
+from mapper.core.geometry import Array, Transform, apply
 from mapper.octree import kernels
+from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import KEY_COUNT, KEY_ZERO
 from mapper.octree.window import Window, WindowBuffer, block_codes, take_touched
 

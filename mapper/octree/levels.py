@@ -7,8 +7,8 @@ from numba import njit
 from numpy import float32, int64
 from numpy.typing import NDArray
 
-from mapper.errors import DataError
-from mapper.geometry import Points
+from mapper.core.errors import DataError
+from mapper.core.geometry import Points
 from mapper.octree.blocks import BlockStore
 from mapper.octree.keys import BLOCK_BITS, BLOCK_DEPTH, BLOCK_VOXELS, KEY_BITS, codes_of, gather
 

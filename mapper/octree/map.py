@@ -5,20 +5,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.octree import OctreeConfig
-from mapper.errors import DataError, MapSizeError
-from mapper.frames import Points32, Scan
-from mapper.geometry import Array, Points, Transform, apply
+from mapper.core.errors import DataError, MapSizeError
+from mapper.core.frames import Points32, Scan
+from mapper.core.geometry import Array, Points, Transform, apply
 from mapper.octree import kernels, levels, queries
 from mapper.octree.attributes import NEVER_SEEN, AttributeLayer, ended_blocks
 from mapper.octree.blocks import BlockStore
 from mapper.octree.boxes import BoxCounts, count_boxes
 from mapper.octree.casting import Cast, Caster, origin_key
+from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import KEY_BITS, KEY_ZERO
 from mapper.octree.levels import Parent
 from mapper.octree.nearest import Nearest, nearest_occupied
+from mapper.octree.scan_update import ScanUpdate
 from mapper.octree.seen_through import SeenThrough
-from mapper.octree.sight import Sight
 from mapper.octree.summing import Overlap, add_blocks
 from mapper.octree.tree_reader import TreeLeaves, fill
 
@@ -144,14 +144,14 @@ class OctreeMap:
                 stamp_ns=NEVER_SEEN,
             )
 
-    def merge(self, sight: Sight) -> None:
+    def merge(self, update: ScanUpdate) -> None:
         """Fuse what a frame saw: the same as inserting its scan, to the last bit, but without attributes.
 
         Raises:
             MapSizeError: The map would be too large; it has not changed then.
         """
-        slots = self.blocks.claim(sight.codes)
-        self._add(sight.cells(), np.arange(len(sight)), slots)
+        slots = self.blocks.claim(update.codes)
+        self._add(update.cells(), np.arange(len(update)), slots)
 
     def _merge(self, cast: Cast) -> None:
         try:

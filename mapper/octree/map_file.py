@@ -18,13 +18,13 @@ import zstandard
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from mapper import atomic
-from mapper.config.octree import OctreeConfig
-from mapper.errors import MapFileError
+from mapper.core.errors import MapFileError
 from mapper.octree.attributes import AttributeLayer
 from mapper.octree.blocks import BLOCK_BYTES, check_memory, find_slots
+from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import BLOCK_VOXELS
 from mapper.octree.map import OctreeMap
+from mapper.runtime import atomic
 
 MAGIC = b"\x89mapper-octree\r\n"
 """Not text, and damaged by whoever takes it for text."""

@@ -7,8 +7,8 @@ from numba import njit
 from numpy import float64, int16, int64
 from numpy.typing import NDArray
 
-from mapper.errors import DataError
-from mapper.geometry import Array, Points
+from mapper.core.errors import DataError
+from mapper.core.geometry import Array, Points
 from mapper.octree.blocks import BlockStore, slot_of
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_MASK, KEY_ZERO, gather, morton
 

@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper import atomic
-from mapper.config.octree import OctreeConfig
-from mapper.errors import MapFileError
+from mapper.core.errors import MapFileError
 from mapper.octree import tree_reader
 from mapper.octree.attributes import UNSET
 from mapper.octree.color_tree import COLOR_NODE, colored
+from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import KEY_BITS
 from mapper.octree.map import OctreeMap, log_odds
 from mapper.octree.map_file import MAGIC, parse_map
 from mapper.octree.tree import NODE, children_in, nodes_in_preorder, words_in_preorder
+from mapper.runtime import atomic
 
 _FULL = b"# Octomap OcTree file"
 _BINARY = b"# Octomap OcTree binary file"
@@ -85,7 +85,7 @@ def write_tree(
         resolution_m: Edge of a voxel.
         tree_name: OctoMap's name for the kind of tree.
     """
-    with atomic.replacing(path) as part, part.open("wb") as file:
+    with atomic.atomic_file(path) as part, part.open("wb") as file:
         file.write(_header_bytes(_BINARY if binary else _FULL, node_count, resolution_m, tree_name))
         for piece in payload:
             file.write(piece.data)

@@ -11,11 +11,11 @@ from numba import njit
 from numpy import int64
 from numpy.typing import NDArray
 
-from mapper.config.octree import OctreeConfig
-from mapper.errors import MapSizeError
-from mapper.geometry import Transform
+from mapper.core.errors import MapSizeError
+from mapper.core.geometry import Transform
 from mapper.octree.attributes import AttributeLayer, LayerArrays
 from mapper.octree.blocks import slot_of
+from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import (
     BLOCK_BITS,
     BLOCK_DEPTH,

@@ -8,10 +8,10 @@ from numba import njit
 from numpy import uint8
 from numpy.typing import NDArray
 
-from mapper.config.octree import SliceConfig
-from mapper.errors import DataError
-from mapper.geometry import Array
-from mapper.octree.ground import Ground, find_ground, lowest_occupied
+from mapper.core.errors import DataError
+from mapper.core.geometry import Array
+from mapper.octree.config import SliceConfig
+from mapper.octree.ground_height import Ground, find_ground, lowest_occupied
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap
 

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.errors import MapSizeError
+from mapper.core.errors import MapSizeError
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS, KEY_MASK, morton
 
 UNTOUCHED, FREE, OCCUPIED = 0, 1, 2

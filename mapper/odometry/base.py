@@ -7,13 +7,13 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.deskew import Twist
+from mapper.core.deskew import Twist
+from mapper.core.frames import Frame
+from mapper.core.geometry import Array, Transform
 from mapper.features.scan_view import ScanView
 from mapper.features.view import View
-from mapper.frames import Frame
-from mapper.geometry import Array, Transform
 from mapper.graph.model import BetweenFactor
-from mapper.sources.base import Entry
+from mapper.sources.base import FrameRef
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class Diagnostics:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Track:
+class FrameResult:
     """One tracked frame.
 
     Attributes:
@@ -92,7 +92,7 @@ Seen = View | ScanView
 class Odometry(Protocol[Observation]):
     """Frame-by-frame tracking, split so that the costly, stateless half can run ahead in threads."""
 
-    def read(self, entry: Entry) -> Observation:
+    def read(self, entry: FrameRef) -> Observation:
         """Reduce a log's frame to what tracking needs, and read no more. Pure: no state is read or written.
 
         Raises:
@@ -100,7 +100,7 @@ class Odometry(Protocol[Observation]):
         """
         ...
 
-    def track(self, observation: Observation) -> Track:
+    def track(self, observation: Observation) -> FrameResult:
         """Place the next observation, in time order."""
         ...
 

@@ -7,22 +7,22 @@ from functools import partial
 
 import numpy as np
 
-from mapper.config.odometry import IsvdOdometryConfig, MatchConfig
-from mapper.deskew import Twist
-from mapper.errors import FrameError
+from mapper.core.deskew import Twist
+from mapper.core.errors import FrameError
+from mapper.core.frames import Frame, PinholeCamera, RgbdFrame
+from mapper.core.geometry import Array, Points, Transform, apply, inverse, mean_rotation, transform
 from mapper.features.detectors import Detector, Features, build_detector
 from mapper.features.matching import Pairs, homography_inliers, match_mutual
 from mapper.features.view import View
-from mapper.frames import Frame, PinholeCamera, RgbdFrame
-from mapper.geometry import Array, Points, Transform, apply, inverse, mean_rotation, transform
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
-from mapper.odometry.base import Diagnostics, Matches, Track
+from mapper.odometry.base import Diagnostics, FrameResult, Matches
+from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
 from mapper.odometry.keyframes import SharpestKeyframes
 from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
 from mapper.sensing.depth_filter import dif
-from mapper.sources.base import Entry
+from mapper.sources.base import FrameRef
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +109,7 @@ class IsvdOdometry:
         self._turn = 0
         self._held: tuple[IsvdObservation, Candidate, MatchConfig] | None = None
 
-    def read(self, entry: Entry) -> IsvdObservation:
+    def read(self, entry: FrameRef) -> IsvdObservation:
         """Observe a frame of a log, without its colours. Pure.
 
         Raises:
@@ -129,7 +129,7 @@ class IsvdOdometry:
         points_body = self._points_body(frame, features)
         return IsvdObservation(frame.stamp_ns, features, points_body, frame.camera, frame.T_body_camera)
 
-    def track(self, observation: IsvdObservation) -> Track:
+    def track(self, observation: IsvdObservation) -> FrameResult:
         """Place the next observation, in time order."""
         self._held = None
         if not self._recent:
@@ -145,7 +145,9 @@ class IsvdOdometry:
             self._held = observation, candidates[0], self._config.match
             return self._place(observation, self._combine(candidates), candidates, method="relocalised")
         diagnostics = Diagnostics(len(observation.features), 0, 0, 0.0, "m", "lost")
-        return Track(observation.stamp_ns, None, np.eye(4), self._recent[-1].T_world_body, False, diagnostics)
+        return FrameResult(
+            observation.stamp_ns, None, np.eye(4), self._recent[-1].T_world_body, False, diagnostics
+        )
 
     def view(self, observation: IsvdObservation, _twist: Twist | None = None, /) -> View:
         """Return what a place is recognised by. Pure."""
@@ -244,7 +246,7 @@ class IsvdOdometry:
         candidates: Sequence[Candidate],
         *,
         method: str,
-    ) -> Track:
+    ) -> FrameResult:
         """Make the frame a node, remember it, and report its measurements."""
         node = self._next_node
         self._next_node += 1
@@ -262,7 +264,7 @@ class IsvdOdometry:
             for candidate in candidates
             if (alignment := candidate.alignment).information is not None
         )
-        return Track(
+        return FrameResult(
             stamp_ns=observation.stamp_ns,
             node=node,
             T_node_body=np.eye(4),

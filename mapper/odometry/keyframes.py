@@ -1,6 +1,6 @@
 """Which frames of a log represent their neighbourhood."""
 
-from mapper.errors import ConfigError
+from mapper.core.errors import ConfigError
 
 
 class SharpestKeyframes:

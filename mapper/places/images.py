@@ -4,14 +4,14 @@ from itertools import compress
 
 import numpy as np
 
-from mapper.config.places import VocabularyConfig
-from mapper.errors import FrameError, VocabularyError
+from mapper.core.errors import FrameError, VocabularyError
+from mapper.core.frames import RgbdFrame
 from mapper.features.windowed import pack
-from mapper.frames import RgbdFrame
-from mapper.parallel import ordered_map
+from mapper.places.config import VocabularyConfig
 from mapper.places.tree import Bits
-from mapper.progress import SILENT, Progress
-from mapper.sources.base import Entry, FrameSource, Skipped
+from mapper.runtime.ordered_map import ordered_map
+from mapper.runtime.progress import SILENT, Progress
+from mapper.sources.base import FrameRef, FrameSource, Skipped
 
 _WORKERS = 2
 
@@ -28,7 +28,7 @@ def descriptors_of(
     """
     detector = config.detector.build()
 
-    def detect(entry: Entry) -> Bits | Skipped:
+    def detect(entry: FrameRef) -> Bits | Skipped:
         try:
             frame = entry.load(colour=False)
         except FrameError as error:

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
 from mapper.places.kernels import shared_weights
 from mapper.places.vocabulary import ONE, Vocabulary, WordVector
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.places import ScanContextConfig
-from mapper.errors import DataError
-from mapper.geometry import Points
+from mapper.core.errors import DataError
+from mapper.core.geometry import Points
+from mapper.places.config import ScanContextConfig
 
 _FIRST_CAPACITY = 256
 

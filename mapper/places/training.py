@@ -5,12 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.places import VocabularyConfig
-from mapper.errors import VocabularyError
+from mapper.core.errors import VocabularyError
+from mapper.places.config import VocabularyConfig
 from mapper.places.kernels import k_majority, seed_centres
 from mapper.places.tree import Bits, WordTree
 from mapper.places.vocabulary import Vocabulary
-from mapper.progress import SILENT, Progress
+from mapper.runtime.progress import SILENT, Progress
 
 MIN_IMAGES = 2
 """Of one image alone, every word would be in all images and tell nothing."""

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
 from mapper.places.kernels import descend
 
 Bits = NDArray[np.uint64]

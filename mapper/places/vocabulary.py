@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import NonNegativeInt, ValidationError
 
-from mapper import atomic
-from mapper.config.base import Config
-from mapper.errors import DataError, VocabularyError
+from mapper.core.config import Config
+from mapper.core.errors import DataError, VocabularyError
 from mapper.places.kernels import shared_weight
 from mapper.places.tree import Bits, Ids, WordTree
+from mapper.runtime import atomic
 
 DESCRIPTOR = "orb"
 """What the bits are: detectors "orb" and "uniform-orb" both describe with it."""

@@ -5,9 +5,9 @@ from typing import Protocol
 
 import numpy as np
 
-from mapper.errors import DataError
-from mapper.frames import Scan
-from mapper.geometry import Array, Transform, is_rigid
+from mapper.core.errors import DataError
+from mapper.core.frames import Scan
+from mapper.core.geometry import Array, Transform, is_rigid
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.errors import DataError
-from mapper.geometry import Array, Points, adjoint, transform
+from mapper.core.errors import DataError
+from mapper.core.geometry import Array, Points, adjoint, transform
 
 _MIN_SHARE = 0.004
 _MIN_ARM_M = 1e-3  # a pole's turning about itself must stay a number
@@ -82,7 +82,7 @@ def degeneracy_of(information: Array, *, points: Points, min_share: float = _MIN
     )
 
 
-def loosened(information: Array, degeneracy: Degeneracy) -> Array:
+def projected(information: Array, degeneracy: Degeneracy) -> Array:
     """Return the information with the unseen motions left open: unknown to within the cloud's extent.
 
     What noise pretends to know of them is dropped; the motions that were seen keep theirs.

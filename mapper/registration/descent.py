@@ -7,7 +7,7 @@ origin its rotation and its translation would otherwise be nearly one.
 import numpy as np
 from numba import njit
 
-from mapper.linear import solve_positive, twist_exp
+from mapper.core.linear import solve_positive, twist_exp
 from mapper.registration.kd_tree import STACK, search
 
 POINT, PLANE, GAUSSIAN = 0, 1, 2
@@ -71,7 +71,7 @@ def descend_on_points(  # type: ignore[no-untyped-def]
             for k in range(3):
                 n[k] = points[partner, k] - p[k]
             add_pair(sums, T, p, n[0], n[1], n[2], weight)
-        T, is_last = stepped(sums, pairs, T, steps)
+        T, is_last = on_frame(sums, pairs, T, steps)
         if is_last:
             break
     return T
@@ -149,7 +149,7 @@ def add_pair(sums, T, p, x, y, z, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def stepped(sums, pairs, T, steps):  # type: ignore[no-untyped-def]
+def on_frame(sums, pairs, T, steps):  # type: ignore[no-untyped-def]
     """Return T after one step of Gauss–Newton, and whether the step was short enough to be the last."""
     H, g = np.empty((6, 6)), np.empty(6)
     k = 0

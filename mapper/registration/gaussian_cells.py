@@ -6,8 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.geometry import Array, Transform, is_rigid
-from mapper.registration.descent import FLATNESS, add_pair, inverse_of, moved, stepped, turned
+from mapper.core.geometry import Array, Transform, is_rigid
+from mapper.registration.descent import FLATNESS, add_pair, inverse_of, moved, on_frame, turned
 from mapper.registration.surfaces import Prepared
 
 _EMPTY = -1
@@ -206,7 +206,7 @@ def _descend(  # type: ignore[no-untyped-def]
                 mean_and_covariance[8] + 1.0 - FLATNESS * m[2] * m[2],
             )
             add_pair(sums, T, p, x, y, z, weight)
-        T, is_last = stepped(sums, pairs, T, steps)
+        T, is_last = on_frame(sums, pairs, T, steps)
         if is_last:
             break
     return T, pairs

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.errors import ConfigError
-from mapper.geometry import Transform, is_rigid, transform
-from mapper.rotations import rotation_from_euler, rotation_from_quaternion
+from mapper.core.errors import ConfigError
+from mapper.core.geometry import Transform, is_rigid, transform
+from mapper.core.rotations import rotation_from_euler, rotation_from_quaternion
 
 
 def parse_guess(text: str | None) -> Transform:

@@ -5,18 +5,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapper.config.hough import GicpStagesConfig, HoughConfig, NdtStagesConfig
-from mapper.frames import Scan
-from mapper.geometry import Points, Transform, angle_between, inverse
+from mapper.core.frames import Scan
+from mapper.core.geometry import Points, Transform, angle_between, inverse
 from mapper.registration.base import Alignment, failed
 from mapper.registration.degeneracy import degeneracy_of
+from mapper.registration.hough_config import GicpStagesConfig, HoughConfig, NdtStagesConfig
 from mapper.registration.ndt import refine_by_cells
 from mapper.registration.overlap import (
     Overlap,
     PlanarFit,
     Witness,
-    climbed,
     overlap_under,
+    refine_planar,
     settled,
     witness,
 )
@@ -176,7 +176,7 @@ class HoughAligner:
     def _verified(self, source: Witness, peaks: list[Peak]) -> list[Candidate]:
         """Return the distinct motions near the peaks that overlap most, the best score first."""
         config, target = self._config, self._target
-        fits = [climbed(target, source, (p.dx_m, p.dy_m, p.alpha_rad), config) for p in peaks]
+        fits = [refine_planar(target, source, (p.dx_m, p.dy_m, p.alpha_rad), config) for p in peaks]
         chosen: list[PlanarFit] = []
         for fit in sorted(fits, key=lambda fit: -fit.overlap):
             if len(chosen) < config.overlap.candidates and not any(

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.odometry import IsvdConfig
-from mapper.geometry import Array, Points, Transform, apply, fit_rigid
+from mapper.core.geometry import Array, Points, Transform, apply, fit_rigid
 from mapper.registration.base import Alignment, failed
+from mapper.registration.config import IsvdConfig
 
 _MM_PER_M = 1000.0
 _MIN_SPREAD_M = 0.01  # points nearer than this to a common line leave a rotation about it open

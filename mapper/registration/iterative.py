@@ -1,12 +1,12 @@
 """ICP, point-to-plane ICP and GICP behind the seam: from coarse pairs to fine ones, then judged."""
 
-from mapper.config.registration import IterativeConfig, RefinedConfig
-from mapper.frames import Scan
-from mapper.geometry import Transform
+from mapper.core.frames import Scan
+from mapper.core.geometry import Transform
+from mapper.registration.acceptance import assess
 from mapper.registration.base import Alignment
+from mapper.registration.config import IterativeConfig, RefinedConfig
 from mapper.registration.refining import Refiner, refine
 from mapper.registration.surfaces import Prepared, prepared
-from mapper.registration.trust import judged
 
 
 class Iterative:
@@ -54,4 +54,4 @@ def refined(
         if not alignment.converged:
             return alignment
         T_target_source = alignment.T_target_source
-    return judged(target, source, T_target_source, config.trust)
+    return assess(target, source, T_target_source, config.trust)

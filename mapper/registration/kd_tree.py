@@ -10,9 +10,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.errors import DataError
-from mapper.frames import Points32
-from mapper.geometry import Array, Points
+from mapper.core.errors import DataError
+from mapper.core.frames import Points32
+from mapper.core.geometry import Array, Points
 
 _LEAF_POINTS = 8
 STACK = 64

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from mapper.config.registration import KissMatcherConfig
-from mapper.frames import Scan
-from mapper.geometry import Transform, is_rigid, transform
+from mapper.core.frames import Scan
+from mapper.core.geometry import Transform, is_rigid, transform
 from mapper.registration.base import Alignment, failed
+from mapper.registration.config import KissMatcherConfig
 from mapper.registration.iterative import cloud_of, refined
 from mapper.registration.surfaces import Prepared, prepared
 

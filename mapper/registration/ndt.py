@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 
-from mapper.config.registration import NdtConfig
-from mapper.frames import Scan
-from mapper.geometry import Points, Transform, is_rigid, nearest_rotation, transform
+from mapper.core.frames import Scan
+from mapper.core.geometry import Points, Transform, is_rigid, nearest_rotation, transform
+from mapper.registration.acceptance import assess
 from mapper.registration.base import Alignment, failed
+from mapper.registration.config import NdtConfig
 from mapper.registration.surfaces import Prepared, prepared
-from mapper.registration.trust import judged
 
 
 class Ndt:
@@ -49,7 +49,7 @@ class NdtAligner:
             if isinstance(found, str):
                 return failed(found)
             T_target_source = found
-        return judged(self._target, cloud, T_target_source, config.trust)
+        return assess(self._target, cloud, T_target_source, config.trust)
 
 
 def refine_by_cells(

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.hough import CellsConfig, ConstellationConfig, ObjectsConfig
-from mapper.frames import Points32
-from mapper.geometry import Array, Transform
-from mapper.registration.ground import surroundings
+from mapper.core.frames import Points32
+from mapper.core.geometry import Array, Transform
+from mapper.registration.ground_removal import surroundings
+from mapper.registration.hough_config import CellsConfig, ConstellationConfig, ObjectsConfig
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,11 +50,11 @@ def centres_of(obstacles: Points32, config: CellsConfig | ObjectsConfig) -> Arra
         return np.empty((0, 2))
     flat = obstacles[:, :2].astype(np.float64)
     if isinstance(config, ObjectsConfig):
-        part_of = _objects(flat, config)
+        component_of = _objects(flat, config)
     else:
-        _, part_of = np.unique(_numbered(flat, config.cell_m), return_inverse=True)
-    sizes = np.bincount(part_of)
-    sums = np.column_stack([np.bincount(part_of, weights=flat[:, axis]) for axis in range(2)])
+        _, component_of = np.unique(_numbered(flat, config.cell_m), return_inverse=True)
+    sizes = np.bincount(component_of)
+    sums = np.column_stack([np.bincount(component_of, weights=flat[:, axis]) for axis in range(2)])
     large = sizes >= _least(flat, config)
     centres: Array = sums[large] / sizes[large, np.newaxis]
     return centres
@@ -69,11 +69,11 @@ def _least(flat: Array, config: CellsConfig | ObjectsConfig) -> float:
 
 def _objects(flat: Array, config: ObjectsConfig) -> NDArray[np.intp]:
     """Return each voxel's object: a part of its group by fine cells, or the group where no part is large."""
-    group_of, part_of = _connected(flat, config.coarse_m), _connected(flat, config.fine_m)
-    large = np.bincount(part_of) >= _least(flat, config)
+    group_of, component_of = _connected(flat, config.coarse_m), _connected(flat, config.fine_m)
+    large = np.bincount(component_of) >= _least(flat, config)
     divided = np.zeros(group_of.max() + 1, np.bool_)
-    divided[group_of[large[part_of]]] = True
-    objects: NDArray[np.intp] = np.where(divided[group_of], part_of, len(large) + group_of)
+    divided[group_of[large[component_of]]] = True
+    objects: NDArray[np.intp] = np.where(divided[group_of], component_of, len(large) + group_of)
     return objects
 
 

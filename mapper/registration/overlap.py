@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.hough import HoughConfig, OverlapConfig
-from mapper.frames import Points32, Scan
-from mapper.geometry import Array, Points, Transform, apply, inverse, rotation_exp, transform
-from mapper.registration.ground import Ground, surroundings
+from mapper.core.frames import Points32, Scan
+from mapper.core.geometry import Array, Points, Transform, apply, inverse, rotation_exp, transform
+from mapper.registration.ground_removal import Ground, surroundings
+from mapper.registration.hough_config import HoughConfig, OverlapConfig
 from mapper.registration.objects import centres_of
 from mapper.registration.overlap_kernels import NEAR, climb, draw_volume, look, range_picture
 
@@ -112,7 +112,7 @@ class PlanarFit:
         )
 
 
-def climbed(
+def refine_planar(
     target: Witness, source: Witness, motion: tuple[float, float, float], config: HoughConfig
 ) -> PlanarFit:
     """Return the planar motion near (dx, dy, α) under which the obstacles overlap most."""

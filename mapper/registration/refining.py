@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.geometry import Array, Transform, apply, is_rigid
+from mapper.core.geometry import Array, Transform, apply, is_rigid
 from mapper.registration.base import Alignment, failed
 from mapper.registration.descent import GAUSSIAN, PLANE, POINT, descend_on_points
 from mapper.registration.surfaces import Prepared

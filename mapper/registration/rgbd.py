@@ -8,8 +8,8 @@ import numpy as np
 import open3d
 from numpy.typing import NDArray
 
-from mapper.frames import NO_DISTORTION, PinholeCamera, RgbdFrame
-from mapper.geometry import Transform, inverse, nearest_rotation, transform
+from mapper.core.frames import NO_DISTORTION, PinholeCamera, RgbdFrame
+from mapper.core.geometry import Transform, inverse, nearest_rotation, transform
 from mapper.registration.base import Alignment, failed
 
 _O3D: Any = open3d  # its stubs know no buffers

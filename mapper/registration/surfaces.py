@@ -6,11 +6,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.errors import DataError
-from mapper.frames import Points32
-from mapper.geometry import Array, Points
+from mapper.core.errors import DataError
+from mapper.core.frames import Points32
+from mapper.core.geometry import Array, Points
+from mapper.core.voxel_grid import voxel_means
 from mapper.registration.kd_tree import KdTree, kd_tree, neighbours_of
-from mapper.thinning import voxel_means
 
 _NEIGHBOURS = 10
 _FEWEST_NEIGHBOURS = 5

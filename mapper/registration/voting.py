@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.config.hough import VotingConfig
-from mapper.geometry import Array, Transform, transform
+from mapper.core.geometry import Array, Transform, transform
+from mapper.registration.hough_config import VotingConfig
 from mapper.registration.kernels import distinct, vote_slices
 
 _PER_ANGLE = 8

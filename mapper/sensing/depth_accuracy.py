@@ -6,10 +6,10 @@ from statistics import median
 
 import numpy as np
 
-from mapper.errors import DataError, FrameError, SourceError
-from mapper.frames import Image, PinholeCamera, RgbdFrame
-from mapper.geometry import Array
-from mapper.sources.base import Entry, FrameSource
+from mapper.core.errors import DataError, FrameError, SourceError
+from mapper.core.frames import Image, PinholeCamera, RgbdFrame
+from mapper.core.geometry import Array
+from mapper.sources.base import FrameRef, FrameSource
 
 _WORST = 100
 """One in so many pixels is among the worst 1 %."""
@@ -202,7 +202,7 @@ def first_frame(source: FrameSource) -> RgbdFrame:
     raise SourceError(f"{source.path}: no frame can be read; the last: {reason}")
 
 
-def depth_frame(entry: Entry) -> RgbdFrame:
+def depth_frame(entry: FrameRef) -> RgbdFrame:
     """Load a frame with its depth.
 
     Raises:

@@ -4,8 +4,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.errors import DataError
-from mapper.frames import DepthImage
+from mapper.core.errors import DataError
+from mapper.core.frames import DepthImage
 
 
 def dif(depth_m: DepthImage) -> DepthImage:

@@ -5,9 +5,9 @@ from typing import Literal
 
 import numpy as np
 
-from mapper.config.depth_noise import DepthNoiseConfig
-from mapper.errors import DataError
-from mapper.geometry import Array
+from mapper.core.errors import DataError
+from mapper.core.geometry import Array
+from mapper.sensing.config import DepthNoiseConfig
 
 _ROUNDS = 5
 _SIGNIFICANCE = 0.05

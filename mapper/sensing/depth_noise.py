@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.depth_noise import DepthNoiseConfig
-from mapper.frames import DepthImage
-from mapper.geometry import Array
+from mapper.core.frames import DepthImage
+from mapper.core.geometry import Array
+from mapper.sensing.config import DepthNoiseConfig
 from mapper.sensing.depth_filter import dif
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.geometry import Array
+from mapper.core.geometry import Array
 
 MAX_NOISE_RATIO = 0.05
 """What scatters by a larger share of its distance is no plane."""

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapper.errors import DataError, FrameError
-from mapper.frames import RgbdFrame, ray_table
-from mapper.geometry import Array
-from mapper.parallel import ordered_map
-from mapper.progress import SILENT, Progress
+from mapper.core.errors import DataError, FrameError
+from mapper.core.frames import RgbdFrame, ray_table
+from mapper.core.geometry import Array
+from mapper.runtime.ordered_map import ordered_map
+from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.depth_accuracy import (
     DepthLevel,
     Patch,
@@ -23,7 +23,7 @@ from mapper.sensing.depth_accuracy import (
 )
 from mapper.sensing.depth_filter import dif
 from mapper.sensing.depth_planes import MAX_NOISE_RATIO, fit_planes
-from mapper.sources.base import Entry, FrameSource
+from mapper.sources.base import FrameRef, FrameSource
 
 _MIN_MEASURED_RATIO = 0.5
 _MAX_TILT_RAD = np.radians(30.0)
@@ -97,7 +97,7 @@ def depth_at(
     where = central_patch(first.camera) if patch is None else patch
     where.refuse_outside(first.camera)
 
-    def seen(entry: Entry) -> tuple[SeenPlane, Array] | str:
+    def seen(entry: FrameRef) -> tuple[SeenPlane, Array] | str:
         try:
             return _see(depth_frame(entry), distance_m, where, keep_tilt=keep_tilt)
         except (DataError, FrameError) as error:

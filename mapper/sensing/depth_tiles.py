@@ -5,11 +5,11 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import DataError, FrameError
-from mapper.frames import RgbdFrame, ray_table
-from mapper.geometry import Array
-from mapper.parallel import ordered_map
-from mapper.progress import SILENT, Progress
+from mapper.core.errors import DataError, FrameError
+from mapper.core.frames import RgbdFrame, ray_table
+from mapper.core.geometry import Array
+from mapper.runtime.ordered_map import ordered_map
+from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.depth_accuracy import (
     DepthLevel,
     Patch,
@@ -23,7 +23,7 @@ from mapper.sensing.depth_accuracy import (
 )
 from mapper.sensing.depth_filter import dif
 from mapper.sensing.depth_planes import MAX_NOISE_RATIO, Planes, fit_planes
-from mapper.sources.base import Entry, FrameSource
+from mapper.sources.base import FrameRef, FrameSource
 
 _TILES_ACROSS = 16
 _BLOCKS = 5
@@ -74,7 +74,7 @@ def depth_of_planes(
     if min(where.width, where.height) < side:
         raise DataError(f"patch {where}: want at least one tile of {side}×{side} px")
 
-    def look(numbered: tuple[int, Entry]) -> tuple[int, list[SeenPlane], ResidualMap] | None:
+    def look(numbered: tuple[int, FrameRef]) -> tuple[int, list[SeenPlane], ResidualMap] | None:
         number, entry = numbered
         try:
             return number, *_planes(depth_frame(entry), where, side, number=number)

@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-from mapper.config.sources import SourceConfig
-from mapper.errors import SourceError
+from mapper.core.errors import SourceError
 from mapper.sources import clouds, kitti, mbag, numbered, poznan, tum
 from mapper.sources.base import FrameSource
+from mapper.sources.config import SourceConfig
 from mapper.sources.ros import files as recordings
 from mapper.sources.selection import select
-from mapper.sources.wheels import read_wheels
+from mapper.sources.wheel_files import read_wheels
 
 __all__ = ["open_source"]
 

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from mapper.config.sensors import Sensor
-from mapper.frames import Frame, Scan
-from mapper.geometry import Array
-from mapper.timebase import Stamps
-from mapper.trajectory import Trajectory
+from mapper.core.frames import Frame, Scan, Sensor
+from mapper.core.geometry import Array
+from mapper.core.timebase import Stamps
+from mapper.core.trajectory import Trajectory
 
 
 class ImageFile(Protocol):
@@ -47,7 +46,7 @@ class ImageFiles:
     depth_units_per_m: float
 
 
-class Entry(Protocol):
+class FrameRef(Protocol):
     """One frame of a log that has not been read yet, so that reading can run ahead in other threads."""
 
     @property
@@ -120,7 +119,7 @@ class FrameSource(Protocol):
         """Return how many entries there will be."""
         ...
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[FrameRef]:
         """Yield every frame's entry in time order; nothing is decoded yet."""
         ...
 

@@ -3,8 +3,8 @@
 import re
 from dataclasses import dataclass
 
-from mapper.errors import SourceError
-from mapper.frames import NO_DISTORTION, PinholeCamera
+from mapper.core.errors import SourceError
+from mapper.core.frames import NO_DISTORTION, PinholeCamera
 
 _Distortion = tuple[float, float, float, float, float]
 

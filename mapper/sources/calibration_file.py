@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mapper.errors import DataError, SourceError
-from mapper.frames import NO_DISTORTION, PinholeCamera
+from mapper.core.errors import DataError, SourceError
+from mapper.core.frames import NO_DISTORTION, PinholeCamera
 from mapper.sources.calibration import Calibration
 
 FILE_NAMES = (

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.config.sensors import Sensor
-from mapper.frames import Frame, Scan
-from mapper.sources.base import Accelerations, Entry, FrameSource, ImageFiles
-from mapper.timebase import NS_PER_S, Stamps
-from mapper.trajectory import Trajectory
+from mapper.core.frames import Frame, Scan, Sensor
+from mapper.core.timebase import NS_PER_S, Stamps
+from mapper.core.trajectory import Trajectory
+from mapper.sources.base import Accelerations, FrameRef, FrameSource, ImageFiles
 
 _PAUSE_NS = NS_PER_S
 """Between one log and the next, where their own stamps do not tell which came first."""
@@ -31,7 +30,7 @@ class Session:
     shift_ns: int
     stamps_ns: Stamps
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[FrameRef]:
         """Yield every frame's entry on the common clock."""
         if not self.shift_ns:
             return self.log.entries()
@@ -59,7 +58,7 @@ class ChainedLog:
     def __len__(self) -> int:
         return sum(len(session.stamps_ns) for session in self.sessions)
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[FrameRef]:
         """Yield every frame's entry, session by session."""
         for session in self.sessions:
             yield from session.entries()
@@ -69,7 +68,7 @@ class ChainedLog:
 class _Shifted:
     """An entry on another clock."""
 
-    entry: Entry
+    entry: FrameRef
     shift_ns: int
 
     @property

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from mapper.config.sources import SourceConfig
-from mapper.errors import SourceError
-from mapper.frames import Scan
+from mapper.core.errors import SourceError
+from mapper.core.frames import Scan
+from mapper.sources.config import SourceConfig
 from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, is_cloud_name, scan_log
 from mapper.sources.scans import ScanEntry, ScanLog
 

@@ -7,8 +7,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.errors import DataError, FrameError
-from mapper.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
+from mapper.core.errors import DataError, FrameError
+from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
 from mapper.sources import png
 from mapper.sources.base import ImageFile
 

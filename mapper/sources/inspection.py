@@ -6,19 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.config.sensors import Sensor
-from mapper.config.sources import SourceConfig
-from mapper.errors import FrameError, SourceError
-from mapper.frames import Scan
+from mapper.core.errors import FrameError, SourceError
+from mapper.core.frames import Scan, Sensor
+from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
+from mapper.core.trajectory import Trajectory
 from mapper.sources import open_source
 from mapper.sources.base import FrameSource
+from mapper.sources.config import SourceConfig
 from mapper.sources.ros import files as recordings
 from mapper.sources.ros.index import Series
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.source import log_of
 from mapper.sources.selection import select
-from mapper.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
-from mapper.trajectory import Trajectory
 
 _GAP_PERIODS = 3.0
 """A pause of as many usual periods is a gap."""

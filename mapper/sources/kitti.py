@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.config.sources import SourceConfig
-from mapper.errors import SourceError
-from mapper.geometry import Transform, nearest_rotation, transform
+from mapper.core.errors import SourceError
+from mapper.core.geometry import Transform, nearest_rotation, transform
+from mapper.sources.config import SourceConfig
 from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, has_clouds, scan_log
 from mapper.sources.scans import ScanLog
 from mapper.sources.text import parse_numbers, rows

@@ -5,13 +5,14 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.atomic import write_text
-from mapper.errors import FrameError, SourceError
-from mapper.frames import Scan
+from mapper.core.errors import FrameError, SourceError
+from mapper.core.frames import Scan
+from mapper.core.timebase import MAX_TRUTH_GAP_NS, Stamps, nearest, seconds_text_from_ns
+from mapper.core.trajectory import Trajectory
+from mapper.runtime.atomic import write_text
 from mapper.sources.base import FrameSource, Skipped
-from mapper.sources.wheels import write_wheels
-from mapper.timebase import MAX_TRUTH_GAP_NS, Stamps, nearest, seconds_text_from_ns
-from mapper.trajectory import Trajectory, write_kitti
+from mapper.sources.trajectory_files import write_kitti
+from mapper.sources.wheel_files import write_wheels
 
 _TIMED = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<f4")])
 

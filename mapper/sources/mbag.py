@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.config.sources import SourceConfig
-from mapper.errors import SourceError
-from mapper.geometry import Transform
+from mapper.core.errors import SourceError
+from mapper.core.geometry import Transform
+from mapper.core.timebase import ns_from_seconds_text
 from mapper.sources.calibration import freiburg_camera
+from mapper.sources.config import SourceConfig
 from mapper.sources.rgbd import RgbdLog, Shot, entries_of, find_calibration, present, read_accelerations
 from mapper.sources.text import (
     parse_numbers,
@@ -24,7 +25,6 @@ from mapper.sources.text import (
     time_order,
     truth_from,
 )
-from mapper.timebase import ns_from_seconds_text
 
 DEPTH_UNITS_PER_M = 5000.0
 HEADER = "!RAWLOG FB1"

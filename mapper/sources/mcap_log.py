@@ -22,8 +22,8 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 
-from mapper.atomic import replacing
-from mapper.errors import DataError, SourceError
+from mapper.core.errors import DataError, SourceError
+from mapper.runtime.atomic import atomic_file
 from mapper.sources.ros.recording import BlockRecording, Part, Span, Topic, ros2_name
 from mapper.sources.ros.writing import Written
 
@@ -98,7 +98,7 @@ class McapWriter:
 @contextmanager
 def mcap_writer(path: Path) -> Iterator[McapWriter]:
     """Yield a writer of an MCAP file that appears whole or not at all."""
-    with replacing(path) as part, part.open("wb") as file:
+    with atomic_file(path) as part, part.open("wb") as file:
         writer = Writer(file, compression=CompressionType.LZ4, enable_data_crcs=True)
         writer.start(profile="ros2", library="mapper")
         yield McapWriter(writer)

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.config.sources import SourceConfig
-from mapper.errors import SourceError
-from mapper.geometry import Transform, nearest_rotation, transform
+from mapper.core.errors import SourceError
+from mapper.core.geometry import Transform, nearest_rotation, transform
+from mapper.core.timebase import NS_PER_S
+from mapper.core.trajectory import Trajectory
 from mapper.sources.calibration import PRIMESENSE, SEVEN_SCENES
+from mapper.sources.config import SourceConfig
 from mapper.sources.rgbd import RgbdLog, Shot, entries_of, find_calibration, read_accelerations
 from mapper.sources.text import parse_numbers, rows, time_order, truth_from
-from mapper.timebase import NS_PER_S
-from mapper.trajectory import Trajectory
 
 DEPTH_UNITS_PER_M = 1000.0
 RATE_HZ = 30.0

@@ -12,7 +12,7 @@ from isal import isal_zlib
 from numba import int32, njit, uint8
 from numpy.typing import NDArray
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
 
 _InflateError: type[Exception] = isal_zlib.error  # type: ignore[assignment]  # its stub says: an instance
 

@@ -5,8 +5,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.geometry import Array
-from mapper.timebase import NS_PER_S
+from mapper.core.geometry import Array
+from mapper.core.timebase import NS_PER_S
 
 TIME_FIELDS = (
     "t",  # Ouster: uint32 nanoseconds after the stamp

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.config.sources import SourceConfig
-from mapper.errors import SourceError
-from mapper.geometry import Transform, transform
-from mapper.rotations import rotation_from_euler
+from mapper.core.errors import SourceError
+from mapper.core.geometry import Transform, transform
+from mapper.core.rotations import rotation_from_euler
+from mapper.core.trajectory import Trajectory
+from mapper.sources.config import SourceConfig
 from mapper.sources.numbered import find_images, stamp_at, stamped
 from mapper.sources.rgbd import RgbdLog, entries_of, find_calibration, read_accelerations
 from mapper.sources.text import parse_numbers, read_lines, rows, truth_from
-from mapper.trajectory import Trajectory
 
 DEPTH_UNITS_PER_M = 1000.0
 RATE_HZ = 10.0  # "every 100 ms" (thesis §5.6)

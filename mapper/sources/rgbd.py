@@ -6,16 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.config.sensors import Sensor
-from mapper.config.sources import CameraConfig
-from mapper.errors import FrameError, SourceError
-from mapper.frames import DepthImage, PinholeCamera, RgbdFrame, Scan
-from mapper.sources.base import Accelerations, Entry, ImageFiles
+from mapper.core.errors import FrameError, SourceError
+from mapper.core.frames import DepthImage, PinholeCamera, RgbdFrame, Scan, Sensor
+from mapper.core.trajectory import Trajectory
+from mapper.sources.base import Accelerations, FrameRef, ImageFiles
 from mapper.sources.calibration import Calibration
 from mapper.sources.calibration_file import FILE_NAMES, read_calibration
+from mapper.sources.config import CameraConfig
 from mapper.sources.images import check_size, read_colour, read_depth_m, read_grey, scan_of
 from mapper.sources.text import parse_numbers, parse_stamp, rows, time_order
-from mapper.trajectory import Trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +66,7 @@ class RgbdLog:
     def __len__(self) -> int:
         return len(self.images)
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[FrameRef]:
         """Yield every frame's entry in time order."""
         yield from self.images
 

@@ -8,7 +8,8 @@ import numpy as np
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.core.timebase import NS_PER_S
 from mapper.sources.ros.clouds import Field, structured
 from mapper.sources.ros.messages import (
     CameraMessage,
@@ -20,7 +21,6 @@ from mapper.sources.ros.messages import (
     PoseMessage,
 )
 from mapper.sources.ros.recording import Topic
-from mapper.timebase import NS_PER_S
 
 _POINT_TYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")  # PointField's constants
 

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer
 
-from mapper.atomic import replacing
-from mapper.frames import PinholeCamera, Scan
-from mapper.geometry import Array, Transform
-from mapper.rotations import quaternion_from_rotation
+from mapper.core.frames import PinholeCamera, Scan
+from mapper.core.geometry import Array, Transform
+from mapper.core.rotations import quaternion_from_rotation
+from mapper.core.timebase import NS_PER_S
+from mapper.runtime.atomic import atomic_file
 from mapper.sources.ros.writing import Written
 from mapper.sources.rosbag import typestore
-from mapper.timebase import NS_PER_S
 
 _CLOUD_TYPES = {"f4": 7, "u4": 6}  # PointField's constants
 
@@ -158,7 +158,7 @@ class BagWriter:
 @contextmanager
 def bag_writer(path: Path) -> Iterator[BagWriter]:
     """Yield a writer of a ROS 1 bag, compressed by LZ4, that appears whole or not at all."""
-    with replacing(path) as part:
+    with atomic_file(path) as part:
         writer = Writer(part)
         writer.set_compression(Writer.CompressionFormat.LZ4)
         with writer:

@@ -5,16 +5,17 @@ from collections.abc import Iterable, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 
-from mapper.config.sources import SourceConfig
-from mapper.errors import SourceError
-from mapper.geometry import Transform, inverse
+from mapper.core.errors import SourceError
+from mapper.core.geometry import Transform, inverse
+from mapper.core.timebase import Stamps
+from mapper.core.trajectory import Trajectory
 from mapper.sources.cloud_files import ENDINGS
+from mapper.sources.config import SourceConfig
 from mapper.sources.scan_stamps import in_order, line_of_each, scan_stamps
 from mapper.sources.scans import ScanEntry, ScanLog
 from mapper.sources.text import rows, time_order, truth_from
+from mapper.sources.trajectory_files import read_kitti
 from mapper.sources.tum import read_truth
-from mapper.timebase import Stamps
-from mapper.trajectory import Trajectory, read_kitti
 
 STAMP_FILES = ("times.txt", "stamps.txt", "timestamps.txt")
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import SourceError
+from mapper.core.errors import SourceError
+from mapper.core.timebase import NS_PER_S, Stamps, ns_from_seconds_text
 from mapper.sources.numbered import stamp_at
 from mapper.sources.text import parse_stamp, rows
-from mapper.timebase import NS_PER_S, Stamps, ns_from_seconds_text
 
 RATE_HZ = 10.0
 

@@ -4,12 +4,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mapper.config.sensors import Sensor
-from mapper.frames import Scan
-from mapper.sources.base import Accelerations, Entry, ImageFiles
+from mapper.core.frames import Scan, Sensor
+from mapper.core.trajectory import Trajectory
+from mapper.sources.base import Accelerations, FrameRef, ImageFiles
 from mapper.sources.cloud_files import read_cloud
 from mapper.sources.point_times import relative_times_s
-from mapper.trajectory import Trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +61,6 @@ class ScanLog:
     def __len__(self) -> int:
         return len(self.scans)
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[FrameRef]:
         """Yield every scan's entry in time order."""
         yield from self.scans

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.sensors import Sensor
-from mapper.config.sources import SourceConfig
-from mapper.errors import SourceError
-from mapper.sources.base import Accelerations, Entry, FrameSource
-from mapper.timebase import NS_PER_S, nearest
-from mapper.trajectory import Trajectory
+from mapper.core.errors import SourceError
+from mapper.core.frames import Sensor
+from mapper.core.timebase import NS_PER_S, nearest
+from mapper.core.trajectory import Trajectory
+from mapper.sources.base import Accelerations, FrameRef, FrameSource
+from mapper.sources.config import SourceConfig
 
 
 @dataclass(slots=True, eq=False)
@@ -34,7 +34,7 @@ class Selection:
     def __len__(self) -> int:
         return int(self.is_used.sum())
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[FrameRef]:
         """Yield the entries in use, in time order."""
         return compress(self.source.entries(), self.is_used)
 

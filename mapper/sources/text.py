@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import DataError, SourceError
-from mapper.geometry import Array, Transform, is_rigid, transform
-from mapper.rotations import rotation_from_quaternion
-from mapper.timebase import Stamps, ns_from_seconds_text
-from mapper.trajectory import Trajectory
+from mapper.core.errors import DataError, SourceError
+from mapper.core.geometry import Array, Transform, is_rigid, transform
+from mapper.core.rotations import rotation_from_quaternion
+from mapper.core.timebase import Stamps, ns_from_seconds_text
+from mapper.core.trajectory import Trajectory
 
 
 def read_lines(path: Path) -> list[str]:

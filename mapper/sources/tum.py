@@ -6,18 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.config.sources import SourceConfig
-from mapper.errors import SourceError
-from mapper.geometry import Transform
+from mapper.core.errors import SourceError
+from mapper.core.geometry import Transform
+from mapper.core.timebase import NS_PER_S, Stamps, nearest
+from mapper.core.trajectory import Trajectory
 from mapper.sources.calibration import freiburg_camera
-from mapper.sources.rgbd import (
-    RgbdLog,
-    Shot,
-    entries_of,
-    find_calibration,
-    present,
-    read_accelerations,
-)
+from mapper.sources.config import SourceConfig
+from mapper.sources.rgbd import RgbdLog, Shot, entries_of, find_calibration, present, read_accelerations
 from mapper.sources.text import (
     parse_numbers,
     parse_stamp,
@@ -27,8 +22,6 @@ from mapper.sources.text import (
     time_order,
     truth_from,
 )
-from mapper.timebase import NS_PER_S, Stamps, nearest
-from mapper.trajectory import Trajectory
 
 DEPTH_UNITS_PER_M = 5000.0
 LOOKED_FOR = "rgb.txt and depth.txt (TUM)"

@@ -8,20 +8,20 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.atomic import write_bytes, write_text
-from mapper.errors import FrameError, SourceError
-from mapper.frames import PinholeCamera, RgbdFrame
-from mapper.rotations import quaternion_from_rotation
-from mapper.sources.appearing import appearing
-from mapper.sources.base import Accelerations, Entry, FrameSource, Skipped
+from mapper.core.errors import FrameError, SourceError
+from mapper.core.frames import PinholeCamera, RgbdFrame
+from mapper.core.rotations import quaternion_from_rotation
+from mapper.core.timebase import MAX_TRUTH_GAP_NS, nearest, seconds_text_from_ns
+from mapper.core.trajectory import Trajectory
+from mapper.runtime.atomic import new_folder, write_bytes, write_text
+from mapper.sources.base import Accelerations, FrameRef, FrameSource, Skipped
 from mapper.sources.calibration_file import calibration_text
 from mapper.sources.images import FINE_UNITS_PER_M, bytes_of, encode_colour, encode_depth
 from mapper.sources.kitti_writing import write_kitti_log
 from mapper.sources.mbag import HEADER
 from mapper.sources.ros.writing import write_recording
-from mapper.sources.wheels import write_wheels
-from mapper.timebase import MAX_TRUTH_GAP_NS, nearest, seconds_text_from_ns
-from mapper.trajectory import Trajectory, write_tum
+from mapper.sources.trajectory_files import write_tum
+from mapper.sources.wheel_files import write_wheels
 
 LogKind = Literal["tum", "mbag", "kitti", "mcap", "bag"]
 
@@ -58,7 +58,7 @@ def write_log(
     """
     if kind == "mcap" or kind == "bag":
         return write_recording(source, out, kind=kind, on_progress=on_progress)
-    with appearing(out) as folder:
+    with new_folder(out) as folder:
         if kind == "kitti":
             return write_kitti_log(source, folder, on_progress=on_progress)
         mbag = f"{out.resolve().name}.mbag" if kind == "mbag" else None
@@ -126,7 +126,7 @@ def _camera_of(source: FrameSource) -> PinholeCamera:
     raise SourceError(f"{source.path}: no frame can be written: {reason}")
 
 
-def _load(entry: Entry) -> RgbdFrame:
+def _load(entry: FrameRef) -> RgbdFrame:
     frame = entry.load()
     if not isinstance(frame, RgbdFrame):
         raise FrameError(
@@ -135,7 +135,7 @@ def _load(entry: Entry) -> RgbdFrame:
     return frame
 
 
-def _write_images(entry: Entry, out: Path) -> _Written:
+def _write_images(entry: FrameRef, out: Path) -> _Written:
     """Copy or encode both images; return their paths relative to ``out``."""
     stamp = seconds_text_from_ns(entry.stamp_ns)
     if (files := entry.files) is not None:

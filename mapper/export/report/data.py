@@ -10,15 +10,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper import run as files
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, nearest
 from mapper.export.grid import grid_image, read_grid
-from mapper.export.jpeg import encode_jpeg
 from mapper.loops.closure import LoopClosure
+from mapper.mapping.thumbnails import encode_jpeg
 from mapper.octree.slice import OccupancyGrid
-from mapper.run import Run
-from mapper.story import Story, story_of
-from mapper.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, nearest
+from mapper.run import files
+from mapper.run.folder import Run
+from mapper.run.results import RunResults, load_results
 
 _VIEW_PX = 1600
 _VIEW_QUALITY = 85
@@ -44,13 +44,13 @@ class Chapter:
     Attributes:
         name: Distinct among the report's runs.
         run: The run.
-        story: What it has to tell.
+        results: What it has to tell.
         figures: What it amounts to, e.g. how far it is from the truth.
     """
 
     name: str
     run: Run
-    story: Story
+    results: RunResults
     figures: Sequence[Figure]
 
 
@@ -60,15 +60,15 @@ def chapter_of(run: Run, name: str, figures: Sequence[Figure]) -> Chapter:
     Raises:
         MapperError: A file of the run cannot be read.
     """
-    return Chapter(name, run, story_of(run), tuple(figures))
+    return Chapter(name, run, load_results(run), tuple(figures))
 
 
 def drawn(chapter: Chapter) -> dict[str, Any]:
     """Return the numbers behind a run's curves and plans, ready for JSON; what is not known is None."""
-    story = chapter.story
-    begin_ns = int(story.trajectory.stamps_ns[0])
+    results = chapter.results
+    begin_ns = int(results.trajectory.stamps_ns[0])
     seconds = _Seconds(begin_ns)
-    records = story.records
+    records = results.records
     return {
         "name": chapter.name,
         "frames": {
@@ -78,22 +78,22 @@ def drawn(chapter: Chapter) -> dict[str, Any]:
             "matches": [record.diagnostics.matches for record in records],
             "inliers": [record.diagnostics.inliers for record in records],
             "residual": _rounded([record.diagnostics.residual for record in records]),
-            "ms": _rounded([story.frame_ms.get(record.stamp_ns, math.nan) for record in records]),
+            "ms": _rounded([results.frame_ms.get(record.stamp_ns, math.nan) for record in records]),
         },
-        "residual_unit": residual_unit(story),
-        "path": _path(story.trajectory.stamps_ns, story.trajectory.positions_world, seconds),
+        "residual_unit": residual_unit(results),
+        "path": _path(results.trajectory.stamps_ns, results.trajectory.positions_world, seconds),
         "truth": None
-        if story.truth is None
-        else _path(story.truth.stamps_ns, story.truth.positions_world, seconds),
-        "error": _errors(story, seconds),
-        "loops": [_loop(loop, story, seconds) for loop in story.loops],
+        if results.truth is None
+        else _path(results.truth.stamps_ns, results.truth.positions_world, seconds),
+        "error": _errors(results, seconds),
+        "loops": [_loop(loop, results, seconds) for loop in results.loops],
         "slice": _plan(read_grid(chapter.run.path / f"{files.SLICE}.yaml")),
     }
 
 
-def residual_unit(story: Story) -> str:
+def residual_unit(results: RunResults) -> str:
     """Return what a run's residuals are measured in; empty if nothing was tracked."""
-    return next((r.diagnostics.residual_unit for r in story.records if r.outcome == "tracked"), "")
+    return next((r.diagnostics.residual_unit for r in results.records if r.outcome == "tracked"), "")
 
 
 def views_uri(run: Run) -> str | None:
@@ -124,21 +124,21 @@ def _path(stamps_ns: NDArray[np.int64], positions: NDArray[np.float64], seconds:
     return {"t": seconds(stamps_ns), "x": x, "y": y, "z": z}
 
 
-def _errors(story: Story, seconds: _Seconds) -> dict[str, Any] | None:
+def _errors(results: RunResults, seconds: _Seconds) -> dict[str, Any] | None:
     """Return how far the estimate is from the truth laid over it: the terms of the ATE, SE(3)-aligned."""
-    if story.truth is None:
+    if results.truth is None:
         return None
-    index, gap_ns = nearest(story.truth.stamps_ns, story.trajectory.stamps_ns)
+    index, gap_ns = nearest(results.truth.stamps_ns, results.trajectory.stamps_ns)
     near = gap_ns <= MAX_TRUTH_GAP_NS
-    miss = story.trajectory.positions_world[near] - story.truth.positions_world[index[near]]
+    miss = results.trajectory.positions_world[near] - results.truth.positions_world[index[near]]
     return {
-        "t": seconds(story.trajectory.stamps_ns[near]),
+        "t": seconds(results.trajectory.stamps_ns[near]),
         "m": _rounded(np.linalg.norm(miss, axis=1).tolist()),
     }
 
 
-def _loop(loop: LoopClosure, story: Story, seconds: _Seconds) -> dict[str, Any]:
-    T_world_node = story.graph.T_world_node
+def _loop(loop: LoopClosure, results: RunResults, seconds: _Seconds) -> dict[str, Any]:
+    T_world_node = results.graph.T_world_node
     ends = None
     if loop.i in T_world_node and loop.j in T_world_node:
         ends = [[round(float(v), 3) for v in T_world_node[node][:2, 3]] for node in (loop.i, loop.j)]

@@ -8,10 +8,10 @@ from itertools import starmap
 from pathlib import Path
 from typing import Any
 
-from mapper.atomic import write_text
-from mapper.errors import ConfigError
+from mapper.core.errors import ConfigError
 from mapper.export.html import document, section
 from mapper.export.report.data import Chapter, drawn, residual_unit, views_uri
+from mapper.runtime.atomic import write_text
 
 _CURVES = (
     ("error", "Distance from the truth", "m"),
@@ -163,7 +163,7 @@ def _plan(number: int, chapter: Chapter) -> str:
 
 def _curves(chapters: Sequence[Chapter]) -> str:
     """Return the places of the curves; residuals of different units are no one curve's."""
-    units = sorted({residual_unit(chapter.story) for chapter in chapters} - {""})
+    units = sorted({residual_unit(chapter.results) for chapter in chapters} - {""})
     curves = [*_CURVES, *(("residual", "Residual of each frame", unit) for unit in units)]
     return _HINT + "".join(
         f'<figure class="curve" data-curve="{key}" data-unit="{escape(unit)}">'
@@ -173,7 +173,7 @@ def _curves(chapters: Sequence[Chapter]) -> str:
 
 
 def _loops(number: int, chapter: Chapter) -> str:
-    loops = chapter.story.loops
+    loops = chapter.results.loops
     held = sum(loop.verdict == "accepted" for loop in loops)
     title = f"{escape(chapter.name)}: {held} of {len(loops)} candidates hold"
     return f'<div class="loops" data-of="{number}"><h3>{title}</h3></div>'

@@ -3,7 +3,7 @@
 import numpy as np
 import rerun.blueprint as rrb
 
-from mapper.geometry import Array
+from mapper.core.geometry import Array
 
 _DIRECTION = np.array([-0.6, -1.0, 0.9])  # from what is looked at to the eye
 _DISTANCE = 0.85  # in diagonals of what is looked at

@@ -4,12 +4,12 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from mapper.core.geometry import Array
 from mapper.export.rerun.recording import RerunLog, recorded
 from mapper.export.run_maps import maps_of, snapshots_of
-from mapper.fusion import Maps
-from mapper.geometry import Array
-from mapper.run import Run
-from mapper.story import Story, story_of
+from mapper.mapping.fusion import Maps
+from mapper.run.folder import Run
+from mapper.run.results import RunResults, load_results
 
 
 def show_run(run: Run, target: str) -> None:
@@ -20,26 +20,26 @@ def show_run(run: Run, target: str) -> None:
         ViewerError: No viewer can be started or reached.
         MapperError: A file of the run cannot be read.
     """
-    story, maps, snapshots = story_of(run), maps_of(run), list(snapshots_of(run))
-    name, corners = run.path.name, extent(story, maps)
+    results, maps, snapshots = load_results(run), maps_of(run), list(snapshots_of(run))
+    name, corners = run.path.name, extent(results, maps)
     with recorded(target, name=name, has_images=bool(snapshots), looking_at=corners) as log:
         log.images(snapshots)
-        log.poses(story.trajectory)
-        tell(log, story, maps)
-        log.diagnostics(story.records)
+        log.poses(results.trajectory)
+        tell(log, results, maps)
+        log.diagnostics(results.records)
         log.about(in_words(run, name=run.path.name))
 
 
-def tell(log: RerunLog, story: Story, maps: Maps) -> None:
+def tell(log: RerunLog, results: RunResults, maps: Maps) -> None:
     """Log what is known once the maps are made."""
-    paths = {"estimate": story.trajectory}
-    if story.truth is not None:
-        paths["truth"] = story.truth
+    paths = {"estimate": results.trajectory}
+    if results.truth is not None:
+        paths["truth"] = results.truth
     for name, trajectory in paths.items():
         log.path(name, trajectory)
-    log.graph(story.graph)
-    log.loops(story.loops, story.graph.T_world_node)
-    log.times(story.frame_ms)
+    log.graph(results.graph)
+    log.loops(results.loops, results.graph.T_world_node)
+    log.times(results.frame_ms)
     log.voxels(maps.octree)
     log.cloud(maps.cloud_points_world, maps.cloud_colors)
     log.grid("slice", maps.grid)
@@ -47,9 +47,9 @@ def tell(log: RerunLog, story: Story, maps: Maps) -> None:
     log.plan(maps.grid, paths)
 
 
-def extent(story: Story, maps: Maps) -> Array:
+def extent(results: RunResults, maps: Maps) -> Array:
     """Return the (2, 3) lower and upper corner around the path and all but a few stray points, metres."""
-    seen = [story.trajectory.positions_world]
+    seen = [results.trajectory.positions_world]
     if len(maps.cloud_points_world):
         seen.append(np.percentile(maps.cloud_points_world, [2.0, 98.0], axis=0))
     points_world = np.concatenate(seen)

@@ -11,22 +11,21 @@ from contextlib import contextmanager
 import numpy as np
 import rerun as rr
 
-from mapper.config import RerunConfig
-from mapper.config.sensors import Sensor
-from mapper.errors import FrameError
-from mapper.export.jpeg import encode_jpeg, shrunk_camera
+from mapper.config.export import RerunConfig
+from mapper.core.errors import FrameError
+from mapper.core.frames import RgbdFrame, Scan, Sensor
+from mapper.core.geometry import Array, Transform, inverse
 from mapper.export.palette import ACCEPTED, ESTIMATE, FACTORS, REJECTED, Rgb
 from mapper.export.rerun.finished import extent, in_words, tell
 from mapper.export.rerun.recording import RerunLog, recorded, transform_of
 from mapper.features.view import View
-from mapper.frames import RgbdFrame, Scan
-from mapper.fusion import Maps
-from mapper.geometry import Array, Transform, inverse
-from mapper.odometry.base import Matches, Track
-from mapper.run import Run
+from mapper.mapping.fusion import Maps
+from mapper.mapping.thumbnails import encode_jpeg, shrunk_camera
+from mapper.odometry.base import FrameResult, Matches
+from mapper.run.folder import Run
+from mapper.run.observers import Step
+from mapper.run.results import RunResults
 from mapper.sources.base import FrameSource
-from mapper.story import Story
-from mapper.watching import Step
 
 _LIVE = "world/live"
 _BODY = f"{_LIVE}/body"
@@ -56,7 +55,7 @@ class LiveRerun:
         self._told_at = 0
         self._told_loops = 0
 
-    def stepped(self, step: Step, /) -> None:
+    def on_frame(self, step: Step, /) -> None:
         """Log where the body is and how tracking went; now and then the image, the cloud and the paths."""
         track = step.track
         self._last_ns = track.stamp_ns
@@ -74,19 +73,19 @@ class LiveRerun:
             self._factors += [(factor.i, factor.j) for factor in (*track.links, *track.factors)]
             self._tell_paths(step)
 
-    def levelled(self, T_level_world: Transform, /) -> None:
+    def on_levelled(self, T_level_world: Transform, /) -> None:
         """Lay what was told so far into the levelled world."""
         self._log.log(_LIVE, transform_of(T_level_world @ inverse(self._T_guess_world)))
 
-    def mapped(self, run: Run, story: Story, maps: Maps, /) -> None:
+    def on_mapped(self, run: Run, results: RunResults, maps: Maps, /) -> None:
         """Log the results; what was only believed is theirs to show now."""
         for name in ("believed", "factors", "loops"):
             self._log.log(f"{_LIVE}/{name}", rr.Clear(recursive=True), stamp_ns=self._last_ns)
-        tell(self._log, story, maps)
+        tell(self._log, results, maps)
         self._log.about(in_words(run, name=run.manifest.input.title))
-        self._log.look_at(extent(story, maps))
+        self._log.look_at(extent(results, maps))
 
-    def _move(self, track: Track) -> None:
+    def _move(self, track: FrameResult) -> None:
         T_guess_body = self._T_guess_world @ track.T_world_body
         self._path.append(T_guess_body[:3, 3].astype(np.float32))
         self._log.log(self._log.body, transform_of(T_guess_body), stamp_ns=track.stamp_ns)
@@ -129,8 +128,8 @@ class LiveRerun:
             radii=rr.Radius.ui_points(1.5),
         )
         moved = np.isfinite(held.before_px[:, 0])
-        ways = np.stack([drawn(held.before_px[moved]), drawn(view.pixels[moved])], axis=1)
-        lines = rr.LineStrips2D(ways, colors=[_MATCHED], radii=rr.Radius.ui_points(0.7))
+        chain = np.stack([drawn(held.before_px[moved]), drawn(view.pixels[moved])], axis=1)
+        lines = rr.LineStrips2D(chain, colors=[_MATCHED], radii=rr.Radius.ui_points(0.7))
         self._log.log(f"{self._log.camera}/features", dots, stamp_ns=view.stamp_ns)
         self._log.log(f"{self._log.camera}/matches", lines, stamp_ns=view.stamp_ns)
 
@@ -142,20 +141,26 @@ class LiveRerun:
 
     def _tell_paths(self, step: Step) -> None:
         """Log the path before loops, the nodes as believed with them, and what ties these; not every time."""
-        loops = step.closer.closures()
+        loops = step.detector.closures()
         grown = len(self._nodes) >= (1.0 + _GROWTH) * self._told_at
         if not grown and len(loops) == self._told_loops:
             return
         self._told_at, self._told_loops = len(self._nodes), len(loops)
-        believed = {node: (self._T_guess_world @ step.closer.believed(node))[:3, 3] for node in self._nodes}
+        current_estimate = {
+            node: (self._T_guess_world @ step.detector.current_estimate(node))[:3, 3] for node in self._nodes
+        }
         self._strips("odometry", [np.array(self._path)], FACTORS["odometry"])
-        self._strips("believed", [np.array(list(believed.values()))], ESTIMATE)
-        self._strips("factors", [[believed[i], believed[j]] for i, j in self._factors], FACTORS["odometry"])
+        self._strips("believed", [np.array(list(current_estimate.values()))], ESTIMATE)
+        self._strips(
+            "factors",
+            [[current_estimate[i], current_estimate[j]] for i, j in self._factors],
+            FACTORS["odometry"],
+        )
         for verdict, color in (("accepted", ACCEPTED), ("rejected", REJECTED)):
             ends = [
-                [believed[loop.i], believed[loop.j]]
+                [current_estimate[loop.i], current_estimate[loop.j]]
                 for loop in loops
-                if loop.verdict == verdict and loop.i in believed and loop.j in believed
+                if loop.verdict == verdict and loop.i in current_estimate and loop.j in current_estimate
             ]
             self._strips(f"loops/{verdict}", ends, color)
 

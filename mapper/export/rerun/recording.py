@@ -35,21 +35,22 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from mapper.core.frames import PinholeCamera
+from mapper.core.geometry import Array, Transform
+from mapper.core.timebase import Stamps
+from mapper.core.trajectory import Trajectory
 from mapper.export.grid import grid_image
-from mapper.export.palette import ACCEPTED, ESTIMATE, FACTORS, REJECTED, TRUTH, Rgb, height_colors
+from mapper.export.palette import ACCEPTED, ESTIMATE, FACTORS, REJECTED, TRUTH, Rgb
 from mapper.export.rerun.blueprint import blueprint_for
 from mapper.export.rerun.target import streaming
-from mapper.frames import PinholeCamera
-from mapper.fusion import Snapshot
-from mapper.geometry import Array, Transform
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure, Verdict
+from mapper.mapping.cloud import height_colors
+from mapper.mapping.fusion import Snapshot
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import OccupancyGrid
-from mapper.records import FrameRecord
-from mapper.timebase import Stamps
-from mapper.trajectory import Trajectory
+from mapper.run.frame_records import FrameRecord
 
 APPLICATION = "mapper"
 BODY = "world/body"

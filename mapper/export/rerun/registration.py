@@ -6,12 +6,11 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from mapper.config.sensors import Sensor
+from mapper.core.frames import Points32, Sensor
+from mapper.core.geometry import Transform
 from mapper.export.palette import ESTIMATE, TRUTH
 from mapper.export.rerun.recording import new_recording, transform_of
 from mapper.export.rerun.target import streaming
-from mapper.frames import Points32
-from mapper.geometry import Transform
 
 _TIMELINE = "stage"
 _DOT_PX = rr.Radius.ui_points(1.5)

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
-from mapper.atomic import replacing
-from mapper.errors import ConfigError, ViewerError
+from mapper.core.errors import ConfigError, ViewerError
+from mapper.runtime.atomic import atomic_file
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -61,7 +61,7 @@ def streaming(
     """
     check_target(target)
     if Path(target).suffix == ENDING:
-        with replacing(Path(target)) as part:
+        with atomic_file(Path(target)) as part:
             recording.save(part, default_blueprint=blueprint)
             failure = None
             try:

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from mapper.linear import solve_positive, turned, twist_exp
+from mapper.core.linear import solve_positive, turned, twist_exp
 from mapper.odometry.local_map.pose import (
     CHI2_2DOF,
     CHI2_3DOF,

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from mapper.linear import turned
+from mapper.core.linear import turned
 
 MIN_DEPTH_M = 0.1
 MIN_VIEW_COSINE = 0.5

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.geometry import Array, Transform, adjoint, apply, inverse
+from mapper.core.geometry import Array, Transform, adjoint, apply, inverse
 from mapper.odometry.local_map.bundle import adjust
 from mapper.odometry.local_map.gather import count_observers, observations_of
 from mapper.odometry.local_map.observation import Observation

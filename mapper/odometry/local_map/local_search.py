@@ -5,13 +5,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.odometry import KeyframeConfig
+from mapper.core.geometry import Array, Transform
 from mapper.features.windowed import Words, match_windows
-from mapper.geometry import Array, Transform
+from mapper.odometry.config import KeyframeConfig
 from mapper.odometry.local_map.gather import project_visible
 from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
 from mapper.odometry.local_map.observation import Observation
-from mapper.odometry.local_map.placing import MAX_HAMMING, Placement, refined, rms_px
+from mapper.odometry.local_map.pose_tracker import MAX_HAMMING, TrackedPose, refined, rms_px
 
 _MAX_RATIO = 0.8
 
@@ -32,7 +32,7 @@ class LocalSearch:
         *,
         reference: int,
         method: str,
-    ) -> Placement | None:
+    ) -> TrackedPose | None:
         """Search the landmarks of the most covisible keyframes and refine the pose with all that match.
 
         Args:
@@ -85,7 +85,7 @@ class LocalSearch:
         landmarks["visible"][visible] += 1
         landmarks["visible"][matched] += 1
         landmarks["found"][ids[agree]] += 1
-        return Placement(
+        return TrackedPose(
             observation,
             T_camera_world,
             landmark_of_feature,

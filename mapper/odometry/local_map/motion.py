@@ -3,43 +3,43 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.odometry import LocalMapConfig
-from mapper.geometry import Points, Transform, apply, exp, inverse, log
+from mapper.core.geometry import Points, Transform, apply, exp, inverse, log
+from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
 from mapper.odometry.local_map.observation import Observation
-from mapper.odometry.local_map.placing import Placement, project, refined, unmatched
-from mapper.odometry.local_map.recall import Recall
+from mapper.odometry.local_map.pose_tracker import TrackedPose, project, refined, unmatched
+from mapper.odometry.local_map.relocalizer import Relocalizer
 
 _MAX_RATIO = 0.9
 
 
-class MotionPlacing:
+class MotionPoseTracker:
     """Predicts, and lets matching without a prediction compete where the prediction found little."""
 
     def __init__(
-        self, config: LocalMapConfig, landmark_map: LandmarkMap, search: LocalSearch, recall: Recall
+        self, config: LocalMapConfig, landmark_map: LandmarkMap, search: LocalSearch, relocalizer: Relocalizer
     ) -> None:
         self._config = config
         self._map = landmark_map
         self._search = search
-        self._recall = recall
+        self._relocalizer = relocalizer
 
     def place(
-        self, observation: Observation, last: Placement, before_last: Placement | None
-    ) -> Placement | None:
+        self, observation: Observation, last: TrackedPose, before_last: TrackedPose | None
+    ) -> TrackedPose | None:
         """Try the predicted motion, then the latest keyframes."""
         predicted = self._by_motion(observation, last, before_last)
         if predicted is not None and predicted.inliers >= self._config.weak_inliers:
             return predicted
         # A weak answer may be a wrong one: let a placement that owes nothing to the prediction compete.
-        matched = self._recall.among(self._map.latest(last.reference), observation, method="fallback")
-        found = [placement for placement in (predicted, matched) if placement is not None]
-        return max(found, key=lambda placement: placement.inliers, default=None)
+        matched = self._relocalizer.among(self._map.latest(last.reference), observation, method="fallback")
+        found = [tracked_pose for tracked_pose in (predicted, matched) if tracked_pose is not None]
+        return max(found, key=lambda tracked_pose: tracked_pose.inliers, default=None)
 
     def _by_motion(
-        self, observation: Observation, last: Placement, before_last: Placement | None
-    ) -> Placement | None:
+        self, observation: Observation, last: TrackedPose, before_last: TrackedPose | None
+    ) -> TrackedPose | None:
         """Look for what the last frame saw where constant velocity predicts it."""
         T_camera_world = self._predicted(observation.stamp_ns, last, before_last)
         seen, points_world, landmark = self._seen_in(last)
@@ -68,7 +68,7 @@ class MotionPlacing:
             observation, T_camera_world, landmark_of_feature, reference=last.reference, method="map"
         )
 
-    def _predicted(self, stamp_ns: int, last: Placement, before_last: Placement | None) -> Transform:
+    def _predicted(self, stamp_ns: int, last: TrackedPose, before_last: TrackedPose | None) -> Transform:
         """Return T_camera_world under constant velocity, which dropped frames do not disturb."""
         if before_last is None:
             return last.T_camera_world
@@ -80,16 +80,16 @@ class MotionPlacing:
         T_camera_world: Transform = exp(steps * rotation_rad, steps * translation_m) @ last.T_camera_world
         return T_camera_world
 
-    def _seen_in(self, placement: Placement) -> tuple[NDArray[np.intp], Points, Ids]:
+    def _seen_in(self, tracked_pose: TrackedPose) -> tuple[NDArray[np.intp], Points, Ids]:
         """Return the features whose place is known: indices, (M, 3) world points, landmark or −1.
 
         Features that are no landmarks help to find the motion: they stand where the depth image puts them.
         """
-        observation, ids = placement.observation, placement.landmark_of_feature
+        observation, ids = tracked_pose.observation, tracked_pose.landmark_of_feature
         landmarks = self._map.landmarks
         known = (ids >= 0) & (landmarks["observers"][ids] > 0)
         near = observation.points_camera[:, 2] <= self._config.max_depth_m
-        points_world = apply(inverse(placement.T_camera_world), observation.points_camera)
+        points_world = apply(inverse(tracked_pose.T_camera_world), observation.points_camera)
         points_world[known] = landmarks["position"][ids[known]]
         seen = np.flatnonzero(known | near)
         return seen, points_world[seen], np.where(known, ids, -1)[seen].astype(np.int32)

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.odometry import KeyframeConfig
-from mapper.errors import FrameError
+from mapper.core.errors import FrameError
+from mapper.core.frames import Frame, RgbdFrame
+from mapper.core.geometry import Array, Points, Transform
 from mapper.features.detectors import Detector
 from mapper.features.view import View
 from mapper.features.windowed import FeatureGrid, Words, pack, sort_into_grid
-from mapper.frames import Frame, RgbdFrame
-from mapper.geometry import Array, Points, Transform
+from mapper.odometry.config import KeyframeConfig
 from mapper.places.vocabulary import Vocabulary
 from mapper.sensing.depth_noise import feature_depth_sigma_m
 

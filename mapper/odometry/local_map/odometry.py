@@ -6,24 +6,24 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.odometry import KeyframeConfig
-from mapper.deskew import Twist
+from mapper.core.deskew import Twist
+from mapper.core.frames import Frame
+from mapper.core.geometry import Transform, inverse
 from mapper.features.detectors import build_detector
 from mapper.features.view import View
-from mapper.frames import Frame
-from mapper.geometry import Transform, inverse
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
-from mapper.odometry.base import Diagnostics, Matches, Track
+from mapper.odometry.base import Diagnostics, FrameResult, Matches
+from mapper.odometry.config import KeyframeConfig
 from mapper.odometry.local_map.landmarks import LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
 from mapper.odometry.local_map.observation import Observation, observe
-from mapper.odometry.local_map.placing import Placement, Placing, unmatched
-from mapper.odometry.local_map.recall import Recall
+from mapper.odometry.local_map.pose_tracker import PoseTracker, TrackedPose, unmatched
+from mapper.odometry.local_map.relocalizer import Relocalizer
 from mapper.places.vocabulary import load_vocabulary
-from mapper.sources.base import Entry
+from mapper.sources.base import FrameRef
 
-MakePlacing = Callable[[LandmarkMap, LocalSearch, Recall], Placing]
+MakePlacing = Callable[[LandmarkMap, LocalSearch, Relocalizer], PoseTracker]
 
 
 class KeyframeOdometry:
@@ -39,16 +39,16 @@ class KeyframeOdometry:
         self._map = LandmarkMap(scale_factor=self._detector.scale_factor)
         self._vocabulary = load_vocabulary(config.vocabulary)
         search = LocalSearch(config, self._map, scale_factor=self._detector.scale_factor)
-        self._recall = Recall(config, self._map, search, self._vocabulary)
-        self._placing = make_placing(self._map, search, self._recall)
-        self._last: Placement | None = None
-        self._before_last: Placement | None = None
+        self._relocalizer = Relocalizer(config, self._map, search, self._vocabulary)
+        self._tracker = make_placing(self._map, search, self._relocalizer)
+        self._last: TrackedPose | None = None
+        self._before_last: TrackedPose | None = None
         self._most_inliers = 0  # since the last keyframe
         self._frames_since_keyframe = 0
         self._lost_frames = 0  # since the last one that was placed
         self._stray_frames = 0  # those of them that show enough to begin with
 
-    def read(self, entry: Entry) -> Observation:
+    def read(self, entry: FrameRef) -> Observation:
         """Observe a frame of a log, without its colours. Pure.
 
         Raises:
@@ -64,22 +64,22 @@ class KeyframeOdometry:
         """
         return observe(frame, self._detector, self._vocabulary, self._config)
 
-    def track(self, observation: Observation) -> Track:
+    def track(self, observation: Observation) -> FrameResult:
         """Place the next frame, in time order."""
-        placement = None if self._last is None else self._place(observation, self._last)
-        if placement is None:
+        tracked_pose = None if self._last is None else self._place(observation, self._last)
+        if tracked_pose is None:
             return self._not_found(observation)
         # What came before a gap says nothing about the motion after it.
         before_last = None if self._lost_frames else self._last
         self._lost_frames = self._stray_frames = 0
         self._frames_since_keyframe += 1
-        self._most_inliers = max(self._most_inliers, placement.inliers)
-        is_keyframe, seen_from = self._wants_keyframe(placement), placement.reference
+        self._most_inliers = max(self._most_inliers, tracked_pose.inliers)
+        is_keyframe, seen_from = self._wants_keyframe(tracked_pose), tracked_pose.reference
         if is_keyframe:
-            placement = self._keep(placement, beside=seen_from)
-        self._before_last, self._last = before_last, placement
-        links = [self._factor(seen_from, placement.reference)] if is_keyframe else []
-        return self._track(placement, is_keyframe=is_keyframe, links=links)
+            tracked_pose = self._keep(tracked_pose, beside=seen_from)
+        self._before_last, self._last = before_last, tracked_pose
+        links = [self._factor(seen_from, tracked_pose.reference)] if is_keyframe else []
+        return self._track(tracked_pose, is_keyframe=is_keyframe, links=links)
 
     def view(self, observation: Observation, _twist: Twist | None = None, /) -> View:
         """Return what a place is recognised by. Pure."""
@@ -123,7 +123,7 @@ class KeyframeOdometry:
         T_i_j = inverse(T_world_i) @ T_world_j
         return BetweenFactor(i, j, T_i_j, with_model_error(self._map.information(i, j), T_i_j))
 
-    def _not_found(self, observation: Observation) -> Track:
+    def _not_found(self, observation: Observation) -> FrameResult:
         """Give the frame up, or begin a new sub-map with it once enough frames showed nothing known."""
         if self._near(observation) >= self._config.min_start_features:
             self._stray_frames += 1
@@ -131,94 +131,94 @@ class KeyframeOdometry:
                 return self._begin(observation)
         return self._lost(observation)
 
-    def _begin(self, observation: Observation) -> Track:
+    def _begin(self, observation: Observation) -> FrameResult:
         """Make the frame a sub-map's first keyframe: the world's origin, or where the camera was last."""
         last = self._last
         T_camera_world = inverse(observation.T_body_camera) if last is None else last.T_camera_world
-        start = Placement(observation, T_camera_world, unmatched(observation), 0, 0, 0.0, "start")
+        start = TrackedPose(observation, T_camera_world, unmatched(observation), 0, 0, 0.0, "start")
         self._lost_frames = self._stray_frames = 0
         self._before_last, self._last = None, self._keep(start, beside=None)
         return self._track(self._last, is_keyframe=True)
 
-    def _place(self, observation: Observation, last: Placement) -> Placement | None:
+    def _place(self, observation: Observation, last: TrackedPose) -> TrackedPose | None:
         """Follow the motion; once that fails, look through the keyframes that look alike."""
         if self._lost_frames == 0:
-            placement = self._placing.place(observation, last, self._before_last)
-            if placement is not None:
-                return placement
+            tracked_pose = self._tracker.place(observation, last, self._before_last)
+            if tracked_pose is not None:
+                return tracked_pose
         here_world = inverse(last.T_camera_world)[:3, 3]
-        lookalikes = self._recall.lookalikes(observation, here_world)
-        return self._recall.among(lookalikes, observation, method="relocalised")
+        candidates = self._relocalizer.candidates(observation, here_world)
+        return self._relocalizer.among(candidates, observation, method="relocalised")
 
-    def _wants_keyframe(self, placement: Placement) -> bool:
+    def _wants_keyframe(self, tracked_pose: TrackedPose) -> bool:
         config = self._config
         if self._frames_since_keyframe >= config.max_keyframe_gap:
             return True
-        kept_ratio = placement.inliers / self._most_inliers
-        weak = placement.inliers < config.weak_inliers
+        kept_ratio = tracked_pose.inliers / self._most_inliers
+        weak = tracked_pose.inliers < config.weak_inliers
         if self._frames_since_keyframe < config.min_keyframe_gap and not weak:
             return kept_ratio < config.hasty_keyframe_ratio
         # Landmarks left behind at one edge of a view hold its pose badly, however many they are.
-        mapped = placement.inliers / max(self._near(placement.observation), 1)
+        mapped = tracked_pose.inliers / max(self._near(tracked_pose.observation), 1)
         return kept_ratio < config.keyframe_ratio or mapped < config.mapped_ratio
 
     def _near(self, observation: Observation) -> int:
         """Return how many features are near enough to become landmarks."""
         return int((observation.points_camera[:, 2] <= self._config.max_depth_m).sum())
 
-    def _keep(self, placement: Placement, *, beside: int | None) -> Placement:
+    def _keep(self, tracked_pose: TrackedPose, *, beside: int | None) -> TrackedPose:
         """Turn a placed frame into a keyframe, refine the map around it, and return it as refined.
 
         ``beside`` is a keyframe of the sub-map it was placed in; None begins a new one.
         """
-        config, observation = self._config, placement.observation
+        config, observation = self._config, tracked_pose.observation
         index = self._map.add_keyframe(
             observation,
-            placement.T_camera_world,
-            placement.landmark_of_feature,
-            new=self._worth_mapping(placement),
+            tracked_pose.T_camera_world,
+            tracked_pose.landmark_of_feature,
+            new=self._worth_mapping(tracked_pose),
             beside=beside,
         )
-        self._recall.remember(index)
+        self._relocalizer.add(index)
         self._map.refine(index, window=config.bundle_keyframes, min_shared=config.min_shared_landmarks)
         self._map.cull(min_found_ratio=config.min_found_ratio)
         self._most_inliers, self._frames_since_keyframe = 0, 0
         keyframe = self._map.keyframes[index]
         return replace(
-            placement,
+            tracked_pose,
             T_camera_world=keyframe.T_camera_world,
             landmark_of_feature=keyframe.landmark_of_feature,
             reference=index,
         )
 
-    def _worth_mapping(self, placement: Placement) -> NDArray[np.bool_]:
+    def _worth_mapping(self, tracked_pose: TrackedPose) -> NDArray[np.bool_]:
         """Return (N,) which features become landmarks: the near ones, and deeper ones while those are few."""
-        depth_m = placement.observation.points_camera[:, 2]
-        unmapped = placement.observation.has_depth & (placement.landmark_of_feature < 0)
+        depth_m = tracked_pose.observation.points_camera[:, 2]
+        unmapped = tracked_pose.observation.has_depth & (tracked_pose.landmark_of_feature < 0)
         worth = unmapped & (depth_m <= self._config.max_depth_m)
-        missing = self._config.min_keyframe_landmarks - placement.inliers - int(worth.sum())
+        missing = self._config.min_keyframe_landmarks - tracked_pose.inliers - int(worth.sum())
         if missing > 0:
             deep = np.flatnonzero(unmapped & ~worth)
             worth[deep[np.argsort(depth_m[deep], kind="stable")[:missing]]] = True
         return worth
 
     def _track(
-        self, placement: Placement, *, is_keyframe: bool, links: Sequence[BetweenFactor] = ()
-    ) -> Track:
-        T_world_body = _body_pose(placement.observation, placement.T_camera_world)
-        node = self._map.keyframes[placement.reference]
+        self, tracked_pose: TrackedPose, *, is_keyframe: bool, links: Sequence[BetweenFactor] = ()
+    ) -> FrameResult:
+        T_world_body = _body_pose(tracked_pose.observation, tracked_pose.T_camera_world)
+        node = self._map.keyframes[tracked_pose.reference]
         T_world_node = _body_pose(node.observation, node.T_camera_world)
         diagnostics = Diagnostics(
-            features=len(placement.observation),
-            matches=placement.matches,
-            inliers=placement.inliers,
-            residual=placement.residual_px,
+            features=len(tracked_pose.observation),
+            matches=tracked_pose.matches,
+            inliers=tracked_pose.inliers,
+            residual=tracked_pose.residual_px,
             residual_unit="px",
-            method=placement.method,
+            method=tracked_pose.method,
         )
-        return Track(
-            stamp_ns=placement.observation.stamp_ns,
-            node=placement.reference,
+        return FrameResult(
+            stamp_ns=tracked_pose.observation.stamp_ns,
+            node=tracked_pose.reference,
             T_node_body=inverse(T_world_node) @ T_world_body,
             T_world_body=T_world_body,
             is_keyframe=is_keyframe,
@@ -226,10 +226,10 @@ class KeyframeOdometry:
             links=links,
         )
 
-    def _lost(self, observation: Observation) -> Track:
+    def _lost(self, observation: Observation) -> FrameResult:
         self._lost_frames += 1
         last = self._last
-        return Track(
+        return FrameResult(
             stamp_ns=observation.stamp_ns,
             node=None,
             T_node_body=np.eye(4),

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.geometry import Array, Points, Transform
 from mapper.features.matching import drawing_order
-from mapper.geometry import Array, Points, Transform
 
 _CONFIDENCE = 0.999
 

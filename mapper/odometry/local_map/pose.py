@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from mapper.linear import solve_positive, twist_exp
+from mapper.core.linear import solve_positive, twist_exp
 
 CHI2_2DOF, CHI2_3DOF = 5.991, 7.815
 """95 % points of χ²: an image point without and with depth."""

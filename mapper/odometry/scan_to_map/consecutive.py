@@ -1,7 +1,7 @@
 """Each scan against the one before it, without a guess (Nagy, Gálai & Benedek; C6)."""
 
-from mapper.config.scan_odometry import HoughOdometryConfig
-from mapper.geometry import Transform
+from mapper.core.geometry import Transform
+from mapper.odometry.scan_to_map.config import HoughOdometryConfig
 from mapper.odometry.scan_to_map.matching import Reach, Sweep
 from mapper.registration.base import Aligner
 

@@ -1,7 +1,7 @@
 """Scan to map by voxelised GICP (Koide, Yokozuka, Oishi & Banno 2021)."""
 
-from mapper.config.scan_odometry import GicpOdometryConfig
-from mapper.geometry import Transform
+from mapper.core.geometry import Transform
+from mapper.odometry.scan_to_map.config import GicpOdometryConfig
 from mapper.odometry.scan_to_map.matching import Reach, Sweep
 from mapper.registration.gaussian_cells import GaussianCells
 

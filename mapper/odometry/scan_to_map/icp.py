@@ -4,8 +4,8 @@ from collections import deque
 
 import numpy as np
 
-from mapper.config.scan_odometry import IcpOdometryConfig
-from mapper.geometry import Points, Transform, apply
+from mapper.core.geometry import Points, Transform, apply
+from mapper.odometry.scan_to_map.config import IcpOdometryConfig
 from mapper.odometry.scan_to_map.matching import Reach, Sweep
 from mapper.registration.refining import refine
 from mapper.registration.surfaces import Prepared, prepared

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from mapper.config.scan_odometry import KissOdometryConfig
-from mapper.geometry import Array, Points, Transform, inverse, is_rigid
+from mapper.core.geometry import Array, Points, Transform, inverse, is_rigid
+from mapper.odometry.scan_to_map.config import KissOdometryConfig
 from mapper.odometry.scan_to_map.matching import Reach, Sweep
 
 

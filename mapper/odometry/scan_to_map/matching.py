@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-from mapper.frames import Scan
-from mapper.geometry import Transform
+from mapper.core.frames import Scan
+from mapper.core.geometry import Transform
 from mapper.registration.surfaces import Prepared
 
 Reach = Literal["near", "far"]

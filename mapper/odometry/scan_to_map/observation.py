@@ -4,13 +4,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapper.config.scan_odometry import ScanOdometryConfig
-from mapper.deskew import Twist, deskewed
-from mapper.errors import FrameError
-from mapper.frames import Frame, Points32, Scan
+from mapper.core.deskew import Twist, deskewed
+from mapper.core.errors import FrameError
+from mapper.core.frames import Frame, Points32, Scan
+from mapper.core.voxel_grid import thin
+from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.odometry.scan_to_map.matching import Sweep
 from mapper.registration.surfaces import prepared
-from mapper.thinning import thin
 
 _FINER = 0.5  # a prepared point is the mean of those thinned to this part of its voxel
 

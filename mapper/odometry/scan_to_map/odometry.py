@@ -7,21 +7,21 @@ from statistics import median
 
 import numpy as np
 
-from mapper.config.scan_odometry import ScanOdometryConfig
-from mapper.deskew import STILL, Twist, twist_between
+from mapper.core.deskew import STILL, Twist, twist_between
+from mapper.core.frames import Frame
+from mapper.core.geometry import Transform, angle_between, inverse
+from mapper.core.timebase import NS_PER_S
 from mapper.features.scan_view import ScanView
-from mapper.frames import Frame
-from mapper.geometry import Transform, angle_between, inverse
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
-from mapper.odometry.base import Diagnostics, Track
+from mapper.odometry.base import Diagnostics, FrameResult
+from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.odometry.scan_to_map.matching import Matcher, Sweep
 from mapper.odometry.scan_to_map.observation import ScanObservation, observe_scan
 from mapper.registration.base import Aligner, Alignment
-from mapper.registration.degeneracy import degeneracy_of, loosened
+from mapper.registration.degeneracy import degeneracy_of, projected
 from mapper.registration.refining import measured
-from mapper.sources.base import Entry
-from mapper.timebase import NS_PER_S
+from mapper.sources.base import FrameRef
 
 _USUAL_OF = 20  # recent scans whose overlap tells what is usual
 _MIN_ELAPSED_S = 0.005  # over less, an error of millimetres would be a velocity
@@ -76,7 +76,7 @@ class ScanOdometry:
         self._lost = 0
         self._next_node = 0
 
-    def read(self, entry: Entry) -> ScanObservation:
+    def read(self, entry: FrameRef) -> ScanObservation:
         """Observe a frame of a log, without its colours. Pure.
 
         Raises:
@@ -92,7 +92,7 @@ class ScanOdometry:
         """
         return observe_scan(frame, self._config)
 
-    def track(self, observation: ScanObservation) -> Track:
+    def track(self, observation: ScanObservation) -> FrameResult:
         """Place the next observation, in time order."""
         if self._keyframe is None:
             return self._start(observation, np.eye(4), method="start")
@@ -181,7 +181,7 @@ class ScanOdometry:
             self._rescuer = keyframe.node, self._rescue.prepare(keyframe.sweep.scan)
         return self._rescuer[1]
 
-    def _follow(self, observation: ScanObservation, sweep: Sweep, placed: _Placed) -> Track:
+    def _follow(self, observation: ScanObservation, sweep: Sweep, placed: _Placed) -> FrameResult:
         """Hang a placed scan on the last keyframe, or make it the next one."""
         keyframe, overlap = self._keyframe, placed.overlap
         assert keyframe is not None
@@ -197,12 +197,12 @@ class ScanOdometry:
         factors: tuple[BetweenFactor, ...] = ()
         if is_keyframe:
             node = self._take_keyframe(observation, sweep, placed.T_world_middle)
-            information = with_model_error(loosened(overlap.information, degeneracy), T_key_body)
+            information = with_model_error(projected(overlap.information, degeneracy), T_key_body)
             factors = (BetweenFactor(keyframe.node, node, T_key_body, information),)
         else:
             self._take(observation, sweep, placed.T_world_middle, is_keyframe=False)
         points = len(sweep.prepared.points)
-        return Track(
+        return FrameResult(
             stamp_ns=observation.scan.stamp_ns,
             node=node,
             T_node_body=np.eye(4) if is_keyframe else T_key_body,
@@ -222,14 +222,14 @@ class ScanOdometry:
             twist=self._twist,
         )
 
-    def _start(self, observation: ScanObservation, T_world_body: Transform, *, method: str) -> Track:
+    def _start(self, observation: ScanObservation, T_world_body: Transform, *, method: str) -> FrameResult:
         """Make a scan the first keyframe of a map; nothing says where it lies to earlier maps."""
         self._matcher.clear()
         self._overlaps.clear()
         self._twist, self._lost, self._first = STILL, 0, observation
         sweep = observation.as_swept(STILL)
         node = self._take_keyframe(observation, sweep, T_world_body)
-        return Track(
+        return FrameResult(
             stamp_ns=observation.scan.stamp_ns,
             node=node,
             T_node_body=np.eye(4),
@@ -239,12 +239,12 @@ class ScanOdometry:
             is_sharp=observation.scan.times_s is None,
         )
 
-    def _lose(self, observation: ScanObservation) -> Track:
+    def _lose(self, observation: ScanObservation) -> FrameResult:
         """Give the scan up, or begin a new map with it once enough in a row were lost."""
         self._lost += 1
         if 0 < self._config.max_lost_scans < self._lost:
             return self._start(observation, self._T_world_last, method="new sub-map")
-        return Track(
+        return FrameResult(
             stamp_ns=observation.scan.stamp_ns,
             node=None,
             T_node_body=np.eye(4),

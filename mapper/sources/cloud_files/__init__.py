@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from mapper.errors import FrameError
+from mapper.core.errors import FrameError
 from mapper.sources.cloud_files.bare import read_bin, read_npy, read_text
 from mapper.sources.cloud_files.las import read_las
 from mapper.sources.cloud_files.parsing import Columns

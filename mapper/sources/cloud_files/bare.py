@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.errors import FrameError
+from mapper.core.errors import FrameError
 from mapper.sources.cloud_files.parsing import Column, Columns, refusing_damage
 
 RECORD_BYTES = 16

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.errors import FrameError
+from mapper.core.errors import FrameError
 from mapper.sources.cloud_files.parsing import Columns, refusing_damage
 
 _EXTRAS = ("gps_time", "red", "green", "blue")

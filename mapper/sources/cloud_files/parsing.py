@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import FrameError
+from mapper.core.errors import FrameError
 
 Column = NDArray[np.number[Any]]
 Columns = Mapping[str, Column]

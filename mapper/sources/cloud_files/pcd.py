@@ -7,7 +7,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import FrameError
+from mapper.core.errors import FrameError
 from mapper.sources.cloud_files.parsing import Columns, parse_rows, refusing_damage
 
 _MOST_LINES = 100

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import FrameError
-from mapper.frames import Points32
+from mapper.core.errors import FrameError
+from mapper.core.frames import Points32
 from mapper.sources.cloud_files.parsing import Column, Columns
 from mapper.sources.point_times import time_field
 

@@ -14,9 +14,9 @@ from typing import BinaryIO
 
 import lz4.frame
 
-from mapper.errors import DataError, SourceError
+from mapper.core.errors import DataError, SourceError
+from mapper.core.timebase import NS_PER_S
 from mapper.sources.ros.recording import BlockRecording, Part, Span, Topic, ros2_name
-from mapper.timebase import NS_PER_S
 
 _MAGIC = b"#ROSBAG V2.0\n"
 _LENGTH = struct.Struct("<I")

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 
-from mapper.errors import FrameError, SourceError
+from mapper.core.errors import FrameError, SourceError
 from mapper.sources.ros.recording import Place, Recorded, Recording, Topic
 
 

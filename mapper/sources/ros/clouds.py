@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import DataError, FrameError
-from mapper.frames import Scan
-from mapper.geometry import Transform, apply
+from mapper.core.errors import DataError, FrameError
+from mapper.core.frames import Scan
+from mapper.core.geometry import Transform, apply
 from mapper.sources.point_times import relative_times_s, time_field
 from mapper.sources.ros.messages import CloudMessage
 from mapper.sources.ros.returns import measured

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from mapper.errors import DataError, FrameError
-from mapper.frames import DepthImage, PinholeCamera, RgbdFrame, Scan
-from mapper.geometry import Transform
+from mapper.core.errors import DataError, FrameError
+from mapper.core.frames import DepthImage, PinholeCamera, RgbdFrame, Scan
+from mapper.core.geometry import Transform
 from mapper.sources.base import ImageFiles
 from mapper.sources.images import check_size, encode_colour, encode_depth, scan_of
 from mapper.sources.ros.clouds import scan_from

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from mapper.config.sources import SourceConfig
-from mapper.errors import SourceError
+from mapper.core.errors import SourceError
+from mapper.sources.config import SourceConfig
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.recording import Recording
 from mapper.sources.ros.source import MessageLog, log_of

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from mapper.errors import DataError
+from mapper.core.errors import DataError
+from mapper.core.timebase import NS_PER_S
 from mapper.sources.ros.clouds import structured
 from mapper.sources.ros.messages import (
     CameraMessage,
@@ -24,7 +25,6 @@ from mapper.sources.ros.messages import (
 )
 from mapper.sources.ros.recording import Topic
 from mapper.sources.text import pose_from_numbers
-from mapper.timebase import NS_PER_S
 
 _Fields = Mapping[str, Any]
 

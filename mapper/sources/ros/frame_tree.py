@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from mapper.geometry import Transform, inverse
+from mapper.core.geometry import Transform, inverse
 from mapper.sources.ros.messages import PoseMessage
 from mapper.sources.text import pose_from_numbers
 

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import FrameError
-from mapper.frames import DepthImage, Image
+from mapper.core.errors import FrameError
+from mapper.core.frames import DepthImage, Image
 from mapper.sources.images import decode_colour, decode_depth_units, decode_grey, depth_m_from
 from mapper.sources.ros.messages import FileMessage, ImageMessage, PixelsMessage
 

@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import DataError, FrameError
+from mapper.core.errors import DataError, FrameError
+from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.sources.ros import foxglove
 from mapper.sources.ros.images import size_of
 from mapper.sources.ros.messages import READ, SMALL, WITH_HEADER, ImageMessage, Message, decode, unpacked
 from mapper.sources.ros.recording import Place, Recording, Topic
-from mapper.timebase import NS_PER_S, Stamps
 
 _NO_STAMP = 1 << 62  # in the year 2116; differences of smaller ones fit into 64 bits
 _TRIED = 10

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.errors import DataError
-from mapper.geometry import Array, Transform
+from mapper.core.errors import DataError
+from mapper.core.geometry import Array, Transform
 from mapper.sources.ros.recording import Topic
 
 

@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.config.sensors import Sensor
-from mapper.config.sources import WheelsConfig
-from mapper.errors import DataError, FrameError
-from mapper.rotations import rotation_from_quaternion
+from mapper.core.errors import DataError, FrameError
+from mapper.core.frames import Sensor
+from mapper.core.rotations import rotation_from_quaternion
+from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Accelerations
+from mapper.sources.config import WheelsConfig
 from mapper.sources.ros.entries import Located
 from mapper.sources.ros.frame_tree import FrameTree
 from mapper.sources.ros.index import Series, first_messages, index_of
@@ -19,8 +20,7 @@ from mapper.sources.ros.messages import TRANSFORMS, ImuMessage, Message, PoseMes
 from mapper.sources.ros.recording import Recording
 from mapper.sources.ros.time_line import ordered
 from mapper.sources.ros.topics import frame_of
-from mapper.sources.wheels import mounting
-from mapper.trajectory import Trajectory
+from mapper.sources.wheel_files import mounting
 
 _MAX_READINGS = 20_000  # levelling asks for fewer, and an hour of a fast unit would take minutes to read
 _MAX_TRANSFORMS = 1_000

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from mapper.errors import DataError, FrameError
+from mapper.core.errors import DataError, FrameError
 
 _CACHE_BYTES = 64 << 20
 

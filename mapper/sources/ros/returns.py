@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.frames import Points32
+from mapper.core.frames import Points32
 
 
 def measured(points: NDArray[np.float32], *, farthest_m: float) -> tuple[Points32, NDArray[np.intp] | None]:

@@ -4,26 +4,20 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mapper.config.sensors import Sensor
-from mapper.config.sources import SourceConfig
-from mapper.errors import SourceError
-from mapper.frames import NO_DISTORTION, PinholeCamera
-from mapper.sources.base import Accelerations, Entry
+from mapper.core.errors import SourceError
+from mapper.core.frames import NO_DISTORTION, PinholeCamera, Sensor
+from mapper.core.trajectory import Trajectory
+from mapper.sources.base import Accelerations, FrameRef
 from mapper.sources.calibration import Calibration
+from mapper.sources.config import SourceConfig
 from mapper.sources.images import FINE_UNITS_PER_M
 from mapper.sources.ros.entries import CloudEntry, RgbdMessages
 from mapper.sources.ros.images import MILLIMETRES_PER_M, size_of
 from mapper.sources.ros.index import Series
-from mapper.sources.ros.messages import (
-    CameraMessage,
-    FileMessage,
-    ImageMessage,
-    PixelsMessage,
-)
+from mapper.sources.ros.messages import CameraMessage, FileMessage, ImageMessage, PixelsMessage
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.time_line import ordered, paired
 from mapper.sources.ros.topics import CameraTopics, choose, frame_of
-from mapper.trajectory import Trajectory
 
 _SAME_LENS_RATIO = 0.01
 _JPEG_START = b"\xff\xd8"
@@ -43,12 +37,12 @@ class MessageLog:
     wheels: Trajectory | None
     notes: Sequence[str]
     count: int
-    entry: Callable[[int], Entry]
+    entry: Callable[[int], FrameRef]
 
     def __len__(self) -> int:
         return self.count
 
-    def entries(self) -> Iterator[Entry]:
+    def entries(self) -> Iterator[FrameRef]:
         """Yield every frame's entry in time order."""
         return map(self.entry, range(self.count))
 
@@ -60,7 +54,7 @@ class _Frames:
     sensor: Sensor
     body: str
     count: int
-    entry: Callable[[int], Entry]
+    entry: Callable[[int], FrameRef]
     notes: Sequence[str]
 
 
@@ -115,7 +109,7 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
         units_per_m = config.camera.depth_factor
     is_jpeg = isinstance(first_color, FileMessage) and bytes(first_color.data[:2]) == _JPEG_START
 
-    def entry(k: int) -> Entry:
+    def entry(k: int) -> FrameRef:
         return RgbdMessages(
             colour=reader.located(color, int(i[k])),
             depth=reader.located(depth, int(j[k])),
@@ -141,7 +135,7 @@ def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Fr
     if "optical" in body:
         notes.append(f"points are in {body}, whose z looks forward; source.body_frame can take another")
 
-    def entry(k: int) -> Entry:
+    def entry(k: int) -> FrameRef:
         return CloudEntry(reader.located(clouds, int(i[k])), T_body_frame)
 
     return _Frames("lidar", body, len(i), entry, notes)

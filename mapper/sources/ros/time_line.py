@@ -6,10 +6,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from mapper.errors import SourceError
+from mapper.core.errors import SourceError
+from mapper.core.timebase import NS_PER_S, Stamps, nearest
 from mapper.sources.ros.index import Series
 from mapper.sources.text import time_order
-from mapper.timebase import NS_PER_S, Stamps, nearest
 
 _Indices = NDArray[np.intp]
 

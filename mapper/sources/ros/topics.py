@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mapper.config.sources import TopicsConfig
-from mapper.errors import SourceError
+from mapper.core.errors import SourceError
+from mapper.sources.config import TopicsConfig
 from mapper.sources.ros.images import is_depth
 from mapper.sources.ros.index import Series
 from mapper.sources.ros.messages import (

@@ -6,9 +6,9 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
 
-from mapper.errors import FrameError, SourceError
-from mapper.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
-from mapper.sources.base import Entry, FrameSource, ImageFiles, Skipped
+from mapper.core.errors import FrameError, SourceError
+from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
+from mapper.sources.base import FrameRef, FrameSource, ImageFiles, Skipped
 from mapper.sources.images import bytes_of, read_colour, read_depth_m
 from mapper.sources.ros.images import MILLIMETRES_PER_M
 from mapper.sources.ros.topics import TRUTH, WHEELS
@@ -124,7 +124,7 @@ def _frames(
             on_progress(done)
 
 
-def _cloud(entry: Entry) -> Written:
+def _cloud(entry: FrameRef) -> Written:
     from mapper.sources.rosbag_writing import cloud_message
 
     scan = entry.load()
@@ -135,7 +135,7 @@ def _cloud(entry: Entry) -> Written:
     )
 
 
-def _images(entry: Entry) -> tuple[Written, Written]:
+def _images(entry: FrameRef) -> tuple[Written, Written]:
     """Return the messages of a frame's colour and depth image."""
     if entry.files is not None:
         return _colour_of_files(entry.stamp_ns, entry.files), _depth_of_files(entry.files)

@@ -1,0 +1,147 @@
+"""How files and overrides become a configuration, and what it says where they are wrong."""
+
+import json
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+from pydantic import ValidationError
+
+from mapper.config.build import BuildConfig
+from mapper.config.sensors import DEFAULTS
+from mapper.core.config import Config
+from mapper.core.errors import ConfigError
+from mapper.core.frames import Sensor
+from mapper.sources.config import SourceConfig
+
+AnyConfig = TypeVar("AnyConfig", bound=Config)
+
+
+def load_config(
+    path: Path | None = None, overrides: Sequence[str] = (), *, sensor: Sensor = "rgbd"
+) -> BuildConfig:
+    """Return the configuration of a TOML file, or a run's JSON, with ``key.path=value`` overrides on top.
+
+    Args:
+        path: The file; None begins with the defaults.
+        overrides: Text, parsed by the model.
+        sensor: Whose defaults hold where neither says anything.
+
+    Raises:
+        ConfigError: The file cannot be read or parsed, or the model refuses a name or a value.
+    """
+    tree = {} if path is None else _read(path)
+    if path is not None:
+        _validated(BuildConfig, _over(DEFAULTS[sensor], tree), str(path))
+    for override in overrides:
+        _put(tree, override)
+    return _validated(
+        BuildConfig, _over(DEFAULTS[sensor], tree), "overrides" if overrides or path is None else str(path)
+    )
+
+
+def load_source_config(path: Path | None = None, overrides: Sequence[str] = ()) -> SourceConfig:
+    """Return the part of a configuration that opens a log, before it is known which sensor took it.
+
+    Raises:
+        ConfigError: As ``load_config``, of that part alone.
+    """
+    tree = {} if path is None else _read(path)
+    for override in overrides:
+        if override.startswith("source."):
+            _put(tree, override)
+    return _validated(BuildConfig, {"source": tree.get("source", {})}, str(path or "overrides")).source
+
+
+def read_config(path: Path, model: type[AnyConfig]) -> AnyConfig:
+    """Return what a TOML or JSON file holds, as a model of any kind; what it leaves out is the model's own.
+
+    Raises:
+        ConfigError: The file cannot be read or parsed, or the model refuses a name or a value.
+    """
+    return _checked(model, _read(path), str(path))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    is_json = path.suffix == ".json"
+    try:
+        text = path.read_text(encoding="utf-8")
+        tree: dict[str, Any] = json.loads(text) if is_json else tomllib.loads(text)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:  # what either parser raises, and text that is not UTF-8
+        raise ConfigError(f"{path}: not valid {'JSON' if is_json else 'TOML'}: {error}") from None
+    return tree
+
+
+def _over(defaults: Mapping[str, Any], tree: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tree with what it leaves out taken from the defaults, part by part."""
+    filled: dict[str, Any] = {**defaults, **tree}
+    for name, value in tree.items():
+        default = defaults.get(name)
+        if isinstance(value, dict) and isinstance(default, dict):
+            filled[name] = {**default, **value}
+    return filled
+
+
+def overridden(config: AnyConfig, overrides: Sequence[str]) -> AnyConfig:
+    """Return a configuration of any kind with ``key.path=value`` overrides on top.
+
+    Raises:
+        ConfigError: The model refuses a name or a value.
+    """
+    tree = config.model_dump()
+    for override in overrides:
+        _put(tree, override)
+    return _validated(type(config), tree, "overrides")
+
+
+def _put(tree: dict[str, Any], override: str) -> None:
+    """Set one dotted key; the value stays text, and the model parses it."""
+    dotted, equals, value = override.partition("=")
+    if not equals or not dotted:
+        raise ConfigError(f"override {override!r}: want key.path=value")
+    *parents, leaf = dotted.split(".")
+    node = tree
+    for key in parents:
+        node = node.setdefault(key, {})
+        if not isinstance(node, dict):
+            raise ConfigError(f"override {override!r}: {key} is a value, not a table")
+    node[leaf] = value
+
+
+def _with_kinds(tree: dict[str, Any], default: Config) -> dict[str, Any]:
+    """Return the tree with what it leaves out and the classes' own defaults would not restore.
+
+    That is every ``kind``, and whatever a part's default says beyond its class: turning one knob of a part
+    must not turn back the others.
+    """
+    filled = dict(tree)
+    for name, value in tree.items():
+        member = getattr(default, name, None)
+        if not isinstance(value, dict) or not isinstance(member, Config):
+            continue
+        if "kind" in type(member).model_fields:
+            value = {"kind": _kind(type(member)), **value}
+            members = get_args(type(default).model_fields[name].annotation)
+            member = next((m() for m in members if _kind(m) == value["kind"]), member)
+        filled[name] = member.model_dump(include=member.model_fields_set) | _with_kinds(value, member)
+    return filled
+
+
+def _kind(member: type[Config]) -> str:
+    return str(member.model_fields["kind"].default)
+
+
+def _validated(model: type[AnyConfig], tree: dict[str, Any], where: str) -> AnyConfig:
+    return _checked(model, _with_kinds(tree, model()), where)
+
+
+def _checked(model: type[AnyConfig], tree: dict[str, Any], where: str) -> AnyConfig:
+    try:
+        return model.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"]) or "configuration"
+        raise ConfigError(f"{where}: {name}: {first['msg']}") from None

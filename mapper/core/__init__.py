@@ -1,0 +1,1 @@
+"""Data types and geometry that every other package builds on."""

@@ -1,0 +1,60 @@
+"""Time as int nanoseconds: exact text conversion and nearest-stamp association."""
+
+from decimal import Decimal, InvalidOperation
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.core.errors import DataError
+
+NS_PER_S = 1_000_000_000
+_LARGEST_S = (2**63 - 1) // NS_PER_S
+
+MAX_TRUTH_GAP_NS = 20_000_000
+"""A true pose farther from a frame in time says nothing about it: TUM's own limit for pairing stamps."""
+
+Stamps = NDArray[np.int64]
+"""(N,) int64 nanoseconds since the Unix epoch (or the log's own zero)."""
+
+
+def ns_from_seconds_text(text: str) -> int:
+    """Parse decimal seconds exactly: "1305031102.175304" becomes 1305031102175304000.
+
+    Raises:
+        DataError: The text is not a finite decimal number, or too large for int64 nanoseconds.
+    """
+    try:
+        seconds = Decimal(text)
+    except InvalidOperation:
+        raise DataError(f"stamp {text!r} is not a decimal number of seconds") from None
+    if not seconds.is_finite():
+        raise DataError(f"stamp {text!r} is not finite")
+    if not -_LARGEST_S <= seconds <= _LARGEST_S:
+        raise DataError(f"stamp {text!r} lies more than 292 years from zero, which 64 bits cannot hold")
+    return int(seconds * NS_PER_S)
+
+
+def seconds_text_from_ns(stamp_ns: int) -> str:
+    """Return decimal seconds that parse back to the same stamp; at least six decimals, as TUM writes them."""
+    sign = "-" if stamp_ns < 0 else ""
+    whole, fraction = divmod(abs(int(stamp_ns)), NS_PER_S)
+    digits = f"{fraction:09d}"
+    return f"{sign}{whole}.{digits[:6]}{digits[6:].rstrip('0')}"
+
+
+def nearest(stamps_ns: Stamps, wanted_ns: Stamps) -> tuple[NDArray[np.intp], Stamps]:
+    """Return, for every wanted stamp, the index of the nearest stamp and the gap to it.
+
+    Args:
+        stamps_ns: (N,) increasing, N ≥ 1.
+        wanted_ns: (M,) in any order.
+
+    Returns:
+        (M,) indices into ``stamps_ns`` and (M,) absolute gaps in nanoseconds. The earlier stamp wins a tie.
+    """
+    right = np.clip(np.searchsorted(stamps_ns, wanted_ns), 1, max(len(stamps_ns) - 1, 1))
+    right = np.minimum(right, len(stamps_ns) - 1)
+    left = np.maximum(right - 1, 0)
+    gap_left, gap_right = np.abs(stamps_ns[left] - wanted_ns), np.abs(stamps_ns[right] - wanted_ns)
+    index = np.where(gap_left <= gap_right, left, right)
+    return index, np.minimum(gap_left, gap_right)

@@ -1,0 +1,71 @@
+"""A body's poses over time, and its TUM and KITTI text forms."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.core.errors import DataError
+from mapper.core.geometry import Array, Transform, inverse, is_rigid
+from mapper.core.timebase import Stamps
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Poses of the body in the world, one per stamp.
+
+    Attributes:
+        stamps_ns: (N,) int64, strictly increasing nanoseconds.
+        T_world_body: (N, 4, 4) float64 rigid motions.
+    """
+
+    stamps_ns: Stamps
+    T_world_body: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.stamps_ns)
+        if self.stamps_ns.shape != (n,) or self.T_world_body.shape != (n, 4, 4):
+            raise DataError(
+                f"trajectory: stamps {self.stamps_ns.shape} and poses {self.T_world_body.shape}, "
+                "want (N,) and (N, 4, 4)"
+            )
+        backwards = np.flatnonzero(np.diff(self.stamps_ns) <= 0)
+        if len(backwards):
+            i = int(backwards[0])
+            raise DataError(
+                f"trajectory: stamp {self.stamps_ns[i + 1]} comes after {self.stamps_ns[i]}; "
+                "stamps must increase"
+            )
+        if n and not is_rigid(self.T_world_body):
+            raise DataError("trajectory: a pose is not a finite rigid motion")
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def positions_world(self) -> Array:
+        """(N, 3) metres, world frame."""
+        positions: Array = self.T_world_body[:, :3, 3]
+        return positions
+
+    @property
+    def path_length_m(self) -> float:
+        """Length of the straight segments between consecutive positions."""
+        return float(np.linalg.norm(np.diff(self.positions_world, axis=0), axis=1).sum())
+
+    def moved(self, T_new_world: Transform) -> "Trajectory":
+        """Return the same motion seen from another world frame."""
+        return Trajectory(self.stamps_ns, T_new_world @ self.T_world_body)
+
+
+def trajectory_from(poses: Iterable[tuple[int, Transform]]) -> Trajectory:
+    """Return a trajectory from (stamp_ns, T_world_body) pairs in time order."""
+    pairs = list(poses)
+    stamps_ns = np.array([stamp for stamp, _ in pairs], dtype=np.int64)
+    return Trajectory(stamps_ns, np.array([T for _, T in pairs]).reshape(-1, 4, 4))
+
+
+def start_to_end(trajectory: Trajectory) -> Transform:
+    """Return T_start_end, the last pose seen from the first."""
+    T_start_end: Transform = inverse(trajectory.T_world_body[0]) @ trajectory.T_world_body[-1]
+    return T_start_end

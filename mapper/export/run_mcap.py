@@ -1,0 +1,97 @@
+"""What a run tells in its MCAP log."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+
+from mapper.export.foxglove_parts import WORLD
+from mapper.export.mcap_log import McapLog
+from mapper.export.palette import TRUTH
+from mapper.loops.closure import Discrepancy, LoopClosure
+from mapper.mapping.cloud import height_colors
+from mapper.mapping.fusion import Maps, ScanSnapshot, Snapshot
+from mapper.run.frame_records import FrameRecord
+from mapper.run.results import RunResults
+
+BODY = "body"
+CAMERA = "camera"
+
+
+def log_results(log: McapLog, results: RunResults) -> None:
+    """Log the transforms, diagnostics, trajectories and factors.
+
+    What belongs to the whole log is logged at its first stamp, as :class:`McapLog` advises.
+    """
+    begin_ns = int(results.trajectory.stamps_ns[0])
+    log.trajectory(begin_ns, results.trajectory, name="estimate")
+    if results.truth is not None:
+        log.trajectory(begin_ns, results.truth, name="truth", color=TRUTH)
+    log.factors(begin_ns, results.graph.factors, T_world_node=results.graph.T_world_node)
+    for stamp_ns, T_world_body in zip(
+        results.trajectory.stamps_ns, results.trajectory.T_world_body, strict=True
+    ):
+        log.transform(int(stamp_ns), T_world_body, parent=WORLD, child=BODY)
+    for record in results.records:
+        log.diagnostics(record.stamp_ns, _fields(record, results.frame_ms))
+    for loop in results.loops:
+        log.loop(loop.stamp_j_ns, _loop_fields(loop))
+
+
+def log_snapshot(log: McapLog, snapshot: Snapshot | ScanSnapshot) -> None:
+    """Log an image with its camera and where that sits on the body, or a scan by height."""
+    if isinstance(snapshot, ScanSnapshot):
+        points_body = snapshot.points_body
+        log.scan(snapshot.stamp_ns, points_body, colors=height_colors(points_body[:, 2]), frame=BODY)
+        return
+    log.transform(snapshot.stamp_ns, snapshot.T_body_camera, parent=BODY, child=CAMERA)
+    log.calibration(snapshot.stamp_ns, snapshot.camera, frame=CAMERA)
+    log.image(snapshot.stamp_ns, snapshot.jpeg, frame=CAMERA)
+
+
+def log_maps(log: McapLog, maps: Maps, *, stamp_ns: int) -> None:
+    """Log the occupied voxels by height, the coloured cloud, the slice and the traversable floor."""
+    leaves = maps.octree.leaves()
+    occupied_world = leaves.centres_world[leaves.log_odds >= maps.octree.occupied_log_odds]
+    log.cloud(stamp_ns, occupied_world, colors=height_colors(occupied_world[:, 2]), name="octree")
+    log.cloud(stamp_ns, maps.cloud_points_world, colors=maps.cloud_colors, name="cloud")
+    log.grid(stamp_ns, maps.grid)
+    log.grid(stamp_ns, maps.traversable, name="traversable")
+
+
+def _loop_fields(loop: LoopClosure) -> dict[str, int | float | str]:
+    """Return numbers and words of a fixed kind: what is not known is NaN."""
+    before = loop.before or Discrepancy(math.nan, math.nan)
+    after = loop.after or Discrepancy(math.nan, math.nan)
+    return {
+        "i": loop.i,
+        "j": loop.j,
+        "verdict": loop.verdict,
+        "reason": loop.reason,
+        "proposed_by": loop.proposed_by,
+        "similarity": _number(loop.similarity),
+        "matches": loop.matches,
+        "inliers": loop.inliers,
+        "rmse_m": _number(loop.rmse_m),
+        "residual_px": _number(loop.residual_px),
+        "weight": _number(loop.weight),
+        "before_m": before.translation_m,
+        "before_rad": before.rotation_rad,
+        "after_m": after.translation_m,
+        "after_rad": after.rotation_rad,
+    }
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _fields(record: FrameRecord, frame_ms: Mapping[int, float]) -> dict[str, int | float | str]:
+    fields = {
+        "outcome": record.outcome,
+        "node": -1 if record.node is None else record.node,
+        "is_keyframe": int(record.is_keyframe),
+        **asdict(record.diagnostics),
+    }
+    if frame_ms:
+        fields["ms"] = frame_ms.get(record.stamp_ns, 0.0)
+    return fields

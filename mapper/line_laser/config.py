@@ -1,0 +1,166 @@
+"""A line-laser sensor: its calibration file, how its stripe is found, and the map made of what it saw."""
+
+from typing import Annotated, Self
+
+from pydantic import Field, NegativeFloat, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+
+from mapper.core.config import Config, Ratio
+
+Covariance = tuple[tuple[float, float], tuple[float, float]]
+Level = Annotated[int, Field(ge=1, le=255)]
+"""Brightness of a pixel of 8 bits."""
+
+
+class RangeLaw(Config):
+    """υ = scale_mm · p^exponent, p the stripe's height in the image, 0 at the bottom and 100 at the top."""
+
+    scale_mm: PositiveFloat
+    exponent: NegativeFloat
+    covariance: Covariance | None = None
+    """Of (ln scale, exponent); None where nobody told."""
+
+
+class LateralLaw(Config):
+    """φ = x / (slope · y + offset) cm, x and y in px from the image's middle column and from its bottom."""
+
+    slope: PositiveFloat
+    offset: float
+    covariance: Covariance | None = None
+    """Of (slope, offset)."""
+
+
+class VehicleConfig(Config):
+    """What carries the sensor."""
+
+    wheelbase_m: PositiveFloat | None = None
+    """Between the axles; encoder readings need it."""
+    sensor_x_m: float = 0.0
+    """How far ahead of the rear axle ranges begin."""
+
+
+class LineLaserCalibration(Config):
+    """What turns the stripe's place in the image into a place before the vehicle."""
+
+    width_px: PositiveInt
+    height_px: PositiveInt
+    reach_m: PositiveFloat
+    """Where the laser meets the floor: what lies farther is never lit."""
+    range: RangeLaw
+    lateral: LateralLaw
+    vehicle: VehicleConfig = VehicleConfig()
+
+    @model_validator(mode="after")
+    def _widens(self) -> Self:
+        """Refuse a lateral law whose lines of sight cross before the laser meets the floor."""
+        height = (1e3 * self.reach_m / self.range.scale_mm) ** (1.0 / self.range.exponent) / 100.0
+        scale = self.lateral.slope * self.height_px * height + self.lateral.offset
+        if scale <= 0.0:
+            raise ValueError(
+                f"lateral: {scale:.3g} px/cm at reach_m = {self.reach_m:g}, want > 0; "
+                "are slope and offset right?"
+            )
+        return self
+
+
+THESIS = LineLaserCalibration(
+    width_px=640,
+    height_px=360,
+    reach_m=1.9,
+    range=RangeLaw(scale_mm=47366.0, exponent=-1.013),
+    lateral=LateralLaw(slope=0.0447, offset=-1.4267),
+)
+"""The sensor of the thesis, eq. 2.44 and 2.45, and the farthest point it could measure."""
+
+
+Degrees = Annotated[float, Field(ge=0.0, lt=360.0)]
+
+
+class StripeConfig(Config):
+    """When a pixel shows the stripe."""
+
+    hue_from_deg: Degrees = 355.0
+    hue_to_deg: Degrees = 10.0
+    """The hues of the laser (figure 2.2); they may pass through 0."""
+    saturation_threshold: Level = 64
+    """Of what has a hue worth the name; the thesis gives none."""
+    intensity_threshold: Level = 250
+    """Of the red channel (eq. 2.39; figure 2.3)."""
+    weight_threshold: Level = 40
+    """Of 2R − G − B (eq. 2.41); the thesis gives none, and without one half of all grey noise is red."""
+    edge_threshold: Level = 150
+    """Of the Laplacian of Gaussian (figure 2.5)."""
+    edge_sigma_px: PositiveFloat = 1.5
+    """Of that Gaussian; the thesis gives none."""
+    join_px: Annotated[int, Field(ge=0, le=100)] = 6
+    """Pixels of a column with at most so many others in between are one stripe."""
+
+
+class LineLaserMapConfig(Config):
+    """The grids: Algorithm 2's before the vehicle, and the one of the world."""
+
+    cell_m: PositiveFloat = 0.01
+    """Edge of a cell of the local grid D[r, e]."""
+    depth_cells: PositiveInt = 190
+    """r: rows of the local grid."""
+    width_cells: PositiveInt = 240
+    """e: its columns."""
+    floor_margin_m: NonNegativeFloat = 0.08
+    """What seems to lie so little before or behind the laser's reach is the floor."""
+    resolution_m: PositiveFloat = 0.02
+    """Edge of a cell of the world's grid."""
+    hit_probability: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.7
+    miss_probability: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.4
+    clamp_min_probability: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.1192
+    clamp_max_probability: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.971
+    max_wheel_gap_s: PositiveFloat = 0.5
+    """An image in a longer gap of the wheels' readings is left out of the map."""
+
+
+class LineLaserConfig(Config):
+    """Everything ``mapper sensor line-laser`` can be told."""
+
+    stripe: StripeConfig = StripeConfig()
+    map: LineLaserMapConfig = LineLaserMapConfig()
+    rate_hz: PositiveFloat | None = None
+    """Images a second where neither names nor a times.txt tell stamps; None is 10."""
+
+
+class LineLaserSynthConfig(Config):
+    """A car with a line laser drives round a block in a room; the same configuration gives the same bytes."""
+
+    seed: Annotated[int, Field(ge=0)] = 0
+    rate_hz: PositiveFloat = 5.0
+    duration_s: PositiveFloat | None = None
+    """Length of the log; None is once round."""
+    speed_mps: PositiveFloat = 0.3
+    wheelbase_m: PositiveFloat = 0.26
+    sensor_x_m: float = 0.2
+    tick_m: NonNegativeFloat = 0.002
+    """Path between two ticks of the encoder."""
+    steering_noise_rad: NonNegativeFloat = 0.003
+
+    width_px: PositiveInt = 640
+    height_px: PositiveInt = 360
+    focal_px: PositiveFloat = 550.0
+    camera_height_m: PositiveFloat = 0.324
+    laser_height_m: PositiveFloat = 0.615
+    reach_m: PositiveFloat = 1.9
+    """The defaults of these four put the stripe within 0.3 % of where eq. 2.44 has it."""
+
+    laser_levels: PositiveFloat = 600.0
+    """Brightness the laser adds to a white wall 1 m away; 255 is the most a pixel can show. The default lets
+    the stripe be seen on the floor at its reach, where the thesis measured its farthest point."""
+    stripe_m: PositiveFloat = 0.004
+    """Width of the stripe, four standard deviations."""
+    ambient: PositiveFloat = 0.55
+    """Brightness of the room; from 1 on, white walls are as bright as a pixel can be."""
+    lamps: NonNegativeFloat = 0.3
+    """Lamps, windows and what shines, per metre of wall."""
+    red_things: NonNegativeFloat = 1.0
+    """Red things per metre of wall."""
+    dull_things: NonNegativeFloat = 0.3
+    """Things that return no laser light, per metre of wall."""
+    gloss: Ratio = 0.15
+    """Share of light that the floor mirrors."""
+    noise_levels: NonNegativeFloat = 3.0
+    jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 85

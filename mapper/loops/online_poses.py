@@ -1,0 +1,113 @@
+"""Where the nodes are believed to be while a log is still being tracked, with the loops found so far."""
+
+from typing import Literal, Protocol
+
+from mapper.core.geometry import Transform, inverse
+from mapper.graph.incremental import IncrementalSolver
+from mapper.graph.model import PoseGraph
+from mapper.graph.proportional import spread
+from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy, exceeds
+from mapper.odometry.base import FrameResult
+
+Correction = Literal["batch", "proportional", "none"]
+"""How the graph is solved in the end (``graph.solve``)."""
+
+
+class OnlinePoseEstimator(Protocol):
+    """Node poses that loops correct; a new node hangs on the believed pose of the one it was tracked from."""
+
+    def add(self, node: int, track: FrameResult) -> None:
+        """Take in a new node, in time order."""
+        ...
+
+    def preload(self, graph: PoseGraph) -> None:
+        """Take in an earlier session, solved, before anything else."""
+        ...
+
+    def close(self, closure: LoopClosure) -> None:
+        """Correct the path by a loop."""
+        ...
+
+    def pose_of(self, node: int) -> Transform:
+        """Return the (4, 4) believed pose of a node."""
+        ...
+
+
+_NEWS = Discrepancy(translation_m=0.02, rotation_rad=0.01)
+"""A loop that moves nothing farther is no news; it waits to be solved with the next that is."""
+
+
+class IncrementalPoseEstimator:
+    """Belief by incremental smoothing (iSAM2, Kaess et al. 2012); it is solved when a loop brings news."""
+
+    def __init__(self) -> None:
+        self._solver = IncrementalSolver()
+        self._T_world_node: dict[int, Transform] = {}
+
+    def preload(self, graph: PoseGraph) -> None:
+        """Take in an earlier session, solved, before anything else."""
+        for node, T_world_node in graph.T_world_node.items():
+            self._solver.add_node(node, T_world_node)
+        self._solver.add_factors(graph.factors)
+        self._solver.update()
+        self._T_world_node = self._solver.poses()
+
+    def add(self, node: int, track: FrameResult) -> None:
+        """Take in a new node, in time order."""
+        self._T_world_node[node] = _first_estimate(track, self._T_world_node)
+        self._solver.add_node(node, self._T_world_node[node])
+        self._solver.add_factors(track.links)
+
+    def close(self, closure: LoopClosure) -> None:
+        """Correct the path by a loop."""
+        factor = closure.factor
+        self._solver.add_factors([factor])
+        miss = discrepancy(factor.T_i_j, self._T_world_node[factor.i], self._T_world_node[factor.j])
+        if exceeds(miss, _NEWS):
+            self._solver.update()
+            self._T_world_node = self._solver.poses()
+
+    def pose_of(self, node: int) -> Transform:
+        """Return the (4, 4) believed pose of a node."""
+        return self._T_world_node[node]
+
+
+class ProportionalPoseEstimator:
+    """Belief by the thesis's proportional correction (A9) of the path as the odometry averaged it (A7)."""
+
+    def __init__(self) -> None:
+        self._T_world_node: dict[int, Transform] = {}
+        self._told: tuple[int, Transform] | None = None
+
+    def preload(self, graph: PoseGraph) -> None:
+        """Take in an earlier session, solved, before anything else."""
+        self._T_world_node |= graph.T_world_node
+
+    def add(self, node: int, track: FrameResult) -> None:
+        """Take in a new node, in time order; the motion since the last one is what the odometry tells."""
+        self._T_world_node[node] = track.T_world_body
+        if self._told is not None:
+            last, T_told = self._told
+            self._T_world_node[node] = self._T_world_node[last] @ inverse(T_told) @ track.T_world_body
+        self._told = node, track.T_world_body
+
+    def close(self, closure: LoopClosure) -> None:
+        """Correct the path by a loop."""
+        self._T_world_node = spread(self._T_world_node, closure.factor)
+
+    def pose_of(self, node: int) -> Transform:
+        """Return the (4, 4) believed pose of a node."""
+        return self._T_world_node[node]
+
+
+def _first_estimate(track: FrameResult, T_world_node: dict[int, Transform]) -> Transform:
+    if not track.links:
+        return track.T_world_body
+    link = track.links[0]
+    T_world_new: Transform = T_world_node[link.i] @ link.T_i_j
+    return T_world_new
+
+
+def build_pose_estimator(correction: Correction) -> OnlinePoseEstimator:
+    """Return the belief that corrects as the graph will be solved."""
+    return ProportionalPoseEstimator() if correction == "proportional" else IncrementalPoseEstimator()

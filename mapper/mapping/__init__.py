@@ -1,0 +1,1 @@
+"""From solved poses to maps: fusing, levelling, planes, the cloud."""

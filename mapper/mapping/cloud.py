@@ -1,0 +1,158 @@
+"""A coloured cloud thinned to one averaged point per voxel, in memory that grows with the scene alone."""
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mapper.core.errors import DataError
+from mapper.core.frames import Points32
+
+Colors = NDArray[np.uint8]
+"""(N, 3) uint8 RGB."""
+
+_KEY_BITS = 21
+_HALF_SPAN = 1 << (_KEY_BITS - 1)  # voxels on either side of the world's origin
+_BATCH = 1 << 16  # points folded in at once: bounds how far ahead of need memory is reserved
+_SUMS = 7  # x, y, z, red, green, blue, count
+
+
+class CloudBuilder:
+    """Folds points into voxels; each voxel keeps the mean position and mean colour of what fell into it.
+
+    Memory is about 72 bytes a voxel and does not depend on how many points are added.
+    """
+
+    def __init__(self, voxel_m: float) -> None:
+        """Start empty.
+
+        Args:
+            voxel_m: Edge of a voxel, metres.
+
+        Raises:
+            DataError: The edge is not a positive number.
+        """
+        if not 0.0 < voxel_m < np.inf:
+            raise DataError(f"cloud: voxel of {voxel_m} m; want a finite edge > 0")
+        self.voxel_m = voxel_m
+        self._size = 0
+        self._keys = np.empty(_BATCH, np.int64)
+        self._sums = np.empty((_BATCH, _SUMS))
+        self._slots = np.full(4 * _BATCH, -1, np.int32)
+
+    def __len__(self) -> int:
+        """Return how many voxels hold a point."""
+        return self._size
+
+    def add(self, points_world: Points32, colors: Colors) -> None:
+        """Fold in a cloud.
+
+        Args:
+            points_world: (N, 3) float32 metres, world frame.
+            colors: (N, 3) uint8 RGB.
+
+        Raises:
+            DataError: Shapes that differ, a coordinate that is not finite, or one beyond the key range.
+        """
+        if points_world.ndim != 2 or points_world.shape[1] != 3 or colors.shape != points_world.shape:
+            raise DataError(
+                f"cloud: points {points_world.shape} and colors {colors.shape}, want two of (N, 3)"
+            )
+        if len(points_world) == 0:
+            return
+        reach_m = max(float(points_world.max()), -float(points_world.min()))
+        limit_m = (_HALF_SPAN - 1) * self.voxel_m
+        if not reach_m <= limit_m:  # also refuses NaN
+            raise DataError(
+                f"cloud: a coordinate of {reach_m} m; {self.voxel_m} m voxels reach {limit_m:.0f} m, "
+                "drop the point or enlarge the voxel"
+            )
+        for first in range(0, len(points_world), _BATCH):
+            batch = slice(first, first + _BATCH)
+            self._reserve(_BATCH)
+            self._size = _fold(
+                points_world[batch],
+                colors[batch],
+                1.0 / self.voxel_m,
+                self._slots,
+                self._keys,
+                self._sums,
+                self._size,
+            )
+
+    def points_and_colors(self) -> tuple[Points32, Colors]:
+        """Return (M, 3) float32 mean positions and (M, 3) uint8 mean colours, voxels in the order met."""
+        sums = self._sums[: self._size]
+        means = sums[:, :6] / sums[:, 6:]
+        return means[:, :3].astype(np.float32), np.rint(means[:, 3:]).astype(np.uint8)
+
+    def _reserve(self, more: int) -> None:
+        need = self._size + more
+        if need > len(self._keys):
+            capacity = max(need, 3 * len(self._keys) // 2)
+            self._keys = np.concatenate([self._keys, np.empty(capacity - len(self._keys), np.int64)])
+            self._sums = np.concatenate([self._sums, np.empty((capacity - len(self._sums), _SUMS))])
+        if 2 * need > len(self._slots):
+            slots = np.full(2 * len(self._slots), -1, np.int32)
+            _rehash(slots, self._keys, self._size)
+            self._slots = slots
+
+
+@njit(cache=True, nogil=True)
+def _slot_of(slots, keys, key):  # type: ignore[no-untyped-def]
+    """Return the slot that holds the key, or the empty one where it belongs (linear probing)."""
+    mask = len(slots) - 1
+    # Fibonacci hashing (Knuth, TAOCP vol. 3, §6.4): neighbouring voxels spread over the table.
+    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    slot = np.int64(mixed >> np.uint64(32)) & mask
+    while slots[slot] >= 0 and keys[slots[slot]] != key:
+        slot = (slot + 1) & mask
+    return slot
+
+
+@njit(cache=True, nogil=True)
+def _rehash(slots, keys, size):  # type: ignore[no-untyped-def]
+    for voxel in range(size):
+        slots[_slot_of(slots, keys, keys[voxel])] = voxel
+
+
+@njit(cache=True, nogil=True)
+def _fold(points, colors, voxels_per_m, slots, keys, sums, size):  # type: ignore[no-untyped-def]
+    """Add each point to its voxel's sums and return how many voxels there are now."""
+    last_key, voxel = np.int64(-1), np.int64(-1)
+    for i in range(len(points)):
+        key = np.int64(0)
+        for axis in range(3):
+            cell = np.int64(np.floor(np.float64(points[i, axis]) * voxels_per_m))
+            key = (key << _KEY_BITS) | (cell + _HALF_SPAN)
+        if key != last_key:  # neighbouring pixels mostly share a voxel, and a look-up is what costs
+            slot = _slot_of(slots, keys, key)
+            if slots[slot] < 0:
+                slots[slot] = size
+                keys[size] = key
+                sums[size] = 0.0
+                size += 1
+            last_key, voxel = key, np.int64(slots[slot])
+        for axis in range(3):
+            sums[voxel, axis] += points[i, axis]
+            sums[voxel, 3 + axis] += colors[i, axis]
+        sums[voxel, 6] += 1.0
+    return size
+
+
+def height_colors(
+    heights_m: NDArray[np.floating], *, between_m: tuple[float, float] | None = None
+) -> NDArray[np.uint8]:
+    """Return (N, 3) uint8 RGB for (N,) heights, from blue to red; the palette is Turbo (Mikhailov 2019).
+
+    Args:
+        heights_m: In any frame.
+        between_m: Heights of pure blue and red; None is the 2nd and the 98th percentile.
+    """
+    if len(heights_m) == 0:
+        return np.empty((0, 3), np.uint8)
+    low, high = between_m or np.percentile(heights_m, [2.0, 98.0])
+    share = np.clip((heights_m - low) / max(float(high - low), 1e-9), 0.0, 1.0)
+    levels = np.rint(255.0 * share).astype(np.uint8).reshape(-1, 1)
+    bgr = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)
+    return np.ascontiguousarray(bgr.reshape(-1, 3)[:, ::-1], dtype=np.uint8)

@@ -1,0 +1,234 @@
+"""The second pass over a log: every tracked frame fused at its final pose."""
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.core.deskew import STILL, Twist, deskewed, twist_at
+from mapper.core.errors import FrameError
+from mapper.core.frames import Frame, PinholeCamera, Points32, RgbdFrame, Scan
+from mapper.core.geometry import Transform
+from mapper.core.trajectory import Trajectory
+from mapper.core.voxel_grid import thin
+from mapper.mapping.cloud import CloudBuilder, Colors, height_colors
+from mapper.mapping.config import FuseSettings, McapConfig
+from mapper.mapping.thumbnails import encode_jpeg, shrunk_camera
+from mapper.navigation.traversable import traversable
+from mapper.octree.casting import Caster
+from mapper.octree.config import OctreeConfig
+from mapper.octree.map import OctreeMap
+from mapper.octree.scan_update import ScanUpdate, pack
+from mapper.octree.scan_update_file import CachedUpdate, ScanUpdateFile, ScanUpdateWriter, cache_update
+from mapper.octree.slice import OccupancyGrid, cut_slice
+from mapper.runtime.ordered_map import ordered_map
+from mapper.runtime.progress import Progress
+from mapper.sources.base import FrameRef, FrameSource
+
+_COLOURED_HEIGHTS_M = -1.0, 8.0  # the same in every scan
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Snapshot:
+    """A small JPEG of one frame.
+
+    Attributes:
+        stamp_ns: The frame's stamp.
+        jpeg: The image.
+        camera: Its camera, as small as the image.
+        T_body_camera: (4, 4) pose of the camera in the body.
+    """
+
+    stamp_ns: int
+    jpeg: bytes
+    camera: PinholeCamera
+    T_body_camera: Transform
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanSnapshot:
+    """A thinned scan.
+
+    Attributes:
+        stamp_ns: The scan's stamp.
+        points_body: (N, 3) float32 metres, body frame.
+    """
+
+    stamp_ns: int
+    points_body: Points32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Maps:
+    """What fusing yields.
+
+    Attributes:
+        octree: Occupied, free and unknown space.
+        cloud_points_world: (N, 3) float32 metres, levelled world.
+        cloud_colors: (N, 3) uint8 RGB.
+        grid: The slice through the octree above the floor.
+        traversable: The floor that a robot can drive on.
+    """
+
+    octree: OctreeMap
+    cloud_points_world: Points32
+    cloud_colors: Colors
+    grid: OccupancyGrid
+    traversable: OccupancyGrid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Job:
+    """A frame to fuse: where it was, what it saw from there before, and who wants to see it in colour."""
+
+    entry: FrameRef
+    T_world_body: Transform
+    twist: Twist
+    known: CachedUpdate | None
+    feeds_cloud: bool
+    feeds_log: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fused:
+    """What a frame saw, or the reason why nobody knows; its points only where somebody wants them."""
+
+    job: _Job
+    update: ScanUpdate | None = None
+    cached: CachedUpdate | None = None
+    scan: Scan | None = None
+    snapshot: Snapshot | ScanSnapshot | None = None
+    reason: str = ""
+
+
+def fuse_log(
+    source: FrameSource,
+    trajectory: Trajectory,
+    config: FuseSettings,
+    *,
+    progress: Progress,
+    on_snapshot: Callable[[Snapshot | ScanSnapshot], None],
+    before: ScanUpdateFile | None,
+    after: ScanUpdateWriter,
+) -> Maps:
+    """Fuse every frame of the trajectory, in time order; decoding and casting run ahead in threads.
+
+    What a frame saw from where it still is, is merged without reading the frame again, to the same bits.
+
+    Args:
+        source: The log that was tracked.
+        trajectory: Final body poses in the levelled world; frames without a pose are left out.
+        config: The octree, cloud, slice and mcap parts matter.
+        progress: Who watches.
+        on_snapshot: Gets every ``mcap.image_stride``-th frame's image, or its points if it has no image.
+        before: What the frames saw when they were fused the last time.
+        after: Gets what they see now.
+    """
+    octree, cloud = OctreeMap(config.octree), CloudBuilder(config.cloud.voxel_m)
+    casters, moved = _Casters(config.octree), 0
+
+    def prepare(job: _Job) -> _Fused:
+        return _prepared(job, config, casters.caster)
+
+    if before is not None and (config.octree.attributes or not before.holds_for(config.octree)):
+        before = None  # colours are in no sight
+    prepared = ordered_map(prepare, _jobs(source, trajectory, config, before), workers=config.workers)
+    with progress.stage("fuse") as report:
+        for done, fused in enumerate(prepared, start=1):
+            report(done, len(trajectory))
+            if fused.update is None or fused.cached is None:
+                progress.note(f"not fused: {fused.reason}")
+                continue
+            if fused.scan is not None and config.octree.attributes:
+                octree.insert(fused.scan, fused.job.T_world_body)
+            else:
+                octree.merge(fused.update)
+            after.add(fused.cached)
+            moved += fused.job.known is None
+            if fused.scan is not None and fused.job.feeds_cloud:
+                _add_to_cloud(cloud, fused.scan, fused.job.T_world_body)
+            if fused.snapshot is not None:
+                on_snapshot(fused.snapshot)
+    if before is not None:
+        progress.note(f"fused again: {moved} of {len(trajectory)} frames, which had moved or were not known")
+    grid, floor = cut_slice(octree, config.slice), traversable(octree, config.traversable)
+    return Maps(octree, *cloud.points_and_colors(), grid, floor)
+
+
+class _Casters(threading.local):
+    """A caster for every thread that asks."""
+
+    def __init__(self, config: OctreeConfig) -> None:
+        self.caster = Caster(config)
+
+
+def _jobs(
+    source: FrameSource, trajectory: Trajectory, config: FuseSettings, before: ScanUpdateFile | None
+) -> Iterator[_Job]:
+    index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
+    image_stride = config.mcap.image_stride
+    for entry in source.entries():
+        index = index_of.get(entry.stamp_ns)
+        if index is not None:
+            T_world_body, known = trajectory.T_world_body[index], None
+            if before is not None and (
+                source.sensor == "rgbd" or _beside_hold(before, trajectory, index, config.octree)
+            ):
+                known = before.lookup(entry.stamp_ns, T_world_body, config=config.octree)
+            yield _Job(
+                entry,
+                T_world_body,
+                STILL if source.sensor == "rgbd" else twist_at(trajectory, index),
+                known,
+                feeds_cloud=index % config.cloud.frame_stride == 0,
+                feeds_log=image_stride > 0 and index % image_stride == 0,
+            )
+
+
+def _beside_hold(before: ScanUpdateFile, trajectory: Trajectory, index: int, config: OctreeConfig) -> bool:
+    """Tell whether the poses before and after one are what they were: a scan is deskewed between them."""
+    return all(
+        before.holds(int(trajectory.stamps_ns[beside]), trajectory.T_world_body[beside], config=config)
+        for beside in (index - 1, index + 1)
+        if 0 <= beside < len(trajectory)
+    )
+
+
+def _prepared(job: _Job, config: FuseSettings, caster: Caster) -> _Fused:
+    """Read and cast one frame as far as needed: its image costs most, and what is known nothing at all."""
+    scan, snapshot = None, None
+    try:
+        if job.feeds_cloud or job.feeds_log or config.octree.attributes:
+            frame = job.entry.load()
+            scan = deskewed(frame.scan(), job.twist)
+            snapshot = _snapshot(frame, scan, config.mcap) if job.feeds_log else None
+        elif job.known is None:
+            scan = deskewed(job.entry.scan(), job.twist)
+    except FrameError as error:  # it was readable in the first pass, so the log changed under us
+        return _Fused(job, reason=str(error))
+    if job.known is not None:
+        return _Fused(job, job.known.update(), job.known, scan, snapshot)
+    assert scan is not None
+    update = pack(caster.cast(scan, job.T_world_body))
+    return _Fused(job, update, cache_update(job.entry.stamp_ns, job.T_world_body, update), scan, snapshot)
+
+
+def _snapshot(frame: Frame, scan: Scan, config: McapConfig) -> Snapshot | ScanSnapshot:
+    if not isinstance(frame, RgbdFrame):
+        return ScanSnapshot(scan.stamp_ns, scan.points_body[thin(scan.points_body, config.scan_voxel_m)])
+    return Snapshot(
+        frame.stamp_ns,
+        encode_jpeg(frame.image, width_px=config.image_width_px, quality=config.image_quality),
+        shrunk_camera(frame.camera, width_px=config.image_width_px),
+        frame.T_body_camera,
+    )
+
+
+def _add_to_cloud(cloud: CloudBuilder, scan: Scan, T_world_body: Transform) -> None:
+    R, t = T_world_body[:3, :3].astype(np.float32), T_world_body[:3, 3].astype(np.float32)
+    points_world = scan.points_body @ R.T + t
+    colors = scan.colors
+    if colors is None:  # the sensor sees no colour, but people see heights in it
+        colors = height_colors(points_world[:, 2], between_m=_COLOURED_HEIGHTS_M)
+    cloud.add(points_world, colors)

@@ -1,0 +1,302 @@
+"""Which way is up, and where the floor is: the frame that maps are sliced in."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+
+from mapper.core.errors import DataError
+from mapper.core.frames import Scan, Sensor
+from mapper.core.geometry import Array, Points, Transform, apply, transform
+from mapper.core.timebase import nearest
+from mapper.core.trajectory import Trajectory
+from mapper.mapping.config import LevelConfig
+from mapper.mapping.planes import (
+    Patches,
+    Vertical,
+    least_support,
+    levels_of,
+    patches_of,
+    thinned,
+    vertical_of,
+)
+from mapper.sources.base import Accelerations
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyAxes:
+    """How a body is roughly held.
+
+    Attributes:
+        up: (3,) unit vector that roughly points up, body frame.
+        forward: (3,) unit vector that the body looks along, body frame.
+        stands_on_floor: The floor is what lies below the sensor, not the lowest of what is around: a street
+            may fall away within sight, and reflections lie below it.
+    """
+
+    up: Array
+    forward: Array
+    stands_on_floor: bool = False
+
+
+AXES: Mapping[Sensor, BodyAxes] = {
+    "rgbd": BodyAxes(up=np.array([0.0, -1.0, 0.0]), forward=np.array([0.0, 0.0, 1.0])),
+    "lidar": BodyAxes(up=np.array([0.0, 0.0, 1.0]), forward=np.array([1.0, 0.0, 0.0]), stands_on_floor=True),
+}
+
+
+_MAX_READING_GAP_NS = 50_000_000
+_MIN_READINGS = 50
+_MAX_READINGS = 5000
+_MAX_TILT_RAD = np.radians(60.0)
+_MAX_SPREAD_RAD = np.radians(20.0)
+_SAME_DIRECTION_RAD = np.radians(3.0)
+_CLEAR_SPREAD_RATIO = 1.25
+
+_MIN_PATCHES = 30
+_MIN_AGREEING_RATIO = 0.3
+_FLAT_COSINE = np.cos(np.radians(10.0))
+_NEAR_FLOOR_M = 0.15
+_MAX_BELOW_FLOOR_RATIO = 0.01
+_LOWEST_PERCENT = 0.5
+_NEAR_SENSOR_M = 12.0
+_MIN_SENSOR_HEIGHT_M = 0.15
+_MIN_FLOOR_POINTS = 100
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Level:
+    """Where the levelled world lies.
+
+    Attributes:
+        T_level_world: (4, 4). In the level frame z points up and the floor is at z = 0; the first pose stands
+            at x = y = 0 and looks along +x.
+        method: What told the vertical: "accelerometer", "planes" or "camera".
+        detail: How sure that is, and how the floor was found; a sentence for the manifest.
+    """
+
+    T_level_world: Transform
+    method: str
+    detail: str
+
+
+def find_level(
+    scans: Sequence[tuple[Scan, Transform]],
+    *,
+    trajectory: Trajectory,
+    accelerations: Accelerations | None,
+    config: LevelConfig,
+    axes: BodyAxes = AXES["rgbd"],
+) -> Level:
+    """Return the level frame of a log.
+
+    Up is told by the accelerometer if the log has one that is unambiguous, else by the planes that the scans
+    show, else by the mean of the body's own up direction. The first two lie within 60° of the last: a
+    camera is held roughly upright.
+
+    Args:
+        scans: Scans, spread over the log, with their T_world_body.
+        trajectory: Where the body was; at least one pose.
+        accelerations: Readings in the accelerometer's own axes, which may be a permutation of the body's.
+        config: How much is looked at.
+        axes: How the sensor's body is held.
+
+    Raises:
+        DataError: The trajectory has no poses.
+    """
+    if not len(trajectory):
+        raise DataError("levelling: the trajectory has no poses")
+    up_guess = _mean_up(trajectory, axes.up)
+    patches = patches_of(scans, points_per_scan=config.points_per_frame, tolerance_m=config.plane_tolerance_m)
+    up_world, method, told = _up(
+        patches, trajectory, accelerations, up_guess=up_guess, tolerance_m=config.plane_tolerance_m
+    )
+    if axes.stands_on_floor:
+        floor_m, found = _floor_below(scans, up_world, tolerance_m=config.plane_tolerance_m)
+    else:
+        heights_m = _heights(scans, up_world, config)
+        floor_m, found = _floor(patches, heights_m, up_world=up_world, tolerance_m=config.plane_tolerance_m)
+    T_level_world = _frame(trajectory.T_world_body[0], up_world, floor_m, axes)
+    return Level(T_level_world, method, f"{told}; {found}")
+
+
+def _up(
+    patches: Patches,
+    trajectory: Trajectory,
+    accelerations: Accelerations | None,
+    *,
+    up_guess: Array,
+    tolerance_m: float,
+) -> tuple[Array, str, str]:
+    """Return up in the world, the method that told it, and how sure it is."""
+    doubts = []
+    if accelerations is not None:
+        up_world, told = _up_by_accelerometer(accelerations, trajectory, up_guess)
+        if up_world is not None:
+            return up_world, "accelerometer", told
+        doubts.append(told)
+    if len(patches) >= _MIN_PATCHES:
+        vertical = vertical_of(patches, up_guess_world=up_guess, tolerance_m=tolerance_m)
+        told = _planes_text(vertical, len(patches))
+        if vertical.horizontal_ratio + vertical.upright_ratio >= _MIN_AGREEING_RATIO:
+            return vertical.up_world, "planes", "; ".join([*doubts, told])
+        doubts.append(f"planes do not agree: {told}")
+    else:
+        doubts.append(f"only {len(patches)} flat patches seen, want {_MIN_PATCHES}")
+    return up_guess, "camera", "; ".join([*doubts, "up is the sensor's mean up direction"])
+
+
+def _up_by_accelerometer(
+    accelerations: Accelerations, trajectory: Trajectory, up_guess: Array
+) -> tuple[Array | None, str]:
+    """Return the mean direction of the readings in the world, or None, and why.
+
+    The accelerometer's axes are one of the 24 right-angled frames; the right one makes gravity stand still
+    in the world while the body turns.
+    """
+    readings, R_world_body = _matched_readings(accelerations, trajectory)
+    if len(readings) < _MIN_READINGS:
+        return None, f"accelerometer: only {len(readings)} readings near a pose, want {_MIN_READINGS}"
+    found = []
+    for R_body_sensor in _right_angled_frames():
+        directions_world = np.einsum("nij,nj->ni", R_world_body, readings @ R_body_sensor.T)
+        mean = directions_world.mean(axis=0)
+        mean /= max(float(np.linalg.norm(mean)), 1e-12)
+        if mean @ up_guess > np.cos(_MAX_TILT_RAD):
+            angles = np.arccos(np.clip(directions_world @ mean, -1.0, 1.0))
+            found.append((float(np.sqrt(np.mean(angles**2))), mean))
+    if not found:
+        return None, "accelerometer: no axes put up within 60° of the camera's"
+    found.sort(key=lambda one: one[0])
+    spread_rad, up_world = found[0]
+    if spread_rad > _MAX_SPREAD_RAD:
+        return (
+            None,
+            f"accelerometer: readings spread over {np.degrees(spread_rad):.0f}°, at most 20° is usable",
+        )
+    others = [spread for spread, up in found if up @ up_world < np.cos(_SAME_DIRECTION_RAD)]
+    if others and others[0] < _CLEAR_SPREAD_RATIO * spread_rad:
+        return None, "accelerometer: its axes are ambiguous because the body hardly turned"
+    return up_world, f"{len(readings)} accelerometer readings spread over {np.degrees(spread_rad):.1f}°"
+
+
+def _matched_readings(accelerations: Accelerations, trajectory: Trajectory) -> tuple[Array, Array]:
+    """Return (N, 3) unit readings and the (N, 3, 3) rotation R_world_body at their time.
+
+    Readings far from the usual length are the hand's doing, not gravity's.
+    """
+    stride = max(1, -(-len(accelerations.stamps_ns) // _MAX_READINGS))
+    stamps_ns = accelerations.stamps_ns[::stride]
+    readings = accelerations.acceleration_mps2[::stride]
+    lengths = np.linalg.norm(readings, axis=1)
+    usable = np.isfinite(lengths) & (lengths > 0.0)
+    if not usable.any():
+        return np.empty((0, 3)), np.empty((0, 3, 3))
+    usual = np.median(lengths[usable])
+    pose, gap_ns = nearest(trajectory.stamps_ns, stamps_ns)
+    usable &= (np.abs(lengths - usual) <= 0.2 * usual) & (gap_ns <= _MAX_READING_GAP_NS)
+    return readings[usable] / lengths[usable, None], trajectory.T_world_body[pose[usable], :3, :3]
+
+
+def _right_angled_frames() -> list[Array]:
+    """Return the 24 rotations that permute and flip axes."""
+    frames = []
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            R = np.zeros((3, 3))
+            R[range(3), order] = signs
+            if np.linalg.det(R) > 0.0:
+                frames.append(R)
+    return frames
+
+
+def _mean_up(trajectory: Trajectory, up_body: Array) -> Array:
+    """Return the mean of the body's up direction; the first one if the body turns over."""
+    ups_world = trajectory.T_world_body[:, :3, :3] @ up_body
+    mean: Array = ups_world.mean(axis=0)
+    length = float(np.linalg.norm(mean))
+    first: Array = ups_world[0]
+    return mean / length if length > 0.3 else first
+
+
+def _heights(scans: Sequence[tuple[Scan, Transform]], up_world: Array, config: LevelConfig) -> Array:
+    """Return (N,) heights along up of the points, metres."""
+    heights = [
+        apply(T_world_body, thinned(scan, config.points_per_frame)) @ up_world for scan, T_world_body in scans
+    ]
+    return np.concatenate([np.empty(0), *heights])
+
+
+def _floor(
+    patches: Patches, heights_m: Array, *, up_world: Array, tolerance_m: float
+) -> tuple[float | None, str]:
+    """Return the floor's height along up, or None if nothing was seen at all, and how it was found.
+
+    The floor is the lowest surface that faces up and that enough patches share. If much lies deeper, it is a
+    table, and the lowest points stand in for the floor.
+    """
+    if not len(heights_m):
+        return None, "no points seen: the floor is put at the first pose"
+    faces_up = patches.normals_world @ up_world > _FLAT_COSINE
+    heights_up_m = patches.centres_world[faces_up] @ up_world
+    surfaces = levels_of(heights_up_m, tolerance_m=tolerance_m, least=least_support(len(heights_up_m)))
+    if surfaces:
+        medians_m = np.array([np.median(heights_up_m[members]) for members in surfaces])
+        # A surface leaves fringes just beside it; the best supported of the lowest ones is listed first.
+        chosen = int(np.flatnonzero(medians_m <= medians_m.min() + _NEAR_FLOOR_M)[0])
+        floor_m = float(medians_m[chosen])
+        if (heights_m < floor_m - _NEAR_FLOOR_M).mean() <= _MAX_BELOW_FLOOR_RATIO:
+            return floor_m, f"floor seen in {len(surfaces[chosen])} of {len(patches)} patches"
+    lowest_m = float(np.percentile(heights_m, _LOWEST_PERCENT))
+    return lowest_m, f"no floor seen: z = 0 is where the lowest {_LOWEST_PERCENT} % of the points end"
+
+
+def _floor_below(
+    scans: Sequence[tuple[Scan, Transform]], up_world: Array, *, tolerance_m: float
+) -> tuple[float | None, str]:
+    """Return the floor's height along up below the first scan that shows one, and how it was found.
+
+    That is the best supported height below the sensor among the points around it.
+    """
+    for scan, T_world_body in scans:
+        sensor_world = apply(T_world_body, scan.origin_body[np.newaxis])[0]
+        points_world = apply(T_world_body, scan.points_body.astype(np.float64)) - sensor_world
+        heights_m = points_world @ up_world
+        across_m = np.linalg.norm(points_world - heights_m[:, np.newaxis] * up_world, axis=1)
+        below_m = heights_m[(across_m <= _NEAR_SENSOR_M) & (heights_m < -_MIN_SENSOR_HEIGHT_M)]
+        least = max(_MIN_FLOOR_POINTS, len(below_m) // 4)
+        levels = levels_of(below_m, tolerance_m=tolerance_m, least=least)
+        if levels:
+            floor_m = float(np.median(below_m[levels[0]]))
+            return floor_m + float(sensor_world @ up_world), f"floor {-floor_m:.2f} m below the sensor"
+    return None, "no floor seen below the sensor: the floor is put at the first pose"
+
+
+def _frame(T_world_first: Transform, up_world: Array, floor_m: float | None, axes: BodyAxes) -> Transform:
+    """Return T_level_world: z up, floor at 0, the first pose at x = y = 0, looking along +x.
+
+    A body that looks straight down or up has no heading; its own up direction then gives +x.
+    """
+    R_world_first, first_world = T_world_first[:3, :3], T_world_first[:3, 3]
+    heading = _flattened(R_world_first @ axes.forward, up_world)
+    if np.linalg.norm(heading) < np.sin(np.radians(10.0)):
+        heading = _flattened(R_world_first @ axes.up, up_world)
+    x_world = heading / np.linalg.norm(heading)
+    R_level_world = np.array([x_world, np.cross(up_world, x_world), up_world])
+    first_level = R_level_world @ first_world
+    height_m = first_level[2] if floor_m is None else floor_m
+    return transform(R_level_world, -np.array([first_level[0], first_level[1], height_m]))
+
+
+def _flattened(direction: Points, up_world: Array) -> Array:
+    flat: Array = direction - (direction @ up_world) * up_world
+    return flat
+
+
+def _planes_text(vertical: Vertical, count: int) -> str:
+    text = (
+        f"of {count} flat patches {100 * vertical.horizontal_ratio:.0f} % are horizontal, "
+        f"{100 * vertical.upright_ratio:.0f} % upright"
+    )
+    return text if vertical.determined else f"{text}, all facing one way: the tilt along them is the camera's"

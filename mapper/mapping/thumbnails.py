@@ -1,0 +1,51 @@
+"""Small JPEG copies of a log's images, and the camera that fits them."""
+
+from dataclasses import replace
+
+import cv2
+
+from mapper.core.errors import DataError
+from mapper.core.frames import Image, PinholeCamera
+
+
+def encode_jpeg(image: Image, *, width_px: int, quality: int) -> bytes:
+    """Return an image as JPEG, shrunk to ``width_px`` if it is wider. Pure and thread-safe.
+
+    Args:
+        image: (H, W, 3) uint8 RGB or (H, W) uint8 grey.
+        width_px: Widest result; the height keeps the proportions.
+        quality: 1 … 100 as libjpeg counts.
+    """
+    height, width = image.shape[:2]
+    if width > width_px:
+        image = cv2.resize(
+            image, (width_px, _height_px(width, height, width_px)), interpolation=cv2.INTER_AREA
+        )
+    if image.ndim == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise DataError(f"image {image.shape} cannot be encoded as JPEG")
+    return bytes(data)
+
+
+def shrunk_camera(camera: PinholeCamera, *, width_px: int) -> PinholeCamera:
+    """Return the camera of the image that :func:`encode_jpeg` makes at the same ``width_px``."""
+    if camera.width_px <= width_px:
+        return camera
+    height_px = _height_px(camera.width_px, camera.height_px, width_px)
+    scale_x, scale_y = width_px / camera.width_px, height_px / camera.height_px
+    # Pixel centres lie at integers, so it is the corner at -0.5 that stays fixed.
+    return replace(
+        camera,
+        width_px=width_px,
+        height_px=height_px,
+        fx_px=camera.fx_px * scale_x,
+        fy_px=camera.fy_px * scale_y,
+        cx_px=(camera.cx_px + 0.5) * scale_x - 0.5,
+        cy_px=(camera.cy_px + 0.5) * scale_y - 0.5,
+    )
+
+
+def _height_px(width: int, height: int, width_px: int) -> int:
+    return max(round(height * width_px / width), 1)

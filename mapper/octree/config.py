@@ -1,0 +1,56 @@
+"""The occupancy octree, levelling and the slice."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+
+from mapper.core.config import Config
+
+Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
+
+
+class OctreeConfig(Config):
+    """OctoMap's sensor model and geometry (Hornung et al. 2013); its defaults."""
+
+    resolution_m: PositiveFloat = 0.05
+    hit_probability: Annotated[float, Field(ge=0.5, lt=1.0)] = 0.7
+    miss_probability: Annotated[float, Field(gt=0.0, le=0.5)] = 0.4
+    clamp_min_probability: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.1192
+    clamp_max_probability: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.971
+    occupied_probability: Probability = 0.5
+    max_range_m: Annotated[float, Field(gt=0.0, allow_inf_nan=True)] = 4.0
+    """Beyond it a ray only frees space, up to this range. Kinect depth is poor past 4 m."""
+    discretize: bool = True
+    """Cast one ray per end voxel (fast), not one per point; both are OctoMap's own modes."""
+    attributes: bool = False
+    """Keep mean colour, hit count and last sight of the voxels where rays end, beside their log-odds."""
+    stays_within_m: NonNegativeFloat = 1e-9
+    """Fusing again along another trajectory leaves a frame as it was fused if no end of a ray moves further;
+    the default forgives the rounding of poses that were text."""
+    dynamic: Literal["none", "seen-through"] = "none"
+    """"none" is OctoMap. "seen-through": see ``seen_through_scans``."""
+    seen_through_scans: Annotated[int, Field(ge=1, le=255)] = 3
+    """When so many scans in a row saw an occupied voxel free, what stood there is gone: its log-odds are
+    those of the misses alone. Only with ``dynamic = "seen-through"``."""
+
+
+class SliceConfig(Config):
+    """The 2D navigation map cut from the octree."""
+
+    min_height_m: float = 0.1
+    """Lower edge of the band above the floor."""
+    max_height_m: float = 1.2
+    """Upper edge of the band above the floor: the robot's height."""
+    above: Literal["floor", "ground"] = "floor"
+    """"floor": the band is level; "ground": it follows streets that rise and fall."""
+    min_cluster_cells: PositiveInt = 1
+    """Smaller 8-connected groups of occupied cells are taken for noise; 1 keeps all."""
+
+    @model_validator(mode="after")
+    def _refuse_an_empty_band(self) -> Self:
+        """Refuse before a log is fused what could not be cut after it."""
+        if self.max_height_m <= self.min_height_m:
+            raise ValueError(
+                f"max_height_m {self.max_height_m} must be above min_height_m {self.min_height_m}"
+            )
+        return self

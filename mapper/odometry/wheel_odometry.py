@@ -1,0 +1,135 @@
+"""The wheels alone: every frame lies where they say the body was (thesis 2.6.3)."""
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from mapper.core.deskew import Twist, twist_at
+from mapper.core.errors import ConfigError
+from mapper.core.frames import Scan
+from mapper.core.geometry import Transform, angle_between, inverse
+from mapper.core.timebase import NS_PER_S
+from mapper.core.trajectory import Trajectory
+from mapper.graph.model import BetweenFactor
+from mapper.graph.wheel_factors import WheelNode, wheel_factor
+from mapper.odometry.base import Diagnostics, FrameOdometry, FrameResult, Seen
+from mapper.odometry.config import LocalMapConfig, WheelsOdometryConfig
+from mapper.odometry.scan_to_map.config import GicpOdometryConfig
+from mapper.sensing.wheel_kinematics import Odometer, pose_at
+from mapper.sources.base import FrameRef
+
+
+class WheelsOdometry:
+    """Places frames of either sensor by their stamps; see :class:`mapper.odometry.base.Odometry`.
+
+    Keyframes are the nodes, numbered from 0, each tied to the one before it. In a gap of the readings frames
+    are lost, but the wheels counted on: what comes after it is tied to what came before.
+    """
+
+    def __init__(self, config: WheelsOdometryConfig, wheels: Trajectory | None) -> None:
+        """Start before the first frame.
+
+        Args:
+            config: Every knob.
+            wheels: T_odom_body, as the log tells.
+
+        Raises:
+            ConfigError: It does not.
+        """
+        if wheels is None:
+            raise ConfigError(
+                "odometry.kind=wheels: the log has no wheel odometry; put wheels.txt or encoders.txt into "
+                "its folder, or name a recording's topic: --set source.topics.wheels=/odom"
+            )
+        self._config = config
+        self._wheels = wheels
+        self._odometer = Odometer(wheels)
+        self._T_world_odom: Transform | None = None
+        self._T_world_body: Transform = np.eye(4)
+        self._keyframe: WheelNode | None = None
+
+    def read(self, entry: FrameRef) -> FrameRef:
+        """Read nothing: the stamp tells where the body was."""
+        return entry
+
+    def track(self, observation: FrameRef) -> FrameResult:
+        """Place the next frame, in time order."""
+        stamp_ns = observation.stamp_ns
+        max_gap_ns = round(self._config.max_gap_s * NS_PER_S)
+        T_odom_body = pose_at(self._wheels, stamp_ns, max_gap_ns=max_gap_ns)
+        if T_odom_body is None:
+            return self._lose(stamp_ns)
+        if self._T_world_odom is None:
+            self._T_world_odom = inverse(T_odom_body)
+        self._T_world_body = self._T_world_odom @ T_odom_body
+        last = keyframe = self._keyframe
+        factors: tuple[BetweenFactor, ...] = ()
+        if last is None:
+            keyframe = WheelNode(0, stamp_ns, T_odom_body)
+        elif self._is_far(inverse(last.T_odom_body) @ T_odom_body):
+            keyframe = WheelNode(last.node + 1, stamp_ns, T_odom_body)
+            factors = (wheel_factor(last, keyframe, self._odometer, self._config, origin="odometry"),)
+        assert keyframe is not None
+        self._keyframe = keyframe
+        return FrameResult(
+            stamp_ns=stamp_ns,
+            node=keyframe.node,
+            T_node_body=inverse(keyframe.T_odom_body) @ T_odom_body,
+            T_world_body=self._T_world_body,
+            is_keyframe=keyframe is not last,
+            diagnostics=_diagnostics("wheels"),
+            factors=factors,
+            links=factors,
+            twist=twist_at(self._wheels, int(np.searchsorted(self._wheels.stamps_ns, stamp_ns))),
+        )
+
+    def view(self, observation: FrameRef, twist: Twist | None = None, /) -> Seen:
+        """Read the frame after all, and return what a place is recognised by. Pure.
+
+        Raises:
+            FrameError: It cannot be read, or not be used.
+        """
+        frame = observation.load(colour=False)
+        eyes = self._scan_eyes if isinstance(frame, Scan) else self._image_eyes
+        return eyes.view(eyes.observe(frame), twist)
+
+    def matches(self) -> None:
+        """Return nothing: no features hold the pose."""
+
+    def finish(self) -> Sequence[BetweenFactor]:
+        """Return nothing: every measurement was final when its frame was tracked."""
+        return ()
+
+    @cached_property
+    def _image_eyes(self) -> FrameOdometry[Any]:
+        return LocalMapConfig(detector=self._config.detector).build()
+
+    @cached_property
+    def _scan_eyes(self) -> FrameOdometry[Any]:
+        return GicpOdometryConfig().build()
+
+    def _is_far(self, T_key_body: Transform) -> bool:
+        config = self._config
+        return (
+            float(np.linalg.norm(T_key_body[:3, 3])) >= config.keyframe_distance_m
+            or angle_between(np.eye(3), T_key_body[:3, :3]) >= config.keyframe_angle_rad
+        )
+
+    def _lose(self, stamp_ns: int) -> FrameResult:
+        """Give up a frame at whose time the wheels said nothing."""
+        first_ns, last_ns = self._wheels.stamps_ns[[0, -1]]
+        where = "in a gap of" if first_ns < stamp_ns < last_ns else "outside"
+        return FrameResult(
+            stamp_ns=stamp_ns,
+            node=None,
+            T_node_body=np.eye(4),
+            T_world_body=self._T_world_body,
+            is_keyframe=False,
+            diagnostics=_diagnostics(f"lost {where} the wheels' readings"),
+        )
+
+
+def _diagnostics(method: str) -> Diagnostics:
+    return Diagnostics(features=0, matches=0, inliers=0, residual=0.0, residual_unit="m", method=method)

@@ -1,0 +1,1 @@
+"""The steps of a build: track, solve, level, fuse; and what changes a finished run."""

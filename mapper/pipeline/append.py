@@ -1,0 +1,146 @@
+"""A second session of the same place: tracked on its own, tied to the first by loops, mapped with it."""
+
+from collections import Counter
+from collections.abc import Sequence, Set
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from mapper.config.build import BuildConfig
+from mapper.core.errors import ConfigError, LoopError
+from mapper.core.trajectory import Trajectory
+from mapper.graph.model import PoseGraph
+from mapper.loops.closure import LoopClosure
+from mapper.loops.config import KeyframeLoopsConfig
+from mapper.odometry.base import Odometry
+from mapper.odometry.node_offset import NodeOffset
+from mapper.pipeline.components import component_of
+from mapper.pipeline.fuse import carry_times, fuse_into
+from mapper.pipeline.reobserve import reobserve
+from mapper.pipeline.solve import solve
+from mapper.pipeline.track import Start, from_tracking, refuse_a_fragment, track_log
+from mapper.run import files
+from mapper.run.folder import Run, appended_log, load_run, open_log, write_run
+from mapper.run.manifest import Manifest, Timing, library_versions, now_text
+from mapper.run.stored_tracking import StoredTracking, load_tracking, save_tracking
+from mapper.runtime.progress import SILENT, Progress
+from mapper.sources.base import FrameSource
+from mapper.sources.chained import ChainedLog, chained, last_session
+from mapper.sources.config import SourceConfig
+
+_SETTLED = ("odometry", "level")
+
+
+def append(
+    second: FrameSource,
+    run: Run,
+    config: BuildConfig,
+    out: Path,
+    *,
+    progress: Progress = SILENT,
+    overwrite: bool = False,
+) -> Run:
+    """Track a log as a later session of a run's place, solve both as one graph, and map them together.
+
+    The run stays as it is, and the new one has its world: the first node of the first session does not move.
+    No gate holds between the sessions until loops tie them, but two tests and another loop that agrees do.
+
+    Args:
+        second: The later log.
+        run: A finished run; its log must be there still, for its keyframes are looked at again.
+        config: The run's own but for what may differ: ``source`` is the second log's, and loops, solver and
+            map may have other settings.
+        out: Run folder to create.
+        progress: Who watches.
+        overwrite: Replace a run that is there, once the new one is whole.
+
+    Raises:
+        ConfigError: The configuration cannot join sessions, or differs in what the first one has settled.
+        TrackingError: Too few frames could be tracked.
+        LoopError: No loop ties the two sessions.
+        RunError: OUT is there already, or the run's log is not what it was.
+    """
+    _refuse_unfit(config, run)
+    first = open_log(run)
+    source = chained(first, second)
+    for note in source.notes:
+        progress.note(note)
+    joined = config.model_copy(update={"source": run.config.source})
+    with write_run(out, _manifest(run, source, config.source), joined, overwrite=overwrite) as writer:
+        carry_times(writer, run.manifest.timing)
+        before = load_tracking(run)
+        known = before.graph.T_world_node.keys()
+        with writer.clock.stage("track"):
+            session = last_session(source)
+            start = _after(before, first, session.wheels, config, progress)
+            tracking = track_log(session, config, progress=progress, start=start)
+        refuse_a_fragment(tracking, config, sensor=source.sensor)
+        _refuse_untied(second, run, tracking.loops, known)
+        with writer.clock.stage("solve"):
+            tracking = component_of(tracking, next(iter(known)), progress=progress)
+            solved = solve(tracking.graph, tracking.loops, config.graph)
+        _refuse_untied(second, run, solved.loops, known)
+        later = from_tracking(replace(tracking, graph=solved.graph, loops=solved.loops), None)
+        save_tracking(writer, before.solved(solved.graph, solved.loops).then(later, truth=source.truth))
+        writer.update(solve=solved.report)
+        fuse_into(writer, source, joined, progress, before=run.path / files.SCAN_UPDATES)
+    return load_run(out)
+
+
+def _refuse_unfit(config: BuildConfig, run: Run) -> None:
+    for name in _SETTLED:
+        if getattr(config, name) != getattr(run.config, name):
+            raise ConfigError(
+                f"{name}: {run.path} has settled it; a session is appended by the same settings"
+            )
+    if not isinstance(config.loops, KeyframeLoopsConfig):
+        raise ConfigError(f"loops.kind={config.loops.kind}: cannot tie two sessions; want places or scans")
+    if config.graph.solve != "batch":
+        raise ConfigError(f"graph.solve={config.graph.solve}: cannot join two sessions; want batch")
+
+
+def _manifest(run: Run, source: ChainedLog, config: SourceConfig) -> Manifest:
+    """Return the manifest to begin with: what is not said again of both sessions holds from the first."""
+    known = run.manifest.input
+    appended = (*known.appended, appended_log(source.sessions[-1], config))
+    return Manifest(
+        status="building",
+        libraries=library_versions(),
+        input=known.model_copy(update={"appended": appended}),
+        levelling=run.manifest.levelling,
+        timing=Timing(started=now_text()),
+    )
+
+
+def _after(
+    before: StoredTracking,
+    first: FrameSource,
+    wheels: Trajectory | None,
+    config: BuildConfig,
+    progress: Progress,
+) -> Start:
+    """Return the start of a session that knows the places of the one before."""
+    assert isinstance(config.loops, KeyframeLoopsConfig)
+    graph = before.graph
+    detector = config.loops.build(config.graph.solve)
+    views = reobserve(first, before.trajectory, set(graph.stamps_ns.values()), config, progress=progress)
+    detector.preload(graph, {node: views[stamp_ns] for node, stamp_ns in graph.stamps_ns.items()})
+    odometry: Odometry[Any] = config.odometry.build(wheels)
+    offset_odometry = NodeOffset(odometry, first_node=max(graph.T_world_node) + 1)
+    known = [factor for factor in graph.factors if factor.origin != "loop"]
+    return Start(
+        offset_odometry, detector, PoseGraph(graph.T_world_node, graph.stamps_ns, known), before.loops
+    )
+
+
+def _refuse_untied(second: FrameSource, run: Run, loops: Sequence[LoopClosure], known: Set[int]) -> None:
+    """Refuse a session of which no loop leads to the known nodes."""
+    between = [loop for loop in loops if loop.i in known and loop.j not in known]
+    if any(loop.verdict == "accepted" for loop in between):
+        return
+    if not between:
+        why = "nothing in it looks like a known place (min_similarity of loops.places or loops.context)"
+    else:
+        refused = Counter(loop.reason.split(":")[0] for loop in between).most_common()
+        why = f"{len(between)} candidates compared, none held: {', '.join(f'{by} {n}' for by, n in refused)}"
+    raise LoopError(f"{second.path}: no loop ties it to {run.path}; {why}; is it the same place?")

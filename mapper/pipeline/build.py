@@ -1,0 +1,95 @@
+"""From a recorded log to a run folder: track, solve, level, fuse."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mapper.config.build import BuildConfig
+from mapper.core.deskew import deskewed, twist_at
+from mapper.core.errors import FrameError
+from mapper.core.trajectory import Trajectory
+from mapper.mapping.levelling import AXES, Level, find_level
+from mapper.pipeline.components import largest_component
+from mapper.pipeline.fuse import fuse_into
+from mapper.pipeline.solve import solve
+from mapper.pipeline.track import from_tracking, refuse_a_fragment, track_log
+from mapper.run.folder import (
+    Run,
+    first_manifest,
+    load_run,
+    write_run,
+)
+from mapper.run.manifest import Levelling
+from mapper.run.observers import NULL_OBSERVER, Observer
+from mapper.run.stored_tracking import save_tracking
+from mapper.runtime.progress import SILENT, Progress
+from mapper.sources.base import FrameSource
+
+
+def build(
+    source: FrameSource,
+    config: BuildConfig,
+    out: Path,
+    *,
+    progress: Progress = SILENT,
+    observer: Observer = NULL_OBSERVER,
+    overwrite: bool = False,
+) -> Run:
+    """Track every frame, solve the graph once, level the world, then fuse every frame at its final pose.
+
+    Args:
+        source: The log.
+        config: Every knob.
+        out: Run folder to create; until it is whole it is called ``OUT.partial``.
+        progress: Who waits.
+        observer: Who looks on.
+        overwrite: Replace a run that is there, once the new one is whole.
+
+    Raises:
+        TrackingError: Too few frames could be tracked; what there is stays in ``OUT.partial``.
+        RunError: OUT is there already, or cannot be made.
+    """
+    with write_run(out, first_manifest(source), config, overwrite=overwrite) as writer:
+        with writer.clock.stage("track"):
+            tracking = track_log(source, config, progress=progress, observer=observer)
+            tracking = largest_component(tracking, progress=progress)
+        save_tracking(writer, from_tracking(tracking, source.truth))
+        refuse_a_fragment(tracking, config, sensor=source.sensor)
+        with writer.clock.stage("solve"):
+            solved = solve(tracking.graph, tracking.loops, config.graph)
+        tracking = replace(tracking, graph=solved.graph, loops=solved.loops)
+        tracking = largest_component(tracking, progress=progress)
+        with writer.clock.stage("level"):
+            level = _level(source, tracking.trajectory(), config)
+        observer.on_levelled(level.T_level_world)
+        tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
+        save_tracking(writer, from_tracking(tracking, source.truth))
+        writer.update(
+            solve=solved.report,
+            levelling=Levelling(method=level.method, detail=level.detail),
+        )
+        fuse_into(writer, source, config, progress, observer=observer)
+    return load_run(out)
+
+
+def _level(source: FrameSource, trajectory: Trajectory, config: BuildConfig) -> Level:
+    """Find the level frame from a few frames, spread over the trajectory."""
+    spread = np.unique(np.linspace(0, len(trajectory) - 1, config.level.frames).round().astype(int))
+    index_of = {int(trajectory.stamps_ns[index]): int(index) for index in spread}
+    scans = []
+    for entry in source.entries():
+        if entry.stamp_ns in index_of:
+            index = index_of[entry.stamp_ns]
+            try:
+                scan = deskewed(entry.scan(), twist_at(trajectory, index))
+            except FrameError:
+                continue  # it was readable a moment ago; the second pass will tell
+            scans.append((scan, trajectory.T_world_body[index]))
+    return find_level(
+        scans,
+        trajectory=trajectory,
+        accelerations=source.accelerations,
+        config=config.level,
+        axes=AXES[source.sensor],
+    )

@@ -1,0 +1,69 @@
+"""Parts of a path that the odometry left untied: wheels and loops tie them; what nothing ties is left out."""
+
+from collections import Counter
+from collections.abc import Set
+from dataclasses import replace
+
+import numpy as np
+
+from mapper.graph.components import components
+from mapper.graph.model import PoseGraph
+from mapper.loops.closure import LoopClosure
+from mapper.odometry.base import Diagnostics, FrameResult
+from mapper.pipeline.track import TrackingResult
+from mapper.runtime.progress import Progress
+
+DISCONNECTED = "untied"
+"""``Diagnostics.method`` of a frame that was placed, but in a part of the path that is left out."""
+
+
+def largest_component(tracking: TrackingResult, *, progress: Progress) -> TrackingResult:
+    """Return what was tracked without the parts that nothing ties to the one with most frames, and say so.
+
+    After a loss the odometry may begin anew where nothing is known. Until a loop joins the two parts, nobody
+    knows how they lie to each other, and a map of both would be a guess: the frames left out count as lost.
+    """
+    frames = Counter(track.node for track in tracking.placed)
+    parts = components(tracking.graph)
+    largest = max(parts, key=lambda nodes: sum(frames[node] for node in nodes), default=[])
+    return component_of(tracking, largest[0], progress=progress) if largest else tracking
+
+
+def component_of(tracking: TrackingResult, node: int, *, progress: Progress) -> TrackingResult:
+    """Return what was tracked without the parts that nothing ties to a node's own, and say so."""
+    parts = components(tracking.graph)
+    if len(parts) <= 1:
+        return tracking
+    frames = Counter(track.node for track in tracking.placed)
+    kept = frozenset(next(nodes for nodes in parts if node in nodes))
+    left_out = sum(frames[node] for nodes in parts for node in nodes if node not in kept)
+    progress.note(
+        f"{left_out} of {len(tracking.placed)} frames lie in {len(parts) - 1} parts of the path that nothing "
+        "ties to the rest; they are left out"
+    )
+    graph = tracking.graph
+    return replace(
+        tracking,
+        tracks=tuple(_lost_unless(track, kept) for track in tracking.tracks),
+        graph=PoseGraph(
+            {node: T for node, T in graph.T_world_node.items() if node in kept},
+            {node: stamp_ns for node, stamp_ns in graph.stamps_ns.items() if node in kept},
+            [factor for factor in graph.factors if factor.i in kept],
+        ),
+        loops=tuple(_refused_unless(loop, kept) for loop in tracking.loops),
+    )
+
+
+def _lost_unless(track: FrameResult, kept: Set[int]) -> FrameResult:
+    if track.node is None or track.node in kept:
+        return track
+    nothing = Diagnostics(
+        track.diagnostics.features, 0, 0, 0.0, track.diagnostics.residual_unit, DISCONNECTED
+    )
+    return replace(track, node=None, T_node_body=np.eye(4), is_keyframe=False, diagnostics=nothing)
+
+
+def _refused_unless(loop: LoopClosure, kept: Set[int]) -> LoopClosure:
+    if loop.verdict == "rejected" or loop.i in kept:
+        return loop
+    return replace(loop, verdict="rejected", reason="untied: in a part of the path that is left out")

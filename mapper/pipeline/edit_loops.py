@@ -1,0 +1,135 @@
+"""Loops that a user adds to a finished run or takes from it: solved and fused again, but not tracked."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from mapper.config.build import BuildConfig
+from mapper.core.errors import ConfigError, LoopError
+from mapper.core.frames import Sensor
+from mapper.graph.chain import by_odometry
+from mapper.graph.components import components
+from mapper.graph.model import PoseGraph
+from mapper.loops.base import Proposal, Verifier, measured
+from mapper.loops.closure import LoopClosure
+from mapper.loops.config import NoLoopsConfig, PlaceLoopsConfig, ScanLoopsConfig
+from mapper.pipeline.fuse import fuse_changed
+from mapper.pipeline.reobserve import reobserve
+from mapper.pipeline.solve import solve
+from mapper.run.folder import Run
+from mapper.run.stored_tracking import StoredTracking, load_tracking
+from mapper.runtime.progress import SILENT, Progress
+from mapper.sources.base import FrameSource
+
+Pair = tuple[int, int]
+"""Two nodes."""
+
+_REMOVED = "hand: removed"
+_LOOPS: Mapping[Sensor, PlaceLoopsConfig | ScanLoopsConfig] = {
+    "rgbd": PlaceLoopsConfig(),
+    "lidar": ScanLoopsConfig(),
+}
+"""How the frames of a run are compared that looked for no loops itself."""
+
+
+def edit_loops(
+    source: FrameSource,
+    run: Run,
+    *,
+    add: Sequence[Pair] = (),
+    remove: Sequence[Pair] = (),
+    progress: Progress = SILENT,
+) -> Run:
+    """Add and remove loops, solve once, fuse what has moved; the run stays as it is unless all of it works.
+
+    A hand's word replaces the proposal, the gate and the agreement of others, but not the measurement: the
+    two frames are compared as every candidate is. The solve starts from odometry alone, so the outcome does
+    not depend on the order of edits.
+
+    Args:
+        source: The log that the run was built from.
+        run: A finished run.
+        add: Pairs of nodes that show one place.
+        remove: Loops that do not.
+        progress: Who watches.
+
+    Raises:
+        ConfigError: The run's configuration does not solve its graph.
+        LoopError: A node is unknown, a loop is there already or is not, two frames do not show one place, or
+            the solver does not believe a loop that was added.
+    """
+    if run.config.graph.solve == "none":
+        raise ConfigError(f"{run.path}: built with graph.solve=none, so loops change nothing; build it again")
+    tracked = load_tracking(run)
+    graph, loops = tracked.graph, list(tracked.loops)
+    for pair in remove:
+        place = _held(loops, pair)
+        if place is None:
+            raise LoopError(f"loop {_text(pair)}: no loop of {run.path} to remove; mapper loops lists them")
+        loops[place] = replace(loops[place], verdict="rejected", reason=_REMOVED)
+    pairs = [_in_time_order(graph, pair) for pair in add]
+    for pair in pairs:
+        if _held(loops, pair) is not None or pairs.count(pair) > 1:
+            raise LoopError(f"loop {_text(pair)}: there already")
+    if pairs:
+        found = _measured(source, tracked, pairs, run.config)
+        loops = [loop for loop in loops if (loop.i, loop.j) not in pairs] + found
+    known = [factor for factor in graph.factors if factor.origin != "loop"]
+    held = [loop.factor for loop in loops if loop.verdict == "accepted"]
+    edited = PoseGraph(by_odometry(graph), graph.stamps_ns, [*known, *held])
+    solved = solve(edited, loops, run.config.graph)
+    for loop in solved.loops[len(loops) - len(pairs) :]:
+        _refuse_rejected(loop)
+    if len(components(solved.graph)) > len(components(graph)):
+        raise LoopError(f"{run.path}: without these loops nothing ties the graph together; nothing removed")
+    return fuse_changed(
+        source, run, tracked.solved(solved.graph, solved.loops), solve=solved.report, progress=progress
+    )
+
+
+def _held(loops: Sequence[LoopClosure], pair: Pair) -> int | None:
+    """Return where the accepted loop between two nodes stands, either way round."""
+    for place, loop in enumerate(loops):
+        if loop.verdict == "accepted" and {loop.i, loop.j} == set(pair):
+            return place
+    return None
+
+
+def _in_time_order(graph: PoseGraph, pair: Pair) -> Pair:
+    for node in pair:
+        if node not in graph.T_world_node:
+            last = max(graph.T_world_node)
+            raise LoopError(f"loop {_text(pair)}: no node {node}; the graph's nodes are 0 … {last}")
+    if pair[0] == pair[1]:
+        raise LoopError(f"loop {_text(pair)}: a node cannot be tied to itself")
+    i, j = sorted(pair, key=graph.stamps_ns.__getitem__)
+    return i, j
+
+
+def _measured(
+    source: FrameSource, tracked: StoredTracking, pairs: Sequence[Pair], config: BuildConfig
+) -> list[LoopClosure]:
+    verifier, graph = _verifier(config, source.sensor), tracked.graph
+    stamps_ns = {graph.stamps_ns[node] for pair in pairs for node in pair}
+    views = reobserve(source, tracked.trajectory, stamps_ns, config)
+    places = {stamp_ns: verifier.describe(seen) for stamp_ns, seen in views.items()}
+    loops = []
+    for i, j in pairs:
+        place_i, place_j = (places[graph.stamps_ns[node]] for node in (i, j))
+        loops.append(measured(Proposal(i, "hand"), j, place_i, place_j, verifier))
+        _refuse_rejected(loops[-1])
+    return loops
+
+
+def _verifier(config: BuildConfig, sensor: Sensor) -> Verifier[Any]:
+    loops = _LOOPS[sensor] if isinstance(config.loops, NoLoopsConfig) else config.loops
+    return loops.verification.build()
+
+
+def _refuse_rejected(loop: LoopClosure) -> None:
+    if loop.verdict == "rejected":
+        raise LoopError(f"loop {_text((loop.i, loop.j))}: not added; {loop.reason}")
+
+
+def _text(pair: Pair) -> str:
+    return f"{pair[0]} → {pair[1]}"

@@ -1,0 +1,242 @@
+"""Fusing: a run's maps, pictures and MCAP log made from its solved poses, and made again after a change."""
+
+import shutil
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mapper.config.build import BuildConfig
+from mapper.core.errors import ConfigError, RunError
+from mapper.core.timebase import NS_PER_S
+from mapper.core.trajectory import Trajectory
+from mapper.export.grid import write_grid
+from mapper.export.mcap_log import McapLog
+from mapper.export.picture import write_cloud_views, write_summary
+from mapper.export.ply import write_ply
+from mapper.export.run_mcap import log_maps, log_results, log_snapshot
+from mapper.graph.model import PoseGraph
+from mapper.mapping.fusion import Maps, fuse_log
+from mapper.octree.map_file import write_map
+from mapper.octree.octomap_file import write_bt, write_ot
+from mapper.octree.scan_update_file import ScanUpdateWriter, open_scan_updates
+from mapper.run import files
+from mapper.run.folder import (
+    Run,
+    RunWriter,
+    load_run,
+    moved_log,
+    paths_of,
+    refuse_another_log,
+    write_run,
+)
+from mapper.run.manifest import Solve, Status, Timing
+from mapper.run.observers import NULL_OBSERVER, Observer
+from mapper.run.results import RunResults, load_results
+from mapper.run.stored_tracking import StoredTracking, load_tracking, save_tracking
+from mapper.runtime.progress import SILENT, Progress
+from mapper.runtime.timing import peak_memory_mb
+from mapper.sources.base import FrameSource
+
+_FUSE_CONFIGS = frozenset(
+    {"octree", "slice", "traversable", "cloud", "mcap", "mesh", "costmap", "rerun", "workers"}
+)
+_TRACKING_STAGES = ("track", "solve", "level")
+
+
+def fuse(
+    source: FrameSource,
+    run: Run,
+    config: BuildConfig,
+    *,
+    trajectory: Trajectory | None = None,
+    progress: Progress = SILENT,
+) -> Run:
+    """Make a run's maps again, with another octree, slice, cloud or MCAP configuration or along other poses.
+
+    What a frame saw is taken from the old run where pose and rays are the same; the maps are those of fusing
+    everything from scratch. The run stays as it is until the new maps are whole, and files that are not ours
+    stay in it.
+
+    Args:
+        source: The log that the run was built from.
+        run: A finished run.
+        config: The run's own configuration with the map's knobs turned.
+        trajectory: Body poses in the levelled world by which to replace the run's; None keeps those.
+        progress: Who watches.
+
+    Raises:
+        ConfigError: The configuration differs in something that tracking has already settled.
+        RunError: The log is not the one that the run was built from, or the trajectory has no frame of it.
+    """
+    for name in sorted(set(BuildConfig.model_fields) - _FUSE_CONFIGS):
+        if getattr(config, name) != getattr(run.config, name):
+            raise ConfigError(f"{name}: fuse keeps what was tracked and cannot change it; run mapper build")
+    changed = None if trajectory is None else _led_along(run, trajectory)
+    return fuse_changed(source, replace(run, config=config), changed, progress=progress)
+
+
+def fuse_changed(
+    source: FrameSource,
+    run: Run,
+    changed: StoredTracking | None = None,
+    *,
+    solve: Solve | None = None,
+    progress: Progress = SILENT,
+) -> Run:
+    """Make a run's maps again after its graph or its poses have changed; see ``fuse``.
+
+    Args:
+        source: The log that the run was built from.
+        run: A finished run, with the configuration to fuse by.
+        changed: What replaces the run's own; None keeps that.
+        solve: What the manifest says of the solve that changed it; None keeps what it says.
+        progress: Who watches.
+
+    Raises:
+        RunError: The log is not the one that the run was built from.
+    """
+    refuse_another_log(run, source)
+    status: Status = "building"
+    manifest = moved_log(run, *paths_of(source)).manifest.model_copy(update={"status": status})
+    with write_run(run.path, manifest, run.config, overwrite=True) as writer:
+        carry_times(writer, manifest.timing)
+        _keep_the_rest(run.path, writer.folder)
+        if changed is not None:
+            save_tracking(writer, changed)
+            for name in files.names_of("poses"):
+                (writer.folder / name).unlink(missing_ok=True)
+        if solve is not None:
+            writer.update(solve=solve)
+        fuse_into(writer, source, run.config, progress, before=run.path / files.SCAN_UPDATES)
+    return load_run(run.path)
+
+
+def carry_times(writer: RunWriter, timing: Timing) -> None:
+    """Count the time that tracking took in an earlier run as this one's."""
+    for stage in _TRACKING_STAGES:
+        writer.clock.seconds[stage] = timing.stage_s[stage]
+
+
+def _led_along(run: Run, trajectory: Trajectory) -> StoredTracking:
+    """Return what a run keeps, with its trajectory replaced and the nodes of its graph moved along."""
+    tracked = load_tracking(run)
+    T_world_body = dict(zip(trajectory.stamps_ns.tolist(), trajectory.T_world_body, strict=True))
+    if T_world_body.keys().isdisjoint(tracked.trajectory.stamps_ns.tolist()):
+        raise RunError(f"{run.path}: none of the trajectory's {len(trajectory)} stamps is one of the run's")
+    graph = tracked.graph
+    moved = {node: T_world_body.get(graph.stamps_ns[node], T) for node, T in graph.T_world_node.items()}
+    return replace(tracked, trajectory=trajectory, graph=PoseGraph(moved, graph.stamps_ns, graph.factors))
+
+
+def _keep_the_rest(folder: Path, new: Path) -> None:
+    """Copy what was tracked, and whatever a user has put there; what was made from the old maps goes."""
+    made_again = files.names_of("maps", "exported maps") | {files.FORMER_SCAN_UPDATES}
+    for child in folder.iterdir():
+        if child.name in made_again:
+            continue
+        if child.is_dir() and not child.is_symlink():
+            shutil.copytree(child, new / child.name, symlinks=True)
+        else:
+            shutil.copy2(child, new / child.name, follow_symlinks=False)
+
+
+def fuse_into(
+    writer: RunWriter,
+    source: FrameSource,
+    config: BuildConfig,
+    progress: Progress,
+    *,
+    before: Path | None = None,
+    observer: Observer = NULL_OBSERVER,
+) -> None:
+    """Fuse a draft's trajectory and write everything that is made from the maps."""
+    results = load_results(Run(writer.folder, config, writer.manifest))
+    if not config.mcap.frame_times:
+        results = replace(results, frame_ms={})
+    trajectory = results.trajectory
+    with McapLog(writer.folder / files.MCAP) as log:
+        with (
+            writer.clock.stage("fuse"),
+            open_scan_updates(before) if before is not None and before.exists() else nullcontext() as known,
+            ScanUpdateWriter(writer.folder / files.SCAN_UPDATES, config.octree) as sights,
+        ):
+            maps = fuse_log(
+                source,
+                trajectory,
+                config,
+                progress=progress,
+                on_snapshot=lambda snapshot: log_snapshot(log, snapshot),
+                before=known,
+                after=sights,
+            )
+        with writer.clock.stage("write"):
+            log_results(log, results)
+            log_maps(log, maps, stamp_ns=int(trajectory.stamps_ns[0]))
+            _write_maps(writer.folder, maps)
+            _write_pictures(writer, maps, results)
+    counts = writer.manifest.counts.model_copy(
+        update={"leaves": len(maps.octree), "cloud_points": len(maps.cloud_points_world)}
+    )
+    writer.update(counts=counts, timing=_timing(writer, trajectory, counts.read))
+    observer.on_mapped(Run(writer.folder, config, writer.manifest), results, maps)
+
+
+def _write_maps(folder: Path, maps: Maps) -> None:
+    write_bt(folder / files.OCTREE_BT, maps.octree)
+    write_ot(folder / files.OCTREE_OT, maps.octree)
+    write_map(folder / files.OCTREE_MAP, maps.octree)
+    write_ply(folder / files.CLOUD, maps.cloud_points_world, maps.cloud_colors)
+    write_grid(folder, files.SLICE, maps.grid)
+    write_grid(folder, files.TRAVERSABLE, maps.traversable)
+
+
+def _write_pictures(writer: RunWriter, maps: Maps, results: RunResults) -> None:
+    counts, levelling = writer.manifest.counts, writer.manifest.levelling
+    trajectory, graph = results.trajectory, results.graph
+    lines = [f"{len(trajectory)} frames, {counts.nodes} keyframes, {trajectory.path_length_m:.2f} m of path"]
+    if levelling is not None:
+        lines.append(f"levelled by {levelling.method}")
+    write_summary(
+        writer.folder / files.SUMMARY,
+        grid=maps.grid,
+        trajectory=trajectory,
+        truth=results.truth,
+        loops_world=np.array(
+            [
+                [graph.T_world_node[node][:3, 3] for node in (factor.i, factor.j)]
+                for factor in graph.factors
+                if factor.origin == "loop"
+            ]
+        ).reshape(-1, 2, 3),
+        title=writer.manifest.input.title,
+        lines=lines,
+    )
+    if len(maps.cloud_points_world):
+        write_cloud_views(
+            writer.folder / files.CLOUD_VIEWS, maps.cloud_points_world, maps.cloud_colors, trajectory
+        )
+
+
+def _duration_s(trajectory: Trajectory, begins_ns: Sequence[int]) -> float:
+    """Return the seconds from first to last frame, without the pauses before logs that begin later."""
+    sessions = np.split(trajectory.stamps_ns, np.searchsorted(trajectory.stamps_ns, begins_ns))
+    return float(sum(stamps[-1] - stamps[0] for stamps in sessions if len(stamps))) / NS_PER_S
+
+
+def _timing(writer: RunWriter, trajectory: Trajectory, frames: int) -> Timing:
+    seconds = {stage: round(value, 3) for stage, value in writer.clock.seconds.items()}
+    total_s = sum(seconds.values())
+    log_s = _duration_s(trajectory, [log.begins_ns for log in writer.manifest.input.appended])
+    return writer.manifest.timing.model_copy(
+        update={
+            "stage_s": seconds,
+            "total_s": round(total_s, 3),
+            "log_s": log_s,
+            "frames_per_s": round(frames / total_s, 2),
+            "real_time_factor": round(log_s / total_s, 3),
+            "peak_memory_mb": round(max(peak_memory_mb(), writer.manifest.timing.peak_memory_mb), 1),
+        }
+    )

@@ -1,0 +1,48 @@
+"""Frames that were tracked long ago, seen again: what a finished run does not keep of them."""
+
+from collections.abc import Collection
+from typing import Any
+
+from mapper.config.build import BuildConfig
+from mapper.core.deskew import twist_at
+from mapper.core.trajectory import Trajectory
+from mapper.odometry.base import Odometry, Seen
+from mapper.runtime.ordered_map import ordered_map
+from mapper.runtime.progress import SILENT, Progress
+from mapper.sources.base import FrameRef, FrameSource
+
+
+def reobserve(
+    source: FrameSource,
+    trajectory: Trajectory,
+    stamps_ns: Collection[int],
+    config: BuildConfig,
+    *,
+    progress: Progress = SILENT,
+) -> dict[int, Seen]:
+    """Return what the odometry of a configuration sees in some frames of a log, by stamp.
+
+    Args:
+        source: The log.
+        trajectory: Where the body was: scans are deskewed by its motion.
+        stamps_ns: Of the frames; each has a pose.
+        config: Which odometry.
+        progress: Who watches.
+
+    Raises:
+        FrameError: A frame cannot be read.
+    """
+    odometry: Odometry[Any] = config.odometry.build(source.wheels)
+    index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
+
+    def view(entry: FrameRef) -> tuple[int, Seen]:
+        twist = twist_at(trajectory, index_of[entry.stamp_ns])
+        return entry.stamp_ns, odometry.view(odometry.read(entry), twist)
+
+    entries = [entry for entry in source.entries() if entry.stamp_ns in stamps_ns]
+    views = {}
+    with progress.stage("recall") as report:
+        for stamp_ns, seen in ordered_map(view, entries, workers=config.workers):
+            views[stamp_ns] = seen
+            report(len(views), len(entries))
+    return views

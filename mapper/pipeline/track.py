@@ -1,0 +1,181 @@
+"""The first pass over a log: every frame tracked in order, and the pose graph that grows from it."""
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+from mapper.config.build import BuildConfig
+from mapper.core.errors import ConfigError, FrameError, TrackingError
+from mapper.core.frames import Sensor
+from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.graph.model import PoseGraph
+from mapper.graph.wheel_factors import wheel_factors
+from mapper.loops.closure import LoopClosure
+from mapper.loops.detector import LoopDetector
+from mapper.odometry.base import FrameResult, Odometry
+from mapper.run.frame_records import records_of
+from mapper.run.observers import NULL_OBSERVER, Observer, Step
+from mapper.run.stored_tracking import StoredTracking
+from mapper.runtime.ordered_map import ordered_map
+from mapper.runtime.progress import Progress
+from mapper.sources.base import FrameRef, FrameSource, Skipped
+
+_DOUBTS: Mapping[Sensor | Literal["wheels"], str] = {
+    "rgbd": "is there texture, and depth within max_depth_m, in the images?",
+    "lidar": "do the scans overlap, and are their units metres?",
+    "wheels": "do the wheels' readings cover the frames' times, without gaps beyond odometry.max_gap_s?",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackingResult:
+    """What the first pass found.
+
+    Attributes:
+        tracks: One per frame that could be read, in time order.
+        skipped: The frames that could not be read.
+        graph: Nodes at the odometry's estimates, with every factor, those of the loops last.
+        loops: Every loop candidate with its verdict.
+        frame_ms: Wall milliseconds that each frame took to read, detect and track, by stamp.
+    """
+
+    tracks: tuple[FrameResult, ...]
+    skipped: tuple[Skipped, ...]
+    graph: PoseGraph
+    loops: tuple[LoopClosure, ...]
+    frame_ms: Mapping[int, float]
+
+    @property
+    def placed(self) -> list[FrameResult]:
+        """The tracks of the frames that were not lost."""
+        return [track for track in self.tracks if track.node is not None]
+
+    def trajectory(self) -> Trajectory:
+        """Return T_world_body = T_world_node · T_node_body of every frame that was not lost."""
+        return trajectory_from(
+            (track.stamp_ns, self.graph.T_world_node[track.node] @ track.T_node_body)
+            for track in self.tracks
+            if track.node is not None
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """What tracking begins with.
+
+    Attributes:
+        odometry: Before its first frame.
+        detector: Knows the places of earlier sessions.
+        graph: Of earlier sessions, without loops.
+        loops: The candidates of earlier sessions.
+    """
+
+    odometry: Odometry[Any]
+    detector: LoopDetector
+    graph: PoseGraph
+    loops: Sequence[LoopClosure] = ()
+
+
+def from_nothing(source: FrameSource, config: BuildConfig) -> Start:
+    """Return the start of a log that is the first of its place.
+
+    Raises:
+        ConfigError: The odometry wants wheels and the log has none, or does not count what the loops go by.
+    """
+    if config.odometry.kind == "wheels" and config.loops.kind == "thesis":
+        raise ConfigError(
+            "loops.kind=thesis looks from frames with many features, and odometry.kind=wheels counts none; "
+            "want loops.kind=places, scans or none"
+        )
+    odometry = config.odometry.build(source.wheels)
+    return Start(odometry, config.loops.build(config.graph.solve), PoseGraph())
+
+
+def track_log(
+    source: FrameSource,
+    config: BuildConfig,
+    *,
+    progress: Progress,
+    start: Start | None = None,
+    observer: Observer = NULL_OBSERVER,
+) -> TrackingResult:
+    """Track every frame of a log, in time order; reading and detecting run ahead in threads.
+
+    A frame that cannot be read is skipped and reported, not fatal. With a ``start`` the graph and the loops
+    returned are those of all sessions, the tracks those of this log.
+    """
+    start = start or from_nothing(source, config)
+    odometry, detector, before = start.odometry, start.detector, start.graph
+    graph = PoseGraph(dict(before.T_world_node), dict(before.stamps_ns), list(before.factors))
+    tracks: list[FrameResult] = []
+    skipped: list[Skipped] = []
+    frame_ms: dict[int, float] = {}
+
+    def observe(entry: FrameRef) -> tuple[FrameRef, Any, float]:
+        began = time.perf_counter()
+        try:
+            observation = odometry.read(entry)
+        except FrameError as error:
+            observation = Skipped(entry.stamp_ns, str(error))
+        return entry, observation, time.perf_counter() - began
+
+    observations = ordered_map(observe, source.entries(), workers=config.workers)
+    with progress.stage("track") as report:
+        for done, (entry, observation, observed_s) in enumerate(observations, start=1):
+            report(done, len(source))
+            if isinstance(observation, Skipped):
+                skipped.append(observation)
+                progress.note(f"skipped: {observation.reason}")
+                continue
+            began = time.perf_counter()
+            track = odometry.track(observation)
+            view = partial(odometry.view, observation, track.twist)
+            if track.is_keyframe and track.node is not None:
+                graph.add_node(track.node, track.stamp_ns, track.T_world_body)
+                detector.add(track.node, track, view)
+            frame_ms[track.stamp_ns] = 1e3 * (observed_s + time.perf_counter() - began)
+            graph.add_factors(track.factors)
+            tracks.append(track)
+            observer.on_frame(Step(entry, track, view, odometry.matches, detector))
+    graph.add_factors(odometry.finish())
+    if config.odometry.kind != "wheels":  # else they have had their say
+        graph.add_factors(wheel_factors(graph.stamps_ns, source.wheels, config.graph.wheels))
+    loops = (*start.loops, *detector.closures())
+    graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")
+    return TrackingResult(tuple(tracks), tuple(skipped), graph, loops, frame_ms)
+
+
+def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: Sensor) -> None:
+    """Refuse to make a map from too little.
+
+    Raises:
+        TrackingError: Fewer frames were tracked than the configuration asks for.
+    """
+    read, placed = len(tracking.tracks), len(tracking.placed)
+    enough = max(config.min_tracked_frames, config.min_tracked_ratio * read)
+    if placed >= enough:
+        return
+    if read == 0 and tracking.skipped:
+        raise TrackingError(
+            f"none of {len(tracking.skipped)} frames could be read; the first: {tracking.skipped[0].reason}"
+        )
+    doubts = _DOUBTS["wheels" if config.odometry.kind == "wheels" else sensor]
+    raise TrackingError(
+        f"only {placed} of {read} frames read could be tracked, want at least {enough:.0f}; "
+        f"{doubts} (min_tracked_frames and min_tracked_ratio set the limit)"
+    )
+
+
+def from_tracking(tracking: TrackingResult, truth: Trajectory | None) -> StoredTracking:
+    """Return what the first pass over a log found."""
+    return StoredTracking(
+        records=records_of(tracking.tracks, tracking.skipped),
+        skipped=tracking.skipped,
+        frame_ms=tracking.frame_ms,
+        trajectory=tracking.trajectory(),
+        graph=tracking.graph,
+        loops=tracking.loops,
+        truth=truth,
+    )

@@ -1,0 +1,75 @@
+"""Whether a motion found between two scans is believed."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.core.geometry import Array, Transform, apply
+from mapper.registration.base import Alignment
+from mapper.registration.config import TrustConfig
+from mapper.registration.degeneracy import degeneracy_of
+from mapper.registration.refining import measured
+from mapper.registration.surfaces import Prepared
+
+_FEW = 0.01  # of all surface; of fewer that face a direction, degeneracy speaks
+
+
+def assess(target: Prepared, source: Prepared, T_target_source: Transform, config: TrustConfig) -> Alignment:
+    """Return what a motion is worth; not converged when surfaces contradict it, or none shows it.
+
+    Most of a scan is ground, and any ground agrees with any other: under a wrong motion up to 95 % of the
+    points can lie on a dense map. So the points are asked by what they face. They vote for the three main
+    directions of the normals, each by its normal's squared cosine, and the motion is believed when enough
+    agree on the direction in which fewest do.
+
+    Args:
+        target: Cloud that stays.
+        source: Cloud that moves; the one with the smaller view, which the other should explain.
+        T_target_source: (4, 4) motion in question.
+        config: What is asked of it, in voxels of the source.
+    """
+    near_m, surface_m = config.near_voxels * source.voxel_m, config.surface_voxels * source.voxel_m
+    alignment = measured(
+        target, source, T_target_source, max_pair_distance_m=near_m, max_surface_distance_m=surface_m
+    )
+    if not alignment.converged:
+        return alignment
+    agree = _agreeing(target, source, T_target_source, near_m, surface_m)
+    share, direction = _weakest(source.normals, agree)
+    if share < config.min_agreeing_ratio:
+        reason = (
+            f"{share:.0%} of the source's surfaces that face ({', '.join(f'{x:.2f}' for x in direction)}) "
+            f"lie on the target's, less than {config.min_agreeing_ratio:.0%}"
+        )
+        return replace(alignment, converged=False, reason=reason)
+    assert alignment.information is not None  # measured and converged
+    degeneracy = degeneracy_of(alignment.information, points=source.points)
+    if degeneracy.is_degenerate:
+        return replace(alignment, converged=False, reason=f"degenerate: no surface shows {degeneracy.text}")
+    return alignment
+
+
+def _agreeing(
+    target: Prepared, source: Prepared, T_target_source: Transform, near_m: float, surface_m: float
+) -> NDArray[np.bool_]:
+    """Return which source points lie on the target's surfaces."""
+    points_target = apply(T_target_source, source.points)
+    indices, distances_m = target.nearest(points_target)
+    normals = target.normals[indices]
+    offsets_m = np.einsum("ni,ni->n", normals, points_target - target.points[indices])
+    agree: NDArray[np.bool_] = (
+        (distances_m <= near_m) & (np.abs(offsets_m) <= surface_m) & normals.any(axis=1)
+    )
+    return agree
+
+
+def _weakest(normals: Array, agree: NDArray[np.bool_]) -> tuple[float, Array]:
+    """Return the share that agrees in the direction where the least does, and that direction."""
+    squares = np.einsum("ni,nj->ij", normals, normals)
+    facing, directions = np.linalg.eigh(squares / max(np.trace(squares), 1.0))
+    weights = np.einsum("ni,ik->nk", normals, directions) ** 2
+    shares = weights[agree].sum(axis=0) / np.maximum(weights.sum(axis=0), np.finfo(float).tiny)
+    weakest = int(np.argmin(np.where(facing >= _FEW, shares, np.inf)))
+    direction = directions[:, weakest]
+    return float(shares[weakest]), direction * np.sign(direction[np.argmax(np.abs(direction))])

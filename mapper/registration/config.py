@@ -1,0 +1,149 @@
+"""Methods that register two scans.
+
+The baselines' lengths are multiples of one voxel, so that one knob fits them to a scene.
+"""
+
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+
+from mapper.core.config import Config, Ratio
+from mapper.registration.hough_config import HoughGicpConfig, HoughNdtConfig
+
+if TYPE_CHECKING:
+    pass
+
+if TYPE_CHECKING:
+    from mapper.registration.base import Registration
+
+VOXEL_M = {"lidar": 0.3, "rgbd": 0.05}
+"""What suits a scene some tens of metres wide, and one of a few metres."""
+
+NEED_NO_GUESS = frozenset({"hough-gicp", "hough-ndt", "kiss-matcher"})
+"""They look for the motion everywhere, and not at a guess."""
+
+Distances = Annotated[tuple[PositiveFloat, ...], Field(min_length=1)]
+
+
+class TrustConfig(Config):
+    """When a motion is believed."""
+
+    near_voxels: PositiveFloat = 3.5
+    surface_voxels: PositiveFloat = 0.33
+    """A source point agrees that lies this near to a target point, and to the surface about it."""
+    min_agreeing_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.3
+    """Of the surfaces that face any one direction, so large a share has to agree. On streets and in yards,
+    against scans and dense maps, nearly all right answers had more, and every wrong one 0.28 or less."""
+
+
+class RefinedConfig(Config):
+    """What the methods share whose answer is refined by nearest pairs."""
+
+    voxel_m: PositiveFloat = VOXEL_M["lidar"]
+    """Scans are reduced to one point in each such voxel; every other length is a multiple of it."""
+    neighbours: Annotated[int, Field(ge=5)] = 10
+    """Nearest points that give each normal and covariance."""
+    pair_distances_voxels: Distances = (7.0, 3.5)
+    """Largest distance between the points of a pair, from coarse to fine."""
+    max_iterations: PositiveInt = 40
+    """At each of these distances."""
+    trust: TrustConfig = TrustConfig()
+
+
+class IterativeConfig(RefinedConfig):
+    """Nearest pairs and the best motion for them, in turn."""
+
+    kind: Literal["icp", "plane-icp", "gicp"]
+
+    def build(self) -> "Registration":
+        """Return the method this configures."""
+        from mapper.registration.iterative import Iterative
+
+        return Iterative(self)
+
+
+class IcpConfig(IterativeConfig):
+    """Point-to-point ICP (Besl & McKay 1992)."""
+
+    kind: Literal["icp"] = "icp"
+
+
+class PlaneIcpConfig(IterativeConfig):
+    """Point-to-plane ICP (Chen & Medioni 1992)."""
+
+    kind: Literal["plane-icp"] = "plane-icp"
+
+
+class GicpConfig(IterativeConfig):
+    """Generalised ICP (Segal, Haehnel & Thrun 2009)."""
+
+    kind: Literal["gicp"] = "gicp"
+
+
+class NdtConfig(Config):
+    """Normal distributions transform (Magnusson 2009), by Open3D."""
+
+    kind: Literal["ndt"] = "ndt"
+    voxel_m: PositiveFloat = VOXEL_M["lidar"]
+    """The source is reduced to one point in each such voxel; every other length is a multiple of it."""
+    neighbours: Annotated[int, Field(ge=5)] = 10
+    """Nearest points that give each normal by which the answer is judged."""
+    cells_voxels: Distances = (7.0, 3.5)
+    """Edges of the target's cells, each with one Gaussian, from coarse to fine."""
+    min_points: Annotated[int, Field(ge=4)] = 6
+    """Cells with fewer points have none."""
+    max_iterations: PositiveInt = 30
+    """At each of these cells."""
+    trust: TrustConfig = TrustConfig()
+
+    def build(self) -> "Registration":
+        """Return the method this configures."""
+        from mapper.registration.ndt import Ndt
+
+        return Ndt(self)
+
+
+class KissMatcherConfig(RefinedConfig):
+    """KISS-Matcher (Lim et al. 2025): matched features, no guess; then GICP."""
+
+    kind: Literal["kiss-matcher"] = "kiss-matcher"
+    feature_voxels: PositiveFloat = 3.33
+    """Features are computed on clouds reduced to voxels this many times larger: a quarter of the time of 1,
+    and as many right answers."""
+
+    def build(self) -> "Registration":
+        """Return the method this configures."""
+        from mapper.registration.kiss_matcher import KissMatcher
+
+        return KissMatcher(self)
+
+
+AnyRegistration = (
+    HoughGicpConfig | HoughNdtConfig | IcpConfig | PlaneIcpConfig | GicpConfig | NdtConfig | KissMatcherConfig
+)
+RegistrationConfig = Annotated[AnyRegistration, Field(discriminator="kind")]
+
+
+class IsvdConfig(Config):
+    """Iterative SVD on matched 3D points (thesis alg. 7, eq. 4.1–4.2)."""
+
+    kind: Literal["isvd"] = "isvd"
+    threshold: Literal["power", "halving"] = "power"
+    """How the largest pair distance shrinks: α·j^β (alg. 7), or by half from ``start_error_mm`` (alg. 6)."""
+    alpha_mm: PositiveFloat = 1200.0
+    beta: Annotated[float, Field(lt=0.0)] = -2.6
+    start_error_mm: PositiveFloat = 1000.0
+    """e_start of the halving threshold; the thesis leaves it open."""
+    step: Literal["svd", "icp"] = "svd"
+    """The motion in each iteration: the SVD of the pairs (alg. 6, 7), or ICP on their points (alg. 5)."""
+    max_iterations: PositiveInt = 25
+    min_error_mm: NonNegativeFloat = 0.0
+    """Stop once the threshold falls below this (e_min of alg. 5, 6)."""
+    min_pairs: PositiveInt = 100
+    """Stop before fewer pairs than this, or than half of a smaller set, would remain ("Auto")."""
+    agreement_mm: PositiveFloat = 50.0
+    """Pairs this close after the motion are said to agree with it."""
+    min_agreeing: Annotated[int, Field(ge=3)] = 20
+    """A motion that fewer pairs agree with is refused."""
+    min_agreement_ratio: Ratio = 0.25
+    """A motion that a smaller share of the pairs agrees with is refused."""

@@ -1,0 +1,81 @@
+"""Which way is up in a single scan, from the ground under the sensor (Fischler & Bolles 1981)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.core.frames import Points32
+from mapper.core.geometry import Array, Points, Transform, transform
+from mapper.registration.hough_config import LevellingConfig
+from mapper.registration.kernels import score_planes, thin
+
+_REFITS = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Levelling:
+    """How a scan stands on its ground.
+
+    Attributes:
+        T_level_body: (4, 4) turns z up and puts the ground below the sensor at z = 0. Identity without.
+        tilt_rad: Angle between body z and the ground's normal; 0 without ground.
+        inlier_ratio: Share of the looked-at points on the ground plane; 0 without ground.
+    """
+
+    T_level_body: Transform
+    tilt_rad: float
+    inlier_ratio: float
+
+
+def level(points_body: Points32, config: LevellingConfig) -> Levelling:
+    """Return how a scan stands; a scan without ground is taken as it is.
+
+    The best of many planes through three random points is refitted to its inliers. It only turns the scan
+    when the tilt is larger than ``level_above_rad``.
+
+    Args:
+        points_body: (N, 3) metres, z less than ``max_tilt_rad`` from up.
+        config: Its knobs.
+    """
+    few = points_body[thin(points_body, config.cell_m, config.reach_m)].astype(np.float64)
+    if len(few) < 3:
+        return Levelling(np.eye(4), 0.0, 0.0)
+    triples = np.random.default_rng(config.seed).integers(0, len(few), (config.samples, 3))
+    plane, score = score_planes(
+        few,
+        triples,
+        np.cos(config.max_tilt_rad),
+        config.min_height_m,
+        config.max_height_m,
+        config.inlier_m,
+        config.below_weight,
+    )
+    if score < 0.0:
+        return Levelling(np.eye(4), 0.0, 0.0)
+    for _ in range(_REFITS):
+        plane = _refitted(few, plane, config.inlier_m)
+    up, height_m = plane[:3], float(plane[3])
+    ratio = float((np.abs(few @ up + height_m) <= config.inlier_m).mean())
+    if ratio < config.min_inlier_ratio:
+        return Levelling(np.eye(4), 0.0, 0.0)
+    tilt_rad = float(np.arccos(np.clip(up[2], -1.0, 1.0)))
+    R = _shortest_turn(up) if tilt_rad > config.level_above_rad else np.eye(3)
+    return Levelling(transform(R, np.array([0.0, 0.0, height_m])), tilt_rad, ratio)
+
+
+def _refitted(points: Points, plane: Array, inlier_m: float) -> Array:
+    """Return the least-squares plane of the inliers: the axis of their least spread."""
+    inliers = points[np.abs(points @ plane[:3] + plane[3]) <= inlier_m]
+    centre = inliers.mean(axis=0)
+    offsets = inliers - centre
+    up = np.linalg.eigh(offsets.T @ offsets)[1][:, 0]
+    up *= np.copysign(1.0, up[2])
+    return np.append(up, -up @ centre)
+
+
+def _shortest_turn(up: Array) -> Array:
+    """Return the rotation that takes ``up`` to z without turning about z (Rodrigues 1840)."""
+    x, y, z = up
+    K = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
+    R: Array = np.eye(3) + K + K @ K / (1.0 + z)
+    return R

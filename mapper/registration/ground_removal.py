@@ -1,0 +1,117 @@
+"""What is ground and what stands on it, by a grid (Nagy, Gálai & Benedek 2016, §3.1)."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.core.frames import Points32
+from mapper.core.geometry import Array, Points, Transform
+from mapper.registration.ground_plane import Levelling, level
+from mapper.registration.hough_config import ConstellationConfig, GroundConfig
+from mapper.registration.kernels import column_heights, thin_obstacles
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """The ground around a scan, in its level frame.
+
+    Attributes:
+        heights_level: (E, E) float32 z of the ground in each column of a grid centred on the origin, rows
+            along y; where no ground is near it is 0.
+        seen: (E, E) bool: points of the ground fell into the column.
+        cell_m: Edge of a column.
+    """
+
+    heights_level: NDArray[np.float32]
+    seen: NDArray[np.bool_]
+    cell_m: float
+
+    @property
+    def points_level(self) -> Points:
+        """(G, 3) the ground at the middle of each column in which it was seen, metres."""
+        rows, columns = np.nonzero(self.seen)
+        half = 0.5 * len(self.seen) - 0.5
+        x, y = (columns - half) * self.cell_m, (rows - half) * self.cell_m
+        return np.column_stack([x, y, self.heights_level[rows, columns]])
+
+    def at(self, x: Array, y: Array) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+        """Return for (N,) places whether ground was seen there, and its height, metres."""
+        edge = len(self.seen)
+        columns = np.floor(x / self.cell_m + 0.5 * edge).astype(np.intp)
+        rows = np.floor(y / self.cell_m + 0.5 * edge).astype(np.intp)
+        inside = (columns >= 0) & (columns < edge) & (rows >= 0) & (rows < edge)
+        rows, columns = np.where(inside, rows, 0), np.where(inside, columns, 0)
+        return inside & self.seen[rows, columns], self.heights_level[rows, columns]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surroundings:
+    """What is around a sensor, seen from above.
+
+    Attributes:
+        levelling: How the scan stands; its level frame is that of the rest.
+        ground: The ground.
+        obstacles: (M, 3) float32 metres, level frame, one point per voxel.
+        heights_m: (M,) float32 their heights above the ground.
+    """
+
+    levelling: Levelling
+    ground: Ground
+    obstacles: Points32
+    heights_m: NDArray[np.float32]
+
+
+def surroundings(points_body: Points32, config: ConstellationConfig) -> Surroundings:
+    """Return what is around a sensor.
+
+    Args:
+        points_body: (N, 3) metres, body frame, z less than ``levelling.max_tilt_rad`` from up.
+        config: Its knobs.
+    """
+    levelling = level(points_body, config.levelling)
+    T_level_body = levelling.T_level_body
+    ground = find_ground(points_body, T_level_body, config.ground)
+    obstacles, heights_m = find_obstacles(points_body, T_level_body, ground, config.ground)
+    return Surroundings(levelling, ground, obstacles, heights_m)
+
+
+def find_ground(points_body: Points32, T_level_body: Transform, config: GroundConfig) -> Ground:
+    """Return the ground of a scan.
+
+    A column is ground when it has enough points, is thin, and its mean is not much above the lowest thin
+    column nearby (C1). Between ground columns, the ground is at the mean of those within the window.
+    """
+    edge = 2 * int(np.ceil(config.radius_m / config.cell_m))
+    count, low, high, mean = column_heights(points_body, T_level_body, config.cell_m, edge)
+    thin = (count >= config.min_points) & (high - low < config.max_thickness_m)
+    size = 2 * int(0.5 * config.window_m / config.cell_m) + 1
+    lowest = cv2.erode(np.where(thin, mean, np.float32(np.inf)), np.ones((size, size), np.uint8))
+    seen = thin & (mean - lowest <= config.max_rise_m)
+    total = cv2.boxFilter(np.where(seen, mean, np.float32(0.0)), -1, (size, size), normalize=False)
+    weight = cv2.boxFilter(seen.astype(np.float32), -1, (size, size), normalize=False)
+    smooth = np.where(weight > 0.5, total / np.maximum(weight, 1.0), np.float32(0.0))
+    return Ground(np.where(seen, mean, smooth), seen, config.cell_m)
+
+
+def find_obstacles(
+    points_body: Points32, T_level_body: Transform, ground: Ground, config: GroundConfig
+) -> tuple[Points32, NDArray[np.float32]]:
+    """Return what is neither ground nor too high, one point per voxel.
+
+    Returns:
+        (M, 3) float32 in the level frame, and (M,) their heights above the ground, metres.
+    """
+    voxels_across = 2 * int(np.ceil(config.radius_m / config.voxel_m))
+    obstacles = thin_obstacles(
+        points_body,
+        T_level_body,
+        ground.heights_level,
+        ground.cell_m,
+        config.min_obstacle_m,
+        config.max_obstacle_m,
+        config.voxel_m,
+        voxels_across,
+    )
+    return obstacles[:, :3], obstacles[:, 3]

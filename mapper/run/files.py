@@ -1,0 +1,105 @@
+"""The files of a run folder: what each is called, what it holds, and which step writes it."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from mapper.runtime.atomic import MANIFEST_NAME
+
+TRAJECTORY = "trajectory.tum"
+KEYFRAMES = "keyframes.tum"
+TRUTH = "truth.tum"
+GRAPH = "graph.g2o"
+LOOPS = "loops.jsonl"
+FRAMES = "frames.csv"
+FRAME_MS = "frame_ms.csv"
+OCTREE_BT = "map.bt"
+OCTREE_OT = "map.ot"
+OCTREE_MAP = "map.octree"
+SLICE = "slice"
+TRAVERSABLE = "traversable"
+CLOUD = "cloud.ply"
+CLOUD_VIEWS = "cloud.png"
+MCAP = "run.mcap"
+SUMMARY = "summary.png"
+SCAN_UPDATES = "scan_updates.bin"
+FORMER_SCAN_UPDATES = "sights.bin"
+"""What ``scan_updates.bin`` was called before 2026-11-22; it is still read."""
+CONFIG = "config.json"
+MANIFEST = MANIFEST_NAME
+MESH = "mesh.ply"
+VOXELS = "voxels.ply"
+VOXEL_MESH = "voxel_mesh.ply"
+COSTMAP = "costmap"
+FOXGLOVE_LAYOUT = "foxglove_layout.json"
+PLAN = "plan.json"
+PLAN_VIEW = "plan.png"
+RERUN = "run.rrd"
+
+
+@dataclass(frozen=True, slots=True)
+class RunFiles:
+    """Files of a run that are written together.
+
+    Attributes:
+        names: What they are called.
+        content: What they hold, as README.md tells it.
+        depends_on: "tracking": written once the log is tracked and its graph is solved; "maps": written by
+            every fuse; "poses" and "exported maps": written on request, and outdated when the poses, or the
+            maps, are made again.
+    """
+
+    names: tuple[str, ...]
+    content: str
+    depends_on: Literal["tracking", "maps", "poses", "exported maps"]
+
+
+def _grid(stem: str) -> tuple[str, ...]:
+    return f"{stem}.pgm", f"{stem}.yaml", f"{stem}.png"
+
+
+RUN_FILES = (
+    RunFiles(
+        (TRAJECTORY, KEYFRAMES), "poses of the body in the levelled world: z up, floor at 0", "tracking"
+    ),
+    RunFiles((TRUTH,), "the log's own truth, in its own frame, where there is any", "tracking"),
+    RunFiles((GRAPH,), "the pose graph at its solution", "tracking"),
+    RunFiles(
+        (LOOPS,),
+        "every loop candidate: who proposed it, what was measured, its verdict and why, its weight",
+        "tracking",
+    ),
+    RunFiles((OCTREE_BT, OCTREE_OT), "the octree, as OctoMap's C++ library reads it", "maps"),
+    RunFiles(
+        (OCTREE_MAP,),
+        "the octree with all that it knows, compressed: `mapper.octree.octomap_file.read_map`",
+        "maps",
+    ),
+    RunFiles(_grid(SLICE), "the 2D map for ROS map_server and nav2, and a picture of it", "maps"),
+    RunFiles(_grid(TRAVERSABLE), "the floor that a robot can drive on, in the same form", "maps"),
+    RunFiles((CLOUD, CLOUD_VIEWS), "the coloured cloud, and two views of it", "maps"),
+    RunFiles((MCAP,), "all of it over time, for Foxglove and Rerun", "maps"),
+    RunFiles((RERUN,), "the same arranged in Rerun, once `mapper view` was asked", "exported maps"),
+    RunFiles((SUMMARY,), "the trajectory over the slice, with the truth", "maps"),
+    RunFiles(
+        (SCAN_UPDATES,),
+        "the voxels that each frame updated, so that fusing again along new poses reads only what moved",
+        "maps",
+    ),
+    RunFiles((FRAMES, FRAME_MS), "the outcome of every frame, and how long it took", "tracking"),
+    RunFiles((CONFIG,), "every setting as it was used; `mapper build --config` takes it back", "maps"),
+    RunFiles(
+        (MANIFEST,),
+        "versions, the input's fingerprint, counts, seconds, memory, and how the run ended",
+        "maps",
+    ),
+    RunFiles((MESH,), "a coloured surface, once `mapper export --as mesh` was asked", "poses"),
+    RunFiles((VOXELS, VOXEL_MESH), "the octree's occupied voxels as points and as cubes", "exported maps"),
+    RunFiles(_grid(COSTMAP), "the slice inflated for nav2", "exported maps"),
+    RunFiles((FOXGLOVE_LAYOUT,), "an arrangement of `run.mcap` for Foxglove", "exported maps"),
+    RunFiles((PLAN, PLAN_VIEW), "the last path that `mapper plan` found", "exported maps"),
+)
+
+
+def names_of(*depends_on: str) -> frozenset[str]:
+    """Return the names of all files that depend on any of these."""
+    return frozenset(name for files in RUN_FILES if files.depends_on in depends_on for name in files.names)

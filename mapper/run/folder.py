@@ -1,0 +1,264 @@
+"""The folder a build leaves: what is in it, how it is filled, and how other verbs read it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from mapper.config.build import BuildConfig
+from mapper.core.errors import MapperError, RunError
+from mapper.core.trajectory import Trajectory
+from mapper.graph.g2o import read_g2o
+from mapper.graph.model import PoseGraph
+from mapper.loops.closure import LoopClosure, read_closures
+from mapper.run import files
+from mapper.run.fingerprint import fingerprint
+from mapper.run.frame_records import FrameRecord, read_frame_ms, read_records
+from mapper.run.manifest import (
+    AppendedLog,
+    Input,
+    Log,
+    Manifest,
+    Timing,
+    is_merged_map,
+    library_versions,
+    now_text,
+    read_manifest,
+)
+from mapper.runtime.atomic import atomic_folder, partial_of, write_text
+from mapper.runtime.timing import Stopwatch
+from mapper.sources import open_source
+from mapper.sources.base import FrameSource
+from mapper.sources.chained import Session, chained, sessions_of
+from mapper.sources.config import SourceConfig
+from mapper.sources.trajectory_files import read_tum
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A finished run.
+
+    Attributes:
+        path: Its folder.
+        config: What it was built with, every default spelled out.
+        manifest: What it says about itself.
+    """
+
+    path: Path
+    config: BuildConfig
+    manifest: Manifest
+
+    def trajectory(self) -> Trajectory:
+        """Return the solved body poses of all tracked frames, in the levelled world."""
+        return read_tum(self.path / files.TRAJECTORY)
+
+    def truth(self) -> Trajectory | None:
+        """Return where the body really was, in the truth's own frame, if the log told."""
+        path = self.path / files.TRUTH
+        return read_tum(path) if path.exists() else None
+
+    def graph(self) -> PoseGraph:
+        """Return the pose graph with its nodes at the solution, in the levelled world."""
+        return read_g2o(self.path / files.GRAPH)
+
+    def loops(self) -> list[LoopClosure]:
+        """Return every loop candidate with its verdict."""
+        return read_closures(self.path / files.LOOPS)
+
+    def records(self) -> list[FrameRecord]:
+        """Return what became of every frame."""
+        return read_records(self.path / files.FRAMES)
+
+    def frame_ms(self) -> dict[int, float]:
+        """Return how many milliseconds each frame took to track, by stamp."""
+        return read_frame_ms(self.path / files.FRAME_MS)
+
+    def files(self) -> list[Path]:
+        """Return the folder's files, by name."""
+        return sorted(child for child in self.path.iterdir() if child.is_file())
+
+
+def load_run(path: Path) -> Run:
+    """Return a finished run.
+
+    Raises:
+        RunError: The folder is missing, is no run, or is not finished; the message says how it ended.
+    """
+    if not path.is_dir():
+        partial = partial_of(path)
+        if is_merged_map(partial):
+            raise RunError(f"{path}: not finished; the mapper merge that began it goes on where it was")
+        if (partial / files.MANIFEST).is_file():
+            raise RunError(f"{path}: not finished: {_ending(partial)}")
+        raise RunError(f"{path}: no such run folder; make one with mapper build LOG --out {path}")
+    if is_merged_map(path):
+        raise RunError(
+            f"{path}: is a merged map, not a run; its {files.OCTREE_BT}, {files.OCTREE_OT} and slice "
+            "are in it"
+        )
+    manifest = read_manifest(path / files.MANIFEST)
+    if manifest.status != "complete":
+        raise RunError(f"{path}: not finished: {_ending(path)}")
+    return Run(path, _read_config(path / files.CONFIG), manifest)
+
+
+def moved_log(run: Run, *logs: Path) -> Run:
+    """Return the run, knowing that its logs lie elsewhere by now.
+
+    Raises:
+        RunError: It was made from another number of logs.
+    """
+    known = run.manifest.input
+    if len(logs) != 1 + len(known.appended):
+        raise RunError(
+            f"{run.path}: made from {1 + len(known.appended)} logs, {known.title}; "
+            f"{len(logs)} given, want all of them in this order"
+        )
+    first, *others = (str(log.resolve()) for log in logs)
+    appended = tuple(
+        log.model_copy(update={"path": path}) for log, path in zip(known.appended, others, strict=True)
+    )
+    moved = known.model_copy(update={"path": first, "appended": appended})
+    return replace(run, manifest=run.manifest.model_copy(update={"input": moved}))
+
+
+def open_log(run: Run) -> FrameSource:
+    """Return the log that a run was built from, with the same frames selected and all that was appended.
+
+    Raises:
+        RunError: It is no longer there, or is not what it was.
+        SourceError: It cannot be opened.
+    """
+    source = _open(run, run.manifest.input, run.config.source)
+    for log in run.manifest.input.appended:
+        source = chained(source, _open(run, log, log.source), shift_ns=log.shift_ns)
+    refuse_another_log(run, source)
+    return source
+
+
+def _open(run: Run, log: Log, config: SourceConfig) -> FrameSource:
+    path = Path(log.path)
+    if not path.exists():
+        raise RunError(f"{path}: the log of {run.path} is no longer there; tell its new place with --log")
+    return open_source(path, config)
+
+
+def refuse_another_log(run: Run, source: FrameSource) -> None:
+    """Refuse a log that is not the one that a run was built from.
+
+    Raises:
+        RunError: Its fingerprint differs, or that of a log that was appended.
+    """
+    logs = (run.manifest.input, *run.manifest.input.appended)
+    for path, log in zip_longest(paths_of(source), logs):
+        if path is None or log is None:
+            raise RunError(
+                f"{source.path}: {run.path} was made from {len(logs)} logs; open them with open_log"
+            )
+        if fingerprint(path) != log.fingerprint:
+            raise RunError(f"{path}: changed since {run.path} was built from it; build it again")
+
+
+def paths_of(source: FrameSource) -> list[Path]:
+    """Return where the logs are that a source is made of."""
+    return [session.log.path for session in sessions_of(source)]
+
+
+class RunWriter:
+    """A run folder being filled; its manifest says "building" until the end is known.
+
+    Attributes:
+        folder: Where the files go.
+        clock: Times the stages.
+        manifest: What will be written at the end; ``update`` replaces parts of it.
+    """
+
+    def __init__(self, folder: Path, manifest: Manifest) -> None:
+        self.folder = folder
+        self.clock = Stopwatch()
+        self.manifest = manifest
+        self.save()
+
+    def update(self, **parts: Any) -> None:
+        """Replace fields of the manifest."""
+        self.manifest = self.manifest.model_copy(update=parts)
+
+    def save(self) -> None:
+        """Write the manifest as it stands."""
+        self.manifest.save(self.folder / files.MANIFEST)
+
+
+@contextmanager
+def write_run(out: Path, manifest: Manifest, config: BuildConfig, *, overwrite: bool) -> Iterator[RunWriter]:
+    """Yield a draft that becomes the run OUT on success and stays behind as ``OUT.partial`` otherwise.
+
+    A failure or an interruption is written into the manifest; a killed process leaves it at "building".
+
+    Raises:
+        RunError: OUT exists and may not be replaced, or is being built by another process.
+    """
+    with atomic_folder(out, overwrite=overwrite) as folder:
+        writer = RunWriter(folder, manifest)
+        try:
+            write_text(folder / files.CONFIG, config.model_dump_json(indent=2) + "\n")
+            yield writer
+        except BaseException as error:
+            status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+            reason = str(error) if isinstance(error, MapperError) else f"{type(error).__name__}: {error}"
+            writer.update(status=status, reason=reason)
+            writer.save()
+            error.add_note(f"what there is so far stays in {folder}")
+            raise
+        writer.update(status="complete")
+        writer.save()
+
+
+def first_manifest(source: FrameSource) -> Manifest:
+    """Return the manifest of a run that has just begun."""
+    return Manifest(
+        status="building",
+        libraries=library_versions(),
+        input=Input(**_facts(source)),
+        timing=Timing(started=now_text()),
+    )
+
+
+def appended_log(session: Session, config: SourceConfig) -> AppendedLog:
+    """Return what the manifest says of a log that was appended."""
+    return AppendedLog(
+        **_facts(session.log),
+        source=config,
+        shift_ns=session.shift_ns,
+        begins_ns=int(session.stamps_ns[0]),
+    )
+
+
+def _facts(source: FrameSource) -> dict[str, Any]:
+    return {
+        "path": str(source.path.resolve()),
+        "kind": source.kind,
+        "fingerprint": fingerprint(source.path),
+        "notes": tuple(source.notes),
+    }
+
+
+def _ending(folder: Path) -> str:
+    manifest = read_manifest(folder / files.MANIFEST)
+    if manifest.status == "building":
+        return f"{folder} is still being built, or its process was killed"
+    return f"{folder} {manifest.status}: {manifest.reason}"
+
+
+def _read_config(path: Path) -> BuildConfig:
+    try:
+        return BuildConfig.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        raise RunError(f"{path}: {name}: {first['msg']}; built by another version?") from None

@@ -1,0 +1,148 @@
+"""What became of every frame of a log, and how long it took."""
+
+import csv
+import io
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from mapper.core.errors import DataError, RunError
+from mapper.odometry.base import Diagnostics, FrameResult
+from mapper.runtime.atomic import write_text
+from mapper.sources.base import Skipped
+
+Outcome = Literal["tracked", "lost", "skipped"]
+
+_COLUMNS = (
+    "stamp_ns",
+    "outcome",
+    "node",
+    "is_keyframe",
+    "method",
+    "features",
+    "matches",
+    "inliers",
+    "residual",
+    "residual_unit",
+    "unseen",
+)
+_NOTHING = Diagnostics(features=0, matches=0, inliers=0, residual=0.0, residual_unit="", method="")
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRecord:
+    """One frame's fate.
+
+    Attributes:
+        stamp_ns: The frame's stamp.
+        outcome: "tracked", "lost" (read, but not placed) or "skipped" (could not be read).
+        node: Graph node that its pose hangs on; None unless tracked.
+        is_keyframe: The frame is that node.
+        diagnostics: How tracking went; all zero for a skipped frame.
+    """
+
+    stamp_ns: int
+    outcome: Outcome
+    node: int | None
+    is_keyframe: bool
+    diagnostics: Diagnostics
+
+
+def records_of(tracks: Iterable[FrameResult], skipped: Iterable[Skipped]) -> list[FrameRecord]:
+    """Return one record per frame, in time order."""
+    records = [
+        FrameRecord(
+            stamp_ns=track.stamp_ns,
+            outcome="lost" if track.node is None else "tracked",
+            node=track.node,
+            is_keyframe=track.is_keyframe,
+            diagnostics=track.diagnostics,
+        )
+        for track in tracks
+    ]
+    records += [FrameRecord(skip.stamp_ns, "skipped", None, False, _NOTHING) for skip in skipped]
+    return sorted(records, key=lambda record: record.stamp_ns)
+
+
+def write_records(path: Path, records: Iterable[FrameRecord]) -> None:
+    """Write CSV with a header; numbers keep every digit."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    for record in records:
+        how = record.diagnostics
+        writer.writerow(
+            [
+                record.stamp_ns,
+                record.outcome,
+                "" if record.node is None else record.node,
+                int(record.is_keyframe),
+                how.method,
+                how.features,
+                how.matches,
+                how.inliers,
+                repr(float(how.residual)),
+                how.residual_unit,
+                how.unseen,
+            ]
+        )
+    write_text(path, text.getvalue())
+
+
+def read_records(path: Path) -> list[FrameRecord]:
+    """Return the records of a CSV file.
+
+    Raises:
+        RunError: The file cannot be read.
+        DataError: It is not what ``write_records`` writes.
+    """
+    try:
+        rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read: {error.strerror}") from None
+    try:
+        return [_record(row) for row in rows]
+    except (KeyError, ValueError, TypeError) as error:
+        raise DataError(f"{path}: not a list of frames with columns {', '.join(_COLUMNS)}: {error}") from None
+
+
+def write_frame_ms(path: Path, frame_ms: Mapping[int, float]) -> None:
+    """Write how many milliseconds each frame took, by stamp."""
+    lines = [f"{stamp_ns},{ms:.3f}" for stamp_ns, ms in frame_ms.items()]
+    write_text(path, "\n".join(["stamp_ns,ms", *lines]) + "\n")
+
+
+def read_frame_ms(path: Path) -> dict[int, float]:
+    """Return what ``write_frame_ms`` wrote.
+
+    Raises:
+        RunError: The file cannot be read.
+        DataError: It is something else.
+    """
+    try:
+        rows = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()[1:]]
+        return {int(stamp_ns): float(ms) for stamp_ns, ms in rows}
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise DataError(f"{path}: not a list of stamp_ns,ms: {error}") from None
+
+
+def _record(row: dict[str, str]) -> FrameRecord:
+    outcomes: dict[str, Outcome] = {"tracked": "tracked", "lost": "lost", "skipped": "skipped"}
+    return FrameRecord(
+        stamp_ns=int(row["stamp_ns"]),
+        outcome=outcomes[row["outcome"]],
+        node=int(row["node"]) if row["node"] else None,
+        is_keyframe=row["is_keyframe"] == "1",
+        diagnostics=Diagnostics(
+            features=int(row["features"]),
+            matches=int(row["matches"]),
+            inliers=int(row["inliers"]),
+            residual=float(row["residual"]),
+            residual_unit=row["residual_unit"],
+            method=row["method"],
+            unseen=row.get("unseen", ""),  # runs of before 2026-11-21 have no such column
+        ),
+    )

@@ -1,0 +1,185 @@
+"""What a run folder says about itself."""
+
+import platform
+import sys
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, ValidationError
+
+import mapper
+from mapper.core.config import Config
+from mapper.core.errors import RunError
+from mapper.runtime.atomic import MANIFEST_NAME, write_text
+from mapper.sources.config import SourceConfig
+
+Status = Literal["building", "complete", "failed", "interrupted"]
+
+_LIBRARIES = (
+    "foxglove-sdk",
+    "gtsam",
+    "kiss-icp",
+    "mahotas",
+    "matplotlib",
+    "mcap",
+    "numba",
+    "numpy",
+    "open3d",
+    "opencv-contrib-python-headless",
+    "pydantic",
+    "rosbags",
+)
+
+
+class Log(Config):
+    """A log that was read."""
+
+    path: str
+    """Absolute."""
+    kind: str
+    fingerprint: str
+    notes: tuple[str, ...] = ()
+    """What opening the log had to leave out or assume."""
+
+
+class AppendedLog(Log):
+    """A later session of the same place."""
+
+    source: SourceConfig
+    """What of it was used; ``config.json`` tells that of the first log."""
+    shift_ns: int
+    """Nanoseconds added to its stamps."""
+    begins_ns: int
+    """Its first frame, on the run's clock."""
+
+
+class Input(Log):
+    """The log that was read, and those that were appended since."""
+
+    appended: tuple[AppendedLog, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """The logs' names."""
+        return " + ".join(Path(log.path).name for log in (self, *self.appended))
+
+
+class Counts(Config):
+    """How many of what; every listed frame is skipped, lost or tracked."""
+
+    listed: int = 0
+    read: int = 0
+    """Listed and not skipped."""
+    skipped: int = 0
+    """Could not be read; ``skipped`` says why."""
+    lost: int = 0
+    """Read, but not placed."""
+    tracked: int = 0
+    nodes: int = 0
+    factors: int = 0
+    loops: int = 0
+    """Loop closures that hold."""
+    loop_candidates: int = 0
+    leaves: int = 0
+    """Known leaves of the octree."""
+    cloud_points: int = 0
+
+
+class SkippedFrame(Config):
+    """A frame that could not be read."""
+
+    stamp_ns: int
+    reason: str
+
+
+class Solve(Config):
+    """What the back end did."""
+
+    error_before: float
+    """½ χ² of the first estimates."""
+    error_after: float
+    iterations: int
+    components: int = 1
+    """Parts of the graph that no factor ties to each other; each is solved on its own."""
+
+
+class Levelling(Config):
+    """How the world frame got its z axis and its floor."""
+
+    method: str
+    detail: str
+
+
+class Timing(Config):
+    """All that differs between two runs on the same input."""
+
+    started: str = ""
+    """UTC, ISO 8601."""
+    stage_s: dict[str, float] = Field(default_factory=dict)
+    """Wall seconds of each stage."""
+    total_s: float = 0.0
+    log_s: float = 0.0
+    """Time between the log's first and last tracked frame."""
+    frames_per_s: float = 0.0
+    """Frames read per wall second, every stage included."""
+    real_time_factor: float = 0.0
+    """Seconds of log mapped per wall second."""
+    peak_memory_mb: float = 0.0
+
+
+class Manifest(Config):
+    """``manifest.json``."""
+
+    status: Status
+    reason: str = ""
+    """Why a run failed."""
+    mapper_version: str = mapper.__version__
+    python_version: str = platform.python_version()
+    platform: str = f"{sys.platform} {platform.machine()}"
+    libraries: dict[str, str] = Field(default_factory=dict)
+    input: Input
+    counts: Counts = Counts()
+    skipped: tuple[SkippedFrame, ...] = ()
+    solve: Solve | None = None
+    levelling: Levelling | None = None
+    timing: Timing = Timing()
+
+    def save(self, path: Path) -> None:
+        """Write the manifest atomically."""
+        write_text(path, self.model_dump_json(indent=2) + "\n")
+
+
+def read_manifest(path: Path) -> Manifest:
+    """Return a folder's manifest.
+
+    Raises:
+        RunError: There is none, or it is not one that this version wrote.
+    """
+    try:
+        return Manifest.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read: {error.strerror}; is {path.parent} a run folder?") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        raise RunError(f"{path}: {name or 'manifest'}: {first['msg']}") from None
+
+
+def library_versions() -> dict[str, str]:
+    """Return the installed version of every library that can change a result."""
+    return {name: metadata.version(name) for name in _LIBRARIES}
+
+
+def now_text() -> str:
+    """Return the present moment, UTC, to the second."""
+    return datetime.now(tz=UTC).isoformat(timespec="seconds")
+
+
+def is_merged_map(folder: Path) -> bool:
+    """Tell whether a folder holds a merged map, not a run."""
+    try:
+        return '"kind": "merged map"' in (folder / MANIFEST_NAME).read_text(encoding="utf-8")[:200]
+    except (OSError, UnicodeDecodeError):
+        return False

@@ -1,0 +1,66 @@
+"""Who looks on while a map is built, without the builder knowing what they do with what they see."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from mapper.core.geometry import Transform
+from mapper.loops.detector import LoopDetector
+from mapper.odometry.base import FrameResult, Matches, Seen
+from mapper.sources.base import FrameRef
+
+if TYPE_CHECKING:
+    from mapper.mapping.fusion import Maps
+    from mapper.run.folder import Run
+    from mapper.run.results import RunResults
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """One frame has been tracked.
+
+    Attributes:
+        entry: The frame; who wants its image loads it again.
+        track: What tracking made of it.
+        view: Gives the features that it was tracked by; costs something, so not to be asked without need.
+        matches: Gives those that hold its pose, and where they were before; the same.
+        detector: The loops so far, and where nodes are believed to be with them.
+    """
+
+    entry: FrameRef
+    track: FrameResult
+    view: Callable[[], Seen]
+    matches: Callable[[], Matches | None]
+    detector: LoopDetector
+
+
+class Observer(Protocol):
+    """Whoever looks on. What they are told is not theirs to change."""
+
+    def on_frame(self, step: Step, /) -> None:
+        """See a frame that was read, in time order, in the thread that tracks."""
+        ...
+
+    def on_levelled(self, T_level_world: Transform, /) -> None:
+        """See where the odometry's world lies in the levelled one, once the graph is solved."""
+        ...
+
+    def on_mapped(self, run: "Run", results: "RunResults", maps: "Maps", /) -> None:
+        """See the results; the run's folder still has the name of one that is being built."""
+        ...
+
+
+class NullObserver:
+    """Nobody looks on."""
+
+    def on_frame(self, step: Step, /) -> None:
+        """Ignore the frame."""
+
+    def on_levelled(self, T_level_world: Transform, /) -> None:
+        """Ignore the world."""
+
+    def on_mapped(self, run: "Run", results: "RunResults", maps: "Maps", /) -> None:
+        """Ignore the results."""
+
+
+NULL_OBSERVER = NullObserver()

@@ -1,0 +1,60 @@
+"""A tracked log, ready to be told: to an MCAP file, to a viewer, or in a report."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.core.geometry import fit_rigid
+from mapper.core.timebase import MAX_TRUTH_GAP_NS, nearest
+from mapper.core.trajectory import Trajectory
+from mapper.graph.model import PoseGraph
+from mapper.loops.closure import LoopClosure
+from mapper.run.folder import Run
+from mapper.run.frame_records import FrameRecord
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunResults:
+    """A tracked log.
+
+    Attributes:
+        trajectory: Final body poses in the levelled world; at least one.
+        graph: Nodes at the solution, same world.
+        records: What became of every frame.
+        loops: Every loop candidate with its verdict.
+        frame_ms: Milliseconds that each frame took, by stamp; empty leaves them out.
+        truth: Where the body really was, laid over the trajectory, if known.
+    """
+
+    trajectory: Trajectory
+    graph: PoseGraph
+    records: Sequence[FrameRecord]
+    loops: Sequence[LoopClosure]
+    frame_ms: Mapping[int, float]
+    truth: Trajectory | None
+
+
+def load_results(run: Run) -> RunResults:
+    """Return what a run has to tell; its maps may still be missing."""
+    trajectory, truth = run.trajectory(), run.truth()
+    if truth is not None:
+        truth = aligned_truth(truth, trajectory)
+    return RunResults(trajectory, run.graph(), run.records(), run.loops(), run.frame_ms(), truth)
+
+
+def aligned_truth(truth: Trajectory, trajectory: Trajectory) -> Trajectory | None:
+    """Return the truth of the trajectory's time, moved to where it fits best.
+
+    None if they share no three stamps.
+    """
+    index, gap_ns = nearest(truth.stamps_ns, trajectory.stamps_ns)
+    near = gap_ns <= MAX_TRUTH_GAP_NS
+    if near.sum() < 3:
+        return None
+    T_level_truth, _ = fit_rigid(trajectory.positions_world[near], truth.positions_world[index[near]])
+    first_ns, last_ns = trajectory.stamps_ns[[0, -1]]
+    meanwhile = slice(
+        *np.searchsorted(truth.stamps_ns, [first_ns - MAX_TRUTH_GAP_NS, last_ns + MAX_TRUTH_GAP_NS])
+    )
+    return Trajectory(truth.stamps_ns[meanwhile], truth.T_world_body[meanwhile]).moved(T_level_truth)

@@ -1,0 +1,118 @@
+"""What a run folder keeps of tracking: written after the first pass, changed when its graph is solved."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from mapper.core.geometry import inverse
+from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.graph.g2o import write_g2o
+from mapper.graph.model import PoseGraph
+from mapper.loops.closure import LoopClosure, write_closures
+from mapper.run import files
+from mapper.run.folder import Run, RunWriter
+from mapper.run.frame_records import FrameRecord, write_frame_ms, write_records
+from mapper.run.manifest import SkippedFrame
+from mapper.sources.base import Skipped
+from mapper.sources.trajectory_files import write_tum
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredTracking:
+    """A log that has been tracked.
+
+    Attributes:
+        records: What became of every frame, in time order.
+        skipped: The frames that could not be read, and why.
+        frame_ms: Wall milliseconds that each frame took, by stamp.
+        trajectory: Body poses of the frames that were placed.
+        graph: Nodes where they are believed to be by now.
+        loops: Every loop candidate with its verdict.
+        truth: Where the body really was, if the log tells.
+    """
+
+    records: Sequence[FrameRecord]
+    skipped: Sequence[Skipped]
+    frame_ms: Mapping[int, float]
+    trajectory: Trajectory
+    graph: PoseGraph
+    loops: Sequence[LoopClosure]
+    truth: Trajectory | None
+
+    def solved(self, graph: PoseGraph, loops: Sequence[LoopClosure]) -> "StoredTracking":
+        """Return the same frames with the graph at another solution: each moves along with its node."""
+        node_of = {record.stamp_ns: record.node for record in self.records if record.node is not None}
+        before, after = self.graph.T_world_node, graph.T_world_node
+        T_after_before = {node: after[node] @ inverse(before[node]) for node in before}
+        moved = [
+            (
+                stamp_ns,
+                T_after_before[node_of[stamp_ns]] @ T_world_body if stamp_ns in node_of else T_world_body,
+            )
+            for stamp_ns, T_world_body in zip(
+                self.trajectory.stamps_ns.tolist(), self.trajectory.T_world_body, strict=True
+            )
+        ]
+        return replace(self, trajectory=trajectory_from(moved), graph=graph, loops=loops)
+
+    def then(self, later: "StoredTracking", *, truth: Trajectory | None) -> "StoredTracking":
+        """Return this log followed by a later one whose graph and loops hold those of this one already."""
+        poses = [
+            pose
+            for part in (self.trajectory, later.trajectory)
+            for pose in zip(part.stamps_ns.tolist(), part.T_world_body, strict=True)
+        ]
+        return StoredTracking(
+            records=[*self.records, *later.records],
+            skipped=[*self.skipped, *later.skipped],
+            frame_ms={**self.frame_ms, **later.frame_ms},
+            trajectory=trajectory_from(poses),
+            graph=later.graph,
+            loops=later.loops,
+            truth=truth,
+        )
+
+
+def load_tracking(run: Run) -> StoredTracking:
+    """Return what a finished run keeps."""
+    return StoredTracking(
+        records=run.records(),
+        skipped=[Skipped(frame.stamp_ns, frame.reason) for frame in run.manifest.skipped],
+        frame_ms=run.frame_ms(),
+        trajectory=run.trajectory(),
+        graph=run.graph(),
+        loops=run.loops(),
+        truth=run.truth(),
+    )
+
+
+def save_tracking(writer: RunWriter, tracked: StoredTracking) -> None:
+    """Write the files that keep it, and count what is in them; a graph without nodes is not written."""
+    folder, graph = writer.folder, tracked.graph
+    write_records(folder / files.FRAMES, tracked.records)
+    write_frame_ms(folder / files.FRAME_MS, tracked.frame_ms)
+    write_tum(folder / files.TRAJECTORY, tracked.trajectory)
+    write_closures(folder / files.LOOPS, tracked.loops)
+    if tracked.truth is not None:
+        write_tum(folder / files.TRUTH, tracked.truth)
+    if graph.T_world_node:
+        write_g2o(folder / files.GRAPH, graph)
+        keyframes = trajectory_from((graph.stamps_ns[node], T) for node, T in graph.T_world_node.items())
+        write_tum(folder / files.KEYFRAMES, keyframes)
+    outcomes = [record.outcome for record in tracked.records]
+    counts = writer.manifest.counts.model_copy(
+        update={
+            "listed": len(outcomes),
+            "read": len(outcomes) - outcomes.count("skipped"),
+            "skipped": outcomes.count("skipped"),
+            "lost": outcomes.count("lost"),
+            "tracked": outcomes.count("tracked"),
+            "nodes": len(graph.T_world_node),
+            "factors": len(graph.factors),
+            "loops": sum(loop.verdict == "accepted" for loop in tracked.loops),
+            "loop_candidates": len(tracked.loops),
+        }
+    )
+    writer.update(
+        counts=counts,
+        skipped=tuple(SkippedFrame(stamp_ns=s.stamp_ns, reason=s.reason) for s in tracked.skipped),
+    )

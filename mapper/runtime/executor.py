@@ -1,0 +1,316 @@
+"""Jobs on processes of this machine, or on a Dask cluster; a worker that dies takes one job with it.
+
+Every local worker is a process of its own with one job at a time, so it is known which job killed it. A Dask
+cluster has to run the same version of this package on the same files: its workers see a shared file system.
+"""
+
+import logging
+import os
+import pickle
+import re
+import signal
+import threading
+import traceback
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
+
+from mapper.core.errors import ConfigError, DependencyError, MapperError
+from mapper.runtime.threads import one_thread_per_library
+
+if TYPE_CHECKING:
+    from distributed import Future
+
+R = TypeVar("R")
+Job = Callable[[], Any]
+
+_ANSWER_S = 10.0
+_ADDRESS = re.compile(r"(tcp|tls|wss?)://.+:\d+")
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """What became of a job that did not finish.
+
+    Attributes:
+        reason: One line: a MapperError's message, another exception's type, message and place, or what
+            ended the worker.
+        attempts: How often the job was begun.
+    """
+
+    reason: str
+    attempts: int
+
+
+def run_jobs(
+    jobs: Sequence[Callable[[], R]],
+    *,
+    processes: int = 1,
+    scheduler: str | None = None,
+    attempts: int = 2,
+    crew: "Crew | None" = None,
+) -> Iterator[tuple[int, R | Failure]]:
+    """Yield the index of each job and its result as they finish, in any order.
+
+    A job that raises, or whose worker dies, is tried again after the others; the others go on. Leaving the
+    iterator early, as Ctrl-C does, ends local workers at once; a Dask worker finishes what it has begun.
+
+    Args:
+        jobs: Callables that can be pickled: a ``functools.partial`` of a module's function, or a frozen
+            dataclass with ``__call__``. Their results travel through a pipe, so big ones belong in files.
+        processes: Workers on this machine, each with one thread per library; 1 works in this process.
+        scheduler: Address of a Dask scheduler, ``tcp://host:8786``; replaces ``processes``.
+        attempts: How often a job is begun before it is given up. Dask itself begins a job whose worker died
+            again on others, as its ``allowed-failures`` says.
+        crew: Workers that were hired before and stay for more; replaces ``processes`` and ``scheduler``.
+
+    Raises:
+        ConfigError: A number is not positive, or the scheduler does not answer, has no workers or went away.
+        DependencyError: There is a scheduler, but Dask's ``distributed`` is not installed.
+    """
+    if attempts < 1:
+        raise ConfigError(f"attempts: {attempts}, want at least 1")
+    if not jobs:
+        return
+    with hired(scheduler, min(processes, len(jobs))) if crew is None else nullcontext(crew) as crew:
+        waiting, begun = deque(range(len(jobs))), Counter[int]()
+        in_hand = 0
+        while waiting or in_hand:
+            while waiting and in_hand < crew.size():
+                index = waiting.popleft()
+                crew.begin(index, jobs[index])
+                in_hand += 1
+            index, outcome = crew.next_done()
+            in_hand -= 1
+            if isinstance(outcome, Failure):
+                begun[index] += outcome.attempts
+                if begun[index] < attempts:
+                    waiting.append(index)
+                    continue
+                outcome = Failure(outcome.reason, begun[index])
+            yield index, outcome
+
+
+class Crew(Protocol):
+    """Whoever does the work; takes no more jobs at once than its size. Leaving it ends the work."""
+
+    def __enter__(self) -> Self: ...
+    def __exit__(self, *_: object) -> None: ...
+
+    def size(self) -> int:
+        """Return how many jobs can be in hand at once."""
+        ...
+
+    def begin(self, index: int, job: Job) -> None:
+        """Begin a job."""
+        ...
+
+    def next_done(self) -> tuple[int, Any]:
+        """Wait for a job, and return its index and its result or Failure."""
+        ...
+
+
+def hired(scheduler: str | None, processes: int) -> Crew:
+    """Return workers for several lists of jobs, one after the other; see ``run_jobs``."""
+    if processes < 1:
+        raise ConfigError(f"processes: {processes}, want at least 1")
+    if scheduler is not None:
+        return _Cluster(scheduler)
+    return _Processes(processes) if processes > 1 else _Here()
+
+
+def _attempt(job: Job) -> Any:
+    """Return a job's result, or the Failure that it came to."""
+    try:
+        return job()
+    except Exception as error:
+        return Failure(_reason(error), 1)
+
+
+def _reason(error: BaseException) -> str:
+    message = " ".join(str(error).split())
+    if isinstance(error, MapperError):
+        return "; ".join([message, *getattr(error, "__notes__", ())])
+    where = traceback.extract_tb(error.__traceback__)
+    place = f" ({Path(where[-1].filename).name}:{where[-1].lineno})" if where else ""
+    return f"{type(error).__name__}: {message}{place}"
+
+
+class _Here(AbstractContextManager["_Here"]):
+    """This very process."""
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def size(self) -> int:
+        return 1
+
+    def begin(self, index: int, job: Job) -> None:
+        self._index, self._job = index, job
+
+    def next_done(self) -> tuple[int, Any]:
+        return self._index, _attempt(self._job)
+
+
+class _Processes(AbstractContextManager["_Processes"]):
+    """Processes on this machine, begun when there is work for them and replaced when they die."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._idle: list[_Worker] = []
+        self._busy: dict[Connection, tuple[_Worker, int]] = {}
+
+    def __exit__(self, *_: object) -> None:
+        for worker in [*self._idle, *(worker for worker, _ in self._busy.values())]:
+            worker.kill()
+
+    def size(self) -> int:
+        return self._count
+
+    def begin(self, index: int, job: Job) -> None:
+        worker = self._idle.pop() if self._idle else _Worker()
+        with suppress(BrokenPipeError):  # it died while idle; next_done will find the pipe closed
+            worker.connection.send(job)
+        self._busy[worker.connection] = worker, index
+
+    def next_done(self) -> tuple[int, Any]:
+        connection = wait(list(self._busy))[0]
+        assert isinstance(connection, Connection)
+        worker, index = self._busy.pop(connection)
+        try:
+            outcome = connection.recv()
+        except (EOFError, ConnectionError):
+            return index, Failure(worker.autopsy(), 1)
+        self._idle.append(worker)
+        return index, outcome
+
+
+class _Worker:
+    """A spawned process that does the jobs sent to it, one at a time, and dies with whoever began it."""
+
+    def __init__(self) -> None:
+        context = get_context("spawn")  # a forked copy of a process with threads may hang
+        self.connection, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
+        self._process.start()
+        theirs.close()  # so that the pipe ends with the process
+
+    def kill(self) -> None:
+        """End the process, whatever it does."""
+        self._process.kill()
+        self._process.join()
+        self.connection.close()
+
+    def autopsy(self) -> str:
+        """Return what the process died of, after its end of the pipe has closed."""
+        self._process.join()
+        self.connection.close()
+        code = self._process.exitcode or 0
+        if code < 0:
+            return f"its worker was killed by {signal.Signals(-code).name}"
+        return f"its worker ended with exit status {code}"
+
+
+def _serve(connection: Connection) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
+    one_thread_per_library()
+    threading.Thread(target=_die_with_the_parent, daemon=True).start()
+    while True:
+        try:
+            packed = connection.recv_bytes()
+        except EOFError:
+            return
+        outcome = _attempt(partial(_unpacked, packed))
+        try:
+            connection.send(outcome)
+        except (pickle.PicklingError, TypeError, AttributeError) as error:
+            connection.send(Failure(_reason(error), 1))
+
+
+def _unpacked(packed: bytes) -> Any:
+    return pickle.loads(packed)()
+
+
+def _die_with_the_parent() -> None:
+    """A parent that was killed cannot end its workers, and a second sweep must not find them at work."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+class _Cluster(AbstractContextManager["_Cluster"]):
+    """The workers of a Dask scheduler."""
+
+    def __init__(self, scheduler: str) -> None:
+        if not _ADDRESS.fullmatch(scheduler):  # Dask itself would try for a while before it said so
+            raise ConfigError(f"scheduler {scheduler!r}: not an address; want tcp://HOST:PORT")
+        try:
+            import distributed
+        except ImportError:
+            raise DependencyError(
+                "a Dask scheduler needs an extra that is not installed: pip install 'mapper[cluster]'"
+            ) from None
+        self._scheduler, self._killed = scheduler, distributed.KilledWorker
+        logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what matters is raised here
+        try:
+            self._client = distributed.Client(scheduler, timeout=_ANSWER_S, set_as_default=False)
+        except OSError:
+            raise ConfigError(
+                f"{scheduler}: no Dask scheduler answers there within {_ANSWER_S:g} s; is it running?"
+            ) from None
+        try:
+            self._client.wait_for_workers(1, timeout=_ANSWER_S)
+        except TimeoutError:
+            self._client.close()
+            raise ConfigError(
+                f"{scheduler}: no worker has joined it; start some: dask worker {scheduler} --nthreads 1"
+            ) from None
+        self._done = distributed.as_completed(loop=self._client.loop)
+        self._index_of: dict[Future[Any], int] = {}
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(OSError, TimeoutError):
+            self._client.close(timeout=_ANSWER_S)
+
+    def size(self) -> int:
+        try:
+            threads: dict[str, int] = self._client.nthreads()
+        except OSError:
+            raise self._gone() from None
+        return max(sum(threads.values()), 1)
+
+    def begin(self, index: int, job: Job) -> None:
+        future = self._client.submit(_attempt_with_limits, job, pure=False)
+        self._index_of[future] = index
+        self._done.add(future)
+
+    def next_done(self) -> tuple[int, Any]:
+        future = next(self._done)
+        index = self._index_of.pop(future)
+        if future.cancelled():
+            raise self._gone()
+        try:
+            error = future.exception()
+            if error is None:
+                return index, future.result()
+        except OSError:
+            raise self._gone() from None
+        if isinstance(error, self._killed):
+            begun = error.allowed_failures + 1
+            return index, Failure(f"its worker died, {begun} of {begun} times; its log may say why", begun)
+        return index, Failure(_reason(error), 1)
+
+    def _gone(self) -> ConfigError:
+        return ConfigError(f"{self._scheduler}: the Dask scheduler went away before all jobs were done")
+
+
+def _attempt_with_limits(job: Job) -> Any:
+    one_thread_per_library()
+    return _attempt(job)

@@ -1,0 +1,45 @@
+"""How a sensor's depth scatters."""
+
+import math
+from typing import TYPE_CHECKING, Self
+
+from pydantic import NonNegativeFloat, model_validator
+
+from mapper.core.config import Config
+
+if TYPE_CHECKING:
+    from mapper.core.geometry import Array
+
+
+class DepthNoiseConfig(Config):
+    """σ_z = a + b·z + c·z², as ``mapper sensor depth`` fits it to planes.
+
+    A sensor that triangulates has a = b = 0 and c = σ_disparity / bf (Khoshelham & Elberink 2012, eq. 10).
+    """
+
+    constant_m: NonNegativeFloat = 0.0
+    """a."""
+    linear: float = 0.0
+    """b, metres per metre."""
+    quadratic_per_m: NonNegativeFloat = 0.0
+    """c, metres per square metre."""
+
+    @model_validator(mode="after")
+    def _is_positive(self) -> Self:
+        least = -2.0 * math.sqrt(self.constant_m * self.quadratic_per_m)
+        some = max(self.constant_m, self.linear, self.quadratic_per_m) > 0.0
+        if not some or self.linear < least or (self.linear == least and least < 0.0):
+            raise ValueError(f"σ_z = {self.text} m is not > 0 at every depth; leave the noise out instead")
+        return self
+
+    @property
+    def text(self) -> str:
+        """The formula, in metres."""
+        terms = {"": self.constant_m, "·z": self.linear, "·z²": self.quadratic_per_m}
+        signed = [f"{'−' if value < 0.0 else '+'} {abs(value):.3g}{z}" for z, value in terms.items() if value]
+        return " ".join(signed).removeprefix("+ ") or "0"
+
+    def sigma_m(self, depth_m: "Array") -> "Array":
+        """Return the standard deviation of depths in metres."""
+        sigma: Array = self.constant_m + depth_m * (self.linear + depth_m * self.quadratic_per_m)
+        return sigma

@@ -1,0 +1,74 @@
+"""Wheel odometry: from encoders and steering to poses, and the pose at any time in between."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from mapper.core.geometry import Array, Transform, exp, interpolate
+from mapper.core.timebase import Stamps
+from mapper.core.trajectory import Trajectory
+
+
+def driven(stamps_ns: Stamps, path_m: Array, steering_rad: Array, *, wheelbase_m: float) -> Trajectory:
+    """Integrate the bicycle model: the turn per metre is tan(steering) / wheelbase (LaValle 2006, §13.1.2.1).
+
+    Between two readings the turn per metre is the mean of theirs, so that the way is an arc.
+
+    Args:
+        stamps_ns: (N,) increasing times of the readings.
+        path_m: (N,) driven by the rear axle since whenever the encoder began; less when driving back.
+        steering_rad: (N,) angle of the front wheel, to the left positive.
+        wheelbase_m: Distance between the axles.
+
+    Returns:
+        T_odom_base of the middle of the rear axle, x forward, y left, z up; it begins at the identity.
+    """
+    curvature_rad_per_m = np.tan(steering_rad) / wheelbase_m
+    T_odom_base = [np.eye(4)]
+    for (begin_m, end_m), (begin, end) in zip(pairwise(path_m), pairwise(curvature_rad_per_m), strict=True):
+        step_m = end_m - begin_m
+        turn_rad = 0.5 * (begin + end) * step_m
+        step = exp(np.array([0.0, 0.0, turn_rad]), np.array([step_m, 0.0, 0.0]))
+        T_odom_base.append(T_odom_base[-1] @ step)
+    return Trajectory(stamps_ns, np.array(T_odom_base))
+
+
+def pose_at(wheels: Trajectory, stamp_ns: int, *, max_gap_ns: int) -> Transform | None:
+    """Return T_odom_body at a time; None outside the readings, or in a gap of more than ``max_gap_ns``."""
+    after = int(np.searchsorted(wheels.stamps_ns, stamp_ns))
+    if after == len(wheels):
+        return None
+    end_ns = int(wheels.stamps_ns[after])
+    if end_ns == stamp_ns:
+        exact: Transform = wheels.T_world_body[after]
+        return exact
+    if after == 0:
+        return None
+    begin_ns = int(wheels.stamps_ns[after - 1])
+    if end_ns - begin_ns > max_gap_ns:
+        return None
+    fraction = (stamp_ns - begin_ns) / (end_ns - begin_ns)
+    return interpolate(wheels.T_world_body[after - 1], wheels.T_world_body[after], fraction)
+
+
+class Odometer:
+    """Counts the metres that wheels drove and the radians they turned, to and fro."""
+
+    def __init__(self, wheels: Trajectory) -> None:
+        """Add up the ways between the poses."""
+        steps_m = np.linalg.norm(np.diff(wheels.positions_world, axis=0), axis=1)
+        chords = np.linalg.norm(np.diff(wheels.T_world_body[:, :3, :3], axis=0), axis=(1, 2))
+        steps_rad = 2.0 * np.arcsin(
+            np.minimum(chords / np.sqrt(8.0), 1.0)
+        )  # |R_a − R_b|_F = √8 sin(angle / 2)
+        self._start_ns = int(wheels.stamps_ns[0])  # nanoseconds since 1970 are too many for a float
+        self._since_start_ns = (wheels.stamps_ns - self._start_ns).astype(np.float64)
+        self._counts = [np.concatenate([[0.0], np.cumsum(steps)]) for steps in (steps_m, steps_rad)]
+
+    def between(self, begin_ns: int, end_ns: int) -> tuple[float, float]:
+        """Return the metres driven and the radians turned from one time to a later one."""
+        span_ns = np.array([begin_ns - self._start_ns, end_ns - self._start_ns], dtype=np.float64)
+        path_m, turn_rad = (
+            np.diff(np.interp(span_ns, self._since_start_ns, count)) for count in self._counts
+        )
+        return float(path_m[0]), float(turn_rad[0])

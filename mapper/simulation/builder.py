@@ -1,0 +1,146 @@
+"""Collects boxes and what each of their faces looks like."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.core.frames import Image
+from mapper.core.geometry import Array
+from mapper.simulation.boxes import Boxes
+
+FACES = 6
+"""−x, +x, −y, +y, −z, +z in the box's own axes; face 2·axis + side."""
+
+_SHADE_BELOW, _SHADE_UPRIGHT, _SHADE_ABOVE = 0.78, 0.86, 1.0
+_SHADE_SWING, _LIGHT_YAW_RAD = 0.10, 0.9
+"""Light comes from above and a little from one side."""
+
+
+@dataclass(frozen=True, slots=True)
+class Skin:
+    """How a texture lies on a face.
+
+    Attributes:
+        texture: Index in the atlas.
+        px_per_m: Scale; None stretches the image over the whole face.
+        offset_m: Where the face's top left corner lies in the image, columns and rows, metres.
+    """
+
+    texture: int
+    px_per_m: float | None = None
+    offset_m: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Faces:
+    """Affine texture maps of N boxes' faces: texel = scale · metres from the face's top left + offset.
+
+    Attributes:
+        textures: (N, 6) int64 index in the atlas.
+        scales: (N, 6, 2) float64 texels per metre along columns and rows.
+        offsets: (N, 6, 2) float64 texels.
+        shades: (N, 6) float64 brightness.
+    """
+
+    textures: NDArray[np.int64]
+    scales: Array
+    offsets: Array
+    shades: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A piece of furniture's own frame: its middle on the floor, and its turn."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+
+    def world(self, x_m: float, y_m: float) -> tuple[float, float]:
+        """Return the world x and y of a point of the piece's frame."""
+        cosine, sine = float(np.cos(self.yaw_rad)), float(np.sin(self.yaw_rad))
+        return self.x_m + cosine * x_m - sine * y_m, self.y_m + sine * x_m + cosine * y_m
+
+
+ORIGIN = Place(0.0, 0.0, 0.0)
+
+
+@dataclass(slots=True)
+class Builder:
+    """The world while it is being furnished."""
+
+    textures: list[Image] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
+    rows: list[tuple[float, ...]] = field(default_factory=list)
+    skins: list[tuple[Skin, ...]] = field(default_factory=list)
+
+    def texture(self, image: Image) -> int:
+        """Take an image in and return its index."""
+        self.textures.append(image)
+        return len(self.textures) - 1
+
+    def box(
+        self,
+        name: str,
+        place: Place,
+        *,
+        low: Sequence[float],
+        size: Sequence[float],
+        skin: Skin,
+        faces: dict[int, Skin] | None = None,
+        turn_rad: float = 0.0,
+    ) -> None:
+        """Add one box.
+
+        Args:
+            name: What it is part of.
+            place: Frame in which ``low`` is given.
+            low: The corner with the smallest x, y, z, metres.
+            size: Extent along x, y, z, metres.
+            skin: Look of every face that ``faces`` does not name.
+            faces: Other looks, by face number.
+            turn_rad: Turn of this box about its own vertical, besides the place's.
+        """
+        cx, cy = place.world(low[0] + size[0] / 2.0, low[1] + size[1] / 2.0)
+        halves = tuple(extent / 2.0 for extent in size)
+        self.names.append(name)
+        self.rows.append((cx, cy, low[2] + halves[2], *halves, place.yaw_rad + turn_rad))
+        self.skins.append(tuple((faces or {}).get(face, skin) for face in range(FACES)))
+
+    def boxes(self) -> Boxes:
+        """Return the solids."""
+        table = np.array(self.rows, dtype=np.float64).reshape(-1, 7)
+        return Boxes(tuple(self.names), table[:, :3].copy(), table[:, 3:6].copy(), table[:, 6].copy())
+
+    def faces(self) -> Faces:
+        """Return the texture maps, in the order of the solids."""
+        n = len(self.names)
+        textures = np.zeros((n, FACES), dtype=np.int64)
+        scales, offsets = np.zeros((n, FACES, 2)), np.zeros((n, FACES, 2))
+        for i, (row, skins) in enumerate(zip(self.rows, self.skins, strict=True)):
+            for face, skin in enumerate(skins):
+                textures[i, face] = skin.texture
+                size_m = 2.0 * np.array(face_halves(np.array(row[3:6]), face))
+                if skin.px_per_m is None:
+                    height, width = self.textures[skin.texture].shape[:2]
+                    scales[i, face] = np.array([width, height]) / size_m
+                else:
+                    scales[i, face] = skin.px_per_m
+                    offsets[i, face] = skin.px_per_m * np.array(skin.offset_m)
+        return Faces(textures, scales, offsets, _shades(np.array(self.rows)[:, 6]))
+
+
+def face_halves(halves: Array, face: int) -> tuple[float, float]:
+    """Return half a face's extent along its texture's columns and rows, metres."""
+    axis = face // 2
+    return (halves[1] if axis == 0 else halves[0]), (halves[1] if axis == 2 else halves[2])
+
+
+def _shades(yaws_rad: Array) -> Array:
+    shades = np.empty((len(yaws_rad), FACES))
+    for face, normal_rad in enumerate((np.pi, 0.0, -np.pi / 2, np.pi / 2)):
+        shades[:, face] = _SHADE_UPRIGHT + _SHADE_SWING * np.cos(yaws_rad + normal_rad - _LIGHT_YAW_RAD)
+    shades[:, 4], shades[:, 5] = _SHADE_BELOW, _SHADE_ABOVE
+    return shades

@@ -1,0 +1,231 @@
+"""Pieces of furniture, each built of boxes in its own frame.
+
+In a piece's frame x runs along its width, +y is its front, z is up; the origin is the middle of its
+footprint.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.simulation.builder import Builder, Place
+from mapper.simulation.workshop import Workshop
+
+_FRONT, _TOP = 3, 5
+_BOARD_M = 0.03
+
+
+@dataclass(frozen=True, slots=True)
+class Studio:
+    """What every piece needs to be built."""
+
+    builder: Builder
+    shop: Workshop
+    rng: np.random.Generator
+
+
+Size = tuple[float, float, float]
+"""Width, depth, height in metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A kind of furniture.
+
+    Attributes:
+        name: What its boxes are called.
+        smallest: Smallest size.
+        largest: Largest size.
+        build: Adds the boxes of one piece of a given size.
+        at_wall: It stands with its back to a wall; otherwise anywhere, turned any way.
+    """
+
+    name: str
+    smallest: Size
+    largest: Size
+    build: Callable[[Studio, Place, Size], None]
+    at_wall: bool
+
+
+def shelf(studio: Studio, place: Place, size: Size) -> None:
+    """A bookcase with books of many heights."""
+    width, depth, height = size
+    box, rng, skin = studio.builder.box, studio.rng, studio.shop.wood()
+    for left in (-width / 2, width / 2 - _BOARD_M):
+        box("shelf", place, low=(left, -depth / 2, 0), size=(_BOARD_M, depth, height), skin=skin)
+    inner = width - 2 * _BOARD_M
+    box("shelf", place, low=(-inner / 2, -depth / 2, 0), size=(inner, 0.01, height), skin=studio.shop.wood())
+    boards = int(height / 0.36)
+    for z in np.linspace(0.06, height - _BOARD_M, boards):
+        box(
+            "shelf",
+            place,
+            low=(-inner / 2, -depth / 2 + 0.01, z),
+            size=(inner, depth - 0.01, _BOARD_M),
+            skin=skin,
+        )
+        if z > height - 0.2:
+            break
+        left = -inner / 2
+        while left < inner / 2 - 0.1:
+            wide = min(float(rng.uniform(0.1, 0.32)), inner / 2 - left)
+            row = (wide, float(rng.uniform(0.5, 0.85)) * depth, float(rng.uniform(0.17, 0.27)))
+            if rng.random() < 0.85:
+                low = (left, -depth / 2 + 0.012, z + _BOARD_M)
+                spines = {_FRONT: studio.shop.books((row[0], row[2]))}
+                box("books", place, low=low, size=row, skin=studio.shop.paint(), faces=spines)
+            left += wide + 0.004
+
+
+def cabinet(studio: Studio, place: Place, size: Size) -> None:
+    """A sideboard or a wardrobe; a low one has things on it."""
+    width, depth, height = size
+    columns, rows = max(round(width / 0.5), 1), (1 if height > 1.5 else int(studio.rng.integers(1, 4)))
+    front = studio.shop.front((width, height - 0.06), columns=columns, rows=rows)
+    low = (-width / 2, -depth / 2, 0.06)
+    body = (width, depth, height - 0.06)
+    studio.builder.box("cabinet", place, low=low, size=body, skin=studio.shop.wood(), faces={_FRONT: front})
+    foot = (width - 0.06, depth - 0.06, 0.06)
+    studio.builder.box(
+        "cabinet", place, low=(low[0] + 0.03, low[1] + 0.03, 0), size=foot, skin=studio.shop.paint()
+    )
+    _clutter(studio, place, size, count=6)
+
+
+def desk(studio: Studio, place: Place, size: Size) -> None:
+    """A desk with drawers, a monitor, papers, and what else lies about."""
+    width, depth, height = size
+    _table_frame(studio, place, size, name="desk")
+    box, shop = studio.builder.box, studio.shop
+    drawers = (0.4, depth - 0.1, height - 0.1)
+    front = shop.front((drawers[0], drawers[2]), columns=1, rows=3)
+    low = (width / 2 - 0.5, -depth / 2 + 0.05, 0.04)
+    box("desk", place, low=low, size=drawers, skin=shop.wood(), faces={_FRONT: front})
+    stand, panel = (0.22, 0.18, 0.015), (0.55, 0.04, 0.34)
+    box("monitor", place, low=(-0.11, -0.28, height), size=stand, skin=shop.paint())
+    box("monitor", place, low=(-0.02, -0.22, height + 0.015), size=(0.04, 0.03, 0.1), skin=shop.paint())
+    faces = {_FRONT: shop.screen((panel[0], panel[2]))}
+    box("monitor", place, low=(-0.275, -0.2, height + 0.1), size=panel, skin=shop.paint(), faces=faces)
+    keyboard = (0.44, 0.15, 0.02)
+    faces = {_TOP: shop.document((keyboard[0], keyboard[1]))}
+    box("keyboard", place, low=(-0.22, 0.08, height), size=keyboard, skin=shop.paint(), faces=faces)
+    _clutter(studio, place, size, count=12)
+
+
+def table(studio: Studio, place: Place, size: Size) -> None:
+    """A table with a few things on it."""
+    _table_frame(studio, place, size, name="table")
+    _clutter(studio, place, size, count=7)
+
+
+def chair(studio: Studio, place: Place, size: Size) -> None:
+    """Four legs, a seat, a back."""
+    width, depth, height = size
+    seat_m = 0.46
+    _legs(studio, place, (width, depth, seat_m), name="chair")
+    box, fabric = studio.builder.box, studio.shop.fabric()
+    box("chair", place, low=(-width / 2, -depth / 2, seat_m), size=(width, depth, 0.05), skin=fabric)
+    for z, high in ((seat_m + 0.15, 0.1), (height - 0.18, 0.18)):
+        box("chair", place, low=(-width / 2, -depth / 2, z), size=(width, 0.03, high), skin=fabric)
+    for left in (-width / 2, width / 2 - 0.03):
+        post = (0.03, 0.029, height - seat_m - 0.05)
+        box("chair", place, low=(left, -depth / 2 + 0.001, seat_m + 0.05), size=post, skin=studio.shop.wood())
+
+
+def sofa(studio: Studio, place: Place, size: Size) -> None:
+    """A sofa with cushions."""
+    width, depth, height = size
+    box, shop, fabric = studio.builder.box, studio.shop, studio.shop.fabric()
+    box("sofa", place, low=(-width / 2, -depth / 2, 0.08), size=(width, depth, 0.32), skin=fabric)
+    box("sofa", place, low=(-width / 2, -depth / 2, 0.4), size=(width, 0.2, height - 0.4), skin=fabric)
+    for left in (-width / 2, width / 2 - 0.16):
+        box("sofa", place, low=(left, -depth / 2 + 0.2, 0.4), size=(0.16, depth - 0.2, 0.2), skin=fabric)
+    for left in np.linspace(-width / 2 + 0.2, width / 2 - 0.6, 3):
+        turn = float(studio.rng.uniform(-0.3, 0.3))
+        low = (float(left), -depth / 2 + 0.26, 0.4)
+        box("cushion", place, low=low, size=(0.38, 0.12, 0.36), skin=shop.fabric(), turn_rad=turn)
+
+
+def cartons(studio: Studio, place: Place, size: Size) -> None:
+    """A crooked pile of cardboard boxes."""
+    width, depth, height = size
+    z = 0.0
+    while z < height - 0.2:
+        high = float(studio.rng.uniform(0.2, 0.35))
+        scale = float(studio.rng.uniform(0.6, 0.75))
+        side = (scale * width, scale * depth, high)
+        _carton(studio, place, (0.0, 0.0, z), side)
+        z += high
+
+
+PIECES = (
+    Piece("shelf", (0.8, 0.26, 1.6), (1.3, 0.32, 2.1), shelf, at_wall=True),
+    Piece("cabinet", (0.8, 0.38, 0.7), (1.4, 0.5, 1.1), cabinet, at_wall=True),
+    Piece("wardrobe", (0.9, 0.5, 1.8), (1.4, 0.6, 2.1), cabinet, at_wall=True),
+    Piece("desk", (1.2, 0.6, 0.7), (1.6, 0.7, 0.78), desk, at_wall=True),
+    Piece("sofa", (1.5, 0.75, 0.7), (1.9, 0.85, 0.85), sofa, at_wall=True),
+    Piece("shelf", (0.8, 0.26, 0.8), (1.2, 0.32, 1.2), shelf, at_wall=True),
+    Piece("cartons", (0.5, 0.45, 0.5), (0.7, 0.6, 1.1), cartons, at_wall=False),
+    Piece("chair", (0.42, 0.42, 0.86), (0.48, 0.46, 0.98), chair, at_wall=False),
+    Piece("table", (0.6, 0.5, 0.5), (0.9, 0.7, 0.74), table, at_wall=False),
+)
+
+
+def _table_frame(studio: Studio, place: Place, size: Size, *, name: str) -> None:
+    width, depth, height = size
+    _legs(studio, place, (width - 0.04, depth - 0.04, height - 0.04), name=name)
+    low = (-width / 2, -depth / 2, height - 0.04)
+    studio.builder.box(name, place, low=low, size=(width, depth, 0.04), skin=studio.shop.wood())
+
+
+def _legs(studio: Studio, place: Place, size: Size, *, name: str) -> None:
+    width, depth, height = size
+    skin = studio.shop.wood()
+    for left in (-width / 2, width / 2 - 0.045):
+        for back in (-depth / 2, depth / 2 - 0.045):
+            studio.builder.box(name, place, low=(left, back, 0), size=(0.045, 0.045, height), skin=skin)
+
+
+def _clutter(studio: Studio, place: Place, size: Size, *, count: int) -> None:
+    """Books, papers, cups and cartons on a top of the given size, in cells so that none collide."""
+    width, depth, height = size
+    columns = max(int(width / 0.24), 1)
+    rows = max(int(depth / 0.24), 1)
+    cells = studio.rng.permutation(columns * rows)[:count]
+    for cell in cells:
+        x = -width / 2 + (cell % columns + 0.5) * width / columns
+        y = -depth / 2 + (cell // columns + 0.5) * depth / rows
+        kind = studio.rng.integers(4)
+        if kind == 0:
+            _carton(studio, place, (x, y, height), (0.16, 0.13, float(studio.rng.uniform(0.08, 0.22))))
+        elif kind == 1:
+            cup = (0.07, 0.07, float(studio.rng.uniform(0.08, 0.2)))
+            low = (x - 0.035, y - 0.035, height)
+            studio.builder.box("cup", place, low=low, size=cup, skin=studio.shop.fabric(), turn_rad=0.4)
+        elif kind == 2:
+            _sheet(studio, place, (x, y, height), (0.15, 0.2, 0.002))
+        else:
+            z = height
+            for _ in range(int(studio.rng.integers(1, 5))):
+                thick = float(studio.rng.uniform(0.015, 0.04))
+                _sheet(studio, place, (x, y, z), (0.14, 0.19, thick))
+                z += thick
+
+
+def _carton(studio: Studio, place: Place, base: tuple[float, float, float], size: Size) -> None:
+    x, y, z = base
+    faces = {face: studio.shop.carton((size[0], size[2])) for face in (1, 2, _FRONT)}
+    faces[_TOP] = studio.shop.carton((size[0], size[1]))
+    turn, low = float(studio.rng.uniform(-0.5, 0.5)), (x - size[0] / 2, y - size[1] / 2, z)
+    studio.builder.box("carton", place, low=low, size=size, skin=faces[1], faces=faces, turn_rad=turn)
+
+
+def _sheet(studio: Studio, place: Place, base: tuple[float, float, float], size: Size) -> None:
+    x, y, z = base
+    cover = (
+        studio.shop.poster((size[0], size[1])) if size[2] > 0.01 else studio.shop.document((size[0], size[1]))
+    )
+    turn, low = float(studio.rng.uniform(-0.6, 0.6)), (x - size[0] / 2, y - size[1] / 2, z)
+    skin = studio.shop.paint()
+    studio.builder.box("paper", place, low=low, size=size, skin=skin, faces={_TOP: cover}, turn_rad=turn)

@@ -1,0 +1,89 @@
+"""What a spinning LiDAR measures: rings of ranges, with noise, losses, times and its own motion in them.
+
+The lidar frame has x forward, y left, z up. A sweep begins looking back and turns clockwise seen from
+above; its stamp is when it begins, so times are never negative.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.core.errors import DataError
+from mapper.core.frames import Points32, Scan
+from mapper.core.geometry import Array, Transform
+from mapper.simulation.config import LidarSensorConfig
+from mapper.simulation.lidar.cast import cast
+from mapper.simulation.lidar.scene import OutdoorScene
+
+
+def firing_times_s(sensor: LidarSensorConfig) -> Array:
+    """Return (A,) seconds after the stamp at which the columns of a sweep are fired."""
+    times: Array = np.linspace(0.0, sensor.sweep_s, sensor.azimuth_steps, endpoint=False)
+    return times
+
+
+def ray_directions(sensor: LidarSensorConfig) -> Array:
+    """Return (A, E, 3) unit vectors in the lidar frame: columns in the order of firing, rings from below."""
+    steps = np.arange(sensor.azimuth_steps) + 0.5
+    azimuth = (np.pi - 2.0 * np.pi * steps / sensor.azimuth_steps)[:, None]
+    elevation = np.linspace(sensor.lowest_ring_rad, sensor.highest_ring_rad, sensor.rings)[None, :]
+    flat, up = np.cos(elevation), np.broadcast_to(np.sin(elevation), (sensor.azimuth_steps, sensor.rings))
+    return np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, up], axis=2)
+
+
+def render_sweep(
+    scene: OutdoorScene,
+    sensor: LidarSensorConfig,
+    T_world_lidar: Array,
+    rng: np.random.Generator,
+    *,
+    stamp_ns: int = 0,
+) -> Scan:
+    """Return the scan of a sensor that moves while it turns: every point as it was seen when it was fired.
+
+    Args:
+        scene: The world.
+        sensor: The LiDAR.
+        T_world_lidar: (A, 4, 4) its pose when each column is fired.
+        rng: This scan's own noise.
+        stamp_ns: When the sweep begins.
+
+    Raises:
+        DataError: Another number of poses than columns.
+    """
+    if T_world_lidar.shape != (sensor.azimuth_steps, 4, 4):
+        raise DataError(
+            f"sweep: poses {T_world_lidar.shape}, want one a column: ({sensor.azimuth_steps}, 4, 4)"
+        )
+    points_lidar, returned = _measure(scene, sensor, T_world_lidar, rng)
+    columns = np.nonzero(returned)[0]
+    times_s = firing_times_s(sensor)[columns].astype(np.float32)
+    return Scan(stamp_ns, points_lidar, times_s=times_s)
+
+
+def render_scan(
+    scene: OutdoorScene,
+    sensor: LidarSensorConfig,
+    T_world_lidar: Transform,
+    rng: np.random.Generator,
+    *,
+    stamp_ns: int = 0,
+) -> Scan:
+    """Return the scan of a sensor that stands still at a (4, 4) pose; its points have no times."""
+    poses = np.broadcast_to(T_world_lidar, (sensor.azimuth_steps, 4, 4))
+    return Scan(stamp_ns, _measure(scene, sensor, poses, rng)[0])
+
+
+def _measure(
+    scene: OutdoorScene, sensor: LidarSensorConfig, T_world_lidar: Array, rng: np.random.Generator
+) -> tuple[Points32, NDArray[np.bool_]]:
+    """Return the points (N, 3) of all returns, and which of (A, E) rays returned."""
+    rays_lidar = ray_directions(sensor)
+    rays_world = np.ascontiguousarray(rays_lidar @ T_world_lidar[:, :3, :3].transpose(0, 2, 1))
+    origins_world = np.ascontiguousarray(T_world_lidar[:, :3, 3])
+    ranges_m = cast(scene.world, origins_world, rays_world, sensor.max_range_m)
+    # Every ray has its own noise, so that what one ray meets does not change another's.
+    noise_m = sensor.range_noise_m * rng.standard_normal(ranges_m.shape)
+    kept = rng.random(ranges_m.shape) >= sensor.dropout_ratio
+    returned = np.isfinite(ranges_m) & (ranges_m >= sensor.min_range_m) & kept
+    points = rays_lidar[returned] * (ranges_m + noise_m)[returned, None]
+    return points.astype(np.float32), returned

@@ -1,0 +1,122 @@
+"""What stands in streets and yards, each about a place on the ground; x is along the kerb."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.simulation.builder import Place
+from mapper.simulation.lidar.solids import Shape, Site
+
+
+def car(site: Site, place: Place, rng: np.random.Generator) -> None:
+    """A saloon or, one time in five, a van."""
+    length, width = float(rng.uniform(3.7, 4.8)), float(rng.uniform(1.65, 1.85))
+    if rng.random() < 0.2:
+        height = float(rng.uniform(1.9, 2.5))
+        site.add("car", place, center=(0.0, 0.0, 0.3 + height / 2), size=(length + 0.8, width, height))
+        return
+    body, cabin = float(rng.uniform(0.6, 0.8)), float(rng.uniform(0.5, 0.65))
+    shift = float(rng.uniform(-0.5, 0.1))
+    site.add("car", place, center=(0.0, 0.0, 0.22 + body / 2), size=(length, width, body))
+    top = (shift, 0.0, 0.22 + body + cabin / 2)
+    site.add("car", place, center=top, size=(0.5 * length, width - 0.25, cabin))
+
+
+def tree(site: Site, place: Place, rng: np.random.Generator) -> None:
+    """A trunk and a crown that begins above whoever passes under it."""
+    trunk, clear = float(rng.uniform(0.2, 0.5)), float(rng.uniform(2.3, 3.2))
+    wide, high = float(rng.uniform(2.0, 4.2)), float(rng.uniform(2.0, 5.0))
+    middle = (float(rng.normal(0.0, 0.2)), float(rng.normal(0.0, 0.2)), clear + high / 2)
+    stem = clear + 0.4 * high
+    site.add(
+        "tree", place, center=(0.0, 0.0, stem / 2), size=(trunk, trunk, stem + 0.6), shape=Shape.CYLINDER
+    )
+    crown = (wide, wide * float(rng.uniform(0.8, 1.2)), high)
+    site.add("tree", place, center=middle, size=crown, shape=Shape.ELLIPSOID)
+
+
+def pole(site: Site, place: Place, rng: np.random.Generator) -> None:
+    """A lamp post, its arm over the road."""
+    thick, height = float(rng.uniform(0.12, 0.22)), float(rng.uniform(4.5, 8.0))
+    post = (thick, thick, height + 0.4)
+    site.add("pole", place, center=(0.0, 0.0, height / 2), size=post, shape=Shape.CYLINDER)
+    if rng.random() < 0.6:
+        site.add("pole", place, center=(0.0, -0.6, height - 0.1), size=(0.25, 1.4, 0.12))
+
+
+def sign(site: Site, place: Place, rng: np.random.Generator) -> None:
+    """A traffic sign."""
+    height, plate = float(rng.uniform(2.1, 2.8)), float(rng.uniform(0.5, 0.9))
+    site.add(
+        "sign", place, center=(0.0, 0.0, height / 2), size=(0.08, 0.08, height + 0.4), shape=Shape.CYLINDER
+    )
+    site.add("sign", place, center=(-0.06, 0.0, height - plate / 2), size=(0.03, plate, plate))
+
+
+def bench(site: Site, place: Place, rng: np.random.Generator) -> None:
+    """A seat with a back, on two blocks."""
+    length = float(rng.uniform(1.4, 2.2))
+    site.add("bench", place, center=(0.0, 0.0, 0.43), size=(length, 0.45, 0.06))
+    site.add("bench", place, center=(0.0, 0.24, 0.65), size=(length, 0.05, 0.4))
+    for side in (-0.4, 0.4):
+        site.add("bench", place, center=(side * length, 0.0, 0.15), size=(0.1, 0.4, 0.5))
+
+
+def bicycle(site: Site, place: Place, rng: np.random.Generator) -> None:
+    """Two flat wheels, a frame and a handlebar."""
+    base = float(rng.uniform(0.95, 1.1))
+    for side in (-0.5, 0.5):
+        site.add(
+            "bicycle",
+            place,
+            center=(side * base, 0.0, 0.34),
+            size=(0.68, 0.06, 0.68),
+            shape=Shape.ELLIPSOID,
+        )
+    site.add("bicycle", place, center=(0.0, 0.0, 0.62), size=(0.75 * base, 0.06, 0.3))
+    site.add("bicycle", place, center=(0.4 * base, 0.0, 1.0), size=(0.06, 0.55, 0.06))
+
+
+def bin_(site: Site, place: Place, rng: np.random.Generator) -> None:
+    """A litter bin."""
+    wide, height = float(rng.uniform(0.4, 0.6)), float(rng.uniform(0.8, 1.2))
+    size = (wide, wide, height + 0.4)
+    site.add("bin", place, center=(0.0, 0.0, height / 2), size=size, shape=Shape.CYLINDER)
+
+
+def bush(site: Site, place: Place, rng: np.random.Generator) -> None:
+    """A round shrub."""
+    size = (float(rng.uniform(0.8, 2.0)), float(rng.uniform(0.7, 1.2)), float(rng.uniform(0.9, 1.8)))
+    site.add("bush", place, center=(0.0, 0.0, 0.35 * size[2]), size=size, shape=Shape.ELLIPSOID)
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A thing and where on a street it is found.
+
+    Attributes:
+        build: Adds one at a place.
+        offset_m: How far from the middle of the road, lowest and highest.
+        along_m: Space it needs along the kerb.
+        across_m: Half its width.
+        share: How often it comes, relative to others.
+    """
+
+    build: Callable[[Site, Place, np.random.Generator], None]
+    offset_m: tuple[float, float]
+    along_m: float
+    across_m: float
+    share: float
+
+
+KINDS: tuple[Kind, ...] = (
+    Kind(car, (3.5, 3.8), 5.8, 0.95, 5.0),
+    Kind(tree, (5.2, 5.8), 3.0, 0.4, 2.5),
+    Kind(pole, (5.0, 5.4), 1.0, 0.3, 1.5),
+    Kind(sign, (5.0, 5.6), 1.0, 0.5, 1.2),
+    Kind(bench, (6.2, 6.8), 2.6, 0.4, 0.8),
+    Kind(bicycle, (6.0, 6.9), 1.8, 0.4, 1.0),
+    Kind(bin_, (5.2, 6.8), 0.8, 0.3, 0.8),
+    Kind(bush, (6.0, 6.6), 2.2, 0.6, 0.8),
+)

@@ -1,0 +1,98 @@
+"""Boxes that travel round the flat, low enough that the camera passes above them; never part of the truth."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from mapper.core.geometry import Array
+from mapper.simulation.boxes import Boxes
+from mapper.simulation.builder import ORIGIN, Builder, Faces, Skin
+from mapper.simulation.config import SynthConfig
+from mapper.simulation.plan import closed_spline
+from mapper.simulation.scene import Scene
+from mapper.simulation.streams import Stream, rng_of
+
+_SMALLEST_M, _LARGEST_M = (0.35, 0.35, 0.5), (0.55, 0.55, 0.75)
+_SLOWEST_MPS, _FASTEST_MPS = 0.3, 0.7
+_CLEARANCE_M = 0.03
+_SAMPLES_PER_POINT = 400
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Movers:
+    """Boxes on the closed way round, each at its own constant speed.
+
+    Attributes:
+        still: The boxes with their middles above the world's origin.
+        faces: How they look, in the textures of the scene; None if there are no boxes.
+        route: (R, 2) control points of the way, as in ``Plan``.
+        starts_m: (M,) where along the way each box is at the start.
+        speeds_mps: (M,) negative against the walker's direction.
+    """
+
+    still: Boxes
+    faces: Faces | None
+    route: Array
+    starts_m: Array
+    speeds_mps: Array
+
+    def __len__(self) -> int:
+        return len(self.still)
+
+    def boxes_at(self, time_s: float) -> Boxes:
+        """Return the boxes where they are so many seconds after the start."""
+        parameter, along_m = _lengths(self.route)
+        here_m = np.mod(self.starts_m + self.speeds_mps * time_s, along_m[-1])
+        xy = closed_spline(self.route, np.interp(here_m, along_m, parameter))
+        return replace(self.still, centers_world=self.still.centers_world + np.pad(xy, ((0, 0), (0, 1))))
+
+    def scene_at(self, scene: Scene, time_s: float) -> Scene:
+        """Return the scene with the boxes in it."""
+        if self.faces is None:
+            return scene
+        a, b = scene.boxes, self.boxes_at(time_s)
+        boxes = Boxes(
+            a.names + b.names,
+            np.concatenate([a.centers_world, b.centers_world]),
+            np.concatenate([a.half_sizes_m, b.half_sizes_m]),
+            np.concatenate([a.yaws_rad, b.yaws_rad]),
+        )
+        faces = Faces(
+            *(
+                np.concatenate([getattr(scene.faces, name), getattr(self.faces, name)])
+                for name in ("textures", "scales", "offsets", "shades")
+            )
+        )
+        return replace(scene, boxes=boxes, faces=faces)
+
+    def as_json(self, times_s: Array) -> list[dict[str, Any]]:
+        """Return one ``{name, size_m, yaw_rad, center_m, centers_m}`` a box; one of ``centers_m`` a time."""
+        rows = self.still.as_json()
+        centers = np.array([self.boxes_at(float(time_s)).centers_world for time_s in times_s])
+        return [{**row, "centers_m": centers[:, i].tolist()} for i, row in enumerate(rows)]
+
+
+def make_movers(config: SynthConfig, scene: Scene) -> Movers:
+    """Return the moving boxes of a configuration, spread over the way round."""
+    rng, count = rng_of(config.seed, Stream.MOVERS), config.moving_boxes
+    builder = Builder()
+    for _ in range(count):
+        size = rng.uniform(_SMALLEST_M, _LARGEST_M).tolist()
+        low = (-size[0] / 2.0, -size[1] / 2.0, _CLEARANCE_M)
+        texture = int(rng.choice(scene.faces.textures.ravel()))
+        skin = Skin(texture, float(config.texture_px_per_m))
+        builder.box(
+            "moving box", ORIGIN, low=low, size=size, skin=skin, turn_rad=float(rng.uniform(0.0, np.pi))
+        )
+    lap_m = float(_lengths(scene.plan.route)[1][-1])
+    starts_m = lap_m * (np.arange(count) + rng.uniform(0.2, 0.8, count)) / max(count, 1)
+    speeds_mps = rng.uniform(_SLOWEST_MPS, _FASTEST_MPS, count) * rng.choice([-1.0, 1.0], count)
+    return Movers(builder.boxes(), builder.faces() if count else None, scene.plan.route, starts_m, speeds_mps)
+
+
+def _lengths(route: Array) -> tuple[Array, Array]:
+    """Return the spline's parameters, densely, and the metres walked up to each."""
+    parameter = np.linspace(0.0, len(route), _SAMPLES_PER_POINT * len(route) + 1)
+    steps_m = np.linalg.norm(np.diff(closed_spline(route, parameter), axis=0), axis=1)
+    return parameter, np.concatenate([[0.0], np.cumsum(steps_m)])

@@ -1,0 +1,214 @@
+"""Exact images of a scene: what every pixel's ray meets first, and the colour it has there.
+
+Boxes are drawn from near to far. A box is tried only in the 16 × 16 px tiles that its projection
+touches and in which something deeper is still to be seen (hierarchical z-buffer, Greene et al. 1993);
+inside a tile each ray is intersected exactly with the slabs of the box (Kay & Kajiya 1986).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mapper.core.errors import DataError
+from mapper.core.frames import NO_DISTORTION, DepthImage, Image, PinholeCamera
+from mapper.core.geometry import Array, Transform
+from mapper.simulation.boxes import Boxes
+from mapper.simulation.scene import Scene
+from mapper.simulation.shade import locate, paint
+
+_TILE_PX = 16
+_NEAR_M = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rendering:
+    """What an ideal camera sees.
+
+    Attributes:
+        rgb: (H, W, 3) uint8.
+        depth_m: (H, W) float32 exact depth along the optical axis, metres; 0 where the ray meets nothing.
+        surface: (H, W) int32 face that was met, 6 · box + face; −1 where there is none.
+        cosine: (H, W) float32 cosine between the ray and the face's normal, 0 … 1.
+    """
+
+    rgb: Image
+    depth_m: DepthImage
+    surface: NDArray[np.int32]
+    cosine: NDArray[np.float32]
+
+
+def render(scene: Scene, camera: PinholeCamera, T_world_camera: Transform) -> Rendering:
+    """Return the exact image and depth of a scene from a pose of the camera's optical frame.
+
+    Raises:
+        DataError: The camera has distortion, which this renderer does not know.
+    """
+    if camera.distortion != NO_DISTORTION:
+        raise DataError(f"render: camera with distortion {camera.distortion}; want a camera without")
+    boxes, faces, atlas = scene.boxes, scene.faces, scene.atlas
+    R_box_camera, origin_box = _box_frames(boxes, T_world_camera)
+    intrinsics = np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px])
+    shape = (camera.height_px, camera.width_px)
+    depth_m = np.full(shape, np.inf)
+    surface = np.full(shape, -1, dtype=np.int32)
+    rectangles, nearest_m = _project(boxes.half_sizes_m, R_box_camera, origin_box, intrinsics, shape)
+    order = np.argsort(nearest_m, kind="stable")
+    order = order[np.isfinite(nearest_m[order])]
+    _trace(
+        boxes.half_sizes_m,
+        R_box_camera,
+        origin_box,
+        intrinsics,
+        order,
+        rectangles,
+        nearest_m,
+        depth_m,
+        surface,
+    )
+    rgb = np.zeros((*shape, 3), dtype=np.uint8)
+    cosine = np.zeros(shape, dtype=np.float32)
+    footprint = np.zeros((*shape, 6), dtype=np.float32)
+    locate(
+        boxes.half_sizes_m,
+        R_box_camera,
+        origin_box,
+        intrinsics,
+        depth_m,
+        surface,
+        faces.scales,
+        faces.offsets,
+        footprint,
+        cosine,
+    )
+    paint(
+        footprint,
+        surface,
+        faces.textures,
+        faces.shades,
+        atlas.texels,
+        atlas.starts,
+        atlas.heights_px,
+        atlas.widths_px,
+        rgb,
+    )
+    depth_m[surface < 0] = 0.0
+    return Rendering(rgb, depth_m.astype(np.float32), surface, cosine)
+
+
+def _box_frames(boxes: Boxes, T_world_camera: Transform) -> tuple[Array, Array]:
+    """Return the camera's axes (N, 3, 3) and its centre (N, 3) in every box's own frame."""
+    cosine, sine = np.cos(boxes.yaws_rad), np.sin(boxes.yaws_rad)
+    R_box_world = np.zeros((len(boxes), 3, 3))
+    R_box_world[:, 0, 0], R_box_world[:, 0, 1] = cosine, sine
+    R_box_world[:, 1, 0], R_box_world[:, 1, 1] = -sine, cosine
+    R_box_world[:, 2, 2] = 1.0
+    offsets_world = T_world_camera[:3, 3] - boxes.centers_world
+    R_box_camera = np.ascontiguousarray(R_box_world @ T_world_camera[:3, :3])
+    return R_box_camera, np.einsum("nij,nj->ni", R_box_world, offsets_world)
+
+
+@njit(cache=True, nogil=True)
+def _project(
+    halves: Array, R_box_camera: Array, origin_box: Array, intrinsics: Array, shape: tuple[int, int]
+) -> tuple[NDArray[np.int64], Array]:
+    """Return each box's pixel rectangle (first column, first row, end column, end row) and nearest depth.
+
+    Edges that pass behind the camera are cut at the near plane. A box that cannot be seen has depth inf.
+    """
+    fx, fy, cx, cy = intrinsics
+    rectangles = np.zeros((len(halves), 4), dtype=np.int64)
+    nearest = np.full(len(halves), np.inf)
+    corners = np.empty((8, 3))
+    for b in range(len(halves)):
+        for c in range(8):
+            for k in range(3):
+                corners[c, k] = 0.0
+            for axis in range(3):
+                reach = halves[b, axis] if (c >> axis) & 1 else -halves[b, axis]
+                for k in range(3):
+                    corners[c, k] += (reach - origin_box[b, axis]) * R_box_camera[b, axis, k]
+        u0, v0, u1, v1, depth = np.inf, np.inf, -np.inf, -np.inf, np.inf
+        for c in range(8):
+            for axis in range(3):
+                d = c ^ (1 << axis)
+                z_c, z_d = corners[c, 2], corners[d, 2]
+                if z_c < _NEAR_M and z_d < _NEAR_M:
+                    continue
+                # The visible end of each edge as seen from this corner: itself, or the cut.
+                f = 0.0 if z_c >= _NEAR_M else (_NEAR_M - z_c) / (z_d - z_c)
+                x = corners[c, 0] + f * (corners[d, 0] - corners[c, 0])
+                y = corners[c, 1] + f * (corners[d, 1] - corners[c, 1])
+                z = max(z_c, _NEAR_M)
+                u, v = fx * x / z + cx, fy * y / z + cy
+                u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
+                depth = min(depth, z)
+        if u1 < 0.0 or v1 < 0.0 or u0 > shape[1] - 1 or v0 > shape[0] - 1:
+            continue
+        rectangles[b, 0] = int(max(np.floor(u0), 0.0))
+        rectangles[b, 1] = int(max(np.floor(v0), 0.0))
+        rectangles[b, 2] = int(min(np.ceil(u1), shape[1] - 1.0)) + 1
+        rectangles[b, 3] = int(min(np.ceil(v1), shape[0] - 1.0)) + 1
+        nearest[b] = depth
+    return rectangles, nearest
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _trace(
+    halves: Array,
+    R_box_camera: Array,
+    origin_box: Array,
+    intrinsics: Array,
+    order: NDArray[np.int64],
+    rectangles: NDArray[np.int64],
+    nearest: Array,
+    depth: Array,
+    surface: NDArray[np.int32],
+) -> None:
+    """Fill depth and surface of every pixel; ``order`` lists boxes from near to far."""
+    fx, fy, cx, cy = intrinsics
+    height, width = depth.shape
+    rows = (height + _TILE_PX - 1) // _TILE_PX
+    columns = (width + _TILE_PX - 1) // _TILE_PX
+    deepest = np.full((rows, columns), np.inf)
+    for b in order:
+        u0, v0, u1, v1 = rectangles[b]
+        ox, oy, oz = origin_box[b]
+        hx, hy, hz = halves[b]
+        R = R_box_camera[b]
+        for tile_v in range(v0 // _TILE_PX, (v1 + _TILE_PX - 1) // _TILE_PX):
+            for tile_u in range(u0 // _TILE_PX, (u1 + _TILE_PX - 1) // _TILE_PX):
+                if nearest[b] >= deepest[tile_v, tile_u]:
+                    continue
+                touched = False
+                left, right = max(u0, tile_u * _TILE_PX), min(u1, (tile_u + 1) * _TILE_PX)
+                for v in range(max(v0, tile_v * _TILE_PX), min(v1, (tile_v + 1) * _TILE_PX)):
+                    y = (v - cy) / fy
+                    bx, by, bz = R[0, 1] * y + R[0, 2], R[1, 1] * y + R[1, 2], R[2, 1] * y + R[2, 2]
+                    for u in range(left, right):
+                        x = (u - cx) / fx
+                        ix = 1.0 / (R[0, 0] * x + bx)
+                        iy = 1.0 / (R[1, 0] * x + by)
+                        iz = 1.0 / (R[2, 0] * x + bz)
+                        # A slab is entered at centre − half and left at centre + half.
+                        mx, my, mz = -ox * ix, -oy * iy, -oz * iz
+                        wx, wy, wz = hx * abs(ix), hy * abs(iy), hz * abs(iz)
+                        enter = max(mx - wx, my - wy, mz - wz)
+                        leave = min(mx + wx, my + wy, mz + wz)
+                        if enter <= leave and enter > _NEAR_M and enter < depth[v, u]:
+                            if enter == mx - wx:
+                                face = 0 if ix > 0.0 else 1
+                            elif enter == my - wy:
+                                face = 2 if iy > 0.0 else 3
+                            else:
+                                face = 4 if iz > 0.0 else 5
+                            depth[v, u] = enter
+                            surface[v, u] = 6 * b + face
+                            touched = True
+                if touched:
+                    worst = 0.0
+                    for v in range(tile_v * _TILE_PX, min((tile_v + 1) * _TILE_PX, height)):
+                        for u in range(tile_u * _TILE_PX, min((tile_u + 1) * _TILE_PX, width)):
+                            worst = max(worst, depth[v, u])
+                    deepest[tile_v, tile_u] = worst

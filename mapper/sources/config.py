@@ -1,0 +1,80 @@
+"""Which part of a log is used, and what the log does not tell by itself."""
+
+from pathlib import Path
+
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+
+from mapper.core.config import Config
+
+
+class CameraConfig(Config):
+    """Intrinsics that override what the log or its folder's name says."""
+
+    fx_px: PositiveFloat
+    fy_px: PositiveFloat
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3 (OpenCV's order)."""
+    depth_factor: PositiveFloat | None = None
+    """Depth image units per metre; None keeps the log's own (5000 for TUM)."""
+
+
+class TopicsConfig(Config):
+    """Which topics of an MCAP file or a ROS bag are read; None is guessed, and told."""
+
+    color: str | None = None
+    """Colour or grey images."""
+    depth: str | None = None
+    """Depth images, registered to the colour images."""
+    camera_info: str | None = None
+    """Calibration of the colour camera."""
+    points: str | None = None
+    """Point clouds; set, they are mapped even where there are RGB-D images too."""
+    imu: str | None = None
+    """Inertial readings, of which the accelerations tell which way is up."""
+    truth: str | None = None
+    """True poses (Odometry, PoseStamped, TransformStamped); None is /ground_truth, if there is one."""
+    wheels: str | None = None
+    """Wheel odometry (Odometry, PoseStamped, TransformStamped); None is /wheel_odometry, if there is one."""
+
+
+class WheelsConfig(Config):
+    """How a log's wheels move its body."""
+
+    wheelbase_m: PositiveFloat | None = None
+    """Between the axles; a log's encoders.txt needs it, its wheels.txt does not."""
+    body_in_base: tuple[float, float, float, float, float, float, float] | None = None
+    """x y z (metres) qx qy qz qw of the body in the frame that the wheels move, x forward, y left, z up; None
+    is what tf tells, or else its origin, looking forward."""
+
+
+class SourceConfig(Config):
+    """The selection every kind of log understands."""
+
+    first_frame: NonNegativeInt = 0
+    """Index of the first frame to use."""
+    last_frame: NonNegativeInt | None = None
+    """Index of the last frame to use, inclusive; None is the end of the log."""
+    stride: PositiveInt = 1
+    """Use every n-th frame."""
+    require_truth: bool = False
+    """Drop frames without ground truth within ``max_truth_gap_s``."""
+    max_truth_gap_s: NonNegativeFloat = 0.02
+    max_pair_gap_s: NonNegativeFloat = 0.02
+    """Largest time between a colour image and its depth image."""
+    rate_hz: PositiveFloat | None = None
+    """Frames per second of numbered files without stamps; None is the format's own (30, Poznań, scans 10)."""
+    camera: CameraConfig | None = None
+    topics: TopicsConfig = TopicsConfig()
+    wheels: WheelsConfig = WheelsConfig()
+    body_frame: str | None = None
+    """Frame in a bag's tf that is a LiDAR's body, e.g. base_link; None is the cloud's own frame."""
+    pattern: str | None = None
+    """Glob of the names of a LiDAR log's clouds, e.g. ``os1_*.bin``; None is all with the usual ending."""
+    stamps_file: Path | None = None
+    """A cloud's stamp a line, seconds or nanoseconds; None looks for stamps in names, then for times.txt."""
+    truth_file: Path | None = None
+    """Poses of a LiDAR log, in TUM's or KITTI's text; None looks for groundtruth.txt and poses.txt."""
+    cloud_scale: PositiveFloat | None = None
+    """Metres per unit of a LiDAR log's files; None is 1, and refuses what looks like millimetres."""

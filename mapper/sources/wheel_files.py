@@ -1,0 +1,115 @@
+"""Wheel odometry beside a log: poses in ``wheels.txt``, or readings in ``encoders.txt``."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mapper.core.errors import DataError, SourceError
+from mapper.core.frames import Sensor
+from mapper.core.geometry import Transform, inverse, transform
+from mapper.core.trajectory import Trajectory
+from mapper.sensing.wheel_kinematics import driven
+from mapper.sources.config import WheelsConfig
+from mapper.sources.text import parse_numbers, parse_stamp, pose_from_numbers, rows, time_order
+from mapper.sources.trajectory_files import read_tum, write_tum
+
+POSES, READINGS = "wheels.txt", "encoders.txt"
+_POSE_COLUMNS = 8
+
+LOOKING_FORWARD: Mapping[Sensor, Transform] = {
+    "rgbd": transform(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3)),
+    "lidar": np.eye(4),
+}
+"""T_base_body of a body at the origin of a frame with x forward, y left and z up."""
+
+
+def mounting(config: WheelsConfig, sensor: Sensor) -> Transform:
+    """Return T_base_body as set, else at the origin and looking forward.
+
+    Raises:
+        SourceError: What was set is no pose.
+    """
+    if config.body_in_base is None:
+        return LOOKING_FORWARD[sensor]
+    T_base_body = pose_from_numbers(np.array(config.body_in_base))
+    if T_base_body is None:
+        raise SourceError(f"source.wheels.body_in_base={config.body_in_base}: its quaternion is zero")
+    return T_base_body
+
+
+def read_wheels(folder: Path, config: WheelsConfig, *, sensor: Sensor) -> tuple[Trajectory | None, list[str]]:
+    """Return T_odom_body as a log's wheels tell, if its folder has a file of them, and notes.
+
+    Args:
+        folder: Where ``wheels.txt`` (``stamp tx ty tz qx qy qz qw`` of the base) or ``encoders.txt``
+            (``stamp path_m steering_rad``) may lie.
+        config: The wheelbase, and where the body is.
+        sensor: What the body is.
+
+    Raises:
+        SourceError: A file is malformed, or there are readings but no wheelbase.
+    """
+    path = next((folder / name for name in (POSES, READINGS) if (folder / name).is_file()), None)
+    return (None, []) if path is None else read_wheels_file(path, config, sensor=sensor)
+
+
+def read_wheels_file(
+    path: Path,
+    config: WheelsConfig,
+    *,
+    sensor: Sensor,
+    wheelbase_by: str = "--set source.wheels.wheelbase_m=…",
+) -> tuple[Trajectory, list[str]]:
+    """Return T_odom_body and notes as above of one file: poses if it is ``wheels.txt`` or has eight columns.
+
+    Args:
+        path: The file.
+        config: As above.
+        sensor: As above.
+        wheelbase_by: How a user tells the wheelbase.
+
+    Raises:
+        SourceError: As above.
+    """
+    if path.name == POSES or len(next(rows(path), (0, []))[1]) == _POSE_COLUMNS:
+        notes: list[str] = []
+        try:
+            T_odom_base = read_tum(path)
+        except DataError as error:
+            raise SourceError(str(error)) from None
+    else:
+        T_odom_base, notes = _integrated(path, config.wheelbase_m, wheelbase_by)
+    wheels = replace(T_odom_base, T_world_body=T_odom_base.T_world_body @ mounting(config, sensor))
+    return wheels, [*notes, f"{path.name}: wheel odometry, {len(wheels)} poses"]
+
+
+def write_wheels(folder: Path, wheels: Trajectory, *, sensor: Sensor) -> None:
+    """Write T_odom_body as the ``wheels.txt`` of a log, of a base that has its origin in the body's.
+
+    So it reads back without a mounting's being told.
+    """
+    T_odom_base = wheels.T_world_body @ inverse(LOOKING_FORWARD[sensor])
+    write_tum(folder / POSES, replace(wheels, T_world_body=T_odom_base))
+
+
+def _integrated(path: Path, wheelbase_m: float | None, wheelbase_by: str) -> tuple[Trajectory, list[str]]:
+    if wheelbase_m is None:
+        raise SourceError(f"{path}: the wheelbase is unknown; {wheelbase_by}")
+    stamps_ns, readings = [], []
+    for number, words in rows(path):
+        where = f"{path}:{number}"
+        if len(words) != 3:
+            raise SourceError(f"{where}: {len(words)} columns, want 3: stamp path_m steering_rad")
+        reading = parse_numbers(words[1:], where=where)
+        if not np.isfinite(reading).all() or abs(reading[1]) >= np.pi / 2.0:
+            raise SourceError(f"{where}: want a finite path, and a steering angle within ±π/2 rad")
+        stamps_ns.append(parse_stamp(words[0], where=where))
+        readings.append(reading)
+    if not readings:
+        raise SourceError(f"{path}: no readings; want lines of stamp path_m steering_rad")
+    stamps = np.array(stamps_ns, dtype=np.int64)
+    order, notes = time_order(stamps, what=path.name)
+    path_m, steering_rad = np.array(readings)[order].T
+    return driven(stamps[order], path_m, steering_rad, wheelbase_m=wheelbase_m), notes
