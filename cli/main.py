@@ -2,7 +2,8 @@
 
 import errno
 import sys
-from typing import Annotated, Any
+import warnings
+from typing import Annotated, Any, TextIO
 
 import typer
 from typer.core import TyperGroup
@@ -31,7 +32,7 @@ from cli.synth import synth
 from cli.view import view
 from cli.vocabulary import vocabulary
 from mapper import __version__
-from mapper.core.errors import MapperError
+from mapper.core.errors import MapperError, MapperWarning
 
 _INTERRUPTED = 130  # 128 + SIGINT, as shells count
 _USER_CAN_HELP = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS}
@@ -60,6 +61,22 @@ class Guarded(TyperGroup):
 def _say(what: str, error: BaseException) -> None:
     print("; ".join([f"mapper: {what}", *getattr(error, "__notes__", ())]), file=sys.stderr)
 
+
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    if issubclass(category, MapperWarning):
+        print(f"mapper: {message}", file=sys.stderr)
+    else:
+        _python_shows_warning(message, category, filename, lineno, file, line)
+
+
+_python_shows_warning = warnings.showwarning
 
 app = typer.Typer(
     cls=Guarded,
@@ -106,4 +123,6 @@ def version(
 def main() -> None:
     """Run the command line."""
     prepare_environment()
+    warnings.showwarning = _show_warning
+    warnings.simplefilter("always", MapperWarning)
     app()

@@ -1,11 +1,13 @@
+import json
 from pathlib import Path
 
 import pytest
 
 from mapper.config.build import BuildConfig
-from mapper.config.loading import load_config, overridden
-from mapper.core.errors import ConfigError
+from mapper.config.loading import load_config, load_run_config, overridden
+from mapper.core.errors import ConfigError, MapperWarning
 from mapper.features.config import SurfConfig
+from mapper.octree.config import OctreeConfig
 from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig
 from mapper.simulation.config import SynthConfig
 
@@ -101,6 +103,30 @@ def test_a_run_s_own_json_gives_the_same_configuration(tmp_path):
 def test_values_that_would_fail_late_are_refused_early(override, message):
     with pytest.raises(ConfigError, match=message):
         load_config(None, [override])
+
+
+def test_a_run_of_an_older_version_loses_the_settings_that_are_no_more(tmp_path):
+    tree = BuildConfig().model_dump(mode="json")
+    tree["odometry"]["former"], tree["odometry"]["detector"]["gone"] = 1, 2
+    tree["octree"]["resolution_m"], tree["old_part"] = 0.1, {"a": 1}
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps(tree))
+    (tmp_path / "manifest.json").write_text("{}")
+    names = r"odometry\.detector\.gone, odometry\.former, old_part$"
+
+    with pytest.warns(MapperWarning, match=names):
+        loaded = load_run_config(path)
+    with pytest.warns(MapperWarning, match=names):
+        again = load_config(path)
+
+    assert loaded == again == BuildConfig(octree=OctreeConfig(resolution_m=0.1))
+
+
+def test_a_file_of_a_user_keeps_no_unknown_setting(tmp_path):
+    path = tmp_path / "config.json"
+    path.write_text('{"octree": {"resolution": 0.1}}')
+    with pytest.raises(ConfigError, match="octree.resolution"):
+        load_config(path)
 
 
 def test_any_configuration_can_be_overridden():

@@ -1,7 +1,8 @@
-"""How files and overrides become a configuration, and what it says where they are wrong."""
+"""Configurations read from files and overrides, with errors that name the setting."""
 
 import json
 import tomllib
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -11,8 +12,9 @@ from pydantic import ValidationError
 from mapper.config.build import BuildConfig
 from mapper.config.sensors import DEFAULTS
 from mapper.core.config import Config
-from mapper.core.errors import ConfigError
+from mapper.core.errors import ConfigError, MapperWarning
 from mapper.core.frames import Sensor
+from mapper.runtime.atomic import MANIFEST_NAME
 from mapper.sources.config import SourceConfig
 
 AnyConfig = TypeVar("AnyConfig", bound=Config)
@@ -33,12 +35,28 @@ def load_config(
     """
     tree = {} if path is None else _read(path)
     if path is not None:
+        if _is_of_a_run(path):
+            _drop_former_settings(tree, path)
         _validated(BuildConfig, _over(DEFAULTS[sensor], tree), str(path))
     for override in overrides:
         _put(tree, override)
     return _validated(
         BuildConfig, _over(DEFAULTS[sensor], tree), "overrides" if overrides or path is None else str(path)
     )
+
+
+def load_run_config(path: Path) -> BuildConfig:
+    """Return the configuration that a run keeps; settings that an older version had are dropped.
+
+    Warns:
+        MapperWarning: Names the settings that were dropped.
+
+    Raises:
+        ConfigError: The file cannot be read or parsed, or the model refuses a value.
+    """
+    tree = _read(path)
+    _drop_former_settings(tree, path)
+    return _checked(BuildConfig, tree, str(path))
 
 
 def load_source_config(path: Path | None = None, overrides: Sequence[str] = ()) -> SourceConfig:
@@ -73,6 +91,38 @@ def _read(path: Path) -> dict[str, Any]:
     except ValueError as error:  # what either parser raises, and text that is not UTF-8
         raise ConfigError(f"{path}: not valid {'JSON' if is_json else 'TOML'}: {error}") from None
     return tree
+
+
+def _is_of_a_run(path: Path) -> bool:
+    return path.suffix == ".json" and (path.parent / MANIFEST_NAME).is_file()
+
+
+def _drop_former_settings(tree: dict[str, Any], path: Path) -> None:
+    """Delete the names that the model does not know; a run's file was complete when it was written."""
+    try:
+        BuildConfig.model_validate(tree)
+    except ValidationError as error:
+        unknown = [one["loc"] for one in error.errors() if one["type"] == "extra_forbidden"]
+        names = [_delete(tree, loc) for loc in unknown]
+        if names:
+            warnings.warn(
+                f"{path}: settings of an older version, which this one does not have, are ignored: "
+                f"{', '.join(names)}",
+                MapperWarning,
+                stacklevel=3,
+            )
+
+
+def _delete(tree: dict[str, Any], loc: Sequence[int | str]) -> str:
+    """Delete a setting and return its dotted name; a location also names the kind of each union's member."""
+    node, names = tree, []
+    for part in loc:
+        if not isinstance(node, dict) or part not in node:
+            continue
+        names.append(str(part))
+        parent, node = node, node[str(part)]
+    del parent[names[-1]]
+    return ".".join(names)
 
 
 def _over(defaults: Mapping[str, Any], tree: Mapping[str, Any]) -> dict[str, Any]:

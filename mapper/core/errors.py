@@ -1,6 +1,6 @@
-"""What can go wrong in a way that a user can act on.
+"""Errors and warnings that a user can act on.
 
-Library code raises these; only ``cli`` turns them into one line and an exit status.
+Library code raises or warns; only ``cli`` turns them into one line and, for an error, an exit status.
 """
 
 
@@ -66,3 +66,7 @@ class ViewerError(MapperError):
 
 class RunError(MapperError):
     """A run folder that is missing, unfinished or already there."""
+
+
+class MapperWarning(UserWarning):
+    """A warning that a user should read; ``cli`` prints it as one line."""

@@ -7,9 +7,8 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from mapper.config.build import BuildConfig
+from mapper.config.loading import load_run_config
 from mapper.core.errors import MapperError, RunError
 from mapper.core.trajectory import Trajectory
 from mapper.graph.g2o import read_g2o
@@ -103,7 +102,7 @@ def load_run(path: Path) -> Run:
     manifest = read_manifest(path / files.MANIFEST)
     if manifest.status != "complete":
         raise RunError(f"{path}: not finished: {_ending(path)}")
-    return Run(path, _read_config(path / files.CONFIG), manifest)
+    return Run(path, load_run_config(path / files.CONFIG), manifest)
 
 
 def moved_log(run: Run, *logs: Path) -> Run:
@@ -251,14 +250,3 @@ def _ending(folder: Path) -> str:
     if manifest.status == "building":
         return f"{folder} is still being built, or its process was killed"
     return f"{folder} {manifest.status}: {manifest.reason}"
-
-
-def _read_config(path: Path) -> BuildConfig:
-    try:
-        return BuildConfig.model_validate_json(path.read_bytes())
-    except OSError as error:
-        raise RunError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        name = ".".join(str(part) for part in first["loc"])
-        raise RunError(f"{path}: {name}: {first['msg']}; built by another version?") from None
