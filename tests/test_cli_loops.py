@@ -11,8 +11,8 @@ from cli.main import app
 from mapper.config.loading import load_config
 from mapper.core.errors import ConfigError
 from mapper.core.geometry import exp
-from mapper.graph.chain import by_odometry
 from mapper.graph.model import BetweenFactor, PoseGraph
+from mapper.graph.odometry_poses import by_odometry
 from mapper.pipeline.build import build
 from mapper.pipeline.edit_loops import edit_loops
 from mapper.run.folder import load_run, open_log

@@ -125,7 +125,7 @@ def test_a_run_of_an_older_version_loses_the_settings_that_are_no_more(tmp_path)
 def test_a_file_of_a_user_keeps_no_unknown_setting(tmp_path):
     path = tmp_path / "config.json"
     path.write_text('{"octree": {"resolution": 0.1}}')
-    with pytest.raises(ConfigError, match="octree.resolution"):
+    with pytest.raises(ConfigError, match=r"octree\.resolution"):
         load_config(path)
 
 

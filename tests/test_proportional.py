@@ -8,7 +8,7 @@ from mapper.core.geometry import exp, inverse, is_rigid, rotation_exp, rotation_
 from mapper.graph.config import GraphConfig
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.graph.optimize import optimize
-from mapper.graph.proportional import distribute, spread
+from mapper.graph.proportional_correction import distribute, spread
 
 INFORMATION = np.eye(6)
 

@@ -1,4 +1,4 @@
-"""The pose graph as data: nodes, relative-pose factors, and nothing about how it is solved."""
+"""Pose graph: nodes, relative-pose factors, and the solution."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -41,7 +41,7 @@ class BetweenFactor:
         j: Node that is measured (the registration's source).
         T_i_j: (4, 4) measured pose of j in i.
         information: (6, 6) Fisher information of j's tangent (rotation, translation): rad⁻², m⁻².
-        origin: Where the measurement comes from.
+        origin: Kind of measurement.
     """
 
     i: int
@@ -104,14 +104,14 @@ class PoseGraph:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solution:
-    """What the solver made of a graph. Factors are told in the graph's order.
+    """Solution of a pose graph; factors are in the graph's order.
 
     Attributes:
         T_world_node: Solved pose of every node.
         iterations: Solver iterations.
         factor_errors_before: ½ χ² of each factor at the first estimates.
         factor_errors: ½ χ² of each factor at the solution.
-        weights: How far each factor was believed, 0 … 1; 1 but for loops in doubt.
+        weights: Final weight of each factor, 0 … 1; only loops can have less than 1.
     """
 
     T_world_node: dict[int, Transform]

@@ -1,20 +1,20 @@
-"""How much a measured relative pose may be trusted."""
+"""Information of measured relative poses: the model error that features share, and inflation."""
 
 import numpy as np
 
 from mapper.core.geometry import Array, Transform, rotation_log
 
 _SHARE = 0.02
-"""Of distance and angle: what calibration and depth distortion leave wrong, however many pixels agree."""
+"""Model error as a share of distance and angle: calibration and depth distortion, common to all pixels."""
 _LEAST_M, _LEAST_RAD = 1e-3, 1e-3
 
 
 def with_model_error(information: Array, T_i_j: Transform) -> Array:
-    """Return the (6, 6) information of a relative pose with the errors that its pixels share.
+    """Return the (6, 6) information of a relative pose with the errors that its features share.
 
-    Features vote as if their errors were independent, so hundreds of them claim fractions of a millimetre.
-    Calibration and depth distortion move them all alike, the more the farther apart the views: loops
-    closed on a real Kinect lie 1 to 2 cm off where their features claim 1 mm.
+    Hundreds of features with independent errors give a sigma of fractions of a millimetre. Calibration and
+    depth distortion move them all alike, the more the farther apart the views: loops closed on a real Kinect
+    are 1 to 2 cm off where independent errors would give 1 mm.
 
     Args:
         information: (6, 6) of j's tangent (rotation, translation) from the features alone.
@@ -30,7 +30,7 @@ def with_model_error(information: Array, T_i_j: Transform) -> Array:
 
 
 def inflated(information: Array, *, sigma_rad: float, sigma_m: float) -> Array:
-    """Return the (6, 6) information of a relative pose with another error on top, the same each way."""
+    """Return the (6, 6) information of a relative pose with an isotropic error added."""
     variances = np.square([sigma_rad] * 3 + [sigma_m] * 3)
     known = np.linalg.inv(np.linalg.inv(information) + np.diag(variances))
     symmetric: Array = 0.5 * (known + known.T)

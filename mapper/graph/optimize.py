@@ -9,11 +9,11 @@ import numpy as np
 from mapper.core.errors import GraphError
 from mapper.core.geometry import is_rigid
 from mapper.graph.batch import Part
-from mapper.graph.chordal import start_of
+from mapper.graph.chordal_initialization import start_of
 from mapper.graph.components import components
 from mapper.graph.config import GraphConfig
 from mapper.graph.model import PoseGraph, Solution
-from mapper.graph.proportional import distribute
+from mapper.graph.proportional_correction import distribute
 from mapper.graph.robust import solve_part
 from mapper.graph.terms import anchor, between, poses_of, values_of
 from mapper.runtime.progress import SILENT, Progress

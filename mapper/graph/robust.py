@@ -1,4 +1,4 @@
-"""Loops may be false: Graduated Non-Convexity decides about each, robust kernels weigh each."""
+"""Robust solving of one component: graduated non-convexity or a robust kernel on its loops."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from mapper.core.geometry import Array
 from mapper.graph.batch import Effort, Part, solve
 from mapper.graph.config import GraphConfig
-from mapper.graph.graduated import chi2_of, graduate, weighted
+from mapper.graph.graduated_non_convexity import chi2_of, graduate, weighted
 from mapper.graph.terms import Kernel, between
 from mapper.runtime.progress import Report
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 
 def solve_part(part: Part, config: GraphConfig, *, report: Report) -> tuple[gtsam.Values, Array, int]:
-    """Solve a part with its loops in doubt.
+    """Solve a component with outlier rejection of its loops.
 
     Args:
-        part: What to solve.
-        config: Which kernel, and when to stop.
-        report: Told how far the last descent is.
+        part: The component.
+        config: Kernel and termination criteria.
+        report: Receives the iterations of the last solve.
 
     Returns:
         The solution, the weight of each loop in [0, 1], and the iterations.
@@ -36,8 +36,8 @@ def solve_part(part: Part, config: GraphConfig, *, report: Report) -> tuple[gtsa
     match config.robust:
         case "gnc" if part.loops:
             weights, near = graduate(part, config.robust_width)
-            believed = weighted(part.loops, weights)
-            solved, iterations = solve(part.held, believed, near.poses, effort=effort)
+            inliers = weighted(part.loops, weights)
+            solved, iterations = solve(part.held, inliers, near.poses, effort=effort)
             return solved, weights, near.iterations + iterations
         case "cauchy" | "huber" | "dcs" as kind:
             kernel = Kernel(kind, config.robust_width)

@@ -1,4 +1,4 @@
-"""What the wheels say of the way between keyframes, as factors."""
+"""Relative-pose factors between keyframes from wheel odometry."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from mapper.sensing.wheel_kinematics import Odometer, pose_at
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WheelNode:
-    """A node, its time, and where the wheels say it is: (4, 4) T_odom_body."""
+    """A node, its time, and its pose by wheel odometry: (4, 4) T_odom_body."""
 
     node: int
     stamp_ns: int
@@ -27,9 +27,9 @@ def wheel_factors(
     """Return a factor between every two nodes that follow each other in time and whose wheel poses are known.
 
     Args:
-        stamps_ns: Time of every node.
+        stamps_ns: Time of every node, nanoseconds.
         wheels: T_odom_body; None without wheels.
-        config: Whether they count, and how much.
+        config: Whether they are used, and their noise.
     """
     if wheels is None or not config.use:
         return []
@@ -46,10 +46,10 @@ def wheel_factors(
 def wheel_factor(
     i: WheelNode, j: WheelNode, odometer: Odometer, noise: WheelNoiseConfig, *, origin: Origin
 ) -> BetweenFactor:
-    """Return what the wheels say of the way from a node to a later one.
+    """Return the factor from a node to a later one.
 
-    The error grows with the distance and the turn on the way, not with where it ended (Thrun, Burgard &
-    Fox 2005, §5.4); wheels know of no height and no tilt, which are as uncertain as the rest.
+    The error grows with the path length and the turning in between, not with the displacement (Thrun,
+    Burgard & Fox 2005, §5.4); wheels measure no height and no tilt, which get the same sigmas.
     """
     path_m, turn_rad = odometer.between(i.stamp_ns, j.stamp_ns)
     sigmas = PoseSigmas(

@@ -5,7 +5,7 @@ from typing import Literal, Protocol
 from mapper.core.geometry import Transform, inverse
 from mapper.graph.incremental import IncrementalSolver
 from mapper.graph.model import PoseGraph
-from mapper.graph.proportional import spread
+from mapper.graph.proportional_correction import spread
 from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy, exceeds
 from mapper.odometry.base import FrameResult
 

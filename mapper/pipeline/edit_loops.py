@@ -7,9 +7,9 @@ from typing import Any
 from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, LoopError
 from mapper.core.frames import Sensor
-from mapper.graph.chain import by_odometry
 from mapper.graph.components import components
 from mapper.graph.model import PoseGraph
+from mapper.graph.odometry_poses import by_odometry
 from mapper.loops.base import Proposal, Verifier, measured
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import NoLoopsConfig, PlaceLoopsConfig, ScanLoopsConfig

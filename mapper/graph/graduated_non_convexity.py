@@ -1,4 +1,4 @@
-"""Graduated Non-Convexity: decide for each loop whether it is believed (Yang et al. 2020)."""
+"""Graduated non-convexity (Yang et al. 2020): which loops of a pose graph are inliers."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ if TYPE_CHECKING:
     import gtsam
 
 _GROWTH = 1.4
-"""Of μ in each round (Yang et al. 2020, remark 5)."""
+"""Factor by which μ grows in each round (Yang et al. 2020, remark 5)."""
 _MAX_ROUNDS = 100
 _ROUND = Effort(max_iterations=3, relative_error=1e-4)
-"""A round only prepares the next."""
+"""Solver effort of a round: its result is only the start of the next."""
 _DECIDED = 1e-3
-"""A weight this close to 0 or 1 has arrived."""
+"""A weight this close to 0 or 1 has converged."""
 _MEDIAN_CHI2 = 5.348
 """Median of χ² with six degrees of freedom."""
 _DRIFT_SLACK = 3.0
-"""Systematic drift grows with the way, not with its root, so long loops disagree more than short ones."""
-_NEARLY = 4.0
-"""Of the limit: what an unused loop may exceed it by, for the path was never pulled to it."""
-_BESIDE = 10
-"""Loops whose ends are at most so many nodes apart stand and fall together."""
-_MOST_SUSPECTS = 8
+"""Systematic drift grows with the path, not its square root: long loops disagree more than short ones."""
+_UNUSED_LOOP_RATIO = 4.0
+"""How many times the limit an unused loop may have: the path has not been optimised with it."""
+_CLUSTER_NODES = 10
+"""Loops whose ends are at most so many nodes apart form a cluster, which is tried as one."""
+_MAX_CLUSTERS_TRIED = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Graduated:
-    """Where a round ended.
+    """State after a round.
 
     Attributes:
-        poses: Nearly solved with the loops that were believed in it.
-        chi2: (L,) squared residual of every loop there, in sigmas.
-        iterations: Taken so far.
+        poses: Poses nearly optimal for the loops weighted in it.
+        chi2: (L,) squared residual of every loop at these poses, in sigmas.
+        iterations: Solver iterations so far.
     """
 
     poses: gtsam.Values
@@ -52,16 +52,16 @@ class Graduated:
 
 
 def graduate(part: Part, width: float) -> tuple[Array, Graduated]:
-    """Return a weight of 0 or 1 for each loop of a part, and where that leaves it.
+    """Return a weight of 0 or 1 for each loop of a component, and the state with these weights.
 
-    Truncated least squares. Information that counts features as independent is over-confident, so the
-    limit is scaled by how far the median loop lies from what odometry predicts, where that is farther than
-    honest. Loops that odometry rules out even so sit out the first round, in which a cluster of
-    false ones could fold the path beyond recovery.
+    Truncated least squares. Information that treats features as independent is over-confident, so the
+    limit is scaled by the distance of the median loop from the odometry's prediction where that exceeds the
+    χ² median. Loops beyond the scaled limit take no part in the first round, in which a cluster of
+    false ones could deform the path beyond recovery.
 
     Args:
-        part: With at least one loop.
-        width: Residual in sigmas beyond which a loop with honest information is false.
+        part: Component with at least one loop.
+        width: Residual in sigmas beyond which a loop with consistent information is an outlier.
 
     Raises:
         GraphError: The solver fails.
@@ -80,7 +80,7 @@ def graduate(part: Part, width: float) -> tuple[Array, Graduated]:
             if (np.minimum(weights, 1.0 - weights) < _DECIDED).all():
                 break
             mu *= _GROWTH
-    now = _reconsidered(part, terms, now, apart=apart, limit=limit)
+    now = _refine_inliers(part, terms, now, apart=apart, limit=limit)
     return (now.chi2 <= limit).astype(np.float64), now
 
 
@@ -108,24 +108,24 @@ def _truncated(chi2: Array, limit: float, mu: float) -> Array:
     return np.clip(ramp, 0.0, 1.0)
 
 
-def _reconsidered(
+def _refine_inliers(
     part: Part, terms: Sequence[gtsam.NonlinearFactor], now: Graduated, *, apart: Array, limit: float
 ) -> Graduated:
-    """Change what is believed where that lowers the truncated cost, while any loop is rejected.
+    """Change the set of inliers where that lowers the truncated cost, while any loop is rejected.
 
-    Weights change one loop at a time. So a true loop may stay out because nothing has pulled the path to it:
-    those nearly good enough are let in. And false loops that agree with each other can hold out against
-    the fewer true ones beside them: clusters are left out, first those that odometry believes least.
+    A true loop may stay rejected because the path was never optimised with it: loops near the limit are
+    added. False loops that agree with each other can outweigh fewer true ones beside them: clusters are
+    removed, first those farthest from the odometry's prediction.
     """
     clusters = sorted(_clusters(part.loops), key=lambda cluster: -float(apart[cluster].max()))
     cost = _cost(part, now, limit)
-    for cluster in (None, *clusters[:_MOST_SUSPECTS]):
-        believed = now.chi2 <= limit
-        tried = now.chi2 <= _NEARLY * limit if cluster is None else believed & ~cluster
-        if believed.all() or (tried == believed).all():
+    for cluster in (None, *clusters[:_MAX_CLUSTERS_TRIED]):
+        inliers = now.chi2 <= limit
+        tried = now.chi2 <= _UNUSED_LOOP_RATIO * limit if cluster is None else inliers & ~cluster
+        if inliers.all() or (tried == inliers).all():
             continue
         then = _round(part, terms, tried.astype(np.float64), now)
-        for share in (_NEARLY, 1.0):
+        for share in (_UNUSED_LOOP_RATIO, 1.0):
             then = _round(part, terms, (then.chi2 <= share * limit).astype(np.float64), then)
         if (lower := _cost(part, then, limit)) < cost:
             now, cost = then, lower
@@ -133,12 +133,12 @@ def _reconsidered(
 
 
 def _cost(part: Part, now: Graduated, limit: float) -> float:
-    """Return what truncated least squares minimises."""
+    """Return the truncated least-squares cost."""
     return 2.0 * sum(term.error(now.poses) for term in part.held) + float(np.minimum(now.chi2, limit).sum())
 
 
 def _clusters(loops: Sequence[BetweenFactor]) -> list[NDArray[np.bool_]]:
-    """Return which loops belong together, as masks: connected by both ends being close."""
+    """Return clusters of loops as masks: loops are connected where both ends are close."""
     ends = np.sort([(loop.i, loop.j) for loop in loops], axis=1)
     left = np.ones(len(loops), dtype=np.bool_)
     clusters = []
@@ -150,7 +150,7 @@ def _clusters(loops: Sequence[BetweenFactor]) -> list[NDArray[np.bool_]]:
             if not left[k]:
                 continue
             left[k], cluster[k] = False, True
-            beside = left & (np.abs(ends - ends[k]) <= _BESIDE).all(axis=1)
+            beside = left & (np.abs(ends - ends[k]) <= _CLUSTER_NODES).all(axis=1)
             rim += np.flatnonzero(beside).tolist()
         clusters.append(cluster)
     return clusters

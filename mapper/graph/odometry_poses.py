@@ -1,13 +1,13 @@
-"""Where odometry alone puts the nodes of a graph that has been solved since."""
+"""Node poses by odometry alone, for a graph that has been solved since."""
 
 from mapper.core.geometry import Transform, inverse
 from mapper.graph.model import PoseGraph
 
 
 def by_odometry(graph: PoseGraph) -> dict[int, Transform]:
-    """Return T_world_node, each hung on the first factor that ties it to an earlier one and is no loop.
+    """Return T_world_node, each chained by the first factor to an earlier node that is no loop.
 
-    A node without such a factor stays where it is, and what hangs on it goes with it: so does the first node.
+    A node without such a factor, as the first one, keeps its pose.
     """
     order = {node: place for place, node in enumerate(graph.T_world_node)}
     T_earlier_node: dict[int, tuple[int, Transform]] = {}

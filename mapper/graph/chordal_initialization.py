@@ -1,4 +1,4 @@
-"""A start that needs no estimates: chordal relaxation (Martinec & Pajdla 2007; Carlone et al. 2015)."""
+"""Initial poses by chordal relaxation, without estimates (Martinec & Pajdla 2007; Carlone et al. 2015)."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _BAD_FIT = 100.0
 
 
 def start_of(part: Part, config: GraphConfig) -> gtsam.Values:
-    """Return where the solver shall begin, as ``config.initial`` says.
+    """Return the initial poses, chosen by ``config.initial``.
 
-    "auto" stays with the estimates if they fit, or if loops are in doubt, which would spoil the relaxation.
-    Otherwise it takes the relaxation if that costs less. If it costs more, both are let take a step first:
-    before it, a start with all rotations right can look worse than one with none.
+    "auto" keeps the estimates if they fit, or if loops may be outliers, which would spoil the relaxation.
+    Otherwise it takes the relaxation if its cost is lower. If it is higher, both are compared after one
+    Gauss–Newton step: before it, a start with all rotations right can cost more than one with none.
 
     Raises:
         GraphError: A chordal start is asked for, and there is none.

@@ -1,4 +1,4 @@
-"""The thesis's loop correction: spread a loop's disagreement along the path (Somlyai, ALGORITHMS.md A9)."""
+"""Proportional loop correction: a loop's error distributed along the path (Somlyai, PhD thesis, §4.1.4)."""
 
 from collections.abc import Mapping
 
@@ -10,10 +10,10 @@ from mapper.graph.model import BetweenFactor, PoseGraph
 
 
 def distribute(graph: PoseGraph) -> dict[int, Transform]:
-    """Return the estimates after every loop was spread, in the order in which they closed.
+    """Return the estimates after the error of every loop was distributed, in the order in which they closed.
 
     Args:
-        graph: Nodes in time order; factors of origin "loop" are spread, others are what made the estimates.
+        graph: Nodes in time order; only factors of origin "loop" are used.
 
     Returns:
         T_world_node of every node, in the graph's order.
@@ -27,15 +27,15 @@ def distribute(graph: PoseGraph) -> dict[int, Transform]:
 
 
 def spread(T_world_node: Mapping[int, Transform], loop: BetweenFactor) -> dict[int, Transform]:
-    """Return poses of which the loop's later node fulfils it.
+    """Return poses that satisfy a loop, its error distributed in proportion to the path length.
 
-    The later node j takes the pose that the loop gives it, T_world_i · T_i_j: a shift Δt and a turn ΔR.
+    The later node j takes the pose T_world_i · T_i_j: a translation Δt and a rotation ΔR.
     A node between takes f · Δt and exp(f · log ΔR), f being its share of the path's length from i to j.
-    Up to i nothing moves; after j everything moves rigidly with j.
+    Nodes up to i keep their poses; nodes after j move rigidly with j.
 
     Args:
         T_world_node: Poses of the nodes in time order.
-        loop: How two of them lie to each other; either may be the later.
+        loop: Measured relative pose of two of them; either may be the later.
 
     Raises:
         GraphError: A node of the loop is not among the poses.
@@ -60,20 +60,20 @@ def spread(T_world_node: Mapping[int, Transform], loop: BetweenFactor) -> dict[i
     poses[i : j + 1, :3, 3] += share[:, np.newaxis] * shift
     poses[j] = wanted
     poses[j + 1 :] = after
-    # Every loop multiplies the rounding that the last ones left, and a transpose is no inverse off SO(3):
-    # after fifty loops in a row the path would burst.
+    # Rounding errors of successive loops multiply, and a transpose is no inverse off SO(3): without the
+    # projection the path diverges after about fifty loops.
     poses[i:, :3, :3] = nearest_rotation(poses[i:, :3, :3])
     return dict(zip(nodes, poses, strict=True))
 
 
 def _shares(positions: Array) -> Array:
-    """Return the share of the way to the last of (N, 3) positions that each has behind it, 0 … 1.
+    """Return the share of the path length up to each of (N, 3) positions, 0 … 1.
 
     Where nothing moved, every step counts the same.
     """
     steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    way = np.cumsum(steps_m if steps_m.sum() > 0.0 else np.ones_like(steps_m))
-    return np.concatenate([[0.0], way / way[-1]])
+    path = np.cumsum(steps_m if steps_m.sum() > 0.0 else np.ones_like(steps_m))
+    return np.concatenate([[0.0], path / path[-1]])
 
 
 def _turns(share: Array, rotation_rad: Array) -> Array:
