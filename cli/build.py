@@ -120,7 +120,7 @@ def built(
 
 
 def _onlooker(rerun: str | None, *, step: bool, overwrite: bool) -> "Onlooker | None":
-    """Return who looks on at a build, refusing at once what would fail at its end."""
+    """Return the observer of a build, refusing at once what would fail at its end."""
     from mapper.core.errors import ConfigError, RunError, ViewerError
 
     if rerun is None:

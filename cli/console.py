@@ -1,4 +1,4 @@
-"""What a user sees while a job runs: bars on a terminal, a line now and then elsewhere. All on stderr."""
+"""Progress on stderr: bars on a terminal, a line now and then elsewhere."""
 
 import sys
 import time

@@ -23,7 +23,7 @@ def demo(
     set_: Overrides = None,
     quiet: Quiet = False,
 ) -> None:
-    """Make a synthetic log of a walk through a flat, build a map from it, and tell where its pictures are.
+    """Make a synthetic log of a walk through a flat, build a map from it, and print where its pictures are.
 
     Example: mapper demo --out /tmp/demo --seconds 20
     """

@@ -18,7 +18,7 @@ _MARKS = {"well": "ok  ", "warning": "warn", "failed": "FAIL"}
 def doctor(
     json_: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
-    """Look at the machine, try every library in a process of its own, and tell what to do.
+    """Check the machine, try every library in a process of its own, and print what to do.
 
     The exit status is 1 if anything failed.
 

@@ -1,4 +1,4 @@
-"""What must be said to the libraries before they are loaded."""
+"""Environment variables that libraries read when they are loaded."""
 
 import os
 from pathlib import Path

@@ -24,7 +24,7 @@ def export(
     log: MovedLogs = None,
     quiet: Quiet = False,
 ) -> None:
-    """Write a run's map, cloud, surface, slice, trajectory or graph for other programs, and tell where it is.
+    """Write a run's map, cloud, surface, slice, trajectory or graph for other programs, and print its path.
 
     Example: mapper export runs/xyz --as octomap --out xyz.ot, or: mapper export runs/xyz --as mesh
     """

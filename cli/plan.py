@@ -17,14 +17,14 @@ _POINT_OPTIONS = ("--from", "--to")
 
 
 class Unknown(StrEnum):
-    """What unknown space counts as."""
+    """Treatment of unknown space."""
 
     BLOCKED = "blocked"
     FREE = "free"
 
 
 class Layer(StrEnum):
-    """Which grid a path in 2D is planned on."""
+    """Grid that a path in 2D is planned on."""
 
     SLICE = "slice"
     TRAVERSABLE = "traversable"

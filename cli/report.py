@@ -39,7 +39,7 @@ def report(
 
 
 def _names(runs: Sequence[Path]) -> list[str]:
-    """Return the folders' names; as they were given where that would not tell them apart."""
+    """Return the folders' names, or their paths as given where names are not unique."""
     short = [run.resolve().name for run in runs]
     seen = Counter(short)
     return [str(run) if seen[name] > 1 else name for run, name in zip(runs, short, strict=True)]

@@ -1,4 +1,4 @@
-"""``mapper config``: every knob with its value."""
+"""``mapper config``: every setting with its value."""
 
 from enum import StrEnum
 from typing import Annotated
@@ -9,7 +9,7 @@ from cli.options import ConfigFile, Overrides
 
 
 class SensorName(StrEnum):
-    """Whose defaults."""
+    """Sensor whose defaults are shown."""
 
     RGBD = "rgbd"
     LIDAR = "lidar"

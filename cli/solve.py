@@ -16,7 +16,7 @@ _MOST_SIZES = 8
 
 
 class RobustKernel(StrEnum):
-    """What is done about false loops."""
+    """Treatment of false loops."""
 
     GNC = "gnc"
     CAUCHY = "cauchy"
@@ -26,7 +26,7 @@ class RobustKernel(StrEnum):
 
 
 class Initial(StrEnum):
-    """Where the solver begins."""
+    """Initial poses of the solver."""
 
     AUTO = "auto"
     GIVEN = "given"

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Stepping:
-    """Looks on together with another, and lets the build go on when a key says so."""
+    """Observer that forwards to another and waits for a key after every frame."""
 
     def __init__(self, other: "Observer") -> None:
         """Refuse to wait for somebody who is not there.

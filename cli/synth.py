@@ -12,7 +12,7 @@ from cli.options import Quiet, assignments, merged
 
 
 class SensorKind(StrEnum):
-    """What takes the log."""
+    """Sensor that takes the log."""
 
     RGBD = "rgbd"
     LIDAR = "lidar"
@@ -20,7 +20,7 @@ class SensorKind(StrEnum):
 
 
 class LidarScene(StrEnum):
-    """Where a LiDAR is."""
+    """Surroundings of a LiDAR."""
 
     STREET = "street"
     COURTYARD = "courtyard"
@@ -151,7 +151,7 @@ def _at_wall(distance_m: float | None) -> dict[str, object]:
 
 
 def _camera_noise(noise: float | None) -> dict[str, object]:
-    """Return every knob of the camera's noise, scaled from its default."""
+    """Return every noise setting of the camera, scaled from its default."""
     from mapper.simulation.config import SensorConfig
 
     if noise is None:
@@ -167,7 +167,7 @@ def _camera_noise(noise: float | None) -> dict[str, object]:
 
 
 def _lidar_noise(noise: float | None) -> dict[str, object]:
-    """Return every knob of the LiDAR's noise, scaled from its default."""
+    """Return every noise setting of the LiDAR, scaled from its default."""
     from mapper.simulation.config import LidarSensorConfig
 
     if noise is None:

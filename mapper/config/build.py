@@ -1,4 +1,4 @@
-"""Every knob with its unit and default, and how files and overrides reach it."""
+"""Configuration of a build."""
 
 from pydantic import NonNegativeInt, PositiveInt
 
@@ -14,7 +14,7 @@ from mapper.sources.config import SourceConfig
 
 
 class BuildConfig(Config):
-    """Everything ``mapper build`` can be told."""
+    """All settings of ``mapper build``."""
 
     source: SourceConfig = SourceConfig()
     odometry: OdometryConfig = LocalMapConfig()

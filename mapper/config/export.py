@@ -1,4 +1,4 @@
-"""What is made from a run on demand."""
+"""Settings of products that are made on demand: meshes and viewer recordings."""
 
 from typing import Annotated
 
@@ -22,7 +22,7 @@ class MeshConfig(Config):
 
 
 class RerunConfig(Config):
-    """What a viewer is shown while a map is built."""
+    """Settings of what a viewer shows while a map is built."""
 
     image_stride: PositiveInt = 3
     """Every n-th frame is shown with its image and cloud, which costs reading it again."""

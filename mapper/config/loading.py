@@ -98,7 +98,7 @@ def _is_of_a_run(path: Path) -> bool:
 
 
 def _drop_former_settings(tree: dict[str, Any], path: Path) -> None:
-    """Delete the names that the model does not know; a run's file was complete when it was written."""
+    """Delete the names that are no settings; a run's file was complete when it was written."""
     try:
         BuildConfig.model_validate(tree)
     except ValidationError as error:

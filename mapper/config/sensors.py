@@ -1,4 +1,4 @@
-"""What a sensor's logs begin with, where that differs from the classes' own defaults."""
+"""Default settings per sensor, where they differ from the classes' own defaults."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,1 +1,1 @@
-"""What can be wrong with a machine or an installation, found before a log is at stake."""
+"""Examination of a machine and an installation, before a log is at stake."""

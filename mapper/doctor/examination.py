@@ -1,4 +1,4 @@
-"""Every look the doctor takes, in the order in which they are told."""
+"""All checks of the examination, in the order in which they are reported."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""What an examination finds."""
+"""Finding of a check."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -1,4 +1,4 @@
-"""Whether each library is there, new enough, and right about a tiny job."""
+"""Checks of every library: installed, new enough, and right about a tiny job."""
 
 import re
 import signal
@@ -17,7 +17,7 @@ _MISSING_OBJECT = re.compile(r"(?P<object>lib[\w.+-]+\.so[\w.]*): cannot open sh
 
 
 def requirements() -> dict[str, str]:
-    """Return the least version of every library that we need, by the name under which pip knows it."""
+    """Return the least version of every required library, by its name in pip."""
     found = {}
     for line in metadata.requires("mapper") or ():
         match = _REQUIREMENT.match(line)
@@ -46,7 +46,7 @@ def look_at_library(name: str, least: str = "0") -> Finding:
 def tried(
     name: str, version: str, command: Sequence[str], *, again: str, patience_s: float = _PATIENCE_S
 ) -> Finding:
-    """Run a self-test in a process of its own, and tell how that ended.
+    """Run a self-test in a process of its own, and return how it ended.
 
     Args:
         name: Of the library.

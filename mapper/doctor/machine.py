@@ -1,4 +1,4 @@
-"""What the machine offers: interpreter, C library, processors, memory, disk, a place for compiled code."""
+"""Checks of the machine: interpreter, C library, processors, memory, disk, a place for compiled code."""
 
 import os
 import platform

@@ -65,7 +65,7 @@ def kiss_icp(_folder: Path) -> None:
 
 
 def kiss_matcher(_folder: Path) -> None:
-    """Build the matcher and let it look for a motion."""
+    """Build the matcher and register a cloud."""
     from kiss_matcher import KISSMatcher
 
     found = KISSMatcher(0.2).estimate(*(points.astype(np.float32) for points in _corners()))

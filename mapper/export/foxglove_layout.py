@@ -1,4 +1,4 @@
-"""How Foxglove is to arrange a run's MCAP log: import the file in its layout menu, then open ``run.mcap``."""
+"""Foxglove layout for a run's MCAP log: import the file in its layout menu, then open ``run.mcap``."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What pictures of several panels share: the page, its panels, their colours, and what is drawn in many."""
+"""Figures of several panels: the page, its panels, their colours, and shared drawing functions."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""What a run already holds, under another name or in another text form."""
+"""Exports that copy a file of the run, or write it in another text form."""
 
 import shutil
 from pathlib import Path
@@ -18,7 +18,7 @@ def octomap(run: Run, path: Path, _progress: Progress) -> None:
 
 
 def native(run: Run, path: Path, _progress: Progress) -> None:
-    """Copy the octree with everything that it knows, compressed."""
+    """Copy the octree with all its attributes, compressed."""
     _copy(run, files.OCTREE_MAP, path)
 
 

@@ -1,4 +1,4 @@
-"""What a run tells in its MCAP log."""
+"""MCAP log of a run: transforms, diagnostics, trajectories, factors, snapshots and maps."""
 
 import math
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""What ``mapper solve`` leaves: the solved graph alone, or a folder with its path, a picture and a report."""
+"""Products of ``mapper solve``: the solved graph alone, or a folder with its path, a picture and a report."""
 
 import json
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ class SolvedGraph:
 
     @property
     def loops(self) -> int:
-        """How many factors are loops."""
+        """Number of factors that are loops."""
         return sum(factor.origin == "loop" for factor in self.graph.factors)
 
     @property

@@ -1,4 +1,4 @@
-"""Occupied voxels for viewers that know no octrees: as points, and as the outside of cubes."""
+"""Occupied voxels for viewers without octrees: as points, and as the outside of cubes."""
 
 from pathlib import Path
 

@@ -22,7 +22,7 @@ _ABSOLUTE_ERROR = 1e-10
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """When to stop: after so many iterations, or when one improves the error by less than this share.
+    """Termination criteria: a number of iterations, or an improvement below this share of the error.
 
     Attributes:
         report: Told the iterations done, and how many there may be; in the end, how many there were.
@@ -101,7 +101,7 @@ def problem_of(terms: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorG
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Descent:
-    """Where steps led; ``rose`` if the last one, not taken, led up or to infinity."""
+    """State of the descent; ``rose`` if the last step, not taken, increased the error."""
 
     values: gtsam.Values
     iterations: int

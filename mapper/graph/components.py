@@ -1,4 +1,4 @@
-"""Connected components of a pose graph, and where a component lies that a later factor ties to another."""
+"""Connected components of a pose graph, and their alignment by the factors between them."""
 
 from collections.abc import Set
 
@@ -24,7 +24,7 @@ def components(graph: PoseGraph) -> list[list[int]]:
 
 
 def align_components(graph: PoseGraph) -> PoseGraph:
-    """Return the graph with every part that the odometry left untied moved to where the first tie says.
+    """Return the graph with every component of the odometry moved to where its first connecting factor puts it.
 
     A part begun after a loss stands where the camera was last seen, which may be rooms away from where it
     was: no place for a solver to start from.
@@ -46,7 +46,7 @@ def align_components(graph: PoseGraph) -> PoseGraph:
 
 
 def _tie(graph: PoseGraph, part: Set[int], T_world_laid: dict[int, Transform]) -> Transform | None:
-    """Return the motion that puts a part where the first factor from what is laid wants it."""
+    """Return the motion that aligns a component with the first factor from those already aligned."""
     for factor in graph.factors:
         if factor.i in T_world_laid and factor.j in part:
             wanted, node = T_world_laid[factor.i] @ factor.T_i_j, factor.j

@@ -1,4 +1,4 @@
-"""How the pose graph is solved."""
+"""Settings of the pose graph's solver and of wheel factors."""
 
 from typing import Literal
 
@@ -10,7 +10,7 @@ KernelKind = Literal["cauchy", "huber", "dcs"]
 
 
 class WheelNoiseConfig(Config):
-    """How far wheels are believed: not far, for they slip, but over any way."""
+    """Noise of wheel odometry."""
 
     max_gap_s: PositiveFloat = 0.2
     """Between two readings; in a longer gap it is not known where the wheels were."""
@@ -25,7 +25,7 @@ class WheelNoiseConfig(Config):
 
 
 class WheelFactorsConfig(WheelNoiseConfig):
-    """What the wheels add to another odometry; where they are the odometry, their word counts once."""
+    """Settings of wheel factors beside another odometry."""
 
     use: bool = True
     """Tie keyframes by the wheels, where a log has them."""

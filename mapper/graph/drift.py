@@ -1,4 +1,4 @@
-"""How far odometry may have drifted between two nodes, and how far a loop says that it has."""
+"""Drift of the odometry between two nodes, and how well a loop agrees with it."""
 
 from __future__ import annotations
 

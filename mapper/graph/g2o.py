@@ -90,7 +90,7 @@ def read_g2o(path: Path, *, guess_loops: bool = False, progress: Progress = SILE
 
 @dataclass(frozen=True, slots=True)
 class _Form:
-    """What the numbers of a line mean.
+    """Meaning of the numbers of a line.
 
     Attributes:
         ids: How many there are.

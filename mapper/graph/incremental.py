@@ -117,7 +117,7 @@ class IncrementalSolver:
         return dict(self._T_world_node)
 
     def _join(self, factor: BetweenFactor) -> None:
-        """Make one component of the two that a factor ties."""
+        """Make one component of the two that a factor connects."""
         two = self._component[factor.i], self._component[factor.j]
         older, younger = (first for first in self._members if first in two)
         joining = self._members.pop(younger)

@@ -22,7 +22,7 @@ _ANCHOR = PoseSigmas(rotation_rad=1e-3, translation_m=1e-3)
 
 @dataclass(frozen=True, slots=True)
 class Kernel:
-    """What large residuals cost: less than their square.
+    """Robust kernel: large residuals cost less than their square.
 
     Attributes:
         kind: "huber" (1964), "cauchy" or "dcs", Dynamic Covariance Scaling (Agarwal et al. 2013).

@@ -40,7 +40,7 @@ class Board:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationShot:
-    """What one image of a board at a known place showed.
+    """Measurements of one image of a board at a known place.
 
     Attributes:
         board: Its stripe.

@@ -30,7 +30,7 @@ class LateralLaw(Config):
 
 
 class VehicleConfig(Config):
-    """What carries the sensor."""
+    """Settings of the vehicle that carries the sensor."""
 
     wheelbase_m: PositiveFloat | None = None
     """Between the axles; encoder readings need it."""
@@ -39,7 +39,7 @@ class VehicleConfig(Config):
 
 
 class LineLaserCalibration(Config):
-    """What turns the stripe's place in the image into a place before the vehicle."""
+    """Calibration: from the stripe's pixel to a point before the vehicle."""
 
     width_px: PositiveInt
     height_px: PositiveInt
@@ -76,7 +76,7 @@ Degrees = Annotated[float, Field(ge=0.0, lt=360.0)]
 
 
 class StripeConfig(Config):
-    """When a pixel shows the stripe."""
+    """Settings of the stripe detection."""
 
     hue_from_deg: Degrees = 355.0
     hue_to_deg: Degrees = 10.0
@@ -117,7 +117,7 @@ class LineLaserMapConfig(Config):
 
 
 class LineLaserConfig(Config):
-    """Everything ``mapper sensor line-laser`` can be told."""
+    """All settings of ``mapper sensor line-laser``."""
 
     stripe: StripeConfig = StripeConfig()
     map: LineLaserMapConfig = LineLaserMapConfig()

@@ -1,4 +1,4 @@
-"""Where the stripe is in an image: each published method on its own, and their combination.
+"""Detection of the laser stripe in an image: each published method on its own, and their combination.
 
 Every method takes an image to the (H, W) uint8 response that it leaves; 0 is a pixel that it rejects.
 """

@@ -1,4 +1,4 @@
-"""What lies in a folder of a line-laser sensor: its images, and the shots it is calibrated by."""
+"""Folders of a line-laser sensor: its images, and the shots it is calibrated by."""
 
 from collections.abc import Sequence
 from pathlib import Path

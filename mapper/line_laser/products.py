@@ -1,4 +1,4 @@
-"""What a line-laser sensor saw, as files: ranges, local grids, the map, points and pictures."""
+"""Output files of a line-laser sensor: ranges, local grids, the map, points and pictures."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence

@@ -15,7 +15,7 @@ from mapper.line_laser.detection import combined, stripe_rows
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineScan:
-    """What one image told.
+    """Ranges measured in one image.
 
     Attributes:
         stamp_ns: Time of capture.

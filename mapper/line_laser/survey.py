@@ -23,7 +23,7 @@ _WORKERS = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """What the wheels make of scans.
+    """Scans with their poses by wheel odometry.
 
     Attributes:
         scans: Those whose place is known.
@@ -46,7 +46,7 @@ def scan_images(
     *,
     progress: Progress = SILENT,
 ) -> tuple[dict[Path, LineScan], list[str]]:
-    """Return what each image that can be read tells, and notes on those that cannot.
+    """Return the scan of each image that can be read, and notes on those that cannot.
 
     Raises:
         SourceError: None can be read.
@@ -80,7 +80,7 @@ def scan_images(
 
 
 def sensor_poses(wheels: Path, calibration: LineLaserCalibration) -> tuple[Trajectory, list[str]]:
-    """Return T_world_sensor as wheels tell it, and notes; the world is where the rear axle begins.
+    """Return T_world_sensor by wheel odometry, and notes; the world's origin is the rear axle's first pose.
 
     Args:
         wheels: ``encoders.txt`` or ``wheels.txt``, or a file of either kind.
@@ -108,7 +108,7 @@ def drive(
     *,
     progress: Progress = SILENT,
 ) -> Drive:
-    """Return the map of scans at the places that wheels tell.
+    """Return the map of scans at their poses by wheel odometry.
 
     Args:
         scans: In time order.

@@ -1,4 +1,4 @@
-"""A second session of the same place: tracked on its own, tied to the first by loops, mapped with it."""
+"""Appending: a second session of the same place, connected to the first by loops and mapped with it."""
 
 from collections import Counter
 from collections.abc import Sequence, Set
@@ -119,7 +119,7 @@ def _after(
     config: BuildConfig,
     progress: Progress,
 ) -> Start:
-    """Return the start of a session that knows the places of the one before."""
+    """Return the start of a session, with the places of the earlier one preloaded."""
     assert isinstance(config.loops, KeyframeLoopsConfig)
     graph = before.graph
     detector = config.loops.build(config.graph.solve)

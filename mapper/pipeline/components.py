@@ -1,4 +1,4 @@
-"""Parts of a path that the odometry left untied: wheels and loops tie them; what nothing ties is left out."""
+"""Disconnected parts of a path: without a loop or wheels between them, all but one are left out."""
 
 from collections import Counter
 from collections.abc import Set
@@ -18,7 +18,7 @@ DISCONNECTED = "untied"
 
 
 def largest_component(tracking: TrackingResult, *, progress: Progress) -> TrackingResult:
-    """Return what was tracked without the parts that nothing ties to the one with most frames, and say so.
+    """Return the component with most frames, and note how many frames are left out.
 
     After a loss the odometry may begin anew where nothing is known. Until a loop joins the two parts, nobody
     knows how they lie to each other, and a map of both would be a guess: the frames left out count as lost.
@@ -30,7 +30,7 @@ def largest_component(tracking: TrackingResult, *, progress: Progress) -> Tracki
 
 
 def component_of(tracking: TrackingResult, node: int, *, progress: Progress) -> TrackingResult:
-    """Return what was tracked without the parts that nothing ties to a node's own, and say so."""
+    """Return the component that holds a node, and note how many frames are left out."""
     parts = components(tracking.graph)
     if len(parts) <= 1:
         return tracking

@@ -1,4 +1,4 @@
-"""The graph between the two passes: solved, and its loops told what became of them."""
+"""Solving a tracked graph: the solution, the final verdict of every loop, and the manifest's record."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -31,7 +31,7 @@ _DOUBTS: Mapping[Sensor | Literal["wheels"], str] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackingResult:
-    """What the first pass found.
+    """Result of the first pass over a log.
 
     Attributes:
         tracks: One per frame that could be read, in time order.
@@ -63,7 +63,7 @@ class TrackingResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Start:
-    """What tracking begins with.
+    """State that tracking begins with.
 
     Attributes:
         odometry: Before its first frame.

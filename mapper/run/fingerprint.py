@@ -1,4 +1,4 @@
-"""What tells one input from another, without reading gigabytes of images."""
+"""Fingerprint of a log: tells inputs apart by names, sizes and lists, without reading every image."""
 
 import hashlib
 import os

@@ -56,7 +56,7 @@ class Run:
         return read_tum(self.path / files.TRAJECTORY)
 
     def truth(self) -> Trajectory | None:
-        """Return where the body really was, in the truth's own frame, if the log told."""
+        """Return the true body poses, in the truth's own frame, if the log has them."""
         path = self.path / files.TRUTH
         return read_tum(path) if path.exists() else None
 

@@ -1,4 +1,4 @@
-"""What became of every frame of a log, and how long it took."""
+"""Frame records: the outcome of every frame of a log, and the time it took."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""What a run folder says about itself."""
+"""Manifest of a run: versions, input, counts, timing and outcome."""
 
 import platform
 import sys
@@ -67,7 +67,7 @@ class Input(Log):
 
 
 class Counts(Config):
-    """How many of what; every listed frame is skipped, lost or tracked."""
+    """Counts of frames, nodes, factors and voxels; every listed frame is skipped, lost or tracked."""
 
     listed: int = 0
     read: int = 0
@@ -95,7 +95,7 @@ class SkippedFrame(Config):
 
 
 class Solve(Config):
-    """What the back end did."""
+    """Record of the pose graph's solve."""
 
     error_before: float
     """½ χ² of the first estimates."""
@@ -106,7 +106,7 @@ class Solve(Config):
 
 
 class Levelling(Config):
-    """How the world frame got its z axis and its floor."""
+    """Record of how the world's z axis and floor were found."""
 
     method: str
     detail: str

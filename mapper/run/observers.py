@@ -1,4 +1,4 @@
-"""Who looks on while a map is built, without the builder knowing what they do with what they see."""
+"""Observers of a build: viewers and prompts that receive every tracked frame and the results."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ class Step:
 
 
 class Observer(Protocol):
-    """Whoever looks on. What they are told is not theirs to change."""
+    """Observer of a build; its arguments are read-only."""
 
     def on_frame(self, step: Step, /) -> None:
         """See a frame that was read, in time order, in the thread that tracks."""
@@ -51,7 +51,7 @@ class Observer(Protocol):
 
 
 class NullObserver:
-    """Nobody looks on."""
+    """Observer that ignores everything."""
 
     def on_frame(self, step: Step, /) -> None:
         """Ignore the frame."""

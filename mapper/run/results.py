@@ -1,4 +1,4 @@
-"""A tracked log, ready to be told: to an MCAP file, to a viewer, or in a report."""
+"""Results of a run, read together for its MCAP log, a viewer or a report."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class RunResults:
 
 
 def load_results(run: Run) -> RunResults:
-    """Return what a run has to tell; its maps may still be missing."""
+    """Return the results of a run; its maps may still be missing."""
     trajectory, truth = run.trajectory(), run.truth()
     if truth is not None:
         truth = aligned_truth(truth, trajectory)

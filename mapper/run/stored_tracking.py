@@ -1,4 +1,4 @@
-"""What a run folder keeps of tracking: written after the first pass, changed when its graph is solved."""
+"""Stored tracking: the files of a run that tracking writes and a solve changes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

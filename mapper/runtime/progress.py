@@ -1,4 +1,4 @@
-"""How a long job tells that it is alive, without knowing who watches."""
+"""Progress of long jobs: stages, counts and notes."""
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -9,10 +9,10 @@ Report = Callable[[int, int], None]
 
 
 class Progress(Protocol):
-    """Whoever watches a job."""
+    """Receiver of a job's progress."""
 
     def stage(self, name: str) -> AbstractContextManager[Report]:
-        """Enter a stage of the job, named in a word or two; it is told how far it is."""
+        """Enter a stage of the job, named in a word or two; the result takes its counts."""
         ...
 
     def note(self, message: str) -> None:
@@ -21,7 +21,7 @@ class Progress(Protocol):
 
 
 class Silent:
-    """Nobody watches."""
+    """Receiver that ignores everything."""
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Report]:  # noqa: ARG002

@@ -23,7 +23,7 @@ class Stopwatch:
 
     @property
     def total_s(self) -> float:
-        """Seconds since the watch was made."""
+        """Seconds since the stopwatch was made."""
         return time.perf_counter() - self._started
 
     @contextmanager

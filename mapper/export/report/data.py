@@ -1,4 +1,4 @@
-"""What the page's curves and plans are drawn from."""
+"""Data of the report's curves and plans."""
 
 import base64
 import math
@@ -39,7 +39,7 @@ class Figure:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chapter:
-    """What a report says of one run.
+    """One run's part of a report.
 
     Attributes:
         name: Distinct among the report's runs.
@@ -125,7 +125,7 @@ def _path(stamps_ns: NDArray[np.int64], positions: NDArray[np.float64], seconds:
 
 
 def _errors(results: RunResults, seconds: _Seconds) -> dict[str, Any] | None:
-    """Return how far the estimate is from the truth laid over it: the terms of the ATE, SE(3)-aligned."""
+    """Return the errors of the estimate against the aligned truth: the terms of the ATE, SE(3)-aligned."""
     if results.truth is None:
         return None
     index, gap_ns = nearest(results.truth.stamps_ns, results.trajectory.stamps_ns)

@@ -1,4 +1,4 @@
-"""How the viewer arranges a recording, so that it looks good at once."""
+"""Rerun blueprint: the arrangement of views for a recording."""
 
 import numpy as np
 import rerun.blueprint as rrb

@@ -1,4 +1,4 @@
-"""A finished run, told to a recording."""
+"""A finished run as a Rerun recording."""
 
 from collections.abc import Iterable
 

@@ -1,4 +1,4 @@
-"""A build, told to a recording while it goes on.
+"""A build as a Rerun recording while it runs.
 
 What tracking believes lies below /world/live, in a world that is upright only by guess; once the graph is
 solved and levelled, that entity is laid into the levelled world. The body stays where the odometry saw it:
@@ -41,7 +41,7 @@ _UNMATCHED: Rgb = (150, 150, 150)
 
 
 class LiveRerun:
-    """Looks on while a map is built, and tells a recording; made by :func:`watching`."""
+    """Observer that logs a build to a recording; made by :func:`watching`."""
 
     def __init__(self, log: RerunLog, sensor: Sensor, config: RerunConfig) -> None:
         self._log = log
@@ -74,7 +74,7 @@ class LiveRerun:
             self._tell_paths(step)
 
     def on_levelled(self, T_level_world: Transform, /) -> None:
-        """Lay what was told so far into the levelled world."""
+        """Log the pose of everything logged so far in the levelled world."""
         self._log.log(_LIVE, transform_of(T_level_world @ inverse(self._T_guess_world)))
 
     def on_mapped(self, run: Run, results: RunResults, maps: Maps, /) -> None:
@@ -140,7 +140,7 @@ class LiveRerun:
         self._log.log(f"{self._log.body}/cloud", points, stamp_ns=scan.stamp_ns)
 
     def _tell_paths(self, step: Step) -> None:
-        """Log the path before loops, the nodes as believed with them, and what ties these; not every time."""
+        """Log the path before loops, the current node estimates and the factors; not for every keyframe."""
         loops = step.detector.closures()
         grown = len(self._nodes) >= (1.0 + _GROWTH) * self._told_at
         if not grown and len(loops) == self._told_loops:
@@ -171,7 +171,7 @@ class LiveRerun:
 
 @contextmanager
 def watching(target: str, source: FrameSource, config: RerunConfig) -> Iterator[LiveRerun]:
-    """Yield a watcher that tells a target; a build that fails leaves what it recorded.
+    """Yield an observer that logs to a target; a build that fails leaves what it recorded.
 
     Args:
         target: FILE.rrd, "spawn", "connect" or "connect:URL".

@@ -1,4 +1,4 @@
-"""What a recording can be told: the entities of a run, by name, and what each is drawn as.
+"""Rerun recordings: the entities of a run, by name, and the archetype of each.
 
 ==========================  =======================  ====================================================
 entity                      archetype                what it is
@@ -117,7 +117,7 @@ class RerunLog:
         )
 
     def mount(self, camera: PinholeCamera, T_body_camera: Transform) -> None:
-        """Log a camera and where it sits on the body; Rerun knows no lens distortion."""
+        """Log a camera and its pose on the body; Rerun has no lens distortion."""
         self.log(self.camera, transform_of(T_body_camera))
         self.log(
             self.camera,
@@ -266,7 +266,7 @@ def recorded(
 
 
 def new_recording() -> rr.RecordingStream:
-    """Return a recording that knows the log's clock only, not when it was told."""
+    """Return a recording whose only timeline is the log's clock."""
     recording = rr.RecordingStream(APPLICATION)
     recording.set_log_time_enabled(False)
     return recording

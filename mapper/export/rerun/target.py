@@ -1,4 +1,4 @@
-"""Where a recording goes: into a file, to a viewer that is started, or to one that runs."""
+"""Targets of a recording: a file, a viewer that is started, or one that runs."""
 
 import os
 import socket

@@ -115,7 +115,7 @@ def _write_shots(folder: Path, config: LineLaserSynthConfig) -> None:
 
 
 def _encoders_text(config: LineLaserSynthConfig) -> str:
-    """Return what encoder and steering tell: whole ticks, and a noisy angle."""
+    """Return readings of encoder and steering: whole ticks, and a noisy angle."""
     last_ns = int(sensor_poses(config).stamps_ns[-1])
     stamps_ns = np.arange(_START_NS, last_ns + _READING_NS, _READING_NS, dtype=np.int64)
     path_m = config.speed_mps * (stamps_ns - _START_NS) / NS_PER_S

@@ -1,4 +1,4 @@
-"""What the camera of a line laser sees: a pinhole, a sheet of light, and all that disturbs.
+"""Rendered images of a line laser: a pinhole camera, a sheet of light, and disturbances.
 
 Camera and laser look level and straight ahead, one above the other, and the sheet falls to the floor at
 the reach. So the stripe's height in the image is a/d + b of the distance d, whatever the column, which for
@@ -47,7 +47,7 @@ class Shot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _View:
-    """What each column looks at, and each pixel.
+    """Directions of the image's columns and pixels.
 
     Attributes:
         sight_world: (W, 2) direction of a column, one metre ahead.

@@ -62,7 +62,7 @@ def make_room(config: LineLaserSynthConfig) -> Room:
 
 
 def make_board(config: LineLaserSynthConfig, *, range_m: float, width_m: float) -> Room:
-    """Return a board that faces whoever stands at the origin and looks along x."""
+    """Return a board that faces an observer at the origin who looks along x."""
     half = 0.5 * width_m
     return furnished(np.array([[[range_m, -half], [range_m, half]]]), config)
 
