@@ -59,7 +59,9 @@ def test_only_the_largest_part_is_kept_and_it_is_said():
     assert sorted(kept.graph.T_world_node) == [3, 4, 5, 6, 7]
     assert [t.node for t in kept.tracks] == [None, None, None, 3, 4, 5, 6, 7]
     assert kept.tracks[0].diagnostics.method == DISCONNECTED
-    assert [(loop.verdict, loop.reason.split(":")[0]) for loop in kept.loops] == [("rejected", "untied")]
+    assert [(loop.verdict, loop.reason.split(":")[0]) for loop in kept.loops] == [
+        ("rejected", "disconnected")
+    ]
     assert {(f.i, f.j) for f in kept.graph.factors} == {(3, 4), (4, 5), (5, 6), (6, 7)}
     assert len(kept.trajectory()) == 5
     (note,) = listener.notes

@@ -89,7 +89,7 @@ def test_a_second_drive_is_tied_to_the_first(first, logs, tmp_path):
 
 
 def test_a_drive_elsewhere_is_refused(first, logs, tmp_path):
-    with pytest.raises(LoopError, match="no loop ties it"):
+    with pytest.raises(LoopError, match="no loop connects it"):
         appended(first, logs / "elsewhere", tmp_path / "joined")
     assert not (tmp_path / "joined").exists()
 

@@ -164,7 +164,7 @@ def _put(tree: dict[str, Any], override: str) -> None:
 def _with_kinds(tree: dict[str, Any], default: Config) -> dict[str, Any]:
     """Return the tree with what it leaves out and the classes' own defaults would not restore.
 
-    That is every ``kind``, and whatever a part's default says beyond its class: turning one knob of a part
+    That is every ``kind``, and whatever a part's default adds to its class: an override of one setting
     must not turn back the others.
     """
     filled = dict(tree)

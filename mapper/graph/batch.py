@@ -38,8 +38,8 @@ class Part:
     """One connected part of a pose graph.
 
     Attributes:
-        known: Its factors that are believed.
-        loops: Its factors in doubt.
+        known: Its factors that are inliers for certain.
+        loops: Its factors that may be outliers.
         held: GTSAM's terms of ``known``, and the anchor.
         start: Where the solver begins.
     """

@@ -27,7 +27,7 @@ def start_of(part: Part, config: GraphConfig) -> gtsam.Values:
     Gauss–Newton step: before it, a start with all rotations right can cost more than one with none.
 
     Raises:
-        GraphError: A chordal start is asked for, and there is none.
+        GraphError: A chordal start is required, and there is none.
     """
     if config.initial == "given":
         return part.start

@@ -21,11 +21,11 @@ def innovations(known: Sequence[BetweenFactor], loops: Sequence[BetweenFactor]) 
     Along the spanning tree of the surest known factors, poses are chained and first-order covariances add
     up in the world's tangent space (Barfoot & Furgale 2014, eq. 55 without the fourth-order terms). It is
     as wide as odometry claims to have drifted: over a long way a large disagreement says little. Parts that
-    only loops tie are tied by the one that the others between them fit best.
+    only loops connect are connected by the loop that the others between them fit best.
 
     Args:
-        known: Factors that are believed.
-        loops: Factors in doubt.
+        known: Factors that are inliers for certain.
+        loops: Factors that may be outliers.
 
     Returns:
         (len(loops),) χ² of six degrees of freedom; 0 of a tie, and of a loop to a node without known factors.

@@ -77,27 +77,27 @@ class IncrementalSolver:
         if not waiting:
             return
         terms = gtsam.NonlinearFactorGraph()
-        tied: dict[int, None] = {}
+        connected: dict[int, None] = {}
         for factor in waiting:
             terms.add(between(factor, kernel=_HUBER if factor.origin == "loop" else None))
-            tied |= dict.fromkeys((factor.i, factor.j))
-        for first in dict.fromkeys(self._component[node] for node in tied):
+            connected |= dict.fromkeys((factor.i, factor.j))
+        for first in dict.fromkeys(self._component[node] for node in connected):
             if first not in self._anchored:
                 terms.add(anchor(first, self._T_world_node[first]))
                 self._anchored.add(first)
-        new = [node for node in tied if node not in self._solved]
+        new = [node for node in connected if node not in self._solved]
         try:
             self._isam.update(terms, values_of(self._T_world_node, new))
             if any(factor.origin == "loop" for factor in waiting):
                 self._isam.update()  # a loop moves poses farther than one linearisation holds
         except RuntimeError as error:  # how GTSAM's C++ exceptions arrive, several lines long
             raise GraphError(f"the growing graph cannot be solved: {' '.join(str(error).split())}") from None
-        self._solved |= tied.keys()
+        self._solved |= connected.keys()
         self._used = len(self._factors)
         self._is_read = False
 
     def pose_of(self, node: int) -> Transform:
-        """Return the (4, 4) believed pose of a node.
+        """Return the (4, 4) current estimate of a node's pose.
 
         Raises:
             GraphError: The node is unknown.
@@ -110,7 +110,7 @@ class IncrementalSolver:
         return self._T_world_node[node]
 
     def poses(self) -> dict[int, Transform]:
-        """Return the (4, 4) believed pose of every node, in the order in which they were added."""
+        """Return the (4, 4) current estimate of every node's pose, in the order in which they were added."""
         if not self._is_read:
             self._T_world_node |= poses_of(self._isam.calculateEstimate())
             self._is_read = True
@@ -122,7 +122,7 @@ class IncrementalSolver:
         older, younger = (first for first in self._members if first in two)
         joining = self._members.pop(younger)
         both_solved = older in self._anchored and younger in self._anchored
-        if both_solved or factor.origin == "loop":  # new nodes hang where their first factor wants them
+        if both_solved or factor.origin == "loop":  # a new node is placed by its first factor
             self._move(joining, factor)
         if both_solved:
             self._restart()

@@ -1,4 +1,4 @@
-"""Solve a pose graph: each connected component on its own, loops as far as they can be believed."""
+"""Batch optimisation of a pose graph: each connected component on its own, loops with outlier rejection."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,7 +30,7 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
     keeps its first node where it was; a node without factors keeps its estimate.
 
     With ``config.solve == "proportional"`` the loops are spread along the path instead, and with "none"
-    all estimates are returned as they are; the errors tell how well they fit.
+    all estimates are returned as they are; the errors show how well they fit.
 
     Args:
         graph: At least one node; it is not changed.
@@ -67,10 +67,10 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
                 )
                 part = replace(part, start=start_of(part, config))
                 with progress.stage("solve") as report:
-                    solved, believed, more = solve_part(part, config, report=report)
+                    solved, loop_weights, more = solve_part(part, config, report=report)
                 T_world_node |= poses_of(solved)
                 iterations += more
-                for k, weight in zip(loops, believed, strict=True):
+                for k, weight in zip(loops, loop_weights, strict=True):
                     weights[k] = float(weight)
     after = _errors(terms, values_of(T_world_node, T_world_node))
     return Solution(T_world_node, iterations, before, after, tuple(weights))

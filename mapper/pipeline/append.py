@@ -28,7 +28,7 @@ from mapper.sources.base import FrameSource
 from mapper.sources.chained import ChainedLog, chained, last_session
 from mapper.sources.config import SourceConfig
 
-_SETTLED = ("odometry", "level")
+_FIXED_BY_FIRST_SESSION = ("odometry", "level")
 
 
 def append(
@@ -51,13 +51,13 @@ def append(
         config: The run's own but for what may differ: ``source`` is the second log's, and loops, solver and
             map may have other settings.
         out: Run folder to create.
-        progress: Who watches.
+        progress: Receives stages, counts and notes.
         overwrite: Replace a run that is there, once the new one is whole.
 
     Raises:
-        ConfigError: The configuration cannot join sessions, or differs in what the first one has settled.
+        ConfigError: The configuration cannot join sessions, or differs in what the first session fixes.
         TrackingError: Too few frames could be tracked.
-        LoopError: No loop ties the two sessions.
+        LoopError: No loop connects the two sessions.
         RunError: OUT is there already, or the run's log is not what it was.
     """
     _refuse_unfit(config, run)
@@ -75,11 +75,11 @@ def append(
             start = _after(before, first, session.wheels, config, progress)
             tracking = track_log(session, config, progress=progress, start=start)
         refuse_a_fragment(tracking, config, sensor=source.sensor)
-        _refuse_untied(second, run, tracking.loops, known)
+        _refuse_unconnected(second, run, tracking.loops, known)
         with writer.clock.stage("solve"):
             tracking = component_of(tracking, next(iter(known)), progress=progress)
             solved = solve(tracking.graph, tracking.loops, config.graph)
-        _refuse_untied(second, run, solved.loops, known)
+        _refuse_unconnected(second, run, solved.loops, known)
         later = from_tracking(replace(tracking, graph=solved.graph, loops=solved.loops), None)
         save_tracking(writer, before.solved(solved.graph, solved.loops).then(later, truth=source.truth))
         writer.update(solve=solved.report)
@@ -88,13 +88,13 @@ def append(
 
 
 def _refuse_unfit(config: BuildConfig, run: Run) -> None:
-    for name in _SETTLED:
+    for name in _FIXED_BY_FIRST_SESSION:
         if getattr(config, name) != getattr(run.config, name):
-            raise ConfigError(
-                f"{name}: {run.path} has settled it; a session is appended by the same settings"
-            )
+            raise ConfigError(f"{name}: fixed by {run.path}; a session is appended with the same settings")
     if not isinstance(config.loops, KeyframeLoopsConfig):
-        raise ConfigError(f"loops.kind={config.loops.kind}: cannot tie two sessions; want places or scans")
+        raise ConfigError(
+            f"loops.kind={config.loops.kind}: cannot connect two sessions; want places or scans"
+        )
     if config.graph.solve != "batch":
         raise ConfigError(f"graph.solve={config.graph.solve}: cannot join two sessions; want batch")
 
@@ -133,7 +133,7 @@ def _after(
     )
 
 
-def _refuse_untied(second: FrameSource, run: Run, loops: Sequence[LoopClosure], known: Set[int]) -> None:
+def _refuse_unconnected(second: FrameSource, run: Run, loops: Sequence[LoopClosure], known: Set[int]) -> None:
     """Refuse a session of which no loop leads to the known nodes."""
     between = [loop for loop in loops if loop.i in known and loop.j not in known]
     if any(loop.verdict == "accepted" for loop in between):
@@ -143,4 +143,4 @@ def _refuse_untied(second: FrameSource, run: Run, loops: Sequence[LoopClosure], 
     else:
         refused = Counter(loop.reason.split(":")[0] for loop in between).most_common()
         why = f"{len(between)} candidates compared, none held: {', '.join(f'{by} {n}' for by, n in refused)}"
-    raise LoopError(f"{second.path}: no loop ties it to {run.path}; {why}; is it the same place?")
+    raise LoopError(f"{second.path}: no loop connects it to {run.path}; {why}; is it the same place?")

@@ -40,10 +40,10 @@ def build(
 
     Args:
         source: The log.
-        config: Every knob.
+        config: All settings.
         out: Run folder to create; until it is whole it is called ``OUT.partial``.
-        progress: Who waits.
-        observer: Who looks on.
+        progress: Receives stages, counts and notes.
+        observer: Receives every tracked frame and the results.
         overwrite: Replace a run that is there, once the new one is whole.
 
     Raises:
@@ -84,7 +84,7 @@ def _level(source: FrameSource, trajectory: Trajectory, config: BuildConfig) -> 
             try:
                 scan = deskewed(entry.scan(), twist_at(trajectory, index))
             except FrameError:
-                continue  # it was readable a moment ago; the second pass will tell
+                continue  # it was readable in the first pass; fusing reports it
             scans.append((scan, trajectory.T_world_body[index]))
     return find_level(
         scans,

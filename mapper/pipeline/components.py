@@ -13,15 +13,15 @@ from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.pipeline.track import TrackingResult
 from mapper.runtime.progress import Progress
 
-DISCONNECTED = "untied"
+DISCONNECTED = "disconnected"
 """``Diagnostics.method`` of a frame that was placed, but in a part of the path that is left out."""
 
 
 def largest_component(tracking: TrackingResult, *, progress: Progress) -> TrackingResult:
     """Return the component with most frames, and note how many frames are left out.
 
-    After a loss the odometry may begin anew where nothing is known. Until a loop joins the two parts, nobody
-    knows how they lie to each other, and a map of both would be a guess: the frames left out count as lost.
+    After a loss the odometry may begin a new component. Until a loop connects the two, their relative pose
+    is unknown, and a map of both would be a guess: the frames left out count as lost.
     """
     frames = Counter(track.node for track in tracking.placed)
     parts = components(tracking.graph)
@@ -39,7 +39,7 @@ def component_of(tracking: TrackingResult, node: int, *, progress: Progress) -> 
     left_out = sum(frames[node] for nodes in parts for node in nodes if node not in kept)
     progress.note(
         f"{left_out} of {len(tracking.placed)} frames lie in {len(parts) - 1} parts of the path that nothing "
-        "ties to the rest; they are left out"
+        "connects to the rest; they are left out"
     )
     graph = tracking.graph
     return replace(
@@ -66,4 +66,4 @@ def _lost_unless(track: FrameResult, kept: Set[int]) -> FrameResult:
 def _refused_unless(loop: LoopClosure, kept: Set[int]) -> LoopClosure:
     if loop.verdict == "rejected" or loop.i in kept:
         return loop
-    return replace(loop, verdict="rejected", reason="untied: in a part of the path that is left out")
+    return replace(loop, verdict="rejected", reason="disconnected: in a part of the path that is left out")

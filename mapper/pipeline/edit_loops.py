@@ -42,7 +42,7 @@ def edit_loops(
 ) -> Run:
     """Add and remove loops, solve once, fuse what has moved; the run stays as it is unless all of it works.
 
-    A hand's word replaces the proposal, the gate and the agreement of others, but not the measurement: the
+    An added pair skips the proposal, the gate and the consistency check, but not the measurement: the
     two frames are compared as every candidate is. The solve starts from odometry alone, so the outcome does
     not depend on the order of edits.
 
@@ -51,12 +51,12 @@ def edit_loops(
         run: A finished run.
         add: Pairs of nodes that show one place.
         remove: Loops that do not.
-        progress: Who watches.
+        progress: Receives stages, counts and notes.
 
     Raises:
         ConfigError: The run's configuration does not solve its graph.
         LoopError: A node is unknown, a loop is there already or is not, two frames do not show one place, or
-            the solver does not believe a loop that was added.
+            the solver rejects a loop that was added.
     """
     if run.config.graph.solve == "none":
         raise ConfigError(f"{run.path}: built with graph.solve=none, so loops change nothing; build it again")
@@ -81,7 +81,7 @@ def edit_loops(
     for loop in solved.loops[len(loops) - len(pairs) :]:
         _refuse_rejected(loop)
     if len(components(solved.graph)) > len(components(graph)):
-        raise LoopError(f"{run.path}: without these loops nothing ties the graph together; nothing removed")
+        raise LoopError(f"{run.path}: without these loops the graph falls apart; nothing removed")
     return fuse_changed(
         source, run, tracked.solved(solved.graph, solved.loops), solve=solved.report, progress=progress
     )
@@ -101,7 +101,7 @@ def _in_time_order(graph: PoseGraph, pair: Pair) -> Pair:
             last = max(graph.T_world_node)
             raise LoopError(f"loop {_text(pair)}: no node {node}; the graph's nodes are 0 … {last}")
     if pair[0] == pair[1]:
-        raise LoopError(f"loop {_text(pair)}: a node cannot be tied to itself")
+        raise LoopError(f"loop {_text(pair)}: a node cannot be connected to itself")
     i, j = sorted(pair, key=graph.stamps_ns.__getitem__)
     return i, j
 

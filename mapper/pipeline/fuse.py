@@ -63,18 +63,18 @@ def fuse(
     Args:
         source: The log that the run was built from.
         run: A finished run.
-        config: The run's own configuration with the map's knobs turned.
+        config: The run's own configuration with other map settings.
         trajectory: Body poses in the levelled world by which to replace the run's; None keeps those.
-        progress: Who watches.
+        progress: Receives stages, counts and notes.
 
     Raises:
-        ConfigError: The configuration differs in something that tracking has already settled.
+        ConfigError: The configuration differs in a setting that tracking has used.
         RunError: The log is not the one that the run was built from, or the trajectory has no frame of it.
     """
     for name in sorted(set(BuildConfig.model_fields) - _FUSE_CONFIGS):
         if getattr(config, name) != getattr(run.config, name):
             raise ConfigError(f"{name}: fuse keeps what was tracked and cannot change it; run mapper build")
-    changed = None if trajectory is None else _led_along(run, trajectory)
+    changed = None if trajectory is None else _with_trajectory(run, trajectory)
     return fuse_changed(source, replace(run, config=config), changed, progress=progress)
 
 
@@ -93,7 +93,7 @@ def fuse_changed(
         run: A finished run, with the configuration to fuse by.
         changed: What replaces the run's own; None keeps that.
         solve: What the manifest says of the solve that changed it; None keeps what it says.
-        progress: Who watches.
+        progress: Receives stages, counts and notes.
 
     Raises:
         RunError: The log is not the one that the run was built from.
@@ -103,7 +103,7 @@ def fuse_changed(
     manifest = moved_log(run, *paths_of(source)).manifest.model_copy(update={"status": status})
     with write_run(run.path, manifest, run.config, overwrite=True) as writer:
         carry_times(writer, manifest.timing)
-        _keep_the_rest(run.path, writer.folder)
+        _copy_kept_files(run.path, writer.folder)
         if changed is not None:
             save_tracking(writer, changed)
             for name in files.names_of("poses"):
@@ -120,7 +120,7 @@ def carry_times(writer: RunWriter, timing: Timing) -> None:
         writer.clock.seconds[stage] = timing.stage_s[stage]
 
 
-def _led_along(run: Run, trajectory: Trajectory) -> StoredTracking:
+def _with_trajectory(run: Run, trajectory: Trajectory) -> StoredTracking:
     """Return what a run keeps, with its trajectory replaced and the nodes of its graph moved along."""
     tracked = load_tracking(run)
     T_world_body = dict(zip(trajectory.stamps_ns.tolist(), trajectory.T_world_body, strict=True))
@@ -131,7 +131,7 @@ def _led_along(run: Run, trajectory: Trajectory) -> StoredTracking:
     return replace(tracked, trajectory=trajectory, graph=PoseGraph(moved, graph.stamps_ns, graph.factors))
 
 
-def _keep_the_rest(folder: Path, new: Path) -> None:
+def _copy_kept_files(folder: Path, new: Path) -> None:
     """Copy what was tracked, and whatever a user has put there; what was made from the old maps goes."""
     made_again = files.names_of("maps", "exported maps") | {files.FORMER_SCAN_UPDATES}
     for child in folder.iterdir():
@@ -161,7 +161,7 @@ def fuse_into(
         with (
             writer.clock.stage("fuse"),
             open_scan_updates(before) if before is not None and before.exists() else nullcontext() as known,
-            ScanUpdateWriter(writer.folder / files.SCAN_UPDATES, config.octree) as sights,
+            ScanUpdateWriter(writer.folder / files.SCAN_UPDATES, config.octree) as updates,
         ):
             maps = fuse_log(
                 source,
@@ -170,7 +170,7 @@ def fuse_into(
                 progress=progress,
                 on_snapshot=lambda snapshot: log_snapshot(log, snapshot),
                 before=known,
-                after=sights,
+                after=updates,
             )
         with writer.clock.stage("write"):
             log_results(log, results)

@@ -27,7 +27,7 @@ def reobserve(
         trajectory: Where the body was: scans are deskewed by its motion.
         stamps_ns: Of the frames; each has a pose.
         config: Which odometry.
-        progress: Who watches.
+        progress: Receives the stage and its counts.
 
     Raises:
         FrameError: A frame cannot be read.

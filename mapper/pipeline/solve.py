@@ -30,7 +30,7 @@ class Solved:
 
 
 def solve(graph: PoseGraph, loops: Sequence[LoopClosure], config: GraphConfig) -> Solved:
-    """Return the graph at its solution, without the loops that the solver did not believe.
+    """Return the graph at its solution, without the loops that the solver rejected.
 
     Args:
         graph: With a factor for each accepted loop, after all the others and in the loops' order.

@@ -22,7 +22,7 @@ from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef, FrameSource, Skipped
 
-_DOUBTS: Mapping[Sensor | Literal["wheels"], str] = {
+_HINTS: Mapping[Sensor | Literal["wheels"], str] = {
     "rgbd": "is there texture, and depth within max_depth_m, in the images?",
     "lidar": "do the scans overlap, and are their units metres?",
     "wheels": "do the wheels' readings cover the frames' times, without gaps beyond odometry.max_gap_s?",
@@ -49,7 +49,7 @@ class TrackingResult:
 
     @property
     def placed(self) -> list[FrameResult]:
-        """The tracks of the frames that were not lost."""
+        """The results of the frames that were not lost."""
         return [track for track in self.tracks if track.node is not None]
 
     def trajectory(self) -> Trajectory:
@@ -78,11 +78,11 @@ class Start:
     loops: Sequence[LoopClosure] = ()
 
 
-def from_nothing(source: FrameSource, config: BuildConfig) -> Start:
+def first_session(source: FrameSource, config: BuildConfig) -> Start:
     """Return the start of a log that is the first of its place.
 
     Raises:
-        ConfigError: The odometry wants wheels and the log has none, or does not count what the loops go by.
+        ConfigError: The odometry needs wheels and the log has none, or the loops need feature counts.
     """
     if config.odometry.kind == "wheels" and config.loops.kind == "thesis":
         raise ConfigError(
@@ -106,7 +106,7 @@ def track_log(
     A frame that cannot be read is skipped and reported, not fatal. With a ``start`` the graph and the loops
     returned are those of all sessions, the tracks those of this log.
     """
-    start = start or from_nothing(source, config)
+    start = start or first_session(source, config)
     odometry, detector, before = start.odometry, start.detector, start.graph
     graph = PoseGraph(dict(before.T_world_node), dict(before.stamps_ns), list(before.factors))
     tracks: list[FrameResult] = []
@@ -161,10 +161,10 @@ def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: 
         raise TrackingError(
             f"none of {len(tracking.skipped)} frames could be read; the first: {tracking.skipped[0].reason}"
         )
-    doubts = _DOUBTS["wheels" if config.odometry.kind == "wheels" else sensor]
+    hint = _HINTS["wheels" if config.odometry.kind == "wheels" else sensor]
     raise TrackingError(
         f"only {placed} of {read} frames read could be tracked, want at least {enough:.0f}; "
-        f"{doubts} (min_tracked_frames and min_tracked_ratio set the limit)"
+        f"{hint} (min_tracked_frames and min_tracked_ratio set the limit)"
     )
 
 

@@ -42,7 +42,7 @@ class RunFiles:
 
     Attributes:
         names: What they are called.
-        content: What they hold, as README.md tells it.
+        content: Their content, as README.md describes it.
         depends_on: "tracking": written once the log is tracked and its graph is solved; "maps": written by
             every fuse; "poses" and "exported maps": written on request, and outdated when the poses, or the
             maps, are made again.

@@ -142,7 +142,7 @@ def open_log(run: Run) -> FrameSource:
 def _open(run: Run, log: Log, config: SourceConfig) -> FrameSource:
     path = Path(log.path)
     if not path.exists():
-        raise RunError(f"{path}: the log of {run.path} is no longer there; tell its new place with --log")
+        raise RunError(f"{path}: the log of {run.path} is no longer there; give its new place with --log")
     return open_source(path, config)
 
 

@@ -37,7 +37,7 @@ class FrameRecord:
     Attributes:
         stamp_ns: The frame's stamp.
         outcome: "tracked", "lost" (read, but not placed) or "skipped" (could not be read).
-        node: Graph node that its pose hangs on; None unless tracked.
+        node: Graph node that its pose is relative to; None unless tracked.
         is_keyframe: The frame is that node.
         diagnostics: How tracking went; all zero for a skipped frame.
     """

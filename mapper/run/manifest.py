@@ -48,7 +48,7 @@ class AppendedLog(Log):
     """A later session of the same place."""
 
     source: SourceConfig
-    """What of it was used; ``config.json`` tells that of the first log."""
+    """Selection of its frames; ``config.json`` holds that of the first log."""
     shift_ns: int
     """Nanoseconds added to its stamps."""
     begins_ns: int
@@ -102,7 +102,7 @@ class Solve(Config):
     error_after: float
     iterations: int
     components: int = 1
-    """Parts of the graph that no factor ties to each other; each is solved on its own."""
+    """Connected components of the graph; each is solved on its own."""
 
 
 class Levelling(Config):

@@ -20,11 +20,11 @@ class Step:
     """One frame has been tracked.
 
     Attributes:
-        entry: The frame; who wants its image loads it again.
+        entry: The frame; loading it again gives its image.
         track: What tracking made of it.
-        view: Gives the features that it was tracked by; costs something, so not to be asked without need.
+        view: Returns the features that it was tracked by; computed at each call.
         matches: Gives those that hold its pose, and where they were before; the same.
-        detector: The loops so far, and where nodes are believed to be with them.
+        detector: The loops so far, and the current estimates of node poses.
     """
 
     entry: FrameRef

@@ -24,7 +24,7 @@ class RunResults:
         records: What became of every frame.
         loops: Every loop candidate with its verdict.
         frame_ms: Milliseconds that each frame took, by stamp; empty leaves them out.
-        truth: Where the body really was, laid over the trajectory, if known.
+        truth: True body poses, aligned with the trajectory, if known.
     """
 
     trajectory: Trajectory

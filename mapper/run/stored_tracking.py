@@ -25,9 +25,9 @@ class StoredTracking:
         skipped: The frames that could not be read, and why.
         frame_ms: Wall milliseconds that each frame took, by stamp.
         trajectory: Body poses of the frames that were placed.
-        graph: Nodes where they are believed to be by now.
+        graph: Nodes at their current estimates.
         loops: Every loop candidate with its verdict.
-        truth: Where the body really was, if the log tells.
+        truth: True body poses, if the log has them.
     """
 
     records: Sequence[FrameRecord]

@@ -10,7 +10,7 @@ from pathlib import Path
 from mapper.core.errors import RunError, SourceError
 
 MANIFEST_NAME = "manifest.json"
-"""The file by which a folder is known to be ours, and so may be replaced when asked to."""
+"""File that marks a folder as one of ours, which ``--overwrite`` may replace."""
 
 
 @contextmanager

@@ -12,7 +12,7 @@ _LIMITS = (
 
 
 def one_thread_per_library() -> None:
-    """Ask for one thread wherever the user has not asked for more; libraries read this when they are loaded.
+    """Limit libraries to one thread where the user has set no other number; they read it when loaded.
 
     Small matrices are slower with several threads.
     """
