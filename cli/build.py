@@ -135,11 +135,11 @@ def _onlooker(rerun: str | None, *, step: bool, overwrite: bool) -> "Onlooker | 
 
     @contextmanager
     def onlooker(source: "FrameSource", config: "BuildConfig") -> "Iterator[Observer]":
-        from mapper.export.rerun.live import watching
+        from mapper.export.rerun.live import live_recording
 
         is_built = False
         try:
-            with watching(target, source, config.rerun) as observer:
+            with live_recording(target, source, config.rerun) as observer:
                 yield Stepping(observer) if step else observer
                 is_built = True
         except ViewerError as error:

@@ -22,7 +22,7 @@ _TOLERANCE = 1
 
 
 class Align(StrEnum):
-    """How the estimate is laid over the truth first."""
+    """Alignment of the estimate with the truth."""
 
     NONE = "none"
     YAW = "yaw"

@@ -32,7 +32,7 @@ class WithPairs(TyperCommand):
 def loops(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder that a build left.")],
     list_: Annotated[
-        bool, typer.Option("--list", help="Print every candidate; done when nothing else is asked.")
+        bool, typer.Option("--list", help="Print every candidate; the default without other options.")
     ] = False,
     accepted: Annotated[bool, typer.Option("--accepted", help="Print only those that hold.")] = False,
     add: Annotated[

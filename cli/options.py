@@ -12,7 +12,7 @@ ConfigFile = Annotated[
 ]
 Overrides = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY.PATH=VALUE", help="Turn one knob; mapper config lists them all."),
+    typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one setting; mapper config lists them all."),
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print errors only.")]
 MovedLogs = Annotated[

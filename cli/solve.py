@@ -84,7 +84,7 @@ def _table(solved: "SolvedGraph") -> str:
         ("seconds", ", ".join(f"{name} {seconds:.1f}" for name, seconds in solved.seconds.items())),
     ]
     if solved.loops:
-        rows.insert(2, ("loops", f"{solved.loops - len(solved.rejected)} of {solved.loops} believed"))
+        rows.insert(2, ("loops", f"{solved.loops - len(solved.rejected)} of {solved.loops} accepted"))
     return "\n".join(f"{name:<12}{text}" for name, text in rows)
 
 

@@ -15,7 +15,7 @@ class Stepping:
     """Observer that forwards to another and waits for a key after every frame."""
 
     def __init__(self, other: "Observer") -> None:
-        """Refuse to wait for somebody who is not there.
+        """Refuse to wait for keys where standard input is no terminal.
 
         Raises:
             ConfigError: Standard input is no terminal.

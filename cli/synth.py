@@ -43,13 +43,13 @@ def synth(
     ] = None,
     rings: Annotated[int | None, typer.Option(help="lidar: beams, one above the other.")] = None,
     wheels: Annotated[
-        bool, typer.Option("--wheels", help="Wheels carry the sensor; wheels.txt tells what they counted.")
+        bool, typer.Option("--wheels", help="Wheels carry the sensor; wheels.txt holds their odometry.")
     ] = False,
     noise: Annotated[float | None, typer.Option(help="Times the sensor's noise; 0 is exact.")] = None,
     seed: Annotated[int | None, typer.Option(help="Another scene, another way through it.")] = None,
     set_: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY.PATH=VALUE", help="Turn any other knob of the scene or sensor."),
+        typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change any setting of the scene or sensor."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -134,7 +134,7 @@ def _refuse(options: dict[str, object], beside: str) -> None:
 
 
 def _at_wall(distance_m: float | None) -> dict[str, object]:
-    """Return the knobs of a tripod before a wall on which nothing hangs."""
+    """Return the settings of a tripod before an empty wall."""
     from mapper.simulation.config import SynthConfig
 
     if distance_m is None:

@@ -64,7 +64,7 @@ def test_a_folder_holds_graph_path_picture_and_report(tmp_path):
     assert report["rejected"] == [[5, 12]]
     assert report["component_sizes"] == [20]
     assert 0.0 < report["error_after"] < report["error_before"]
-    assert "4 of 5 believed" in shown
+    assert "4 of 5 accepted" in shown
     again = read_g2o(tmp_path / "out/graph.g2o")
     assert [factor.origin for factor in again.factors].count("loop") == 5
     assert np.linalg.norm(again.T_world_node[19][:3, 3] - truth[19][:3, 3]) < 0.05
@@ -100,7 +100,7 @@ def test_a_foreign_file_is_plain_least_squares_unless_doubt_is_asked_for(tmp_pat
     plain_report = json.loads((tmp_path / "plain/solve.json").read_text())
     robust_report = json.loads((tmp_path / "robust/solve.json").read_text())
     assert plain_report["loops"] == 0
-    assert "believed" not in plain
+    assert "accepted" not in plain
     assert robust_report["loops"] == 5
     assert robust_report["rejected"] == [[5, 12]]
     assert robust_report["error_after"] < 0.1 * plain_report["error_after"]

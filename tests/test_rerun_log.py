@@ -277,7 +277,7 @@ def test_images_come_with_the_features_that_were_found_and_those_that_agreed(liv
     assert len(told.values("/world/live/body/cloud", "Points3D:positions")) == len(records)
 
 
-def test_what_was_believed_ends_up_in_the_levelled_world(live):
+def test_estimates_end_up_in_the_levelled_world(live):
     run, told = live
     T = np.eye(4)
     T[:3, :3] = told.one("/world/live", "Transform3D:mat3x3").reshape(3, 3).T
@@ -288,7 +288,7 @@ def test_what_was_believed_ends_up_in_the_levelled_world(live):
     on_levelled = positions @ T[:3, :3].T + T[:3, 3]
     assert np.abs(on_levelled - run.trajectory().positions_world).max() < 0.03  # what loops have moved
 
-    paths = [value for _, value in told.values("/world/live/believed", "LineStrips3D:strips") if value]
+    paths = [value for _, value in told.values("/world/live/estimates", "LineStrips3D:strips") if value]
     assert len(paths[-1][0]) > 0.9 * run.manifest.counts.nodes
     graph = [value for _, value in told.values("/world/live/factors", "LineStrips3D:strips") if value]
     assert len(graph[-1]) >= len(paths[-1][0]) - 1
@@ -316,7 +316,7 @@ def test_a_scan_is_a_cloud_without_an_image(tmp_path):
         def closures(self):
             return ()
 
-        def believed(self, _node):
+        def current_estimate(self, _node):
             return np.eye(4)
 
     path = tmp_path / "scan.rrd"

@@ -21,22 +21,22 @@ _THREADS = "OMP_NUM_THREADS"
 def look_at_python() -> Finding:
     """Return our version and the interpreter's."""
     machine = f"{sys.platform} {platform.machine()}"
-    told = f"mapper {mapper.__version__} on Python {platform.python_version()}, {machine}"
+    text = f"mapper {mapper.__version__} on Python {platform.python_version()}, {machine}"
     if sys.version_info < _LEAST_PYTHON:
-        return Finding("python", "failed", told, "use Python 3.11 or newer")
-    return Finding("python", "well", told)
+        return Finding("python", "failed", text, "use Python 3.11 or newer")
+    return Finding("python", "well", text)
 
 
 def look_at_glibc() -> Finding:
     """Return the C library's version; wheels are built for one and run on any later."""
     name, version = platform.libc_ver()
-    told = f"{name or 'another C library than glibc'} {version}".strip()
+    text = f"{name or 'another C library than glibc'} {version}".strip()
     numbers = tuple(int(number) for number in re.findall(r"\d+", version)[:2])
     if name == "glibc" and numbers < _LEAST_GLIBC:
         return Finding(
-            "glibc", "failed", f"{told}, Open3D's wheel wants 2.35", "use Debian 12, Ubuntu 22.04 or newer"
+            "glibc", "failed", f"{text}, Open3D's wheel wants 2.35", "use Debian 12, Ubuntu 22.04 or newer"
         )
-    return Finding("glibc", "well", told)
+    return Finding("glibc", "well", text)
 
 
 def processors() -> int:
@@ -49,36 +49,36 @@ def processors() -> int:
 def look_at_threads() -> Finding:
     """Return how many processors we may use, and whether libraries start threads of their own."""
     each = os.environ.get(_THREADS, "unset")
-    told = f"{processors()} processors for us, {_THREADS} is {each}"
+    text = f"{processors()} processors for us, {_THREADS} is {each}"
     if each != "1":
         return Finding(
-            "threads", "warning", told, f"unset {_THREADS}: small matrices are slower with several"
+            "threads", "warning", text, f"unset {_THREADS}: small matrices are slower with several"
         )
-    return Finding("threads", "well", told)
+    return Finding("threads", "well", text)
 
 
 def look_at_memory() -> Finding:
     """Return how much memory is there."""
     meminfo = Path("/proc/meminfo")
     if not meminfo.exists():
-        return Finding("memory", "well", "this system does not tell")
+        return Finding("memory", "well", "this system does not report it")
     lines = re.findall(r"^(\w+): +(\d+) kB", meminfo.read_text(encoding="ascii"), re.MULTILINE)
     kilobytes = {name: int(value) for name, value in lines}
     total_gb, free_gb = (kilobytes[name] * 1024 / 1e9 for name in ("MemTotal", "MemAvailable"))
-    told = f"{free_gb:.1f} GB of {total_gb:.1f} GB available"
+    text = f"{free_gb:.1f} GB of {total_gb:.1f} GB available"
     if free_gb < _LEAST_MEMORY_GB:
-        return Finding("memory", "warning", told, "end other programs, or build with --set workers=0")
-    return Finding("memory", "well", told)
+        return Finding("memory", "warning", text, "end other programs, or build with --set workers=0")
+    return Finding("memory", "well", text)
 
 
 def look_at_disk() -> Finding:
     """Return how much room there is for runs here, and for scratch files."""
     places = {"here": Path.cwd(), "scratch": Path(tempfile.gettempdir())}
     free_gb = {name: shutil.disk_usage(place).free / 1e9 for name, place in places.items()}
-    told = ", ".join(f"{free_gb[name]:.1f} GB free in {place} ({name})" for name, place in places.items())
+    text = ", ".join(f"{free_gb[name]:.1f} GB free in {place} ({name})" for name, place in places.items())
     if min(free_gb.values()) < _LEAST_DISK_GB:
-        return Finding("disk", "warning", told, "make room, or choose an --out and a TMPDIR elsewhere")
-    return Finding("disk", "well", told)
+        return Finding("disk", "warning", text, "make room, or choose an --out and a TMPDIR elsewhere")
+    return Finding("disk", "well", text)
 
 
 def look_at_kernels() -> Finding:
@@ -86,13 +86,13 @@ def look_at_kernels() -> Finding:
     package = Path(mapper.__file__).parent
     folder = Path(os.environ.get("NUMBA_CACHE_DIR") or package)
     compiled = {file.name.rpartition("-")[0] for file in folder.rglob("*.nbi")}
-    told = f"{len(compiled)} compiled kernels kept in {folder}"
+    text = f"{len(compiled)} compiled kernels kept in {folder}"
     if not os.access(_nearest_existing(folder), os.W_OK):
         remedy = "set NUMBA_CACHE_DIR to a folder that may be written"
-        return Finding("numba cache", "failed", f"{told}, which cannot be written", remedy)
+        return Finding("numba cache", "failed", f"{text}, which cannot be written", remedy)
     if not compiled:
-        return Finding("numba cache", "well", f"{told}: the first verb compiles them, in about a minute")
-    return Finding("numba cache", "well", told)
+        return Finding("numba cache", "well", f"{text}: the first verb compiles them, in about a minute")
+    return Finding("numba cache", "well", text)
 
 
 def _nearest_existing(folder: Path) -> Path:

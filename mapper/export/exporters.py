@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mapper.run.folder import Run
 
 Write = Callable[["Run", Path, Progress], None]
-"""Writes one file of a run, whole or not at all; a job of seconds tells how far it is."""
+"""Writes one file of a run atomically; long jobs report progress."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,7 @@ class Exporter:
 
     Attributes:
         summary: What it is, in a few words.
-        function: ``module:name`` of the ``Write``, below :mod:`mapper.export`; imported when asked for.
+        function: ``module:name`` of the ``Write``, below :mod:`mapper.export`; imported at the first use.
         file_name: Its name inside the run; some are there since the build.
         endings: What another name may end with.
         beside: Endings of the files that come with it.
@@ -49,7 +49,7 @@ _MESH_ENDINGS = (".ply", ".obj", ".glb")
 
 EXPORTERS = {
     "octomap": Exporter("octree for OctoMap and ROS", "run_files:octomap", "map.bt", (".bt", ".ot")),
-    "native": Exporter("octree with all that it knows", "run_files:native", "map.octree", (".octree",)),
+    "native": Exporter("octree with all attributes", "run_files:native", "map.octree", (".octree",)),
     "ply": Exporter("coloured cloud", "run_files:cloud", "cloud.ply", (".ply",)),
     "voxels": Exporter("occupied voxels' centres", "voxels:centres", "voxels.ply", (".ply",)),
     "voxel-mesh": Exporter("occupied voxels as cubes", "voxels:cubes", "voxel_mesh.ply", _MESH_ENDINGS),
@@ -91,7 +91,7 @@ def export(
         out: The file; None keeps it in the run, under the name that this kind has there.
         config: The run's own configuration with the kind's settings turned.
         overwrite: Replace what is at OUT.
-        progress: Who watches.
+        progress: Receives stages, counts and notes.
 
     Raises:
         ConfigError: No such kind, a name that does not end like one, or settings that the kind does not read.

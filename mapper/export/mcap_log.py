@@ -308,7 +308,7 @@ class McapLog:
         Args:
             topic: Where to.
             schema: What its records are called.
-            stamp_ns: Time of what is told.
+            stamp_ns: Time of the message, nanoseconds.
             record: Name to int, float or str; the same names and types every time.
 
         Raises:

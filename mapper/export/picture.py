@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _MARGIN_M = 0.3
 _HEADROOM_M = 0.3  # above the highest camera position; what lies higher would hide the rooms from above
 _VIEW_PX = 900
-_BELIEVED = 0.5  # weight from which a factor counts as held
+_ACCEPTED_WEIGHT = 0.5  # weight from which a factor counts as held
 _TILT_RAD = np.deg2rad(32.0)
 _TURN_RAD = np.deg2rad(-35.0)
 _NAMED = 12  # of many runs only the first are in the legend
@@ -237,9 +237,9 @@ def write_graph_views(path: Path, graph: PoseGraph, solution: Solution, *, title
         seen = np.array(list(T_world_node.values()))[:, :3, 3] @ axes_world[:2].T
         axes = figure.add_axes((0.02 + 0.49 * column, 0.02, 0.47, 0.86))
         for origin, color in FACTORS.items():
-            for believed, style in ((True, "solid"), (False, "dotted")):
+            for accepted, style in ((True, "solid"), (False, "dotted")):
                 drawn = [
-                    factor.origin == origin and (weight >= _BELIEVED) == believed
+                    factor.origin == origin and (weight >= _ACCEPTED_WEIGHT) == accepted
                     for factor, weight in zip(graph.factors, solution.weights, strict=True)
                 ]
                 axes.add_collection(

@@ -54,7 +54,7 @@ class SolvedGraph:
 
     @property
     def rejected(self) -> list[tuple[int, int]]:
-        """Nodes i, j of every loop that the solver did not believe."""
+        """Nodes i, j of every loop that the solver rejected."""
         pairs = zip(self.graph.factors, self.solution.weights, strict=True)
         return [(factor.i, factor.j) for factor, weight in pairs if weight < BELIEVED]
 

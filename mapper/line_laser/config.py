@@ -17,7 +17,7 @@ class RangeLaw(Config):
     scale_mm: PositiveFloat
     exponent: NegativeFloat
     covariance: Covariance | None = None
-    """Of (ln scale, exponent); None where nobody told."""
+    """Of (ln scale, exponent); None if unknown."""
 
 
 class LateralLaw(Config):
@@ -122,7 +122,7 @@ class LineLaserConfig(Config):
     stripe: StripeConfig = StripeConfig()
     map: LineLaserMapConfig = LineLaserMapConfig()
     rate_hz: PositiveFloat | None = None
-    """Images a second where neither names nor a times.txt tell stamps; None is 10."""
+    """Images a second where neither file names nor a times.txt give stamps; None is 10."""
 
 
 class LineLaserSynthConfig(Config):

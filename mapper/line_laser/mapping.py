@@ -28,14 +28,14 @@ def map_scans(
     *,
     progress: Progress = SILENT,
 ) -> OccupancyGrid:
-    """Return what scans say together: occupied where the stripe lay, free between there and the sensor.
+    """Return the map of all scans: occupied where the stripe was, free between there and the sensor.
 
     Each scan changes a cell once, and a hit goes before a miss; the log-odds are clamped (Hornung et al.
     2013, §3.4), so that the map follows what changes. Free is where nothing reaches up to the sheet of light:
     what is low is seen from afar only, where the sheet is low too.
 
     Args:
-        scans: What each image told, in order.
+        scans: The scan of each image, in order.
         T_world_sensor: (N, 4, 4) where the sensor was, x ahead, y left; only the plane counts.
         config: Size of a cell and the probabilities.
         progress: Told of every scan.
@@ -83,8 +83,8 @@ def _update(
     local = corners - first
     states = np.zeros(last[::-1] - first[::-1], np.uint8)
     for run in _neighbours(scan.columns):
-        sight = np.concatenate([local[:1], local[1:][run]]) - 0.5
-        fixed = np.rint(sight * (1 << _SUBCELL_BITS)).astype(np.int32)
+        ray = np.concatenate([local[:1], local[1:][run]]) - 0.5
+        fixed = np.rint(ray * (1 << _SUBCELL_BITS)).astype(np.int32)
         cv2.fillPoly(states, [fixed], _SEEN_FREE, shift=_SUBCELL_BITS)
     columns, rows = np.floor(local[1:][~scan.is_floor]).astype(np.int64).T
     states[rows, columns] = _SEEN_OCCUPIED

@@ -57,14 +57,14 @@ def write_scans(
 
 def _lines(image: str, scan: LineScan) -> Iterator[str]:
     stamp = seconds_text_from_ns(scan.stamp_ns)
-    told = zip(
+    rows = zip(
         scan.columns.tolist(),
         scan.rows_px.tolist(),
         scan.points_sensor.tolist(),
         scan.is_floor.tolist(),
         strict=True,
     )
-    for column, row, (x, y), is_floor in told:
+    for column, row, (x, y), is_floor in rows:
         yield f"{image},{stamp},{column},{row:.3f},{x:.4f},{y:.4f},{int(is_floor)}\n"
 
 

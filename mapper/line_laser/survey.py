@@ -112,7 +112,7 @@ def drive(
 
     Args:
         scans: In time order.
-        T_world_sensor: As wheels tell.
+        T_world_sensor: Sensor poses by wheel odometry.
         config: Of the map.
         progress: Told of every scan.
 
@@ -129,7 +129,7 @@ def drive(
             f"{seconds_text_from_ns(int(T_world_sensor.stamps_ns[0]))} s: are they of one clock?"
         )
     lost = len(scans) - len(known)
-    notes = [f"wheels tell no place of {lost} images; these are not in the map"] if lost else []
+    notes = [f"no wheel pose for {lost} images; these are not in the map"] if lost else []
     trajectory = trajectory_from((scan.stamp_ns, T) for scan, T in known)
     kept = [scan for scan, _ in known]
     return Drive(kept, trajectory, map_scans(kept, trajectory.T_world_body, config, progress=progress), notes)

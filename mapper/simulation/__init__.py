@@ -1,4 +1,4 @@
-"""A furnished flat that does not exist, recorded by a camera that never made a mistake we do not know of."""
+"""Synthetic RGB-D logs with exact truth: a furnished flat, recorded by a simulated Kinect."""
 
 from mapper.simulation.boxes import Boxes, read_scene
 from mapper.simulation.log import write_tum_log

@@ -1,4 +1,4 @@
-"""Collects boxes and what each of their faces looks like."""
+"""Scene builder: boxes and the textures of their faces."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -20,7 +20,7 @@ _SHADE_SWING, _LIGHT_YAW_RAD = 0.10, 0.9
 
 @dataclass(frozen=True, slots=True)
 class Skin:
-    """How a texture lies on a face.
+    """Placement of a texture on a face.
 
     Attributes:
         texture: Index in the atlas.

@@ -152,7 +152,7 @@ class LidarSynthConfig(Config):
     scene: Literal["street", "courtyard"] = "street"
     """"street": round a block between facades; "courtyard": a yard with few things in it."""
     loop_m: Annotated[float, Field(ge=30.0)] = 300.0
-    """Length of the way round, which the scene is laid out along."""
+    """Length of the closed route, along which the scene is built."""
     slope_rad: Annotated[float, Field(ge=0.0, lt=0.3)] = 0.01
     """Mean slope of the ground."""
     undulation_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
@@ -195,7 +195,7 @@ COURTYARD = LidarSynthConfig(
 )
 """A LiDAR carried by hand, strongly tilting and turning, past few things.
 
-Its sweeps are free of motion: half a second apart, poses alone do not tell how each sweep turned.
+Its sweeps are free of motion: with poses half a second apart, the turning within a sweep is unknown.
 """
 
 SCENES: Mapping[str, LidarSynthConfig] = {"street": STREET, "courtyard": COURTYARD}

@@ -18,7 +18,7 @@ _BOARD_M = 0.03
 
 @dataclass(frozen=True, slots=True)
 class Studio:
-    """What every piece needs to be built."""
+    """Shared inputs of the furniture builders."""
 
     builder: Builder
     shop: Workshop

@@ -1,4 +1,4 @@
-"""What every drawn texture is made of: smooth noise, tints and scattered marks."""
+"""Elements of drawn textures: smooth noise, tints and scattered marks."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""How the camera moves: round the flat, a little before a desk, fast on the spot, or not, before a wall."""
+"""Camera paths: round the flat, before a desk, fast rotation, or still before a wall."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

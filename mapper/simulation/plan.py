@@ -54,7 +54,7 @@ class Wall:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """Where everything that stands still may stand.
+    """Floor areas on which furniture may stand.
 
     Attributes:
         rooms: In the order in which the route visits them.

@@ -24,7 +24,7 @@ _NEAR_M = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rendering:
-    """What an ideal camera sees.
+    """Rendering by an ideal camera.
 
     Attributes:
         rgb: (H, W, 3) uint8.

@@ -32,7 +32,7 @@ _TRIES = 40
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """A world that can be rendered and asked about.
+    """A world that can be rendered and queried.
 
     Attributes:
         boxes: Every solid; ``boxes.occupied`` and ``boxes.signed_distance_m`` are the ground truth of maps.

@@ -1,4 +1,4 @@
-"""What a Kinect v1 makes of an exact image: noisy, quantised, incomplete depth and grainy colour."""
+"""Kinect v1 noise: noisy, quantised, incomplete depth and grainy colour made of an exact image."""
 
 import math
 from statistics import NormalDist

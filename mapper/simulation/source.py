@@ -51,7 +51,7 @@ class SyntheticEntry:
         return None
 
     def load(self, *, colour: bool = True) -> RgbdFrame:
-        """Render the frame, with its own noise; the same whenever it is asked for."""
+        """Render the frame, with its own noise; every call gives the same pixels."""
         image, depth_m = self.source.observe(self.index)
         frame = RgbdFrame(self.stamp_ns, image, depth_m, self.source.camera)
         return frame if colour else RgbdFrame(self.stamp_ns, frame.gray, depth_m, self.source.camera)

@@ -6,7 +6,7 @@ import numpy as np
 
 
 class Stream(IntEnum):
-    """What a stream is for; the numbers are part of what a seed means."""
+    """Purpose of a random stream; the numbers are part of a seed's meaning."""
 
     PLAN = 0
     SURFACES = 1

@@ -1,4 +1,4 @@
-"""What wheels under a sensor would have counted."""
+"""Simulated wheel odometry under a sensor."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -23,7 +23,7 @@ def counted(
     sensor: Sensor,
     rng: np.random.Generator,
 ) -> Trajectory:
-    """Return T_odom_body as wheels tell it that carry a body over what they take for level ground.
+    """Return T_odom_body of wheels that carry a body over ground taken as level.
 
     Wheels of another size than they are taken to be make every way too long or too short, and another
     distance between them every turn; uneven ground adds a random walk of the heading. Wheels know of no
@@ -47,15 +47,15 @@ def counted(
         path_m = float(np.linalg.norm(step[:2, 3]))
         turn_rad = float(np.arctan2(step[1, 0], step[0, 0])) * (1.0 + rounder)
         turn_rad += config.heading_rad_per_sqrt_m * float(np.sqrt(path_m) * rng.standard_normal())
-        told = exp(np.array([0.0, 0.0, turn_rad]), np.zeros(3))
-        told[:3, 3] = step[:3, 3] * (1.0 + longer)
-        T_odom_base.append(T_odom_base[-1] @ told)
+        measured = exp(np.array([0.0, 0.0, turn_rad]), np.zeros(3))
+        measured[:3, 3] = step[:3, 3] * (1.0 + longer)
+        T_odom_base.append(T_odom_base[-1] @ measured)
     T_base_body = inverse(T_world_base[0]) @ T_world_body[0]
     return Trajectory(START_NS + since_start_ns, np.array(T_odom_base) @ T_base_body)
 
 
 def _upright(T_world_body: Transform, sensor: Sensor) -> Transform:
-    """Return the pose of an upright base on the floor below a body, x the way that the body looks."""
+    """Return the pose of an upright base on the floor below a body, x along the body's forward axis."""
     ahead = (T_world_body @ inverse(LOOKING_FORWARD[sensor]))[:2, 0]
     yaw_rad = float(np.arctan2(ahead[1], ahead[0]))
     return transform(rotation_from_euler(0.0, 0.0, yaw_rad), np.array([*T_world_body[:2, 3], 0.0]))

@@ -1,4 +1,4 @@
-"""Materials that furniture is made of, drawn once and laid on each piece with another offset."""
+"""Materials of furniture, drawn once and applied to each piece with another offset."""
 
 import numpy as np
 
@@ -59,7 +59,7 @@ class Workshop:
         return Skin(self._builder.texture(prints.document(self._rng, self._shape(size_m, finer=2.0))))
 
     def screen(self, size_m: tuple[float, float]) -> Skin:
-        """What a monitor shows."""
+        """Picture of a monitor."""
         return Skin(self._builder.texture(prints.screen(self._rng, self._shape(size_m, finer=1.5))))
 
     def carton(self, size_m: tuple[float, float]) -> Skin:

@@ -44,7 +44,7 @@ class Chapter:
     Attributes:
         name: Distinct among the report's runs.
         run: The run.
-        results: What it has to tell.
+        results: Its trajectory, graph, records and truth.
         figures: What it amounts to, e.g. how far it is from the truth.
     """
 

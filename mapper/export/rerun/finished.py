@@ -25,12 +25,12 @@ def show_run(run: Run, target: str) -> None:
     with recorded(target, name=name, has_images=bool(snapshots), looking_at=corners) as log:
         log.images(snapshots)
         log.poses(results.trajectory)
-        tell(log, results, maps)
+        log_run(log, results, maps)
         log.diagnostics(results.records)
         log.about(in_words(run, name=run.path.name))
 
 
-def tell(log: RerunLog, results: RunResults, maps: Maps) -> None:
+def log_run(log: RerunLog, results: RunResults, maps: Maps) -> None:
     """Log what is known once the maps are made."""
     paths = {"estimate": results.trajectory}
     if results.truth is not None:

@@ -1,7 +1,7 @@
 """A build as a Rerun recording while it runs.
 
-What tracking believes lies below /world/live, in a world that is upright only by guess; once the graph is
-solved and levelled, that entity is laid into the levelled world. The body stays where the odometry saw it:
+The estimates of tracking are logged below /world/live, in a world that is upright only by guess; once the
+graph is solved and levelled, that entity gets its pose in the levelled world. The body keeps the odometry's poses:
 Rerun would not show poses that are logged anew at the same stamps.
 """
 
@@ -16,7 +16,7 @@ from mapper.core.errors import FrameError
 from mapper.core.frames import RgbdFrame, Scan, Sensor
 from mapper.core.geometry import Array, Transform, inverse
 from mapper.export.palette import ACCEPTED, ESTIMATE, FACTORS, REJECTED, Rgb
-from mapper.export.rerun.finished import extent, in_words, tell
+from mapper.export.rerun.finished import extent, in_words, log_run
 from mapper.export.rerun.recording import RerunLog, recorded, transform_of
 from mapper.features.view import View
 from mapper.mapping.fusion import Maps
@@ -30,7 +30,7 @@ from mapper.sources.base import FrameSource
 _LIVE = "world/live"
 _BODY = f"{_LIVE}/body"
 _GROWTH = 0.02  # a path is logged anew once it has grown by so much: all of it, so in all 50 times its length
-_TOLD = ("features", "matches", "inliers", "residual")
+_LOGGED_DIAGNOSTICS = ("features", "matches", "inliers", "residual")
 _UPRIGHT: dict[Sensor, Transform] = {
     # x right, y down, z forward, held level, becomes x right, y forward, z up.
     "rgbd": np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]),
@@ -41,7 +41,7 @@ _UNMATCHED: Rgb = (150, 150, 150)
 
 
 class LiveRerun:
-    """Observer that logs a build to a recording; made by :func:`watching`."""
+    """Observer that logs a build to a recording; made by :func:`live_recording`."""
 
     def __init__(self, log: RerunLog, sensor: Sensor, config: RerunConfig) -> None:
         self._log = log
@@ -52,15 +52,15 @@ class LiveRerun:
         self._path: list[Array] = []
         self._nodes: list[int] = []
         self._factors: list[tuple[int, int]] = []
-        self._told_at = 0
-        self._told_loops = 0
+        self._logged_nodes = 0
+        self._logged_loops = 0
 
     def on_frame(self, step: Step, /) -> None:
         """Log where the body is and how tracking went; now and then the image, the cloud and the paths."""
         track = step.track
         self._last_ns = track.stamp_ns
         self._log.keeps = True  # a build that fails is best understood by looking at it
-        for name in _TOLD:
+        for name in _LOGGED_DIAGNOSTICS:
             value = float(getattr(track.diagnostics, name))
             self._log.log(f"diagnostics/{name}", rr.Scalars(value), stamp_ns=track.stamp_ns)
         if track.node is not None:
@@ -71,17 +71,17 @@ class LiveRerun:
         if track.is_keyframe and track.node is not None:
             self._nodes.append(track.node)
             self._factors += [(factor.i, factor.j) for factor in (*track.links, *track.factors)]
-            self._tell_paths(step)
+            self._log_paths(step)
 
     def on_levelled(self, T_level_world: Transform, /) -> None:
         """Log the pose of everything logged so far in the levelled world."""
         self._log.log(_LIVE, transform_of(T_level_world @ inverse(self._T_guess_world)))
 
     def on_mapped(self, run: Run, results: RunResults, maps: Maps, /) -> None:
-        """Log the results; what was only believed is theirs to show now."""
-        for name in ("believed", "factors", "loops"):
+        """Log the results and clear the estimates made during tracking."""
+        for name in ("estimates", "factors", "loops"):
             self._log.log(f"{_LIVE}/{name}", rr.Clear(recursive=True), stamp_ns=self._last_ns)
-        tell(self._log, results, maps)
+        log_run(self._log, results, maps)
         self._log.about(in_words(run, name=run.manifest.input.title))
         self._log.look_at(extent(results, maps))
 
@@ -95,7 +95,7 @@ class LiveRerun:
         try:
             frame = step.entry.load()
         except FrameError:
-            return  # it was readable a moment ago; the second pass will tell
+            return  # it was readable in the first pass; fusing reports it
         if isinstance(frame, RgbdFrame):
             self._show_image(frame, step)
             pixels = frame.depth_m.size
@@ -139,28 +139,28 @@ class LiveRerun:
         points = rr.Points3D(scan.points_body[kept], colors=colors, radii=rr.Radius.ui_points(1.0))
         self._log.log(f"{self._log.body}/cloud", points, stamp_ns=scan.stamp_ns)
 
-    def _tell_paths(self, step: Step) -> None:
+    def _log_paths(self, step: Step) -> None:
         """Log the path before loops, the current node estimates and the factors; not for every keyframe."""
         loops = step.detector.closures()
-        grown = len(self._nodes) >= (1.0 + _GROWTH) * self._told_at
-        if not grown and len(loops) == self._told_loops:
+        grown = len(self._nodes) >= (1.0 + _GROWTH) * self._logged_nodes
+        if not grown and len(loops) == self._logged_loops:
             return
-        self._told_at, self._told_loops = len(self._nodes), len(loops)
-        current_estimate = {
+        self._logged_nodes, self._logged_loops = len(self._nodes), len(loops)
+        positions = {
             node: (self._T_guess_world @ step.detector.current_estimate(node))[:3, 3] for node in self._nodes
         }
         self._strips("odometry", [np.array(self._path)], FACTORS["odometry"])
-        self._strips("believed", [np.array(list(current_estimate.values()))], ESTIMATE)
+        self._strips("estimates", [np.array(list(positions.values()))], ESTIMATE)
         self._strips(
             "factors",
-            [[current_estimate[i], current_estimate[j]] for i, j in self._factors],
+            [[positions[i], positions[j]] for i, j in self._factors],
             FACTORS["odometry"],
         )
         for verdict, color in (("accepted", ACCEPTED), ("rejected", REJECTED)):
             ends = [
-                [current_estimate[loop.i], current_estimate[loop.j]]
+                [positions[loop.i], positions[loop.j]]
                 for loop in loops
-                if loop.verdict == verdict and loop.i in current_estimate and loop.j in current_estimate
+                if loop.verdict == verdict and loop.i in positions and loop.j in positions
             ]
             self._strips(f"loops/{verdict}", ends, color)
 
@@ -170,7 +170,7 @@ class LiveRerun:
 
 
 @contextmanager
-def watching(target: str, source: FrameSource, config: RerunConfig) -> Iterator[LiveRerun]:
+def live_recording(target: str, source: FrameSource, config: RerunConfig) -> Iterator[LiveRerun]:
     """Yield an observer that logs to a target; a build that fails leaves what it recorded.
 
     Args:

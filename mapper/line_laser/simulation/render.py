@@ -54,7 +54,7 @@ class _View:
         depth_m: (W,) to its wall, metres ahead.
         wall: (W,) which, −1 for none.
         along_m: (W,) where on the wall.
-        slant: (W,) cosine between sight and the wall's normal.
+        slant: (W,) cosine between the viewing ray and the wall's normal.
         up_m: (H, W) height on the wall; below the floor, where its mirror image is.
     """
 

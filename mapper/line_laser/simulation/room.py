@@ -1,4 +1,4 @@
-"""Walls seen from above, what hangs on them, and the way round."""
+"""Walls in plan view, pictures on them, and the vehicle's path."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ class Room:
     Attributes:
         ends_world: (S, 2, 2) both ends of each wall from above, metres.
         colors: (S, 3) share of red, green and blue light each returns.
-        patches: What hangs on them; later ones lie over earlier ones.
+        patches: Pictures on them; later ones cover earlier ones.
         floor: (3,) share of red, green and blue light that the floor returns.
     """
 

@@ -1,4 +1,4 @@
-"""What each of many rays meets first, among solids sorted into square cells of the ground plan.
+"""Ray casting for LiDAR: the first solid on each ray, with solids sorted into cells of the ground plan.
 
 A ray visits the cells under it in order (Amanatides & Woo 1987), skips what it passes above or below
 there, and ends where a solid is met before the cell is left. In units of a solid's half sizes the three
@@ -115,7 +115,7 @@ def _solid_range_m(
 ) -> float:
     """Return where a ray enters the first solid, metres; inf if it meets none.
 
-    ``tested`` remembers each solid's last ray, so that one in many cells is tried once (Amanatides & Woo).
+    ``tested`` holds each solid's last ray, so that one in many cells is tried once (Amanatides & Woo).
     """
     columns, rows = tops.shape
     dx, dy, dz = direction

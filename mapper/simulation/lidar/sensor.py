@@ -1,4 +1,4 @@
-"""What a spinning LiDAR measures: rings of ranges, with noise, losses, times and its own motion in them.
+"""Spinning LiDAR: rings of ranges, with noise, dropouts, point times and motion during the sweep.
 
 The lidar frame has x forward, y left, z up. A sweep begins looking back and turns clockwise seen from
 above; its stamp is when it begins, so times are never negative.

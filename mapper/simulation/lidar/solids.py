@@ -15,7 +15,7 @@ from mapper.simulation.lidar.terrain import Ground
 
 
 class Shape(IntEnum):
-    """How a solid fills its box; in units of the box's half sizes all three are unit shapes."""
+    """Shape of a solid inside its box; in units of the box's half sizes all three are unit shapes."""
 
     BOX = 0
     CYLINDER = 1
@@ -24,7 +24,7 @@ class Shape(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solids:
-    """Everything that stands on the ground.
+    """Solids of an outdoor scene.
 
     Attributes:
         hulls: The box around each solid.

@@ -27,7 +27,7 @@ class SyntheticLidarEntry:
 
     @property
     def stamp_ns(self) -> int:
-        """When the sweep begins, nanoseconds."""
+        """Start of the sweep, nanoseconds."""
         return int(self.source.stamps_ns[self.index])
 
     @property
@@ -36,7 +36,7 @@ class SyntheticLidarEntry:
         return None
 
     def load(self, *, colour: bool = True) -> Scan:  # noqa: ARG002 - a scan has no colour to leave out
-        """Cast the scan, with its own noise; the same whenever it is asked for."""
+        """Cast the scan, with its own noise; every call gives the same points."""
         return self.source.observe(self.index)
 
     def scan(self) -> Scan:

@@ -1,4 +1,4 @@
-"""What stands in streets and yards, each about a place on the ground; x is along the kerb."""
+"""Objects of streets and yards, each at a place on the ground; x is along the kerb."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ def car(site: Site, place: Place, rng: np.random.Generator) -> None:
 
 
 def tree(site: Site, place: Place, rng: np.random.Generator) -> None:
-    """A trunk and a crown that begins above whoever passes under it."""
+    """A trunk and a crown that begins above head height."""
     trunk, clear = float(rng.uniform(0.2, 0.5)), float(rng.uniform(2.3, 3.2))
     wide, high = float(rng.uniform(2.0, 4.2)), float(rng.uniform(2.0, 5.0))
     middle = (float(rng.normal(0.0, 0.2)), float(rng.normal(0.0, 0.2)), clear + high / 2)
