@@ -1,8 +1,8 @@
 """A build as a Rerun recording while it runs.
 
 The estimates of tracking are logged below /world/live, in a world that is upright only by guess; once the
-graph is solved and levelled, that entity gets its pose in the levelled world. The body keeps the odometry's poses:
-Rerun would not show poses that are logged anew at the same stamps.
+graph is solved and levelled, that entity gets its pose in the levelled world. The body keeps the odometry's
+poses: Rerun would not show poses that are logged anew at the same stamps.
 """
 
 from collections.abc import Callable, Iterator, Sequence
