@@ -348,7 +348,7 @@ def test_images_are_placed_by_the_wheels(folder):
     encoders.write_text("".join(f"{1001 + 0.1 * k:.1f} {0.05 * k:.2f} 0\n" for k in range(30)))
     driven = drive(scans, sensor_poses(encoders, calibration)[0], CONFIG.map)
     assert driven.trajectory.positions_world[:, 0] == pytest.approx([0.2 + 0.25, 0.2 + 0.75, 0.2 + 1.25])
-    assert any("no place of 1 images" in note for note in driven.notes)
+    assert any("no wheel pose for 1 images" in note for note in driven.notes)
     wall_m = ahead_m(THESIS, np.array([200.0]))[0]
     assert state_at(driven.grid, 0.45 + wall_m, 0.0) == OCCUPIED
 
