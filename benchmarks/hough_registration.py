@@ -26,7 +26,7 @@ from mapper.registration.base import Registration
 from mapper.registration.config import KissMatcherConfig
 from mapper.registration.hough_config import HoughConfig, HoughGicpConfig, HoughNdtConfig
 from mapper.simulation.config import COURTYARD, STREET, LidarSynthConfig
-from mapper.simulation.lidar import SyntheticLidarSource
+from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 
@@ -50,31 +50,31 @@ class Pair:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Log:
+class PosedScans:
     """Scans with their poses."""
 
     scans: list[Scan]
     T_world_body: list[Transform]
 
 
-def recorded(folder: Path) -> Log:
+def recorded(folder: Path) -> PosedScans:
     """Return the scans of a log, those far from its first included."""
     source = open_source(folder, SourceConfig())
     assert source.truth is not None
     scans = [entry.load().scan() for entry in source.entries()]
-    return Log(scans, list(source.truth.T_world_body))
+    return PosedScans(scans, list(source.truth.T_world_body))
 
 
-def rendered(config: LidarSynthConfig, *, seed: int, count: int) -> Log:
+def rendered(config: LidarSynthConfig, *, seed: int, count: int) -> PosedScans:
     """Return evenly chosen synthetic scans, each taken at an instant."""
     sensor = config.sensor.model_copy(update={"motion_distortion": False})
-    source = SyntheticLidarSource(config.model_copy(update={"seed": seed, "sensor": sensor}))
+    source = LidarSimulator(config.model_copy(update={"seed": seed, "sensor": sensor}))
     poses = source.truth.T_world_body
     chosen = np.linspace(0, len(poses) - 1, count).astype(int)
-    return Log([source.observe(int(i)) for i in chosen], [poses[i] for i in chosen])
+    return PosedScans([source.observe(int(i)) for i in chosen], [poses[i] for i in chosen])
 
 
-def near_pairs(logs: list[Log], *, count: int, offset_m: float = NEAR_M) -> Iterator[Pair]:
+def near_pairs(logs: list[PosedScans], *, count: int, offset_m: float = NEAR_M) -> Iterator[Pair]:
     """Yield perturbed pairs of scans taken within 10 m of each other, so many over all logs."""
     rng = np.random.default_rng(0)
     for log, share in zip(logs, np.diff(np.linspace(0, count, len(logs) + 1).astype(int)), strict=True):
@@ -100,7 +100,7 @@ def without_origins(pairs: Iterator[Pair]) -> Iterator[Pair]:
         yield Pair(pair.target, source, pair.T_target_source)
 
 
-def sparse_pairs(logs: list[Log], *, count: int, rings: bool) -> Iterator[Pair]:
+def sparse_pairs(logs: list[PosedScans], *, count: int, rings: bool) -> Iterator[Pair]:
     """Yield scans with 16 of 64 rings, or 10 % of their points, against a map of all the others."""
     rng = np.random.default_rng(0)
     for log, share in zip(logs, np.diff(np.linspace(0, count, len(logs) + 1).astype(int)), strict=True):
@@ -120,14 +120,14 @@ def sparse(scan: Scan, rng: np.random.Generator, *, rings: bool) -> Scan:
     return Scan(stamp_ns=scan.stamp_ns, points_body=scan.points_body[keep], origin_body=scan.origin_body)
 
 
-def map_of_others(log: Log, *, without: int, T_world_map: Transform) -> Scan:
+def map_of_others(log: PosedScans, *, without: int, T_world_map: Transform) -> Scan:
     """Return a dense map of all scans but one."""
     scans = [scan for i, scan in enumerate(log.scans) if i != without]
     poses = [inverse(T_world_map) @ T for i, T in enumerate(log.T_world_body) if i != without]
     return merged(scans, poses, voxel_m=MAP_VOXEL_M)
 
 
-def far_pairs(log: Log, *, count: int) -> Iterator[Pair]:
+def far_pairs(log: PosedScans, *, count: int) -> Iterator[Pair]:
     """Yield pairs from the two ends of a log: the answer lies at the accumulator's edge or beyond."""
     rng = np.random.default_rng(0)
     for _ in range(count):
@@ -137,7 +137,7 @@ def far_pairs(log: Log, *, count: int) -> Iterator[Pair]:
         yield Pair(log.scans[i], source, inverse(log.T_world_body[i]) @ T_world_source)
 
 
-def strangers(logs: list[Log], *, count: int) -> Iterator[Pair]:
+def strangers(logs: list[PosedScans], *, count: int) -> Iterator[Pair]:
     """Yield pairs of scans of different logs, which show different places."""
     rng = np.random.default_rng(0)
     for _ in range(count):

@@ -37,7 +37,7 @@ from mapper.run.manifest import Input, Manifest
 from mapper.simulation.config import SCENES
 from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source
-from mapper.sources.base import FrameSource
+from mapper.sources.base import Log
 from mapper.sources.trajectory_files import write_tum
 
 RUNS = 8
@@ -53,21 +53,20 @@ class Cost:
     peak_mb: float
 
 
-def make_runs(source: FrameSource, resolution_m: float, *, stride: int, folder: Path) -> list[Run]:
+def make_runs(source: Log, resolution_m: float, *, stride: int, folder: Path) -> list[Run]:
     """Fuse pieces of a log at the true poses, each as a run folder."""
     truth = source.truth
     if truth is None:
         raise SystemExit(f"{source.path}: has no truth")
     config = load_config(None, [f"octree.resolution_m={resolution_m}"], sensor="lidar")
-    entries = list(source.entries())
-    indices, _ = nearest(truth.stamps_ns, np.array([entry.stamp_ns for entry in entries]))
-    step = len(entries) / RUNS
+    indices, _ = nearest(truth.stamps_ns, source.stamps_ns)
+    step = len(source) / RUNS
     runs = []
     for number in range(RUNS):
         octree = OctreeMap(config.octree)
-        piece = range(round(number * step), min(round((number + SHARE) * step), len(entries)), stride)
+        piece = range(round(number * step), min(round((number + SHARE) * step), len(source)), stride)
         for frame in piece:
-            scan = deskewed(entries[frame].scan(), twist_at(truth, int(indices[frame])))
+            scan = deskewed(source.entry_at(frame).scan(), twist_at(truth, int(indices[frame])))
             octree.insert(scan, truth.T_world_body[indices[frame]])
         found = Input(path=str(source.path), kind=source.kind, fingerprint=f"sha256:{number}")
         path = folder / f"run{number}"

@@ -22,7 +22,7 @@ from mapper.places.guided import match_by_word
 from mapper.places.index import PlaceIndex
 from mapper.places.tree import Bits
 from mapper.places.vocabulary import Vocabulary, WordVector, load_vocabulary, similarity
-from mapper.simulation import SyntheticSource
+from mapper.simulation import CameraSimulator
 from mapper.simulation.config import SynthConfig
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
@@ -105,7 +105,8 @@ def frames(data: Path) -> tuple[str, list[Bits]]:
     if (data / "rgb.txt").exists():
         entries = list(open_source(data, SourceConfig(stride=10)).entries())
     else:
-        entries = list(SyntheticSource(SynthConfig(seed=3, frame_rate_hz=3.0, duration_s=15.0)).entries())
+        config = SynthConfig(seed=3, frame_rate_hz=3.0, duration_s=15.0)
+        entries = list(CameraSimulator(config).log().entries())
     detector = UniformOrbConfig().build()
     chosen = [entries[i * (len(entries) - 2) // PAIRS + j] for i in range(PAIRS) for j in range(2)]
     return data.name, [pack(detector.detect(entry.load(colour=False).gray).descriptors) for entry in chosen]

@@ -9,7 +9,6 @@ pose shows a place seen before (nearer than 0.3 m and 20 degrees) to the one tha
 """
 
 import argparse
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -17,7 +16,6 @@ import numpy as np
 
 from evaluators.trajectory import align, associate, ate
 from mapper.config.loading import load_config
-from mapper.core.frames import RgbdFrame, Scan
 from mapper.core.geometry import angle_between
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
@@ -26,55 +24,21 @@ from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT
 from mapper.simulation.config import SensorConfig, SynthConfig
 from mapper.simulation.path import START_NS
-from mapper.simulation.source import SyntheticSource
-from mapper.sources.base import Accelerations, FrameRef
+from mapper.simulation.source import CameraSimulator, SyntheticEntry
+from mapper.sources.base import Log
 
 KINDS = ("local-map", "pnp")
 SEEDS = 4
 NEAR_M, NEAR_RAD = 0.3, np.radians(20.0)
 
 
-@dataclass(frozen=True, slots=True)
-class RenderedEntry:
-    """A frame that lies in memory; tracking needs no colour, so it has none."""
-
-    frame: RgbdFrame
-    files: None = None
-
-    @property
-    def stamp_ns(self) -> int:
-        """Time of the frame."""
-        return self.frame.stamp_ns
-
-    def load(self, *, colour: bool = True) -> RgbdFrame:  # noqa: ARG002
-        """Return the frame."""
-        return self.frame
-
-    def scan(self) -> Scan:
-        """Return the frame's points."""
-        return self.frame.scan()
-
-
-class RenderedSource:
-    """A synthetic log that is rendered once and tracked often."""
-
-    def __init__(self, config: SynthConfig) -> None:
-        source = SyntheticSource(config)
-        self.config = config
-        self.path, self.name, self.kind = source.path, source.path.name, source.kind
-        self.truth: Trajectory | None = source.truth
-        self.accelerations: Accelerations | None = None
-        self.notes: Sequence[str] = ()
-        self.rendered: list[FrameRef] = [
-            RenderedEntry(entry.load(colour=False)) for entry in source.entries()
-        ]
-
-    def __len__(self) -> int:
-        return len(self.rendered)
-
-    def entries(self) -> Iterator[FrameRef]:
-        """Yield every frame in time order."""
-        return iter(self.rendered)
+def rendered(config: SynthConfig) -> Log:
+    """Return a synthetic log that is rendered once and tracked often, in grey, which is enough to track."""
+    log = CameraSimulator(config).log()
+    frames = [entry.load(colour=False) for entry in log.entries()]
+    return replace(
+        log, entry_at=lambda index: SyntheticEntry(frames[index].stamp_ns, lambda _colour: frames[index])
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,20 +68,20 @@ def setting(k: int) -> SynthConfig:
     )
 
 
-def judged(source: RenderedSource, overrides: list[str]) -> Outcome:
+def judged(log: Log, flat: SynthConfig, overrides: list[str]) -> Outcome:
     """Track and solve a log, and compare with what was there to be found."""
     config = load_config(None, overrides)
-    truth = source.truth
+    truth = log.truth
     assert truth is not None
-    tracking = track_log(source, config, progress=SILENT)
+    tracking = track_log(log, config, progress=SILENT)
     solved = solve(tracking.graph, tracking.loops, config.graph)
     matched = associate(replace(tracking, graph=solved.graph).trajectory(), truth)
     rmse_m = ate(align(matched, "se3").moved(matched)).rmse
 
     placed = {track.stamp_ns for track in tracking.placed}
-    start_ns = START_NS + round(source.config.blackout_start_s * NS_PER_S)
-    end_ns = start_ns + round(source.config.blackout_duration_s * NS_PER_S)
-    lit = [entry.stamp_ns for entry in source.rendered if not start_ns <= entry.stamp_ns < end_ns]
+    start_ns = START_NS + round(flat.blackout_start_s * NS_PER_S)
+    end_ns = start_ns + round(flat.blackout_duration_s * NS_PER_S)
+    lit = [stamp_ns for stamp_ns in log.stamps_ns.tolist() if not start_ns <= stamp_ns < end_ns]
     after = [stamp for stamp in lit if stamp >= end_ns]
     known = [i for i, stamp in enumerate(after) if seen_before(truth, stamp, until_ns=start_ns)]
     found = [i for i, stamp in enumerate(after) if stamp in placed and i >= known[0]] if known else []
@@ -150,11 +114,11 @@ def main() -> None:
     outcomes: dict[str, list[Outcome]] = {kind: [] for kind in KINDS}
     print("seed  rad/s  dark  " + "".join(f"{kind:>10}: frames  lost  ATE mm" for kind in KINDS))
     for k in range(arguments.settings):
-        source = RenderedSource(setting(k))
-        config = source.config
+        config = setting(k)
+        log = rendered(config)
         row = f"{config.seed:4d}  {config.max_yaw_rate_rad_s:5.1f}  {config.blackout_duration_s:3.1f}s  "
         for kind in KINDS:
-            outcome = judged(source, [*arguments.overrides, f"odometry.kind={kind}"])
+            outcome = judged(log, config, [*arguments.overrides, f"odometry.kind={kind}"])
             outcomes[kind].append(outcome)
             frames = "never" if outcome.frames is None else outcome.frames
             row += f"{frames:>18} {outcome.lost:>5} {outcome.ate_mm:>7.1f}"

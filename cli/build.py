@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from mapper.config.build import BuildConfig
     from mapper.run.folder import Run
     from mapper.run.observers import Observer
-    from mapper.sources.base import FrameSource
+    from mapper.sources.base import Log
 
-    Onlooker = Callable[[FrameSource, BuildConfig], AbstractContextManager[Observer]]
+    Onlooker = Callable[[Log, BuildConfig], AbstractContextManager[Observer]]
 
 
 def build(
@@ -134,7 +134,7 @@ def _onlooker(rerun: str | None, *, step: bool, overwrite: bool) -> "Onlooker | 
         raise RunError(f"{target}: exists already; choose another, or pass --overwrite to replace it")
 
     @contextmanager
-    def onlooker(source: "FrameSource", config: "BuildConfig") -> "Iterator[Observer]":
+    def onlooker(source: "Log", config: "BuildConfig") -> "Iterator[Observer]":
         from mapper.export.rerun.live import live_recording
 
         is_built = False

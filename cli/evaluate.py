@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mapper.core.timebase import Stamps
     from mapper.core.trajectory import Trajectory
     from mapper.run.folder import Run
-    from mapper.sources.base import FrameSource
+    from mapper.sources.base import Log
 
 _TOLERANCE = 1
 
@@ -188,13 +188,13 @@ def _held_against(
     )
 
 
-def _log_of(run: "Run", log: Path | None) -> "FrameSource":
+def _log_of(run: "Run", log: Path | None) -> "Log":
     from mapper.run.folder import moved_log, open_log
 
     return open_log(run if log is None else moved_log(run, log))
 
 
-def _sharpness_of(source: "FrameSource", trajectory: "Trajectory") -> "list[Metric]":
+def _sharpness_of(source: "Log", trajectory: "Trajectory") -> "list[Metric]":
     from evaluators.sharpness import RADIUS_M, sharpness_metrics, views_of
 
     views = views_of(source, trajectory, progress=progress_for(quiet=False))
@@ -214,8 +214,7 @@ def _frames_ns(run: "Run | None", log: Path | None, *, used: bool) -> "Stamps | 
         return np.array([record.stamp_ns for record in run.records()], dtype=np.int64)
     if log is None:
         return None
-    source = open_source(log, load_source_config(None, []))
-    return np.array([entry.stamp_ns for entry in source.entries()], dtype=np.int64)
+    return open_source(log, load_source_config(None, [])).stamps_ns
 
 
 def _numbers(text: str) -> list[float]:

@@ -129,7 +129,6 @@ def _load(name: str, config: "SourceConfig") -> "tuple[Frame, Sensor]":
             )
         return read_scan(Path(name), scale=config.cloud_scale), "lidar"
     opened = open_source(Path(log), config)
-    entries = list(opened.entries())
-    if not index.isdecimal() or int(index) >= len(entries):
-        raise SourceError(f"{name}: want a frame of {log} from @0 to @{len(entries) - 1}")
-    return entries[int(index)].load(), opened.sensor
+    if not index.isdecimal() or int(index) >= len(opened):
+        raise SourceError(f"{name}: want a frame of {log} from @0 to @{len(opened) - 1}")
+    return opened.entry_at(int(index)).load(), opened.sensor

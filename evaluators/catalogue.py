@@ -7,10 +7,10 @@ from mapper.core.errors import ConfigError
 from mapper.core.frames import Sensor
 from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig, PnpConfig
 from mapper.registration.config import NEED_NO_GUESS
-from mapper.sources.base import FrameSource
+from mapper.sources.base import Log
 
 
-def methods_for(source: FrameSource, config: CompareConfig) -> tuple[list[Method], list[str]]:
+def methods_for(source: Log, config: CompareConfig) -> tuple[list[Method], list[str]]:
     """Return the chosen methods that can use a log, and a sentence on those that cannot.
 
     Raises:

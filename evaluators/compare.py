@@ -21,7 +21,7 @@ from mapper.core.geometry import inverse
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, Stamps
 from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.runtime.progress import SILENT, Progress
-from mapper.sources.base import FrameSource, Skipped
+from mapper.sources.base import Log, Skipped
 
 _WARM_UP_FRAMES = 2
 
@@ -69,7 +69,7 @@ def trials_config(config: CompareConfig, sensor: Sensor) -> TrialsConfig:
     return config.rgbd if sensor == "rgbd" else config.lidar
 
 
-def compare(source: FrameSource, config: CompareConfig, *, progress: Progress = SILENT) -> Comparison:
+def compare(source: Log, config: CompareConfig, *, progress: Progress = SILENT) -> Comparison:
     """Run every chosen method over the whole log, and on pairs of its frames.
 
     Frames are read one at a time and shown to one method after the other, so memory does not grow with the
@@ -155,7 +155,7 @@ class _Racer:
 
 
 def _race(
-    source: FrameSource, methods: Sequence[Method], reader: Reader, *, progress: Progress
+    source: Log, methods: Sequence[Method], reader: Reader, *, progress: Progress
 ) -> tuple[list[_Racer], Stamps, list[Skipped]]:
     """Show every frame to every method."""
     racers = [_Racer(method) for method in methods]
@@ -188,7 +188,7 @@ def _while(truth: Trajectory, stamps_ns: Stamps) -> Trajectory | None:
 
 
 def _register(
-    source: FrameSource,
+    source: Log,
     methods: Sequence[Method],
     truth: Trajectory,
     config: CompareConfig,
@@ -196,10 +196,9 @@ def _register(
     progress: Progress,
 ) -> list[Trial]:
     """Register pairs of frames by every method from every guess."""
-    entries = list(source.entries())
-    stamps_ns = np.array([entry.stamp_ns for entry in entries], np.int64)
     settings, reader = trials_config(config, source.sensor), Reader(config.rgbd)
-    pairs = pairs_of(stamps_ns, truth, count=config.pairs, frames_apart=settings.frames_apart)
+    entries = list(source.entries())
+    pairs = pairs_of(source.stamps_ns, truth, count=config.pairs, frames_apart=settings.frames_apart)
     trials: list[Trial] = []
     with progress.stage("register") as report:
         for done, pair in enumerate(pairs, start=1):
@@ -215,7 +214,7 @@ def _register(
     return trials
 
 
-def _warm_up(source: FrameSource, methods: Sequence[Method], config: CompareConfig) -> None:
+def _warm_up(source: Log, methods: Sequence[Method], config: CompareConfig) -> None:
     """Let every method load its libraries and compiled code before anything is timed."""
     reader = Reader(config.rgbd)
     moments = []

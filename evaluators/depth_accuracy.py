@@ -17,7 +17,7 @@ from mapper.sensing.depth_accuracy import DepthLevel, Patch, ResidualMap, refuse
 from mapper.sensing.depth_fit import NoiseFit, fit_noise
 from mapper.sensing.depth_still import depth_at
 from mapper.sensing.depth_tiles import depth_of_planes
-from mapper.sources.base import FrameSource
+from mapper.sources.base import Log
 
 SENSOR, NUMBERS, ACCURACY, RESIDUALS = "sensor.toml", "depth.csv", "accuracy.png", "residuals.png"
 
@@ -44,7 +44,7 @@ class DepthStudy:
 
 
 def study_depth(
-    sources: Sequence[FrameSource],
+    sources: Sequence[Log],
     distances_m: Sequence[float] | None,
     *,
     patch: Patch | None = None,

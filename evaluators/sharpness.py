@@ -17,7 +17,7 @@ from mapper.core.geometry import Array, Points, apply
 from mapper.core.trajectory import Trajectory
 from mapper.core.voxel_grid import thin
 from mapper.runtime.progress import SILENT, Progress
-from mapper.sources.base import FrameSource
+from mapper.sources.base import Log
 
 RADIUS_M: dict[Sensor, float] = {"rgbd": 0.2, "lidar": 0.5}
 """Of the patches: small enough for walls to be flat, large against what scans are laid wrong by."""
@@ -53,7 +53,7 @@ class Views:
             raise DataError(f"sharpness: points, directions and frames {shapes}, want (N, 3), (N, 3), (N,)")
 
 
-def views_of(source: FrameSource, trajectory: Trajectory, *, progress: Progress = SILENT) -> Views:
+def views_of(source: Log, trajectory: Trajectory, *, progress: Progress = SILENT) -> Views:
     """Return evenly chosen points of evenly chosen scans, laid out by a trajectory: enough, whatever the log.
 
     Args:

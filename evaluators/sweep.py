@@ -24,7 +24,7 @@ from mapper.run.fingerprint import fingerprint
 from mapper.runtime.atomic import resumable_folder, write_text
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources import open_source
-from mapper.sources.base import FrameSource
+from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 
 CELLS, RUNS, SCRATCH, PLAN = "cells", "runs", "scratch", "sweep.json"
@@ -85,7 +85,7 @@ def plan_sweep(path: Path, out: Path) -> Plan:
     out, versions = out.resolve(), environment()
     entries: dict[Place, Cell | str] = {}
     for name, log in _logs(path, config).items():
-        sources: dict[SourceConfig, FrameSource] = {}
+        sources: dict[SourceConfig, Log] = {}
         mark = fingerprint(log)
         for method in config.method:
             for configuration in config.configuration:
@@ -153,8 +153,8 @@ def _resolved(
     log: Path,
     method: MethodConfig,
     configuration: ConfigurationConfig,
-    sources: dict[SourceConfig, FrameSource],
-) -> tuple[BuildConfig, FrameSource]:
+    sources: dict[SourceConfig, Log],
+) -> tuple[BuildConfig, Log]:
     """Return a build's configuration, and its log; opening one may mean to read through it."""
     file = None if method.config is None else path.parent / method.config
     overrides = (*method.set, *configuration.set)
@@ -171,7 +171,7 @@ def _resolved(
     return config.model_copy(update={"workers": 0}), source  # a core for each cell, so that times compare
 
 
-def _misfit(config: BuildConfig, source: FrameSource) -> str:
+def _misfit(config: BuildConfig, source: Log) -> str:
     """Return why a log cannot be built so; empty if it can."""
     odometry, loops = config.odometry, config.loops
     if source.sensor == "lidar" and isinstance(odometry, IsvdOdometryConfig | KeyframeConfig):

@@ -17,14 +17,15 @@ from mapper.places.config import VocabularyConfig
 from mapper.places.images import descriptors_of
 from mapper.places.training import train
 from mapper.places.vocabulary import SHIPPED
-from mapper.simulation import SyntheticSource, make_scene
+from mapper.simulation import CameraSimulator, make_scene
 from mapper.simulation.config import SensorConfig, SynthConfig
+from mapper.sources.base import Log
 
 FIRST_SEED = 1000  # far from the seeds that tests and examples use
 FLATS = 12
 
 
-def sources() -> Iterator[SyntheticSource]:
+def logs() -> Iterator[Log]:
     """Yield walks through flats of many sizes, emptier and fuller, seen sharply and less so."""
     rng = np.random.default_rng(FIRST_SEED)
     for seed in range(FIRST_SEED, FIRST_SEED + FLATS):
@@ -42,7 +43,8 @@ def sources() -> Iterator[SyntheticSource]:
         )
         scene = make_scene(flat)
         for path, rate_hz in (("loop", 0.6), ("spin", 0.3), ("desk", 0.15)):
-            yield SyntheticSource(flat.model_copy(update={"path": path, "frame_rate_hz": rate_hz}), scene)
+            config = flat.model_copy(update={"path": path, "frame_rate_hz": rate_hz})
+            yield CameraSimulator(config, scene).log()
 
 
 def main() -> None:
@@ -52,7 +54,7 @@ def main() -> None:
     out: Path = parser.parse_args().out
     cv2.setNumThreads(1)
     config, progress = VocabularyConfig(), progress_for(quiet=False)
-    images = [bits for source in sources() for bits in descriptors_of(source, config, progress=progress)]
+    images = [bits for log in logs() for bits in descriptors_of(log, config, progress=progress)]
     vocabulary = train(
         images,
         config=config,

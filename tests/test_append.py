@@ -152,7 +152,7 @@ def test_a_third_session_is_appended_to_two(joined, desk_log, tmp_path):
     source = open_source(desk_log, SourceConfig(last_frame=12))
     three = append(source, joined, overridden(joined.config, ["source.last_frame=12"]), tmp_path / "three")
     assert three.manifest.counts.tracked == 31 + 13
-    assert [len(session.stamps_ns) for session in sessions_of(open_log(three))] == [16, 15, 13]
+    assert [len(session.log) for session in sessions_of(open_log(three))] == [16, 15, 13]
     assert three.manifest.input.appended[1].shift_ns > 0
     matched = associate(three.trajectory(), three.truth())
     assert len(matched) == 44

@@ -3,11 +3,13 @@
 import csv
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from logs_made import MemoryEntry
 from mcap.reader import make_reader
 from test_cli import mapper
 
@@ -20,7 +22,7 @@ from evaluators.methods import registration_method
 from mapper.config.compare import CompareConfig, LidarCompareConfig
 from mapper.core.errors import ConfigError, DataError, FrameError
 from mapper.simulation.config import STREET, LidarSensorConfig
-from mapper.simulation.lidar import SyntheticLidarSource
+from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.trajectory_files import read_tum
@@ -50,7 +52,7 @@ def on_desk(desk):
 @pytest.fixture(scope="module")
 def street():
     sensor = LidarSensorConfig(rings=32, azimuth_steps=450, motion_distortion=False)
-    return SyntheticLidarSource(STREET.model_copy(update={"sensor": sensor, "duration_s": 0.6}))
+    return LidarSimulator(STREET.model_copy(update={"sensor": sensor, "duration_s": 0.6})).log()
 
 
 @pytest.fixture(scope="module")
@@ -151,41 +153,28 @@ def test_a_method_that_breaks_down_does_not_take_the_others_along(desk, on_desk,
     assert "bad broke down at frame 1: ZeroDivisionError: over a stone" in tables_text(comparison)
 
 
-class Damaged:
-    """A log of which some frames cannot be read, and which may have no truth."""
+def damaged(log, bad):
+    """A log of which some frames cannot be read."""
 
-    def __init__(self, source, bad, *, truth=True):
-        self.path, self.name, self.sensor = source.path, source.name, source.sensor
-        self.truth = source.truth if truth else None
-        self._source, self._bad = source, bad
+    def entry_at(index):
+        entry = log.entry_at(index)
+        torn = FrameError(f"frame {entry.stamp_ns}: torn")
+        return MemoryEntry(entry.stamp_ns, torn) if index in bad else entry
 
-    def __len__(self):
-        return len(self._source)
-
-    def entries(self):
-        for index, entry in enumerate(self._source.entries()):
-            yield Unreadable(entry.stamp_ns) if index in self._bad else entry
-
-
-class Unreadable:
-    def __init__(self, stamp_ns):
-        self.stamp_ns = stamp_ns
-
-    def load(self, **_options):
-        raise FrameError(f"frame {self.stamp_ns}: torn")
+    return replace(log, entry_at=entry_at)
 
 
 def test_frames_that_cannot_be_read_are_skipped_for_all(desk):
-    comparison = compare(Damaged(desk, {3, 4}), RGBD.model_copy(update={"methods": ("gicp",), "pairs": 6}))
+    comparison = compare(damaged(desk, {3, 4}), RGBD.model_copy(update={"methods": ("gicp",), "pairs": 6}))
     assert [skip.reason.endswith("torn") for skip in comparison.skipped] == [True, True]
     assert comparison.runs[0].frames == 6
     assert comparison.runs[0].errors.ate_m < 0.02
     with pytest.raises(DataError, match="none of 8 frames can be read; the first: frame"):
-        compare(Damaged(desk, set(range(8))), RGBD)
+        compare(damaged(desk, set(range(8))), RGBD)
 
 
 def test_without_truth_there_is_speed_and_a_path_only(desk, tmp_path):
-    comparison = compare(Damaged(desk, set(), truth=False), RGBD.model_copy(update={"methods": ("gicp",)}))
+    comparison = compare(replace(desk, truth=None), RGBD.model_copy(update={"methods": ("gicp",)}))
     row = odometry_records(comparison)[0]
     assert (row["ate_rmse_m"], row["rpe_rmse_m"], row["drift_ratio"]) == (None, None, None)
     assert row["frames_per_s"] > 0.0

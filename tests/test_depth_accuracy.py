@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from logs_made import MemoryEntry, log_in_memory
 
 from evaluators.depth_accuracy import study_depth
 from mapper.core.errors import DataError, SourceError
@@ -14,7 +15,7 @@ from mapper.sensing.depth_planes import fit_planes
 from mapper.sensing.depth_still import depth_at
 from mapper.sensing.depth_tiles import depth_of_planes
 from mapper.simulation.config import SensorConfig, SynthConfig
-from mapper.simulation.source import SyntheticSource
+from mapper.simulation.source import CameraSimulator
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 
@@ -23,33 +24,10 @@ CAMERA = PinholeCamera(320, 240, 262.5, 262.5, 159.5, 119.5)
 A, B, C = 0.0012, 0.0008, 0.0015
 
 
-class FrameRef:
-    files = None
-
-    def __init__(self, frame):
-        self.frame, self.stamp_ns = frame, frame.stamp_ns
-
-    def load(self, *, colour):  # noqa: ARG002
-        return self.frame
-
-
-class Log:
-    """Frames in memory."""
-
-    path = name = "made"
-    sensor = "rgbd"
-
-    def __init__(self, depths, camera=CAMERA):
-        image = np.full((camera.height_px, camera.width_px), 128, np.uint8)
-        self.frames = [
-            RgbdFrame(i, image, depth.astype(np.float32), camera) for i, depth in enumerate(depths)
-        ]
-
-    def __len__(self):
-        return len(self.frames)
-
-    def entries(self):
-        return map(FrameRef, self.frames)
+def log_of(depths, camera=CAMERA):
+    image = np.full((camera.height_px, camera.width_px), 128, np.uint8)
+    frames = [RgbdFrame(i, image, depth.astype(np.float32), camera) for i, depth in enumerate(depths)]
+    return log_in_memory([MemoryEntry(i, frame) for i, frame in enumerate(frames)], name="made")
 
 
 def plane_m(distance_m, *, tilt_rad=0.0):
@@ -63,7 +41,7 @@ def wall(distance_m, *, frames=4, tilt_rad=0.0, fixed_m=0.0, sigma_m=None, seed=
     exact = plane_m(distance_m, tilt_rad=tilt_rad)
     sigma_m = A + B * exact + C * exact**2 if sigma_m is None else sigma_m
     fixed = fixed_m * rng.standard_normal(exact.shape)
-    return Log([exact + fixed + sigma_m * rng.standard_normal(exact.shape) for _ in range(frames)])
+    return log_of([exact + fixed + sigma_m * rng.standard_normal(exact.shape) for _ in range(frames)])
 
 
 # Definitions
@@ -159,8 +137,8 @@ def test_one_frame_tells_nothing_of_time():
 
 def test_the_patch_decides_what_is_seen():
     log = wall(1.0)
-    for frame in log.frames:
-        frame.depth_m[:, 200:] = 0.7
+    for entry in log.entries():
+        entry.frame.depth_m[:, 200:] = 0.7
     level, _ = depth_at(log, 1.0, patch=Patch(0, 0, 200, 240))
     assert level.typical.raw.max_error_m < 0.03
     with pytest.raises(DataError, match=r"none of 4 frames shows a plane; the first: .* lie \d+% off any"):
@@ -174,7 +152,7 @@ def test_a_wall_seen_at_a_slant_is_refused():
 
 def test_frames_without_the_plane_are_left_out():
     log = wall(1.0, frames=5)
-    log.frames[2].depth_m[:] = 0.0
+    log.entry_at(2).frame.depth_m[:] = 0.0
     assert depth_at(log, 1.0)[0].frames == 4
 
 
@@ -195,13 +173,11 @@ def test_distances_in_the_wrong_order_are_refused():
 
 
 def test_scans_are_refused():
-    log = Log([])
-    log.sensor = "lidar"
+    scans = [MemoryEntry(0, Scan(0, np.zeros((1, 3), np.float32)))]
     with pytest.raises(SourceError, match="a log of scans"):
-        depth_at(log, 1.0)
-    log.sensor, log.frames = "rgbd", [Scan(0, np.zeros((1, 3), np.float32))]
+        depth_at(log_in_memory(scans, sensor="lidar"), 1.0)
     with pytest.raises(SourceError, match="no frame can be read; the last: frame 0: a scan"):
-        depth_at(log, 1.0)
+        depth_at(log_in_memory(scans), 1.0)
 
 
 # The noise over the distance
@@ -264,7 +240,7 @@ def corner(distance_m, *, seed=0):
 
 
 def test_noise_is_recovered_from_whatever_planes_there_are():
-    log = Log([corner(d, seed=k) for k, d in enumerate(np.linspace(0.9, 3.0, 14))])
+    log = log_of([corner(d, seed=k) for k, d in enumerate(np.linspace(0.9, 3.0, 14))])
     levels, _ = depth_of_planes(log)
     z = np.array([level.typical.distance_m for level in levels])
     assert z[0] < 1.1
@@ -278,7 +254,7 @@ def test_noise_is_recovered_from_whatever_planes_there_are():
 
 
 def test_no_more_frames_than_asked_for_are_looked_at_and_no_balls():
-    log = Log([corner(0.9, seed=k) for k in range(9)])
+    log = log_of([corner(0.9, seed=k) for k in range(9)])
     levels, picture = depth_of_planes(log, most_frames=4)
     assert {level.frames for level in levels} == {3}
     assert np.isnan(picture.error_m[60:140, 120:200]).mean() > 0.7, "a ball is no plane"
@@ -289,7 +265,7 @@ def test_a_log_without_planes_is_refused():
     rng = np.random.default_rng(0)
     rough = [1.5 + 0.3 * rng.standard_normal((240, 320)).cumsum(axis=1) / 10.0 for _ in range(3)]
     with pytest.raises(DataError, match="no distance has 30 of 3 frames; want walls, floors or tables"):
-        depth_of_planes(Log(np.maximum(rough, 0.2)))
+        depth_of_planes(log_of(np.maximum(rough, 0.2)))
 
 
 @pytest.mark.skipif(not FR1_XYZ.is_dir(), reason=f"no {FR1_XYZ}")
@@ -330,7 +306,7 @@ BARE = SynthConfig(
 
 def test_the_synthetic_kinect_is_as_noisy_as_nguyen_et_al_measured():
     for distance_m in (0.8, 2.5):
-        log = SyntheticSource(BARE.model_copy(update={"wall_distance_m": distance_m}))
+        log = CameraSimulator(BARE.model_copy(update={"wall_distance_m": distance_m})).log()
         level, _ = depth_at(log, distance_m)
         assert level.typical.raw.std_m == pytest.approx(0.0012 + 0.0019 * (distance_m - 0.4) ** 2, rel=0.05)
         assert level.typical.filtered.std_m > 0.5 * level.typical.raw.std_m, "half of its noise is in patches"
@@ -339,4 +315,4 @@ def test_the_synthetic_kinect_is_as_noisy_as_nguyen_et_al_measured():
 
 def test_a_wall_beyond_the_room_is_refused():
     with pytest.raises(SourceError, match=r"wall_distance_m 9: the room is 4\.\d\d m wide"):
-        SyntheticSource(BARE.model_copy(update={"wall_distance_m": 9.0}))
+        CameraSimulator(BARE.model_copy(update={"wall_distance_m": 9.0})).log()

@@ -10,7 +10,7 @@ from mapper.odometry.config import LocalMapConfig
 from mapper.sensing.config import DepthNoiseConfig
 from mapper.sensing.depth_noise import feature_depth_sigma_m
 from mapper.simulation.config import SynthConfig
-from mapper.simulation.source import SyntheticSource
+from mapper.simulation.source import CameraSimulator
 
 NOISE = DepthNoiseConfig(constant_m=0.002, linear=-0.001, quadratic_per_m=0.003)
 TINY = DepthNoiseConfig(constant_m=1e-9)
@@ -67,7 +67,7 @@ def test_beside_an_edge_the_depth_is_hardly_known():
 
 def test_the_odometry_weighs_by_it_and_by_nothing_without_it():
     frame = next(
-        SyntheticSource(SynthConfig(width_px=320, height_px=240, texture_px_per_m=96)).entries()
+        CameraSimulator(SynthConfig(width_px=320, height_px=240, texture_px_per_m=96)).log().entries()
     ).load()
     wall_m = np.full_like(frame.depth_m, 2.0)
     wall_m[:120] = 0.0

@@ -6,14 +6,14 @@ from mapper.core.geometry import angle_between, apply, inverse, rotation_exp, tr
 from mapper.registration.hough import Hough
 from mapper.registration.hough_config import HoughGicpConfig, HoughNdtConfig, HoughTrustConfig
 from mapper.simulation.config import COURTYARD, STREET
-from mapper.simulation.lidar import SyntheticLidarSource
+from mapper.simulation.lidar import LidarSimulator
 
 UP = np.array([0.0, 0.0, 1.0])
 
 
 def source_of(config, seed):
     sensor = config.sensor.model_copy(update={"motion_distortion": False, "rings": 32})
-    return SyntheticLidarSource(config.model_copy(update={"seed": seed, "sensor": sensor}))
+    return LidarSimulator(config.model_copy(update={"seed": seed, "sensor": sensor}))
 
 
 def moved(scan, T_new_body):

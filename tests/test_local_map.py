@@ -14,16 +14,16 @@ from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
 from mapper.odometry.config import LocalMapConfig
 from mapper.simulation.config import SynthConfig
-from mapper.simulation.source import SyntheticSource
+from mapper.simulation.source import CameraSimulator
 
 
 @pytest.fixture(scope="module")
 def source():
-    return SyntheticSource(
+    return CameraSimulator(
         SynthConfig(
             path="desk", duration_s=3.0, frame_rate_hz=15.0, width_px=320, height_px=240, texture_px_per_m=96
         )
-    )
+    ).log()
 
 
 @pytest.fixture(scope="module")

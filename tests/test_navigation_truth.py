@@ -14,7 +14,7 @@ from mapper.navigation.voxels import known_box
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import FREE, OCCUPIED, cut_slice
-from mapper.simulation import Boxes, SyntheticSource
+from mapper.simulation import Boxes, CameraSimulator
 from mapper.simulation.config import IDEAL_SENSOR, SynthConfig
 
 CELL = 0.05
@@ -33,14 +33,14 @@ CONFIG = SynthConfig(
 
 @pytest.fixture(scope="module")
 def source():
-    return SyntheticSource(CONFIG)
+    return CameraSimulator(CONFIG)
 
 
 @pytest.fixture(scope="module")
 def octree(source):
     """Fuse a walk through all rooms at its true poses."""
     octree = OctreeMap(OctreeConfig(resolution_m=CELL, max_range_m=5.0))
-    for entry, T_world_camera in zip(source.entries(), source.truth.T_world_body, strict=True):
+    for entry, T_world_camera in zip(source.log().entries(), source.truth.T_world_body, strict=True):
         octree.insert(entry.load(colour=False).scan(), T_world_camera)
     return octree
 

@@ -11,7 +11,7 @@ from mapper.octree.casting import Caster
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.scan_update import pack
-from mapper.simulation import Boxes, SyntheticSource, read_scene, write_tum_log
+from mapper.simulation import Boxes, CameraSimulator, read_scene, write_tum_log
 from mapper.simulation.config import IDEAL_SENSOR, SynthConfig
 
 PLAIN = SynthConfig(
@@ -43,7 +43,7 @@ def wall_seen(at_x_m):
 def sights_of(source):
     caster = Caster(OctreeConfig())
     poses = source.truth.T_world_body
-    return [pack(caster.cast(entry.scan(), poses[i])) for i, entry in enumerate(source.entries())]
+    return [pack(caster.cast(entry.scan(), poses[i])) for i, entry in enumerate(source.log().entries())]
 
 
 def merged(sights, **knobs):
@@ -55,7 +55,7 @@ def merged(sights, **knobs):
 
 @pytest.fixture(scope="module")
 def busy():
-    source = SyntheticSource(BUSY)
+    source = CameraSimulator(BUSY)
     return source, sights_of(source)
 
 
@@ -85,7 +85,7 @@ def test_an_empty_map_cannot_be_judged():
 
 
 def test_a_noisy_log_with_true_poses_maps_the_world_to_a_voxel():
-    source = SyntheticSource(PLAIN)
+    source = CameraSimulator(PLAIN)
     values = values_of(merged(sights_of(source)), source.scene.boxes.signed_distance_m)
     assert min(values.values()) >= 0.97, values
 
@@ -101,12 +101,12 @@ def test_what_moves_is_seen_where_it_is_and_leaves_the_truth_alone(busy):
     assert flat.min() > 0.2, "they keep to the way that furniture leaves free"
     tops = source.movers.still.centers_world[:, 2] + source.movers.still.half_sizes_m[:, 2]
     assert tops.max() < 0.8 < source.truth.positions_world[:, 2].min()
-    assert source.scene.boxes.as_json() == SyntheticSource(PLAIN).scene.boxes.as_json()
+    assert source.scene.boxes.as_json() == CameraSimulator(PLAIN).scene.boxes.as_json()
 
-    exact = SyntheticSource(BUSY.model_copy(update={"sensor": IDEAL_SENSOR}))
+    exact = CameraSimulator(BUSY.model_copy(update={"sensor": IDEAL_SENSOR}))
     moving = exact.render(30).surface >= 6 * len(exact.scene.boxes)
     assert moving.any()
-    still = SyntheticSource(PLAIN.model_copy(update={"sensor": IDEAL_SENSOR})).render(30)
+    still = CameraSimulator(PLAIN.model_copy(update={"sensor": IDEAL_SENSOR})).render(30)
     np.testing.assert_array_equal(exact.render(30).depth_m[~moving], still.depth_m[~moving])
 
 
@@ -129,7 +129,7 @@ def test_the_scene_file_says_where_the_boxes_were(tmp_path):
     write_tum_log(tmp_path / "still", config.model_copy(update={"moving_boxes": 0}))
     scene, still = (json.loads((tmp_path / name / "scene.json").read_text()) for name in ("busy", "still"))
 
-    source = SyntheticSource(config)
+    source = CameraSimulator(config)
     assert [len(row["centers_m"]) for row in scene["moving"]] == [3, 3]
     np.testing.assert_array_equal(
         [row["centers_m"][2] for row in scene["moving"]], source.movers.boxes_at(0.2).centers_world

@@ -11,7 +11,7 @@ from mapper.places.guided import match_by_word
 from mapper.places.index import PlaceIndex
 from mapper.places.training import train
 from mapper.places.vocabulary import ONE, WordVector, load_vocabulary, similarity
-from mapper.simulation import SyntheticSource
+from mapper.simulation import CameraSimulator
 from mapper.simulation.config import SynthConfig
 
 MATCHING = {"max_hamming": 64, "max_ratio": 0.85}
@@ -154,7 +154,7 @@ def two_laps():
     config = SynthConfig(
         seed=5, laps=2.0, frame_rate_hz=0.5, width_px=320, height_px=240, texture_px_per_m=128
     )
-    source, detector = SyntheticSource(config), UniformOrbConfig().build()
+    source, detector = CameraSimulator(config).log(), UniformOrbConfig().build()
     bits = [pack(detector.detect(entry.load(colour=False).gray).descriptors) for entry in source.entries()]
     return source.truth.T_world_body, bits
 

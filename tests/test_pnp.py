@@ -12,7 +12,7 @@ from mapper.core.trajectory import trajectory_from
 from mapper.odometry.config import PnpConfig
 from mapper.odometry.local_map.p3p import ransac_p3p
 from mapper.simulation.config import SynthConfig
-from mapper.simulation.source import SyntheticSource
+from mapper.simulation.source import CameraSimulator
 
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5])
 PAPER = Path(__file__).parents[1] / "configs" / "zhao.toml"
@@ -20,11 +20,11 @@ PAPER = Path(__file__).parents[1] / "configs" / "zhao.toml"
 
 @pytest.fixture(scope="module")
 def source():
-    return SyntheticSource(
+    return CameraSimulator(
         SynthConfig(
             path="desk", duration_s=2.0, frame_rate_hz=15.0, width_px=320, height_px=240, texture_px_per_m=96
         )
-    )
+    ).log()
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from mapper.registration.config import GicpConfig
 from mapper.registration.guess import parse_guess
 from mapper.registration.hough_config import HoughGicpConfig
 from mapper.simulation.config import STREET, LidarSensorConfig
-from mapper.simulation.lidar import SyntheticLidarSource
+from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source
 from mapper.sources.clouds import read_scan
 
@@ -39,7 +39,7 @@ def write_kitti(path, points):
 @pytest.fixture(scope="module")
 def street():
     sensor = LidarSensorConfig(rings=48, azimuth_steps=600, motion_distortion=False)
-    return SyntheticLidarSource(STREET.model_copy(update={"seed": 4, "duration_s": 1.0, "sensor": sensor}))
+    return LidarSimulator(STREET.model_copy(update={"seed": 4, "duration_s": 1.0, "sensor": sensor}))
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import angle_between, apply, exp, inverse
 from mapper.registration.config import RegistrationConfig
 from mapper.simulation.config import STREET, LidarSensorConfig
-from mapper.simulation.lidar import SyntheticLidarSource
+from mapper.simulation.lidar import LidarSimulator
 
 EVERY_METHOD = [member() for member in get_args(get_args(RegistrationConfig)[0])]
 NEEDS_NO_GUESS = [
@@ -22,7 +22,7 @@ every_method = pytest.mark.parametrize("config", EVERY_METHOD, ids=lambda config
 
 def street(seed):
     sensor = LidarSensorConfig(rings=48, azimuth_steps=600, motion_distortion=False)
-    return SyntheticLidarSource(STREET.model_copy(update={"seed": seed, "duration_s": 2.0, "sensor": sensor}))
+    return LidarSimulator(STREET.model_copy(update={"seed": seed, "duration_s": 2.0, "sensor": sensor}))
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from mapper.graph.components import components
 from mapper.graph.model import PoseGraph
 from mapper.odometry.config import LocalMapConfig, PnpConfig
 from mapper.simulation.config import SynthConfig
-from mapper.simulation.source import SyntheticSource
+from mapper.simulation.source import CameraSimulator
 
 RATE_HZ = 15.0
 BOTH = pytest.mark.parametrize("config", [LocalMapConfig(), PnpConfig()], ids=lambda config: config.kind)
@@ -18,7 +18,7 @@ BOTH = pytest.mark.parametrize("config", [LocalMapConfig(), PnpConfig()], ids=la
 @pytest.fixture(scope="module")
 def source():
     """One and a half turns on the spot."""
-    return SyntheticSource(
+    return CameraSimulator(
         SynthConfig(
             path="spin",
             duration_s=7.0,
@@ -28,7 +28,7 @@ def source():
             height_px=240,
             texture_px_per_m=96,
         )
-    )
+    ).log()
 
 
 @pytest.fixture(scope="module")

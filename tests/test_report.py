@@ -116,8 +116,7 @@ def test_what_a_log_calls_itself_cannot_become_markup(runs):
 
 
 def test_a_run_without_truth_loops_and_views_has_a_page(desk_log, tmp_path):
-    source = open_source(desk_log)
-    source.truth = None
+    source = replace(open_source(desk_log), truth=None)
     run = build(source, BuildConfig.model_validate({"loops": {"kind": "none"}}), tmp_path / "bare")
     (run.path / "cloud.png").unlink()
     data = drawn(chapter_of(run, "bare", []))

@@ -18,7 +18,7 @@ from mapper.odometry.scan_to_map.config import (
 )
 from mapper.odometry.scan_to_map.odometry import ScanOdometry
 from mapper.simulation.config import STREET, LidarSensorConfig
-from mapper.simulation.lidar import SyntheticLidarSource
+from mapper.simulation.lidar import LidarSimulator
 
 EVERY_KIND = [GicpOdometryConfig(), IcpOdometryConfig(), KissOdometryConfig(), HoughOdometryConfig()]
 LIMITS = {"gicp": (0.03, 0.1), "icp": (0.03, 0.1), "kiss-icp": (0.25, 0.5), "hough-ndt": (0.15, 1.5)}
@@ -29,7 +29,7 @@ SENSOR = LidarSensorConfig(rings=32, azimuth_steps=450)
 @cache
 def street(seed=0, *, motion_distortion=False):
     sensor = SENSOR.model_copy(update={"motion_distortion": motion_distortion})
-    return SyntheticLidarSource(STREET.model_copy(update={"seed": seed, "duration_s": 2.5, "sensor": sensor}))
+    return LidarSimulator(STREET.model_copy(update={"seed": seed, "duration_s": 2.5, "sensor": sensor})).log()
 
 
 @cache

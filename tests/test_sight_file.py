@@ -1,5 +1,7 @@
 """Moving what was mapped: a map made again from what frames saw, and from those alone that moved."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -16,7 +18,7 @@ from mapper.octree.map import OctreeMap
 from mapper.octree.scan_update import decompressed, pack
 from mapper.octree.scan_update_file import ScanUpdateWriter, displacement_m, open_scan_updates
 from mapper.runtime.progress import SILENT
-from mapper.simulation import SyntheticSource
+from mapper.simulation import CameraSimulator
 from mapper.simulation.config import SynthConfig
 
 FRAMES = 16
@@ -25,16 +27,11 @@ OVER_HERE = exp(np.array([0.0, 0.0, 0.2]), np.array([0.3, -0.1, 0.02]))
 
 
 class Counted:
-    """A source that counts which frames are read."""
+    """A log that counts which of its frames are read."""
 
     def __init__(self, source):
-        self._source = source
-        self.sensor = source.sensor
         self.read = []
-
-    def entries(self):
-        for entry in self._source.entries():
-            yield CountedEntry(entry, self.read)
+        self.log = replace(source, entry_at=lambda index: CountedEntry(source.entry_at(index), self.read))
 
 
 class CountedEntry:
@@ -60,7 +57,7 @@ def source():
         frame_rate_hz=5.0,
         duration_s=(FRAMES - 1) / 5.0,
     )
-    return SyntheticSource(config)
+    return CameraSimulator(config).log()
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +107,7 @@ def test_only_frames_that_moved_are_read_and_the_bits_are_those_of_fusing_from_s
     trajectory, counted = moved(source.truth, indices), Counted(source)
 
     with open_scan_updates(first) as before:
-        again = fused(counted, trajectory, tmp_path / "again.bin", before=before, config=config)
+        again = fused(counted.log, trajectory, tmp_path / "again.bin", before=before, config=config)
 
     scratch = fused(source, trajectory, tmp_path / "scratch.bin", config=config)
     assert counted.read == [int(source.truth.stamps_ns[i]) for i in indices if i > 0]
@@ -125,11 +122,13 @@ def test_frames_that_left_and_frames_that_came_are_right_too(source, first, tmp_
 
     with open_scan_updates(first) as before:
         assert_same_bits(
-            fused(counted, fewer, tmp_path / "fewer.bin", before=before), fused(source, fewer, tmp_path / "a")
+            fused(counted.log, fewer, tmp_path / "fewer.bin", before=before),
+            fused(source, fewer, tmp_path / "a"),
         )
     with open_scan_updates(tmp_path / "fewer.bin") as before:
         assert_same_bits(
-            fused(counted, truth, tmp_path / "more.bin", before=before), fused(source, truth, tmp_path / "b")
+            fused(counted.log, truth, tmp_path / "more.bin", before=before),
+            fused(source, truth, tmp_path / "b"),
         )
 
     assert counted.read == truth.stamps_ns[1:3].tolist()
@@ -139,7 +138,7 @@ def test_another_sensor_model_needs_no_frame_and_another_resolution_needs_all(so
     for override, reads in (("octree.hit_probability=0.6", 0), ("octree.resolution_m=0.1", FRAMES - 1)):
         config, counted = overridden(CONFIG, [override]), Counted(source)
         with open_scan_updates(first) as before:
-            again = fused(counted, source.truth, tmp_path / "again.bin", before=before, config=config)
+            again = fused(counted.log, source.truth, tmp_path / "again.bin", before=before, config=config)
         assert len(counted.read) == reads
         assert_same_bits(again, fused(source, source.truth, tmp_path / "scratch.bin", config=config))
 
@@ -152,12 +151,12 @@ def test_within_the_tolerance_frames_stay_as_they_were_fused_and_do_not_drift(so
     counted = Counted(source)
 
     with open_scan_updates(first) as before:
-        stayed = fused(counted, nudged, tmp_path / "stayed.bin", before=before, config=config)
+        stayed = fused(counted.log, nudged, tmp_path / "stayed.bin", before=before, config=config)
     assert counted.read == []
     assert_same_bits(stayed, fused(source, source.truth, tmp_path / "scratch.bin"))
 
     with open_scan_updates(tmp_path / "stayed.bin") as before:
-        went = fused(counted, nudged_again, tmp_path / "went.bin", before=before, config=config)
+        went = fused(counted.log, nudged_again, tmp_path / "went.bin", before=before, config=config)
     assert counted.read == [int(source.truth.stamps_ns[2])]
     assert_same_bits(went, fused(source, nudged_again, tmp_path / "scratch.bin"))
 

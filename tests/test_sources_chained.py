@@ -6,7 +6,7 @@ from conftest import FIRST_NS, PERIOD_NS
 
 from mapper.core.timebase import NS_PER_S
 from mapper.sources import open_source
-from mapper.sources.chained import chained, last_session, sessions_of
+from mapper.sources.chained import chained, sessions_of
 from mapper.sources.config import SourceConfig
 
 
@@ -100,7 +100,7 @@ def test_without_truth_there_is_none(tiny_tum_log):
 
 def test_the_last_session_is_on_the_common_clock(two):
     source = chained(*two)
-    last = last_session(source)
+    last = source.sessions[-1].log
     assert stamps_of(last) == stamps_of(source)[4:]
     assert (len(last), last.name) == (3, "two")
     np.testing.assert_array_equal(last.truth.stamps_ns, source.truth.stamps_ns[4:])
@@ -109,4 +109,4 @@ def test_the_last_session_is_on_the_common_clock(two):
 def test_a_single_log_is_one_session(two):
     (session,) = sessions_of(two[0])
     assert session.log is two[0]
-    assert [entry.stamp_ns for entry in session.entries()] == stamps_of(two[0])
+    assert [entry.stamp_ns for entry in session.log.entries()] == stamps_of(two[0])

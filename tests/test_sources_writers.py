@@ -1,10 +1,7 @@
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from pathlib import Path
-
 import numpy as np
 import pytest
 from conftest import FIRST_NS, PERIOD_NS, picture
+from logs_made import MemoryEntry, log_in_memory
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
@@ -12,39 +9,6 @@ from mapper.sources import open_source
 from mapper.sources.writers import write_log
 
 CAMERA = PinholeCamera(64, 48, 60.0, 61.0, 31.5, 23.5, (0.1, -0.2, 0.001, 0.002, 0.05))
-
-
-@dataclass
-class InMemory:
-    """An entry without files; ``frame`` may be an error to raise."""
-
-    stamp_ns: int
-    frame: object
-    files: None = None
-
-    def load(self, *, colour: bool = True):  # noqa: ARG002
-        if isinstance(self.frame, Exception):
-            raise self.frame
-        return self.frame
-
-
-@dataclass
-class MemorySource:
-    made: list[InMemory]
-    path: Path = Path("memory")
-    name: str = "memory"
-    kind: str = "memory"
-    truth: object = None
-    accelerations: object = None
-    wheels: object = None
-    sensor: str = "rgbd"
-    notes: list[str] = field(default_factory=list)
-
-    def __len__(self) -> int:
-        return len(self.made)
-
-    def entries(self) -> Iterator[InMemory]:
-        yield from self.made
 
 
 def frame_at(stamp_ns, seed):
@@ -105,11 +69,11 @@ def test_truth_is_written_only_where_it_is_near(tiny_tum_log, tmp_path):
 
 def test_frames_without_files_are_encoded_losslessly(tmp_path):
     stamps = [FIRST_NS, FIRST_NS + PERIOD_NS + 1]
-    source = MemorySource([InMemory(s, frame_at(s, i)) for i, s in enumerate(stamps)])
+    source = log_in_memory([MemoryEntry(s, frame_at(s, i)) for i, s in enumerate(stamps)])
     write_log(source, tmp_path / "out", kind="tum")
     again = open_source(tmp_path / "out")
     assert again.name == "memory"
-    for entry, made in zip(again.entries(), source.made, strict=True):
+    for entry, made in zip(again.entries(), source.entries(), strict=True):
         frame = entry.load()
         assert frame.stamp_ns == made.stamp_ns
         assert frame.camera == CAMERA
@@ -121,26 +85,26 @@ def test_depth_beyond_16_bits_becomes_no_measurement(tmp_path):
     depth_m = np.full((48, 64), 13.2, np.float32)
     depth_m[0] = 1.0
     frame = RgbdFrame(FIRST_NS, picture(0)[0], depth_m, CAMERA)
-    write_log(MemorySource([InMemory(FIRST_NS, frame)]), tmp_path / "out", kind="tum")
+    write_log(log_in_memory([MemoryEntry(FIRST_NS, frame)]), tmp_path / "out", kind="tum")
     again = next(iter(open_source(tmp_path / "out").entries())).load()
     assert (again.depth_m[0] == 1.0).all()
     assert (again.depth_m[1:] == 0.0).all()
 
 
 def test_a_frame_that_cannot_be_read_is_skipped_and_returned(tmp_path):
-    bad = InMemory(FIRST_NS, FrameError("broken"))
-    good = InMemory(FIRST_NS + 1000, frame_at(FIRST_NS + 1000, 1))
-    skipped = write_log(MemorySource([bad, good]), tmp_path / "out", kind="mbag")
+    bad = MemoryEntry(FIRST_NS, FrameError("broken"))
+    good = MemoryEntry(FIRST_NS + 1000, frame_at(FIRST_NS + 1000, 1))
+    skipped = write_log(log_in_memory([bad, good]), tmp_path / "out", kind="mbag")
     assert [(s.stamp_ns, s.reason) for s in skipped] == [(FIRST_NS, "broken")]
     assert len(open_source(tmp_path / "out")) == 1
 
 
 def test_scans_and_empty_logs_are_refused_before_anything_is_written(tmp_path):
-    scan = InMemory(5, Scan(5, np.zeros((1, 3), np.float32)))
+    scan = MemoryEntry(5, Scan(5, np.zeros((1, 3), np.float32)))
     with pytest.raises(SourceError, match="a scan without images; TUM and mbag hold RGB-D frames"):
-        write_log(MemorySource([scan]), tmp_path / "out", kind="tum")
+        write_log(log_in_memory([scan]), tmp_path / "out", kind="tum")
     with pytest.raises(SourceError, match="no frame can be written: it has no frames"):
-        write_log(MemorySource([]), tmp_path / "out", kind="tum")
+        write_log(log_in_memory([]), tmp_path / "out", kind="tum")
     assert not (tmp_path / "out").exists()
 
 
@@ -166,6 +130,6 @@ def test_a_log_that_was_interrupted_leaves_nothing(tiny_tum_log, tmp_path, kind)
 
 
 def test_a_lidars_log_is_refused_before_its_scans_are_read(tmp_path):
-    source = MemorySource([InMemory(5, FrameError("was read"))], sensor="lidar")
+    source = log_in_memory([MemoryEntry(5, FrameError("was read"))], sensor="lidar")
     with pytest.raises(SourceError, match=r"memory: scans without images; .* --as kitti"):
         write_log(source, tmp_path / "out", kind="tum")

@@ -10,8 +10,8 @@ from mapper.core.geometry import angle_between, apply, inverse, transform
 from mapper.core.timebase import NS_PER_S
 from mapper.simulation import (
     Boxes,
+    CameraSimulator,
     Scene,
-    SyntheticSource,
     camera_of,
     make_path,
     make_scene,
@@ -34,12 +34,12 @@ def changed(config, **knobs):
 
 @pytest.fixture(scope="module")
 def source():
-    return SyntheticSource(SMALL)
+    return CameraSimulator(SMALL)
 
 
 @pytest.fixture(scope="module")
 def detailed():
-    return SyntheticSource(changed(SMALL, width_px=320, height_px=240, texture_px_per_m=128))
+    return CameraSimulator(changed(SMALL, width_px=320, height_px=240, texture_px_per_m=128))
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from mapper.core.errors import DataError, SourceError
 from mapper.core.geometry import angle_between, apply, inverse
 from mapper.simulation.config import COURTYARD, IDEAL_LIDAR, STREET, LidarSensorConfig, LidarSynthConfig
 from mapper.simulation.lidar import (
-    SyntheticLidarSource,
+    LidarSimulator,
     make_outdoor_scene,
     render_scan,
     render_sweep,
@@ -31,7 +31,7 @@ def exact(config, **knobs):
 
 @pytest.fixture(scope="module", params=[STREET, COURTYARD], ids=["street", "courtyard"])
 def source(request):
-    return SyntheticLidarSource(exact(request.param))
+    return LidarSimulator(exact(request.param))
 
 
 def distances_m(scene, points_world):
@@ -56,7 +56,7 @@ def distances_m(scene, points_world):
 
 
 def poses_of(source, index, scan):
-    start_s = seconds_of(source.stamps_ns[index : index + 1])
+    start_s = seconds_of(source.truth.stamps_ns[index : index + 1])
     return source.drive.poses(start_s + scan.times_s.astype(np.float64))
 
 
@@ -66,23 +66,21 @@ def undistorted_world(source, index, scan):
 
 
 def test_undoing_the_motion_puts_every_point_on_a_surface(source):
-    for index in (0, len(source) // 3, len(source) - 1):
+    for index in (0, len(source.truth) // 3, len(source.truth) - 1):
         scan = source.observe(index)
         assert len(scan.points_body) > 1000
         assert distances_m(source.scene, undistorted_world(source, index, scan)).max() < 1e-4
 
 
 def test_leaving_the_motion_in_does_not(source):
-    index = len(source) // 3
+    index = len(source.truth) // 3
     scan = source.observe(index)
     points_world = apply(source.truth.T_world_body[index], scan.points_body.astype(float))
     assert np.percentile(distances_m(source.scene, points_world), 90) > 0.02
 
 
 def test_two_frozen_scans_lie_on_the_same_surfaces_by_their_true_motion(source):
-    frozen = SyntheticLidarSource(
-        source.config.model_copy(update={"sensor": FROZEN, "rate_hz": 2.0}), source.scene
-    )
+    frozen = LidarSimulator(source.config.model_copy(update={"sensor": FROZEN, "rate_hz": 2.0}), source.scene)
     first, second = frozen.observe(4), frozen.observe(6)
     assert first.times_s is None
     T_world_first, T_world_second = frozen.truth.T_world_body[[4, 6]]
@@ -93,8 +91,8 @@ def test_two_frozen_scans_lie_on_the_same_surfaces_by_their_true_motion(source):
 
 def test_the_same_seed_is_the_same_log_and_another_is_not(source):
     config = source.config.model_copy(update={"sensor": LidarSensorConfig(**SMALL)})
-    once, again = (SyntheticLidarSource(config) for _ in range(2))
-    other = SyntheticLidarSource(config.model_copy(update={"seed": 1}))
+    once, again = (LidarSimulator(config) for _ in range(2))
+    other = LidarSimulator(config.model_copy(update={"seed": 1}))
     late = again.observe(5)  # before the others: no scan depends on what was asked for before
     for index in (0, 5):
         np.testing.assert_array_equal(once.observe(index).points_body, again.observe(index).points_body)
@@ -104,16 +102,16 @@ def test_the_same_seed_is_the_same_log_and_another_is_not(source):
 
 
 def test_entries_are_the_scans_at_the_truths_stamps(source):
-    entries = list(source.entries())
+    entries = list(source.log().entries())
     assert [entry.stamp_ns for entry in entries] == source.truth.stamps_ns.tolist()
-    assert len(entries) == len(source)
+    assert len(entries) == len(source.log())
     scan = entries[3].load(colour=False)
     assert scan.stamp_ns == entries[3].stamp_ns
     np.testing.assert_array_equal(entries[3].scan().points_body, scan.points_body)
 
 
 def test_rings_columns_and_times_are_as_configured():
-    source = SyntheticLidarSource(exact(STREET, duration_s=1.0))
+    source = LidarSimulator(exact(STREET, duration_s=1.0))
     scan = source.observe(0)
     x, y, z = scan.points_body.astype(float).T
     rings = np.linspace(-0.35, 0.25, 16)
@@ -123,12 +121,12 @@ def test_rings_columns_and_times_are_as_configured():
     assert 0.0 <= scan.times_s.min() <= scan.times_s.max() < EXACT.sweep_s
     turned = (np.pi - azimuth) / (2.0 * np.pi)  # clockwise from looking back
     np.testing.assert_allclose(turned - scan.times_s / EXACT.sweep_s, 0.5 / 180, atol=1e-5)
-    assert len(source) == 11
+    assert len(source.log()) == 11
 
 
 def test_noise_dropout_and_range_are_as_configured():
     scene = make_outdoor_scene(STREET)
-    T_world_lidar = SyntheticLidarSource(STREET, scene).truth.T_world_body[0]
+    T_world_lidar = LidarSimulator(STREET, scene).truth.T_world_body[0]
     sensor = FROZEN.model_copy(update={"azimuth_steps": 900})
     clean = render_scan(scene, sensor, T_world_lidar, np.random.default_rng(0)).points_body
     noisy = render_scan(
@@ -150,7 +148,7 @@ def test_noise_dropout_and_range_are_as_configured():
 
 def test_the_sensor_tilts_and_looks_around_as_far_as_told():
     steady, swinging = (
-        SyntheticLidarSource(exact(COURTYARD, tilt_rad=tilt, yaw_swing_rad=yaw)).truth.T_world_body
+        LidarSimulator(exact(COURTYARD, tilt_rad=tilt, yaw_swing_rad=yaw)).truth.T_world_body
         for tilt, yaw in ((0.0, 0.0), (0.5, 0.8))
     )
     tilt_rad = np.arccos((steady[:, :3, 2] * swinging[:, :3, 2]).sum(axis=1))
@@ -165,13 +163,13 @@ def test_the_sensor_tilts_and_looks_around_as_far_as_told():
 )
 @pytest.mark.parametrize("seed", range(3))
 def test_the_way_is_as_long_as_told_closes_and_is_free(scene, loop_m, seed):
-    source = SyntheticLidarSource(exact(STREET, scene=scene, loop_m=loop_m, seed=seed))
+    source = LidarSimulator(exact(STREET, scene=scene, loop_m=loop_m, seed=seed))
     route = source.scene.route
     assert route.length_m == pytest.approx(loop_m, rel=0.05)
     np.testing.assert_allclose(route.points(np.array([0.0])), route.points(np.array([route.length_m])))
     assert source.truth.path_length_m == pytest.approx(loop_m + 15.0, rel=0.05)
     T_world_body = source.truth.T_world_body
-    passing = np.linalg.norm(T_world_body[0, :2, 3] - T_world_body[len(source) // 2 :, :2, 3], axis=1)
+    passing = np.linalg.norm(T_world_body[0, :2, 3] - T_world_body[len(source.truth) // 2 :, :2, 3], axis=1)
     assert passing.min() < 0.5
     height_m = T_world_body[:, 2, 3] - source.scene.ground.height_m(T_world_body[:, :2, 3])
     np.testing.assert_allclose(height_m, 1.7)
@@ -185,7 +183,7 @@ def test_a_sweep_wants_a_pose_for_every_column():
 
 
 def test_a_dense_map_is_exact_even_and_where_it_was_asked_for():
-    source = SyntheticLidarSource(exact(COURTYARD))
+    source = LidarSimulator(exact(COURTYARD))
     T_world_map = source.truth.T_world_body[7]
     points = sample_map(source.scene, T_world_map, spacing_m=0.3, radius_m=15.0).points_body.astype(float)
     assert len(points) > 3000
@@ -210,12 +208,12 @@ def test_a_written_log_reads_back_as_it_was(tmp_path, motion_distortion):
     told = []
     write_lidar_log(tmp_path / "log", config, on_progress=lambda done, total: told.append((done, total)))
 
-    source, log = SyntheticLidarSource(config), open_source(tmp_path / "log")
+    source, log = LidarSimulator(config), open_source(tmp_path / "log")
     assert (log.kind, log.sensor, list(log.notes)) == ("kitti", "lidar", [])
     assert told == [(done, 7) for done in range(1, 8)]
     np.testing.assert_array_equal(log.truth.stamps_ns, source.truth.stamps_ns)
     np.testing.assert_allclose(log.truth.T_world_body, source.truth.T_world_body, atol=1e-15)
-    for entry, made in zip(log.entries(), source.entries(), strict=True):
+    for entry, made in zip(log.entries(), source.log().entries(), strict=True):
         read, scan = entry.load(), made.load()
         assert read.stamp_ns == scan.stamp_ns
         np.testing.assert_array_equal(read.points_body, scan.points_body)

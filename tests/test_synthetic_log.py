@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import SourceError
-from mapper.simulation import Rendering, SyntheticSource, observe, read_scene, write_tum_log
+from mapper.simulation import CameraSimulator, Rendering, observe, read_scene, write_tum_log
 from mapper.simulation.config import IDEAL_SENSOR, SensorConfig, SynthConfig
 from mapper.simulation.path import seconds_of
 from mapper.simulation.sensor import BASELINE_M, DISPARITY_FOCAL_PX, axial_sigma_m
@@ -30,7 +30,7 @@ def changed(config, **knobs):
 
 @pytest.fixture(scope="module")
 def source():
-    return SyntheticSource(PLAIN)
+    return CameraSimulator(PLAIN)
 
 
 def flat(depth_m, *, width=320, height=240):
@@ -110,9 +110,9 @@ def test_an_ideal_sensor_changes_nothing(source):
 
 def test_exposure_blurs_what_moves_and_leaves_depth_alone(source):
     spin = changed(PLAIN, path="spin", max_yaw_rate_rad_s=2.0)
-    sharp = SyntheticSource(spin, source.scene).render(30)
+    sharp = CameraSimulator(spin, source.scene).render(30)
     exposed = changed(spin, sensor=changed(IDEAL_SENSOR, exposure_s=0.03))
-    blurred = SyntheticSource(exposed, source.scene).render(30)
+    blurred = CameraSimulator(exposed, source.scene).render(30)
 
     def contrast(rgb):
         return np.abs(np.diff(rgb.astype(float), axis=1)).mean()
@@ -124,9 +124,9 @@ def test_exposure_blurs_what_moves_and_leaves_depth_alone(source):
 
 def test_a_frame_does_not_depend_on_the_others(source):
     config = changed(PLAIN, sensor=SensorConfig())
-    noisy = SyntheticSource(config, source.scene)
+    noisy = CameraSimulator(config, source.scene).log()
     entries = list(noisy.entries())
-    alone = list(SyntheticSource(config, source.scene).entries())[20].load()
+    alone = CameraSimulator(config, source.scene).log().entry_at(20).load()
     for entry in entries[18:20]:
         entry.load()
     after_others = entries[20].load()
@@ -139,11 +139,11 @@ def test_a_frame_does_not_depend_on_the_others(source):
 
 def test_dropped_frames_are_missing_and_a_covered_lens_is_black(source):
     config = changed(PLAIN, drop_ratio=0.2, blackout_start_s=1.0, blackout_duration_s=0.5)
-    lossy = SyntheticSource(config, source.scene)
+    lossy = CameraSimulator(config, source.scene).log()
     entries = list(lossy.entries())
 
     assert len(entries) == len(lossy)
-    assert 0.74 < len(lossy) / len(source) < 0.86
+    assert 0.74 < len(lossy) / len(source.truth) < 0.86
     for entry in entries[::4][:20]:
         seconds = seconds_of(np.array([entry.stamp_ns]))[0]
         frame = entry.load()
@@ -157,7 +157,7 @@ def log(tmp_path_factory):
     seen = []
     write_tum_log(out, config, on_progress=lambda done, total: seen.append((done, total)))
     assert seen == [(i, 10) for i in range(1, 11)]
-    return out, SyntheticSource(config)
+    return out, CameraSimulator(config)
 
 
 def test_the_folder_reads_back_as_the_source_in_memory(log):
@@ -166,8 +166,8 @@ def test_the_folder_reads_back_as_the_source_in_memory(log):
 
     assert opened.kind == "tum"
     assert list(opened.notes) == []
-    assert len(opened) == len(source) == 10
-    for written, made in zip(opened.entries(), source.entries(), strict=True):
+    assert len(opened) == len(source.log()) == 10
+    for written, made in zip(opened.entries(), source.log().entries(), strict=True):
         frame, expected = written.load(), made.load()
         assert frame.stamp_ns == expected.stamp_ns
         assert frame.camera == expected.camera

@@ -2,10 +2,10 @@
 
 import struct
 import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
+from logs_made import MemoryEntry, log_in_memory
 
 from mapper.core.errors import DataError, VocabularyError
 from mapper.core.frames import Scan
@@ -93,24 +93,10 @@ def test_one_image_is_nothing_to_train_on(images):
         train([images[0], images[0][:0]], config=SMALL, trained_on="", rng=np.random.default_rng(0))
 
 
-class ScanLog:
-    """A log of three scans, which have no images."""
-
-    path = Path("lidar")
-
-    def __len__(self):
-        return 3
-
-    def entries(self):
-        return iter([self] * 3)
-
-    def load(self, *, colour):  # noqa: ARG002
-        return Scan(0, np.zeros((1, 3), np.float32), np.zeros(3))
-
-
 def test_a_log_without_images_is_refused():
+    scans = [MemoryEntry(i, Scan(i, np.zeros((1, 3), np.float32))) for i in range(3)]
     with pytest.raises(VocabularyError, match="lidar: holds scans without images"):
-        descriptors_of(ScanLog(), SMALL)
+        descriptors_of(log_in_memory(scans, name="lidar", sensor="lidar"), SMALL)
 
 
 def test_nodes_are_ancestors_of_words(images, vocabulary):

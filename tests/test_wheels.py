@@ -19,7 +19,7 @@ from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT
 from mapper.sensing.wheel_kinematics import driven, pose_at
 from mapper.simulation.config import SynthConfig
-from mapper.simulation.source import SyntheticSource
+from mapper.simulation.source import CameraSimulator
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig, WheelsConfig
 from mapper.sources.trajectory_files import write_tum
@@ -150,7 +150,7 @@ def test_a_mounting_without_a_rotation_is_refused(tiny_tum_log):
 @pytest.fixture(scope="module")
 def interrupted():
     """A walk during which the lens is covered for two seconds, and wheels that drift on the way."""
-    source = SyntheticSource(
+    source = CameraSimulator(
         SynthConfig(
             duration_s=8.0,
             frame_rate_hz=15.0,
@@ -160,15 +160,14 @@ def interrupted():
             blackout_start_s=3.0,
             blackout_duration_s=2.0,
         )
-    )
+    ).log()
     rng = np.random.default_rng(4)
     truth, T = source.truth.T_world_body, [np.eye(4)]
     for before, after in pairwise(truth):
         step = inverse(before) @ after
         step[:3, 3] *= 1.02
         T.append(T[-1] @ step @ exp(rng.normal(0.0, 5e-4, 3), rng.normal(0.0, 5e-4, 3)))
-    source.wheels = Trajectory(source.stamps_ns, np.array(T))
-    return source
+    return replace(source, wheels=Trajectory(source.stamps_ns, np.array(T)))
 
 
 def mapped(source, config):

@@ -11,8 +11,8 @@ from cli.main import app
 from mapper.config.loading import load_config
 from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT
-from mapper.simulation import SyntheticSource, write_tum_log
-from mapper.simulation.lidar import SyntheticLidarSource
+from mapper.simulation import CameraSimulator, write_tum_log
+from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig, TopicsConfig, WheelsConfig
 from mapper.sources.writers import left_out, write_log
@@ -22,12 +22,12 @@ SHORT = FLAT.model_copy(update={"duration_s": 2.0, "wheels": EXACT.model_copy(up
 
 @pytest.fixture(scope="module")
 def flat():
-    return SyntheticSource(SHORT)
+    return CameraSimulator(SHORT).log()
 
 
 @pytest.fixture(scope="module")
 def street():
-    return SyntheticLidarSource(STREET_ON_WHEELS.model_copy(update={"duration_s": 0.5}))
+    return LidarSimulator(STREET_ON_WHEELS.model_copy(update={"duration_s": 0.5})).log()
 
 
 def assert_same_wheels(source, again):

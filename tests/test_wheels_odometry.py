@@ -20,11 +20,11 @@ from mapper.odometry.config import WheelsOdometryConfig
 from mapper.pipeline.track import refuse_a_fragment, track_log
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT
-from mapper.simulation import SyntheticSource, write_tum_log
+from mapper.simulation import CameraSimulator, make_scene, write_tum_log
 from mapper.simulation.config import IDEAL_LIDAR, IDEAL_SENSOR, STREET, SynthConfig, SynthWheelsConfig
-from mapper.simulation.lidar import SyntheticLidarSource
+from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source
-from mapper.sources.chained import chained, last_session
+from mapper.sources.chained import chained
 
 EXACT = SynthWheelsConfig(path_sigma=0.0, turn_sigma=0.0, heading_rad_per_sqrt_m=0.0)
 FLAT = SynthConfig(
@@ -51,34 +51,30 @@ STREET_ON_WHEELS = STREET.model_copy(
 
 
 @pytest.fixture(scope="module")
-def flat():
-    return SyntheticSource(FLAT)
+def scene():
+    return make_scene(FLAT)
+
+
+@pytest.fixture(scope="module")
+def flat(scene):
+    return CameraSimulator(FLAT, scene).log()
 
 
 class Watched:
     """A log that counts how often its frames are read, and of which some cannot be."""
 
     def __init__(self, source, damaged=()):
-        self.source, self.damaged, self.reads = source, damaged, []
-
-    def __getattr__(self, name):
-        return getattr(self.source, name)
-
-    def __len__(self):
-        return len(self.source)
-
-    def entries(self):
-        for index, entry in enumerate(self.source.entries()):
-            yield WatchedEntry(self, index, entry)
+        self.damaged, self.reads = damaged, []
+        self.log = replace(source, entry_at=lambda index: WatchedEntry(self, index, source.entry_at(index)))
 
 
 class WatchedEntry:
-    def __init__(self, log, index, entry):
-        self.log, self.index, self.entry, self.stamp_ns = log, index, entry, entry.stamp_ns
+    def __init__(self, watched, index, entry):
+        self.watched, self.index, self.entry, self.stamp_ns = watched, index, entry, entry.stamp_ns
 
     def load(self, *, colour=True):
-        self.log.reads.append(self.index)
-        if self.index in self.log.damaged:
+        self.watched.reads.append(self.index)
+        if self.index in self.watched.damaged:
             raise FrameError(f"frame {self.index}: damaged")
         return self.entry.load(colour=colour)
 
@@ -91,19 +87,18 @@ def wheels_with(source, keep):
     """A log whose wheels were read only where ``keep`` says, seconds after the start."""
     since_s = (source.wheels.stamps_ns - source.stamps_ns[0]) / NS_PER_S
     kept = keep(since_s)
-    thinned = Watched(source)
-    thinned.wheels = replace(
+    thinned = replace(
         source.wheels,
         stamps_ns=source.wheels.stamps_ns[kept],
         T_world_body=source.wheels.T_world_body[kept],
     )
-    return thinned
+    return replace(source, wheels=thinned)
 
 
 def test_no_frame_is_read_and_every_one_lies_where_it_was_taken(flat):
-    log = Watched(flat)
-    tracking = track_log(log, by_wheels(), progress=SILENT)
-    assert log.reads == []
+    watched = Watched(flat)
+    tracking = track_log(watched.log, by_wheels(), progress=SILENT)
+    assert watched.reads == []
     path, truth = tracking.trajectory(), flat.truth
     T_truth_world = truth.T_world_body[0]
     np.testing.assert_array_equal(path.stamps_ns, truth.stamps_ns)
@@ -113,19 +108,19 @@ def test_no_frame_is_read_and_every_one_lies_where_it_was_taken(flat):
     assert origins == ["odometry"] * (len(tracking.graph.T_world_node) - 1)
 
 
-def test_walls_stand_where_they_are(flat):
+def test_walls_stand_where_they_are(flat, scene):
     octree = OctreeMap(OctreeConfig())
     path = track_log(flat, by_wheels(), progress=SILENT).trajectory()
     scans = ordered_map(lambda entry: entry.scan(), flat.entries(), workers=2)
     for scan, T_world_body in zip(scans, path.T_world_body, strict=True):
         octree.insert(scan, flat.truth.T_world_body[0] @ T_world_body)
-    for metric in occupancy_metrics(octree, flat.scene.boxes.signed_distance_m):
+    for metric in occupancy_metrics(octree, scene.boxes.signed_distance_m):
         assert metric.value > (0.995 if "precision" in metric.name else 0.95), metric.name
 
 
-def test_wheels_of_another_size_and_distance_stretch_the_path_and_its_turns(flat):
+def test_wheels_of_another_size_and_distance_stretch_the_path_and_its_turns(flat, scene):
     wrong = FLAT.model_copy(update={"wheels": SynthWheelsConfig(path_sigma=0.1, turn_sigma=0.1)})
-    one, again = SyntheticSource(wrong, flat.scene).wheels, SyntheticSource(wrong, flat.scene).wheels
+    one, again = (CameraSimulator(wrong, scene).log().wheels for _ in range(2))
     np.testing.assert_array_equal(one.T_world_body, again.T_world_body)
     longer = one.path_length_m / flat.wheels.path_length_m
     assert abs(longer - 1.0) > 0.005
@@ -161,8 +156,7 @@ def test_readings_of_another_time_are_named_as_what_is_wrong(flat):
 
 
 def test_a_log_without_wheels_is_refused_with_the_remedy(flat):
-    log = Watched(flat)
-    log.wheels = None
+    log = replace(flat, wheels=None)
     with pytest.raises(ConfigError, match=r"has no wheel odometry; put wheels.txt .* source.topics.wheels="):
         track_log(log, by_wheels(), progress=SILENT)
     with pytest.raises(ConfigError, match=r"loops.kind=thesis looks from frames with many features, and"):
@@ -170,11 +164,11 @@ def test_a_log_without_wheels_is_refused_with_the_remedy(flat):
 
 
 def test_loops_look_at_keyframes_only_and_pass_a_damaged_one_by(flat):
-    log = Watched(flat, damaged={0})
-    tracking = track_log(log, by_wheels("loops.kind=places"), progress=SILENT)
+    watched = Watched(flat, damaged={0})
+    tracking = track_log(watched.log, by_wheels("loops.kind=places"), progress=SILENT)
     nodes = set(tracking.graph.stamps_ns.values())
-    keyframes = [k for k, entry in enumerate(log.entries()) if entry.stamp_ns in nodes]
-    assert log.reads == keyframes
+    keyframes = [k for k, entry in enumerate(flat.entries()) if entry.stamp_ns in nodes]
+    assert watched.reads == keyframes
     assert len(tracking.placed) == len(flat)
 
 
@@ -184,7 +178,7 @@ def test_keyframes_are_recognised_by_what_their_sensor_saw(flat):
     seen = odometry.view(odometry.read(entry), odometry.track(entry).twist)
     assert isinstance(seen, View)
     assert seen.is_orb
-    street = SyntheticLidarSource(STREET_ON_WHEELS)
+    street = LidarSimulator(STREET_ON_WHEELS).log()
     odometry = WheelsOdometryConfig().build(street.wheels)
     entries = list(street.entries())
     track = [odometry.track(odometry.read(entry)) for entry in entries][10]
@@ -198,14 +192,14 @@ def test_keyframes_are_recognised_by_what_their_sensor_saw(flat):
     assert 0.05 < moved_m < 0.5
 
 
-def test_a_synthetic_log_on_disk_has_its_wheels(tmp_path, flat):
+def test_a_synthetic_log_on_disk_has_its_wheels(tmp_path, scene):
     config = FLAT.model_copy(update={"duration_s": 0.4})
     write_tum_log(tmp_path / "log", config)
     wheels = open_source(tmp_path / "log").wheels
-    expected = SyntheticSource(config, flat.scene).wheels
-    np.testing.assert_array_equal(wheels.stamps_ns, expected.stamps_ns)
-    np.testing.assert_allclose(wheels.T_world_body, expected.T_world_body, atol=1e-6)
-    assert wheels.stamps_ns[-1] >= SyntheticSource(config, flat.scene).stamps_ns[-1]
+    log = CameraSimulator(config, scene).log()
+    np.testing.assert_array_equal(wheels.stamps_ns, log.wheels.stamps_ns)
+    np.testing.assert_allclose(wheels.T_world_body, log.wheels.T_world_body, atol=1e-6)
+    assert wheels.stamps_ns[-1] >= log.stamps_ns[-1]
 
 
 def test_a_camera_that_sways_up_and_down_has_no_wheels():
@@ -216,7 +210,7 @@ def test_a_camera_that_sways_up_and_down_has_no_wheels():
 def test_a_later_session_keeps_its_wheels_on_the_common_clock(flat):
     source = chained(flat, flat)
     assert source.wheels is None
-    session = last_session(source)
+    session = source.sessions[-1].log
     shift_ns = source.sessions[1].shift_ns
     np.testing.assert_array_equal(session.wheels.stamps_ns, flat.wheels.stamps_ns + shift_ns)
     path = track_log(session, by_wheels(), progress=SILENT).trajectory()
@@ -225,6 +219,6 @@ def test_a_later_session_keeps_its_wheels_on_the_common_clock(flat):
 
 def test_the_configuration_that_is_shipped_looks_at_nothing(flat):
     config = load_config(Path(__file__).parents[1] / "configs/wheels.toml")
-    log = Watched(flat)
-    assert len(track_log(log, config, progress=SILENT).placed) == len(flat)
-    assert log.reads == []
+    watched = Watched(flat)
+    assert len(track_log(watched.log, config, progress=SILENT).placed) == len(flat)
+    assert watched.reads == []

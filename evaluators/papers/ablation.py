@@ -19,7 +19,7 @@ from mapper.pipeline.solve import solve
 from mapper.pipeline.track import TrackingResult, refuse_a_fragment
 from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
-from mapper.sources.base import FrameSource
+from mapper.sources.base import Log
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,7 +42,7 @@ class Followed:
         return self.frames - (0 if self.estimate is None else len(self.estimate))
 
 
-def follow(source: FrameSource, variants: Mapping[str, BuildConfig]) -> dict[str, Followed]:
+def follow(source: Log, variants: Mapping[str, BuildConfig]) -> dict[str, Followed]:
     """Return what every setting makes of a log.
 
     Each frame is read once, each detector looks at it once, and frames are matched and registered once by

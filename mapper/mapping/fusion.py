@@ -24,7 +24,7 @@ from mapper.octree.scan_update_file import CachedUpdate, ScanUpdateFile, ScanUpd
 from mapper.octree.slice import OccupancyGrid, cut_slice
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
-from mapper.sources.base import FrameRef, FrameSource
+from mapper.sources.base import FrameRef, Log
 
 _COLOURED_HEIGHTS_M = -1.0, 8.0  # the same in every scan
 
@@ -103,7 +103,7 @@ class _Fused:
 
 
 def fuse_log(
-    source: FrameSource,
+    source: Log,
     trajectory: Trajectory,
     config: FuseSettings,
     *,
@@ -164,7 +164,7 @@ class _Casters(threading.local):
 
 
 def _jobs(
-    source: FrameSource, trajectory: Trajectory, config: FuseSettings, before: ScanUpdateFile | None
+    source: Log, trajectory: Trajectory, config: FuseSettings, before: ScanUpdateFile | None
 ) -> Iterator[_Job]:
     index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
     image_stride = config.mcap.image_stride

@@ -24,15 +24,15 @@ from mapper.run.folder import Run, appended_log, load_run, open_log, write_run
 from mapper.run.manifest import Manifest, Timing, library_versions, now_text
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_tracking
 from mapper.runtime.progress import SILENT, Progress
-from mapper.sources.base import FrameSource
-from mapper.sources.chained import ChainedLog, chained, last_session
+from mapper.sources.base import Log
+from mapper.sources.chained import chained
 from mapper.sources.config import SourceConfig
 
 _FIXED_BY_FIRST_SESSION = ("odometry", "level")
 
 
 def append(
-    second: FrameSource,
+    second: Log,
     run: Run,
     config: BuildConfig,
     out: Path,
@@ -71,7 +71,7 @@ def append(
         before = load_tracking(run)
         known = before.graph.T_world_node.keys()
         with writer.clock.stage("track"):
-            session = last_session(source)
+            session = source.sessions[-1].log
             start = _after(before, first, session.wheels, config, progress)
             tracking = track_log(session, config, progress=progress, start=start)
         refuse_a_fragment(tracking, config, sensor=source.sensor)
@@ -99,7 +99,7 @@ def _refuse_unfit(config: BuildConfig, run: Run) -> None:
         raise ConfigError(f"graph.solve={config.graph.solve}: cannot join two sessions; want batch")
 
 
-def _manifest(run: Run, source: ChainedLog, config: SourceConfig) -> Manifest:
+def _manifest(run: Run, source: Log, config: SourceConfig) -> Manifest:
     """Return the manifest to begin with: what is not said again of both sessions holds from the first."""
     known = run.manifest.input
     appended = (*known.appended, appended_log(source.sessions[-1], config))
@@ -114,7 +114,7 @@ def _manifest(run: Run, source: ChainedLog, config: SourceConfig) -> Manifest:
 
 def _after(
     before: StoredTracking,
-    first: FrameSource,
+    first: Log,
     wheels: Trajectory | None,
     config: BuildConfig,
     progress: Progress,
@@ -133,7 +133,7 @@ def _after(
     )
 
 
-def _refuse_unconnected(second: FrameSource, run: Run, loops: Sequence[LoopClosure], known: Set[int]) -> None:
+def _refuse_unconnected(second: Log, run: Run, loops: Sequence[LoopClosure], known: Set[int]) -> None:
     """Refuse a session of which no loop leads to the known nodes."""
     between = [loop for loop in loops if loop.i in known and loop.j not in known]
     if any(loop.verdict == "accepted" for loop in between):

@@ -24,11 +24,11 @@ from mapper.run.manifest import Levelling
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.stored_tracking import save_tracking
 from mapper.runtime.progress import SILENT, Progress
-from mapper.sources.base import FrameSource
+from mapper.sources.base import Log
 
 
 def build(
-    source: FrameSource,
+    source: Log,
     config: BuildConfig,
     out: Path,
     *,
@@ -73,7 +73,7 @@ def build(
     return load_run(out)
 
 
-def _level(source: FrameSource, trajectory: Trajectory, config: BuildConfig) -> Level:
+def _level(source: Log, trajectory: Trajectory, config: BuildConfig) -> Level:
     """Find the level frame from a few frames, spread over the trajectory."""
     spread = np.unique(np.linspace(0, len(trajectory) - 1, config.level.frames).round().astype(int))
     index_of = {int(trajectory.stamps_ns[index]): int(index) for index in spread}

@@ -19,7 +19,7 @@ from mapper.pipeline.solve import solve
 from mapper.run.folder import Run
 from mapper.run.stored_tracking import StoredTracking, load_tracking
 from mapper.runtime.progress import SILENT, Progress
-from mapper.sources.base import FrameSource
+from mapper.sources.base import Log
 
 Pair = tuple[int, int]
 """Two nodes."""
@@ -33,7 +33,7 @@ _LOOPS: Mapping[Sensor, PlaceLoopsConfig | ScanLoopsConfig] = {
 
 
 def edit_loops(
-    source: FrameSource,
+    source: Log,
     run: Run,
     *,
     add: Sequence[Pair] = (),
@@ -107,7 +107,7 @@ def _in_time_order(graph: PoseGraph, pair: Pair) -> Pair:
 
 
 def _measured(
-    source: FrameSource, tracked: StoredTracking, pairs: Sequence[Pair], config: BuildConfig
+    source: Log, tracked: StoredTracking, pairs: Sequence[Pair], config: BuildConfig
 ) -> list[LoopClosure]:
     verifier, graph = _verifier(config, source.sensor), tracked.graph
     stamps_ns = {graph.stamps_ns[node] for pair in pairs for node in pair}

@@ -9,11 +9,11 @@ from mapper.core.trajectory import Trajectory
 from mapper.odometry.base import Odometry, Seen
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
-from mapper.sources.base import FrameRef, FrameSource
+from mapper.sources.base import FrameRef, Log
 
 
 def reobserve(
-    source: FrameSource,
+    source: Log,
     trajectory: Trajectory,
     stamps_ns: Collection[int],
     config: BuildConfig,

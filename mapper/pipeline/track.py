@@ -20,7 +20,7 @@ from mapper.run.observers import NULL_OBSERVER, Observer, Step
 from mapper.run.stored_tracking import StoredTracking
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
-from mapper.sources.base import FrameRef, FrameSource, Skipped
+from mapper.sources.base import FrameRef, Log, Skipped
 
 _HINTS: Mapping[Sensor | Literal["wheels"], str] = {
     "rgbd": "is there texture, and depth within max_depth_m, in the images?",
@@ -78,7 +78,7 @@ class Start:
     loops: Sequence[LoopClosure] = ()
 
 
-def first_session(source: FrameSource, config: BuildConfig) -> Start:
+def first_session(source: Log, config: BuildConfig) -> Start:
     """Return the start of a log that is the first of its place.
 
     Raises:
@@ -94,7 +94,7 @@ def first_session(source: FrameSource, config: BuildConfig) -> Start:
 
 
 def track_log(
-    source: FrameSource,
+    source: Log,
     config: BuildConfig,
     *,
     progress: Progress,

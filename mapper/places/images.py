@@ -11,14 +11,12 @@ from mapper.places.config import VocabularyConfig
 from mapper.places.tree import Bits
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
-from mapper.sources.base import FrameRef, FrameSource, Skipped
+from mapper.sources.base import FrameRef, Log, Skipped
 
 _WORKERS = 2
 
 
-def descriptors_of(
-    source: FrameSource, config: VocabularyConfig, *, progress: Progress = SILENT
-) -> list[Bits]:
+def descriptors_of(source: Log, config: VocabularyConfig, *, progress: Progress = SILENT) -> list[Bits]:
     """Return (N_i, 4) uint64 descriptors of each of up to ``frames_per_log`` frames, evenly spread.
 
     Frames that cannot be read are noted and left out.

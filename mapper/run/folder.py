@@ -20,7 +20,7 @@ from mapper.run.frame_records import FrameRecord, read_frame_ms, read_records
 from mapper.run.manifest import (
     AppendedLog,
     Input,
-    Log,
+    InputLog,
     Manifest,
     Timing,
     is_merged_map,
@@ -31,8 +31,8 @@ from mapper.run.manifest import (
 from mapper.runtime.atomic import atomic_folder, partial_of, write_text
 from mapper.runtime.timing import Stopwatch
 from mapper.sources import open_source
-from mapper.sources.base import FrameSource
-from mapper.sources.chained import Session, chained, sessions_of
+from mapper.sources.base import Log, Session
+from mapper.sources.chained import chained, sessions_of
 from mapper.sources.config import SourceConfig
 from mapper.sources.trajectory_files import read_tum
 
@@ -125,7 +125,7 @@ def moved_log(run: Run, *logs: Path) -> Run:
     return replace(run, manifest=run.manifest.model_copy(update={"input": moved}))
 
 
-def open_log(run: Run) -> FrameSource:
+def open_log(run: Run) -> Log:
     """Return the log that a run was built from, with the same frames selected and all that was appended.
 
     Raises:
@@ -139,14 +139,14 @@ def open_log(run: Run) -> FrameSource:
     return source
 
 
-def _open(run: Run, log: Log, config: SourceConfig) -> FrameSource:
+def _open(run: Run, log: InputLog, config: SourceConfig) -> Log:
     path = Path(log.path)
     if not path.exists():
         raise RunError(f"{path}: the log of {run.path} is no longer there; give its new place with --log")
     return open_source(path, config)
 
 
-def refuse_another_log(run: Run, source: FrameSource) -> None:
+def refuse_another_log(run: Run, source: Log) -> None:
     """Refuse a log that is not the one that a run was built from.
 
     Raises:
@@ -162,8 +162,8 @@ def refuse_another_log(run: Run, source: FrameSource) -> None:
             raise RunError(f"{path}: changed since {run.path} was built from it; build it again")
 
 
-def paths_of(source: FrameSource) -> list[Path]:
-    """Return where the logs are that a source is made of."""
+def paths_of(source: Log) -> list[Path]:
+    """Return the paths of the logs that a log is made of."""
     return [session.log.path for session in sessions_of(source)]
 
 
@@ -216,7 +216,7 @@ def write_run(out: Path, manifest: Manifest, config: BuildConfig, *, overwrite: 
         writer.save()
 
 
-def first_manifest(source: FrameSource) -> Manifest:
+def first_manifest(source: Log) -> Manifest:
     """Return the manifest of a run that has just begun."""
     return Manifest(
         status="building",
@@ -232,11 +232,11 @@ def appended_log(session: Session, config: SourceConfig) -> AppendedLog:
         **_facts(session.log),
         source=config,
         shift_ns=session.shift_ns,
-        begins_ns=int(session.stamps_ns[0]),
+        begins_ns=int(session.log.stamps_ns[0]),
     )
 
 
-def _facts(source: FrameSource) -> dict[str, Any]:
+def _facts(source: Log) -> dict[str, Any]:
     return {
         "path": str(source.path.resolve()),
         "kind": source.kind,

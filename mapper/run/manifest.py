@@ -33,7 +33,7 @@ _LIBRARIES = (
 )
 
 
-class Log(Config):
+class InputLog(Config):
     """A log that was read."""
 
     path: str
@@ -44,7 +44,7 @@ class Log(Config):
     """What opening the log had to leave out or assume."""
 
 
-class AppendedLog(Log):
+class AppendedLog(InputLog):
     """A later session of the same place."""
 
     source: SourceConfig
@@ -55,7 +55,7 @@ class AppendedLog(Log):
     """Its first frame, on the run's clock."""
 
 
-class Input(Log):
+class Input(InputLog):
     """The log that was read, and those that were appended since."""
 
     appended: tuple[AppendedLog, ...] = ()

@@ -9,7 +9,7 @@ import numpy as np
 from mapper.core.errors import DataError, FrameError, SourceError
 from mapper.core.frames import Image, PinholeCamera, RgbdFrame
 from mapper.core.geometry import Array
-from mapper.sources.base import FrameRef, FrameSource
+from mapper.sources.base import FrameRef, Log
 
 _WORST = 100
 """One in so many pixels is among the worst 1 %."""
@@ -176,7 +176,7 @@ class ResidualMap:
     caption: str
 
 
-def refuse_scans(source: FrameSource) -> None:
+def refuse_scans(source: Log) -> None:
     """Refuse a log without depth images.
 
     Raises:
@@ -186,7 +186,7 @@ def refuse_scans(source: FrameSource) -> None:
         raise SourceError(f"{source.path}: a log of scans; this measures depth images, so want an RGB-D log")
 
 
-def first_frame(source: FrameSource) -> RgbdFrame:
+def first_frame(source: Log) -> RgbdFrame:
     """Return the first frame of a log that can be read.
 
     Raises:

@@ -23,7 +23,7 @@ from mapper.sensing.depth_accuracy import (
 )
 from mapper.sensing.depth_filter import dif
 from mapper.sensing.depth_planes import MAX_NOISE_RATIO, fit_planes
-from mapper.sources.base import FrameRef, FrameSource
+from mapper.sources.base import FrameRef, Log
 
 _MIN_MEASURED_RATIO = 0.5
 _MAX_TILT_RAD = np.radians(30.0)
@@ -68,7 +68,7 @@ class _Pixels:
 
 
 def depth_at(
-    source: FrameSource,
+    source: Log,
     distance_m: float,
     *,
     patch: Patch | None = None,
@@ -167,7 +167,7 @@ def _see(frame: RgbdFrame, distance_m: float, patch: Patch, *, keep_tilt: bool) 
     return seen, np.where(measured, depth_m - on_plane_m, np.nan)
 
 
-def _refuse_elsewhere(source: FrameSource, shown_m: float, distance_m: float) -> None:
+def _refuse_elsewhere(source: Log, shown_m: float, distance_m: float) -> None:
     if abs(shown_m - distance_m) > _MAX_DISTANCE_RATIO * distance_m:
         raise DataError(
             f"{source.path}: shows a plane at {shown_m:.3g} m, not at {distance_m:g} m; are the distances "

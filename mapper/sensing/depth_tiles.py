@@ -23,7 +23,7 @@ from mapper.sensing.depth_accuracy import (
 )
 from mapper.sensing.depth_filter import dif
 from mapper.sensing.depth_planes import MAX_NOISE_RATIO, Planes, fit_planes
-from mapper.sources.base import FrameRef, FrameSource
+from mapper.sources.base import FrameRef, Log
 
 _TILES_ACROSS = 16
 _BLOCKS = 5
@@ -40,7 +40,7 @@ _DECODERS = 2
 
 
 def depth_of_planes(
-    source: FrameSource,
+    source: Log,
     *,
     patch: Patch | None = None,
     most_frames: int | None = None,

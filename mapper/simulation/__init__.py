@@ -1,4 +1,4 @@
-"""Synthetic RGB-D logs with exact truth: a furnished flat, recorded by a simulated Kinect."""
+"""Simulated RGB-D logs: a furnished flat, a path through it, and what a camera sees, with exact truth."""
 
 from mapper.simulation.boxes import Boxes, read_scene
 from mapper.simulation.log import write_tum_log
@@ -6,13 +6,13 @@ from mapper.simulation.path import make_path
 from mapper.simulation.raycast import Rendering, render
 from mapper.simulation.scene import Scene, make_scene
 from mapper.simulation.sensor import observe
-from mapper.simulation.source import SyntheticSource, camera_of
+from mapper.simulation.source import CameraSimulator, camera_of
 
 __all__ = [
     "Boxes",
+    "CameraSimulator",
     "Rendering",
     "Scene",
-    "SyntheticSource",
     "camera_of",
     "make_path",
     "make_scene",

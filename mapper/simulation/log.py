@@ -6,14 +6,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mapper.core.frames import PinholeCamera, RgbdFrame
+from mapper.core.frames import RgbdFrame
 from mapper.core.timebase import seconds_text_from_ns
 from mapper.runtime.atomic import new_folder
 from mapper.runtime.ordered_map import ordered_map
 from mapper.simulation.boxes import write_scene
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.path import seconds_of
-from mapper.simulation.source import SyntheticEntry, SyntheticSource
+from mapper.simulation.source import CameraSimulator
+from mapper.sources.calibration_file import calibration_text
 from mapper.sources.trajectory_files import write_tum
 from mapper.sources.wheel_files import write_wheels
 
@@ -50,36 +51,38 @@ def write_tum_log(
     with new_folder(out) as folder:
         for name in ("rgb", "depth"):
             (folder / name).mkdir()
-        _write(folder, SyntheticSource(config), on_progress or (lambda _done, _total: None))
+        _write(folder, CameraSimulator(config), on_progress or (lambda _done, _total: None))
 
 
-def _write(folder: Path, source: SyntheticSource, on_progress: Callable[[int, int], None]) -> None:
-    config = source.config
+def _write(folder: Path, simulator: CameraSimulator, on_progress: Callable[[int, int], None]) -> None:
+    config, log = simulator.config, simulator.log()
     lists = {
         "rgb": ["# color images", "# timestamp filename"],
         "depth": ["# depth maps", "# timestamp filename"],
     }
 
-    def save(entry: SyntheticEntry) -> str:
-        name = seconds_text_from_ns(entry.stamp_ns)
-        _save_images(folder, name, entry.load(), image_format=config.image_format)
+    def save(index: int) -> str:
+        frame = simulator.observe(index)
+        name = seconds_text_from_ns(frame.stamp_ns)
+        _save_images(folder, name, frame, image_format=config.image_format)
         return name
 
-    for done, name in enumerate(ordered_map(save, source.entries(), workers=_WORKERS), start=1):
+    for done, name in enumerate(ordered_map(save, simulator.kept.tolist(), workers=_WORKERS), start=1):
         lists["rgb"].append(f"{name} rgb/{name}.{config.image_format}")
         lists["depth"].append(f"{name} depth/{name}.png")
-        on_progress(done, len(source))
+        on_progress(done, len(log))
     for kind, lines in lists.items():
         (folder / f"{kind}.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    write_tum(folder / "groundtruth.txt", source.truth)
-    (folder / "calibration.toml").write_text(_calibration_text(source.camera), encoding="utf-8")
-    if source.wheels is not None:
-        write_wheels(folder, source.wheels, sensor=source.sensor)
-    news = {name for name in ("moving_boxes", "wheels") if not getattr(config, name)}
-    news |= {"wall_distance_m"} if config.path != "wall" else set()
-    knobs = config.model_dump(mode="json", exclude=news)  # a flat without them says what it always said
-    moving = source.movers.as_json(seconds_of(source.stamps_ns))
-    write_scene(folder / "scene.json", source.scene.boxes, knobs, moving=moving)
+    write_tum(folder / "groundtruth.txt", simulator.truth)
+    calibration = calibration_text(simulator.camera, depth_units_per_m=DEPTH_FACTOR)
+    (folder / "calibration.toml").write_text(calibration, encoding="utf-8")
+    if log.wheels is not None:
+        write_wheels(folder, log.wheels, sensor=log.sensor)
+    unset = {name for name in ("moving_boxes", "wheels") if not getattr(config, name)}
+    unset |= {"wall_distance_m"} if config.path != "wall" else set()
+    settings = config.model_dump(mode="json", exclude=unset)  # so that older logs' files keep their bytes
+    moving = simulator.movers.as_json(seconds_of(simulator.truth.stamps_ns))
+    write_scene(folder / "scene.json", simulator.scene.boxes, settings, moving=moving)
 
 
 def _save_images(folder: Path, name: str, frame: RgbdFrame, *, image_format: str) -> None:
@@ -93,17 +96,3 @@ def _save_images(folder: Path, name: str, frame: RgbdFrame, *, image_format: str
     ):
         _, encoded = cv2.imencode(path.suffix, image, flags)
         path.write_bytes(encoded.tobytes())
-
-
-def _calibration_text(camera: PinholeCamera) -> str:
-    rows = {
-        "width_px": camera.width_px,
-        "height_px": camera.height_px,
-        "fx_px": camera.fx_px,
-        "fy_px": camera.fy_px,
-        "cx_px": camera.cx_px,
-        "cy_px": camera.cy_px,
-        "distortion": list(camera.distortion),
-        "depth_factor": DEPTH_FACTOR,
-    }
-    return "".join(f"{key} = {value!r}\n" for key, value in rows.items())

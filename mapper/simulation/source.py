@@ -1,18 +1,18 @@
-"""A synthetic log in memory: a ``FrameSource`` whose frames are rendered when they are loaded."""
+"""Camera simulator: an RGB-D log in memory whose frames are rendered when they are loaded."""
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan, Sensor
-from mapper.core.geometry import angle_between
-from mapper.core.timebase import Stamps
+from mapper.core.frames import Frame, PinholeCamera, RgbdFrame, Scan, Sensor
+from mapper.core.geometry import Array, angle_between
 from mapper.core.trajectory import Trajectory
-from mapper.simulation.config import SynthConfig
+from mapper.simulation.config import LidarSynthConfig, SynthConfig
 from mapper.simulation.movers import Movers, make_movers
 from mapper.simulation.path import Motion, frame_stamps, make_motion, seconds_of
 from mapper.simulation.raycast import Rendering, render
@@ -20,7 +20,7 @@ from mapper.simulation.scene import Scene, make_scene
 from mapper.simulation.sensor import observe
 from mapper.simulation.streams import Stream, rng_of
 from mapper.simulation.wheel_readings import counted
-from mapper.sources.base import Accelerations, ImageFiles
+from mapper.sources.base import ImageFiles, Log
 
 _BLUR_STEP_PX = 2.0
 _MAX_SUBEXPOSURES = 12
@@ -35,50 +35,78 @@ def camera_of(config: SynthConfig) -> PinholeCamera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SyntheticEntry:
-    """One frame that will be rendered when it is loaded."""
-
-    source: "SyntheticSource"
-    index: int
-
-    @property
-    def stamp_ns(self) -> int:
-        """Time of the frame, nanoseconds."""
-        return int(self.source.stamps_ns[self.index])
-
-    @property
-    def files(self) -> ImageFiles | None:
-        """None: there are none."""
-        return None
-
-    def load(self, *, colour: bool = True) -> RgbdFrame:
-        """Render the frame, with its own noise; every call gives the same pixels."""
-        image, depth_m = self.source.observe(self.index)
-        frame = RgbdFrame(self.stamp_ns, image, depth_m, self.source.camera)
-        return frame if colour else RgbdFrame(self.stamp_ns, frame.gray, depth_m, self.source.camera)
-
-    def scan(self) -> Scan:
-        """Render the frame and keep its returns."""
-        return self.load(colour=False).scan()
-
-
-class SyntheticSource:
-    """A log that was never written.
+    """Frame that is simulated when it is loaded, and is the same every time.
 
     Attributes:
-        config: What it is made from.
+        stamp_ns: Time of the frame, nanoseconds.
+        simulate: Returns the frame; an image is grey where its argument is false.
+        files: None, for there are none.
+    """
+
+    stamp_ns: int
+    simulate: Callable[[bool], Frame]
+    files: ImageFiles | None = None
+
+    def load(self, *, colour: bool = True) -> Frame:
+        """Return the frame."""
+        return self.simulate(colour)
+
+    def scan(self) -> Scan:
+        """Return the frame's returns."""
+        return self.simulate(False).scan()
+
+
+def synthetic_log(
+    config: SynthConfig | LidarSynthConfig,
+    *,
+    name: str,
+    sensor: Sensor,
+    truth: Trajectory,
+    poses: Callable[[Array], Array],
+    simulate: Callable[[int, bool], Frame],
+) -> Log:
+    """Return the log of a simulated sensor, with wheel odometry where it is configured.
+
+    Args:
+        config: What the log is made from.
+        name: What the log is called.
+        sensor: What the frames are.
+        truth: Exact T_world_body of every frame.
+        poses: Maps (N,) seconds after the start to (N, 4, 4) exact T_world_body.
+        simulate: Returns a frame by its number; an image is grey where the second argument is false.
+    """
+    wheels = None
+    if config.wheels is not None:
+        wheels = counted(
+            config.wheels,
+            poses,
+            duration_s=float(seconds_of(truth.stamps_ns[-1:])[0]),
+            sensor=sensor,
+            rng=rng_of(config.seed, Stream.WHEELS),
+        )
+    return Log(
+        path=Path(name),
+        name=name,
+        kind="synthetic",
+        sensor=sensor,
+        stamps_ns=truth.stamps_ns,
+        entry_at=lambda index: SyntheticEntry(int(truth.stamps_ns[index]), partial(simulate, index)),
+        truth=truth,
+        wheels=wheels,
+    )
+
+
+class CameraSimulator:
+    """RGB-D camera that moves through a flat.
+
+    Attributes:
+        config: What the log is made from.
         scene: The world, without what moves in it.
         movers: What moves in it.
         camera: The camera.
         motion: Its pose at any time.
-        stamps_ns: (N,) stamps of all frames, also of those that the log drops.
-        path: A name for messages.
-        name: The same.
-        kind: "synthetic".
-        sensor: "rgbd".
-        truth: The exact pose of every frame, also of dropped ones.
-        accelerations: None; there is no accelerometer.
-        wheels: What the vehicle's would have counted; None without.
-        notes: Empty.
+        truth: Exact T_world_camera of every frame, also of those that the log drops.
+        kept: Indices of the frames that are in the log; the first always is.
     """
 
     def __init__(self, config: SynthConfig, scene: Scene | None = None) -> None:
@@ -87,54 +115,36 @@ class SyntheticSource:
         self.movers: Movers = make_movers(config, self.scene)
         self.camera = camera_of(config)
         self.motion: Motion = make_motion(config, self.scene)
-        self.stamps_ns: Stamps = frame_stamps(config, self.motion)
-        self.name = f"synthetic-{config.path}-{config.seed}"
-        self.path = Path(self.name)
-        self.kind = "synthetic"
-        self.sensor: Sensor = "rgbd"
-        self.accelerations: Accelerations | None = None
-        self.wheels: Trajectory | None = None
-        if config.wheels is not None:
-            self.wheels = counted(
-                config.wheels,
-                self.motion.poses,
-                duration_s=float(seconds_of(self.stamps_ns[-1:])[0]),
-                sensor=self.sensor,
-                rng=rng_of(config.seed, Stream.WHEELS),
-            )
-        self.notes: Sequence[str] = ()
+        stamps_ns = frame_stamps(config, self.motion)
+        self.truth = Trajectory(stamps_ns, self.motion.poses(seconds_of(stamps_ns)))
+        chances = rng_of(config.seed, Stream.DROPS).random(len(stamps_ns))
+        chances[0] = 1.0
+        self.kept: NDArray[np.intp] = np.flatnonzero(chances >= config.drop_ratio)
 
-    @cached_property
-    def truth(self) -> Trajectory:
-        """Exact T_world_camera of every frame."""
-        return Trajectory(self.stamps_ns, self.motion.poses(seconds_of(self.stamps_ns)))
-
-    @cached_property
-    def kept(self) -> tuple[int, ...]:
-        """Indices of the frames that are in the log; the first always is."""
-        chances = rng_of(self.config.seed, Stream.DROPS).random(len(self.stamps_ns))
-        return tuple(i for i, chance in enumerate(chances) if i == 0 or chance >= self.config.drop_ratio)
-
-    def __len__(self) -> int:
-        return len(self.kept)
-
-    def entries(self) -> Iterator[SyntheticEntry]:
-        """Yield every kept frame's entry in time order."""
-        for index in self.kept:
-            yield SyntheticEntry(self, index)
+    def log(self) -> Log:
+        """Return the log that the camera records."""
+        log = synthetic_log(
+            self.config,
+            name=f"synthetic-{self.config.path}-{self.config.seed}",
+            sensor="rgbd",
+            truth=self.truth,
+            poses=self.motion.poses,
+            simulate=self.observe,
+        )
+        return log.subset(self.kept)
 
     def render(self, index: int) -> Rendering:
         """Return the exact image and depth of a frame, blurred by motion during the exposure."""
-        middle_s = seconds_of(self.stamps_ns[index : index + 1])
+        middle_s = seconds_of(self.truth.stamps_ns[index : index + 1])
         scene = self.movers.scene_at(self.scene, float(middle_s[0]))
         exact = render(scene, self.camera, self.truth.T_world_body[index])
         exposure_s = self.config.sensor.exposure_s
         if exposure_s == 0.0:
             return exact
         count = self._subexposures(index)
-        moments_s = exposure_s * ((np.arange(count) + 0.5) / count - 0.5)
+        offsets_s = exposure_s * ((np.arange(count) + 0.5) / count - 0.5)
         total = np.zeros(exact.rgb.shape, dtype=np.uint16)
-        times_s = middle_s + moments_s
+        times_s = middle_s + offsets_s
         for time_s, T_world_camera in zip(times_s, self.motion.poses(times_s), strict=True):
             scene = self.movers.scene_at(self.scene, float(time_s))
             total += render(scene, self.camera, T_world_camera).rgb
@@ -144,21 +154,28 @@ class SyntheticSource:
     def _subexposures(self, index: int) -> int:
         """Return how many images make a smooth blur: one for each two pixels of motion at a metre."""
         half_s = self.config.sensor.exposure_s / 2.0
-        middle_s = seconds_of(self.stamps_ns[index : index + 1])
+        middle_s = seconds_of(self.truth.stamps_ns[index : index + 1])
         begin, end = self.motion.poses(middle_s + np.array([-half_s, half_s]))
         turn_px = angle_between(begin[:3, :3], end[:3, :3]) * self.camera.fx_px
         shift_px = float(np.linalg.norm(end[:3, 3] - begin[:3, 3])) * self.camera.fx_px
         return int(np.clip(math.ceil((turn_px + shift_px) / _BLUR_STEP_PX), 1, _MAX_SUBEXPOSURES))
 
-    def observe(self, index: int) -> tuple[Image, DepthImage]:
-        """Return colour and depth of a frame as the sensor reports them."""
+    def observe(self, index: int, colour: bool = True) -> RgbdFrame:
+        """Return a frame as the sensor reports it, in grey where ``colour`` is false."""
         if self._covered(index):
             shape = (self.camera.height_px, self.camera.width_px)
-            return np.zeros((*shape, 3), dtype=np.uint8), np.zeros(shape, dtype=np.float32)
-        rng = rng_of(self.config.seed, Stream.SENSOR, index)
-        return observe(self.render(index), focal_px=self.camera.fx_px, sensor=self.config.sensor, rng=rng)
+            image, depth_m = np.zeros((*shape, 3), dtype=np.uint8), np.zeros(shape, dtype=np.float32)
+        else:
+            image, depth_m = observe(
+                self.render(index),
+                focal_px=self.camera.fx_px,
+                sensor=self.config.sensor,
+                rng=rng_of(self.config.seed, Stream.SENSOR, index),
+            )
+        frame = RgbdFrame(int(self.truth.stamps_ns[index]), image, depth_m, self.camera)
+        return frame if colour else replace(frame, image=frame.gray)
 
     def _covered(self, index: int) -> bool:
         start_s = self.config.blackout_start_s
-        time_s = float(seconds_of(self.stamps_ns[index]))
+        time_s = float(seconds_of(self.truth.stamps_ns[index]))
         return start_s <= time_s < start_s + self.config.blackout_duration_s

@@ -1,24 +1,25 @@
 """Recorded logs as sequences of frames."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from mapper.core.errors import SourceError
 from mapper.sources import clouds, kitti, mbag, numbered, poznan, tum
-from mapper.sources.base import FrameSource
+from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.ros import files as recordings
-from mapper.sources.selection import select
+from mapper.sources.selection import selected
 from mapper.sources.wheel_files import read_wheels
 
 __all__ = ["open_source"]
 
-# The first that recognises a path opens it. Poznań's images are numbered too, so it is asked before;
-# any log may have clouds lying about, so they are asked last.
+# The first that recognises a path reads it. Poznań's images are numbered too, so it comes before numbered
+# images; any log's folder may have clouds in it, so clouds come last.
 _FORMATS = (tum, mbag, poznan, numbered, kitti, recordings, clouds)
 _DEFAULTS = SourceConfig()
 
 
-def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> FrameSource:
+def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> Log:
     """Return a recorded log, recognised by its files, with the configured selection of its frames.
 
     Args:
@@ -33,10 +34,10 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> FrameSource:
         raise SourceError(f"{path}: no such file or folder")
     for log_format in _FORMATS:
         if log_format.recognise(path):
-            log: FrameSource = log_format.open_log(path, config)
+            log: Log = log_format.read_log(path, config)
             if log.wheels is None and path.is_dir():
-                log.wheels, notes = read_wheels(path, config.wheels, sensor=log.sensor)
-                log.notes = [*log.notes, *notes]
-            return select(log, config)
+                wheels, notes = read_wheels(path, config.wheels, sensor=log.sensor)
+                log = replace(log, wheels=wheels, notes=[*log.notes, *notes])
+            return selected(log, config)
     looked_for = "; ".join(log_format.LOOKED_FOR for log_format in _FORMATS)
     raise SourceError(f"{path}: not a log of a known format; looked for {looked_for}")

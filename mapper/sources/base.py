@@ -1,9 +1,12 @@
 """The seam between recorded logs and everything else."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.frames import Frame, Scan, Sensor
 from mapper.core.geometry import Array
@@ -92,36 +95,63 @@ class Accelerations:
     acceleration_mps2: Array
 
 
-class FrameSource(Protocol):
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Log:
     """A recorded log: the same frames in time order, however often it is read.
 
     Attributes:
         path: What was opened.
         name: What the log calls itself; the folder's name where it does not say.
-        kind: Which format it was recognised as, e.g. "tum".
+        kind: Format that it was recognised as, e.g. "tum".
         sensor: What its frames are.
-        truth: Where the body really was, if the log tells.
+        stamps_ns: (N,) time of every frame, nanoseconds, strictly increasing.
+        entry_at: Returns the entry of frame 0 … N - 1; nothing is decoded yet.
+        truth: True T_world_body, if the log has it.
         accelerations: Accelerometer readings, if the log has them.
-        wheels: Where its wheels say the body was, in a frame of their own that drifts, if it has wheels.
+        wheels: T_odom_body by wheel odometry, in a frame of its own that drifts, if the log has it.
         notes: What opening it had to leave out or assume, a sentence each.
+        sessions: The logs that a chained log is made of, oldest first; empty for any other.
     """
 
     path: Path
     name: str
     kind: str
     sensor: Sensor
-    truth: Trajectory | None
-    accelerations: Accelerations | None
-    wheels: Trajectory | None
-    notes: Sequence[str]
+    stamps_ns: Stamps
+    entry_at: Callable[[int], FrameRef]
+    truth: Trajectory | None = None
+    accelerations: Accelerations | None = None
+    wheels: Trajectory | None = None
+    notes: Sequence[str] = ()
+    sessions: "Sequence[Session]" = ()
 
     def __len__(self) -> int:
-        """Return how many entries there will be."""
-        ...
+        return len(self.stamps_ns)
 
     def entries(self) -> Iterator[FrameRef]:
         """Yield every frame's entry in time order; nothing is decoded yet."""
-        ...
+        return map(self.entry_at, range(len(self)))
+
+    def subset(self, indices: NDArray[np.intp]) -> "Log":
+        """Return the log with only the frames of some increasing indices; all else stays as it is."""
+        return replace(
+            self,
+            stamps_ns=self.stamps_ns[indices],
+            entry_at=lambda index: self.entry_at(int(indices[index])),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Session:
+    """One of the logs of a chain.
+
+    Attributes:
+        log: The log, on the clock of the chain.
+        shift_ns: Nanoseconds that were added to its own stamps.
+    """
+
+    log: Log
+    shift_ns: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,71 +1,26 @@
 """Several logs as one, in the order in which they were mapped: sessions of one place."""
 
-from collections.abc import Iterator, Sequence
+from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from pathlib import Path
+from itertools import accumulate, pairwise
+from typing import TypeVar
 
 import numpy as np
 
-from mapper.core.frames import Frame, Scan, Sensor
-from mapper.core.timebase import NS_PER_S, Stamps
+from mapper.core.frames import Frame, Scan
+from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
-from mapper.sources.base import Accelerations, FrameRef, FrameSource, ImageFiles
+from mapper.sources.base import Accelerations, FrameRef, ImageFiles, Log, Session
+
+_Stamped = TypeVar("_Stamped", Trajectory, Accelerations)
 
 _PAUSE_NS = NS_PER_S
-"""Between one log and the next, where their own stamps do not tell which came first."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Session:
-    """A log and where it lies on the common clock.
-
-    Attributes:
-        log: The log, on its own clock.
-        shift_ns: What its stamps are raised by.
-        stamps_ns: (N,) its frames on the common clock.
-    """
-
-    log: FrameSource
-    shift_ns: int
-    stamps_ns: Stamps
-
-    def entries(self) -> Iterator[FrameRef]:
-        """Yield every frame's entry on the common clock."""
-        if not self.shift_ns:
-            return self.log.entries()
-        return (_Shifted(entry, self.shift_ns) for entry in self.log.entries())
-
-
-@dataclass(slots=True, eq=False)
-class ChainedLog:
-    """Sessions one after the other; see :class:`mapper.sources.base.FrameSource`.
-
-    There are no accelerations: two logs' readings may be in different axes. There are no wheels but a single
-    session's: each log's are in a frame of their own.
-    """
-
-    sessions: Sequence[Session]
-    path: Path
-    name: str
-    kind: str
-    truth: Trajectory | None
-    notes: Sequence[str]
-    sensor: Sensor
-    accelerations: Accelerations | None = None
-    wheels: Trajectory | None = None
-
-    def __len__(self) -> int:
-        return sum(len(session.stamps_ns) for session in self.sessions)
-
-    def entries(self) -> Iterator[FrameRef]:
-        """Yield every frame's entry, session by session."""
-        for session in self.sessions:
-            yield from session.entries()
+"""Time between two logs whose own stamps do not tell which came first."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Shifted:
+class _ShiftedEntry:
     """An entry on another clock."""
 
     entry: FrameRef
@@ -87,86 +42,93 @@ class _Shifted:
         return replace(self.entry.scan(), stamp_ns=self.stamp_ns)
 
 
-def chained(first: FrameSource, second: FrameSource, *, shift_ns: int | None = None) -> ChainedLog:
+def chained(first: Log, second: Log, *, shift_ns: int | None = None) -> Log:
     """Return a log followed by another.
+
+    The chain has no accelerations, for two logs' readings may be in different axes, and no wheel odometry,
+    for each log's is in a frame of its own. Its ``sessions`` keep both.
 
     Args:
         first: A log, or several chained ones.
         second: The log that comes after.
-        shift_ns: What its stamps are raised by. None leaves them as they are if they come after the first
-            log's, and otherwise lets it begin one second after the first log's end.
+        shift_ns: Nanoseconds to add to the second log's stamps. None leaves them as they are if they come
+            after the first log's, and otherwise lets it begin one second after the first log's end.
     """
-    before = sessions_of(first)
-    end_ns, stamps_ns = int(before[-1].stamps_ns[-1]), _stamps(second)
-    begin_ns = int(stamps_ns[0])
+    end_ns, begin_ns = int(first.stamps_ns[-1]), int(second.stamps_ns[0])
     if shift_ns is None:
         shift_ns = 0 if begin_ns > end_ns else end_ns + _PAUSE_NS - begin_ns
-    return _chain([*before, Session(second, shift_ns, stamps_ns + shift_ns)])
-
-
-def last_session(source: ChainedLog) -> ChainedLog:
-    """Return the last of the logs alone, on the common clock."""
-    return _chain(source.sessions[-1:])
-
-
-def sessions_of(source: FrameSource) -> Sequence[Session]:
-    """Return the logs that a source is made of: itself, unless it is chained."""
-    if isinstance(source, ChainedLog):
-        return source.sessions
-    return [Session(source, 0, _stamps(source))]
-
-
-def _chain(sessions: Sequence[Session]) -> ChainedLog:
+    sessions = (*sessions_of(first), Session(_shifted(second, shift_ns), shift_ns))
     logs = [session.log for session in sessions]
-    truth, notes = _truth(sessions)
+    truth, notes = _joined_truth(logs)
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     notes += [
         f"{session.log.name}: stamps raised by {session.shift_ns / NS_PER_S:.3f} s, to follow the log before"
         for session in sessions
         if session.shift_ns
     ]
-    return ChainedLog(
-        sessions=sessions,
+    starts = [0, *accumulate(map(len, logs))]
+
+    def entry_at(index: int) -> FrameRef:
+        number = bisect_right(starts, index) - 1
+        return logs[number].entry_at(index - starts[number])
+
+    return Log(
         path=logs[0].path,
         name=" + ".join(log.name for log in logs),
         kind=" + ".join(dict.fromkeys(log.kind for log in logs)),
+        sensor=logs[0].sensor,
+        stamps_ns=np.concatenate([log.stamps_ns for log in logs]),
+        entry_at=entry_at,
         truth=truth,
         notes=notes,
-        sensor=logs[0].sensor,
-        wheels=_shifted(logs[0].wheels, sessions[0].shift_ns) if len(logs) == 1 else None,
+        sessions=sessions,
     )
 
 
-def _shifted(wheels: Trajectory | None, shift_ns: int) -> Trajectory | None:
-    return wheels and replace(wheels, stamps_ns=wheels.stamps_ns + shift_ns)
+def sessions_of(log: Log) -> Sequence[Session]:
+    """Return the logs that a log is made of: itself, unless it is chained."""
+    return log.sessions or (Session(log, 0),)
 
 
-def _stamps(source: FrameSource) -> Stamps:
-    return np.array([entry.stamp_ns for entry in source.entries()], dtype=np.int64)
+def _shifted(log: Log, shift_ns: int) -> Log:
+    """Return a log on a clock that is ahead of its own."""
+    if not shift_ns:
+        return log
+    return replace(
+        log,
+        stamps_ns=log.stamps_ns + shift_ns,
+        entry_at=lambda index: _ShiftedEntry(log.entry_at(index), shift_ns),
+        truth=_later(log.truth, shift_ns),
+        wheels=_later(log.wheels, shift_ns),
+        accelerations=_later(log.accelerations, shift_ns),
+    )
 
 
-def _truth(sessions: Sequence[Session]) -> tuple[Trajectory | None, list[str]]:
-    """Return the truths one after the other, each until half way to the next session's first frame."""
+def _later(stamped: _Stamped | None, shift_ns: int) -> _Stamped | None:
+    return stamped and replace(stamped, stamps_ns=stamped.stamps_ns + shift_ns)
+
+
+def _joined_truth(logs: Sequence[Log]) -> tuple[Trajectory | None, list[str]]:
+    """Return the truths one after the other, each until half way to the next log's first frame."""
     bounds_ns = [
         np.iinfo(np.int64).min,
-        *((int(a.stamps_ns[-1]) + int(b.stamps_ns[0])) // 2 for a, b in pairwise(sessions)),
+        *((int(a.stamps_ns[-1]) + int(b.stamps_ns[0])) // 2 for a, b in pairwise(logs)),
         np.iinfo(np.int64).max,
     ]
-    told, parts = [], []
-    for session, (begin_ns, end_ns) in zip(sessions, pairwise(bounds_ns), strict=True):
-        truth = session.log.truth
-        if truth is None:
+    named, parts = [], []
+    for log, (begin_ns, end_ns) in zip(logs, pairwise(bounds_ns), strict=True):
+        if log.truth is None:
             continue
-        stamps_ns = truth.stamps_ns + session.shift_ns
+        stamps_ns = log.truth.stamps_ns
         inside = (stamps_ns > begin_ns) & (stamps_ns <= end_ns)
         if inside.any():
-            told.append(session.log.name)
-            parts.append((stamps_ns[inside], truth.T_world_body[inside]))
-    if not told:
+            named.append(log.name)
+            parts.append((stamps_ns[inside], log.truth.T_world_body[inside]))
+    if not named:
         return None, []
     notes = []
-    if len(told) < len(sessions):
-        notes.append(f"ground truth of {' and '.join(told)} only")
-    if len(told) > 1:
-        notes.append(f"the ground truths of {' and '.join(told)} are taken to be in one world")
+    if len(named) < len(logs):
+        notes.append(f"ground truth of {' and '.join(named)} only")
+    if len(named) > 1:
+        notes.append(f"the ground truths of {' and '.join(named)} are taken to be in one world")
     return Trajectory(*map(np.concatenate, zip(*parts, strict=True))), notes

@@ -4,9 +4,10 @@ from pathlib import Path
 
 from mapper.core.errors import SourceError
 from mapper.core.frames import Scan
+from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, is_cloud_name, scan_log
-from mapper.sources.scans import ScanEntry, ScanLog
+from mapper.sources.scans import ScanEntry
 
 LOOKED_FOR = "two or more clouds, .bin .pcd .ply .xyz .npy .las .laz, or .txt .csv with a number in the name"
 TRUTH_FILES = ("groundtruth.txt", "poses.txt")
@@ -17,8 +18,8 @@ def recognise(path: Path) -> bool:
     return (path.is_file() and is_cloud_name(path)) or bool(_folders(path))
 
 
-def open_log(path: Path, config: SourceConfig) -> ScanLog:
-    """Open a folder of clouds, or the only such folder in a folder.
+def read_log(path: Path, config: SourceConfig) -> Log:
+    """Return the log of a folder of clouds, or of the only such folder in a folder.
 
     Raises:
         SourceError: It is a single cloud, there are several folders, no cloud matches the pattern, or a text

@@ -1,4 +1,4 @@
-"""What is in a log, without building anything from it."""
+"""Facts of a log, without building anything from it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from mapper.core.frames import Scan, Sensor
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.sources import open_source
-from mapper.sources.base import FrameSource
+from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.ros import files as recordings
 from mapper.sources.ros.index import Series
 from mapper.sources.ros.reader import RecordingReader
-from mapper.sources.ros.source import log_of
-from mapper.sources.selection import select
+from mapper.sources.ros.source import recording_log
+from mapper.sources.selection import selected
 
 _GAP_PERIODS = 3.0
 """A pause of as many usual periods is a gap."""
@@ -113,7 +113,7 @@ def inspect_log(path: Path, config: SourceConfig) -> Inspection:
     reader = RecordingReader(recordings.open_recording(path))
     topics = [_topic(series) for series in reader.series.values()]
     try:
-        return Inspection(path, topics, _facts(select(log_of(reader, config), config)), None)
+        return Inspection(path, topics, _facts(selected(recording_log(reader, config), config)), None)
     except SourceError as error:
         return Inspection(path, topics, None, str(error))
 
@@ -138,17 +138,16 @@ def _topic(series: Series) -> TopicFacts:
     return TopicFacts(topic.name, topic.type, topic.encoding, timing_of(series.stamps_ns))
 
 
-def _facts(source: FrameSource) -> LogFacts:
-    stamps_ns = np.array([entry.stamp_ns for entry in source.entries()], dtype=np.int64)
+def _facts(source: Log) -> LogFacts:
     content, calibration = _first_frame(source)
     return LogFacts(
         name=source.name,
         kind=source.kind,
         sensor=source.sensor,
-        frames=timing_of(stamps_ns),
+        frames=timing_of(source.stamps_ns),
         content=content,
         calibration=calibration,
-        truth=None if source.truth is None else _truth_text(source.truth, stamps_ns),
+        truth=None if source.truth is None else _truth_text(source.truth, source.stamps_ns),
         wheels=None if source.wheels is None else timing_of(source.wheels.stamps_ns),
         wheels_path_m=0.0 if source.wheels is None else source.wheels.path_length_m,
         readings=0 if source.accelerations is None else len(source.accelerations.stamps_ns),
@@ -156,7 +155,7 @@ def _facts(source: FrameSource) -> LogFacts:
     )
 
 
-def _first_frame(source: FrameSource) -> tuple[str, str | None]:
+def _first_frame(source: Log) -> tuple[str, str | None]:
     """Return what the first readable frame is, and its camera's calibration."""
     reason = "there is none"
     for entry in source.entries():

@@ -11,9 +11,9 @@ import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform, nearest_rotation, transform
+from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, has_clouds, scan_log
-from mapper.sources.scans import ScanLog
 from mapper.sources.text import parse_numbers, rows
 
 LOOKED_FOR = "velodyne/000000.bin or sequences/00/velodyne/000000.bin (KITTI)"
@@ -26,8 +26,8 @@ def recognise(path: Path) -> bool:
     return bool(_sequences(path))
 
 
-def open_log(path: Path, config: SourceConfig) -> ScanLog:
-    """Open a sequence, or the only one of a dataset's folder.
+def read_log(path: Path, config: SourceConfig) -> Log:
+    """Return the log of a sequence, or of the only one of a dataset's folder.
 
     Raises:
         SourceError: There are several sequences, no scan matches the pattern, or a text file is malformed.

@@ -10,7 +10,7 @@ from mapper.core.frames import Scan
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, Stamps, nearest, seconds_text_from_ns
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.atomic import write_text
-from mapper.sources.base import FrameSource, Skipped
+from mapper.sources.base import Log, Skipped
 from mapper.sources.trajectory_files import write_kitti
 from mapper.sources.wheel_files import write_wheels
 
@@ -18,7 +18,7 @@ _TIMED = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<f4")])
 
 
 def write_kitti_log(
-    source: FrameSource, out: Path, *, on_progress: Callable[[int], None] | None = None
+    source: Log, out: Path, *, on_progress: Callable[[int], None] | None = None
 ) -> list[Skipped]:
     """Write a LiDAR log as a KITTI folder and return the scans that could not be.
 

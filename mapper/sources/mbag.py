@@ -1,4 +1,4 @@
-"""mbag: the thesis's unified text format of RGB-D logs (A12, thesis §3.5).
+"""mbag: the unified text format of RGB-D logs of Somlyai (PhD thesis, §3.5).
 
 Two header lines, ``!RAWLOG FB1`` and ``!dbName: desk``, then one line a frame:
 ``timestamp; rgb; depth; x; y; z; qx; qy; qz; qw``. Paths are relative to the file. A frame without ground
@@ -13,9 +13,10 @@ import numpy as np
 from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform
 from mapper.core.timebase import ns_from_seconds_text
+from mapper.sources.base import Log
 from mapper.sources.calibration import freiburg_camera
 from mapper.sources.config import SourceConfig
-from mapper.sources.rgbd import RgbdLog, Shot, entries_of, find_calibration, present, read_accelerations
+from mapper.sources.rgbd import FramePair, find_calibration, present, rgbd_log
 from mapper.sources.text import (
     parse_numbers,
     parse_stamp,
@@ -39,8 +40,8 @@ def recognise(path: Path) -> bool:
     return _mbag_file(path) is not None
 
 
-def open_log(path: Path, config: SourceConfig) -> RgbdLog:
-    """Open an mbag file, or the one in a folder.
+def read_log(path: Path, config: SourceConfig) -> Log:
+    """Return the log of an mbag file, or of the one in a folder.
 
     Raises:
         SourceError: The file is empty or malformed, none of its images exists, or the camera is unknown.
@@ -49,17 +50,17 @@ def open_log(path: Path, config: SourceConfig) -> RgbdLog:
     if file is None:
         raise SourceError(f"{path}: want {LOOKED_FOR}")
     name = _name_of(file)
-    shots: list[Shot] = []
+    pairs: list[FramePair] = []
     poses: list[tuple[int, Transform | None]] = []
     for number, words in rows(file, separator=";"):
-        shot, pose_words = _parse(file, number, words)
-        shots.append(shot)
+        pair, pose_words = _parse(file, number, words)
+        pairs.append(pair)
         if any(word.lower() not in _MISSING for word in pose_words):
             numbers = parse_numbers([word or "nan" for word in pose_words], where=f"{file}:{number}")
-            poses.append((shot.stamp_ns, pose_from_numbers(numbers)))
-    if not shots:
+            poses.append((pair.stamp_ns, pose_from_numbers(numbers)))
+    if not pairs:
         raise SourceError(f"{file}: empty list; want lines of timestamp; rgb; depth; x; y; z; qx; qy; qz; qw")
-    shots, notes = _usable(file, shots)
+    pairs, notes = _usable(file, pairs)
     calibration, units_per_m = find_calibration(
         file.parent,
         config.camera,
@@ -67,15 +68,15 @@ def open_log(path: Path, config: SourceConfig) -> RgbdLog:
         depth_units_per_m=DEPTH_UNITS_PER_M,
     )
     truth, truth_notes = truth_from(poses, what=file.name) if poses else (None, [])
-    accelerations, acceleration_notes = read_accelerations(file.parent)
-    return RgbdLog(
+    return rgbd_log(
+        pairs,
+        calibration,
+        depth_units_per_m=units_per_m,
         path=path,
         name=name,
         kind="mbag",
         truth=truth,
-        accelerations=accelerations,
-        notes=[*notes, *truth_notes, *acceleration_notes],
-        images=entries_of(shots, calibration, depth_units_per_m=units_per_m),
+        notes=[*notes, *truth_notes],
     )
 
 
@@ -95,7 +96,7 @@ def _name_of(file: Path) -> str:
     return next((found[1] for found in names if found), file.stem)
 
 
-def _parse(file: Path, number: int, words: list[str]) -> tuple[Shot, list[str]]:
+def _parse(file: Path, number: int, words: list[str]) -> tuple[FramePair, list[str]]:
     where = f"{file}:{number}"
     if len(words) not in (3, 10):
         raise SourceError(f"{where}: {len(words)} fields, want 10: timestamp; rgb; depth; x … qw")
@@ -104,22 +105,22 @@ def _parse(file: Path, number: int, words: list[str]) -> tuple[Shot, list[str]]:
     colour, depth = (file.parent / word.replace("\\", "/") for word in words[1:3])
     # The format has one stamp a line; an image named by its stamp, as TUM's are, still tells its own.
     depth_stamp_ns = ns_from_seconds_text(depth.stem) if _STAMP_NAME.fullmatch(depth.stem) else stamp_ns
-    return Shot(stamp_ns, colour, depth_stamp_ns, depth), words[3:]
+    return FramePair(stamp_ns, colour, depth_stamp_ns, depth), words[3:]
 
 
-def _usable(file: Path, shots: list[Shot]) -> tuple[list[Shot], list[str]]:
-    """Return the shots whose two images exist, in time order."""
-    has_colour = present(shot.colour for shot in shots)
-    has_depth = present(shot.depth for shot in shots)
-    kept = [shot for shot, *has in zip(shots, has_colour, has_depth, strict=True) if all(has)]
+def _usable(file: Path, pairs: list[FramePair]) -> tuple[list[FramePair], list[str]]:
+    """Return the pairs whose two images exist, in time order."""
+    has_colour = present(pair.colour for pair in pairs)
+    has_depth = present(pair.depth for pair in pairs)
+    kept = [pair for pair, *has in zip(pairs, has_colour, has_depth, strict=True) if all(has)]
     if not kept:
         raise SourceError(
-            f"{file}: none of its {len(shots)} pairs of images exists; the first: {shots[0].colour}"
+            f"{file}: none of its {len(pairs)} pairs of images exists; the first: {pairs[0].colour}"
         )
     notes = []
-    if len(kept) < len(shots):
+    if len(kept) < len(pairs):
         notes.append(
-            f"{file.name}: {len(shots) - len(kept)} of {len(shots)} listed pairs do not exist; dropped"
+            f"{file.name}: {len(pairs) - len(kept)} of {len(pairs)} listed pairs do not exist; dropped"
         )
-    order, order_notes = time_order(np.array([shot.stamp_ns for shot in kept]), what=file.name)
+    order, order_notes = time_order(np.array([pair.stamp_ns for pair in kept]), what=file.name)
     return [kept[i] for i in order], [*notes, *order_notes]

@@ -16,9 +16,10 @@ from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform, nearest_rotation, transform
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
+from mapper.sources.base import Log
 from mapper.sources.calibration import PRIMESENSE, SEVEN_SCENES
 from mapper.sources.config import SourceConfig
-from mapper.sources.rgbd import RgbdLog, Shot, entries_of, find_calibration, read_accelerations
+from mapper.sources.rgbd import FramePair, find_calibration, rgbd_log
 from mapper.sources.text import parse_numbers, rows, time_order, truth_from
 
 DEPTH_UNITS_PER_M = 1000.0
@@ -55,8 +56,8 @@ def recognise(path: Path) -> bool:
     return find_images(path) is not None or bool(_sequences(path))
 
 
-def open_log(path: Path, config: SourceConfig) -> RgbdLog:
-    """Open a folder of numbered images; a folder with a single sequence opens that.
+def read_log(path: Path, config: SourceConfig) -> Log:
+    """Return the log of a folder of numbered images, or of the only sequence in a folder.
 
     Raises:
         SourceError: The folder holds several sequences, or a pose file or the calibration is malformed.
@@ -79,18 +80,18 @@ def open_log(path: Path, config: SourceConfig) -> RgbdLog:
         notes.append(
             f"camera assumed to be the {known.origin}; if not, put a calibration.toml beside the log"
         )
-    shots, stamp_notes = stamped(images.pairs, rate_hz=config.rate_hz or RATE_HZ)
-    truth, truth_notes = _read_truth(path, images.pairs, shots)
-    accelerations, acceleration_notes = read_accelerations(path)
-    order, order_notes = time_order(np.array([shot.stamp_ns for shot in shots]), what="image names")
-    return RgbdLog(
+    pairs, stamp_notes = stamped(images.pairs, rate_hz=config.rate_hz or RATE_HZ)
+    truth, truth_notes = _read_truth(path, pairs)
+    order, order_notes = time_order(np.array([pair.stamp_ns for pair in pairs]), what="image names")
+    return rgbd_log(
+        [pairs[i] for i in order],
+        calibration,
+        depth_units_per_m=units_per_m,
         path=path,
         name=path.resolve().name,
         kind="7-scenes" if is_seven_scenes else "redwood",
         truth=truth,
-        accelerations=accelerations,
-        notes=[*notes, *stamp_notes, *order_notes, *truth_notes, *acceleration_notes],
-        images=entries_of([shots[i] for i in order], calibration, depth_units_per_m=units_per_m),
+        notes=[*notes, *stamp_notes, *order_notes, *truth_notes],
     )
 
 
@@ -115,19 +116,19 @@ def find_images(folder: Path) -> NumberedImages | None:
     return NumberedImages(pairs, notes)
 
 
-def stamped(pairs: Sequence[NumberedPair], *, rate_hz: float) -> tuple[list[Shot], list[str]]:
+def stamped(images: Sequence[NumberedPair], *, rate_hz: float) -> tuple[list[FramePair], list[str]]:
     """Return the pairs with stamps from their names, or else from their numbers at a rate."""
-    if all(pair.microseconds is not None for pair in pairs):
-        stamps_ns = [1000 * (pair.microseconds or 0) for pair in pairs]
+    if all(pair.microseconds is not None for pair in images):
+        stamps_ns = [1000 * (pair.microseconds or 0) for pair in images]
         notes = []
     else:
-        stamps_ns = [stamp_at(pair.number, rate_hz=rate_hz) for pair in pairs]
+        stamps_ns = [stamp_at(pair.number, rate_hz=rate_hz) for pair in images]
         notes = [f"file names carry no time; {rate_hz:g} frames a second assumed (source.rate_hz)"]
-    shots = [
-        Shot(stamp_ns, pair.colour, stamp_ns, pair.depth)
-        for stamp_ns, pair in zip(stamps_ns, pairs, strict=True)
+    pairs = [
+        FramePair(stamp_ns, pair.colour, stamp_ns, pair.depth)
+        for stamp_ns, pair in zip(stamps_ns, images, strict=True)
     ]
-    return shots, notes
+    return pairs, notes
 
 
 def stamp_at(number: int, *, rate_hz: float) -> int:
@@ -150,26 +151,24 @@ def _by_number(folder: Path, word: str) -> dict[int, tuple[Path, int | None]]:
     return found
 
 
-def _read_truth(
-    folder: Path, pairs: Sequence[NumberedPair], shots: Sequence[Shot]
-) -> tuple[Trajectory | None, list[str]]:
+def _read_truth(folder: Path, pairs: Sequence[FramePair]) -> tuple[Trajectory | None, list[str]]:
     """Read one pose file a frame if there are any, else a Redwood trajectory."""
     poses: list[tuple[int, Transform | None]] = []
-    for pair, shot in zip(pairs, shots, strict=True):
+    for pair in pairs:
         beside = pair.colour.with_name(f"{pair.colour.stem.split('.')[0]}.pose.txt")
         path = beside if beside.is_file() else folder / "pose" / f"{pair.colour.stem}.txt"
         if path.is_file():
             matrix = [_row_of_4(path, number, words) for number, words in rows(path)]
-            poses.append((shot.stamp_ns, _pose_of(matrix, path)))
+            poses.append((pair.stamp_ns, _pose_of(matrix, path)))
     if poses:
         return truth_from(poses, what="pose files")
     trajectories = [
         path for name in ("*traj*.log", "*traj*.txt", "*.log") for path in sorted(folder.glob(name))
     ]
-    return _read_redwood(trajectories[0], shots) if trajectories else (None, [])
+    return _read_redwood(trajectories[0], pairs) if trajectories else (None, [])
 
 
-def _read_redwood(path: Path, shots: Sequence[Shot]) -> tuple[Trajectory | None, list[str]]:
+def _read_redwood(path: Path, pairs: Sequence[FramePair]) -> tuple[Trajectory | None, list[str]]:
     """Read blocks of a line ``i i i+1`` and a 4×4 matrix; i counts the images from 0."""
     lines = list(rows(path))
     if len(lines) % 5:
@@ -180,12 +179,12 @@ def _read_redwood(path: Path, shots: Sequence[Shot]) -> tuple[Trajectory | None,
         if len(words) != 3 or not words[0].isdigit():
             raise SourceError(f"{path}:{number}: {' '.join(words)!r}, want the block's number, as in: 0 0 1")
         index = int(words[0])
-        if index >= len(shots):
+        if index >= len(pairs):
             raise SourceError(
-                f"{path}:{number}: pose of image {index}, but there are only {len(shots)} images"
+                f"{path}:{number}: pose of image {index}, but there are only {len(pairs)} images"
             )
         matrix = [_row_of_4(path, row_number, row) for row_number, row in lines[block + 1 : block + 5]]
-        poses.append((shots[index].stamp_ns, _pose_of(matrix, path)))
+        poses.append((pairs[index].stamp_ns, _pose_of(matrix, path)))
     return truth_from(poses, what=path.name)
 
 

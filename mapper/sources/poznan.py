@@ -1,8 +1,8 @@
-"""Poznań folders: numbered images, and the truth of each as ``number x y z roll pitch yaw`` (thesis §3.5).
+"""Poznań folders: numbered images and true poses ``number x y z roll pitch yaw`` (Somlyai, PhD thesis, §3.5).
 
 Images lie in ``rgb/`` and ``depth/`` (``rgb_0.png``, ``depth_0.png``, with or without leading zeros) or side
-by side. The truth is the text file whose name speaks of "ground" or "gt" and whose rows have seven columns,
-the first an image number. Positions are metres. Angles are degrees if a comment line says "deg", radians if
+by side. The truth is the text file with "ground" or "gt" in its name and rows of seven columns, the first an
+image number. Positions are metres. Angles are degrees if a comment line says "deg", radians if
 it says "rad"; without either they are degrees if any exceeds a full turn of 2π, radians if none does.
 """
 
@@ -16,13 +16,14 @@ from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform, transform
 from mapper.core.rotations import rotation_from_euler
 from mapper.core.trajectory import Trajectory
+from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.numbered import find_images, stamp_at, stamped
-from mapper.sources.rgbd import RgbdLog, entries_of, find_calibration, read_accelerations
+from mapper.sources.rgbd import find_calibration, rgbd_log
 from mapper.sources.text import parse_numbers, read_lines, rows, truth_from
 
 DEPTH_UNITS_PER_M = 1000.0
-RATE_HZ = 10.0  # "every 100 ms" (thesis §5.6)
+RATE_HZ = 10.0  # "every 100 ms", Somlyai (PhD thesis), §5.6
 LOOKED_FOR = "groundtruth.txt of number x y z roll pitch yaw with numbered images (Poznań)"
 
 _TRUTH_NAME = re.compile(r"ground|(?:^|[^a-z])gt(?:[^a-z]|$)", re.IGNORECASE)
@@ -33,8 +34,8 @@ def recognise(path: Path) -> bool:
     return _truth_file(path) is not None and find_images(path) is not None
 
 
-def open_log(path: Path, config: SourceConfig) -> RgbdLog:
-    """Open a Poznań folder.
+def read_log(path: Path, config: SourceConfig) -> Log:
+    """Return the log of a Poznań folder.
 
     Raises:
         SourceError: Images or truth are missing or malformed, or the camera is unknown.
@@ -43,21 +44,21 @@ def open_log(path: Path, config: SourceConfig) -> RgbdLog:
     if images is None or truth_path is None:
         raise SourceError(f"{path}: not a Poznań log; want {LOOKED_FOR}")
     rate_hz = config.rate_hz or RATE_HZ
-    shots, stamp_notes = stamped(images.pairs, rate_hz=rate_hz)
+    pairs, stamp_notes = stamped(images.pairs, rate_hz=rate_hz)
     calibration, units_per_m = find_calibration(
         path, config.camera, known=None, depth_units_per_m=DEPTH_UNITS_PER_M
     )
-    stamps_ns = {pair.number: shot.stamp_ns for pair, shot in zip(images.pairs, shots, strict=True)}
+    stamps_ns = {image.number: pair.stamp_ns for image, pair in zip(images.pairs, pairs, strict=True)}
     truth, truth_notes = _read_truth(truth_path, stamps_ns, rate_hz=rate_hz)
-    accelerations, acceleration_notes = read_accelerations(path)
-    return RgbdLog(
+    return rgbd_log(
+        pairs,
+        calibration,
+        depth_units_per_m=units_per_m,
         path=path,
         name=path.resolve().name,
         kind="poznan",
         truth=truth,
-        accelerations=accelerations,
-        notes=[*images.notes, *stamp_notes, *truth_notes, *acceleration_notes],
-        images=entries_of(shots, calibration, depth_units_per_m=units_per_m),
+        notes=[*images.notes, *stamp_notes, *truth_notes],
     )
 
 

@@ -1,15 +1,15 @@
-"""What every RGB-D log made of image files shares: its frames, its camera and its accelerometer."""
+"""RGB-D logs made of image files: their frames, their camera and their accelerometer."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mapper.core.errors import FrameError, SourceError
-from mapper.core.frames import DepthImage, PinholeCamera, RgbdFrame, Scan, Sensor
+from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
 from mapper.core.trajectory import Trajectory
-from mapper.sources.base import Accelerations, FrameRef, ImageFiles
+from mapper.sources.base import Accelerations, ImageFiles, Log
 from mapper.sources.calibration import Calibration
 from mapper.sources.calibration_file import FILE_NAMES, read_calibration
 from mapper.sources.config import CameraConfig
@@ -19,19 +19,29 @@ from mapper.sources.text import parse_numbers, parse_stamp, rows, time_order
 
 @dataclass(frozen=True, slots=True)
 class RgbdEntry:
-    """One colour and depth image on disk; the body is the camera."""
+    """Colour and depth image of a log, not read yet; the body is the camera.
+
+    Attributes:
+        stamp_ns: Time of the colour image, nanoseconds.
+        files: Both images as they are encoded.
+        camera: Camera of both images.
+        read_image: Returns the (H, W, 3) RGB image, or the grey one where its argument is false.
+        read_depth_m: Returns (H, W) depth in metres.
+    """
 
     stamp_ns: int
     files: ImageFiles
     camera: PinholeCamera
+    read_image: Callable[[bool], Image]
+    read_depth_m: Callable[[], DepthImage]
 
     def load(self, *, colour: bool = True) -> RgbdFrame:
         """Read and decode both images.
 
         Raises:
-            FrameError: A file is missing, damaged, of the wrong kind or of another size than the camera's.
+            FrameError: An image is missing, damaged, of the wrong kind or of another size than the camera's.
         """
-        image = read_colour(self.files.colour) if colour else read_grey(self.files.colour)
+        image = self.read_image(colour)
         check_size(image.shape, self.camera, f"{self.files.colour}")
         return RgbdFrame(self.stamp_ns, image, self._depth_m(), self.camera)
 
@@ -44,31 +54,73 @@ class RgbdEntry:
         return scan_of(self._depth_m(), self.camera, stamp_ns=self.stamp_ns)
 
     def _depth_m(self) -> DepthImage:
-        depth_m = read_depth_m(self.files.depth, self.files.depth_units_per_m)
+        depth_m = self.read_depth_m()
         check_size(depth_m.shape, self.camera, f"{self.files.depth}")
         return depth_m
 
 
-@dataclass(slots=True, eq=False)
-class RgbdLog:
-    """A log whose frames are pairs of image files; see :class:`mapper.sources.base.FrameSource`."""
+@dataclass(frozen=True, slots=True)
+class FramePair:
+    """Stamps and files of one frame, before the log's camera is known."""
 
-    path: Path
-    name: str
-    kind: str
-    truth: Trajectory | None
-    accelerations: Accelerations | None
-    notes: Sequence[str]
-    images: Sequence[RgbdEntry]
-    sensor: Sensor = "rgbd"
-    wheels: Trajectory | None = None
+    stamp_ns: int
+    colour: Path
+    depth_stamp_ns: int
+    depth: Path
 
-    def __len__(self) -> int:
-        return len(self.images)
 
-    def entries(self) -> Iterator[FrameRef]:
-        """Yield every frame's entry in time order."""
-        yield from self.images
+def rgbd_log(
+    pairs: Sequence[FramePair],
+    calibration: Calibration,
+    *,
+    depth_units_per_m: float,
+    path: Path,
+    name: str,
+    kind: str,
+    truth: Trajectory | None,
+    notes: Iterable[str],
+) -> Log:
+    """Return the log of some image files, with the readings of an accelerometer where there are any.
+
+    Args:
+        pairs: Its frames, in strictly increasing time.
+        calibration: Intrinsics of all of them; the first colour image that can be read tells their size.
+        depth_units_per_m: Depth image units per metre.
+        path: What was opened: a folder, or a file in the folder of the log.
+        name: As of :class:`Log`.
+        kind: As of :class:`Log`.
+        truth: As of :class:`Log`.
+        notes: What finding all these had to leave out or assume.
+
+    Raises:
+        SourceError: No colour image can be read, they are not of the calibration's size, or a line of
+            ``accelerometer.txt`` is malformed.
+    """
+    camera = _camera_of(pairs, calibration)
+    accelerations, acceleration_notes = read_accelerations(path if path.is_dir() else path.parent)
+
+    def entry_at(index: int) -> RgbdEntry:
+        pair = pairs[index]
+        files = ImageFiles(pair.colour, pair.depth, pair.depth_stamp_ns, depth_units_per_m)
+        return RgbdEntry(
+            pair.stamp_ns,
+            files,
+            camera,
+            read_image=lambda colour: read_colour(files.colour) if colour else read_grey(files.colour),
+            read_depth_m=lambda: read_depth_m(files.depth, depth_units_per_m),
+        )
+
+    return Log(
+        path=path,
+        name=name,
+        kind=kind,
+        sensor="rgbd",
+        stamps_ns=np.array([pair.stamp_ns for pair in pairs], dtype=np.int64),
+        entry_at=entry_at,
+        truth=truth,
+        accelerations=accelerations,
+        notes=[*notes, *acceleration_notes],
+    )
 
 
 def find_calibration(
@@ -100,45 +152,16 @@ def find_calibration(
     return stated, units_per_m
 
 
-@dataclass(frozen=True, slots=True)
-class Shot:
-    """One frame's stamps and files, before the log's camera is known."""
-
-    stamp_ns: int
-    colour: Path
-    depth_stamp_ns: int
-    depth: Path
-
-
-def entries_of(
-    shots: Sequence[Shot], calibration: Calibration, *, depth_units_per_m: float
-) -> list[RgbdEntry]:
-    """Return the entries of shots, all seen by one camera as large as the first readable colour image.
-
-    Raises:
-        SourceError: No colour image can be read, or they are not of the calibration's size.
-    """
-    camera = _camera_of(shots, calibration)
-    return [
-        RgbdEntry(
-            shot.stamp_ns,
-            ImageFiles(shot.colour, shot.depth, shot.depth_stamp_ns, depth_units_per_m),
-            camera,
-        )
-        for shot in shots
-    ]
-
-
-def _camera_of(shots: Sequence[Shot], calibration: Calibration) -> PinholeCamera:
+def _camera_of(pairs: Sequence[FramePair], calibration: Calibration) -> PinholeCamera:
     first_reason = ""
-    for shot in shots:
+    for pair in pairs:
         try:
-            height_px, width_px = read_grey(shot.colour).shape
+            height_px, width_px = read_grey(pair.colour).shape
         except FrameError as error:
             first_reason = first_reason or str(error)
         else:
             return calibration.camera(width_px=width_px, height_px=height_px)
-    raise SourceError(f"none of {len(shots)} colour images can be read; the first: {first_reason}")
+    raise SourceError(f"none of {len(pairs)} colour images can be read; the first: {first_reason}")
 
 
 def present(paths: Iterable[Path]) -> list[bool]:

@@ -9,10 +9,11 @@ from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform, inverse
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
+from mapper.sources.base import Log
 from mapper.sources.cloud_files import ENDINGS
 from mapper.sources.config import SourceConfig
 from mapper.sources.scan_stamps import in_order, line_of_each, scan_stamps
-from mapper.sources.scans import ScanEntry, ScanLog
+from mapper.sources.scans import ScanEntry
 from mapper.sources.text import rows, time_order, truth_from
 from mapper.sources.trajectory_files import read_kitti
 from mapper.sources.tum import read_truth
@@ -71,7 +72,7 @@ def scan_log(
     config: SourceConfig,
     T_posed_lidar: Transform | None = None,
     notes: Iterable[str] = (),
-) -> ScanLog:
+) -> Log:
     """Return the log of some clouds, in time order.
 
     Args:
@@ -95,13 +96,17 @@ def scan_log(
         _chosen(path, config.truth_file) or truth_file, files, stamps_ns, T_posed_lidar
     )
     order, order_notes = time_order(stamps_ns, what="scans")
-    return ScanLog(
+    return Log(
         path=path,
         name=path.resolve().name,
         kind=kind,
+        sensor="lidar",
+        stamps_ns=stamps_ns[order],
+        entry_at=lambda index: ScanEntry(
+            int(stamps_ns[order[index]]), files[order[index]], config.cloud_scale
+        ),
         truth=truth,
         notes=[*notes, *stamp_notes, *order_notes, *truth_notes],
-        scans=[ScanEntry(int(stamps_ns[i]), files[i], config.cloud_scale) for i in order],
     )
 
 

@@ -1,19 +1,17 @@
-"""What LiDAR logs made of cloud files share: the scans themselves, and the log of them."""
+"""The scans of LiDAR logs that are made of cloud files."""
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mapper.core.frames import Scan, Sensor
-from mapper.core.trajectory import Trajectory
-from mapper.sources.base import Accelerations, FrameRef, ImageFiles
+from mapper.core.frames import Scan
+from mapper.sources.base import ImageFiles
 from mapper.sources.cloud_files import read_cloud
 from mapper.sources.point_times import relative_times_s
 
 
 @dataclass(frozen=True, slots=True)
 class ScanEntry:
-    """One cloud on disk; the body is the LiDAR."""
+    """Cloud file, not read yet; the body is the LiDAR."""
 
     stamp_ns: int
     path: Path
@@ -42,25 +40,3 @@ class ScanEntry:
             FrameError: As ``load``.
         """
         return self.load()
-
-
-@dataclass(slots=True, eq=False)
-class ScanLog:
-    """A log whose frames are cloud files; see :class:`mapper.sources.base.FrameSource`."""
-
-    path: Path
-    name: str
-    kind: str
-    truth: Trajectory | None
-    notes: Sequence[str]
-    scans: Sequence[ScanEntry]
-    sensor: Sensor = "lidar"
-    accelerations: Accelerations | None = None
-    wheels: Trajectory | None = None
-
-    def __len__(self) -> int:
-        return len(self.scans)
-
-    def entries(self) -> Iterator[FrameRef]:
-        """Yield every scan's entry in time order."""
-        yield from self.scans

@@ -10,9 +10,10 @@ from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform
 from mapper.core.timebase import NS_PER_S, Stamps, nearest
 from mapper.core.trajectory import Trajectory
+from mapper.sources.base import Log
 from mapper.sources.calibration import freiburg_camera
 from mapper.sources.config import SourceConfig
-from mapper.sources.rgbd import RgbdLog, Shot, entries_of, find_calibration, present, read_accelerations
+from mapper.sources.rgbd import FramePair, find_calibration, present, rgbd_log
 from mapper.sources.text import (
     parse_numbers,
     parse_stamp,
@@ -38,8 +39,8 @@ def recognise(path: Path) -> bool:
     return (path / "rgb.txt").is_file()
 
 
-def open_log(path: Path, config: SourceConfig) -> RgbdLog:
-    """Open a TUM folder: each colour image with its nearest depth image.
+def read_log(path: Path, config: SourceConfig) -> Log:
+    """Return the log of a TUM folder: each colour image with its nearest depth image.
 
     Raises:
         SourceError: A list is missing, empty or malformed, no two images pair, or the camera is unknown.
@@ -47,7 +48,7 @@ def open_log(path: Path, config: SourceConfig) -> RgbdLog:
     notes: list[str] = []
     colour = _read_list(path, "rgb.txt", notes)
     depth = _read_list(path, "depth.txt", notes)
-    shots = _pair(colour, depth, max_gap_s=config.max_pair_gap_s, path=path, notes=notes)
+    pairs = _paired(colour, depth, max_gap_s=config.max_pair_gap_s, path=path, notes=notes)
     name = _name_of(path)
     calibration, units_per_m = find_calibration(
         path,
@@ -56,15 +57,15 @@ def open_log(path: Path, config: SourceConfig) -> RgbdLog:
         depth_units_per_m=DEPTH_UNITS_PER_M,
     )
     truth, truth_notes = read_truth(path / "groundtruth.txt")
-    accelerations, acceleration_notes = read_accelerations(path)
-    return RgbdLog(
+    return rgbd_log(
+        pairs,
+        calibration,
+        depth_units_per_m=units_per_m,
         path=path,
         name=name,
         kind="tum",
         truth=truth,
-        accelerations=accelerations,
-        notes=[*notes, *truth_notes, *acceleration_notes],
-        images=entries_of(shots, calibration, depth_units_per_m=units_per_m),
+        notes=[*notes, *truth_notes],
     )
 
 
@@ -112,9 +113,9 @@ def _read_list(folder: Path, name: str, notes: list[str]) -> _ImageList:
     return _ImageList(stamps[order], [paths[kept[i]] for i in order])
 
 
-def _pair(
+def _paired(
     colour: _ImageList, depth: _ImageList, *, max_gap_s: float, path: Path, notes: list[str]
-) -> list[Shot]:
+) -> list[FramePair]:
     """Pair each colour image with the nearest depth image, at most ``max_gap_s`` apart."""
     partner, gap_ns = nearest(depth.stamps_ns, colour.stamps_ns)
     paired = np.flatnonzero(gap_ns <= round(max_gap_s * NS_PER_S))
@@ -127,7 +128,7 @@ def _pair(
         without = f"no depth image within {max_gap_s * 1e3:g} ms"
         notes.append(f"{alone} of {len(gap_ns)} colour images have {without}; left out")
     return [
-        Shot(
+        FramePair(
             stamp_ns=int(colour.stamps_ns[i]),
             colour=colour.paths[i],
             depth_stamp_ns=int(depth.stamps_ns[partner[i]]),

@@ -14,7 +14,7 @@ from mapper.core.rotations import quaternion_from_rotation
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, nearest, seconds_text_from_ns
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.atomic import new_folder, write_bytes, write_text
-from mapper.sources.base import Accelerations, FrameRef, FrameSource, Skipped
+from mapper.sources.base import Accelerations, FrameRef, Log, Skipped
 from mapper.sources.calibration_file import calibration_text
 from mapper.sources.images import FINE_UNITS_PER_M, bytes_of, encode_colour, encode_depth
 from mapper.sources.kitti_writing import write_kitti_log
@@ -40,7 +40,7 @@ class _Written:
 
 
 def write_log(
-    source: FrameSource, out: Path, *, kind: LogKind, on_progress: Callable[[int], None] | None = None
+    source: Log, out: Path, *, kind: LogKind, on_progress: Callable[[int], None] | None = None
 ) -> list[Skipped]:
     """Write a log in another format and return the frames that could not be.
 
@@ -65,7 +65,7 @@ def write_log(
         return _write_images_log(source, folder, mbag=mbag, on_progress=on_progress)
 
 
-def left_out(source: FrameSource, kind: LogKind) -> list[str]:
+def left_out(source: Log, kind: LogKind) -> list[str]:
     """Return what of a log a format has no place for, a sentence each."""
     has = {"wheel odometry": source.wheels is not None, "accelerations": source.accelerations is not None}
     no_place: dict[LogKind, list[str]] = {"mbag": ["wheel odometry"], "kitti": ["accelerations"]}
@@ -73,7 +73,7 @@ def left_out(source: FrameSource, kind: LogKind) -> list[str]:
 
 
 def _write_images_log(
-    source: FrameSource,
+    source: Log,
     out: Path,
     *,
     mbag: str | None,
@@ -113,7 +113,7 @@ def _write_images_log(
     return skipped
 
 
-def _camera_of(source: FrameSource) -> PinholeCamera:
+def _camera_of(source: Log) -> PinholeCamera:
     """Return the camera of the first readable frame: one without any is no RGB-D log."""
     if source.sensor == "lidar":
         raise SourceError(f"{source.path}: scans without images; TUM and mbag hold RGB-D frames: --as kitti")
@@ -167,7 +167,7 @@ def _accelerations_text(accelerations: Accelerations, name: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _mbag_text(written: list[_Written], source: FrameSource) -> str:
+def _mbag_text(written: list[_Written], source: Log) -> str:
     lines = [HEADER, f"!dbName: {source.name}"]
     poses = _pose_words(np.array([frame.stamp_ns for frame in written], dtype=np.int64), source.truth)
     for frame, pose in zip(written, poses, strict=True):

@@ -25,7 +25,7 @@ from mapper.odometry.base import FrameResult, Matches
 from mapper.run.folder import Run
 from mapper.run.observers import Step
 from mapper.run.results import RunResults
-from mapper.sources.base import FrameSource
+from mapper.sources.base import Log
 
 _LIVE = "world/live"
 _BODY = f"{_LIVE}/body"
@@ -170,7 +170,7 @@ class LiveRerun:
 
 
 @contextmanager
-def live_recording(target: str, source: FrameSource, config: RerunConfig) -> Iterator[LiveRerun]:
+def live_recording(target: str, source: Log, config: RerunConfig) -> Iterator[LiveRerun]:
     """Yield an observer that logs to a target; a build that fails leaves what it recorded.
 
     Args:

@@ -1,14 +1,14 @@
-"""Streets and yards that do not exist, scanned by a LiDAR whose every motion is known."""
+"""Simulated LiDAR logs: streets and yards, a route through them, and what a LiDAR sees, with exact truth."""
 
 from mapper.simulation.lidar.dense import sample_map
 from mapper.simulation.lidar.log import write_lidar_log
 from mapper.simulation.lidar.scene import OutdoorScene, make_outdoor_scene
 from mapper.simulation.lidar.sensor import render_scan, render_sweep
-from mapper.simulation.lidar.source import SyntheticLidarSource
+from mapper.simulation.lidar.source import LidarSimulator
 
 __all__ = [
+    "LidarSimulator",
     "OutdoorScene",
-    "SyntheticLidarSource",
     "make_outdoor_scene",
     "render_scan",
     "render_sweep",

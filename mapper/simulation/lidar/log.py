@@ -8,7 +8,7 @@ from mapper.core.timebase import seconds_text_from_ns
 from mapper.runtime.atomic import new_folder
 from mapper.runtime.ordered_map import ordered_map
 from mapper.simulation.config import LidarSynthConfig
-from mapper.simulation.lidar.source import SyntheticLidarEntry, SyntheticLidarSource
+from mapper.simulation.lidar.source import LidarSimulator
 from mapper.sources.kitti_writing import save_scan
 from mapper.sources.trajectory_files import write_kitti
 from mapper.sources.wheel_files import write_wheels
@@ -33,26 +33,27 @@ def write_lidar_log(
     Raises:
         SourceError: ``out`` exists, or cannot be written.
     """
-    source = SyntheticLidarSource(config)
+    simulator = LidarSimulator(config)
+    log = simulator.log()
 
-    def save(entry: SyntheticLidarEntry) -> None:
-        save_scan(clouds / f"{entry.index:06d}", entry.load())
+    def save(index: int) -> None:
+        save_scan(clouds / f"{index:06d}", simulator.observe(index))
 
     with new_folder(out) as folder:
         clouds = folder / "velodyne"
         clouds.mkdir()
-        for done, _ in enumerate(ordered_map(save, source.entries(), workers=_WORKERS), start=1):
+        for done, _ in enumerate(ordered_map(save, range(len(log)), workers=_WORKERS), start=1):
             if on_progress is not None:
-                on_progress(done, len(source))
-        times = [seconds_text_from_ns(int(stamp_ns)) for stamp_ns in source.stamps_ns]
+                on_progress(done, len(log))
+        times = [seconds_text_from_ns(stamp_ns) for stamp_ns in log.stamps_ns.tolist()]
         (folder / "times.txt").write_text("\n".join(times) + "\n", encoding="utf-8")
-        write_kitti(folder / "poses.txt", source.truth)
-        if source.wheels is not None:
-            write_wheels(folder, source.wheels, sensor=source.sensor)
-        news = {"wheels"} if config.wheels is None else set()  # without them it says what it always said
+        write_kitti(folder / "poses.txt", simulator.truth)
+        if log.wheels is not None:
+            write_wheels(folder, log.wheels, sensor=log.sensor)
+        unset = {"wheels"} if config.wheels is None else set()  # so that older logs' files keep their bytes
         scene = {
-            "config": config.model_dump(mode="json", exclude=news),
-            "ground": source.scene.ground.as_json(),
-            "solids": source.scene.solids.as_json(),
+            "config": config.model_dump(mode="json", exclude=unset),
+            "ground": simulator.scene.ground.as_json(),
+            "solids": simulator.scene.solids.as_json(),
         }
         (folder / "scene.json").write_text(json.dumps(scene, indent=1) + "\n", encoding="utf-8")

@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 from mapper.core.errors import DataError, FrameError
-from mapper.core.frames import DepthImage, PinholeCamera, RgbdFrame, Scan
+from mapper.core.frames import PinholeCamera, Scan
 from mapper.core.geometry import Transform
 from mapper.sources.base import ImageFiles
-from mapper.sources.images import check_size, encode_colour, encode_depth, scan_of
+from mapper.sources.images import encode_colour, encode_depth
+from mapper.sources.rgbd import RgbdEntry
 from mapper.sources.ros.clouds import scan_from
 from mapper.sources.ros.images import depth_file_of, depth_m_of, image_of
 from mapper.sources.ros.messages import CloudMessage, FileMessage, ImageMessage, Message, decode
@@ -15,7 +16,7 @@ from mapper.sources.ros.recording import Place, Recording, Topic
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """A message that has not been read yet."""
+    """Message that has not been read yet."""
 
     recording: Recording
     topic: Topic
@@ -49,58 +50,34 @@ class Located:
         return message
 
 
-@dataclass(frozen=True, slots=True)
-class RgbdMessages:
-    """A colour and a depth message; the body is the camera."""
+def rgbd_entry(
+    colour: Located, depth: Located, camera: PinholeCamera, *, units_per_m: float, colour_suffix: str
+) -> RgbdEntry:
+    """Return the entry of a colour and a depth message; the body is the camera.
 
-    colour: Located
-    depth: Located
-    camera: PinholeCamera
-    units_per_m: float
-    colour_suffix: str
+    As files the images are what the messages hold where that is a file, else encoded as PNG.
 
-    @property
-    def stamp_ns(self) -> int:
-        """Return the colour image's time."""
-        return self.colour.stamp_ns
-
-    @property
-    def files(self) -> ImageFiles:
-        """Return the images as files: as they are where they are files, else encoded as PNG."""
-        return ImageFiles(
-            _ColourFile(self.colour, self.colour_suffix),
-            _DepthFile(self.depth, self.units_per_m),
-            self.depth.stamp_ns,
-            self.units_per_m,
-        )
-
-    def load(self, *, colour: bool = True) -> RgbdFrame:
-        """Read and decode both images.
-
-        Raises:
-            FrameError: A message is damaged, in an encoding that is not read, or of another size.
-        """
-        image = image_of(self.colour.image(), colour=colour, where=f"{self.colour}")
-        check_size(image.shape, self.camera, f"{self.colour}")
-        return RgbdFrame(self.stamp_ns, image, self._depth_m(), self.camera)
-
-    def scan(self) -> Scan:
-        """Read and decode the depth image alone.
-
-        Raises:
-            FrameError: As ``load``.
-        """
-        return scan_of(self._depth_m(), self.camera, stamp_ns=self.stamp_ns)
-
-    def _depth_m(self) -> DepthImage:
-        depth_m = depth_m_of(self.depth.image(), units_per_m=self.units_per_m, where=f"{self.depth}")
-        check_size(depth_m.shape, self.camera, f"{self.depth}")
-        return depth_m
+    Args:
+        colour: Colour or grey image; its time is the frame's.
+        depth: Depth image, registered to it.
+        camera: Camera of both.
+        units_per_m: 16-bit depth units per metre.
+        colour_suffix: Ending of a colour image's file.
+    """
+    return RgbdEntry(
+        colour.stamp_ns,
+        ImageFiles(
+            _ColourFile(colour, colour_suffix), _DepthFile(depth, units_per_m), depth.stamp_ns, units_per_m
+        ),
+        camera,
+        read_image=lambda in_colour: image_of(colour.image(), colour=in_colour, where=f"{colour}"),
+        read_depth_m=lambda: depth_m_of(depth.image(), units_per_m=units_per_m, where=f"{depth}"),
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class CloudEntry:
-    """A cloud message."""
+    """Point cloud message, not read yet."""
 
     cloud: Located
     T_body_frame: Transform
@@ -138,6 +115,9 @@ class _ColourFile:
     message: Located
     suffix: str
 
+    def __str__(self) -> str:
+        return f"{self.message}"
+
     def read_bytes(self) -> bytes:
         message = self.message.image()
         if isinstance(message, FileMessage):
@@ -152,6 +132,9 @@ class _DepthFile:
     message: Located
     units_per_m: float
     suffix: str = ".png"
+
+    def __str__(self) -> str:
+        return f"{self.message}"
 
     def read_bytes(self) -> bytes:
         message = self.message.image()

@@ -3,10 +3,11 @@
 from pathlib import Path
 
 from mapper.core.errors import SourceError
+from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.recording import Recording
-from mapper.sources.ros.source import MessageLog, log_of
+from mapper.sources.ros.source import recording_log
 
 LOOKED_FOR = ".mcap, .bag (ROS 1), .db3 or a folder of them (ROS 2)"
 
@@ -22,13 +23,13 @@ def recognise(path: Path) -> bool:
     return path.suffix in (*_ENDINGS, _PACKED)
 
 
-def open_log(path: Path, config: SourceConfig) -> MessageLog:
-    """Open a recording as a log.
+def read_log(path: Path, config: SourceConfig) -> Log:
+    """Return the log of a recording.
 
     Raises:
         SourceError: It is damaged beyond reading, or nothing in it can be mapped.
     """
-    return log_of(RecordingReader(open_recording(path)), config)
+    return recording_log(RecordingReader(open_recording(path)), config)
 
 
 def open_recording(path: Path) -> Recording:

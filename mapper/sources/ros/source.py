@@ -1,17 +1,16 @@
-"""MCAP files and ROS bags as logs; see :class:`mapper.sources.base.FrameSource`."""
+"""Logs of MCAP files and ROS bags."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from mapper.core.errors import SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera, Sensor
-from mapper.core.trajectory import Trajectory
-from mapper.sources.base import Accelerations, FrameRef
+from mapper.core.timebase import Stamps
+from mapper.sources.base import FrameRef, Log
 from mapper.sources.calibration import Calibration
 from mapper.sources.config import SourceConfig
 from mapper.sources.images import FINE_UNITS_PER_M
-from mapper.sources.ros.entries import CloudEntry, RgbdMessages
+from mapper.sources.ros.entries import CloudEntry, rgbd_entry
 from mapper.sources.ros.images import MILLIMETRES_PER_M, size_of
 from mapper.sources.ros.index import Series
 from mapper.sources.ros.messages import CameraMessage, FileMessage, ImageMessage, PixelsMessage
@@ -24,41 +23,18 @@ _JPEG_START = b"\xff\xd8"
 _BROWN_CONRADY = ("plumb_bob", "brown_conrady", "rational_polynomial")
 
 
-@dataclass(slots=True, eq=False)
-class MessageLog:
-    """A log whose frames are messages; see :class:`mapper.sources.base.FrameSource`."""
-
-    path: Path
-    name: str
-    kind: str
-    sensor: Sensor
-    truth: Trajectory | None
-    accelerations: Accelerations | None
-    wheels: Trajectory | None
-    notes: Sequence[str]
-    count: int
-    entry: Callable[[int], FrameRef]
-
-    def __len__(self) -> int:
-        return self.count
-
-    def entries(self) -> Iterator[FrameRef]:
-        """Yield every frame's entry in time order."""
-        return map(self.entry, range(self.count))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Frames:
-    """The frames of a log: how many, how to make an entry of each, and the frame of reference of all."""
+    """Frames of a recording: their stamps, how to make an entry of each, and the coordinate frame of all."""
 
     sensor: Sensor
     body: str
-    count: int
-    entry: Callable[[int], FrameRef]
+    stamps_ns: Stamps
+    entry_at: Callable[[int], FrameRef]
     notes: Sequence[str]
 
 
-def log_of(reader: RecordingReader, config: SourceConfig) -> MessageLog:
+def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     """Return a recording as a log; no frame is decoded before its time.
 
     Raises:
@@ -79,17 +55,17 @@ def log_of(reader: RecordingReader, config: SourceConfig) -> MessageLog:
     wheels, wheel_notes = reader.wheels(
         choice.wheels, body=frames.body, config=config.wheels, sensor=frames.sensor
     )
-    return MessageLog(
+    return Log(
         path=recording.path,
         name=recording.path.resolve().stem,
         kind=recording.kind,
         sensor=frames.sensor,
+        stamps_ns=frames.stamps_ns,
+        entry_at=frames.entry_at,
         truth=truth,
         accelerations=accelerations,
         wheels=wheels,
         notes=[*choice.notes, *recording.notes, *frames.notes, *truth_notes, *wheel_notes, *imu_notes],
-        count=frames.count,
-        entry=frames.entry,
     )
 
 
@@ -109,16 +85,16 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
         units_per_m = config.camera.depth_factor
     is_jpeg = isinstance(first_color, FileMessage) and bytes(first_color.data[:2]) == _JPEG_START
 
-    def entry(k: int) -> FrameRef:
-        return RgbdMessages(
-            colour=reader.located(color, int(i[k])),
-            depth=reader.located(depth, int(j[k])),
-            camera=camera,
+    def entry_at(index: int) -> FrameRef:
+        return rgbd_entry(
+            reader.located(color, int(i[index])),
+            reader.located(depth, int(j[index])),
+            camera,
             units_per_m=units_per_m,
             colour_suffix=".jpg" if is_jpeg else ".png",
         )
 
-    return _Frames("rgbd", frame, len(i), entry, notes)
+    return _Frames("rgbd", frame, color.stamps_ns[i], entry_at, notes)
 
 
 def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Frames:
@@ -131,14 +107,13 @@ def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Fr
             f"{reader.recording.path}: source.body_frame={body}: tf does not connect it to the clouds' "
             f"frame {frame}; it tells of {', '.join(reader.tree.frames) or 'no frames'}"
         )
-
     if "optical" in body:
         notes.append(f"points are in {body}, whose z looks forward; source.body_frame can take another")
 
-    def entry(k: int) -> FrameRef:
-        return CloudEntry(reader.located(clouds, int(i[k])), T_body_frame)
+    def entry_at(index: int) -> FrameRef:
+        return CloudEntry(reader.located(clouds, int(i[index])), T_body_frame)
 
-    return _Frames("lidar", body, len(i), entry, notes)
+    return _Frames("lidar", body, clouds.stamps_ns[i], entry_at, notes)
 
 
 def _first_image(reader: RecordingReader, series: Series) -> ImageMessage:

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple, Protocol
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
-from mapper.sources.base import FrameRef, FrameSource, ImageFiles, Skipped
+from mapper.sources.base import FrameRef, ImageFiles, Log, Skipped
 from mapper.sources.images import bytes_of, read_colour, read_depth_m
 from mapper.sources.ros.images import MILLIMETRES_PER_M
 from mapper.sources.ros.topics import TRUTH, WHEELS
@@ -42,7 +42,7 @@ class MessageWriter(Protocol):
 
 
 def write_recording(
-    source: FrameSource, out: Path, *, kind: MessageKind, on_progress: Callable[[int], None] | None = None
+    source: Log, out: Path, *, kind: MessageKind, on_progress: Callable[[int], None] | None = None
 ) -> list[Skipped]:
     """Write a log as one file of ROS messages and return the frames that could not be.
 
@@ -89,7 +89,7 @@ def _writer(out: Path, kind: MessageKind) -> AbstractContextManager[MessageWrite
     return mcap_writer(out)
 
 
-def _first_frame(source: FrameSource) -> RgbdFrame | Scan:
+def _first_frame(source: Log) -> RgbdFrame | Scan:
     reason = "it has no frames"
     for entry in source.entries():
         try:
@@ -100,7 +100,7 @@ def _first_frame(source: FrameSource) -> RgbdFrame | Scan:
 
 
 def _frames(
-    source: FrameSource,
+    source: Log,
     first: RgbdFrame | Scan,
     skipped: list[Skipped],
     on_progress: Callable[[int], None] | None,
@@ -185,7 +185,7 @@ def _camera_info(stamp_ns: int, folder: str, camera: PinholeCamera) -> Written:
     return Written(stamp_ns, f"{folder}/camera_info", "sensor_msgs/msg/CameraInfo", cdr)
 
 
-def _truth(source: FrameSource) -> Iterator[Written]:
+def _truth(source: Log) -> Iterator[Written]:
     from mapper.sources.rosbag_writing import pose_message
 
     if source.truth is not None:
@@ -194,7 +194,7 @@ def _truth(source: FrameSource) -> Iterator[Written]:
             yield Written(stamp_ns, TRUTH, "geometry_msgs/msg/PoseStamped", cdr)
 
 
-def _wheels(source: FrameSource) -> Iterator[Written]:
+def _wheels(source: Log) -> Iterator[Written]:
     from mapper.sources.rosbag_writing import odometry_message
 
     if source.wheels is not None:
@@ -204,7 +204,7 @@ def _wheels(source: FrameSource) -> Iterator[Written]:
             yield Written(stamp_ns, WHEELS, "nav_msgs/msg/Odometry", cdr)
 
 
-def _accelerations(source: FrameSource) -> Iterator[Written]:
+def _accelerations(source: Log) -> Iterator[Written]:
     from mapper.sources.rosbag_writing import imu_message
 
     if (told := source.accelerations) is not None:
