@@ -22,9 +22,9 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 
-from mapper.core.errors import DataError, SourceError
+from mapper.core.errors import DataError
 from mapper.runtime.atomic import atomic_file
-from mapper.sources.ros.recording import BlockRecording, Part, Span, Topic, ros2_name
+from mapper.sources.ros.recording import BlockRecording, Contents, Part, Span, Topic, open_blocks, ros2_name
 from mapper.sources.ros.writing import Written
 
 _MAGIC = b"\x89MCAP0\r\n"
@@ -36,33 +36,19 @@ _CHUNK = struct.Struct(
 _MOST_BY_LZ4 = 255  # a byte of LZ4 repeats no more
 
 
-def is_mcap(path: Path) -> bool:
-    """Tell whether a file begins as MCAP files do."""
-    with path.open("rb") as file:
-        return file.read(len(_MAGIC)) == _MAGIC
-
-
 def open_mcap(path: Path) -> BlockRecording:
     """Return an MCAP file as a recording.
 
     Raises:
         SourceError: The file is no MCAP file, or cannot be read.
     """
-    try:
-        if not is_mcap(path):
-            raise SourceError(f"{path}: does not begin as MCAP files do; is it damaged, or another format?")
-        with path.open("rb") as file:
-            contents = _summarised(file) or _walked(file, path)
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
-    return BlockRecording(
+    return open_blocks(
         path,
         kind="mcap",
-        blocks=contents.blocks,
+        magic=_MAGIC,
+        called="MCAP files",
+        read_contents=lambda file: _summarised(file) or _walked(file, path),
         unpack=_unpacked,
-        split=contents.split,
-        expected=contents.expected,
-        notes=contents.notes,
     )
 
 
@@ -105,13 +91,11 @@ def mcap_writer(path: Path) -> Iterator[McapWriter]:
         writer.finish()
 
 
-class _Contents:
+class _Contents(Contents):
     """What is known of a file: its blocks, and its channels as far as they have been seen."""
 
     def __init__(self) -> None:
-        self.blocks: list[Span] = []
-        self.expected: int | None = None
-        self.notes: list[str] = []
+        super().__init__()
         self._schemas: dict[int, str] = {}
         self._topics: dict[int, Topic] = {}
 
@@ -187,10 +171,7 @@ def _walked(file: BinaryIO, path: Path) -> _Contents:
             contents.blocks.append(Span(at, _RECORD.size + length))
         at = file.seek(at + _RECORD.size + length)
     if not is_whole:
-        contents.notes.append(
-            f"{path.name}: the recording was cut off: no index, and {size - at} of {size} bytes at its end "
-            "are no whole record; read as far as it goes"
-        )
+        contents.note_cut(path, at=at, size=size)
     return contents
 
 

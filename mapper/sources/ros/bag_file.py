@@ -14,20 +14,14 @@ from typing import BinaryIO
 
 import lz4.frame
 
-from mapper.core.errors import DataError, SourceError
+from mapper.core.errors import DataError
 from mapper.core.timebase import NS_PER_S
-from mapper.sources.ros.recording import BlockRecording, Part, Span, Topic, ros2_name
+from mapper.sources.ros.recording import BlockRecording, Contents, Part, Span, Topic, open_blocks, ros2_name
 
 _MAGIC = b"#ROSBAG V2.0\n"
 _LENGTH = struct.Struct("<I")
 _MESSAGE, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 5, 6, 7  # the values of a header's op
 _Fields = Mapping[bytes, bytes]
-
-
-def is_bag(path: Path) -> bool:
-    """Tell whether a file begins as ROS 1 bags do."""
-    with path.open("rb") as file:
-        return file.read(len(_MAGIC)) == _MAGIC
 
 
 def open_bag(path: Path) -> BlockRecording:
@@ -36,31 +30,21 @@ def open_bag(path: Path) -> BlockRecording:
     Raises:
         SourceError: The file is no bag of format 2.0, or cannot be read.
     """
-    try:
-        if not is_bag(path):
-            raise SourceError(f"{path}: does not begin as ROS 1 bags of format 2.0 do; is it damaged?")
-        with path.open("rb") as file:
-            contents = _indexed(file) or _walked(file, path)
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
-    return BlockRecording(
+    return open_blocks(
         path,
         kind="rosbag",
-        blocks=contents.blocks,
+        magic=_MAGIC,
+        called="ROS 1 bags of format 2.0",
+        read_contents=lambda file: _indexed(file) or _walked(file, path),
         unpack=_unpacked,
-        split=contents.split,
-        expected=contents.expected,
-        notes=contents.notes,
     )
 
 
-class _Contents:
+class _Contents(Contents):
     """What is known of a bag: its chunks, and its connections as far as they have been seen."""
 
     def __init__(self) -> None:
-        self.blocks: list[Span] = []
-        self.expected: int | None = None
-        self.notes: list[str] = []
+        super().__init__()
         self._topics: dict[bytes, Topic] = {}
 
     def add_connection(self, fields: _Fields, data: bytes) -> None:
@@ -121,10 +105,7 @@ def _walked(file: BinaryIO, path: Path) -> _Contents:
             if fields.get(b"op") == bytes([_CHUNK]):
                 contents.blocks.append(Span(at, start + length - at))
             at = start + length
-    contents.notes.append(
-        f"{path.name}: the recording was cut off: no index, and {size - at} of {size} bytes at its end "
-        "are no whole record; read as far as it goes"
-    )
+    contents.note_cut(path, at=at, size=size)
     return contents
 
 

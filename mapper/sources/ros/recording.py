@@ -1,13 +1,14 @@
-"""The seam between recorded files and what their messages mean: raw messages, and where each lies."""
+"""Files of recorded messages: raw messages, and where each lies."""
 
 import threading
+from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import BinaryIO, NamedTuple, Protocol
 
-from mapper.core.errors import DataError, FrameError
+from mapper.core.errors import DataError, FrameError, SourceError
 
 _CACHE_BYTES = 64 << 20
 
@@ -97,48 +98,66 @@ class Part(NamedTuple):
     length: int
 
 
+class Contents(ABC):
+    """Blocks of a recording, and the messages in them; a subclass for each format of files.
+
+    Attributes:
+        blocks: Where the blocks lie, in the order of the file.
+        expected: How many messages the file says that it holds, if it says so.
+        notes: What is lost already, a sentence each.
+    """
+
+    def __init__(self) -> None:
+        self.blocks: list[Span] = []
+        self.expected: int | None = None
+        self.notes: list[str] = []
+
+    @abstractmethod
+    def split(self, data: memoryview) -> Iterator[Part]:
+        """Yield the messages of an unpacked block.
+
+        Raises:
+            DataError: It is damaged from here on.
+        """
+
+    def note_cut(self, path: Path, *, at: int, size: int) -> None:
+        """Add a note that a file of ``size`` bytes has no index, and no whole record from ``at`` on."""
+        self.notes.append(
+            f"{path.name}: the recording was cut off: no index, and {size - at} of {size} bytes at its end "
+            "are no whole record; read as far as it goes"
+        )
+
+
 class BlockRecording:
-    """A recording made of blocks that are each stored, compressed and checked on their own."""
+    """Recording made of blocks that are each stored, compressed and checked on their own."""
 
     def __init__(
-        self,
-        path: Path,
-        *,
-        kind: str,
-        blocks: Sequence[Span],
-        unpack: Callable[[bytes], memoryview],
-        split: Callable[[memoryview], Iterator[Part]],
-        expected: int | None,
-        notes: Sequence[str],
+        self, path: Path, *, kind: str, contents: Contents, unpack: Callable[[bytes], memoryview]
     ) -> None:
         """Keep what a format's module has found in a file.
 
         Args:
             path: The file.
             kind: As of :class:`Recording`.
-            blocks: Where the blocks lie, in the order of the file.
+            contents: Its blocks.
             unpack: Returns the bytes of a stored block; DataError if they are damaged.
-            split: Yields the messages of an unpacked block; DataError where it cannot go on.
-            expected: How many messages the file says that it holds, if it says so.
-            notes: What was lost already.
         """
         self.path = path
         self.kind = kind
-        self.notes = list(notes)
-        self._blocks = blocks
+        self.notes = list(contents.notes)
+        self._contents = contents
         self._unpack = unpack
-        self._split = split
-        self._expected = expected
         self._unpacked: OrderedDict[int, memoryview] = OrderedDict()
         self._lock = threading.Lock()
 
     def messages(self) -> Iterator[Recorded]:
         """Yield every message that can be read, in the order of the file."""
         count = damaged = damaged_bytes = 0
-        for number, span in enumerate(self._blocks):
+        blocks, expected = self._contents.blocks, self._contents.expected
+        for number, span in enumerate(blocks):
             try:
                 data = self._load(number)
-                for topic, log_ns, offset, length in self._split(data):
+                for topic, log_ns, offset, length in self._contents.split(data):
                     count += 1
                     place = Place(number, offset, length)
                     yield Recorded(topic, log_ns, place, data[offset : offset + length])
@@ -146,9 +165,9 @@ class BlockRecording:
                 damaged += 1
                 damaged_bytes += span.length
         if damaged:
-            lost = f"{damaged} of {len(self._blocks)} chunks are damaged: {damaged_bytes} bytes"
-            if self._expected is not None:
-                lost += f" with {self._expected - count} of {self._expected} messages"
+            lost = f"{damaged} of {len(blocks)} chunks are damaged: {damaged_bytes} bytes"
+            if expected is not None:
+                lost += f" with {expected - count} of {expected} messages"
             self.notes.append(f"{self.path.name}: {lost} lost")
 
     def read(self, place: Place) -> memoryview:
@@ -175,7 +194,7 @@ class BlockRecording:
         return self._unpacked[number]
 
     def _load(self, number: int) -> memoryview:
-        start, length = self._blocks[number]
+        start, length = self._contents.blocks[number]
         try:
             with self.path.open("rb") as file:
                 file.seek(start)
@@ -183,3 +202,36 @@ class BlockRecording:
         except OSError as error:
             raise DataError(f"cannot be read: {error.strerror}") from None
         return self._unpack(stored)
+
+
+def open_blocks(
+    path: Path,
+    *,
+    kind: str,
+    magic: bytes,
+    called: str,
+    read_contents: Callable[[BinaryIO], Contents],
+    unpack: Callable[[bytes], memoryview],
+) -> BlockRecording:
+    """Return a file as a recording.
+
+    Args:
+        path: The file.
+        kind: As of :class:`Recording`.
+        magic: Bytes that every file of the format begins with.
+        called: The format's files, for messages.
+        read_contents: Finds the blocks of an open file.
+        unpack: As of :class:`BlockRecording`.
+
+    Raises:
+        SourceError: The file does not begin as it should, or cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            if file.read(len(magic)) != magic:
+                raise SourceError(f"{path}: does not begin as {called} do; is it damaged, or another format?")
+            file.seek(0)
+            contents = read_contents(file)
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
+    return BlockRecording(path, kind=kind, contents=contents, unpack=unpack)
