@@ -38,7 +38,7 @@ from mapper.run.results import RunResults, load_results
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_tracking
 from mapper.runtime.progress import SILENT, Progress
 from mapper.runtime.timing import peak_memory_mb
-from mapper.sources.base import FrameSource
+from mapper.sources.base import Log
 
 _FUSE_CONFIGS = frozenset(
     {"octree", "slice", "traversable", "cloud", "mcap", "mesh", "costmap", "rerun", "workers"}
@@ -47,7 +47,7 @@ _TRACKING_STAGES = ("track", "solve", "level")
 
 
 def fuse(
-    source: FrameSource,
+    source: Log,
     run: Run,
     config: BuildConfig,
     *,
@@ -79,7 +79,7 @@ def fuse(
 
 
 def fuse_changed(
-    source: FrameSource,
+    source: Log,
     run: Run,
     changed: StoredTracking | None = None,
     *,
@@ -145,7 +145,7 @@ def _copy_kept_files(folder: Path, new: Path) -> None:
 
 def fuse_into(
     writer: RunWriter,
-    source: FrameSource,
+    source: Log,
     config: BuildConfig,
     progress: Progress,
     *,

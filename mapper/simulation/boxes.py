@@ -1,4 +1,4 @@
-"""Solids of the synthetic world: boxes turned about the vertical, and exact questions about them."""
+"""Solids of the simulated flat: boxes turned about the vertical, and exact distances to them."""
 
 import json
 import math
@@ -77,7 +77,7 @@ class Boxes:
 def write_scene(
     path: Path, boxes: Boxes, config: dict[str, Any], *, moving: Sequence[dict[str, Any]] = ()
 ) -> None:
-    """Write the exact geometry, and what made it, as JSON; ``moving`` only if anything does."""
+    """Write the exact geometry and its configuration as JSON; ``moving`` only if anything moves."""
     scene: dict[str, Any] = {"config": config, "boxes": boxes.as_json()}
     if moving:
         scene["moving"] = list(moving)

@@ -1,4 +1,4 @@
-"""Scene builder: boxes and the textures of their faces."""
+"""Builder of the flat: collects boxes and the texture of each face."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -52,7 +52,7 @@ class Faces:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A piece of furniture's own frame: its middle on the floor, and its turn."""
+    """Frame of a piece of furniture: its middle on the floor, and its turn."""
 
     x_m: float
     y_m: float
@@ -69,7 +69,7 @@ ORIGIN = Place(0.0, 0.0, 0.0)
 
 @dataclass(slots=True)
 class Builder:
-    """The world while it is being furnished."""
+    """Builder of the flat's boxes and faces."""
 
     textures: list[Image] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
@@ -77,7 +77,7 @@ class Builder:
     skins: list[tuple[Skin, ...]] = field(default_factory=list)
 
     def texture(self, image: Image) -> int:
-        """Take an image in and return its index."""
+        """Add an image and return its index."""
         self.textures.append(image)
         return len(self.textures) - 1
 

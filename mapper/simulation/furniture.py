@@ -18,7 +18,7 @@ _BOARD_M = 0.03
 
 @dataclass(frozen=True, slots=True)
 class Studio:
-    """Shared inputs of the furniture builders."""
+    """Materials, random numbers and the builder, which every piece needs."""
 
     builder: Builder
     shop: Workshop

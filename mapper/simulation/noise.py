@@ -1,4 +1,4 @@
-"""Elements of drawn textures: smooth noise, tints and scattered marks."""
+"""Parts of drawn textures: smooth noise, tints and scattered marks."""
 
 import cv2
 import numpy as np

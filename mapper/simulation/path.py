@@ -1,4 +1,4 @@
-"""Camera paths: round the flat, before a desk, fast rotation, or still before a wall."""
+"""Paths of the camera: round the flat, small motions before a desk, turns on the spot, or still at a wall."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ _STILL_S = 20.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """A camera's pose at any time.
+    """Motion of a camera: its pose at any time.
 
     Attributes:
         duration_s: From the first to the last frame.

@@ -1,4 +1,4 @@
-"""The floor plan: rooms in two rows, the ring of doors that joins them, and the way round."""
+"""Floor plan of the flat: rooms in two rows, the doors that join them, and the walking route."""
 
 from dataclasses import dataclass
 
@@ -54,7 +54,7 @@ class Wall:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """Floor areas on which furniture may stand.
+    """Floor plan: rooms, walls and the walking route.
 
     Attributes:
         rooms: In the order in which the route visits them.

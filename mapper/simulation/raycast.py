@@ -1,4 +1,4 @@
-"""Exact images of a scene: what every pixel's ray meets first, and the colour it has there.
+"""Exact images of a scene by ray casting: the first surface on every pixel's ray, and its colour.
 
 Boxes are drawn from near to far. A box is tried only in the 16 × 16 px tiles that its projection
 touches and in which something deeper is still to be seen (hierarchical z-buffer, Greene et al. 1993);
@@ -24,7 +24,7 @@ _NEAR_M = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rendering:
-    """Rendering by an ideal camera.
+    """Image and depth of by an ideal.
 
     Attributes:
         rgb: (H, W, 3) uint8.

@@ -32,7 +32,7 @@ _TRIES = 40
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """A world that can be rendered and queried.
+    """World that can be rendered, with exact geometry.
 
     Attributes:
         boxes: Every solid; ``boxes.occupied`` and ``boxes.signed_distance_m`` are the ground truth of maps.
@@ -130,7 +130,7 @@ def _build_wall(config: SynthConfig, studio: Studio, wall: Wall, *, plan: Plan, 
 def _along_strip(room: Room, wall: Wall, span: tuple[float, float], *, above: bool) -> float:
     """Return where a wall face's left end, seen from inside the room, lies on the room's strip, metres.
 
-    The strip runs along the walls y = y1, x = x0, y = y0, x = x1. ``above`` tells that the room is on
+    The strip runs along the walls y = y1, x = x0, y = y0, x = x1. ``above`` is true where the room is on
     the wall's upper side.
     """
     width, depth = room.x1_m - room.x0_m, room.y1_m - room.y0_m

@@ -1,4 +1,4 @@
-"""Kinect v1 noise: noisy, quantised, incomplete depth and grainy colour made of an exact image."""
+"""Sensor model of a Kinect v1: noisy, quantised, incomplete depth and grainy colour from an exact image."""
 
 import math
 from statistics import NormalDist
@@ -128,8 +128,8 @@ def _unseen(
     edge = depth_m - near > _EDGE_RATIO * depth_m
     chance[edge] = np.maximum(chance[edge], np.float32(_EDGE_CHANCE))
     draws = rng.random(depth_m.shape, dtype=np.float32)
-    unseen: NDArray[np.bool_] = draws < np.float32(dropout_ratio) * chance
-    return unseen
+    is_lost: NDArray[np.bool_] = draws < np.float32(dropout_ratio) * chance
+    return is_lost
 
 
 def _in_shadow(depth_m: DepthImage, focal_px: float) -> NDArray[np.bool_]:

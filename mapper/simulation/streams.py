@@ -6,7 +6,7 @@ import numpy as np
 
 
 class Stream(IntEnum):
-    """Purpose of a random stream; the numbers are part of a seed's meaning."""
+    """Purpose of a stream; a seed's results depend on these numbers."""
 
     PLAN = 0
     SURFACES = 1

@@ -1,4 +1,4 @@
-"""Simulated wheel odometry under a sensor."""
+"""Simulated wheel odometry of a vehicle that carries a sensor."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -23,14 +23,14 @@ def counted(
     sensor: Sensor,
     rng: np.random.Generator,
 ) -> Trajectory:
-    """Return T_odom_body of wheels that carry a body over ground taken as level.
+    """Return T_odom_body of wheel odometry with errors, for a vehicle on what it takes for level ground.
 
-    Wheels of another size than they are taken to be make every way too long or too short, and another
-    distance between them every turn; uneven ground adds a random walk of the heading. Wheels know of no
-    height and no tilt: the body is taken to be mounted as it stood at first.
+    An error of the wheels' size scales every path, an error of their distance scales every turn, and uneven
+    ground adds a random walk of the heading. Wheels measure no height and no tilt: the body keeps the
+    mounting that it has at first.
 
     Args:
-        config: How wrong they are, and how often they are read.
+        config: Size of the errors, and rate of the readings.
         poses: Maps (N,) seconds after the start to (N, 4, 4) exact T_world_body.
         duration_s: Length of the log.
         sensor: What the body is.

@@ -11,7 +11,7 @@ _BOARD_M = 1.6
 
 
 class Workshop:
-    """Hands out skins; every call may give another one."""
+    """Maker of skins; every call may return another one."""
 
     def __init__(self, builder: Builder, rng: np.random.Generator, *, px_per_m: float) -> None:
         self._builder, self._rng, self._px_per_m = builder, rng, px_per_m

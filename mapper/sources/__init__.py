@@ -25,7 +25,7 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> Log:
     Args:
         path: Folder of a TUM, Poznań, 7-Scenes, Redwood or KITTI log or of clouds, an mbag file or its
             folder, an MCAP file, or a ROS bag.
-        config: Selection, pairing, camera, and what a folder of clouds does not tell by itself.
+        config: Selection, pairing, camera, and what the files of a log do not state.
 
     Raises:
         SourceError: Nothing is there, no format fits, the log is malformed or nothing of it is selected.

@@ -1,4 +1,4 @@
-"""The seam between recorded logs and everything else."""
+"""Recorded logs, whatever their format: frames that are not read yet, and what else a log holds."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from mapper.core.errors import SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
+from mapper.sources.config import CameraConfig
 
 _Distortion = tuple[float, float, float, float, float]
 
@@ -47,6 +48,12 @@ class Calibration:
             )
         numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px)
         return PinholeCamera(width_px, height_px, *numbers, distortion=self.distortion)
+
+
+def configured(camera: CameraConfig) -> Calibration:
+    """Return the intrinsics that a configuration sets."""
+    numbers = (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px)
+    return Calibration("source.camera", *numbers, distortion=camera.distortion)
 
 
 _VGA = (640, 480)

@@ -16,7 +16,7 @@ from mapper.sources.base import Accelerations, FrameRef, ImageFiles, Log, Sessio
 _Stamped = TypeVar("_Stamped", Trajectory, Accelerations)
 
 _PAUSE_NS = NS_PER_S
-"""Time between two logs whose own stamps do not tell which came first."""
+"""Time between two logs whose own stamps are not in order."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -163,7 +163,7 @@ def _decoded(data: bytes, flags: int, where: str) -> NDArray[np.uint8] | NDArray
 
 
 def _check_whole(data: bytes) -> None:
-    """OpenCV reports a truncated file on stderr only, so look for the end marker first."""
+    """Refuse a file without its end marker: OpenCV reports truncation on stderr only."""
     tail = data.rstrip(b"\0")[-64:]
     if data.startswith(_JPEG_START) and _JPEG_END not in tail:
         raise DataError("truncated JPEG: it ends before its end marker")

@@ -20,12 +20,12 @@ from mapper.sources.ros.source import recording_log
 from mapper.sources.selection import selected
 
 _GAP_PERIODS = 3.0
-"""A pause of as many usual periods is a gap."""
+"""Median periods that a pause must exceed to be a gap."""
 
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """How messages or frames follow each other.
+    """Rate and gaps of messages or frames.
 
     Attributes:
         count: How many there are.
@@ -46,7 +46,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class TopicFacts:
-    """A topic of a recording."""
+    """Topic of a recording."""
 
     name: str
     type: str
@@ -56,18 +56,18 @@ class TopicFacts:
 
 @dataclass(frozen=True, slots=True)
 class LogFacts:
-    """What can be mapped of a log.
+    """Facts of a log that can be mapped.
 
     Attributes:
         name: What the log calls itself.
         kind: Which format it is in.
         sensor: "rgbd" or "lidar".
         frames: How its frames follow each other.
-        content: What the first frame that can be read is, in words.
+        content: The first frame that can be read, in words.
         calibration: The camera, in words; None of a LiDAR.
         truth: What truth there is, in words; None without.
         wheels: How the readings of its wheels follow each other; None without.
-        wheels_path_m: How far they drove.
+        wheels_path_m: Length of their path, metres.
         readings: How many accelerations there are.
         notes: What opening it had to leave out or assume.
     """
@@ -87,7 +87,7 @@ class LogFacts:
 
 @dataclass(frozen=True, slots=True)
 class Inspection:
-    """What is in a log.
+    """Facts of a log, and of a recording's topics.
 
     Attributes:
         path: What was opened.
@@ -119,7 +119,7 @@ def inspect_log(path: Path, config: SourceConfig) -> Inspection:
 
 
 def timing_of(stamps_ns: Stamps) -> Timing:
-    """Return how one or more stamps follow each other, whatever their order."""
+    """Return rate and gaps of one or more stamps in any order."""
     ordered_ns = np.sort(stamps_ns)
     apart_s = np.diff(ordered_ns) / NS_PER_S
     usual_s = float(np.median(apart_s)) if len(apart_s) else 0.0
@@ -156,7 +156,7 @@ def _facts(source: Log) -> LogFacts:
 
 
 def _first_frame(source: Log) -> tuple[str, str | None]:
-    """Return what the first readable frame is, and its camera's calibration."""
+    """Return the first readable frame and its camera's calibration, in words."""
     reason = "there is none"
     for entry in source.entries():
         try:

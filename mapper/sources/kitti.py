@@ -1,7 +1,7 @@
 """KITTI odometry: velodyne/*.bin with calib.txt, poses.txt and times.txt (Geiger et al. 2012).
 
 The benchmark keeps ``sequences/00/velodyne`` and ``poses/00.txt``; SemanticKITTI and converters of other
-logs put ``poses.txt`` beside ``velodyne``. Where ``calib.txt`` tells where the LiDAR is in the camera, poses
+logs put ``poses.txt`` beside ``velodyne``. Where ``calib.txt`` has the pose of the LiDAR in the camera, poses
 are the camera's; else they are the LiDAR's own.
 """
 

@@ -61,7 +61,7 @@ def write_kitti_log(
 
 
 def save_scan(stem: Path, scan: Scan) -> None:
-    """Write KITTI's records, whose intensities are 0; where points have times, an array of x, y, z and t."""
+    """Write a scan as KITTI's records with intensity 0, or x, y, z and t as an array where it has times."""
     if scan.times_s is None:
         records = np.zeros((len(scan.points_body), 4), dtype="<f4")
         records[:, :3] = scan.points_body

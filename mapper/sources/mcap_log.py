@@ -1,7 +1,7 @@
 """MCAP files as recordings, and messages written to them; the home of the mcap library for reading.
 
-A whole file's summary tells where its chunks lie; where there is none (the recorder was killed, the file was
-cut), the records are walked from the start as far as they go. Either way a damaged chunk costs itself only.
+A whole file's summary has the places of its chunks; where there is none (the recorder was killed, the file
+was cut), the records are walked from the start as far as they go. A damaged chunk costs itself only.
 """
 
 import os
@@ -92,7 +92,7 @@ def mcap_writer(path: Path) -> Iterator[McapWriter]:
 
 
 class _Contents(Contents):
-    """What is known of a file: its blocks, and its channels as far as they have been seen."""
+    """Blocks of a file, and its channels as far as they have been read."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -121,7 +121,7 @@ class _Contents(Contents):
                 self.describe(opcode, bytes(data[start : start + length]))
 
     def describe(self, opcode: int, record: bytes) -> None:
-        """Learn of a schema or a channel."""
+        """Keep a schema or a channel."""
         stream = ReadDataStream(BytesIO(record))
         try:
             if opcode == Opcode.SCHEMA:
@@ -133,7 +133,7 @@ class _Contents(Contents):
 
 
 def _summarised(file: BinaryIO) -> _Contents | None:
-    """Return what the summary at the end of a whole file tells; None without one."""
+    """Return the contents by the summary at the end of a whole file; None without one."""
     try:
         summary = make_reader(file).get_summary()
     except (McapError, OSError, ValueError, struct.error):
@@ -155,7 +155,7 @@ def _summarised(file: BinaryIO) -> _Contents | None:
 
 
 def _walked(file: BinaryIO, path: Path) -> _Contents:
-    """Return what the records tell from the start of a file to where they end or make no sense."""
+    """Return the contents by the records, from the start of a file to its end or the first damaged one."""
     contents = _Contents()
     size = file.seek(0, os.SEEK_END)
     at = file.seek(len(_MAGIC))
@@ -198,7 +198,7 @@ def _unpacked(stored: bytes) -> memoryview:
 
 
 def _decompressed(packed: memoryview, compression: bytes, size: int) -> memoryview:
-    """Return what a chunk unpacks to; of a damaged one hardly more than the size that it tells."""
+    """Return the unpacked bytes of a chunk; of a damaged one hardly more than the size it states."""
     try:
         if compression == b"":
             return packed

@@ -1,4 +1,4 @@
-"""When each point of a sweep was measured, whatever unit and clock its sensor's driver wrote."""
+"""Times of a sweep's points, in whatever unit and on whatever clock the sensor's driver wrote them."""
 
 from collections.abc import Iterable
 
@@ -46,12 +46,12 @@ def relative_times_s(values: NDArray[np.number], stamp_ns: int) -> NDArray[np.fl
         stamp_ns: Time of the scan, nanoseconds.
 
     Returns:
-        (N,) float32 seconds, negative before the stamp; None where the values tell nothing: none, all the
+        (N,) float32 seconds, negative before the stamp; None where the values are no times: none, all the
         same, not finite, or further apart than a sweep lasts.
     """
     if len(values) == 0:
         return None
-    values = np.ascontiguousarray(values)  # what is looked at thrice is worth gathering
+    values = np.ascontiguousarray(values)  # faster, for they are read three times
     first, last = values.min(), values.max()  # NaN is the least and the largest of all
     if not (np.isfinite(first) and np.isfinite(last)):
         return None

@@ -10,11 +10,11 @@ from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Accelerations, ImageFiles, Log
-from mapper.sources.calibration import Calibration
+from mapper.sources.calibration import Calibration, configured
 from mapper.sources.calibration_file import FILE_NAMES, read_calibration
 from mapper.sources.config import CameraConfig
 from mapper.sources.images import check_size, read_colour, read_depth_m, read_grey, scan_of
-from mapper.sources.text import parse_numbers, parse_stamp, rows, time_order
+from mapper.sources.text import parse_numbers, parse_stamp, table, time_order
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ def rgbd_log(
 
     Args:
         pairs: Its frames, in strictly increasing time.
-        calibration: Intrinsics of all of them; the first colour image that can be read tells their size.
+        calibration: Intrinsics of all of them; the first colour image that can be read gives their size.
         depth_units_per_m: Depth image units per metre.
         path: What was opened: a folder, or a file in the folder of the log.
         name: As of :class:`Log`.
@@ -141,9 +141,7 @@ def find_calibration(
     stated = known if path is None else read_calibration(path)
     units_per_m = depth_units_per_m if stated is None else stated.depth_units_per_m or depth_units_per_m
     if config is not None:
-        numbers = (config.fx_px, config.fy_px, config.cx_px, config.cy_px)
-        set_by_user = Calibration("source.camera", *numbers, distortion=config.distortion)
-        return set_by_user, config.depth_factor or units_per_m
+        return configured(config), config.depth_factor or units_per_m
     if stated is None:
         raise SourceError(
             f"{folder}: intrinsics unknown; put a calibration.toml with fx_px, fy_px, cx_px and cy_px there, "
@@ -189,10 +187,7 @@ def read_accelerations(folder: Path) -> tuple[Accelerations | None, list[str]]:
     if not path.is_file():
         return None, []
     stamps_ns, readings, dropped = [], [], 0
-    for number, words in rows(path):
-        where = f"{path}:{number}"
-        if len(words) != 4:
-            raise SourceError(f"{where}: {len(words)} columns, want 4: stamp ax ay az")
+    for where, words in table(path, "stamp", "ax", "ay", "az"):
         numbers = parse_numbers(words, where=where)
         if np.isfinite(numbers).all():
             stamps_ns.append(parse_stamp(words[0], where=where))

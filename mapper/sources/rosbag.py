@@ -26,7 +26,7 @@ _POINT_TYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")  # PointFiel
 
 
 def decode_ros(topic: Topic, data: memoryview) -> Message:
-    """Return what a ROS message says, in CDR (ROS 2) or in ROS 1's serialisation.
+    """Return a decoded ROS message, of CDR (ROS 2) or of ROS 1's serialisation.
 
     Raises:
         DataError: The message is damaged, or of a type that is not read.
@@ -45,7 +45,7 @@ def decode_ros(topic: Topic, data: memoryview) -> Message:
 
 @cache
 def typestore(encoding: str) -> Any:
-    """Return the standard messages; what a map is made from has not changed since Humble and Noetic."""
+    """Return the standard message types; those that are read have not changed since Humble and Noetic."""
     if encoding != "ros1":
         return get_typestore(Stores.ROS2_HUMBLE)
     store = get_typestore(Stores.ROS1_NOETIC)

@@ -1,4 +1,4 @@
-"""Folders of clouds: which of the files, and where the LiDAR was when it took them."""
+"""LiDAR logs made of folders of clouds: their files, their stamps and the LiDAR's true poses."""
 
 import os
 from collections.abc import Iterable, Sequence
@@ -138,14 +138,14 @@ def _read_truth(
         return read_truth(path)
     T_world_posed = read_kitti(path).T_world_body
     lines = line_of_each(files, len(T_world_posed))
-    told = [] if lines is None else [(i, line) for i, line in enumerate(lines) if line < len(T_world_posed)]
+    posed = [] if lines is None else [(i, line) for i, line in enumerate(lines) if line < len(T_world_posed)]
     notes = []
-    if len(told) < len(files):
-        notes.append(f"{path.name}: {len(T_world_posed)} poses tell of {len(told)} of {len(files)} scans")
-    if not told:
+    if len(posed) < len(files):
+        notes.append(f"{path.name}: {len(T_world_posed)} poses tell of {len(posed)} of {len(files)} scans")
+    if not posed:
         return None, notes
     T_world_lidar = T_world_posed
     if T_posed_lidar is not None:  # the world is where the LiDAR began, as it is for KITTI's camera
         T_world_lidar = inverse(T_posed_lidar) @ T_world_posed @ T_posed_lidar
-    truth, more = truth_from([(int(stamps_ns[i]), T_world_lidar[line]) for i, line in told], what=path.name)
+    truth, more = truth_from([(int(stamps_ns[i]), T_world_lidar[line]) for i, line in posed], what=path.name)
     return truth, [*notes, *more]

@@ -1,4 +1,4 @@
-"""When each cloud of a folder was taken: by its name, by a list beside it, or by its number and a rate."""
+"""Stamps of the clouds in a folder: by their names, by a list beside them, or by their numbers and a rate."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import SourceError
 from mapper.core.timebase import NS_PER_S, Stamps, ns_from_seconds_text
 from mapper.sources.numbered import stamp_at
-from mapper.sources.text import parse_stamp, rows
+from mapper.sources.text import parse_stamp, table
 
 RATE_HZ = 10.0
 
@@ -34,7 +34,7 @@ def in_order(paths: Iterable[Path]) -> list[Path]:
 
 @dataclass(frozen=True, slots=True)
 class Wording:
-    """What the files are called in what is said of their stamps, and what would settle these."""
+    """Words of messages about stamps: what the files are, and the settings for their rate and list."""
 
     files: str = "scans"
     rate: str = "source.rate_hz"
@@ -86,7 +86,7 @@ def numbers_of(files: Sequence[Path]) -> NDArray[np.int64] | None:
 
 
 def line_of_each(files: Sequence[Path], total: int) -> NDArray[np.int64] | None:
-    """Return which of ``total`` lines, from 0, tells of each cloud: as many lines, else the names' numbers.
+    """Return which of ``total`` lines, from 0, belongs to each cloud: as many lines, else the names' numbers.
 
     A number may lie beyond the last line. None where neither pairs them.
     """
@@ -95,10 +95,7 @@ def line_of_each(files: Sequence[Path], total: int) -> NDArray[np.int64] | None:
 
 def _listed(path: Path, files: Sequence[Path], wording: Wording) -> Stamps:
     stamps_ns = []
-    for number, words in rows(path):
-        where = f"{path}:{number}"
-        if len(words) != 1:
-            raise SourceError(f"{where}: {len(words)} columns, want 1: a stamp")
+    for where, words in table(path, "a stamp"):
         stamps_ns.append(_epoch_ns(words[0]) or parse_stamp(words[0], where=where))
     lines = line_of_each(files, len(stamps_ns))
     if lines is None or lines.max() >= len(stamps_ns):

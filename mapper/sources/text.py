@@ -38,6 +38,19 @@ def rows(path: Path, *, separator: str | None = None) -> Iterator[tuple[int, lis
             yield number, [word.strip() for word in line.split(separator)]
 
 
+def table(path: Path, *columns: str) -> Iterator[tuple[str, list[str]]]:
+    """Yield place and words of every row of a file that has these columns; the place is for messages.
+
+    Raises:
+        SourceError: As :func:`read_lines`, or a row has another number of columns.
+    """
+    for number, words in rows(path):
+        where = f"{path}:{number}"
+        if len(words) != len(columns):
+            raise SourceError(f"{where}: {len(words)} columns, want {len(columns)}: {' '.join(columns)}")
+        yield where, words
+
+
 def parse_stamp(text: str, *, where: str) -> int:
     """Return decimal seconds as nanoseconds.
 

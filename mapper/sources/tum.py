@@ -19,7 +19,7 @@ from mapper.sources.text import (
     parse_stamp,
     pose_from_numbers,
     read_lines,
-    rows,
+    table,
     time_order,
     truth_from,
 )
@@ -78,10 +78,7 @@ def read_truth(path: Path) -> tuple[Trajectory | None, list[str]]:
     if not path.is_file():
         return None, []
     poses: list[tuple[int, Transform | None]] = []
-    for number, words in rows(path):
-        where = f"{path}:{number}"
-        if len(words) != 8:
-            raise SourceError(f"{where}: {len(words)} columns, want 8: stamp tx ty tz qx qy qz qw")
+    for where, words in table(path, "stamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw"):
         numbers = parse_numbers(words, where=where)
         if np.isfinite(numbers[0]):
             poses.append((parse_stamp(words[0], where=where), pose_from_numbers(numbers[1:])))
@@ -94,10 +91,8 @@ def _read_list(folder: Path, name: str, notes: list[str]) -> _ImageList:
     """Read ``stamp filename`` lines in time order, without the files that do not exist."""
     path = folder / name
     stamps_ns, paths = [], []
-    for number, words in rows(path):
-        if len(words) != 2:
-            raise SourceError(f"{path}:{number}: {len(words)} columns, want 2: stamp filename")
-        stamps_ns.append(parse_stamp(words[0], where=f"{path}:{number}"))
+    for where, words in table(path, "stamp", "filename"):
+        stamps_ns.append(parse_stamp(words[0], where=where))
         paths.append(folder / words[1])
     if not paths:
         raise SourceError(f"{path}: empty list; want lines of: stamp filename")
@@ -139,7 +134,7 @@ def _paired(
 
 
 def _name_of(path: Path) -> str:
-    """TUM's lists say which recording they come from: ``# file: 'rgbd_dataset_freiburg1_xyz.bag'``."""
+    """Return the recording that TUM's list names, ``# file: 'rgbd_…_xyz.bag'``, or else the folder."""
     for line in read_lines(path / "rgb.txt"):
         if not line.startswith("#"):
             break

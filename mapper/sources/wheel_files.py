@@ -12,7 +12,7 @@ from mapper.core.geometry import Transform, inverse, transform
 from mapper.core.trajectory import Trajectory
 from mapper.sensing.wheel_kinematics import driven
 from mapper.sources.config import WheelsConfig
-from mapper.sources.text import parse_numbers, parse_stamp, pose_from_numbers, rows, time_order
+from mapper.sources.text import parse_numbers, parse_stamp, pose_from_numbers, rows, table, time_order
 from mapper.sources.trajectory_files import read_tum, write_tum
 
 POSES, READINGS = "wheels.txt", "encoders.txt"
@@ -40,7 +40,7 @@ def mounting(config: WheelsConfig, sensor: Sensor) -> Transform:
 
 
 def read_wheels(folder: Path, config: WheelsConfig, *, sensor: Sensor) -> tuple[Trajectory | None, list[str]]:
-    """Return T_odom_body as a log's wheels tell, if its folder has a file of them, and notes.
+    """Return T_odom_body of a log's wheels, if its folder has a file of them, and notes.
 
     Args:
         folder: Where ``wheels.txt`` (``stamp tx ty tz qx qy qz qw`` of the base) or ``encoders.txt``
@@ -68,7 +68,7 @@ def read_wheels_file(
         path: The file.
         config: As above.
         sensor: As above.
-        wheelbase_by: How a user tells the wheelbase.
+        wheelbase_by: How a user sets the wheelbase, for the message.
 
     Raises:
         SourceError: As above.
@@ -88,7 +88,7 @@ def read_wheels_file(
 def write_wheels(folder: Path, wheels: Trajectory, *, sensor: Sensor) -> None:
     """Write T_odom_body as the ``wheels.txt`` of a log, of a base that has its origin in the body's.
 
-    So it reads back without a mounting's being told.
+    It reads back without a configured mounting.
     """
     T_odom_base = wheels.T_world_body @ inverse(LOOKING_FORWARD[sensor])
     write_tum(folder / POSES, replace(wheels, T_world_body=T_odom_base))
@@ -98,10 +98,7 @@ def _integrated(path: Path, wheelbase_m: float | None, wheelbase_by: str) -> tup
     if wheelbase_m is None:
         raise SourceError(f"{path}: the wheelbase is unknown; {wheelbase_by}")
     stamps_ns, readings = [], []
-    for number, words in rows(path):
-        where = f"{path}:{number}"
-        if len(words) != 3:
-            raise SourceError(f"{where}: {len(words)} columns, want 3: stamp path_m steering_rad")
+    for where, words in table(path, "stamp", "path_m", "steering_rad"):
         reading = parse_numbers(words[1:], where=where)
         if not np.isfinite(reading).all() or abs(reading[1]) >= np.pi / 2.0:
             raise SourceError(f"{where}: want a finite path, and a steering angle within ±π/2 rad")

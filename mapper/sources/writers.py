@@ -1,4 +1,4 @@
-"""Logs written in other formats: TUM folders and the thesis's mbag (A12) here, the rest elsewhere."""
+"""Writers of logs in other formats: TUM and mbag (Somlyai, PhD thesis, §3.5) here, the rest elsewhere."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -66,7 +66,7 @@ def write_log(
 
 
 def left_out(source: Log, kind: LogKind) -> list[str]:
-    """Return what of a log a format has no place for, a sentence each."""
+    """Return the parts of a log that a format has no place for, a sentence each."""
     has = {"wheel odometry": source.wheels is not None, "accelerations": source.accelerations is not None}
     no_place: dict[LogKind, list[str]] = {"mbag": ["wheel odometry"], "kitti": ["accelerations"]}
     return [f"{kind} has no place for {what}; left out" for what in no_place.get(kind, []) if has[what]]

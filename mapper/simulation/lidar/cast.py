@@ -1,4 +1,4 @@
-"""Ray casting for LiDAR: the first solid on each ray, with solids sorted into cells of the ground plan.
+"""Ray casting among solids that are sorted into square cells of the ground plan.
 
 A ray visits the cells under it in order (Amanatides & Woo 1987), skips what it passes above or below
 there, and ends where a solid is met before the cell is left. In units of a solid's half sizes the three

@@ -1,4 +1,4 @@
-"""The way round: a closed rounded rectangle, and how the sensor moves along it."""
+"""Route of the simulated LiDAR: a closed rounded rectangle, and the sensor's motion along it."""
 
 import math
 from dataclasses import dataclass
@@ -104,7 +104,7 @@ def _rounded_rectangle(size_m: tuple[float, float], *, radius_m: float) -> Array
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """A sensor's pose at any time.
+    """Motion of a sensor: its pose at any time.
 
     Attributes:
         config: How it moves.

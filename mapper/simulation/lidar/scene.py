@@ -27,7 +27,7 @@ _TRIES = 40
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutdoorScene:
-    """A world that can be scanned.
+    """World that can be scanned.
 
     Attributes:
         solids: Everything that stands on the ground.

@@ -1,4 +1,4 @@
-"""Spinning LiDAR: rings of ranges, with noise, dropouts, point times and motion during the sweep.
+"""Sensor model of a spinning LiDAR: rings of ranges with noise, losses, times and its own motion.
 
 The lidar frame has x forward, y left, z up. A sweep begins looking back and turns clockwise seen from
 above; its stamp is when it begins, so times are never negative.

@@ -15,7 +15,7 @@ from mapper.simulation.lidar.terrain import Ground
 
 
 class Shape(IntEnum):
-    """Shape of a solid inside its box; in units of the box's half sizes all three are unit shapes."""
+    """Shape of a solid in its box; in units of the box's half sizes all three are unit shapes."""
 
     BOX = 0
     CYLINDER = 1
@@ -56,7 +56,7 @@ class Solids:
 
 @dataclass(slots=True)
 class Site:
-    """The world while it is being built.
+    """Builder of the outdoor world.
 
     Attributes:
         ground: What everything stands on.

@@ -1,4 +1,4 @@
-"""Objects of streets and yards, each at a place on the ground; x is along the kerb."""
+"""Objects of streets and yards, each built about a place on the ground; x is along the kerb."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Files with one cloud each, in the formats that people record and exchange them in."""
+"""Readers of cloud files: one point cloud each, in the usual formats."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -28,10 +28,10 @@ ENDINGS = tuple(_READERS)
 
 
 def read_cloud(path: Path, *, scale: float | None = None) -> RawCloud:
-    """Return what a cloud's file says, without missing returns.
+    """Return the cloud of a file, without missing returns.
 
     Args:
-        path: A file; its ending tells the format.
+        path: A file; its ending decides the format.
         scale: Metres per unit of the file. None is 1, and refuses what looks like millimetres.
 
     Raises:

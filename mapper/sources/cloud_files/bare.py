@@ -49,7 +49,7 @@ def read_npy(path: Path) -> Columns:
 def read_text(path: Path) -> Columns:
     """Read lines of x y z …, separated by blanks, commas or semicolons.
 
-    A header with as many names as there are columns tells which are x, y and z; else they are the first.
+    A header with as many names as there are columns says which are x, y and z; else they are the first.
 
     Raises:
         FrameError: It is not text, or its lines are not as many numbers each, three or more.
@@ -69,7 +69,7 @@ def read_text(path: Path) -> Columns:
 
 
 def _header(text: str) -> tuple[list[str], int | None]:
-    """Return the names of the columns, if a header tells, and how many lines come before the first point."""
+    """Return the columns' names, if a header has them, and the number of lines before the first point."""
     names: list[str] = []
     for number, line in enumerate(text.split("\n", _HEADER_LINES)[:_HEADER_LINES]):
         words = line.split()

@@ -1,4 +1,4 @@
-"""What the parsers of cloud files share: their result, lines of text, and how they refuse damage."""
+"""Helpers of the parsers of cloud files: their result, lines of text, and errors about damage."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager

@@ -1,4 +1,4 @@
-"""From a cloud file's columns to points that were measured, in metres around the sensor."""
+"""Measured points, in metres around the sensor, from the columns of a cloud file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +22,7 @@ _SAMPLES = 4096
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawCloud:
-    """The points of a cloud's file that measured something.
+    """Measured points of a cloud file.
 
     Attributes:
         points: (N, 3) float32, metres, sensor frame.

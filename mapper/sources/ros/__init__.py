@@ -1,6 +1,5 @@
 """Logs made of messages: MCAP files and ROS bags, read without ROS.
 
-A recording (``recording``) yields raw messages; ``index`` keeps when and where each lies; ``messages`` says
-what they mean, whichever encoding they came in; ``topics`` chooses what a map is made from; ``source`` is the
-log.
+A recording (``recording``) yields raw messages; ``index`` keeps time and place of each; ``messages`` decodes
+them, whatever their encoding; ``topics`` chooses those that a map is made from; ``source`` makes the log.
 """

@@ -1,6 +1,6 @@
 """ROS 1 bags as recordings: the bag format 2.0 (https://wiki.ros.org/Bags/Format/2.0), whole or cut off.
 
-A bag's index tells where its chunks lie; a bag that was never closed has none, and its records are walked
+A bag's index has the places of its chunks; a bag that was never closed has none, and its records are walked
 from the start as far as they go.
 """
 
@@ -41,15 +41,14 @@ def open_bag(path: Path) -> BlockRecording:
 
 
 class _Contents(Contents):
-    """What is known of a bag: its chunks, and its connections as far as they have been seen."""
+    """Chunks of a bag, and its connections as far as they have been read."""
 
     def __init__(self) -> None:
         super().__init__()
         self._topics: dict[bytes, Topic] = {}
 
     def add_connection(self, fields: _Fields, data: bytes) -> None:
-        told = _fields(data)
-        type_ = ros2_name(told[b"type"].decode())
+        type_ = ros2_name(_fields(data)[b"type"].decode())
         self._topics[fields[b"conn"]] = Topic(fields[b"topic"].decode(), type_, "ros1")
 
     def split(self, data: memoryview) -> Iterator[Part]:
@@ -69,7 +68,7 @@ class _Contents(Contents):
 
 
 def _indexed(file: BinaryIO) -> _Contents | None:
-    """Return what the index of a closed bag tells; None without a whole one."""
+    """Return the contents by the index of a closed bag; None without a whole one."""
     contents = _Contents()
     try:
         size = file.seek(0, os.SEEK_END)
@@ -95,7 +94,7 @@ def _indexed(file: BinaryIO) -> _Contents | None:
 
 
 def _walked(file: BinaryIO, path: Path) -> _Contents:
-    """Return what the records tell from the start of a bag to where they end or make no sense."""
+    """Return the contents by the records, from the start of a bag to its end or the first damaged one."""
     contents = _Contents()
     size = file.seek(0, os.SEEK_END)
     at = len(_MAGIC)

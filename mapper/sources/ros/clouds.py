@@ -1,4 +1,4 @@
-"""Point clouds in messages as scans: structured views of the payload, and what of it was measured."""
+"""Point clouds in messages as scans: structured views of the payload, and its measured points."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -59,7 +59,7 @@ def structured(
 
 
 def scan_from(message: CloudMessage, *, T_body_frame: Transform, with_colours: bool, where: str) -> Scan:
-    """Return what was measured of a cloud, in the body frame.
+    """Return the measured points of a cloud, in the body frame.
 
     Points that are not finite, or at the sensor itself, are what drivers write for missing returns; points
     beyond every sensor's reach are damage.

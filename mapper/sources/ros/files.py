@@ -1,4 +1,4 @@
-"""Which files are recordings, and which of their readers opens them."""
+"""Recordings recognised by their names, and opened by the reader of their format."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The tree of coordinate frames that tf tells."""
+"""Tree of the coordinate frames in tf."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -10,7 +10,7 @@ from mapper.sources.text import pose_from_numbers
 
 
 class FrameTree:
-    """Where frames are in each other, as first told: what is mounted on a robot does not move."""
+    """Tree of coordinate frames, each at its first pose, for what is mounted on a robot does not move."""
 
     def __init__(self, poses: Iterable[PoseMessage]) -> None:
         """Keep the first pose of every frame in its parent."""
@@ -24,7 +24,7 @@ class FrameTree:
 
     @property
     def frames(self) -> Sequence[str]:
-        """Every frame that is told of, in order of name."""
+        """Every frame, in order of name."""
         return sorted(self._parents.keys() | {parent for parent, _ in self._parents.values()})
 
     def find(self, to: str, from_: str) -> Transform | None:

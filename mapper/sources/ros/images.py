@@ -1,4 +1,4 @@
-"""Images in messages as arrays of ours: RGB, grey and depth in metres."""
+"""Images in messages as arrays: RGB, grey and depth in metres."""
 
 import struct
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ MILLIMETRES_PER_M = 1000.0
 
 @dataclass(frozen=True, slots=True)
 class _Encoding:
-    """How colour pixels are stored, and OpenCV's way to RGB and to grey; None is how they are."""
+    """Encoding of colour pixels, and OpenCV's codes for RGB and grey; None leaves them as they are."""
 
     channels: int
     to_rgb: int | None

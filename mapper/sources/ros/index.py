@@ -1,4 +1,4 @@
-"""When and where every message of a recording is, from one pass over it; nothing but headers is decoded."""
+"""Index of a recording: time and place of every message, from one pass that decodes headers only."""
 
 import struct
 from array import array
@@ -23,7 +23,7 @@ _KEPT_BYTES = 32 << 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Series:
-    """The messages of one topic, in the order of the recording.
+    """Messages of one topic, in the order of the recording.
 
     Attributes:
         topic: What they are.
@@ -50,8 +50,8 @@ class Series:
 
 
 @dataclass(slots=True)
-class _Growing:
-    """A topic's messages so far: 40 bytes each, and what is kept."""
+class _SeriesBuilder:
+    """Messages of a topic found so far: 40 bytes each, and those that are kept whole."""
 
     stamps_ns: "array[int]" = field(default_factory=lambda: array("q"))
     log_ns: "array[int]" = field(default_factory=lambda: array("q"))
@@ -62,12 +62,12 @@ class _Growing:
 
 def index_of(recording: Recording) -> Mapping[str, Series]:
     """Return the series of every topic that has messages, by its name."""
-    growing: dict[Topic, _Growing] = {}
+    builders: dict[Topic, _SeriesBuilder] = {}
     room_bytes = _KEPT_BYTES
     for topic, log_ns, place, data in recording.messages():
-        series = growing.get(topic)
+        series = builders.get(topic)
         if series is None:
-            series = growing[topic] = _Growing()
+            series = builders[topic] = _SeriesBuilder()
         try:
             stamp_ns = stamp_of(topic, data) if topic.type in WITH_HEADER else log_ns
         except DataError:
@@ -90,7 +90,7 @@ def index_of(recording: Recording) -> Mapping[str, Series]:
             undated=series.undated,
             kept=series.kept,
         )
-        for topic, series in sorted(growing.items(), key=lambda item: item[0].name)
+        for topic, series in sorted(builders.items(), key=lambda item: item[0].name)
         if series.stamps_ns
     }
 

@@ -1,4 +1,4 @@
-"""What the messages that a map is made from say, in our own terms; ``decode`` reads every encoding."""
+"""Messages that a map is made from, independent of their encoding; ``decode`` reads every encoding."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -84,7 +84,7 @@ class CloudMessage:
         stamp_ns: Time of the cloud.
         frame: Coordinate frame of the points.
         points: (N,) structured view of the message's own bytes; organised rows follow each other.
-        T_frame_points: Pose of the points in ``frame``; only Foxglove's clouds tell one.
+        T_frame_points: Pose of the points in ``frame``; only Foxglove's clouds have one.
     """
 
     stamp_ns: int
@@ -95,12 +95,12 @@ class CloudMessage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseMessage:
-    """Where a frame is in another (TransformStamped, PoseStamped, Odometry and Foxglove's).
+    """Pose of a frame in another (TransformStamped, PoseStamped, Odometry and Foxglove's).
 
     Attributes:
         stamp_ns: When.
-        parent: The frame that it is told in.
-        child: The frame that it is told of; "" where the message does not name it.
+        parent: Frame of reference.
+        child: Frame that has the pose; "" where the message does not name it.
         numbers: x y z in metres and qx qy qz qw of T_parent_child; they may be no pose.
     """
 
@@ -171,7 +171,7 @@ def unpacked(topic: Topic, data: memoryview) -> memoryview:
 
 
 def decode(topic: Topic, data: memoryview) -> Message:
-    """Return what a message says; large payloads are views of ``data``.
+    """Return a decoded message; large payloads are views of ``data``.
 
     Raises:
         DataError: The message is damaged, or of a type or in an encoding that is not read.

@@ -1,4 +1,4 @@
-"""What one pass over a recording finds, and its small topics read in full."""
+"""Reader of a recording: an index from one pass over it, and its poses and accelerations."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -29,7 +29,7 @@ _FARTHEST_M = 1e8  # farther than anything drives: a damaged message
 
 
 class RecordingReader:
-    """A recording and its index, from one pass over it.
+    """Recording and its index, from one pass over it.
 
     Attributes:
         recording: The file.
@@ -53,15 +53,13 @@ class RecordingReader:
         """Return the poses of a topic as those of the body, and notes."""
         if series is None:
             return None, []
-        truth, child, notes = self._told(series)
+        truth, child, notes = self._poses_of(series)
         if truth is None or child in ("", body):
             return truth, notes
         T_child_body = self.tree.find(child, body)
         if T_child_body is None:
-            untied = (
-                f"{series.topic.name}: poses of {child}, which tf does not tie to {body}; taken as its own"
-            )
-            return truth, [*notes, untied]
+            note = f"{series.topic.name}: poses of {child}, which tf does not tie to {body}; taken as its own"
+            return truth, [*notes, note]
         return replace(truth, T_world_body=truth.T_world_body @ T_child_body), notes
 
     def wheels(
@@ -76,7 +74,7 @@ class RecordingReader:
         """
         if series is None:
             return None, []
-        wheels, child, notes = self._told(series)
+        wheels, child, notes = self._poses_of(series)
         if wheels is None or child == body:
             return wheels, notes
         T_base_body = self.tree.find(child, body) if child and config.body_in_base is None else None
@@ -107,16 +105,16 @@ class RecordingReader:
         R_body_imu = np.eye(3) if T_body_imu is None else T_body_imu[:3, :3]
         return Accelerations(stamps_ns, acceleration_imu @ R_body_imu.T), notes
 
-    def _told(self, series: Series) -> tuple[Trajectory | None, str, list[str]]:
-        """Return the poses of a topic in time order, whose they are, and notes."""
+    def _poses_of(self, series: Series) -> tuple[Trajectory | None, str, list[str]]:
+        """Return the poses of a topic in time order, the frame that moves, and notes."""
         order, order_notes = ordered(series)
         poses = list(self._poses(series, order))
         child = next((pose.child.lstrip("/") for pose in poses), "")
-        told, pose_notes = _trajectory(poses, what=series.topic.name)
-        return told, child, [*order_notes, *pose_notes]
+        trajectory, pose_notes = _trajectory(poses, what=series.topic.name)
+        return trajectory, child, [*order_notes, *pose_notes]
 
     def _transforms(self) -> Iterator[PoseMessage]:
-        """Yield what tf tells, the static first: whole, or as much of it as names every frame."""
+        """Yield the transforms of tf, the static first; of many, enough to name every frame."""
         series = [one for one in self.series.values() if one.topic.type in TRANSFORMS]
         for one in sorted(series, key=lambda one: "static" not in one.topic.name):
             yield from self._poses(one, _spread(np.arange(len(one)), most=_MAX_TRANSFORMS))

@@ -15,7 +15,7 @@ _CACHE_BYTES = 64 << 20
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A stream of messages.
+    """Stream of messages.
 
     Attributes:
         name: E.g. "/camera/color/image_raw".
@@ -35,7 +35,7 @@ def ros2_name(type_: str) -> str:
 
 
 class Place(NamedTuple):
-    """Where a message's bytes lie: in which block of the recording, and where in it."""
+    """Place of a message's bytes: the block of the recording, and the bytes within it."""
 
     block: int
     offset: int
@@ -43,7 +43,7 @@ class Place(NamedTuple):
 
 
 class Recorded(NamedTuple):
-    """A raw message, as the recorder wrote it at ``log_ns``."""
+    """Raw message, as the recorder wrote it at ``log_ns``."""
 
     topic: Topic
     log_ns: int
@@ -52,7 +52,7 @@ class Recorded(NamedTuple):
 
 
 class Recording(Protocol):
-    """A file of messages, read once from end to end, and then a message at a time."""
+    """File of messages, read once from end to end, and then a message at a time."""
 
     @property
     def path(self) -> Path:
@@ -90,7 +90,7 @@ class Span(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A message within a block's unpacked bytes."""
+    """Message within a block's unpacked bytes."""
 
     topic: Topic
     log_ns: int

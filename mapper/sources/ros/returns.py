@@ -1,4 +1,4 @@
-"""Which points of a cloud were measured, found and copied in one pass over its bytes."""
+"""Measured points of a cloud, found and copied in one pass over its bytes."""
 
 import numpy as np
 from numba import njit
@@ -12,7 +12,7 @@ def measured(points: NDArray[np.float32], *, farthest_m: float) -> tuple[Points3
 
     Args:
         points: (N, 3) with any strides, metres.
-        farthest_m: From it on, what is told is damage.
+        farthest_m: Distance from which on a point is taken for damage, metres.
 
     Returns:
         Their coordinates, and (M,) rows; None where that is all of them.

@@ -7,7 +7,7 @@ from mapper.core.errors import SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera, Sensor
 from mapper.core.timebase import Stamps
 from mapper.sources.base import FrameRef, Log
-from mapper.sources.calibration import Calibration
+from mapper.sources.calibration import Calibration, configured
 from mapper.sources.config import SourceConfig
 from mapper.sources.images import FINE_UNITS_PER_M
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry
@@ -131,8 +131,7 @@ def _camera(reader: RecordingReader, topics: CameraTopics, config: SourceConfig)
     first = _first_image(reader, topics.color)
     width_px, height_px = size_of(first, where=f"{reader.recording.path}: {name}")
     if config.camera is not None:
-        numbers = (config.camera.fx_px, config.camera.fy_px, config.camera.cx_px, config.camera.cy_px)
-        calibration = Calibration("source.camera", *numbers, distortion=config.camera.distortion)
+        calibration = configured(config.camera)
     else:
         info = topics.info and reader.firsts.get(topics.info.topic.name)
         if topics.info is None or not isinstance(info, CameraMessage):
@@ -164,20 +163,20 @@ def _calibration(info: CameraMessage, *, is_rectified: bool, name: str) -> Calib
 
 
 def _refuse_unregistered(reader: RecordingReader, topics: CameraTopics, camera: PinholeCamera) -> None:
-    """Depth must lie on colour's pixels: sizes must agree and, where both are told, focal lengths."""
+    """Refuse depth that is not on colour's pixels: of another size or, if both are known, focal length."""
     name = topics.depth.topic.name
     first = _first_image(reader, topics.depth)
     size_px = size_of(first, where=f"{reader.recording.path}: {name}")
-    told = f"{size_px[0]}×{size_px[1]} px"
+    found = f"{size_px[0]}×{size_px[1]} px"
     is_same = size_px == (camera.width_px, camera.height_px)
     info = topics.depth_info and reader.firsts.get(topics.depth_info.topic.name)
     if isinstance(info, CameraMessage) and info.K.shape == (9,) and info.K[0] > 0.0:
-        told += f", focal length {info.K[0]:.1f} px"
+        found += f", focal length {info.K[0]:.1f} px"
         is_same &= abs(info.K[0] / camera.fx_px - 1.0) <= _SAME_LENS_RATIO
     if not is_same:
         color = topics.color.topic.name
         raise SourceError(
-            f"{reader.recording.path}: {name} ({told}) is not registered to {color} "
+            f"{reader.recording.path}: {name} ({found}) is not registered to {color} "
             f"({camera.width_px}×{camera.height_px} px, focal length {camera.fx_px:.1f} px); record depth "
             "that is, such as aligned_depth_to_color, or choose it with source.topics.depth=…"
         )

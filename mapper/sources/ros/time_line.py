@@ -80,7 +80,7 @@ def paired(
 
 
 def _sound(series: Series) -> tuple[_Indices, list[str]]:
-    """Return the messages whose stamps go with their neighbours', and a note on the others."""
+    """Return the messages whose stamps agree with their neighbours', and a note on the others."""
     stamps_ns = series.stamps_ns
     is_sound = np.ones(len(stamps_ns), dtype=bool)
     if len(stamps_ns) >= _NEIGHBOURS:
@@ -132,7 +132,7 @@ def _overlap_note(name: str, dropped: int, total: int) -> Sequence[str]:
 
 
 def _end_note(color: Series, depth: Series) -> Sequence[str]:
-    """Say which topic stopped before the other, by the clock of the recorder."""
+    """Return a note if one topic stopped before the other, by the clock of the recorder."""
     first, last = sorted((color, depth), key=lambda series: int(series.log_ns[-1]))
     early_s = (int(last.log_ns[-1]) - int(first.log_ns[-1])) / NS_PER_S
     if early_s <= _STOPPED_S:

@@ -1,4 +1,4 @@
-"""Which topics of a recording a map is made from: the user's choice, or a guess that is told."""
+"""Choice of the topics that a map is made from: the user's, or a guess that a note reports."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ _GRAVITY_MPS2 = (5.0, 20.0)  # an accelerometer feels it, a gyroscope's empty ac
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraTopics:
-    """The topics of an RGB-D camera.
+    """Topics of an RGB-D camera.
 
     Attributes:
         color: Colour or grey images.
@@ -48,14 +48,14 @@ class CameraTopics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Choice:
-    """The topics that are read.
+    """Topics that are read.
 
     Attributes:
-        frames: What is mapped: images, or clouds.
+        frames: Topics that are mapped: images, or clouds.
         imu: Inertial readings, if there are any.
         truth: True poses, if there are any.
         wheels: Wheel odometry, if it was asked for or is called so.
-        notes: What was guessed, a sentence each.
+        notes: Guesses, a sentence each.
     """
 
     frames: CameraTopics | Series
@@ -96,8 +96,8 @@ def choose(
         info = info or next(iter([*_beside(color, infos), *_of_frame(color, infos, firsts), *only]), None)
         depth_info = next((one for one in _beside(depth, infos) if one is not info), None)
         frames = CameraTopics(color, depth, info, depth_info)
-        told = f"colour {color.topic.name}, depth {depth.topic.name}"
-        notes = [_choice_note(told, config.color and config.depth, "color=… and source.topics.depth")]
+        chosen = f"colour {color.topic.name}, depth {depth.topic.name}"
+        notes = [_choice_note(chosen, config.color and config.depth, "color=… and source.topics.depth")]
         if points is not None:
             notes.append(
                 f"there are point clouds too: to map those, source.topics.points={points.topic.name}"
@@ -153,7 +153,7 @@ class _Picker:
         return self._series[wanted]
 
     def refuse_own_runs(self) -> None:
-        """A run's log has clouds and images too, but they are results."""
+        """Refuse the log of a run, whose clouds and images are results."""
         if any(one.topic.type.startswith(_OWN_TYPES) for one in self._series.values()):
             raise SourceError(
                 f"{self._path}: a run that mapper wrote: its trajectory, its map and images without depth; "
@@ -161,8 +161,8 @@ class _Picker:
             )
 
 
-def _choice_note(told: str, chosen: str | None, option: str) -> str:
-    return told if chosen else f"{told}; choose others with source.topics.{option}=…"
+def _choice_note(choice: str, by_user: str | None, option: str) -> str:
+    return choice if by_user else f"{choice}; choose others with source.topics.{option}=…"
 
 
 def _color_rank(name: str) -> tuple[int, ...]:
@@ -177,7 +177,7 @@ def _depth_rank(name: str) -> tuple[int, ...]:
 
 
 def _cloud_rank(name: str) -> tuple[int, ...]:
-    """Prefer what a driver publishes to what was made of it."""
+    """Rank clouds of a driver before clouds that were computed from them."""
     lower = name.lower()
     is_made = any(word in lower for word in ("map", "filter", "ground", "cluster", "registered", "depth"))
     return int(is_made), int(not any(word in lower for word in ("lidar", "velodyne", "ouster", "points")))
