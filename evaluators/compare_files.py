@@ -26,7 +26,7 @@ from evaluators.trajectory import Matched
 from mapper.core.geometry import Array
 from mapper.export.compare_log import PathErrors, write_comparison_log
 from mapper.export.compare_picture import write_path_errors, write_paths, write_registration_errors
-from mapper.export.ros2 import Value
+from mapper.export.ros_messages import Value
 from mapper.run.manifest import library_versions
 from mapper.runtime.atomic import MANIFEST_NAME, write_text
 from mapper.sources.trajectory_files import write_tum

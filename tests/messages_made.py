@@ -8,9 +8,9 @@ from conftest import FIRST_NS, PERIOD_NS, picture
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from mapper.core.frames import PinholeCamera
-from mapper.sources.mcap_log import mcap_writer
-from mapper.sources.ros.writing import Written
-from mapper.sources.rosbag_writing import bag_writer, camera_info_message, image_message
+from mapper.sources.ros.encode_ros import bag_writer, camera_info_message, image_message
+from mapper.sources.ros.log_writing import Written
+from mapper.sources.ros.mcap_file import mcap_writer
 
 CAMERA = PinholeCamera(64, 48, 60.0, 61.0, 31.5, 23.5, (0.1, -0.2, 0.001, 0.002, 0.05))
 COLOR, DEPTH = "/cam/color/image_raw", "/cam/aligned_depth/image_raw"

@@ -11,8 +11,8 @@ from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
-from mapper.sources.ros.writing import Written
-from mapper.sources.rosbag_writing import cloud_message
+from mapper.sources.ros.encode_ros import cloud_message
+from mapper.sources.ros.log_writing import Written
 from mapper.sources.writers import write_log
 
 KINDS = ["mcap", "bag"]

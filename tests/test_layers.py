@@ -12,8 +12,8 @@ MAY_IMPORT = {"mapper": {"mapper"}, "evaluators": {"evaluators", "mapper"}, "cli
 TRIES_THEM_ALL = "mapper/doctor/self_tests.py"
 HOMES = {
     "gtsam": ("mapper/graph/",),
-    "mcap": ("mapper/export/mcap_log.py", "mapper/sources/mcap_log.py"),
-    "rosbags": ("mapper/sources/rosbag.py", "mapper/sources/rosbag_writing.py"),
+    "mcap": ("mapper/export/mcap_log.py", "mapper/sources/ros/"),
+    "rosbags": ("mapper/sources/ros/",),
     "foxglove": ("mapper/export/",),
     "mahotas": ("mapper/features/",),
     "laspy": ("mapper/sources/cloud_files/las.py",),

@@ -7,7 +7,7 @@ import pytest
 import zstandard
 
 from mapper.core.errors import DataError
-from mapper.sources.mcap_log import _unpacked
+from mapper.sources.ros.mcap_file import _unpacked
 
 CONTENT = bytes(range(256)) * 400
 PACK = {b"lz4": lz4.frame.compress, b"zstd": zstandard.compress, b"": bytes}

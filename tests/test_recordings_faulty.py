@@ -12,8 +12,8 @@ from mapper.core.timebase import NS_PER_S
 from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
-from mapper.sources.mcap_log import open_mcap
-from mapper.sources.ros.writing import COLOR, DEPTH, Written
+from mapper.sources.ros.log_writing import COLOR, DEPTH, Written
+from mapper.sources.ros.mcap_file import open_mcap
 from mapper.sources.writers import write_log
 
 Messages = Sequence[Written]

@@ -4,11 +4,11 @@ import pytest
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Scan
 from mapper.core.geometry import exp
-from mapper.sources.ros.clouds import scan_from, structured
+from mapper.sources.ros.cloud_messages import scan_from, structured
+from mapper.sources.ros.decode_ros import decode_ros
+from mapper.sources.ros.encode_ros import cloud_message
 from mapper.sources.ros.messages import CloudMessage
 from mapper.sources.ros.recording import Topic
-from mapper.sources.rosbag import decode_ros
-from mapper.sources.rosbag_writing import cloud_message
 
 STAMP_NS = 1_700_000_000_123_456_789
 TOPIC = Topic("/points", "sensor_msgs/msg/PointCloud2", "cdr")

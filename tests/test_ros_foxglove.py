@@ -13,7 +13,7 @@ from mcap.writer import Writer
 from mapper.core.errors import DataError
 from mapper.core.timebase import NS_PER_S
 from mapper.sources import open_source
-from mapper.sources.ros.foxglove import decode_foxglove, stamp_of
+from mapper.sources.ros.decode_foxglove import decode_foxglove, stamp_of
 from mapper.sources.ros.messages import decode
 from mapper.sources.ros.recording import Topic
 

@@ -6,7 +6,7 @@ import pytest
 from conftest import picture
 
 from mapper.core.errors import FrameError
-from mapper.sources.ros.images import depth_m_of, image_of, is_depth, size_of
+from mapper.sources.ros.image_messages import depth_m_of, image_of, is_depth, size_of
 from mapper.sources.ros.messages import FileMessage, PixelsMessage
 
 RGB, UNITS = picture(3)

@@ -12,8 +12,8 @@ from mapper.core.geometry import exp
 from mapper.core.rotations import quaternion_from_rotation
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig, TopicsConfig
-from mapper.sources.ros.writing import Written
-from mapper.sources.rosbag_writing import cloud_message, imu_message, pose_message
+from mapper.sources.ros.encode_ros import cloud_message, imu_message, pose_message
+from mapper.sources.ros.log_writing import Written
 from mapper.sources.writers import write_log
 
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)

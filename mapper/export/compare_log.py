@@ -10,7 +10,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.export.mcap_log import McapLog
 from mapper.export.palette import TRUTH
 from mapper.export.panels import color_of
-from mapper.export.ros2 import Value
+from mapper.export.ros_messages import Value
 
 
 @dataclass(frozen=True, slots=True, eq=False)

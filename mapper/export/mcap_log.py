@@ -58,7 +58,6 @@ from mapper.core.errors import DataError
 from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import Points, Transform
 from mapper.core.trajectory import Trajectory
-from mapper.export import ros2
 from mapper.export.foxglove_parts import (
     WORLD,
     check_stamp,
@@ -70,6 +69,14 @@ from mapper.export.foxglove_parts import (
     vector_of,
 )
 from mapper.export.palette import ESTIMATE, FACTORS, PLAN, Rgb
+from mapper.export.ros_messages import (
+    OCCUPANCY_GRID_NAME,
+    OCCUPANCY_GRID_SCHEMA,
+    Value,
+    encode_occupancy_grid,
+    encode_record,
+    record_schema,
+)
 from mapper.graph.model import BetweenFactor
 from mapper.octree.slice import OccupancyGrid
 from mapper.runtime.atomic import atomic_file
@@ -288,21 +295,21 @@ class McapLog:
         if topic not in self._channels:
             self._register(
                 topic,
-                ros2.OCCUPANCY_GRID_NAME,
+                OCCUPANCY_GRID_NAME,
                 encoding="ros2msg",
-                text=ros2.OCCUPANCY_GRID_SCHEMA.encode(),
+                text=OCCUPANCY_GRID_SCHEMA.encode(),
             )
-        self._write(topic, ros2.encode_occupancy_grid(grid, stamp_ns=stamp_ns, frame_id=WORLD), stamp_ns)
+        self._write(topic, encode_occupancy_grid(grid, stamp_ns=stamp_ns, frame_id=WORLD), stamp_ns)
 
-    def diagnostics(self, stamp_ns: int, record: Mapping[str, ros2.Value]) -> None:
+    def diagnostics(self, stamp_ns: int, record: Mapping[str, Value]) -> None:
         """Log one frame's numbers and words on /diagnostics."""
         self.record("/diagnostics", "mapper/msg/Diagnostics", stamp_ns, record)
 
-    def loop(self, stamp_ns: int, record: Mapping[str, ros2.Value]) -> None:
+    def loop(self, stamp_ns: int, record: Mapping[str, Value]) -> None:
         """Log one loop candidate and its verdict on /loops."""
         self.record("/loops", "mapper/msg/Loop", stamp_ns, record)
 
-    def record(self, topic: str, schema: str, stamp_ns: int, record: Mapping[str, ros2.Value]) -> None:
+    def record(self, topic: str, schema: str, stamp_ns: int, record: Mapping[str, Value]) -> None:
         """Log numbers and words.
 
         Args:
@@ -315,7 +322,7 @@ class McapLog:
             DataError: Another kind of value, or another record than the first.
         """
         check_stamp(stamp_ns)
-        fields = ros2.record_schema(record)
+        fields = record_schema(record)
         if topic not in self._channels:
             self._record_fields[topic] = fields
             self._register(topic, schema, encoding="ros2msg", text=fields.encode())
@@ -324,7 +331,7 @@ class McapLog:
                 f"{topic} at {stamp_ns}: fields {fields.split()}, "
                 f"want those of the first record: {self._record_fields[topic].split()}"
             )
-        self._write(topic, ros2.encode_record(record), stamp_ns)
+        self._write(topic, encode_record(record), stamp_ns)
 
     def _points(
         self,

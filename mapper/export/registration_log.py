@@ -10,7 +10,7 @@ from mapper.core.geometry import Transform, apply
 from mapper.core.timebase import NS_PER_S
 from mapper.export.mcap_log import McapLog
 from mapper.export.palette import ESTIMATE, TRUTH
-from mapper.export.ros2 import Value
+from mapper.export.ros_messages import Value
 
 
 def write_registration_log(

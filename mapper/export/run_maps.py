@@ -14,8 +14,8 @@ from mapper.octree.octomap_file import read_map
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.sources.cloud_files.ply import read_ply
-from mapper.sources.mcap_log import open_mcap
 from mapper.sources.ros.frame_tree import FrameTree
+from mapper.sources.ros.mcap_file import open_mcap
 from mapper.sources.ros.messages import CameraMessage, FileMessage, decode
 
 

@@ -40,7 +40,7 @@ def open_recording(path: Path) -> Recording:
     """
     if not path.is_dir():
         return _opened(path)
-    from mapper.sources.ros.bag_folder import JoinedRecording
+    from mapper.sources.ros.ros2_bag import JoinedRecording
 
     parts: list[Recording] = []
     lost: list[str] = []
@@ -57,15 +57,15 @@ def open_recording(path: Path) -> Recording:
 def _opened(path: Path) -> Recording:
     # Each reader loads a library that the others do not need.
     if path.suffix == ".mcap":
-        from mapper.sources.mcap_log import open_mcap
+        from mapper.sources.ros.mcap_file import open_mcap
 
         return open_mcap(path)
     if path.suffix == ".bag":
-        from mapper.sources.ros.bag_file import open_bag
+        from mapper.sources.ros.ros1_bag import open_bag
 
         return open_bag(path)
     if path.suffix == ".db3":
-        from mapper.sources.ros.bag_folder import DatabaseRecording
+        from mapper.sources.ros.ros2_bag import DatabaseRecording
 
         return DatabaseRecording(path)
     if path.suffix == _PACKED:
@@ -77,7 +77,7 @@ def _opened(path: Path) -> Recording:
 
 def _parts(folder: Path) -> list[Path]:
     """Return a folder's recordings in sequence, of the first kind that ROS 2 records and that is there."""
-    from mapper.sources.ros.bag_folder import in_sequence
+    from mapper.sources.ros.ros2_bag import in_sequence
 
     for ending in _IN_FOLDERS:
         if parts := [path for path in folder.glob(f"*{ending}") if path.is_file()]:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.timebase import NS_PER_S, Stamps
-from mapper.sources.ros import foxglove
-from mapper.sources.ros.images import size_of
+from mapper.sources.ros import decode_foxglove
+from mapper.sources.ros.image_messages import size_of
 from mapper.sources.ros.messages import READ, SMALL, WITH_HEADER, ImageMessage, Message, decode, unpacked
 from mapper.sources.ros.recording import Place, Recording, Topic
 
@@ -118,7 +118,7 @@ def stamp_of(topic: Topic, data: memoryview) -> int:
         DataError: The message is too short to have one, or is written in an encoding that is not read.
     """
     if topic.encoding not in ("cdr", "ros1"):
-        return foxglove.stamp_of(topic.encoding, data)
+        return decode_foxglove.stamp_of(topic.encoding, data)
     data = unpacked(topic, data)
     if len(data) < 12:
         raise DataError(f"{topic.name}: a message of {len(data)} bytes has no header")

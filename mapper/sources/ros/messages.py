@@ -178,10 +178,10 @@ def decode(topic: Topic, data: memoryview) -> Message:
     """
     try:
         if topic.encoding in ("cdr", "ros1"):
-            from mapper.sources.rosbag import decode_ros  # loads rosbags, which only ROS logs need
+            from mapper.sources.ros.decode_ros import decode_ros  # loads rosbags, which only ROS logs need
 
             return decode_ros(topic, unpacked(topic, data))
-        from mapper.sources.ros.foxglove import decode_foxglove
+        from mapper.sources.ros.decode_foxglove import decode_foxglove
 
         return decode_foxglove(topic, data)
     except (ValueError, KeyError, IndexError, TypeError, OverflowError) as error:

@@ -11,7 +11,7 @@ from mapper.sources.calibration import Calibration, configured
 from mapper.sources.config import SourceConfig
 from mapper.sources.images import FINE_UNITS_PER_M
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry
-from mapper.sources.ros.images import MILLIMETRES_PER_M, size_of
+from mapper.sources.ros.image_messages import MILLIMETRES_PER_M, size_of
 from mapper.sources.ros.index import Series
 from mapper.sources.ros.messages import CameraMessage, FileMessage, ImageMessage, PixelsMessage
 from mapper.sources.ros.reader import RecordingReader

@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.sources.config import TopicsConfig
-from mapper.sources.ros.images import is_depth
+from mapper.sources.ros.image_messages import is_depth
 from mapper.sources.ros.index import Series
 from mapper.sources.ros.messages import (
     CAMERAS,

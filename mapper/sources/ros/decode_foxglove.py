@@ -14,7 +14,7 @@ import numpy as np
 
 from mapper.core.errors import DataError
 from mapper.core.timebase import NS_PER_S
-from mapper.sources.ros.clouds import structured
+from mapper.sources.ros.cloud_messages import structured
 from mapper.sources.ros.messages import (
     CameraMessage,
     CloudMessage,

@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mapper.core.errors import DataError
 from mapper.core.timebase import NS_PER_S
-from mapper.sources.ros.clouds import Field, structured
+from mapper.sources.ros.cloud_messages import Field, structured
 from mapper.sources.ros.messages import (
     CameraMessage,
     CloudMessage,

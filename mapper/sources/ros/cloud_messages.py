@@ -11,7 +11,7 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, apply
 from mapper.sources.point_times import relative_times_s, time_field
 from mapper.sources.ros.messages import CloudMessage
-from mapper.sources.ros.returns import measured
+from mapper.sources.ros.valid_returns import measured
 
 Field = tuple[str, int, str, int]
 """Name, offset in a point, numpy's name of its type with the byte order, and how many there are."""

@@ -24,8 +24,8 @@ from mcap.writer import CompressionType, Writer
 
 from mapper.core.errors import DataError
 from mapper.runtime.atomic import atomic_file
+from mapper.sources.ros.log_writing import Written
 from mapper.sources.ros.recording import BlockRecording, Contents, Part, Span, Topic, open_blocks, ros2_name
-from mapper.sources.ros.writing import Written
 
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")  # opcode, length of what follows
@@ -53,7 +53,7 @@ def open_mcap(path: Path) -> BlockRecording:
 
 
 class McapWriter:
-    """Writes ROS 2 messages; see :class:`mapper.sources.ros.writing.MessageWriter`."""
+    """Writes ROS 2 messages; see :class:`mapper.sources.ros.log_writing.MessageWriter`."""
 
     def __init__(self, writer: Writer) -> None:
         """Write to an open file."""
@@ -74,7 +74,7 @@ class McapWriter:
 
     def _registered(self, topic: str, type_: str) -> int:
         if type_ not in self._schemas:
-            from mapper.sources.rosbag_writing import definition  # rosbags is not needed to read
+            from mapper.sources.ros.encode_ros import definition  # rosbags is not needed to read
 
             text = definition(type_).encode()
             self._schemas[type_] = self._writer.register_schema(type_, "ros2msg", text)

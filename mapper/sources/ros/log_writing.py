@@ -10,7 +10,7 @@ from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
 from mapper.sources.base import FrameRef, ImageFiles, Log, Skipped
 from mapper.sources.images import bytes_of, read_colour, read_depth_m
-from mapper.sources.ros.images import MILLIMETRES_PER_M
+from mapper.sources.ros.image_messages import MILLIMETRES_PER_M
 from mapper.sources.ros.topics import TRUTH, WHEELS
 
 MessageKind = Literal["mcap", "bag"]
@@ -81,10 +81,10 @@ def write_recording(
 
 def _writer(out: Path, kind: MessageKind) -> AbstractContextManager[MessageWriter]:
     if kind == "bag":
-        from mapper.sources.rosbag_writing import bag_writer
+        from mapper.sources.ros.encode_ros import bag_writer
 
         return bag_writer(out)
-    from mapper.sources.mcap_log import mcap_writer
+    from mapper.sources.ros.mcap_file import mcap_writer
 
     return mcap_writer(out)
 
@@ -125,7 +125,7 @@ def _frames(
 
 
 def _cloud(entry: FrameRef) -> Written:
-    from mapper.sources.rosbag_writing import cloud_message
+    from mapper.sources.ros.encode_ros import cloud_message
 
     scan = entry.load()
     if not isinstance(scan, Scan):
@@ -165,28 +165,28 @@ def _depth_of_files(files: ImageFiles) -> Written:
 
 
 def _image(stamp_ns: int, folder: str, pixels: Image | DepthImage, *, encoding: str) -> Written:
-    from mapper.sources.rosbag_writing import image_message
+    from mapper.sources.ros.encode_ros import image_message
 
     cdr = image_message(stamp_ns, pixels, encoding=encoding, frame=_CAMERA_FRAME)
     return Written(stamp_ns, f"{folder}/image_raw", "sensor_msgs/msg/Image", cdr)
 
 
 def _file(stamp_ns: int, topic: str, data: bytes, *, format_: str) -> Written:
-    from mapper.sources.rosbag_writing import compressed_image_message
+    from mapper.sources.ros.encode_ros import compressed_image_message
 
     cdr = compressed_image_message(stamp_ns, data, format_=format_, frame=_CAMERA_FRAME)
     return Written(stamp_ns, topic, "sensor_msgs/msg/CompressedImage", cdr)
 
 
 def _camera_info(stamp_ns: int, folder: str, camera: PinholeCamera) -> Written:
-    from mapper.sources.rosbag_writing import camera_info_message
+    from mapper.sources.ros.encode_ros import camera_info_message
 
     cdr = camera_info_message(stamp_ns, camera, frame=_CAMERA_FRAME)
     return Written(stamp_ns, f"{folder}/camera_info", "sensor_msgs/msg/CameraInfo", cdr)
 
 
 def _truth(source: Log) -> Iterator[Written]:
-    from mapper.sources.rosbag_writing import pose_message
+    from mapper.sources.ros.encode_ros import pose_message
 
     if source.truth is not None:
         for stamp_ns, T in zip(source.truth.stamps_ns.tolist(), source.truth.T_world_body, strict=True):
@@ -195,7 +195,7 @@ def _truth(source: Log) -> Iterator[Written]:
 
 
 def _wheels(source: Log) -> Iterator[Written]:
-    from mapper.sources.rosbag_writing import odometry_message
+    from mapper.sources.ros.encode_ros import odometry_message
 
     if source.wheels is not None:
         body = _LIDAR_FRAME if source.sensor == "lidar" else _CAMERA_FRAME
@@ -205,7 +205,7 @@ def _wheels(source: Log) -> Iterator[Written]:
 
 
 def _accelerations(source: Log) -> Iterator[Written]:
-    from mapper.sources.rosbag_writing import imu_message
+    from mapper.sources.ros.encode_ros import imu_message
 
     if (told := source.accelerations) is not None:
         for stamp_ns, reading in zip(told.stamps_ns.tolist(), told.acceleration_mps2, strict=True):

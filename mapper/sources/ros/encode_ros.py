@@ -14,8 +14,8 @@ from mapper.core.geometry import Array, Transform
 from mapper.core.rotations import quaternion_from_rotation
 from mapper.core.timebase import NS_PER_S
 from mapper.runtime.atomic import atomic_file
-from mapper.sources.ros.writing import Written
-from mapper.sources.rosbag import typestore
+from mapper.sources.ros.decode_ros import typestore
+from mapper.sources.ros.log_writing import Written
 
 _CLOUD_TYPES = {"f4": 7, "u4": 6}  # PointField's constants
 
@@ -138,7 +138,7 @@ def imu_message(stamp_ns: int, acceleration_mps2: Array, *, frame: str) -> bytes
 
 
 class BagWriter:
-    """Writes a ROS 1 bag; see :class:`mapper.sources.ros.writing.MessageWriter`."""
+    """Writes a ROS 1 bag; see :class:`mapper.sources.ros.log_writing.MessageWriter`."""
 
     def __init__(self, writer: Writer) -> None:
         """Write to an open bag."""
