@@ -8,27 +8,26 @@ from conftest import FIRST_NS, PERIOD_NS, picture
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from mapper.core.frames import PinholeCamera
-from mapper.sources.ros.encode_ros import bag_writer, camera_info_message, image_message
-from mapper.sources.ros.log_writing import Written
-from mapper.sources.ros.mcap_file import mcap_writer
+from mapper.sources.ros.encode_ros import SerializedMessage, camera_info_message, image_message
+from mapper.sources.ros.message_writers import message_writer
 
 CAMERA = PinholeCamera(64, 48, 60.0, 61.0, 31.5, 23.5, (0.1, -0.2, 0.001, 0.002, 0.05))
 COLOR, DEPTH = "/cam/color/image_raw", "/cam/aligned_depth/image_raw"
 
 
-def image(stamp_ns: int, topic: str, pixels: np.ndarray, encoding: str, *, frame: str = "optical") -> Written:
-    cdr = image_message(stamp_ns, pixels, encoding=encoding, frame=frame)
-    return Written(stamp_ns, topic, "sensor_msgs/msg/Image", cdr)
+def image(
+    stamp_ns: int, topic: str, pixels: np.ndarray, encoding: str, *, frame: str = "optical"
+) -> SerializedMessage:
+    return image_message(stamp_ns, topic, pixels, encoding=encoding, frame=frame)
 
 
 def camera_info(
     stamp_ns: int, topic: str = "/cam/color/camera_info", camera: PinholeCamera = CAMERA
-) -> Written:
-    cdr = camera_info_message(stamp_ns, camera, frame="optical")
-    return Written(stamp_ns, topic, "sensor_msgs/msg/CameraInfo", cdr)
+) -> SerializedMessage:
+    return camera_info_message(stamp_ns, topic, camera, frame="optical")
 
 
-def shots(n: int = 6, *, first_ns: int = FIRST_NS) -> list[Written]:
+def shots(n: int = 6, *, first_ns: int = FIRST_NS) -> list[SerializedMessage]:
     """RGB-D messages whose depth, in millimetres, comes 5 ms before the colour."""
     messages = []
     for i in range(n):
@@ -42,14 +41,10 @@ def shots(n: int = 6, *, first_ns: int = FIRST_NS) -> list[Written]:
     return messages
 
 
-def write(path: Path, messages: Iterable[Written]) -> Path:
+def write(path: Path, messages: Iterable[SerializedMessage]) -> Path:
     """Write messages in the order given, into whatever the path is named as."""
-    if path.suffix == ".mcap":
-        with mcap_writer(path) as writer:
-            for message in messages:
-                writer.write(message)
-    elif path.suffix == ".bag":
-        with bag_writer(path) as writer:
+    if path.suffix in (".mcap", ".bag"):
+        with message_writer(path, kind=path.suffix[1:]) as writer:
             for message in messages:
                 writer.write(message)
     else:
@@ -57,7 +52,7 @@ def write(path: Path, messages: Iterable[Written]) -> Path:
     return path
 
 
-def write_folder(folder: Writer, messages: Iterable[Written]) -> None:
+def write_folder(folder: Writer, messages: Iterable[SerializedMessage]) -> None:
     """Write messages as ROS 2 records them, a nanosecond apart."""
     from rosbags.typesys import Stores, get_typestore
 

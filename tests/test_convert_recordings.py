@@ -12,7 +12,6 @@ from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.ros.encode_ros import cloud_message
-from mapper.sources.ros.log_writing import Written
 from mapper.sources.writers import write_log
 
 KINDS = ["mcap", "bag"]
@@ -131,10 +130,7 @@ def test_points_keep_their_times(tmp_path):
     times_s = np.linspace(0.0, 0.1, 100, dtype=np.float32)
     points = np.random.default_rng(0).uniform(1.0, 9.0, (100, 3)).astype(np.float32)
     scans = [Scan(FIRST_NS + i * 10**8, points, times_s=times_s) for i in range(2)]
-    messages = [
-        Written(s.stamp_ns, "/points", "sensor_msgs/msg/PointCloud2", cloud_message(s, frame="lidar"))
-        for s in scans
-    ]
+    messages = [cloud_message("/points", scan, frame="lidar") for scan in scans]
     log = write(tmp_path / "log.mcap", messages)
     write_log(open_source(log), tmp_path / "kitti", kind="kitti")
     for source in (open_source(log), open_source(tmp_path / "kitti")):

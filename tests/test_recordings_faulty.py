@@ -12,11 +12,12 @@ from mapper.core.timebase import NS_PER_S
 from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
-from mapper.sources.ros.log_writing import COLOR, DEPTH, Written
+from mapper.sources.ros.encode_ros import SerializedMessage
+from mapper.sources.ros.log_writing import COLOR, DEPTH
 from mapper.sources.ros.mcap_file import open_mcap
 from mapper.sources.writers import write_log
 
-Messages = Sequence[Written]
+Messages = Sequence[SerializedMessage]
 
 
 @pytest.fixture(scope="module")
@@ -24,12 +25,12 @@ def messages(desk_log, tmp_path_factory) -> Messages:
     path = tmp_path_factory.mktemp("faulty") / "desk.mcap"
     write_log(open_source(desk_log), path, kind="mcap")
     return [
-        Written(log_ns, topic.name, topic.type, bytes(data))
+        SerializedMessage(log_ns, topic.name, topic.type, bytes(data))
         for topic, log_ns, _, data in open_mcap(path).messages()
     ]
 
 
-def damaged(messages: Messages) -> list[Written]:
+def damaged(messages: Messages) -> list[SerializedMessage]:
     """Every eighth image is cut short or overwritten."""
     rng = np.random.default_rng(0)
     spoilt = []
@@ -41,13 +42,13 @@ def damaged(messages: Messages) -> list[Written]:
     return spoilt
 
 
-def missing(messages: Messages) -> list[Written]:
+def missing(messages: Messages) -> list[SerializedMessage]:
     """One message in six is not there."""
     rng = np.random.default_rng(1)
     return [message for message in messages if rng.random() > 1 / 6]
 
 
-def set_back(messages: Messages) -> list[Written]:
+def set_back(messages: Messages) -> list[SerializedMessage]:
     """After the first three quarters the clock is a second behind."""
     at = messages[len(messages) * 3 // 4].stamp_ns
     return [
@@ -56,7 +57,7 @@ def set_back(messages: Messages) -> list[Written]:
     ]
 
 
-def stopped(messages: Messages) -> list[Written]:
+def stopped(messages: Messages) -> list[SerializedMessage]:
     """Depth ends after two thirds."""
     at = messages[len(messages) * 2 // 3].stamp_ns
     return [
@@ -64,7 +65,7 @@ def stopped(messages: Messages) -> list[Written]:
     ]
 
 
-def _stamped(message: Written, stamp_ns: int) -> Written:
+def _stamped(message: SerializedMessage, stamp_ns: int) -> SerializedMessage:
     stamp = struct.pack("<iI", *divmod(stamp_ns, NS_PER_S))
     return message._replace(cdr=message.cdr[:4] + stamp + message.cdr[12:])
 

@@ -49,7 +49,7 @@ def test_what_is_written_is_read_bit_by_bit():
         colors=rng.integers(0, 256, (50, 3), dtype=np.uint8),
         times_s=np.linspace(0.0, 0.1, 50, dtype=np.float32),
     )
-    data = memoryview(cloud_message(scan, frame="lidar"))
+    data = memoryview(cloud_message("/points", scan, frame="lidar").cdr)
     message = decode_ros(TOPIC, data)
     again = scan_of(message)
     assert (message.stamp_ns, message.frame) == (STAMP_NS, "lidar")
@@ -60,7 +60,7 @@ def test_what_is_written_is_read_bit_by_bit():
 
 
 def test_the_payload_is_not_copied():
-    data = memoryview(cloud_message(Scan(STAMP_NS, some_points()), frame="lidar"))
+    data = memoryview(cloud_message("/points", Scan(STAMP_NS, some_points()), frame="lidar").cdr)
     points = decode_ros(TOPIC, data).points
     start = np.frombuffer(data, np.uint8).ctypes.data
     assert start <= points.ctypes.data < start + len(data)
@@ -102,7 +102,9 @@ def test_missing_returns_are_dropped_with_their_times():
 def test_a_scan_is_told_in_the_body():
     T_body_frame = exp(np.array([0.1, -0.2, 2.0]), np.array([0.5, 0.0, 1.2]))
     points = some_points()
-    message = decode_ros(TOPIC, memoryview(cloud_message(Scan(STAMP_NS, points), frame="lidar")))
+    message = decode_ros(
+        TOPIC, memoryview(cloud_message("/points", Scan(STAMP_NS, points), frame="lidar").cdr)
+    )
     scan = scan_of(message, T=T_body_frame)
     np.testing.assert_allclose(
         scan.points_body, points @ T_body_frame[:3, :3].T + T_body_frame[:3, 3], atol=1e-5

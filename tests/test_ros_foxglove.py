@@ -13,8 +13,8 @@ from mcap.writer import Writer
 from mapper.core.errors import DataError
 from mapper.core.timebase import NS_PER_S
 from mapper.sources import open_source
+from mapper.sources.ros.decode import decode
 from mapper.sources.ros.decode_foxglove import decode_foxglove, stamp_of
-from mapper.sources.ros.messages import decode
 from mapper.sources.ros.recording import Topic
 
 STAMP = messages.Timestamp(sec=FIRST_NS // NS_PER_S, nsec=FIRST_NS % NS_PER_S)

@@ -12,8 +12,7 @@ from mapper.core.geometry import exp
 from mapper.core.rotations import quaternion_from_rotation
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig, TopicsConfig
-from mapper.sources.ros.encode_ros import cloud_message, imu_message, pose_message
-from mapper.sources.ros.log_writing import Written
+from mapper.sources.ros.encode_ros import SerializedMessage, cloud_message, imu_message, odometry_message
 from mapper.sources.writers import write_log
 
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
@@ -26,8 +25,7 @@ def made(type_, **fields):
 
 def cloud(stamp_ns, topic="/velodyne_points", n=20):
     points = np.random.default_rng(stamp_ns % 1000).uniform(-9.0, 9.0, (n, 3)).astype(np.float32)
-    cdr = cloud_message(Scan(stamp_ns, points), frame="lidar")
-    return Written(stamp_ns, topic, "sensor_msgs/msg/PointCloud2", cdr)
+    return cloud_message(topic, Scan(stamp_ns, points), frame="lidar")
 
 
 def transforms(*told, topic="/tf_static"):
@@ -52,31 +50,17 @@ def transforms(*told, topic="/tf_static"):
             )
         )
     type_ = "tf2_msgs/msg/TFMessage"
-    return Written(FIRST_NS, topic, type_, bytes(ROS2.serialize_cdr(made(type_, transforms=stamped), type_)))
+    return SerializedMessage(
+        FIRST_NS, topic, type_, bytes(ROS2.serialize_cdr(made(type_, transforms=stamped), type_))
+    )
 
 
 def odometry(stamp_ns, T, *, child="base_link", topic="/odom"):
-    pose = ROS2.deserialize_cdr(pose_message(stamp_ns, T, frame="odom"), "geometry_msgs/msg/PoseStamped")
-    zero = made("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-    message = made(
-        "nav_msgs/msg/Odometry",
-        header=pose.header,
-        child_frame_id=child,
-        pose=made("geometry_msgs/msg/PoseWithCovariance", pose=pose.pose, covariance=np.zeros(36)),
-        twist=made(
-            "geometry_msgs/msg/TwistWithCovariance",
-            twist=made("geometry_msgs/msg/Twist", linear=zero, angular=zero),
-            covariance=np.zeros(36),
-        ),
-    )
-    return Written(
-        stamp_ns, topic, "nav_msgs/msg/Odometry", bytes(ROS2.serialize_cdr(message, "nav_msgs/msg/Odometry"))
-    )
+    return odometry_message(stamp_ns, topic, T, frame="odom", child=child)
 
 
 def imu(stamp_ns, acceleration, *, frame="imu", topic="/imu/data"):
-    cdr = imu_message(stamp_ns, np.array(acceleration), frame=frame)
-    return Written(stamp_ns, topic, "sensor_msgs/msg/Imu", cdr)
+    return imu_message(stamp_ns, topic, np.array(acceleration), frame=frame)
 
 
 def opened(path, messages, **config):
@@ -245,12 +229,7 @@ def test_a_camera_of_rectified_images_has_no_distortion(tmp_path):
 
 def test_points_of_a_camera_are_told_to_look_forward(tmp_path):
     points = np.random.default_rng(0).uniform(1.0, 5.0, (20, 3)).astype(np.float32)
-    messages = [
-        Written(
-            t, "/points", "sensor_msgs/msg/PointCloud2", cloud_message(Scan(t, points), frame="depth_optical")
-        )
-        for t in stamps(2)
-    ]
+    messages = [cloud_message("/points", Scan(t, points), frame="depth_optical") for t in stamps(2)]
     notes = opened(tmp_path / "a.mcap", messages).notes
     assert notes[-1].startswith("points are in depth_optical, whose z looks forward")
 

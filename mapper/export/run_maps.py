@@ -14,9 +14,10 @@ from mapper.octree.octomap_file import read_map
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.sources.cloud_files.ply import read_ply
+from mapper.sources.ros.decode import decode
 from mapper.sources.ros.frame_tree import FrameTree
 from mapper.sources.ros.mcap_file import open_mcap
-from mapper.sources.ros.messages import CameraMessage, FileMessage, decode
+from mapper.sources.ros.messages import CameraMessage, FileMessage
 
 
 def maps_of(run: Run) -> Maps:

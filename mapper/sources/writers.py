@@ -19,7 +19,6 @@ from mapper.sources.calibration_file import calibration_text
 from mapper.sources.images import FINE_UNITS_PER_M, bytes_of, encode_colour, encode_depth
 from mapper.sources.kitti_writing import write_kitti_log
 from mapper.sources.mbag import HEADER
-from mapper.sources.ros.log_writing import write_recording
 from mapper.sources.trajectory_files import write_tum
 from mapper.sources.wheel_files import write_wheels
 
@@ -57,6 +56,8 @@ def write_log(
             has room for.
     """
     if kind == "mcap" or kind == "bag":
+        from mapper.sources.ros.log_writing import write_recording  # loads rosbags
+
         return write_recording(source, out, kind=kind, on_progress=on_progress)
     with new_folder(out) as folder:
         if kind == "kitti":

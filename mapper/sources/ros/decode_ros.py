@@ -1,12 +1,10 @@
-"""ROS messages read and written; the home of rosbags, which knows their types and encodings."""
+"""ROS messages decoded, from CDR (ROS 2) or ROS 1's serialisation."""
 
 from collections.abc import Callable, Mapping
-from functools import cache
 from typing import Any
 
 import numpy as np
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mapper.core.errors import DataError
 from mapper.core.timebase import NS_PER_S
@@ -21,12 +19,13 @@ from mapper.sources.ros.messages import (
     PoseMessage,
 )
 from mapper.sources.ros.recording import Topic
+from mapper.sources.ros.typestore import typestore
 
-_POINT_TYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")  # PointField's constants
+_POINT_FIELD_TYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")  # PointField's constants
 
 
 def decode_ros(topic: Topic, data: memoryview) -> Message:
-    """Return a decoded ROS message, of CDR (ROS 2) or of ROS 1's serialisation.
+    """Return a decoded ROS message; its payload is a view of ``data``.
 
     Raises:
         DataError: The message is damaged, or of a type that is not read.
@@ -38,20 +37,9 @@ def decode_ros(topic: Topic, data: memoryview) -> Message:
     deserialize = store.deserialize_ros1 if topic.encoding == "ros1" else store.deserialize_cdr
     try:
         message = deserialize(data, topic.type)
-    except (SerdeError, AssertionError, IndexError, ValueError) as error:  # what damaged lengths lead to
+    except (SerdeError, AssertionError, IndexError, ValueError) as error:  # raised for damaged lengths
         raise DataError(f"a damaged message: {error}") from None
     return read(message)
-
-
-@cache
-def typestore(encoding: str) -> Any:
-    """Return the standard message types; those that are read have not changed since Humble and Noetic."""
-    if encoding != "ros1":
-        return get_typestore(Stores.ROS2_HUMBLE)
-    store = get_typestore(Stores.ROS1_NOETIC)
-    for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):  # rosbags leaves them out of Noetic's
-        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))
-    return store
 
 
 def _pixels(m: Any) -> PixelsMessage:
@@ -81,7 +69,7 @@ def _camera(m: Any) -> CameraMessage:
 def _cloud(m: Any) -> CloudMessage:
     order = ">" if m.is_bigendian else "<"
     fields: list[Field] = [
-        (f.name, f.offset, order + _POINT_TYPES[f.datatype], max(f.count, 1)) for f in m.fields
+        (f.name, f.offset, order + _POINT_FIELD_TYPES[f.datatype], max(f.count, 1)) for f in m.fields
     ]
     points = structured(
         memoryview(m.data),
@@ -100,11 +88,11 @@ def _imu(m: Any) -> ImuMessage:
 
 def _pose_stamped(m: Any) -> list[PoseMessage]:
     pose = getattr(m.pose, "pose", m.pose)  # with or without covariance
-    return [_placed(m.header, getattr(m, "child_frame_id", ""), pose.position, pose.orientation)]
+    return [_pose(m.header, getattr(m, "child_frame_id", ""), pose.position, pose.orientation)]
 
 
 def _transform_stamped(m: Any) -> list[PoseMessage]:
-    return [_placed(m.header, m.child_frame_id, m.transform.translation, m.transform.rotation)]
+    return [_pose(m.header, m.child_frame_id, m.transform.translation, m.transform.rotation)]
 
 
 def _transforms(m: Any) -> list[PoseMessage]:
@@ -126,7 +114,7 @@ _READERS: Mapping[str, Callable[[Any], Message]] = {
 }
 
 
-def _placed(header: Any, child: str, p: Any, q: Any) -> PoseMessage:
+def _pose(header: Any, child: str, p: Any, q: Any) -> PoseMessage:
     numbers = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
     return PoseMessage(_ns(header.stamp), header.frame_id, child, numbers)
 

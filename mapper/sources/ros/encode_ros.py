@@ -1,40 +1,49 @@
-"""ROS messages written: serialised by rosbags, into ROS 1 bags by it too; its second home."""
+"""What a log holds as serialised ROS 2 messages: images, calibrations, clouds, poses and accelerations."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.rosbag1 import Writer
 
 from mapper.core.frames import PinholeCamera, Scan
 from mapper.core.geometry import Array, Transform
-from mapper.core.rotations import quaternion_from_rotation
-from mapper.core.timebase import NS_PER_S
-from mapper.runtime.atomic import atomic_file
-from mapper.sources.ros.decode_ros import typestore
-from mapper.sources.ros.log_writing import Written
+from mapper.sources.ros.typestore import make_header, make_message, make_pose, serialize
 
-_CLOUD_TYPES = {"f4": 7, "u4": 6}  # PointField's constants
+_POINT_FIELD_TYPES = {"f4": 7, "u4": 6}  # PointField's constants
 
 
-def definition(type_: str) -> str:
-    """Return the text that defines a message type and all that it is made of, as ROS 2 has it."""
-    text, _ = typestore("cdr").generate_msgdef(type_, ros_version=2)
-    return str(text)
+class SerializedMessage(NamedTuple):
+    """A ROS 2 message to write.
+
+    Attributes:
+        stamp_ns: Time of the message.
+        topic: Where it is published.
+        type: E.g. "sensor_msgs/msg/Image".
+        cdr: The message as CDR, little-endian.
+    """
+
+    stamp_ns: int
+    topic: str
+    type: str
+    cdr: bytes
 
 
 def image_message(
-    stamp_ns: int, pixels: NDArray[np.uint8] | NDArray[np.float32], *, encoding: str, frame: str
-) -> bytes:
+    stamp_ns: int,
+    topic: str,
+    pixels: NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32],
+    *,
+    encoding: str,
+    frame: str,
+) -> SerializedMessage:
     """Return a sensor_msgs/msg/Image of (H, W, …) pixels."""
     height, width = pixels.shape[:2]
     data = np.ascontiguousarray(pixels).view(np.uint8).reshape(-1)
-    return _encoded(
+    return _serialized(
         "sensor_msgs/msg/Image",
-        _header(stamp_ns, frame),
+        stamp_ns,
+        topic,
+        frame,
         height=height,
         width=width,
         encoding=encoding,
@@ -44,18 +53,22 @@ def image_message(
     )
 
 
-def compressed_image_message(stamp_ns: int, file: bytes, *, format_: str, frame: str) -> bytes:
-    """Return a sensor_msgs/msg/CompressedImage."""
+def compressed_image_message(
+    stamp_ns: int, topic: str, file: bytes, *, format_: str, frame: str
+) -> SerializedMessage:
+    """Return a sensor_msgs/msg/CompressedImage of an image file."""
     data = np.frombuffer(file, np.uint8)
-    return _encoded("sensor_msgs/msg/CompressedImage", _header(stamp_ns, frame), format=format_, data=data)
+    return _serialized("sensor_msgs/msg/CompressedImage", stamp_ns, topic, frame, format=format_, data=data)
 
 
-def camera_info_message(stamp_ns: int, camera: PinholeCamera, *, frame: str) -> bytes:
+def camera_info_message(stamp_ns: int, topic: str, camera: PinholeCamera, *, frame: str) -> SerializedMessage:
     """Return a sensor_msgs/msg/CameraInfo."""
     K = camera.matrix
-    return _encoded(
+    return _serialized(
         "sensor_msgs/msg/CameraInfo",
-        _header(stamp_ns, frame),
+        stamp_ns,
+        topic,
+        frame,
         height=camera.height_px,
         width=camera.width_px,
         distortion_model="plumb_bob",
@@ -65,13 +78,13 @@ def camera_info_message(stamp_ns: int, camera: PinholeCamera, *, frame: str) -> 
         p=np.column_stack([K, np.zeros(3)]).ravel(),
         binning_x=0,
         binning_y=0,
-        roi=_made(
+        roi=make_message(
             "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
         ),
     )
 
 
-def cloud_message(scan: Scan, *, frame: str) -> bytes:
+def cloud_message(topic: str, scan: Scan, *, frame: str) -> SerializedMessage:
     """Return a sensor_msgs/msg/PointCloud2 of a scan's points, times and colours."""
     columns = [(name, "f4") for name in "xyz"]
     columns += [("time", "f4")] if scan.times_s is not None else []
@@ -85,12 +98,20 @@ def cloud_message(scan: Scan, *, frame: str) -> bytes:
         red, green, blue = scan.colors.T.astype(np.uint32)
         points["rgb"] = red << 16 | green << 8 | blue
     fields = [
-        _made("sensor_msgs/msg/PointField", name=name, offset=4 * i, datatype=_CLOUD_TYPES[kind], count=1)
+        make_message(
+            "sensor_msgs/msg/PointField",
+            name=name,
+            offset=4 * i,
+            datatype=_POINT_FIELD_TYPES[kind],
+            count=1,
+        )
         for i, (name, kind) in enumerate(columns)
     ]
-    return _encoded(
+    return _serialized(
         "sensor_msgs/msg/PointCloud2",
-        _header(scan.stamp_ns, frame),
+        scan.stamp_ns,
+        topic,
+        frame,
         height=1,
         width=len(points),
         fields=fields,
@@ -102,88 +123,54 @@ def cloud_message(scan: Scan, *, frame: str) -> bytes:
     )
 
 
-def pose_message(stamp_ns: int, T_frame_body: Transform, *, frame: str) -> bytes:
+def pose_message(stamp_ns: int, topic: str, T_frame_body: Transform, *, frame: str) -> SerializedMessage:
     """Return a geometry_msgs/msg/PoseStamped."""
-    return _encoded("geometry_msgs/msg/PoseStamped", _header(stamp_ns, frame), pose=_pose(T_frame_body))
+    return _serialized("geometry_msgs/msg/PoseStamped", stamp_ns, topic, frame, pose=make_pose(T_frame_body))
 
 
-def odometry_message(stamp_ns: int, T_frame_child: Transform, *, frame: str, child: str) -> bytes:
-    """Return a nav_msgs/msg/Odometry of poses alone: nothing is told of velocities, nor of covariances."""
-    zero = _made("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-    still, unknown = _made("geometry_msgs/msg/Twist", linear=zero, angular=zero), np.zeros(36)
-    return _encoded(
+def odometry_message(
+    stamp_ns: int, topic: str, T_frame_child: Transform, *, frame: str, child: str
+) -> SerializedMessage:
+    """Return a nav_msgs/msg/Odometry of a pose alone: velocities and covariances are zero."""
+    zero, no_covariance = _vector(0.0, 0.0, 0.0), np.zeros(36)
+    return _serialized(
         "nav_msgs/msg/Odometry",
-        _header(stamp_ns, frame),
+        stamp_ns,
+        topic,
+        frame,
         child_frame_id=child,
-        pose=_made("geometry_msgs/msg/PoseWithCovariance", pose=_pose(T_frame_child), covariance=unknown),
-        twist=_made("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=unknown),
+        pose=make_message(
+            "geometry_msgs/msg/PoseWithCovariance", pose=make_pose(T_frame_child), covariance=no_covariance
+        ),
+        twist=make_message(
+            "geometry_msgs/msg/TwistWithCovariance",
+            twist=make_message("geometry_msgs/msg/Twist", linear=zero, angular=zero),
+            covariance=no_covariance,
+        ),
     )
 
 
-def imu_message(stamp_ns: int, acceleration_mps2: Array, *, frame: str) -> bytes:
-    """Return a sensor_msgs/msg/Imu with accelerations only; a first covariance of −1 marks the absent."""
-    x, y, z = acceleration_mps2.tolist()
+def imu_message(stamp_ns: int, topic: str, acceleration_mps2: Array, *, frame: str) -> SerializedMessage:
+    """Return a sensor_msgs/msg/Imu of an acceleration alone: −1 begins the covariance of what is absent."""
     absent = np.array([-1.0, *[0.0] * 8])
-    zero = _made("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-    return _encoded(
+    return _serialized(
         "sensor_msgs/msg/Imu",
-        _header(stamp_ns, frame),
-        orientation=_made("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+        stamp_ns,
+        topic,
+        frame,
+        orientation=make_message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
         orientation_covariance=absent,
-        angular_velocity=zero,
+        angular_velocity=_vector(0.0, 0.0, 0.0),
         angular_velocity_covariance=absent,
-        linear_acceleration=_made("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+        linear_acceleration=_vector(*acceleration_mps2.tolist()),
         linear_acceleration_covariance=np.zeros(9),
     )
 
 
-class BagWriter:
-    """Writes a ROS 1 bag; see :class:`mapper.sources.ros.log_writing.MessageWriter`."""
-
-    def __init__(self, writer: Writer) -> None:
-        """Write to an open bag."""
-        self._writer = writer
-        self._connections: dict[str, Any] = {}
-
-    def write(self, message: Written) -> None:
-        """Append a message, in ROS 1's serialisation."""
-        if message.topic not in self._connections:
-            self._connections[message.topic] = self._writer.add_connection(
-                message.topic, message.type, typestore=typestore("ros1")
-            )
-        data = typestore("cdr").cdr_to_ros1(message.cdr, message.type)
-        self._writer.write(self._connections[message.topic], message.stamp_ns, data)
+def _serialized(type_: str, stamp_ns: int, topic: str, frame: str, **fields: Any) -> SerializedMessage:
+    message = make_message(type_, header=make_header(stamp_ns, frame), **fields)
+    return SerializedMessage(stamp_ns, topic, type_, serialize(message))
 
 
-@contextmanager
-def bag_writer(path: Path) -> Iterator[BagWriter]:
-    """Yield a writer of a ROS 1 bag, compressed by LZ4, that appears whole or not at all."""
-    with atomic_file(path) as part:
-        writer = Writer(part)
-        writer.set_compression(Writer.CompressionFormat.LZ4)
-        with writer:
-            yield BagWriter(writer)
-
-
-def _made(type_: str, **fields: Any) -> Any:
-    return typestore("cdr").types[type_](**fields)
-
-
-def _pose(T_frame_body: Transform) -> Any:
-    x, y, z = T_frame_body[:3, 3].tolist()
-    qx, qy, qz, qw = quaternion_from_rotation(T_frame_body[:3, :3]).tolist()
-    return _made(
-        "geometry_msgs/msg/Pose",
-        position=_made("geometry_msgs/msg/Point", x=x, y=y, z=z),
-        orientation=_made("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
-    )
-
-
-def _header(stamp_ns: int, frame: str) -> Any:
-    sec, nanosec = divmod(stamp_ns, NS_PER_S)
-    stamp = _made("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-    return _made("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
-
-
-def _encoded(type_: str, header: Any, **fields: Any) -> bytes:
-    return bytes(typestore("cdr").serialize_cdr(_made(type_, header=header, **fields), type_))
+def _vector(x: float, y: float, z: float) -> Any:
+    return make_message("geometry_msgs/msg/Vector3", x=x, y=y, z=z)

@@ -9,8 +9,9 @@ from mapper.sources.base import ImageFiles
 from mapper.sources.images import encode_colour, encode_depth
 from mapper.sources.rgbd import RgbdEntry
 from mapper.sources.ros.cloud_messages import scan_from
+from mapper.sources.ros.decode import decode
 from mapper.sources.ros.image_messages import depth_file_of, depth_m_of, image_of
-from mapper.sources.ros.messages import CloudMessage, FileMessage, ImageMessage, Message, decode
+from mapper.sources.ros.messages import CloudMessage, FileMessage, ImageMessage, Message
 from mapper.sources.ros.recording import Place, Recording, Topic
 
 

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError, FrameError
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.sources.ros import decode_foxglove
+from mapper.sources.ros.decode import decode, decompressed
 from mapper.sources.ros.image_messages import size_of
-from mapper.sources.ros.messages import READ, SMALL, WITH_HEADER, ImageMessage, Message, decode, unpacked
+from mapper.sources.ros.messages import READ, SMALL, WITH_HEADER, ImageMessage, Message
 from mapper.sources.ros.recording import Place, Recording, Topic
 
 _NO_STAMP = 1 << 62  # in the year 2116; differences of smaller ones fit into 64 bits
@@ -119,7 +120,7 @@ def stamp_of(topic: Topic, data: memoryview) -> int:
     """
     if topic.encoding not in ("cdr", "ros1"):
         return decode_foxglove.stamp_of(topic.encoding, data)
-    data = unpacked(topic, data)
+    data = decompressed(topic, data)
     if len(data) < 12:
         raise DataError(f"{topic.name}: a message of {len(data)} bytes has no header")
     if topic.encoding == "ros1":  # a sequence number, then seconds and nanoseconds

@@ -7,7 +7,6 @@ was cut), the records are walked from the start as far as they go. A damaged chu
 import os
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
@@ -20,11 +19,8 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Schema
-from mcap.writer import CompressionType, Writer
 
 from mapper.core.errors import DataError
-from mapper.runtime.atomic import atomic_file
-from mapper.sources.ros.log_writing import Written
 from mapper.sources.ros.recording import BlockRecording, Contents, Part, Span, Topic, open_blocks, ros2_name
 
 _MAGIC = b"\x89MCAP0\r\n"
@@ -50,45 +46,6 @@ def open_mcap(path: Path) -> BlockRecording:
         read_contents=lambda file: _summarised(file) or _walked(file, path),
         unpack=_unpacked,
     )
-
-
-class McapWriter:
-    """Writes ROS 2 messages; see :class:`mapper.sources.ros.log_writing.MessageWriter`."""
-
-    def __init__(self, writer: Writer) -> None:
-        """Write to an open file."""
-        self._writer = writer
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
-
-    def write(self, message: Written) -> None:
-        """Append a message; its log time is its stamp."""
-        if message.topic not in self._channels:
-            self._channels[message.topic] = self._registered(message.topic, message.type)
-        self._writer.add_message(
-            self._channels[message.topic],
-            log_time=message.stamp_ns,
-            data=message.cdr,
-            publish_time=message.stamp_ns,
-        )
-
-    def _registered(self, topic: str, type_: str) -> int:
-        if type_ not in self._schemas:
-            from mapper.sources.ros.encode_ros import definition  # rosbags is not needed to read
-
-            text = definition(type_).encode()
-            self._schemas[type_] = self._writer.register_schema(type_, "ros2msg", text)
-        return int(self._writer.register_channel(topic, "cdr", self._schemas[type_]))
-
-
-@contextmanager
-def mcap_writer(path: Path) -> Iterator[McapWriter]:
-    """Yield a writer of an MCAP file that appears whole or not at all."""
-    with atomic_file(path) as part, part.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.LZ4, enable_data_crcs=True)
-        writer.start(profile="ros2", library="mapper")
-        yield McapWriter(writer)
-        writer.finish()
 
 
 class _Contents(Contents):

@@ -1,4 +1,4 @@
-"""Messages that a map is made from, independent of their encoding; ``decode`` reads every encoding."""
+"""Decoded messages, the same for every encoding, and the ROS and Foxglove types that become each of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -6,9 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Transform
-from mapper.sources.ros.recording import Topic
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +82,7 @@ class CloudMessage:
         stamp_ns: Time of the cloud.
         frame: Coordinate frame of the points.
         points: (N,) structured view of the message's own bytes; organised rows follow each other.
-        T_frame_points: Pose of the points in ``frame``; only Foxglove's clouds have one.
+        T_frame_points: Pose of the points in ``frame``; only Foxglove's clouds have another than identity.
     """
 
     stamp_ns: int
@@ -95,12 +93,12 @@ class CloudMessage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseMessage:
-    """Pose of a frame in another (TransformStamped, PoseStamped, Odometry and Foxglove's).
+    """Pose of a coordinate frame in another (TransformStamped, PoseStamped, Odometry and Foxglove's).
 
     Attributes:
-        stamp_ns: When.
-        parent: Frame of reference.
-        child: Frame that has the pose; "" where the message does not name it.
+        stamp_ns: Time of the pose.
+        parent: The frame in which the pose is given.
+        child: The frame whose pose it is; "" where the message does not name it.
         numbers: x y z in metres and qx qy qz qw of T_parent_child; they may be no pose.
     """
 
@@ -112,10 +110,10 @@ class PoseMessage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuMessage:
-    """A reading of an inertial unit.
+    """A reading of an inertial measurement unit (sensor_msgs/Imu).
 
     Attributes:
-        stamp_ns: When.
+        stamp_ns: Time of the reading.
         frame: The unit's frame.
         acceleration_mps2: (3,) specific force: it points up at rest.
     """
@@ -150,39 +148,3 @@ TRANSFORMS = frozenset(
 WITH_HEADER = IMAGES | CAMERAS | CLOUDS | IMUS | POSES | {"foxglove.FrameTransform"}
 READ = WITH_HEADER | TRANSFORMS
 SMALL = IMUS | POSES | TRANSFORMS
-
-_ZSTD = b"\x28\xb5\x2f\xfd"  # how its frames begin, and no CDR message does
-
-
-def unpacked(topic: Topic, data: memoryview) -> memoryview:
-    """Return a message as it was sent; rosbag2 can compress each, which only its metadata.yaml tells.
-
-    Raises:
-        DataError: It cannot be decompressed.
-    """
-    if topic.encoding != "cdr" or data[: len(_ZSTD)] != _ZSTD:
-        return data
-    import zstandard
-
-    try:
-        return memoryview(zstandard.decompress(data))
-    except (zstandard.ZstdError, MemoryError) as error:
-        raise DataError(f"a message that cannot be decompressed: {error}") from None
-
-
-def decode(topic: Topic, data: memoryview) -> Message:
-    """Return a decoded message; large payloads are views of ``data``.
-
-    Raises:
-        DataError: The message is damaged, or of a type or in an encoding that is not read.
-    """
-    try:
-        if topic.encoding in ("cdr", "ros1"):
-            from mapper.sources.ros.decode_ros import decode_ros  # loads rosbags, which only ROS logs need
-
-            return decode_ros(topic, unpacked(topic, data))
-        from mapper.sources.ros.decode_foxglove import decode_foxglove
-
-        return decode_foxglove(topic, data)
-    except (ValueError, KeyError, IndexError, TypeError, OverflowError) as error:
-        raise DataError(f"a damaged message: {error}") from None
