@@ -70,16 +70,16 @@ from mapper.export.foxglove_parts import (
 )
 from mapper.export.palette import ESTIMATE, FACTORS, PLAN, Rgb
 from mapper.export.ros_messages import (
-    OCCUPANCY_GRID_NAME,
-    OCCUPANCY_GRID_SCHEMA,
+    OCCUPANCY_GRID,
     Value,
     encode_occupancy_grid,
     encode_record,
-    record_schema,
+    record_definition,
 )
 from mapper.graph.model import BetweenFactor
 from mapper.octree.slice import OccupancyGrid
 from mapper.runtime.atomic import atomic_file
+from mapper.sources.ros.typestore import definition
 
 PLAN_TOPICS = ("/plan", "/plan/dots")
 
@@ -293,12 +293,8 @@ class McapLog:
         check_stamp(stamp_ns)
         topic = f"/map/{name}"
         if topic not in self._channels:
-            self._register(
-                topic,
-                OCCUPANCY_GRID_NAME,
-                encoding="ros2msg",
-                text=OCCUPANCY_GRID_SCHEMA.encode(),
-            )
+            text = definition(OCCUPANCY_GRID).encode()
+            self._register(topic, OCCUPANCY_GRID, encoding="ros2msg", text=text)
         self._write(topic, encode_occupancy_grid(grid, stamp_ns=stamp_ns, frame_id=WORLD), stamp_ns)
 
     def diagnostics(self, stamp_ns: int, record: Mapping[str, Value]) -> None:
@@ -322,7 +318,7 @@ class McapLog:
             DataError: Another kind of value, or another record than the first.
         """
         check_stamp(stamp_ns)
-        fields = record_schema(record)
+        fields = record_definition(record)
         if topic not in self._channels:
             self._record_fields[topic] = fields
             self._register(topic, schema, encoding="ros2msg", text=fields.encode())
@@ -331,7 +327,7 @@ class McapLog:
                 f"{topic} at {stamp_ns}: fields {fields.split()}, "
                 f"want those of the first record: {self._record_fields[topic].split()}"
             )
-        self._write(topic, encode_record(record), stamp_ns)
+        self._write(topic, encode_record(record, type_=schema, definition=fields), stamp_ns)
 
     def _points(
         self,
