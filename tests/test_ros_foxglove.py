@@ -25,6 +25,7 @@ D = [0.1, -0.2, 0.001, 0.002, 0.05]
 POSITION = messages.Vector3(x=1.0, y=-2.0, z=3.5)
 ORIENTATION = messages.Quaternion(x=0.0, y=0.0, z=0.6, w=0.8)
 POSE = messages.Pose(position=POSITION, orientation=ORIENTATION)
+RAW_IMAGE = Topic("/t", "foxglove.RawImage", "protobuf")
 NUMBERS = (1.0, -2.0, 3.5, 0.0, 0.0, 0.6, 0.8)
 
 
@@ -105,7 +106,7 @@ def test_json_says_the_same():
         "step": 192, "data": base64.b64encode(RGB.tobytes()).decode(),
     }  # fmt: skip
     data = json.dumps(fields).encode()
-    assert stamp_of("json", memoryview(data)) == FIRST_NS
+    assert stamp_of(Topic("/t", "foxglove.RawImage", "json"), memoryview(data)) == FIRST_NS
     told, expected = (
         read("foxglove.RawImage", data, "json"),
         read("foxglove.RawImage", raw_image(RGB, "rgb8").encode()),
@@ -120,8 +121,38 @@ def test_json_says_the_same():
 
 def test_a_stamp_is_read_without_the_rest():
     data = raw_image(RGB, "rgb8").encode()
-    assert stamp_of("protobuf", memoryview(data)) == FIRST_NS
-    assert stamp_of("protobuf", memoryview(data)[:16]) == FIRST_NS
+    assert stamp_of(RAW_IMAGE, memoryview(data)) == FIRST_NS
+    assert stamp_of(RAW_IMAGE, memoryview(data)[:16]) == FIRST_NS
+
+
+def test_a_stamp_may_come_late_or_not_at_all():
+    data = raw_image(RGB, "rgb8").encode()
+    end = 2 + data[1]  # of the first field, the timestamp
+    assert stamp_of(RAW_IMAGE, memoryview(data[end:] + data[:end])) == FIRST_NS
+    assert stamp_of(RAW_IMAGE, memoryview(data[end:])) == 0
+
+
+@pytest.mark.parametrize(
+    ("type_", "message"),
+    [
+        ("foxglove.PointCloud", cloud(np.arange(30, dtype=np.float32))),
+        ("foxglove.CameraCalibration", calibration()),
+        ("foxglove.PoseInFrame", messages.PoseInFrame(timestamp=STAMP, frame_id="world", pose=POSE)),
+    ],
+)
+def test_damage_is_found_or_leaves_a_message(type_, message):
+    rng, whole = np.random.default_rng(0), message.encode()
+    topic, damaged = Topic("/t", type_, "protobuf"), 0
+    for _ in range(300):
+        data = bytearray(whole)
+        data[rng.integers(len(data))] = rng.integers(256)
+        data = memoryview(bytes(data[: rng.integers(len(data) // 2, len(data) + 1)]))
+        for read_part in (decode, stamp_of):
+            try:
+                read_part(topic, data)
+            except DataError:
+                damaged += 1
+    assert 200 < damaged < 500
 
 
 @pytest.mark.parametrize("cut", [1, 5, 20, 200])
@@ -150,14 +181,14 @@ def test_json_of_another_shape_is_an_error(data):
 )
 def test_a_damaged_stamp_is_an_error(encoding, data):
     with pytest.raises(DataError):
-        stamp_of(encoding, memoryview(data))
+        stamp_of(Topic("/t", "foxglove.RawImage", encoding), memoryview(data))
 
 
 def test_what_is_not_read_is_named():
     with pytest.raises(DataError, match=r"messages of type foxglove.Log are not read"):
         decode_foxglove(Topic("/log", "foxglove.Log", "protobuf"), memoryview(b""))
     with pytest.raises(DataError, match="encoded as 'flatbuffer' are not read"):
-        stamp_of("flatbuffer", memoryview(b""))
+        stamp_of(Topic("/t", "foxglove.RawImage", "flatbuffer"), memoryview(b""))
 
 
 def test_a_foxglove_recording_is_a_log(tmp_path):

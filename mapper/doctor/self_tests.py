@@ -177,6 +177,14 @@ def rosbags(_folder: Path) -> None:
     _expect(store.deserialize_cdr(data, time.__msgtype__) == time, "the message came back another")
 
 
+def protobuf(_folder: Path) -> None:
+    """Turn a protobuf message into bytes and back."""
+    from google.protobuf.timestamp_pb2 import Timestamp
+
+    time = Timestamp(seconds=1, nanos=2)
+    _expect(Timestamp.FromString(time.SerializeToString()) == time, "the message came back another")
+
+
 def isal(_folder: Path) -> None:
     """Deflate and inflate."""
     from isal import isal_zlib
@@ -242,6 +250,7 @@ SELF_TESTS: dict[str, Callable[[Path], None]] = {
     "numpy": numpy,
     "open3d": open3d,
     "opencv-contrib-python-headless": opencv,
+    "protobuf": protobuf,
     "pyarrow": pyarrow,
     "pydantic": pydantic,
     "pypcd4": pypcd4,

@@ -1,16 +1,22 @@
-"""Foxglove's schemas, as protobuf or JSON (https://docs.foxglove.dev/docs/sdk/schemas).
+"""Foxglove's messages decoded, from protobuf or JSON (https://docs.foxglove.dev/docs/sdk/schemas).
 
-Both become the same dictionaries. The field numbers of the published .proto files never change, so reading
-protobuf's wire format takes a loop and a table, and large payloads stay views of the message.
+Protobuf is parsed with the schemas of foxglove-sdk and not with those in the file, which may be damaged: the
+field numbers of a published schema never change.
 """
 
 import base64
 import json
-import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
+from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from foxglove import messages
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.message import DecodeError
+from google.protobuf.message_factory import GetMessages
+from google.protobuf.timestamp_pb2 import Timestamp
 
 from mapper.core.errors import DataError
 from mapper.core.timebase import NS_PER_S
@@ -26,87 +32,33 @@ from mapper.sources.ros.messages import (
 from mapper.sources.ros.recording import Topic
 from mapper.sources.text import pose_from_numbers
 
-_Fields = Mapping[str, Any]
-
-# Of each message: field number to name, and how it is stored; a message's own name is a nested message,
-# and a star marks what repeats.
-_TABLES: Mapping[str, Mapping[int, tuple[str, str]]] = {
-    "time": {1: ("sec", "int"), 2: ("nsec", "int")},
-    "foxglove.CompressedImage": {
-        1: ("timestamp", "time"),
-        2: ("data", "bytes"),
-        3: ("format", "text"),
-        4: ("frame_id", "text"),
-    },
-    "foxglove.RawImage": {
-        1: ("timestamp", "time"),
-        2: ("width", "int"),
-        3: ("height", "int"),
-        4: ("encoding", "text"),
-        5: ("step", "int"),
-        6: ("data", "bytes"),
-        7: ("frame_id", "text"),
-    },
-    "foxglove.CameraCalibration": {
-        1: ("timestamp", "time"),
-        2: ("width", "int"),
-        3: ("height", "int"),
-        4: ("distortion_model", "text"),
-        5: ("D", "doubles"),
-        6: ("K", "doubles"),
-        8: ("P", "doubles"),
-        9: ("frame_id", "text"),
-    },
-    "foxglove.PointCloud": {
-        1: ("timestamp", "time"),
-        2: ("frame_id", "text"),
-        3: ("pose", "pose"),
-        4: ("point_stride", "int"),
-        5: ("fields", "field*"),
-        6: ("data", "bytes"),
-    },
-    "field": {1: ("name", "text"), 2: ("offset", "int"), 3: ("type", "int")},
-    "foxglove.FrameTransform": {
-        1: ("timestamp", "time"),
-        2: ("parent_frame_id", "text"),
-        3: ("child_frame_id", "text"),
-        4: ("translation", "vector"),
-        5: ("rotation", "vector"),
-    },
-    "foxglove.FrameTransforms": {1: ("transforms", "foxglove.FrameTransform*")},
-    "foxglove.PoseInFrame": {1: ("timestamp", "time"), 2: ("frame_id", "text"), 3: ("pose", "pose")},
-    "pose": {1: ("position", "vector"), 2: ("orientation", "vector")},
-    "vector": {1: ("x", "double"), 2: ("y", "double"), 3: ("z", "double"), 4: ("w", "double")},
-}
-_EMPTY: Mapping[str, Any] = {
-    "int": 0,
-    "double": 0.0,
-    "doubles": np.empty(0),
-    "text": "",
-    "bytes": memoryview(b""),
-}
-_NUMERIC_TYPES = ("", "u1", "i1", "u2", "i2", "u4", "i4", "f4", "f8")  # PackedElementField.NumericType
-_VARINT, _FIXED_64, _LENGTH, _FIXED_32 = 0, 1, 2, 5
+_NUMERIC_TYPES = dict(enumerate(("u1", "i1", "u2", "i2", "u4", "i4", "f4", "f8"), start=1))
+"""Numpy's names of PackedElementField.NumericType."""
+_TIMESTAMP_TAG = 1 << 3 | 2
+"""The byte before the timestamp of a message: field 1, a nested message. The next is its length."""
+_LONGEST_TIMESTAMP = 22  # bytes: seconds and nanoseconds are a tag and at most ten bytes each
 
 
-def stamp_of(encoding: str, data: memoryview) -> int:
-    """Return a message's timestamp, nanoseconds; every schema with one has it first.
+def stamp_of(topic: Topic, data: memoryview) -> int:
+    """Return a message's timestamp, nanoseconds; 0 where a protobuf message has none.
 
     Raises:
-        DataError: The message is damaged, has none, or is neither protobuf nor JSON.
+        DataError: The timestamp is damaged, or the message is neither protobuf nor JSON.
     """
     try:
-        if encoding == "protobuf":
-            return next((_ns(_parsed("time", value)) for number, value in _wire(data) if number == 1), 0)
-        if encoding == "json":
-            return _ns(_json(data).get("timestamp", {}))
-    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        if topic.encoding == "protobuf":
+            return _ns(_protobuf_timestamp(topic, data))
+        if topic.encoding == "json":
+            return _ns(_parse_json(data).timestamp)
+    except (DecodeError, AttributeError, ValueError, TypeError, OverflowError) as error:
         raise DataError(f"a damaged timestamp: {error}") from None
-    raise DataError(f"messages encoded as {encoding!r} are not read; known are cdr, ros1, protobuf and json")
+    raise DataError(
+        f"messages encoded as {topic.encoding!r} are not read; known are cdr, ros1, protobuf and json"
+    )
 
 
 def decode_foxglove(topic: Topic, data: memoryview) -> Message:
-    """Return what a message says.
+    """Return a decoded message.
 
     Raises:
         DataError: The message is damaged, or of a schema that is not read.
@@ -114,57 +66,59 @@ def decode_foxglove(topic: Topic, data: memoryview) -> Message:
     read = _READERS.get(topic.type)
     if read is None:
         raise DataError(f"messages of type {topic.type} are not read")
-    return read(_json(data) if topic.encoding == "json" else _parsed(topic.type, data))
+    try:
+        return read(_parse_json(data) if topic.encoding == "json" else _parse_protobuf(topic.type, data))
+    except (DecodeError, AttributeError) as error:  # the latter for a field that a JSON message lacks
+        raise DataError(f"a damaged message: {error}") from None
 
 
-def _pixels(m: _Fields) -> PixelsMessage:
+def _pixels(m: Any) -> PixelsMessage:
     return PixelsMessage(
-        stamp_ns=_ns(m["timestamp"]),
-        frame=m["frame_id"],
-        encoding=m["encoding"],
-        width_px=m["width"],
-        height_px=m["height"],
-        row_bytes=m["step"],
+        stamp_ns=_ns(m.timestamp),
+        frame=m.frame_id,
+        encoding=m.encoding,
+        width_px=m.width,
+        height_px=m.height,
+        row_bytes=m.step,
         is_big_endian=False,
-        data=_bytes(m["data"]),
+        data=_payload(m.data),
     )
 
 
-def _file(m: _Fields) -> FileMessage:
-    return FileMessage(_ns(m["timestamp"]), m["frame_id"], m["format"], _bytes(m["data"]))
+def _file(m: Any) -> FileMessage:
+    return FileMessage(_ns(m.timestamp), m.frame_id, m.format, _payload(m.data))
 
 
-def _camera(m: _Fields) -> CameraMessage:
-    D, K, P = (np.asarray(m[name], dtype=np.float64) for name in "DKP")
-    return CameraMessage(m["frame_id"], m["width"], m["height"], m["distortion_model"], D, K, P)
+def _camera(m: Any) -> CameraMessage:
+    D, K, P = (np.array(numbers, dtype=np.float64) for numbers in (m.D, m.K, m.P))
+    return CameraMessage(m.frame_id, m.width, m.height, m.distortion_model, D, K, P)
 
 
-def _cloud(m: _Fields) -> CloudMessage:
-    fields = [(f["name"], f["offset"], "<" + _NUMERIC_TYPES[f["type"]], 1) for f in m["fields"]]
-    data = _bytes(m["data"])
-    stride = m["point_stride"]
+def _cloud(m: Any) -> CloudMessage:
+    fields = [(f.name, f.offset, "<" + _NUMERIC_TYPES[f.type], 1) for f in m.fields]
+    data, stride = _payload(m.data), m.point_stride
     points = structured(data, fields, point_bytes=stride, shape=(1, len(data) // max(stride, 1)))
-    T_frame_points = pose_from_numbers(np.array(_numbers(m["pose"]["position"], m["pose"]["orientation"])))
+    T_frame_points = pose_from_numbers(np.array(_numbers(m.pose.position, m.pose.orientation)))
     if T_frame_points is None:  # protobuf leaves zeros out: an empty pose is none
         T_frame_points = np.eye(4)
-    return CloudMessage(_ns(m["timestamp"]), m["frame_id"], points, T_frame_points)
+    return CloudMessage(_ns(m.timestamp), m.frame_id, points, T_frame_points)
 
 
-def _transform(m: _Fields) -> list[PoseMessage]:
-    numbers = _numbers(m["translation"], m["rotation"])
-    return [PoseMessage(_ns(m["timestamp"]), m["parent_frame_id"], m["child_frame_id"], numbers)]
+def _transform(m: Any) -> list[PoseMessage]:
+    numbers = _numbers(m.translation, m.rotation)
+    return [PoseMessage(_ns(m.timestamp), m.parent_frame_id, m.child_frame_id, numbers)]
 
 
-def _transforms(m: _Fields) -> list[PoseMessage]:
-    return [pose for transform in m["transforms"] for pose in _transform(transform)]
+def _transforms(m: Any) -> list[PoseMessage]:
+    return [pose for transform in m.transforms for pose in _transform(transform)]
 
 
-def _pose_in_frame(m: _Fields) -> list[PoseMessage]:
-    numbers = _numbers(m["pose"]["position"], m["pose"]["orientation"])
-    return [PoseMessage(_ns(m["timestamp"]), m["frame_id"], "", numbers)]
+def _pose_in_frame(m: Any) -> list[PoseMessage]:
+    numbers = _numbers(m.pose.position, m.pose.orientation)
+    return [PoseMessage(_ns(m.timestamp), m.frame_id, "", numbers)]
 
 
-_READERS: Mapping[str, Callable[[_Fields], Message]] = {
+_READERS: Mapping[str, Callable[[Any], Message]] = {
     "foxglove.RawImage": _pixels,
     "foxglove.CompressedImage": _file,
     "foxglove.CameraCalibration": _camera,
@@ -175,93 +129,48 @@ _READERS: Mapping[str, Callable[[_Fields], Message]] = {
 }
 
 
-def _numbers(p: _Fields, q: _Fields) -> tuple[float, ...]:
-    return (p["x"], p["y"], p["z"], q["x"], q["y"], q["z"], q["w"])
+def _numbers(p: Any, q: Any) -> tuple[float, ...]:
+    return (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
 
 
-def _ns(time: _Fields) -> int:
-    return int(time["sec"]) * NS_PER_S + int(time["nsec"])
+def _ns(time: Any) -> int:
+    """Return a protobuf or a JSON timestamp in nanoseconds."""
+    if isinstance(time, SimpleNamespace):
+        return int(time.sec) * NS_PER_S + int(time.nsec)
+    return int(time.seconds * NS_PER_S + time.nanos)
 
 
-def _bytes(data: memoryview | str) -> memoryview:
-    """JSON has no bytes: it spells them in base 64."""
-    return memoryview(base64.b64decode(data)) if isinstance(data, str) else data
+def _payload(data: bytes | str) -> memoryview:
+    """Return bytes, which JSON spells in base 64."""
+    return memoryview(base64.b64decode(data) if isinstance(data, str) else data)
 
 
-def _json(data: memoryview) -> _Fields:
-    fields = json.loads(bytes(data))
-    if not isinstance(fields, dict):
+def _parse_json(data: memoryview) -> Any:
+    message = json.loads(bytes(data), object_hook=lambda fields: SimpleNamespace(**fields))
+    if not isinstance(message, SimpleNamespace):
         raise DataError("a JSON message that is no object")
-    return fields
+    return message
 
 
-def _parsed(kind: str, data: memoryview) -> _Fields:
-    """Return a protobuf message's fields by name; absent ones are empty, as protobuf has it."""
-    table = _TABLES[kind]
-    fields: dict[str, Any] = {}
-    for name, stored in table.values():
-        if stored.endswith("*"):
-            fields[name] = []
-        elif stored not in _TABLES:
-            fields[name] = _EMPTY[stored]
-    for number, value in _wire(data):
-        if number not in table:
-            continue
-        name, stored = table[number]
-        if stored.endswith("*"):
-            fields[name].append(_parsed(stored[:-1], value))
-        elif stored in _TABLES:
-            fields[name] = _parsed(stored, value)
-        elif stored == "text":
-            fields[name] = str(value, "utf-8")
-        elif stored == "doubles":
-            fields[name] = np.frombuffer(value, "<f8")
-        else:
-            fields[name] = value
-    for name, stored in table.values():
-        if stored in _TABLES and name not in fields:
-            fields[name] = _parsed(stored, memoryview(b""))
-    return fields
+def _parse_protobuf(type_: str, data: memoryview) -> Any:
+    return _message_class(type_).FromString(data)
 
 
-def _wire(data: memoryview) -> Iterator[tuple[int, Any]]:
-    """Yield number and value of every field: int, float or the bytes of a text, message or packed list.
+@cache
+def _message_class(type_: str) -> Any:
+    if type_ not in _READERS:
+        raise DataError(f"messages of type {type_} are not read")
+    schema = getattr(messages, type_.removeprefix("foxglove.")).get_schema()
+    return GetMessages(FileDescriptorSet.FromString(schema.data).file)[type_]
 
-    The wire format is https://protobuf.dev/programming-guides/encoding.
+
+def _protobuf_timestamp(topic: Topic, data: memoryview) -> Any:
+    """Return the timestamp, without parsing the rest where it comes first, as encoders write it.
+
+    So no payload is copied to index a recording, and a message that is cut short keeps its stamp.
     """
-    at = 0
-    try:
-        while at < len(data):
-            key, at = _varint(data, at)
-            number, kind = key >> 3, key & 7
-            if kind == _VARINT:
-                value, at = _varint(data, at)
-                yield number, value
-            elif kind == _FIXED_64:
-                yield number, struct.unpack_from("<d", data, at)[0]
-                at += 8
-            elif kind == _FIXED_32:
-                yield number, struct.unpack_from("<I", data, at)[0]
-                at += 4
-            elif kind == _LENGTH:
-                length, at = _varint(data, at)
-                if at + length > len(data):
-                    raise DataError("a protobuf message that ends within a field")
-                yield number, data[at : at + length]
-                at += length
-            else:
-                raise DataError(f"a protobuf field of the unknown wire type {kind}")
-    except (IndexError, struct.error):
-        raise DataError("a protobuf message that ends within a field") from None
-
-
-def _varint(data: memoryview, at: int) -> tuple[int, int]:
-    """Return a number of seven bits a byte, the lowest first, and where it ends."""
-    value = shift = 0
-    while True:
-        byte = data[at]
-        at += 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value, at
-        shift += 7
+    if len(data) < 2 or data[0] >> 3 != 1:
+        return _parse_protobuf(topic.type, data).timestamp
+    if data[0] != _TIMESTAMP_TAG or data[1] > min(_LONGEST_TIMESTAMP, len(data) - 2):
+        raise DataError("a timestamp that is no message or is cut short")
+    return Timestamp.FromString(data[2 : 2 + data[1]])

@@ -119,7 +119,7 @@ def stamp_of(topic: Topic, data: memoryview) -> int:
         DataError: The message is too short to have one, or is written in an encoding that is not read.
     """
     if topic.encoding not in ("cdr", "ros1"):
-        return decode_foxglove.stamp_of(topic.encoding, data)
+        return decode_foxglove.stamp_of(topic, data)
     data = decompressed(topic, data)
     if len(data) < 12:
         raise DataError(f"{topic.name}: a message of {len(data)} bytes has no header")
