@@ -15,7 +15,7 @@ from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import exp, inverse
 from mapper.core.rotations import rotation_from_quaternion
 from mapper.core.trajectory import Trajectory
-from mapper.export.foxglove_parts import dotted
+from mapper.export.foxglove_messages import sample_segments
 from mapper.export.mcap_log import McapLog
 from mapper.graph.model import BetweenFactor, PoseSigmas
 from mapper.mapping.thumbnails import encode_jpeg, shrunk_camera
@@ -239,7 +239,7 @@ def test_refuses_diagnostics_that_change_shape(tmp_path):
 
 def test_dots_thin_out_before_there_are_too_many():
     starts, ends = np.zeros((3, 3)), np.diag([1000.0, 2000.0, 0.0])
-    points = dotted(starts, ends)
+    points = sample_segments(starts, ends)
     assert 90_000 < len(points) <= 100_010
     assert points.max() == 2000.0
 

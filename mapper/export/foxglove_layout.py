@@ -1,10 +1,10 @@
-"""Foxglove layout for a run's MCAP log: import the file in its layout menu, then open ``run.mcap``."""
+"""Foxglove layout of a run's MCAP file: import it in Foxglove's layout menu, then open ``run.mcap``."""
 
 from pathlib import Path
 
 import foxglove.layouts as fl
 
-from mapper.export.foxglove_parts import WORLD
+from mapper.export.foxglove_messages import WORLD
 from mapper.export.palette import ESTIMATE, PLAN, TRUTH, Rgb
 from mapper.export.run_mcap import BODY
 from mapper.run.folder import Run
@@ -19,12 +19,12 @@ _CURVES = (
 
 
 def layout(run: Run, path: Path, _progress: Progress) -> None:
-    """Write a layout: the map beside the images, the curves and the loops."""
+    """Write the layout of a run: the map beside the images, the curves and the loops."""
     write_text(path, layout_json(voxel_m=run.config.octree.resolution_m) + "\n")
 
 
 def layout_json(*, voxel_m: float) -> str:
-    """Return the layout of logs whose voxels have this edge."""
+    """Return the layout as JSON, for a map whose voxels have this edge."""
     beside = fl.SplitContainer(
         direction="column",
         items=[
@@ -60,7 +60,7 @@ def _map(voxel_m: float) -> fl.ThreeDeePanel:
         "/plan": _line(PLAN),
         "/graph/factors": fl.BaseRendererSceneUpdateTopicSettings(visible=True),
         "/camera/calibration": fl.BaseRendererCameraTopicSettings(visible=True, distance=0.3),
-        # The same again as dots, for a viewer that draws no lines.
+        # Lines as dots, for a viewer that draws no lines.
         "/trajectory/estimate/dots": hidden,
         "/trajectory/truth/dots": hidden,
         "/plan/dots": hidden,

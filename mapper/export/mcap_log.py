@@ -1,6 +1,6 @@
-"""A run as one MCAP file that Foxglove and Rerun both open.
+"""MCAP files that Foxglove and Rerun both show: a run's results, a comparison's, a registration's.
 
-What each viewer makes of it (Foxglove's own documentation; Rerun 0.41's importer, which the tests run):
+What each viewer makes of the topics (Foxglove's documentation; Rerun 0.41's importer, which the tests run):
 
 =====================  ============================  ==================  ===========================
 topic                  schema                        Foxglove            Rerun
@@ -29,12 +29,12 @@ topic                  schema                        Foxglove            Rerun
 So lines are logged as dots too, the slice is a ROS message (Rerun ignores foxglove.Grid) and so are the
 diagnostics (Rerun keeps JSON as opaque bytes).
 
-Every message's ``log_time`` and ``publish_time`` is the stamp of the data. Results of the whole log have no
-moment of their own: log them at the first stamp, for both viewers show the latest message at or before the
-playhead, and the transforms beside them are in hindsight too.
+Every message's ``log_time`` and ``publish_time`` is the stamp of the data. Results of the whole log belong
+at the first stamp: both viewers show the latest message at or before the playhead, and the transforms too are
+those of the solved graph.
 
-The writer is the ``mcap`` package and not the one inside foxglove-sdk, which keeps quiet about a full disk
-until the file is closed; foxglove-sdk encodes the messages.
+The ``mcap`` package writes the file, because the writer inside foxglove-sdk reports a full disk only when the
+file is closed; foxglove-sdk encodes the messages.
 """
 
 import struct
@@ -58,13 +58,13 @@ from mapper.core.errors import DataError
 from mapper.core.frames import PinholeCamera
 from mapper.core.geometry import Points, Transform
 from mapper.core.trajectory import Trajectory
-from mapper.export.foxglove_parts import (
+from mapper.export.foxglove_messages import (
     WORLD,
     check_stamp,
-    dotted,
     lines_of,
     pose_of,
     quaternion_of,
+    sample_segments,
     timestamp_of,
     vector_of,
 )
@@ -88,14 +88,14 @@ _POINT = np.dtype([("position", "<f4", 3), ("rgba", "u1", 4)])
 
 
 class McapLog:
-    """Context manager that writes one MCAP file; the file appears when the block ends well, or not at all.
+    """Writer of one MCAP file, a context manager: the file appears when the block ends without an error.
 
     Messages may come in any order of stamps: the file is chunked and indexed. The same calls give the
     same bytes.
     """
 
     def __init__(self, path: Path) -> None:
-        """Prepare to write ``path``; nothing is touched until the block is entered."""
+        """Prepare to write ``path``; no file is made until the block is entered."""
         self._opened = self._open(path)
         self._writer: Writer
         self._schemas: dict[str, int] = {}
@@ -123,7 +123,7 @@ class McapLog:
             self._writer.finish()
 
     def transform(self, stamp_ns: int, T_parent_child: Transform, *, parent: str, child: str) -> None:
-        """Log where a frame is in its parent, on /tf."""
+        """Log the pose of a frame in its parent on /tf."""
         self._publish(
             "/tf",
             messages.FrameTransform(
@@ -147,7 +147,7 @@ class McapLog:
         )
 
     def calibration(self, stamp_ns: int, camera: PinholeCamera, *, frame: str) -> None:
-        """Log the camera of the images as logged: a shrunk image needs the shrunk camera."""
+        """Log the camera of the images on /camera/calibration: of a shrunk image the shrunk camera."""
         K = camera.matrix
         self._publish(
             "/camera/calibration",
@@ -178,10 +178,8 @@ class McapLog:
             stamp_ns,
         )
         positions = trajectory.positions_world
-        points = dotted(positions[:-1], positions[1:])
-        self._points(
-            f"{topic}/dots", stamp_ns, points, np.broadcast_to(np.array(color, np.uint8), points.shape)
-        )
+        points = sample_segments(positions[:-1], positions[1:])
+        self._points(f"{topic}/dots", stamp_ns, points, np.array(color, np.uint8))
 
     def factors(
         self,
@@ -206,7 +204,7 @@ class McapLog:
                 continue
             ends = np.array([[T_world_node[node][:3, 3] for node in pair] for pair in pairs])
             entities.append(lines_of(ends.reshape(-1, 3), color, stamp_ns=stamp_ns, name=origin))
-            points = dotted(ends[:, 0], ends[:, 1])
+            points = sample_segments(ends[:, 0], ends[:, 1])
             clouds.append(points)
             colors.append(np.broadcast_to(np.array(color, np.uint8), points.shape))
         self._publish("/graph/factors", messages.SceneUpdate(entities=entities), stamp_ns)
@@ -231,7 +229,7 @@ class McapLog:
     def plan(self, stamp_ns: int, waypoints_world: Points) -> None:
         """Log a planned path through (N, 3) points on /plan, and as dots below that.
 
-        The poses are not turned: a path says where to be, not which way to look.
+        The poses have no rotation: a path has positions only.
         """
         T_world_waypoint = np.tile(np.eye(4), (len(waypoints_world), 1, 1))
         T_world_waypoint[:, :3, 3] = waypoints_world
@@ -243,11 +241,11 @@ class McapLog:
             ),
             stamp_ns,
         )
-        points = dotted(waypoints_world[:-1], waypoints_world[1:])
-        self._points(dots_topic, stamp_ns, points, np.broadcast_to(np.array(PLAN, np.uint8), points.shape))
+        points = sample_segments(waypoints_world[:-1], waypoints_world[1:])
+        self._points(dots_topic, stamp_ns, points, np.array(PLAN, np.uint8))
 
     def copy(self, path: Path, *, without: Container[str]) -> None:
-        """Log every message of another log, in its order, but those on some topics.
+        """Log every message of another MCAP file, in its order, except those on some topics.
 
         Raises:
             DataError: The file is no MCAP log, or is damaged.
@@ -309,13 +307,13 @@ class McapLog:
         """Log numbers and words.
 
         Args:
-            topic: Where to.
-            schema: What its records are called.
-            stamp_ns: Time of the message, nanoseconds.
+            topic: E.g. "/loops".
+            schema: Name of the records' message type.
+            stamp_ns: Time of the record.
             record: Name to int, float or str; the same names and types every time.
 
         Raises:
-            DataError: Another kind of value, or another record than the first.
+            DataError: A value of another type, or other fields than those of the first record.
         """
         check_stamp(stamp_ns)
         fields = record_definition(record)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict
 
-from mapper.export.foxglove_parts import WORLD
+from mapper.export.foxglove_messages import WORLD
 from mapper.export.mcap_log import McapLog
 from mapper.export.palette import TRUTH
 from mapper.loops.closure import Discrepancy, LoopClosure

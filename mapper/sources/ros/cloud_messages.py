@@ -1,4 +1,4 @@
-"""Point clouds in messages as scans: structured views of the payload, and its measured points."""
+"""Point cloud messages as scans: structured views of the payload, without missing returns."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,10 +11,10 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, apply
 from mapper.sources.point_times import relative_times_s, time_field
 from mapper.sources.ros.messages import CloudMessage
-from mapper.sources.ros.valid_returns import measured
+from mapper.sources.ros.valid_returns import valid_returns
 
 Field = tuple[str, int, str, int]
-"""Name, offset in a point, numpy's name of its type with the byte order, and how many there are."""
+"""Name, offset in a point in bytes, numpy's name of the type with its byte order, and number of values."""
 
 _FARTHEST_M = 5000.0
 _SEPARATE_COLOURS = (("r", "g", "b"), ("red", "green", "blue"))
@@ -33,10 +33,10 @@ def structured(
 
     Args:
         data: The payload.
-        fields: What a point is made of.
-        point_bytes: From one point to the next.
-        shape: Rows and points of a row.
-        row_bytes: From one row to the next; None where they follow each other.
+        fields: Fields of a point.
+        point_bytes: Distance from one point to the next.
+        shape: Number of rows, and of points in a row.
+        row_bytes: Distance from one row to the next; None where they follow each other.
 
     Raises:
         DataError: The payload is shorter than the numbers say, or they contradict each other.
@@ -59,16 +59,16 @@ def structured(
 
 
 def scan_from(message: CloudMessage, *, T_body_frame: Transform, with_colours: bool, where: str) -> Scan:
-    """Return the measured points of a cloud, in the body frame.
+    """Return the valid points of a cloud, in the body frame.
 
-    Points that are not finite, or at the sensor itself, are what drivers write for missing returns; points
-    beyond every sensor's reach are damage.
+    Drivers write missing returns as points that are not finite or at the sensor itself; points beyond the
+    reach of every sensor are damage.
 
     Args:
         message: The cloud.
         T_body_frame: Pose of the cloud's frame in the body's.
         with_colours: Take the points' colours too, if there are any.
-        where: What to name in an error.
+        where: Name of the message in an error.
 
     Raises:
         FrameError: The points have no x, y and z.
@@ -77,7 +77,7 @@ def scan_from(message: CloudMessage, *, T_body_frame: Transform, with_colours: b
     names = points.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
         raise FrameError(f"{where}: points of {', '.join(names)}; want x, y and z")
-    points_body, rows = measured(_coordinates(points), farthest_m=_FARTHEST_M)
+    points_body, rows = valid_returns(_coordinates(points), farthest_m=_FARTHEST_M)
     kept = slice(None) if rows is None else rows
     T_body_points = T_body_frame @ message.T_frame_points
     if not np.array_equal(T_body_points, np.eye(4)):

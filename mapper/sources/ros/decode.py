@@ -8,7 +8,7 @@ _ZSTD = b"\x28\xb5\x2f\xfd"  # how its frames begin, and no CDR message does
 
 
 def decompressed(topic: Topic, data: memoryview) -> memoryview:
-    """Return a message as it was published: rosbag2 can compress each, which only its metadata.yaml tells.
+    """Return a message as it was published: rosbag2 can compress each, and says so in metadata.yaml alone.
 
     Raises:
         DataError: It cannot be decompressed.

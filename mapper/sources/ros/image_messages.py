@@ -1,4 +1,4 @@
-"""Images in messages as arrays: RGB, grey and depth in metres."""
+"""Image messages as arrays: RGB, grey, and depth in metres."""
 
 import struct
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ MILLIMETRES_PER_M = 1000.0
 
 @dataclass(frozen=True, slots=True)
 class _Encoding:
-    """Encoding of colour pixels, and OpenCV's codes for RGB and grey; None leaves them as they are."""
+    """Storage of colour pixels, and OpenCV's conversions to RGB and to grey; None for no conversion."""
 
     channels: int
     to_rgb: int | None
@@ -49,7 +49,7 @@ _DEPTH_HEADER = struct.Struct("<iff")  # compressedDepth's: how it is stored, an
 
 
 def is_depth(message: ImageMessage) -> bool:
-    """Tell whether an image is of depth, by its encoding."""
+    """Return whether an image is of depth, by its encoding."""
     if isinstance(message, PixelsMessage):
         return message.encoding in _DEPTH
     return "compressedDepth" in message.format or message.format.startswith(tuple(_DEPTH))
@@ -109,7 +109,7 @@ def depth_m_of(message: ImageMessage, *, units_per_m: float, where: str) -> Dept
     order = ">" if message.is_big_endian else "<"
     pixels = _pixels(message, order + kind, 1, where=where)
     if kind == "f4":
-        return _measured(pixels)
+        return _valid_depth(pixels)
     return depth_m_from(np.ascontiguousarray(pixels, dtype=np.uint16), units_per_m)
 
 
@@ -122,7 +122,7 @@ def depth_file_of(message: ImageMessage) -> bytes | None:
 
 
 def _depth_m_of_file(message: FileMessage, *, units_per_m: float, where: str) -> DepthImage:
-    """Read a PNG, behind a header if it is compressedDepth's.
+    """Decode a PNG, which in compressedDepth follows a header.
 
     Its 32-bit depth is stored as A / depth + B in 16 bits, with A and B in the header.
     """
@@ -139,14 +139,14 @@ def _depth_m_of_file(message: FileMessage, *, units_per_m: float, where: str) ->
         return depth_m_from(units, units_per_m)
     with np.errstate(divide="ignore"):
         depth_m = np.float32(a) / (units.astype(np.float32) - np.float32(b))
-    return _measured(np.where(units > 0, depth_m, np.float32(0.0)))
+    return _valid_depth(np.where(units > 0, depth_m, np.float32(0.0)))
 
 
-def _measured(depth_m: DepthImage) -> DepthImage:
-    """Return depth with 0 where it is not finite, not in front of the camera, or that of a rendered sky."""
-    measured: DepthImage = np.array(depth_m, dtype=np.float32)  # aligned, which a message need not be
-    np.copyto(measured, 0.0, where=~((measured >= 0.0) & (measured < _FARTHEST_M)))
-    return measured
+def _valid_depth(depth_m: DepthImage) -> DepthImage:
+    """Return depth with 0 where it is not finite, negative, or beyond the reach of every depth camera."""
+    valid: DepthImage = np.array(depth_m, dtype=np.float32)  # aligned, which a message need not be
+    np.copyto(valid, 0.0, where=~((valid >= 0.0) & (valid < _FARTHEST_M)))
+    return valid
 
 
 def _pixels(message: PixelsMessage, kind: str, channels: int, *, where: str) -> NDArray[Any]:

@@ -155,20 +155,20 @@ def _depth_of_files(files: ImageFiles) -> SerializedMessage:
     )
 
 
-def _truth(source: FrameSource) -> Iterator[SerializedMessage]:
+def _truth(source: Log) -> Iterator[SerializedMessage]:
     if source.truth is not None:
         for stamp_ns, T in zip(source.truth.stamps_ns.tolist(), source.truth.T_world_body, strict=True):
             yield pose_message(stamp_ns, TRUTH, T, frame=_WORLD)
 
 
-def _wheels(source: FrameSource) -> Iterator[SerializedMessage]:
+def _wheels(source: Log) -> Iterator[SerializedMessage]:
     if source.wheels is not None:
         body = _LIDAR_FRAME if source.sensor == "lidar" else _CAMERA_FRAME
         for stamp_ns, T in zip(source.wheels.stamps_ns.tolist(), source.wheels.T_world_body, strict=True):
             yield odometry_message(stamp_ns, WHEELS, T, frame=_ODOM, child=body)
 
 
-def _accelerations(source: FrameSource) -> Iterator[SerializedMessage]:
+def _accelerations(source: Log) -> Iterator[SerializedMessage]:
     if (readings := source.accelerations) is not None:
         for stamp_ns, reading in zip(readings.stamps_ns.tolist(), readings.acceleration_mps2, strict=True):
             yield imu_message(stamp_ns, IMU, reading, frame=_IMU_FRAME)

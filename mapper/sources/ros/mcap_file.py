@@ -1,4 +1,4 @@
-"""MCAP files as recordings, and messages written to them; the home of the mcap library for reading.
+"""MCAP files read as recordings, whole or cut off (https://mcap.dev/spec).
 
 A whole file's summary has the places of its chunks; where there is none (the recorder was killed, the file
 was cut), the records are walked from the start as far as they go. A damaged chunk costs itself only.
@@ -29,7 +29,7 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _CHUNK = struct.Struct(
     "<QQQII"
 )  # first and last time, unpacked size and CRC, length of the compression's name
-_MOST_BY_LZ4 = 255  # a byte of LZ4 repeats no more
+_MAX_LZ4_RATIO = 255  # one byte of LZ4 expands to no more
 
 
 def open_mcap(path: Path) -> BlockRecording:
@@ -44,7 +44,7 @@ def open_mcap(path: Path) -> BlockRecording:
         magic=_MAGIC,
         called="MCAP files",
         read_contents=lambda file: _summarised(file) or _walked(file, path),
-        unpack=_unpacked,
+        unpack=_unpack,
     )
 
 
@@ -72,12 +72,12 @@ class _Contents(Contents):
                 if length < _MESSAGE.size:
                     raise DataError(f"a message record of {length} bytes, want {_MESSAGE.size} or more")
                 channel, _, log_ns, _ = _MESSAGE.unpack_from(data, start)
-                if channel in self._topics:  # else the chunk that names it is lost
+                if channel in self._topics:  # else the chunk that defines it is lost
                     yield Part(self._topics[channel], log_ns, start + _MESSAGE.size, length - _MESSAGE.size)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self.describe(opcode, bytes(data[start : start + length]))
+                self._add_definition(opcode, bytes(data[start : start + length]))
 
-    def describe(self, opcode: int, record: bytes) -> None:
+    def _add_definition(self, opcode: int, record: bytes) -> None:
         """Keep a schema or a channel."""
         stream = ReadDataStream(BytesIO(record))
         try:
@@ -132,7 +132,7 @@ def _walked(file: BinaryIO, path: Path) -> _Contents:
     return contents
 
 
-def _unpacked(stored: bytes) -> memoryview:
+def _unpack(stored: bytes) -> memoryview:
     """Return the records of a chunk; any other record is its own content."""
     if len(stored) < _RECORD.size:
         raise DataError("a chunk beyond the end of the file")
@@ -161,10 +161,10 @@ def _decompressed(packed: memoryview, compression: bytes, size: int) -> memoryvi
             return packed
         if compression == b"zstd":
             if zstandard.frame_content_size(packed) not in (-1, size):  # -1: the frame does not say
-                raise DataError(f"a chunk of {size} bytes whose content is told to be of another size")
+                raise DataError(f"a chunk of {size} bytes whose content states another size")
             return memoryview(zstandard.decompress(packed, max_output_size=size))
         if compression == b"lz4":
-            if size > _MOST_BY_LZ4 * len(packed):
+            if size > _MAX_LZ4_RATIO * len(packed):
                 raise DataError(f"a chunk of {len(packed)} bytes that LZ4 cannot have made of {size}")
             return memoryview(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1))
     except (zstandard.ZstdError, RuntimeError, MemoryError) as error:  # RuntimeError is lz4's

@@ -9,7 +9,7 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapFileWriter
 from rosbags.rosbag1 import Writer as BagFileWriter
 
-from mapper.runtime.atomic import replacing
+from mapper.runtime.atomic import atomic_file
 from mapper.sources.ros.encode_ros import SerializedMessage
 from mapper.sources.ros.typestore import definition, typestore
 
@@ -27,7 +27,7 @@ class MessageWriter(Protocol):
 @contextmanager
 def message_writer(path: Path, *, kind: RecordingKind) -> Iterator[MessageWriter]:
     """Yield a writer of a file, compressed by LZ4, that appears whole or not at all."""
-    with replacing(path) as part:
+    with atomic_file(path) as part:
         if kind == "bag":
             bag = BagFileWriter(part)
             bag.set_compression(BagFileWriter.CompressionFormat.LZ4)

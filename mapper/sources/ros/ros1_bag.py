@@ -1,6 +1,6 @@
-"""ROS 1 bags as recordings: the bag format 2.0 (https://wiki.ros.org/Bags/Format/2.0), whole or cut off.
+"""ROS 1 bags read as recordings, whole or cut off (format 2.0, https://wiki.ros.org/Bags/Format/2.0).
 
-A bag's index has the places of its chunks; a bag that was never closed has none, and its records are walked
+A bag's index has the places of its chunks; a bag that was never closed has none, and its records are read
 from the start as far as they go.
 """
 
@@ -36,7 +36,7 @@ def open_bag(path: Path) -> BlockRecording:
         magic=_MAGIC,
         called="ROS 1 bags of format 2.0",
         read_contents=lambda file: _indexed(file) or _walked(file, path),
-        unpack=_unpacked,
+        unpack=_unpack,
     )
 
 
@@ -108,8 +108,8 @@ def _walked(file: BinaryIO, path: Path) -> _Contents:
     return contents
 
 
-def _unpacked(stored: bytes) -> memoryview:
-    """Return the records of a chunk; those that are not compressed stay where they are."""
+def _unpack(stored: bytes) -> memoryview:
+    """Return the records of a chunk: a view where they are not compressed."""
     fields, start, length = _record(memoryview(stored), 0)
     data = memoryview(stored)[start : start + length]
     compression = fields.get(b"compression")
@@ -126,7 +126,7 @@ def _unpacked(stored: bytes) -> memoryview:
 
 
 def _record_at(file: BinaryIO, at: int, size: int) -> tuple[_Fields, int, int]:
-    """Return a record's header, and where its data start in the file and how long they are."""
+    """Return the header of a file's record at a byte, and start and length of its data."""
     file.seek(at)
     (header_length,) = _LENGTH.unpack(file.read(_LENGTH.size).ljust(_LENGTH.size, b"\xff"))
     start = at + _LENGTH.size + header_length + _LENGTH.size
@@ -140,7 +140,7 @@ def _record_at(file: BinaryIO, at: int, size: int) -> tuple[_Fields, int, int]:
 
 
 def _record(data: memoryview, at: int) -> tuple[_Fields, int, int]:
-    """Return a record's header, and where its data start in these bytes and how long they are."""
+    """Return the header of a chunk's record at a byte, and start and length of its data."""
     try:
         (header_length,) = _LENGTH.unpack_from(data, at)
         start = at + 2 * _LENGTH.size + header_length

@@ -1,4 +1,4 @@
-"""ROS 2 bags as recordings: .db3 files (SQLite) alone, and folders of .db3 or .mcap files in sequence."""
+"""ROS 2 bags read as recordings: .db3 files (SQLite), and folders of .db3 or .mcap files in sequence."""
 
 import re
 import sqlite3
@@ -11,12 +11,12 @@ from mapper.sources.ros.recording import Place, Recorded, Recording, Topic
 
 
 class DatabaseRecording:
-    """A .db3 file: a message's place is its row. See :class:`Recording`."""
+    """Recording in a .db3 file; the place of a message is its row. See :class:`Recording`."""
 
     kind = "rosbag2"
 
     def __init__(self, path: Path) -> None:
-        """Read which topics there are.
+        """Read the list of topics.
 
         Raises:
             SourceError: The file is no SQLite database of rosbag2, or cannot be read.
@@ -26,7 +26,7 @@ class DatabaseRecording:
         try:
             with closing(self._connect()) as database:
                 rows = database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
-        except (sqlite3.Error, UnicodeDecodeError) as error:  # damage may reach into the error's own text
+        except (sqlite3.Error, UnicodeDecodeError) as error:  # the text of SQLite's error may be damaged too
             raise SourceError(f"{path}: not a .db3 file that rosbag2 wrote: {error}") from None
         self._topics = {number: Topic(name, type_, encoding) for number, name, type_, encoding in rows}
 
@@ -63,15 +63,15 @@ class DatabaseRecording:
         return memoryview(row[0])
 
     def _connect(self) -> sqlite3.Connection:
-        # Immutable: neither a lock nor a journal is made beside somebody's log. But where a recorder was
-        # killed, its journal holds the last messages, and such a database is read with it or not at all.
+        # Immutable: SQLite makes neither a lock nor a journal beside the log. But where a recorder was
+        # killed, its journal holds the last messages, and SQLite opens such a database with its journal only.
         has_journal = self.path.with_name(f"{self.path.name}-wal").exists()
         how = "mode=ro" if has_journal else "mode=ro&immutable=1"
         return sqlite3.connect(f"{self.path.resolve().as_uri()}?{how}", uri=True)
 
 
 class JoinedRecording:
-    """Recordings of one session that was split into files. See :class:`Recording`."""
+    """Recording of one session that was split into files. See :class:`Recording`."""
 
     kind = "rosbag2"
 
@@ -89,7 +89,7 @@ class JoinedRecording:
 
     @property
     def notes(self) -> Sequence[str]:
-        """What was lost, a sentence each."""
+        """Return what was lost, a sentence each."""
         return [*self._lost, *(note for part in self._parts for note in part.notes)]
 
     def messages(self) -> Iterator[Recorded]:

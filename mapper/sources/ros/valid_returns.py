@@ -1,4 +1,4 @@
-"""Measured points of a cloud, found and copied in one pass over its bytes."""
+"""Filter of missing and damaged returns of a point cloud, compiled: one pass over its bytes."""
 
 import numpy as np
 from numba import njit
@@ -7,15 +7,17 @@ from numpy.typing import NDArray
 from mapper.core.frames import Points32
 
 
-def measured(points: NDArray[np.float32], *, farthest_m: float) -> tuple[Points32, NDArray[np.intp] | None]:
-    """Return (M, 3) points that are finite, not at the origin, and near enough, and which those are.
+def valid_returns(
+    points: NDArray[np.float32], *, farthest_m: float
+) -> tuple[Points32, NDArray[np.intp] | None]:
+    """Return the points that are finite, not at the origin, and nearer than a limit, and their rows.
 
     Args:
         points: (N, 3) with any strides, metres.
-        farthest_m: Distance from which on a point is taken for damage, metres.
+        farthest_m: Limit of the distance from the origin.
 
     Returns:
-        Their coordinates, and (M,) rows; None where that is all of them.
+        (M, 3) coordinates, and (M,) rows; None for the rows where all points are valid.
     """
     kept_points = np.empty((len(points), 3), np.float32)
     rows = np.empty(len(points), np.intp)
@@ -27,7 +29,7 @@ def measured(points: NDArray[np.float32], *, farthest_m: float) -> tuple[Points3
 
 @njit(cache=True, nogil=True)
 def _gather(points, farthest_m2, kept_points, rows):  # type: ignore[no-untyped-def]
-    """Copy what was measured to the front, and return how much that is; NaN compares false."""
+    """Copy the valid points to the front and return their number; NaN compares false."""
     count = 0
     for row in range(len(points)):
         x, y, z = points[row, 0], points[row, 1], points[row, 2]

@@ -1,4 +1,4 @@
-"""Poses, stamps and lines as Foxglove's messages have them."""
+"""Parts of Foxglove's messages: timestamps, poses and lines, and lines as dots."""
 
 import numpy as np
 from foxglove import messages
@@ -10,16 +10,16 @@ from mapper.core.timebase import NS_PER_S
 from mapper.export.palette import Rgb
 
 _DOT_SPACING_M = 0.01
-_MOST_DOTS = 100_000
+_MAX_DOTS = 100_000
 _LAST_SECOND = 2**31  # builtin_interfaces/Time counts seconds in an int32
 _LINE_WIDTH_PX = 2.0
 WORLD = "world"
 
 
-def dotted(starts: Points, ends: Points) -> Points:
+def sample_segments(starts: Points, ends: Points) -> Points:
     """Return points along (S, 3) segments, ends included: 1 cm apart, or further where that is too many."""
     lengths_m = np.linalg.norm(ends - starts, axis=1)
-    spacing_m = max(_DOT_SPACING_M, float(lengths_m.sum()) / _MOST_DOTS)
+    spacing_m = max(_DOT_SPACING_M, float(lengths_m.sum()) / _MAX_DOTS)
     counts = np.ceil(lengths_m / spacing_m).astype(np.intp) + 1
     segment = np.repeat(np.arange(len(starts)), counts)
     step = np.arange(len(segment)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -29,7 +29,7 @@ def dotted(starts: Points, ends: Points) -> Points:
 
 
 def check_stamp(stamp_ns: int) -> None:
-    """Refuse a stamp that no message can hold.
+    """Raise for a stamp that a message cannot hold.
 
     Raises:
         DataError: It is before 1970 or after 2038.
@@ -39,29 +39,29 @@ def check_stamp(stamp_ns: int) -> None:
 
 
 def timestamp_of(stamp_ns: int) -> messages.Timestamp:
-    """Return a stamp in nanoseconds as a message has it.
+    """Return a stamp in nanoseconds as Foxglove's timestamp.
 
     Raises:
-        DataError: No message can hold it.
+        DataError: It is before 1970 or after 2038.
     """
     check_stamp(stamp_ns)
     return messages.Timestamp(int(stamp_ns // NS_PER_S), int(stamp_ns % NS_PER_S))
 
 
 def vector_of(T: Transform) -> messages.Vector3:
-    """Return the translation of a (4, 4) motion."""
+    """Return the translation of a (4, 4) pose as Foxglove's vector."""
     x, y, z = T[:3, 3].tolist()
     return messages.Vector3(x=x, y=y, z=z)
 
 
 def quaternion_of(T: Transform) -> messages.Quaternion:
-    """Return the rotation of a (4, 4) motion."""
+    """Return the rotation of a (4, 4) pose as Foxglove's quaternion."""
     x, y, z, w = (float(value) for value in quaternion_from_rotation(T[:3, :3]))
     return messages.Quaternion(x=x, y=y, z=z, w=w)
 
 
 def pose_of(T: Transform) -> messages.Pose:
-    """Return a (4, 4) pose as a message has it."""
+    """Return a (4, 4) pose as Foxglove's."""
     return messages.Pose(position=vector_of(T), orientation=quaternion_of(T))
 
 
