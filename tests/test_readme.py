@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from mapper.run.files import RUN_FILES
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import write_lidar_log
 
@@ -99,6 +100,12 @@ def test_the_set_up_commands_exist_and_ci_calls_the_second():
     assert subprocess.run(["bash", "-n", ROOT / test], check=False).returncode == 0
 
 
+def test_the_files_of_a_run_are_listed_as_the_code_lists_them():
+    rows = [f"| {', '.join(f'`{name}`' for name in files.names)} | {files.content} |" for files in RUN_FILES]
+    assert "\n".join(rows) in README
+
+
 def test_every_file_of_a_run_is_explained(place):
+    named = {name for files in RUN_FILES for name in files.names}
     for path in (place / "runs" / "xyz").iterdir():
-        assert f"`{path.name}`" in README, path.name
+        assert path.name in named, path.name
