@@ -10,7 +10,7 @@ from mapper.config.loading import load_config
 from mapper.core.geometry import angle_between, apply, exp, inverse
 from mapper.core.trajectory import trajectory_from
 from mapper.odometry.config import PnpConfig
-from mapper.odometry.local_map.p3p import ransac_p3p
+from mapper.registration.p3p import ransac_p3p
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.source import CameraSimulator
 

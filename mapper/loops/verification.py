@@ -12,10 +12,10 @@ from mapper.graph.noise import with_model_error
 from mapper.loops.base import Verification
 from mapper.loops.config import VerificationConfig
 from mapper.odometry.base import Seen
-from mapper.odometry.local_map.p3p import ransac_p3p
-from mapper.odometry.local_map.pose import normal_matrix, refine_pose
 from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
+from mapper.registration.p3p import ransac_p3p
+from mapper.registration.reprojection import normal_matrix, refine_pose
 
 _LM_ROUNDS, _LM_ITERATIONS = 4, 10
 _MAX_HAMMING = 64

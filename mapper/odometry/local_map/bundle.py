@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 
 from mapper.core.linear import solve_positive, turned, twist_exp
-from mapper.odometry.local_map.pose import (
+from mapper.registration.reprojection import (
     CHI2_2DOF,
     CHI2_3DOF,
     HUBER_2DOF,

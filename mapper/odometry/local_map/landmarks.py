@@ -10,8 +10,8 @@ from mapper.core.geometry import Array, Transform, adjoint, apply, inverse
 from mapper.odometry.local_map.bundle import adjust
 from mapper.odometry.local_map.gather import count_observers, observations_of
 from mapper.odometry.local_map.observation import Observation
-from mapper.odometry.local_map.pose import normal_matrix
 from mapper.odometry.local_map.table import Table
+from mapper.registration.reprojection import normal_matrix
 
 Ids = NDArray[np.int32]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array, Points, Transform, apply
 from mapper.odometry.local_map.landmarks import Ids
 from mapper.odometry.local_map.observation import Observation
-from mapper.odometry.local_map.pose import refine_pose
+from mapper.registration.reprojection import refine_pose
 
 MAX_HAMMING = 64
 """Descriptors that differ in more of their 256 bits never match."""

@@ -9,11 +9,11 @@ from mapper.odometry.config import KeyframeConfig
 from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
 from mapper.odometry.local_map.observation import Observation
-from mapper.odometry.local_map.p3p import ransac_p3p
 from mapper.odometry.local_map.pose_tracker import MAX_HAMMING, TrackedPose, refined, unmatched
 from mapper.places.guided import match_by_word
 from mapper.places.index import PlaceIndex
 from mapper.places.vocabulary import Vocabulary
+from mapper.registration.p3p import ransac_p3p
 
 _MAX_RATIO = 0.85
 

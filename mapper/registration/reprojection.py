@@ -1,4 +1,4 @@
-"""Pose from map points and their images: compiled Levenberg–Marquardt."""
+"""Camera pose by least reprojection error: compiled Levenberg–Marquardt."""
 
 import numpy as np
 from numba import njit
@@ -14,7 +14,7 @@ HUBER_2DOF, HUBER_3DOF = np.sqrt(CHI2_2DOF), np.sqrt(CHI2_3DOF)
 
 @njit(cache=True, nogil=True)
 def residual(T, point, measured, intrinsics, out):
-    """Write the residual (3,) of a world point seen in a camera, and return its camera-frame position.
+    """Write the residual (3,) of a world point in a camera, and return its camera-frame position.
 
     Args:
         T: (4, 4) T_camera_world.
@@ -139,7 +139,7 @@ def refine_pose(T_camera_world, points, measured, weights, intrinsics, rounds, i
         measured: (N, 3) u, v, bf/z in pixels; NaN in the third place without depth.
         weights: (N, 3) inverse variances of the three, px⁻².
         intrinsics: (5,) fx, fy, cx, cy, bf.
-        rounds: How often the inliers are chosen.
+        rounds: Number of times the inliers are chosen.
         iterations: Steps per round.
     """
     T = T_camera_world.copy()
@@ -160,11 +160,11 @@ def refine_pose(T_camera_world, points, measured, weights, intrinsics, rounds, i
                 trial, points, measured, weights, intrinsics, inlier, robust, trial_H, trial_g
             )
             if trial_cost <= cost:
-                settled = cost - trial_cost < 1e-5 * cost
+                converged = cost - trial_cost < 1e-5 * cost
                 T, cost, damping = trial, trial_cost, max(damping * 0.2, 1e-9)
                 H, trial_H = trial_H, H
                 g, trial_g = trial_g, g
-                if settled:
+                if converged:
                     break
             else:
                 damping *= 10.0

@@ -1,4 +1,4 @@
-"""Pose from points and pixels alone: P3P inside RANSAC (Zhao et al. 2020, §1.2)."""
+"""Camera pose from 3D–2D pairs without a first guess: P3P inside RANSAC (Zhao et al. 2020, §1.2)."""
 
 import cv2
 import numpy as np
@@ -19,21 +19,21 @@ def ransac_p3p(
     iterations: int,
     seed: int = 0,
 ) -> tuple[Transform, NDArray[np.intp]] | None:
-    """Return the T_camera_world that most pairs agree with, and which do; None if no four pairs give any.
+    """Return the T_camera_world with most inlier pairs, and their indices; None if no four pairs give a pose.
 
-    Three pairs have up to four solutions (Gao et al. 2003), and a fourth chooses among them.
+    Three pairs have up to four solutions (Gao et al. 2003); a fourth pair chooses among them.
 
     Args:
         points_world: (N, 3) metres, N ≥ 4.
-        pixels: (N, 2) undistorted pixels that show them.
+        pixels: (N, 2) their undistorted pixels.
         intrinsics: (≥ 4,) fx, fy, cx, cy.
-        tolerance_px: A pair agrees when its point projects this close to its pixel: β.
-        iterations: How many draws at most; fewer once a better one has become unlikely.
+        tolerance_px: A pair is an inlier when its point projects this close to its pixel (β in the paper).
+        iterations: Largest number of draws; fewer once a better one has become unlikely.
         seed: Of the draws; see ``drawing_order``.
     """
     fx, fy, cx, cy = intrinsics[:4]
     order = drawing_order(len(pixels), seed)
-    found, rotation, translation, agreeing = cv2.solvePnPRansac(
+    found, rotation, translation, inliers = cv2.solvePnPRansac(
         points_world[order],
         pixels[order],
         np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
@@ -43,9 +43,9 @@ def ransac_p3p(
         confidence=_CONFIDENCE,
         flags=cv2.SOLVEPNP_P3P,
     )
-    if not found or agreeing is None:
+    if not found or inliers is None:
         return None
     T_camera_world = np.eye(4)
     T_camera_world[:3, :3], _ = cv2.Rodrigues(rotation)
     T_camera_world[:3, 3] = translation[:, 0]
-    return T_camera_world, np.sort(order[agreeing[:, 0]])
+    return T_camera_world, np.sort(order[inliers[:, 0]])
