@@ -122,13 +122,13 @@ def test_model_errors_grow_with_the_distance_between_the_views():
 # Drift
 
 
-def chain(length: int) -> list[BetweenFactor]:
+def steps(length: int) -> list[BetweenFactor]:
     return [BetweenFactor(k, k + 1, at(1.0, 0.0, 0.1), SURE) for k in range(length)]
 
 
 def test_the_way_between_two_nodes_is_as_long_as_the_path():
     chain = OdometryChain()
-    chain.add(chain(10))
+    chain.add(steps(10))
     path = chain.between(2, 9)
     assert path.path_m == pytest.approx(7.0)
     assert path.turned_rad == pytest.approx(0.7)
@@ -137,27 +137,27 @@ def test_the_way_between_two_nodes_is_as_long_as_the_path():
 
 def test_a_loop_shortens_every_way_over_it():
     chain = OdometryChain()
-    chain.add(chain(10))
+    chain.add(steps(10))
     chain.add([BetweenFactor(0, 10, at(0.1), SURE, "loop")])
     assert chain.between(1, 9).path_m == pytest.approx(2.1)
 
 
 def test_what_nothing_ties_has_no_way():
     chain = OdometryChain()
-    chain.add(chain(3))
+    chain.add(steps(3))
     chain.add([BetweenFactor(20, 21, at(1.0), SURE)])
     assert chain.between(0, 21) is None
 
 
 def test_around_a_node_lie_those_within_reach():
     chain = OdometryChain()
-    chain.add(chain(10))
+    chain.add(steps(10))
     assert sorted(chain.around(5, within_m=2.0)) == [3, 4, 5, 6, 7]
 
 
 def test_the_gate_widens_with_the_way():
     chain = OdometryChain()
-    chain.add(chain(40))
+    chain.add(steps(40))
     gate = GateConfig()
     near, far = (allowed(gate, chain.between(0, node)) for node in (1, 40))
     assert far.translation_m == pytest.approx(gate.slack_m + gate.drift_ratio * 40.0)
