@@ -24,7 +24,7 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, angle_between, inverse
 from mapper.registration.base import Registration
 from mapper.registration.config import KissMatcherConfig
-from mapper.registration.hough_config import HoughConfig, HoughGicpConfig, HoughNdtConfig
+from mapper.registration.hough.config import HoughConfig, HoughGicpConfig, HoughNdtConfig
 from mapper.simulation.config import COURTYARD, STREET, LidarSynthConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source

@@ -13,7 +13,7 @@ from mapper.core.geometry import Transform
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.registration.base import Alignment
 from mapper.registration.config import AnyRegistration
-from mapper.registration.hough_config import HoughGicpConfig, HoughNdtConfig
+from mapper.registration.hough.config import HoughGicpConfig, HoughNdtConfig
 
 _WARM_UP_STRIDE = 10
 
@@ -97,7 +97,7 @@ def _timed(
 ) -> tuple[Alignment, Transform | None, dict[str, float]]:
     began = time.perf_counter()
     if isinstance(config, HoughGicpConfig | HoughNdtConfig):
-        from mapper.registration.hough import Hough
+        from mapper.registration.hough.aligner import Hough
 
         voter = Hough(config).prepare(target)
         prepared = time.perf_counter()

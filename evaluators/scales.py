@@ -6,7 +6,7 @@ from mapper.core.config import Config
 from mapper.core.frames import Sensor
 from mapper.odometry.scan_to_map.config import KissOdometryConfig
 from mapper.registration.config import VOXEL_M, RegistrationConfig
-from mapper.registration.hough_config import HoughConfig
+from mapper.registration.hough.config import HoughConfig
 
 AnyConfig = TypeVar("AnyConfig", bound=Config)
 

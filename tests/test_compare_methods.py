@@ -19,7 +19,7 @@ from mapper.odometry.config import IsvdOdometryConfig
 from mapper.odometry.scan_to_map.config import KissOdometryConfig
 from mapper.registration.base import Alignment, failed
 from mapper.registration.config import VOXEL_M
-from mapper.registration.hough_config import HoughGicpConfig
+from mapper.registration.hough.config import HoughGicpConfig
 from mapper.registration.rgbd import HybridRgbd
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig

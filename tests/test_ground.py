@@ -2,16 +2,16 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import angle_between, apply, rotation_exp, transform
-from mapper.registration.ground_plane import level
-from mapper.registration.ground_removal import find_ground, find_obstacles, surroundings
-from mapper.registration.hough_config import (
+from mapper.registration.hough.config import (
     CellsConfig,
     ConstellationConfig,
     GroundConfig,
     LevellingConfig,
     ObjectsConfig,
 )
-from mapper.registration.objects import centres_of, constellation
+from mapper.registration.hough.ground_plane import level
+from mapper.registration.hough.ground_removal import find_ground, find_obstacles, surroundings
+from mapper.registration.hough.object_detection import centres_of, constellation
 
 HEIGHT_M = 1.7
 

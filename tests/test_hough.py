@@ -3,8 +3,8 @@ import pytest
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import angle_between, apply, inverse, rotation_exp, transform
-from mapper.registration.hough import Hough
-from mapper.registration.hough_config import HoughGicpConfig, HoughNdtConfig, HoughTrustConfig
+from mapper.registration.hough.aligner import Hough
+from mapper.registration.hough.config import HoughGicpConfig, HoughNdtConfig, HoughTrustConfig
 from mapper.simulation.config import COURTYARD, STREET
 from mapper.simulation.lidar import LidarSimulator
 

@@ -18,7 +18,7 @@ from mapper.core.rotations import rotation_from_euler
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.registration.config import GicpConfig
 from mapper.registration.guess import parse_guess
-from mapper.registration.hough_config import HoughGicpConfig
+from mapper.registration.hough.config import HoughGicpConfig
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import apply
-from mapper.registration.hough_config import VotingConfig
-from mapper.registration.voting import vote
+from mapper.registration.hough.config import VotingConfig
+from mapper.registration.hough.voting import vote
 
 
 def turned(centres, alpha_rad):

@@ -23,8 +23,8 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, angle_between, inverse
 from mapper.core.rotations import euler_from_rotation
 from mapper.export.registration_picture import write_before_and_after
-from mapper.registration.hough import Hough, Stages
-from mapper.registration.hough_config import HoughConfig, HoughGicpConfig, HoughNdtConfig
+from mapper.registration.hough.aligner import Hough, Stages
+from mapper.registration.hough.config import HoughConfig, HoughGicpConfig, HoughNdtConfig
 
 OFFSET_M = 10.0
 METHODS: dict[str, HoughConfig] = {"hough-ndt": HoughNdtConfig(), "hough-gicp": HoughGicpConfig()}

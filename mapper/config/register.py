@@ -9,7 +9,7 @@ from mapper.core.errors import ConfigError
 from mapper.core.frames import Sensor
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.registration.config import NEED_NO_GUESS, VOXEL_M, AnyRegistration
-from mapper.registration.hough_config import HoughConfig, HoughGicpConfig
+from mapper.registration.hough.config import HoughConfig, HoughGicpConfig
 from mapper.sources.config import SourceConfig
 
 _METHODS: dict[str, type[Config]] = {

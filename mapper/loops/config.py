@@ -9,7 +9,7 @@ from mapper.core.config import Config, Ratio
 from mapper.odometry.config import MatchConfig
 from mapper.places.config import PlacesConfig, ScanContextConfig
 from mapper.registration.config import IsvdConfig
-from mapper.registration.hough_config import ConstellationConfig, GroundConfig, VotingConfig
+from mapper.registration.hough.config import ConstellationConfig, GroundConfig, VotingConfig
 
 if TYPE_CHECKING:
     from mapper.features.view import View

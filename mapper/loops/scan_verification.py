@@ -17,14 +17,14 @@ from mapper.loops.scans import ScanPlace
 from mapper.odometry.base import Seen
 from mapper.registration.base import Alignment
 from mapper.registration.degeneracy import degeneracy_of
-from mapper.registration.ground_plane import level
-from mapper.registration.ground_removal import find_ground, find_obstacles
-from mapper.registration.kernels import thin
-from mapper.registration.objects import centres_of
-from mapper.registration.overlap_kernels import look, range_picture
+from mapper.registration.hough.ground_kernels import thin
+from mapper.registration.hough.ground_plane import level
+from mapper.registration.hough.ground_removal import find_ground, find_obstacles
+from mapper.registration.hough.object_detection import centres_of
+from mapper.registration.hough.overlap_kernels import look, range_picture
+from mapper.registration.hough.voting import vote
 from mapper.registration.refining import refine
 from mapper.registration.surfaces import Prepared, prepared
-from mapper.registration.voting import vote
 
 _SAME = Discrepancy(translation_m=3.0, rotation_rad=0.3)
 """Guesses nearer to a motion are taken for it: GICP would lead from there to the same."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from mapper.core.config import Config, Ratio
-from mapper.registration.hough_config import HoughGicpConfig, HoughNdtConfig
+from mapper.registration.hough.config import HoughGicpConfig, HoughNdtConfig
 
 if TYPE_CHECKING:
     pass

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
 from mapper.core.config import Config, Ratio
-from mapper.registration.hough_config import HoughGicpConfig, HoughNdtConfig
+from mapper.registration.hough.config import HoughGicpConfig, HoughNdtConfig
 
 if TYPE_CHECKING:
     from mapper.core.trajectory import Trajectory

@@ -208,7 +208,7 @@ class HoughConfig(Config):
 
     def build(self) -> "Registration":
         """Return the method this configures."""
-        from mapper.registration.hough import Hough
+        from mapper.registration.hough.aligner import Hough
 
         return Hough(self)
 

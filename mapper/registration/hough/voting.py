@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.core.geometry import Array, Transform, transform
-from mapper.registration.hough_config import VotingConfig
-from mapper.registration.kernels import distinct, vote_slices
+from mapper.registration.hough.config import VotingConfig
+from mapper.registration.hough.voting_kernels import distinct, vote_slices
 
 _PER_ANGLE = 8
 

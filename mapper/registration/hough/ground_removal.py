@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, Transform
-from mapper.registration.ground_plane import Levelling, level
-from mapper.registration.hough_config import ConstellationConfig, GroundConfig
-from mapper.registration.kernels import column_heights, thin_obstacles
+from mapper.registration.hough.config import ConstellationConfig, GroundConfig
+from mapper.registration.hough.ground_kernels import column_heights, thin_obstacles
+from mapper.registration.hough.ground_plane import Levelling, level
 
 
 @dataclass(frozen=True, slots=True, eq=False)

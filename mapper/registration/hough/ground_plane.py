@@ -6,8 +6,8 @@ import numpy as np
 
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, Transform, transform
-from mapper.registration.hough_config import LevellingConfig
-from mapper.registration.kernels import score_planes, thin
+from mapper.registration.hough.config import LevellingConfig
+from mapper.registration.hough.ground_kernels import score_planes, thin
 
 _REFITS = 3
 

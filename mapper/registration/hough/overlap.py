@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import Points32, Scan
 from mapper.core.geometry import Array, Points, Transform, apply, inverse, rotation_exp, transform
-from mapper.registration.ground_removal import Ground, surroundings
-from mapper.registration.hough_config import HoughConfig, OverlapConfig
-from mapper.registration.objects import centres_of
-from mapper.registration.overlap_kernels import NEAR, climb, draw_volume, look, range_picture
+from mapper.registration.hough.config import HoughConfig, OverlapConfig
+from mapper.registration.hough.ground_removal import Ground, surroundings
+from mapper.registration.hough.object_detection import centres_of
+from mapper.registration.hough.overlap_kernels import NEAR, climb, draw_volume, look, range_picture
 
 _FITS = 3
 _FIT_WIDTH_M = 0.5

@@ -1,4 +1,4 @@
-"""Registration without a guess: Hough voting, verified, then refined (Nagy, Gálai & Benedek 2016)."""
+"""Registration without a first guess: Hough voting, verified, then refined (Nagy, Gálai & Benedek 2016)."""
 
 import time
 from dataclasses import dataclass, replace
@@ -9,9 +9,8 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import Points, Transform, angle_between, inverse
 from mapper.registration.base import Alignment, failed
 from mapper.registration.degeneracy import degeneracy_of
-from mapper.registration.hough_config import GicpStagesConfig, HoughConfig, NdtStagesConfig
-from mapper.registration.ndt import refine_by_cells
-from mapper.registration.overlap import (
+from mapper.registration.hough.config import GicpStagesConfig, HoughConfig, NdtStagesConfig
+from mapper.registration.hough.overlap import (
     Overlap,
     PlanarFit,
     Witness,
@@ -20,9 +19,10 @@ from mapper.registration.overlap import (
     settled,
     witness,
 )
+from mapper.registration.hough.voting import Peak, vote
+from mapper.registration.ndt import refine_by_cells
 from mapper.registration.refining import measured, refined_motion
 from mapper.registration.surfaces import Prepared, prepared
-from mapper.registration.voting import Peak, vote
 
 
 @dataclass(frozen=True, slots=True, eq=False)

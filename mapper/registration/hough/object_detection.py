@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Transform
-from mapper.registration.ground_removal import surroundings
-from mapper.registration.hough_config import CellsConfig, ConstellationConfig, ObjectsConfig
+from mapper.registration.hough.config import CellsConfig, ConstellationConfig, ObjectsConfig
+from mapper.registration.hough.ground_removal import surroundings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
