@@ -100,7 +100,7 @@ def _registered(
         prepared(reference.points, voxel_m=voxel_m),
         T_map_reference,
         kind="plane-icp",
-        max_pair_distance_m=_PAIR_VOXELS * voxel_m,
+        pair_distances_m=(_PAIR_VOXELS * voxel_m,),
     )
     if isinstance(found, str):
         raise DataError(f"--register: {found}")

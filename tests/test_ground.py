@@ -11,7 +11,7 @@ from mapper.registration.hough.config import (
 )
 from mapper.registration.hough.ground_plane import level
 from mapper.registration.hough.ground_removal import find_ground, find_obstacles, surroundings
-from mapper.registration.hough.object_detection import centres_of, constellation
+from mapper.registration.hough.object_detection import centres_of
 
 HEIGHT_M = 1.7
 
@@ -28,6 +28,11 @@ def box(rng, x, y, *, size=0.8, height=2.0, count=400):
     face = rng.integers(0, 2, count)
     sides[np.arange(count), face] = np.sign(sides[np.arange(count), face]) * 0.5
     return np.column_stack([sides * size + [x, y], rng.uniform(-HEIGHT_M, height - HEIGHT_M, count)])
+
+
+def centres_in(points, centres):
+    around = surroundings(as_scan(points), ConstellationConfig(centres=centres))
+    return centres_of(around.obstacles, centres)
 
 
 def as_scan(points):
@@ -101,7 +106,7 @@ def test_cells_are_where_things_stand(rng):
     places = np.array([[10.9, 5.1], [-7.1, 12.9], [3.1, -15.1]])
     scan = np.concatenate([field(rng), *[box(rng, x, y) for x, y in places]])
 
-    centres = constellation(as_scan(scan), ConstellationConfig(centres=CellsConfig())).centres_level
+    centres = centres_in(scan, CellsConfig())
 
     gaps = np.linalg.norm(places[:, None] - centres[None], axis=2).min(axis=1)
     assert gaps.max() < 0.5
@@ -111,10 +116,10 @@ def test_objects_are_the_parts_of_a_group(rng):
     places = np.array([[10.0, 5.0], [10.0, 6.6], [-7.0, 12.0]])  # the first two share coarse cells that touch
     scan = np.concatenate([field(rng), *[box(rng, x, y) for x, y in places]])
 
-    found = constellation(as_scan(scan), ConstellationConfig(centres=ObjectsConfig()))
+    found = centres_in(scan, ObjectsConfig())
 
     assert len(found) == 3
-    gaps = np.linalg.norm(places[:, None] - found.centres_level[None], axis=2).min(axis=1)
+    gaps = np.linalg.norm(places[:, None] - found[None], axis=2).min(axis=1)
     assert gaps.max() < 0.2
 
 
@@ -129,6 +134,5 @@ def test_a_group_without_a_large_part_is_one_object():
 
 @pytest.mark.parametrize("centres", [CellsConfig(), ObjectsConfig()], ids=lambda c: c.kind)
 def test_an_empty_field_has_no_constellation(rng, centres):
-    config = ConstellationConfig(centres=centres)
-    assert len(constellation(as_scan(field(rng)), config)) == 0
-    assert len(constellation(np.empty((0, 3), np.float32), config)) == 0
+    assert len(centres_in(field(rng), centres)) == 0
+    assert len(centres_in(np.empty((0, 3)), centres)) == 0

@@ -4,7 +4,7 @@ import pytest
 from mapper.core.frames import Scan
 from mapper.core.geometry import angle_between, apply, inverse, rotation_exp, transform
 from mapper.registration.hough.aligner import Hough
-from mapper.registration.hough.config import HoughGicpConfig, HoughNdtConfig, HoughTrustConfig
+from mapper.registration.hough.config import HoughAcceptanceConfig, HoughGicpConfig, HoughNdtConfig
 from mapper.simulation.config import COURTYARD, STREET
 from mapper.simulation.lidar import LidarSimulator
 
@@ -108,7 +108,7 @@ def test_tells_its_stages(street):
     assert list(stages.seconds) == ["describe", "vote", "verify", "prepare source", "refine"]
     assert min(stages.seconds.values()) >= 0.0
     assert stages.peaks[0].votes > 0
-    assert stages.overlap.agree > 0.3
+    assert stages.refined.agreeing_ratio > 0.3
     assert stages.alignment.converged
 
 
@@ -195,7 +195,7 @@ def test_bad_scans_are_refused_with_a_reason(street, make, config):
 
 def test_trust_can_be_asked_for_more(street):
     target, source, _ = street
-    config = HoughGicpConfig(trust=HoughTrustConfig(min_agreeing_ratio=0.99))
+    config = HoughGicpConfig(acceptance=HoughAcceptanceConfig(min_agreeing_ratio=0.99))
 
     found = Hough(config).prepare(target).align(source, np.eye(4))
 

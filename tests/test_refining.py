@@ -34,7 +34,7 @@ def test_a_known_motion_is_found_between_different_samples_of_the_same_walls(kin
     target = prepared(walls(rng, tilt_rad=0.5), voxel_m=VOXEL_M)
     source = prepared(moved(walls(rng, tilt_rad=0.5), MOTION), voxel_m=VOXEL_M)
 
-    found = refine(target, source, np.eye(4), kind=kind, max_pair_distance_m=0.6)
+    found = refine(target, source, np.eye(4), kind=kind, pair_distances_m=(0.6,))
 
     miss = inverse(MOTION) @ found.T_target_source
     assert np.linalg.norm(miss[:3, 3]) < (0.03 if kind == "icp" else 0.003)
@@ -54,7 +54,7 @@ def test_the_same_clouds_give_the_same_bytes_and_stay_as_they_were(kind):
             prepared(other, voxel_m=VOXEL_M),
             guess,
             kind=kind,
-            max_pair_distance_m=0.6,
+            pair_distances_m=(0.6,),
         )
         for _ in range(2)
     ]
@@ -94,7 +94,7 @@ def test_a_wall_does_not_see_the_motion_along_itself_by_any_kind():
     wall = np.column_stack([u, np.zeros_like(u), v]).astype(np.float32)
     cloud = prepared(wall, voxel_m=VOXEL_M)
     for kind in KINDS:
-        found = refine(cloud, cloud, np.eye(4), kind=kind, max_pair_distance_m=0.5)
+        found = refine(cloud, cloud, np.eye(4), kind=kind, pair_distances_m=(0.5,))
         along_x, along_y = found.information[3, 3], found.information[4, 4]
         assert along_x < 1e-6 * along_y
 
@@ -103,11 +103,11 @@ def test_too_few_points_and_clouds_apart_are_no_answer():
     cloud = prepared(walls(np.random.default_rng(5)), voxel_m=VOXEL_M)
     for few in (np.empty((0, 3), np.float32), np.zeros((1, 3), np.float32)):
         answer = refine(
-            cloud, prepared(few, voxel_m=VOXEL_M), np.eye(4), kind="gicp", max_pair_distance_m=1.0
+            cloud, prepared(few, voxel_m=VOXEL_M), np.eye(4), kind="gicp", pair_distances_m=(1.0,)
         )
         assert not answer.converged
         assert f"{len(few)} points" in answer.reason
-    apart = refine(cloud, cloud, exp(np.zeros(3), np.full(3, 50.0)), kind="gicp", max_pair_distance_m=1.0)
+    apart = refine(cloud, cloud, exp(np.zeros(3), np.full(3, 50.0)), kind="gicp", pair_distances_m=(1.0,))
     assert not apart.converged
     assert "do not overlap" in apart.reason
 
@@ -121,7 +121,7 @@ def test_the_motion_is_the_one_that_small_gicp_finds(kind):
         prepared(source, voxel_m=VOXEL_M),
         np.eye(4),
         kind=kind,
-        max_pair_distance_m=0.6,
+        pair_distances_m=(0.6,),
         max_iterations=100,
     )
     theirs, tree = small_gicp.preprocess_points(target, VOXEL_M, 10, 1)

@@ -103,7 +103,7 @@ def test_a_guess_and_a_knob_reach_the_method(clouds):
         "--guess",
         guess,
         "--set",
-        "registration.trust.min_agreeing_ratio=1",
+        "registration.acceptance.min_agreeing_ratio=1",
     )
     assert strict.exit_code == 1
     assert "less than 100%" in strict.stderr

@@ -6,7 +6,7 @@ import pytest
 from mapper.core.frames import Scan
 from mapper.core.geometry import apply, exp
 from mapper.registration.acceptance import assess
-from mapper.registration.config import KissMatcherConfig, NdtConfig, TrustConfig
+from mapper.registration.config import AcceptanceConfig, KissMatcherConfig, NdtConfig
 from mapper.registration.kiss_matcher import KissMatcher
 from mapper.registration.ndt import Ndt, refine_by_cells
 from mapper.registration.refining import measured
@@ -36,7 +36,7 @@ def clouds():
 
 
 def test_the_right_motion_is_believed(clouds):
-    alignment = assess(*clouds, np.eye(4), TrustConfig())
+    alignment = assess(*clouds, np.eye(4), AcceptanceConfig())
     assert alignment.converged, alignment.reason
     assert alignment.inlier_ratio > 0.9
 
@@ -46,7 +46,7 @@ def test_a_wrong_motion_over_the_same_floor_is_not(clouds, turn_rad):
     wrong = exp(np.array([0.0, 0.0, turn_rad]), np.array([3.0, -2.0, 0.0]))
     assert measured(*clouds, wrong, max_pair_distance_m=1.0).inlier_ratio > 0.75
 
-    alignment = assess(*clouds, wrong, TrustConfig())
+    alignment = assess(*clouds, wrong, AcceptanceConfig())
 
     assert not alignment.converged
     assert "surfaces that face" in alignment.reason
@@ -59,7 +59,7 @@ def test_a_floor_alone_is_degenerate_and_the_reason_says_along_what():
         prepared(np.column_stack([*rng.uniform(-20.0, 20.0, (2, 50_000)), np.zeros(50_000)]), voxel_m=VOXEL_M)
         for _ in range(2)
     ]
-    alignment = assess(*floors, np.eye(4), TrustConfig())
+    alignment = assess(*floors, np.eye(4), AcceptanceConfig())
     assert not alignment.converged
     assert alignment.reason == "degenerate: no surface shows translation along x and y, rotation about z"
 
@@ -68,9 +68,9 @@ def test_ndt_says_so_where_open3d_only_warns():
     rng = np.random.default_rng(2)
     target, source = yard(rng, points=20_000), yard(rng, points=5_000)
     far = exp(np.zeros(3), np.array([300.0, 0.0, 0.0]))
-    assert "no overlap" in refine_by_cells(target, source, far, cell_m=2.0)
-    assert "has 6 points" in refine_by_cells(target[:3], source, np.eye(4), cell_m=2.0)
-    assert refine_by_cells(target, source[:0], np.eye(4), cell_m=2.0) == "no points in the source"
+    assert "no overlap" in refine_by_cells(target, source, far, cells_m=(2.0,))
+    assert "has 6 points" in refine_by_cells(target[:3], source, np.eye(4), cells_m=(2.0,))
+    assert refine_by_cells(target, source[:0], np.eye(4), cells_m=(2.0,)) == "no points in the source"
 
 
 def test_ndt_prints_nothing(capfd):

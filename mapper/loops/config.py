@@ -132,19 +132,13 @@ class ScanVerificationConfig(Config):
     """Largest distance between the points of a GICP pair, from coarse to fine."""
     max_iterations: PositiveInt = 20
     """At each of these distances."""
-    direction_rad: PositiveFloat = 0.035
-    """Resolution of the lines of sight."""
-    guess_margin_m: PositiveFloat = 1.5
     margin_m: PositiveFloat = 0.3
-    margin_ratio: NonNegativeFloat = 0.01
-    """What stands in one scan agrees with a surface of the other at its range, give or take this, before and
-    after GICP, and so much of the range. What is nearer than all in its direction was looked through."""
-    min_returns: PositiveInt = 3
-    """And so many of the nine directions around it have a return."""
+    """Margin of the free-space check along a ray, after GICP."""
     min_agreeing_ratio: Ratio = 0.3
     """A smaller share of what stands that agrees, in either direction, is no loop."""
     max_contradicting_ratio: Ratio = 0.06
-    """A larger share that was looked through, of what was not hidden, is no loop: parked cars leave."""
+    """A larger share of the visible obstacles in the other scan's free space is no loop. More, where much of
+    what stands moves: parked cars leave."""
     min_compared: PositiveInt = 100
     """Fewer points that agree or contradict say nothing: bare yards all look alike."""
     min_lead: NonNegativeFloat = 0.07

@@ -75,7 +75,8 @@ class KeyframeLoopDetector(Generic[Place]):
     """Compares keyframes with known places; believes what the tests, the gate and another loop confirm.
 
     A candidate is measured (``Verifier``), held against how far the odometry can have drifted since
-    (``OdometryChain``), and kept back until a loop from another keyframe nearby agrees (``ConsistencyCheck``).
+    (``OdometryChain``), and kept back until a loop from another keyframe nearby agrees
+    (``ConsistencyCheck``).
     """
 
     def __init__(

@@ -1,13 +1,12 @@
-"""Whether two scans are of one place: neither may have looked through what stands in the other."""
+"""Verification of a loop between two scans: a guess by voting, GICP, and the free-space check of both."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapper.core.errors import ConfigError
-from mapper.core.geometry import Array, Points, Transform, apply, inverse
+from mapper.core.geometry import Array, Transform, inverse
 from mapper.features.scan_view import ScanView
 from mapper.graph.noise import inflated
 from mapper.loops.base import Verification
@@ -17,82 +16,55 @@ from mapper.loops.scans import ScanPlace
 from mapper.odometry.base import Seen
 from mapper.registration.base import Alignment
 from mapper.registration.degeneracy import degeneracy_of
+from mapper.registration.free_space import FreeSpaceCheck, FreeSpaceCounts, ScanDescription, range_image
 from mapper.registration.hough.ground_kernels import thin
 from mapper.registration.hough.ground_plane import level
 from mapper.registration.hough.ground_removal import find_ground, find_obstacles
 from mapper.registration.hough.object_detection import centres_of
-from mapper.registration.hough.overlap_kernels import look, range_picture
 from mapper.registration.hough.voting import vote
 from mapper.registration.refining import refine
 from mapper.registration.surfaces import Prepared, prepared
 
+DIRECTION_RAD = 0.035
+"""Resolution of the range image, two degrees: the kept points are thin."""
+GUESS_MARGIN_M = 1.5
+"""Margin of the free-space check before GICP: a guess is off by up to a bin of the accumulator."""
 _SAME = Discrepancy(translation_m=3.0, rotation_rad=0.3)
-"""Guesses nearer to a motion are taken for it: GICP would lead from there to the same."""
+"""A guess nearer to the motion than both counts as the same one: GICP leads from there to the same answer."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Outlook:
-    """What one scan has to say about a motion.
+class _Description:
+    """Description of one scan.
 
     Attributes:
-        centres_level: (N, 2) metres: its constellation.
-        obstacles_body: (M, 3) metres: what stands on the ground, one point per voxel.
-        picture: Least range in each direction, metres.
+        centres_level: (N, 2) metres, level frame: the centres that vote.
+        free_space: Level frame, obstacles and rays.
     """
 
     centres_level: Array
-    obstacles_body: Points
-    picture: NDArray[np.float32]
-
-
-@dataclass(frozen=True, slots=True)
-class _Testimony:
-    """What one scan says of what stands in another.
-
-    Attributes:
-        obstacles: How many points were looked at.
-        agree: How many of them lie where it saw a surface.
-        through: How many of them it looked through.
-    """
-
-    obstacles: int
-    agree: int
-    through: int
-
-    @property
-    def agreeing(self) -> float:
-        """Share of all that agrees."""
-        return self.agree / max(self.obstacles, 1)
-
-    @property
-    def contradicting(self) -> float:
-        """Share that contradicts, of what was not hidden."""
-        return self.through / max(self.agree + self.through, 1)
-
-    @property
-    def score(self) -> float:
-        """Largest where most agrees and least contradicts."""
-        return self.agreeing - self.contradicting
+    free_space: ScanDescription
 
 
 class ScanVerifier:
-    """Guesses the motion by constellations (C3), refines it by GICP, and asks both scans whether it holds.
+    """Verifier of loops between scans.
 
-    Points that lie together say little: any ground lies on any other, and the walls of one street on those
-    of the next. What stands where the other scan saw farther says that these are two places.
+    A motion is guessed by Hough voting (Nagy, Gálai & Benedek 2016, §3.3), refined by GICP, and accepted when
+    the free-space check of the two scans neither contradicts it nor fits another guess as well.
     """
 
     def __init__(self, config: ScanVerificationConfig) -> None:
         self._config = config
+        self._coarse, self._fine = FreeSpaceCheck(GUESS_MARGIN_M), FreeSpaceCheck(config.margin_m)
         # Keyframes in a row are compared with the same places.
-        self._outlook = lru_cache(config.remembered)(partial(_outlook_of, config=config))
+        self._description = lru_cache(config.remembered)(partial(_describe, config=config))
         self._cloud = lru_cache(config.remembered)(partial(_cloud_of, config=config))
 
     def describe(self, seen: Seen, /) -> ScanPlace:
-        """Return the scan, thin.
+        """Return the scan, thinned.
 
         Raises:
-            ConfigError: It is an image's view.
+            ConfigError: It is the view of an image.
         """
         if not isinstance(seen, ScanView):
             raise ConfigError("loops.kind=scans compares scans, and these are images; want places or thesis")
@@ -104,119 +76,92 @@ class ScanVerifier:
         return ScanPlace(seen.stamp_ns, points_body, levelling.T_level_body)
 
     def verify(self, i: ScanPlace, j: ScanPlace) -> Verification:
-        """Return how scan j lies to scan i, or why they are not of one place."""
+        """Return the pose of scan j in scan i, or why they are not of one place."""
         config = self._config
         guesses = self._guesses(i, j)
         if not guesses:
             return Verification(0, "vote: nothing stands in both that could agree on a motion")
         _, guess = guesses[0]
-        told = self._told(i, j, guess, margin_m=config.guess_margin_m)
-        if told.reason:
-            return told
-        alignment = self._refined(i, j, guess)
+        found = self._compared(i, j, guess, self._coarse)
+        if found.reason:
+            return found
+        alignment = refine(
+            self._cloud(i),
+            self._cloud(j),
+            guess,
+            kind="gicp",
+            pair_distances_m=config.pair_distances_m,
+            max_iterations=config.max_iterations,
+        )
         if not alignment.converged:
-            return replace(told, reason=f"gicp: {alignment.reason}")
+            return replace(found, reason=f"gicp: {alignment.reason}")
         T_i_j = alignment.T_target_source
-        told = replace(self._told(i, j, T_i_j, margin_m=config.margin_m), rmse_m=alignment.inlier_rmse_m)
-        if told.reason:
-            return told
+        found = replace(self._compared(i, j, T_i_j, self._fine), rmse_m=alignment.inlier_rmse_m)
+        if found.reason:
+            return found
         rivals = [score for score, other in guesses if exceeds(discrepancy(other, np.eye(4), T_i_j), _SAME)]
-        lead = self._score(i, j, T_i_j) - max(rivals, default=-1.0)
+        lead = _score(self._worse(i, j, T_i_j, self._coarse)) - max(rivals, default=-1.0)
         if lead < config.min_lead:
-            return replace(told, reason=f"rival: leads another motion by {lead:.2f}, want {config.min_lead}")
-        return self._measured(told, alignment, self._cloud(j))
+            return replace(found, reason=f"rival: leads another motion by {lead:.2f}, want {config.min_lead}")
+        return self._measured(found, alignment, self._cloud(j))
 
     def _guesses(self, i: ScanPlace, j: ScanPlace) -> list[tuple[float, Transform]]:
-        """Return planar motions that what stands in both scans votes for, scored, the best first."""
-        centres = self._outlook(i).centres_level, self._outlook(j).centres_level
+        """Return the planar motions with most votes of centres and their scores, the best score first."""
+        centres = self._description(i).centres_level, self._description(j).centres_level
         peaks = vote(*centres, self._config.voting)
         guesses = [inverse(i.T_level_body) @ peak.motion @ j.T_level_body for peak in peaks]
-        scored = [(self._score(i, j, guess), guess) for guess in guesses]
+        scored = [(_score(self._worse(i, j, guess, self._coarse)), guess) for guess in guesses]
         return sorted(scored, key=lambda of: -of[0])
 
-    def _score(self, i: ScanPlace, j: ScanPlace, T_i_j: Transform) -> float:
-        """Return how much more agrees than contradicts, for the scan that likes a guess less."""
-        return min(of.score for of in self._testimonies(i, j, T_i_j, self._config.guess_margin_m))
+    def _worse(self, i: ScanPlace, j: ScanPlace, T_i_j: Transform, check: FreeSpaceCheck) -> FreeSpaceCounts:
+        """Return the counts of the scan that fits the motion less."""
+        result = check.compare(self._description(i).free_space, self._description(j).free_space, T_i_j)
+        return min(result.source, result.target, key=_score)
 
-    def _testimonies(
-        self, i: ScanPlace, j: ScanPlace, T_i_j: Transform, margin_m: float
-    ) -> tuple[_Testimony, _Testimony]:
-        """Return what each scan says of what stands in the other."""
-        outlook_i, outlook_j = self._outlook(i), self._outlook(j)
-        return (
-            self._testimony(outlook_i, outlook_j, T_i_j, margin_m),
-            self._testimony(outlook_j, outlook_i, inverse(T_i_j), margin_m),
-        )
-
-    def _testimony(self, by: _Outlook, of: _Outlook, T_by_of: Transform, margin_m: float) -> _Testimony:
+    def _compared(self, i: ScanPlace, j: ScanPlace, T_i_j: Transform, check: FreeSpaceCheck) -> Verification:
+        """Return the outcome of the free-space check, by the scan that fits the motion less."""
         config = self._config
-        agree, through = look(
-            by.picture,
-            np.zeros(3),
-            of.obstacles_body,
-            T_by_of,
-            config.direction_rad,
-            margin_m,
-            config.margin_ratio,
-            config.min_returns,
-        )
-        return _Testimony(len(of.obstacles_body), agree, through)
-
-    def _told(self, i: ScanPlace, j: ScanPlace, T_i_j: Transform, *, margin_m: float) -> Verification:
-        """Return the verdict of the scan that likes the motion less."""
-        config = self._config
-        worse = min(self._testimonies(i, j, T_i_j, margin_m), key=lambda of: of.score)
-        compared, reason = worse.agree + worse.through, ""
-        if compared < config.min_compared:
-            reason = f"overlap: {compared} points to compare, want {config.min_compared}"
-        elif worse.agreeing < config.min_agreeing_ratio:
+        worse, reason = self._worse(i, j, T_i_j, check), ""
+        if worse.visible < config.min_compared:
+            reason = f"overlap: {worse.visible} points to compare, want {config.min_compared}"
+        elif worse.agreeing_ratio < config.min_agreeing_ratio:
             reason = (
-                f"overlap: {worse.agreeing:.0%} of what stands in one stands in the other, "
+                f"overlap: {worse.agreeing_ratio:.0%} of what stands in one stands in the other, "
                 f"want {config.min_agreeing_ratio:.0%}"
             )
-        elif worse.contradicting > config.max_contradicting_ratio:
+        elif worse.visible_contradicting_ratio > config.max_contradicting_ratio:
             reason = (
-                f"sight: {worse.contradicting:.0%} of what stands in one was looked through in the other, "
-                f"at most {config.max_contradicting_ratio:.0%}"
+                f"sight: {worse.visible_contradicting_ratio:.0%} of what stands in one was looked through in "
+                f"the other, at most {config.max_contradicting_ratio:.0%}"
             )
-        return Verification(compared, reason, worse.agree)
+        return Verification(worse.visible, reason, worse.agreeing)
 
-    def _refined(self, i: ScanPlace, j: ScanPlace, T_i_j: Transform) -> Alignment:
-        for distance_m in self._config.pair_distances_m:
-            alignment = refine(
-                self._cloud(i),
-                self._cloud(j),
-                T_i_j,
-                kind="gicp",
-                max_pair_distance_m=distance_m,
-                max_iterations=self._config.max_iterations,
-            )
-            if not alignment.converged:
-                break
-            T_i_j = alignment.T_target_source
-        return alignment
-
-    def _measured(self, told: Verification, alignment: Alignment, source: Prepared) -> Verification:
-        """Return the motion as a measurement, if the surfaces hold it in every direction."""
+    def _measured(self, found: Verification, alignment: Alignment, source: Prepared) -> Verification:
+        """Return the motion as a measurement, if the surfaces make every direction of it observable."""
         config = self._config
         assert alignment.information is not None  # GICP converged
         degeneracy = degeneracy_of(alignment.information, points=source.points)
         if degeneracy.is_degenerate:
-            return replace(told, reason=f"degenerate: no surface shows {degeneracy.text}")
+            return replace(found, reason=f"degenerate: no surface shows {degeneracy.text}")
         information = inflated(alignment.information, sigma_rad=config.sigma_rad, sigma_m=config.sigma_m)
-        return replace(told, T_i_j=alignment.T_target_source, information=information)
+        return replace(found, T_i_j=alignment.T_target_source, information=information)
+
+
+def _score(counts: FreeSpaceCounts) -> float:
+    """Return the share that agrees, less the share of the visible that contradicts."""
+    return counts.agreeing_ratio - counts.visible_contradicting_ratio
 
 
 def _cloud_of(place: ScanPlace, *, config: ScanVerificationConfig) -> Prepared:
     return prepared(place.points_body, voxel_m=config.voxel_m)
 
 
-def _outlook_of(place: ScanPlace, *, config: ScanVerificationConfig) -> _Outlook:
-    points_body, T_level_body = place.points_body, place.T_level_body
+def _describe(place: ScanPlace, *, config: ScanVerificationConfig) -> _Description:
+    points_body, T_level_body, origin_body = place.points_body, place.T_level_body, np.zeros(3)
     ground = find_ground(points_body, T_level_body, config.constellation.ground)
     obstacles, _ = find_obstacles(points_body, T_level_body, ground, config.constellation.ground)
-    return _Outlook(
+    ranges_m = range_image(points_body, origin_body, DIRECTION_RAD)
+    return _Description(
         centres_of(obstacles, config.constellation.centres),
-        apply(inverse(T_level_body), obstacles.astype(np.float64)),
-        range_picture(points_body, np.zeros(3), config.direction_rad),
+        ScanDescription(T_level_body, np.ascontiguousarray(obstacles), ranges_m, DIRECTION_RAD, origin_body),
     )

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, apply
 from mapper.registration.base import Alignment
-from mapper.registration.config import TrustConfig
+from mapper.registration.config import AcceptanceConfig
 from mapper.registration.degeneracy import degeneracy_of
 from mapper.registration.refining import measured
 from mapper.registration.surfaces import Prepared
@@ -15,7 +15,9 @@ from mapper.registration.surfaces import Prepared
 _FEW = 0.01  # of all surface; of fewer that face a direction, degeneracy speaks
 
 
-def assess(target: Prepared, source: Prepared, T_target_source: Transform, config: TrustConfig) -> Alignment:
+def assess(
+    target: Prepared, source: Prepared, T_target_source: Transform, config: AcceptanceConfig
+) -> Alignment:
     """Return what a motion is worth; not converged when surfaces contradict it, or none shows it.
 
     Most of a scan is ground, and any ground agrees with any other: under a wrong motion up to 95 % of the

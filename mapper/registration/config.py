@@ -25,8 +25,8 @@ NEED_NO_GUESS = frozenset({"hough-gicp", "hough-ndt", "kiss-matcher"})
 Distances = Annotated[tuple[PositiveFloat, ...], Field(min_length=1)]
 
 
-class TrustConfig(Config):
-    """When a motion is believed."""
+class AcceptanceConfig(Config):
+    """When a motion is accepted."""
 
     near_voxels: PositiveFloat = 3.5
     surface_voxels: PositiveFloat = 0.33
@@ -47,7 +47,7 @@ class RefinedConfig(Config):
     """Largest distance between the points of a pair, from coarse to fine."""
     max_iterations: PositiveInt = 40
     """At each of these distances."""
-    trust: TrustConfig = TrustConfig()
+    acceptance: AcceptanceConfig = AcceptanceConfig()
 
 
 class IterativeConfig(RefinedConfig):
@@ -94,7 +94,7 @@ class NdtConfig(Config):
     """Cells with fewer points have none."""
     max_iterations: PositiveInt = 30
     """At each of these cells."""
-    trust: TrustConfig = TrustConfig()
+    acceptance: AcceptanceConfig = AcceptanceConfig()
 
     def build(self) -> "Registration":
         """Return the method this configures."""

@@ -42,16 +42,14 @@ def refined(
     target: Prepared, source: Prepared, T_target_source: Transform, config: RefinedConfig, *, kind: Refiner
 ) -> Alignment:
     """Return the motion refined at one pair distance after another, judged."""
-    for distance_voxels in config.pair_distances_voxels:
-        alignment = refine(
-            target,
-            source,
-            T_target_source,
-            kind=kind,
-            max_pair_distance_m=distance_voxels * config.voxel_m,
-            max_iterations=config.max_iterations,
-        )
-        if not alignment.converged:
-            return alignment
-        T_target_source = alignment.T_target_source
-    return assess(target, source, T_target_source, config.trust)
+    alignment = refine(
+        target,
+        source,
+        T_target_source,
+        kind=kind,
+        pair_distances_m=[voxels * config.voxel_m for voxels in config.pair_distances_voxels],
+        max_iterations=config.max_iterations,
+    )
+    if not alignment.converged:
+        return alignment
+    return assess(target, source, alignment.T_target_source, config.acceptance)

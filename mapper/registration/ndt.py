@@ -1,5 +1,6 @@
 """The normal distributions transform (Magnusson 2009, as Open3D has it), judged by the surfaces."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -37,19 +38,17 @@ class NdtAligner:
         """Return the motion refined from a guess at one cell size after another, judged."""
         config = self._config
         cloud = prepared(source.points_body, voxel_m=config.voxel_m, neighbours=config.neighbours)
-        for cell_voxels in config.cells_voxels:
-            found = refine_by_cells(
-                self._points_target,
-                cloud.points,
-                T_target_source,
-                cell_m=cell_voxels * config.voxel_m,
-                min_points=config.min_points,
-                max_iterations=config.max_iterations,
-            )
-            if isinstance(found, str):
-                return failed(found)
-            T_target_source = found
-        return assess(self._target, cloud, T_target_source, config.trust)
+        found = refine_by_cells(
+            self._points_target,
+            cloud.points,
+            T_target_source,
+            cells_m=[cell_voxels * config.voxel_m for cell_voxels in config.cells_voxels],
+            min_points=config.min_points,
+            max_iterations=config.max_iterations,
+        )
+        if isinstance(found, str):
+            return failed(found)
+        return assess(self._target, cloud, found, config.acceptance)
 
 
 def refine_by_cells(
@@ -57,37 +56,45 @@ def refine_by_cells(
     source: Points,
     T_target_source: Transform,
     *,
-    cell_m: float,
+    cells_m: Sequence[float],
     min_points: int = 6,
     max_iterations: int = 30,
 ) -> Transform | str:
     """Return the motion refined from a guess, or why there is none.
 
-    Open3D gives up with a warning, returns the motion it had by then and calls the fitness of that motion
-    what it is; only a fitness of zero tells for certain that it did nothing. So whatever this returns is
-    to be judged by other means.
+    When Open3D does not converge it warns, returns its last motion and that motion's fitness; only a fitness
+    of zero shows for certain that it found nothing. So the motion has to be assessed by other means.
 
     Args:
         target: (N, 3) points that make the Gaussians, metres.
         source: (M, 3) points that are placed in them, metres.
         T_target_source: (4, 4) guess.
-        cell_m: Edge of the cells.
+        cells_m: Edges of the cells, from coarse to fine.
         min_points: Cells with fewer points have no Gaussian.
-        max_iterations: At most so many.
+        max_iterations: Largest number of steps at each cell size.
     """
+    if len(source) == 0:
+        return "no points in the source"
+    for cell_m in cells_m:
+        found = _by_cells(target, source, T_target_source, cell_m, min_points, max_iterations)
+        if isinstance(found, str):
+            return found
+        T_target_source = found
+    return T_target_source
+
+
+def _by_cells(
+    target: Points, source: Points, T: Transform, cell_m: float, min_points: int, max_iterations: int
+) -> Transform | str:
     import open3d
 
     registration = open3d.pipelines.registration
-    if len(source) == 0:
-        return "no points in the source"
     option = registration.NormalDistributionsTransformOption(
         voxel_size=cell_m, min_points_per_voxel=min_points, max_iteration=max_iterations
     )
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         try:
-            result = registration.registration_ndt(
-                _open3d_cloud(source), _open3d_cloud(target), option, T_target_source
-            )
+            result = registration.registration_ndt(_open3d_cloud(source), _open3d_cloud(target), option, T)
         except RuntimeError:
             return f"no cell of {cell_m:g} m has {min_points} points of the target in it"
     if result.fitness == 0.0:

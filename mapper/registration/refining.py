@@ -1,6 +1,6 @@
 """A motion refined by the nearest pairs of two clouds, by ICP, plane ICP or GICP; and what it is worth."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -26,12 +26,12 @@ def refine(
     T_target_source: Transform,
     *,
     kind: Refiner,
-    max_pair_distance_m: float,
+    pair_distances_m: Sequence[float],
     max_iterations: int = 40,
 ) -> Alignment:
-    """Return the motion refined from a guess by the nearest pairs, as ``measured`` with that pair distance.
+    """Return the motion refined from a guess by the nearest pairs, as ``measured`` at the last pair distance.
 
-    It tells no right answer from a wrong one: that is for the caller, who knows what overlap to expect.
+    Converged does not mean right: the caller has to compare the inliers with the overlap that it expects.
 
     Args:
         target: Cloud that stays; its normals and tree are used.
@@ -39,20 +39,18 @@ def refine(
         T_target_source: (4, 4) guess.
         kind: ``icp`` (Besl & McKay 1992), ``plane-icp`` (Chen & Medioni 1992), ``gicp`` (Segal, Haehnel
             & Thrun 2009).
-        max_pair_distance_m: Points without a partner this near take no part.
-        max_iterations: At most so many.
+        pair_distances_m: Largest distance between the points of a pair, from coarse to fine.
+        max_iterations: Largest number of steps at each of these distances.
     """
-    found = refined_motion(
-        target,
-        source,
-        T_target_source,
-        kind=kind,
-        max_pair_distance_m=max_pair_distance_m,
-        max_iterations=max_iterations,
-    )
-    if isinstance(found, str):
-        return failed(found)
-    return measured(target, source, found, max_pair_distance_m=max_pair_distance_m)
+    for distance_m in pair_distances_m:
+        found = _descended(target, source, T_target_source, kind, distance_m, max_iterations)
+        if isinstance(found, str):
+            return failed(found)
+        alignment = measured(target, source, found, max_pair_distance_m=distance_m)
+        if not alignment.converged:
+            break
+        T_target_source = found
+    return alignment
 
 
 def refined_motion(
@@ -61,10 +59,21 @@ def refined_motion(
     T_target_source: Transform,
     *,
     kind: Refiner,
-    max_pair_distance_m: float,
+    pair_distances_m: Sequence[float],
     max_iterations: int = 40,
 ) -> Transform | str:
-    """Return what ``refine`` does but not what it is worth, or why there is none."""
+    """Return the motion of ``refine`` without its assessment, or why there is none; arguments as there."""
+    for distance_m in pair_distances_m:
+        found = _descended(target, source, T_target_source, kind, distance_m, max_iterations)
+        if isinstance(found, str):
+            return found
+        T_target_source = found
+    return T_target_source
+
+
+def _descended(
+    target: Prepared, source: Prepared, T: Transform, kind: Refiner, distance_m: float, max_iterations: int
+) -> Transform | str:
     if min(len(target.points), len(source.points)) < _MIN_PAIRS or target.tree is None:
         return (
             f"{len(target.points)} and {len(source.points)} points after downsampling, "
@@ -77,9 +86,9 @@ def refined_motion(
         target.normals,
         source.points,
         source.normals,
-        T_target_source,
+        T,
         _DISTANCES[kind],
-        max_pair_distance_m,
+        distance_m,
         max_iterations,
         np.array([_STEP_RAD, _STEP_VOXELS * source.voxel_m]),
     )

@@ -30,7 +30,7 @@ class IcpMatcher:
                 sweep.prepared,
                 T_world_body,
                 kind="plane-icp" if self._config.distance == "plane" else "icp",
-                max_pair_distance_m=distance_m,
+                pair_distances_m=(distance_m,),
                 max_iterations=self._config.max_iterations,
             )
             if not found.converged:

@@ -1,4 +1,7 @@
-"""Configuration of the Hough-space registration (Nagy, Gálai & Benedek 2016)."""
+"""Settings of the Hough registration (Nagy, Gálai & Benedek 2016).
+
+Every length in metres is a setting, also those that nobody turns: for depth cameras all are shrunk alike.
+"""
 
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,40 +14,32 @@ if TYPE_CHECKING:
 
 
 class LevellingConfig(Config):
-    """Which way is up in one scan: the plane most points lie on and few below, by random samples."""
+    """Level frame of one scan: the plane with most points on it and few below, by random samples."""
 
     max_tilt_rad: Annotated[float, Field(gt=0.0, lt=1.4)] = 0.7
     """Steeper planes are walls."""
-    level_above_rad: NonNegativeFloat = 0.09
-    """A smaller tilt stays: on a sloping street the plane would tilt what gravity has levelled."""
     inlier_m: PositiveFloat = 0.12
     """Largest distance of a ground point from the plane."""
     min_height_m: float = 0.3
     max_height_m: float = 4.0
     """The sensor stands between these heights above the plane."""
-    below_weight: NonNegativeFloat = 1.0
-    """What a point below the plane costs, in inliers."""
     cell_m: PositiveFloat = 1.0
-    """One point per cubic cell is looked at, so that near ground does not outvote the rest."""
+    """One point per cubic cell is used, so that near ground does not outvote the rest."""
     reach_m: PositiveFloat = 40.0
-    """Points farther away along an axis are not looked at."""
+    """Points farther away along an axis are not used."""
     samples: PositiveInt = 400
     """Planes tried."""
-    min_inlier_ratio: Ratio = 0.03
-    """With a smaller share of inliers there is no ground, and the scan is taken as level."""
     seed: NonNegativeInt = 0
     """Of the random samples."""
 
 
 class GroundConfig(Config):
-    """What is ground: C1's grid, and what of the rest is looked at."""
+    """Ground removal on a grid (§3.1), and which of the remaining points are obstacles."""
 
     cell_m: PositiveFloat = 0.5
     """Edge of a cell of the grid."""
-    min_points: PositiveInt = 3
-    """Cells with fewer points are noise."""
     max_thickness_m: PositiveFloat = 0.25
-    """Between the lowest and the highest point of a ground cell (C1)."""
+    """Between the lowest and the highest point of a ground cell, as published."""
     window_m: PositiveFloat = 8.0
     """Neighbourhood of a cell."""
     max_rise_m: PositiveFloat = 0.5
@@ -52,15 +47,16 @@ class GroundConfig(Config):
     radius_m: PositiveFloat = 60.0
     """Half the edge of the grid: points farther away along an axis are dropped."""
     min_obstacle_m: float = 0.5
-    """Lowest height above the ground of what is no ground."""
+    """Least height of an obstacle above the ground."""
     max_obstacle_m: float = 8.0
-    """What is higher is cut off. C1 has 4 m; a tilted sensor sees little but walls, and more up to 8."""
+    """Higher points are dropped. The paper has 4 m; the scans of a tilted sensor are mostly walls, with more
+    up to 8."""
     voxel_m: PositiveFloat = 0.4
     """Obstacles are thinned to one point per voxel, so that sparse and dense clouds weigh alike."""
 
 
 class CellsConfig(Config):
-    """A constellation of the centroids of occupied cells: more and steadier points than objects."""
+    """Centroids of occupied cells in place of objects: more of them, and steadier."""
 
     kind: Literal["cells"] = "cells"
     cell_m: PositiveFloat = 2.0
@@ -70,7 +66,7 @@ class CellsConfig(Config):
 
 
 class ObjectsConfig(Config):
-    """C2: a constellation of objects, by two levels of grid cells."""
+    """Centres of objects, by two levels of grid cells (§3.2)."""
 
     kind: Literal["objects"] = "objects"
     coarse_m: PositiveFloat = 1.0
@@ -90,16 +86,17 @@ class ConstellationConfig(Config):
 
 
 class VotingConfig(Config):
-    """C3: the accumulator A[dx, dy, α]."""
+    """Accumulator A[dx, dy, α] (§3.3)."""
 
     max_offset_m: PositiveFloat = 10.0
-    """Largest offset looked for along each axis."""
+    """Largest offset searched along each axis."""
     margin_m: NonNegativeFloat = 2.0
     """The accumulator reaches so much farther: a peak at its edge would be cut."""
     bin_m: PositiveFloat = 1.0
     """Edge of a bin of dx and dy; one bin is centred on zero."""
     angles: PositiveInt = 180
-    """Steps of a full turn. C3 has 360; half of them find the same peaks, and verification refines them."""
+    """Steps of a full turn. The paper has 360; half of them find the same peaks, and verification refines
+    them."""
     peaks: PositiveInt = 20
     """Distinct peaks that are verified."""
     distinct_m: PositiveFloat = 2.0
@@ -108,66 +105,38 @@ class VotingConfig(Config):
 
 
 class OverlapConfig(Config):
-    """How peaks are verified: by what the two scans saw of each other's obstacles."""
+    """Verification of the peaks: planar refinement by overlap, then the free-space check."""
 
     voxel_m: PositiveFloat = 0.4
     """Obstacles of one scan within a voxel of those of the other overlap."""
     obstacles: PositiveInt = 1000
-    """Voxels, and columns of ground, that are looked at, evenly chosen."""
+    """Number of obstacle voxels, and of ground columns, that are compared, evenly chosen."""
     step_m: PositiveFloat = 0.4
     step_rad: PositiveFloat = 0.0175
     halvings: NonNegativeInt = 2
-    """From each peak the overlap is climbed in these steps, halved so often."""
+    """From each peak the overlap is maximised in these steps, halved so often."""
     candidates: PositiveInt = 6
-    """Peaks with the most overlap that are held against both scans' lines of sight."""
+    """Number of peaks, those with most overlap, that pass to the free-space check."""
     distinct_m: PositiveFloat = 1.0
     distinct_rad: PositiveFloat = 0.05
     """Motions nearer than both are the same."""
-    direction_rad: PositiveFloat = 0.0175
-    """Resolution of the lines of sight."""
     rays: PositiveInt = 40_000
-    """Points, evenly chosen, whose lines of sight are looked along."""
+    """Number of points, evenly chosen, whose rays make the range image."""
     margin_m: PositiveFloat = 0.2
-    margin_ratio: NonNegativeFloat = 0.01
-    """An obstacle agrees with a surface at its range, give or take this and so much of the range. One nearer
-    than all that the other scan saw in its direction contradicts it."""
-    min_returns: PositiveInt = 3
-    """And it contradicts only where so many of the directions around it have a return."""
-    contradiction_weight: NonNegativeFloat = 5.0
-    """A motion's score is the share of obstacles that agree, less so many times that which contradicts."""
+    """Margin of the free-space check along a ray."""
 
 
-class HoughTrustConfig(Config):
-    """When the answer is believed; otherwise there is none."""
+class HoughAcceptanceConfig(Config):
+    """When the answer is accepted; otherwise there is none."""
 
-    min_centres: PositiveInt = 5
-    """A scan with fewer centres shows no objects."""
-    min_score: float = 0.0
-    """A best candidate with a lower score is refused without being refined. Right ones had 0.3 and more,
-    those of different streets −0.4 and less."""
     min_agreeing_ratio: Ratio = 0.1
-    """Share of each scan's obstacles that the other saw, too. Right answers had 0.12 and more."""
-    min_ground_ratio: Ratio = 0.15
-    """Share of a scan's ground that the other saw, too. Where two views have but a wall in common, any wall
-    will do: wrong answers that nothing contradicted had 0.07 and less, right ones 0.31 and more."""
-    max_contradicting_ratio: Ratio = 0.015
-    """Share of the obstacles that the other scan looked through, the mean of both. Right answers had 0.008
-    and less, or 0.014 where a cloud's origin was not where it was seen from; answers in other, similar
-    courtyards 0.016 and more."""
-    many_centres: PositiveInt = 150
-    max_contradicting_many_ratio: Ratio = 0.03
-    """The same where both scans have many centres, whose agreement is no chance: traffic may contradict more.
-    Right answers had 0.023 and less, wrong ones 0.1 and more."""
+    """Share of each scan's obstacles that the other measured, too. Right answers had 0.12 and more."""
     min_lead: NonNegativeFloat = 0.1
     """By how much the score leads that of any other motion."""
     pair_m: PositiveFloat = 0.5
     """A point of the refined clouds counts as an inlier that lies so near to one of the other."""
-    min_share: Ratio = 0.004
-    """Each motion's displacements go along the surfaces' normals by this share, or the answer is loose."""
     refined: PositiveInt = 3
-    """Candidates that are refined, where their scores are near."""
-    near_score: NonNegativeFloat = 0.3
-    """How near."""
+    """Largest number of candidates that are refined, where their scores are near."""
 
 
 class GicpStagesConfig(Config):
@@ -181,25 +150,22 @@ class GicpStagesConfig(Config):
 
 
 class NdtStagesConfig(Config):
-    """NDT on what is not ground (C4)."""
+    """NDT on the points above the ground (§3.4)."""
 
     kind: Literal["ndt"] = "ndt"
     cells_m: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (2.0, 1.0)
     """Edges of the cells, from coarse to fine."""
-    min_points: Annotated[int, Field(ge=4)] = 6
-    """Cells with fewer points have no Gaussian."""
     max_iterations: PositiveInt = 30
     """At each of these cells."""
-    with_ground: bool = False
 
 
 class HoughConfig(Config):
-    """What the Hough-space registrations share."""
+    """Settings common to the Hough registrations."""
 
     constellation: ConstellationConfig
     voting: VotingConfig
     overlap: OverlapConfig = OverlapConfig()
-    trust: HoughTrustConfig = HoughTrustConfig()
+    acceptance: HoughAcceptanceConfig = HoughAcceptanceConfig()
     voxel_m: PositiveFloat = 0.4
     """The clouds that are refined have one point per voxel."""
     neighbours: Annotated[int, Field(ge=5)] = 10
@@ -214,7 +180,7 @@ class HoughConfig(Config):
 
 
 class HoughGicpConfig(HoughConfig):
-    """Occupied cells, Hough, GICP: our default."""
+    """Occupied cells, Hough voting, GICP: our default."""
 
     kind: Literal["hough-gicp"] = "hough-gicp"
     constellation: ConstellationConfig = ConstellationConfig()
@@ -225,7 +191,7 @@ class HoughGicpConfig(HoughConfig):
 
 
 class HoughNdtConfig(HoughConfig):
-    """Objects, Hough, NDT, as published; peaks are verified, and tilted scans levelled, all the same."""
+    """Objects, Hough voting, NDT, as published, with our levelling of tilted scans and our verification."""
 
     kind: Literal["hough-ndt"] = "hough-ndt"
     constellation: ConstellationConfig = ConstellationConfig(

@@ -1,4 +1,4 @@
-"""What is ground and what stands on it, by a grid (Nagy, Gálai & Benedek 2016, §3.1)."""
+"""Ground of a scan and the obstacles on it, by a grid (Nagy, Gálai & Benedek 2016, §3.1)."""
 
 from dataclasses import dataclass
 
@@ -12,14 +12,17 @@ from mapper.registration.hough.config import ConstellationConfig, GroundConfig
 from mapper.registration.hough.ground_kernels import column_heights, thin_obstacles
 from mapper.registration.hough.ground_plane import Levelling, level
 
+MIN_POINTS = 3
+"""Columns with fewer points are noise."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ground:
-    """The ground around a scan, in its level frame.
+    """Ground around a scan, in its level frame.
 
     Attributes:
         heights_level: (E, E) float32 z of the ground in each column of a grid centred on the origin, rows
-            along y; where no ground is near it is 0.
+            along y; 0 where no ground is near.
         seen: (E, E) bool: points of the ground fell into the column.
         cell_m: Edge of a column.
     """
@@ -30,14 +33,14 @@ class Ground:
 
     @property
     def points_level(self) -> Points:
-        """(G, 3) the ground at the middle of each column in which it was seen, metres."""
+        """(G, 3) metres: the ground at the middle of each column with points of it."""
         rows, columns = np.nonzero(self.seen)
         half = 0.5 * len(self.seen) - 0.5
         x, y = (columns - half) * self.cell_m, (rows - half) * self.cell_m
         return np.column_stack([x, y, self.heights_level[rows, columns]])
 
     def at(self, x: Array, y: Array) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-        """Return for (N,) places whether ground was seen there, and its height, metres."""
+        """Return for (N,) positions whether their column has points of the ground, and its height, metres."""
         edge = len(self.seen)
         columns = np.floor(x / self.cell_m + 0.5 * edge).astype(np.intp)
         rows = np.floor(y / self.cell_m + 0.5 * edge).astype(np.intp)
@@ -48,13 +51,13 @@ class Ground:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
-    """What is around a sensor, seen from above.
+    """A scan divided into ground and obstacles.
 
     Attributes:
-        levelling: How the scan stands; its level frame is that of the rest.
+        levelling: Level frame of the scan.
         ground: The ground.
         obstacles: (M, 3) float32 metres, level frame, one point per voxel.
-        heights_m: (M,) float32 their heights above the ground.
+        heights_m: (M,) float32 heights of the obstacles above the ground.
     """
 
     levelling: Levelling
@@ -64,11 +67,11 @@ class Surroundings:
 
 
 def surroundings(points_body: Points32, config: ConstellationConfig) -> Surroundings:
-    """Return what is around a sensor.
+    """Return the ground and the obstacles of a scan.
 
     Args:
         points_body: (N, 3) metres, body frame, z less than ``levelling.max_tilt_rad`` from up.
-        config: Its knobs.
+        config: Settings.
     """
     levelling = level(points_body, config.levelling)
     T_level_body = levelling.T_level_body
@@ -81,11 +84,11 @@ def find_ground(points_body: Points32, T_level_body: Transform, config: GroundCo
     """Return the ground of a scan.
 
     A column is ground when it has enough points, is thin, and its mean is not much above the lowest thin
-    column nearby (C1). Between ground columns, the ground is at the mean of those within the window.
+    column nearby. Between ground columns, the ground is at the mean of those within the window.
     """
     edge = 2 * int(np.ceil(config.radius_m / config.cell_m))
     count, low, high, mean = column_heights(points_body, T_level_body, config.cell_m, edge)
-    thin = (count >= config.min_points) & (high - low < config.max_thickness_m)
+    thin = (count >= MIN_POINTS) & (high - low < config.max_thickness_m)
     size = 2 * int(0.5 * config.window_m / config.cell_m) + 1
     lowest = cv2.erode(np.where(thin, mean, np.float32(np.inf)), np.ones((size, size), np.uint8))
     seen = thin & (mean - lowest <= config.max_rise_m)
@@ -98,7 +101,7 @@ def find_ground(points_body: Points32, T_level_body: Transform, config: GroundCo
 def find_obstacles(
     points_body: Points32, T_level_body: Transform, ground: Ground, config: GroundConfig
 ) -> tuple[Points32, NDArray[np.float32]]:
-    """Return what is neither ground nor too high, one point per voxel.
+    """Return the points that are neither ground nor too high, one per voxel.
 
     Returns:
         (M, 3) float32 in the level frame, and (M,) their heights above the ground, metres.

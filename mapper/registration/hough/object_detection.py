@@ -1,46 +1,16 @@
-"""The constellation of a scan: the few points on the plane by which it is recognised (C2)."""
-
-from dataclasses import dataclass
+"""Centres of the objects on the ground, seen from above (Nagy, Gálai & Benedek 2016, §3.2)."""
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.frames import Points32
-from mapper.core.geometry import Array, Transform
-from mapper.registration.hough.config import CellsConfig, ConstellationConfig, ObjectsConfig
-from mapper.registration.hough.ground_removal import surroundings
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Constellation:
-    """What stands around a sensor, seen from above.
-
-    Attributes:
-        centres_level: (N, 2) metres, level frame: x, y of objects or of occupied cells.
-        T_level_body: (4, 4) the frame they are told in.
-    """
-
-    centres_level: Array
-    T_level_body: Transform
-
-    def __len__(self) -> int:
-        return len(self.centres_level)
-
-
-def constellation(points_body: Points32, config: ConstellationConfig) -> Constellation:
-    """Return the constellation of a scan; an empty field or an empty scan has one without centres.
-
-    Args:
-        points_body: (N, 3) metres, body frame, z roughly up.
-        config: Its knobs.
-    """
-    around = surroundings(points_body, config)
-    return Constellation(centres_of(around.obstacles, config.centres), around.levelling.T_level_body)
+from mapper.core.geometry import Array
+from mapper.registration.hough.config import CellsConfig, ObjectsConfig
 
 
 def centres_of(obstacles: Points32, config: CellsConfig | ObjectsConfig) -> Array:
-    """Return the (N, 2) centres, metres, of what stands on the ground.
+    """Return the (N, 2) centres, metres, of the obstacles' objects or occupied cells.
 
     Args:
         obstacles: (M, 3) one point per voxel, as ``find_obstacles`` gives them.
@@ -52,25 +22,25 @@ def centres_of(obstacles: Points32, config: CellsConfig | ObjectsConfig) -> Arra
     if isinstance(config, ObjectsConfig):
         component_of = _objects(flat, config)
     else:
-        _, component_of = np.unique(_numbered(flat, config.cell_m), return_inverse=True)
+        _, component_of = np.unique(_cell_numbers(flat, config.cell_m), return_inverse=True)
     sizes = np.bincount(component_of)
     sums = np.column_stack([np.bincount(component_of, weights=flat[:, axis]) for axis in range(2)])
-    large = sizes >= _least(flat, config)
+    large = sizes >= _min_voxels(flat, config)
     centres: Array = sums[large] / sizes[large, np.newaxis]
     return centres
 
 
-def _least(flat: Array, config: CellsConfig | ObjectsConfig) -> float:
-    """Return how many voxels make an object or an occupied cell, in a cloud of this density."""
+def _min_voxels(flat: Array, config: CellsConfig | ObjectsConfig) -> float:
+    """Return the least number of voxels of an object or an occupied cell, in a cloud of this density."""
     cell_m = config.coarse_m if isinstance(config, ObjectsConfig) else config.cell_m
-    _, counts = np.unique(_numbered(flat, cell_m), return_counts=True)
+    _, counts = np.unique(_cell_numbers(flat, cell_m), return_counts=True)
     return max(1.0, config.min_voxels_ratio * float(np.median(counts)))
 
 
 def _objects(flat: Array, config: ObjectsConfig) -> NDArray[np.intp]:
-    """Return each voxel's object: a part of its group by fine cells, or the group where no part is large."""
+    """Return each voxel's object: its component by fine cells, or its group where no component is large."""
     group_of, component_of = _connected(flat, config.coarse_m), _connected(flat, config.fine_m)
-    large = np.bincount(component_of) >= _least(flat, config)
+    large = np.bincount(component_of) >= _min_voxels(flat, config)
     divided = np.zeros(group_of.max() + 1, np.bool_)
     divided[group_of[large[component_of]]] = True
     objects: NDArray[np.intp] = np.where(divided[group_of], component_of, len(large) + group_of)
@@ -78,7 +48,7 @@ def _objects(flat: Array, config: ObjectsConfig) -> NDArray[np.intp]:
 
 
 def _connected(flat: Array, cell_m: float) -> NDArray[np.intp]:
-    """Return for each point the component, of cells that touch at a side or a corner, it lies in."""
+    """Return each point's component of cells that touch at a side or a corner."""
     cells = _cells(flat, cell_m)
     cells -= cells.min(axis=0)
     image = np.zeros(cells.max(axis=0) + 1, np.uint8)
@@ -87,8 +57,8 @@ def _connected(flat: Array, cell_m: float) -> NDArray[np.intp]:
     return labels[cells[:, 0], cells[:, 1]].astype(np.intp) - 1
 
 
-def _numbered(flat: Array, cell_m: float) -> NDArray[np.int64]:
-    """Return for each point the number of its cell."""
+def _cell_numbers(flat: Array, cell_m: float) -> NDArray[np.int64]:
+    """Return the number of each point's cell."""
     cells = _cells(flat, cell_m)
     cells -= cells.min(axis=0)
     numbers: NDArray[np.int64] = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]

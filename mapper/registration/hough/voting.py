@@ -1,4 +1,4 @@
-"""Hough voting over (dx, dy, α): the planar motion that most pairs of centres agree on (C3)."""
+"""Hough voting over (dx, dy, α) by pairs of centres (Nagy, Gálai & Benedek 2016, §3.3, alg. 1)."""
 
 from dataclasses import dataclass
 
@@ -32,9 +32,14 @@ class Peak:
     @property
     def motion(self) -> Transform:
         """(4, 4) T_target_source between the two level frames."""
-        cosine, sine = np.cos(self.alpha_rad), np.sin(self.alpha_rad)
-        R = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-        return transform(R, np.array([self.dx_m, self.dy_m, 0.0]))
+        return planar_motion(self.dx_m, self.dy_m, self.alpha_rad)
+
+
+def planar_motion(dx_m: float, dy_m: float, alpha_rad: float) -> Transform:
+    """Return the (4, 4) motion that turns by α about z and then moves by (dx, dy)."""
+    cosine, sine = np.cos(alpha_rad), np.sin(alpha_rad)
+    R = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    return transform(R, np.array([dx_m, dy_m, 0.0]))
 
 
 def vote(target: Array, source: Array, config: VotingConfig) -> list[Peak]:

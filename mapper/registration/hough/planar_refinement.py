@@ -1,0 +1,89 @@
+"""Planar refinement of the accumulator's peaks: most overlap of the obstacles, then ground on ground."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.core.geometry import Transform, apply, rotation_exp, transform
+from mapper.registration.hough.config import HoughConfig, OverlapConfig
+from mapper.registration.hough.description import HoughDescription
+from mapper.registration.hough.ground_removal import Ground
+from mapper.registration.hough.planar_kernels import FULL_OVERLAP, hill_climb
+from mapper.registration.hough.voting import planar_motion
+
+_FITS = 3
+_FIT_WIDTH_M = 0.5
+_MIN_FIT_CELLS = 30
+_FIT_RIDGE = 1.0
+"""Weight, in cells, of a plane without step or slope."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlanarFit:
+    """A planar motion between level frames, and the overlap of the obstacles under it.
+
+    Attributes:
+        dx_m: Offset along the target's level x.
+        dy_m: Offset along its y.
+        alpha_rad: Turn about up.
+        overlap: 0 … 1, how many of the source's obstacles lie on the target's.
+    """
+
+    dx_m: float
+    dy_m: float
+    alpha_rad: float
+    overlap: float
+
+    def is_near(self, other: "PlanarFit", config: OverlapConfig) -> bool:
+        """Tell whether two are the same motion."""
+        turn = np.angle(np.exp(1j * (self.alpha_rad - other.alpha_rad)))
+        return bool(
+            np.hypot(self.dx_m - other.dx_m, self.dy_m - other.dy_m) <= config.distinct_m
+            and abs(turn) <= config.distinct_rad
+        )
+
+
+def refine_planar(
+    target: HoughDescription,
+    source: HoughDescription,
+    motion: tuple[float, float, float],
+    config: HoughConfig,
+) -> PlanarFit:
+    """Return the planar motion near (dx, dy, α) under which the obstacles overlap most."""
+    overlap = config.overlap
+    (dx_m, dy_m, alpha_rad), total = hill_climb(
+        target.volume,
+        source.free_space.obstacles_level,
+        source.heights_m,
+        np.array(motion),
+        overlap.voxel_m,
+        config.constellation.ground.min_obstacle_m,
+        overlap.step_m,
+        overlap.step_rad,
+        overlap.halvings,
+    )
+    share = total / (FULL_OVERLAP * max(len(source.heights_m), 1))
+    return PlanarFit(float(dx_m), float(dy_m), float(alpha_rad), float(share))
+
+
+def align_grounds(target: Ground, source: Ground, fit: PlanarFit) -> Transform:
+    """Return T_target_source between the level frames: the planar motion, with ground on ground.
+
+    The difference of the two grounds, a step and a slope, is fitted by least squares under Tukey's biweight
+    (Beaton & Tukey 1974). Where both scans show too little common ground, the planar motion is returned.
+    """
+    T = planar_motion(fit.dx_m, fit.dy_m, fit.alpha_rad)
+    x, y, z = apply(T, source.points_level).T
+    seen, heights = target.at(x, y)
+    if seen.sum() < _MIN_FIT_CELLS:
+        return T
+    rows = np.column_stack([np.ones(len(x)), x, y])[seen]
+    gaps_m = heights[seen] - z[seen]
+    plane = np.array([np.median(gaps_m), 0.0, 0.0])
+    for _ in range(_FITS):
+        weights = np.clip(1.0 - ((gaps_m - rows @ plane) / _FIT_WIDTH_M) ** 2, 0.0, None) ** 2
+        weighted = rows * weights[:, np.newaxis]
+        plane = np.linalg.solve(weighted.T @ rows + _FIT_RIDGE * np.eye(3), weighted.T @ gaps_m)
+    step, slope_x, slope_y = plane
+    tilt = transform(rotation_exp(np.array([slope_y, -slope_x, 0.0])), np.array([0.0, 0.0, step]))
+    return tilt @ T
