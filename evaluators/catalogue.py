@@ -1,5 +1,7 @@
 """The methods that `mapper compare` knows, set up for a log's sensor."""
 
+from functools import partial
+
 from evaluators.methods import AnyRegistration, Method, odometry_method, registration_method
 from evaluators.scales import kiss_icp, registrations_for
 from mapper.config.compare import CompareConfig
@@ -7,6 +9,7 @@ from mapper.core.errors import ConfigError
 from mapper.core.frames import Sensor
 from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig, PnpConfig
 from mapper.registration.config import NEED_NO_GUESS
+from mapper.registration.factory import build_registration
 from mapper.sources.base import Log
 
 
@@ -51,7 +54,9 @@ def _image_methods(max_depth_m: float) -> list[Method]:
 def _scan_methods(sensor: Sensor) -> list[Method]:
     """Return every registration of scans, those that need a guess first, and KISS-ICP."""
     registrations = [
-        registration_method(one.kind, one.build, uses_guess=one.kind not in NEED_NO_GUESS)
+        registration_method(
+            one.kind, partial(build_registration, one), uses_guess=one.kind not in NEED_NO_GUESS
+        )
         for one in registrations_for(sensor)
     ]
     kiss = kiss_icp(sensor)

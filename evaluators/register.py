@@ -13,6 +13,7 @@ from mapper.core.geometry import Transform
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.registration.base import Alignment
 from mapper.registration.config import AnyRegistration
+from mapper.registration.factory import build_registration
 from mapper.registration.hough.config import HoughGicpConfig, HoughNdtConfig
 
 _WARM_UP_STRIDE = 10
@@ -104,7 +105,7 @@ def _timed(
         course = voter.stages(source)
         hough = None if course.hough is None else course.hough.T_target_source
         return course.alignment, hough, {"prepare": prepared - began, **course.seconds}
-    aligner = config.build().prepare(target)
+    aligner = build_registration(config).prepare(target)
     prepared = time.perf_counter()
     alignment = aligner.align(source, T_target_source)
     return alignment, None, {"prepare": prepared - began, "align": time.perf_counter() - prepared}

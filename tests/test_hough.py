@@ -3,6 +3,7 @@ import pytest
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import angle_between, apply, inverse, rotation_exp, transform
+from mapper.registration.factory import build_registration
 from mapper.registration.hough.aligner import Hough
 from mapper.registration.hough.config import HoughAcceptanceConfig, HoughGicpConfig, HoughNdtConfig
 from mapper.simulation.config import COURTYARD, STREET
@@ -52,7 +53,7 @@ def courtyard():
 @pytest.mark.parametrize("config", [HoughGicpConfig(), HoughNdtConfig()], ids=lambda c: c.kind)
 def test_recovers_any_yaw_both_ways_without_a_guess(street, config):
     target, source, T_target_source = street
-    method = config.build()
+    method = build_registration(config)
     for a, b, T_a_b in ((target, source, T_target_source), (source, target, inverse(T_target_source))):
         found = method.prepare(a).align(b, np.eye(4))
 
@@ -67,7 +68,7 @@ def test_recovers_any_yaw_both_ways_without_a_guess(street, config):
 def test_recovers_motion_between_tilted_scans(courtyard):
     target, source, T_target_source = courtyard
 
-    found = HoughGicpConfig().build().prepare(target).align(source, np.eye(4))
+    found = build_registration(HoughGicpConfig()).prepare(target).align(source, np.eye(4))
 
     miss_m, miss_deg = miss(found, T_target_source)
     assert found.converged, found.reason
@@ -81,7 +82,7 @@ def test_recovers_a_sparse_scan_in_a_dense_one(street, kept_ratio):
     keep = np.random.default_rng(0).random(len(source.points_body)) < kept_ratio
     sparse = Scan(stamp_ns=0, points_body=source.points_body[keep], origin_body=source.origin_body)
 
-    found = HoughGicpConfig().build().prepare(target).align(sparse, np.eye(4))
+    found = build_registration(HoughGicpConfig()).prepare(target).align(sparse, np.eye(4))
 
     assert found.converged, found.reason
     assert miss(found, T_target_source)[0] < 0.1
@@ -90,7 +91,7 @@ def test_recovers_a_sparse_scan_in_a_dense_one(street, kept_ratio):
 def test_same_answer_whatever_the_guess_and_the_order(street):
     target, source, _ = street
     before = source.points_body.copy()
-    aligner = HoughGicpConfig().build().prepare(target)
+    aligner = build_registration(HoughGicpConfig()).prepare(target)
     first = aligner.align(source, np.eye(4))
     aligner.align(target, np.eye(4))
     again = aligner.align(source, transform(np.eye(3), np.array([50.0, 0.0, 0.0])))
@@ -101,7 +102,7 @@ def test_same_answer_whatever_the_guess_and_the_order(street):
 
 def test_tells_its_stages(street):
     target, source, T_target_source = street
-    stages = HoughGicpConfig().build().prepare(target).stages(source)
+    stages = Hough(HoughGicpConfig()).prepare(target).stages(source)
 
     gap = inverse(T_target_source) @ stages.hough.T_target_source
     assert np.linalg.norm(gap[:3, 3]) < 0.5
@@ -117,7 +118,7 @@ def test_tells_its_stages(street):
 def test_strangers_are_refused(config, seeds):
     a, b = (source_of(config, seed).observe(4) for seed in seeds)
 
-    found = HoughGicpConfig().build().prepare(a).align(b, np.eye(4))
+    found = build_registration(HoughGicpConfig()).prepare(a).align(b, np.eye(4))
 
     assert not found.converged
     assert found.reason
@@ -127,7 +128,7 @@ def test_an_answer_beyond_the_range_is_refused():
     log = source_of(STREET, 3)
     target, source, _ = pair_of(log, 0, 0, yaw_rad=1.0, shift_m=(25.0, 0.0, 0.0))
 
-    assert not HoughGicpConfig().build().prepare(target).align(source, np.eye(4)).converged
+    assert not build_registration(HoughGicpConfig()).prepare(target).align(source, np.eye(4)).converged
 
 
 def test_two_motions_as_good_as_each_other_are_none():
@@ -150,7 +151,7 @@ def test_two_motions_as_good_as_each_other_are_none():
         )
     scan = Scan(stamp_ns=0, points_body=np.concatenate([field, *posts]).astype(np.float32))
 
-    found = HoughGicpConfig().build().prepare(scan).align(scan, np.eye(4))
+    found = build_registration(HoughGicpConfig()).prepare(scan).align(scan, np.eye(4))
 
     assert not found.converged
     assert "ambiguous" in found.reason
@@ -185,7 +186,7 @@ def far_away(rng):
 @pytest.mark.parametrize("config", [HoughGicpConfig(), HoughNdtConfig()], ids=lambda c: c.kind)
 def test_bad_scans_are_refused_with_a_reason(street, make, config):
     bad = Scan(stamp_ns=0, points_body=make(np.random.default_rng(0)).astype(np.float32))
-    method = config.build()
+    method = build_registration(config)
 
     for target, source in ((street[0], bad), (bad, street[0]), (bad, bad)):
         found = method.prepare(target).align(source, np.eye(4))
@@ -216,7 +217,7 @@ def test_along_a_corridor_nothing_is_known():
         points = np.concatenate([np.column_stack([x, y, np.full(30_000, -1.7)]), *walls])
         return Scan(stamp_ns=0, points_body=(points + rng.normal(0.0, 0.01, points.shape)).astype(np.float32))
 
-    found = HoughGicpConfig().build().prepare(corridor(0)).align(corridor(1), np.eye(4))
+    found = build_registration(HoughGicpConfig()).prepare(corridor(0)).align(corridor(1), np.eye(4))
 
     assert not found.converged
     assert found.reason

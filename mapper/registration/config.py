@@ -1,26 +1,23 @@
-"""Methods that register two scans.
+"""Settings of the methods that register two scans.
 
-The baselines' lengths are multiples of one voxel, so that one knob fits them to a scene.
+A new method is registered in two places: its settings in ``AnyRegistration`` here, its class in
+``factory.py``.
+
+The local methods' lengths are multiples of one voxel, so that this one setting fits them to a scene.
 """
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from mapper.core.config import Config, Ratio
 from mapper.registration.hough.config import HoughGicpConfig, HoughNdtConfig
 
-if TYPE_CHECKING:
-    pass
-
-if TYPE_CHECKING:
-    from mapper.registration.base import Registration
-
 VOXEL_M = {"lidar": 0.3, "rgbd": 0.05}
-"""What suits a scene some tens of metres wide, and one of a few metres."""
+"""Voxel for a scene some tens of metres wide, and for one of a few metres."""
 
 NEED_NO_GUESS = frozenset({"hough-gicp", "hough-ndt", "kiss-matcher"})
-"""They look for the motion everywhere, and not at a guess."""
+"""Global methods: they search all motions, and use no guess."""
 
 Distances = Annotated[tuple[PositiveFloat, ...], Field(min_length=1)]
 
@@ -37,7 +34,7 @@ class AcceptanceConfig(Config):
 
 
 class RefinedConfig(Config):
-    """What the methods share whose answer is refined by nearest pairs."""
+    """Settings common to the methods whose answer is refined by nearest pairs."""
 
     voxel_m: PositiveFloat = VOXEL_M["lidar"]
     """Scans are reduced to one point in each such voxel; every other length is a multiple of it."""
@@ -50,31 +47,19 @@ class RefinedConfig(Config):
     acceptance: AcceptanceConfig = AcceptanceConfig()
 
 
-class IterativeConfig(RefinedConfig):
-    """Nearest pairs and the best motion for them, in turn."""
-
-    kind: Literal["icp", "plane-icp", "gicp"]
-
-    def build(self) -> "Registration":
-        """Return the method this configures."""
-        from mapper.registration.iterative import Iterative
-
-        return Iterative(self)
-
-
-class IcpConfig(IterativeConfig):
+class IcpConfig(RefinedConfig):
     """Point-to-point ICP (Besl & McKay 1992)."""
 
     kind: Literal["icp"] = "icp"
 
 
-class PlaneIcpConfig(IterativeConfig):
+class PlaneIcpConfig(RefinedConfig):
     """Point-to-plane ICP (Chen & Medioni 1992)."""
 
     kind: Literal["plane-icp"] = "plane-icp"
 
 
-class GicpConfig(IterativeConfig):
+class GicpConfig(RefinedConfig):
     """Generalised ICP (Segal, Haehnel & Thrun 2009)."""
 
     kind: Literal["gicp"] = "gicp"
@@ -87,7 +72,7 @@ class NdtConfig(Config):
     voxel_m: PositiveFloat = VOXEL_M["lidar"]
     """The source is reduced to one point in each such voxel; every other length is a multiple of it."""
     neighbours: Annotated[int, Field(ge=5)] = 10
-    """Nearest points that give each normal by which the answer is judged."""
+    """Nearest points that give each normal by which the answer is assessed."""
     cells_voxels: Distances = (7.0, 3.5)
     """Edges of the target's cells, each with one Gaussian, from coarse to fine."""
     min_points: Annotated[int, Field(ge=4)] = 6
@@ -95,12 +80,6 @@ class NdtConfig(Config):
     max_iterations: PositiveInt = 30
     """At each of these cells."""
     acceptance: AcceptanceConfig = AcceptanceConfig()
-
-    def build(self) -> "Registration":
-        """Return the method this configures."""
-        from mapper.registration.ndt import Ndt
-
-        return Ndt(self)
 
 
 class KissMatcherConfig(RefinedConfig):
@@ -111,12 +90,6 @@ class KissMatcherConfig(RefinedConfig):
     """Features are computed on clouds reduced to voxels this many times larger: a quarter of the time of 1,
     and as many right answers."""
 
-    def build(self) -> "Registration":
-        """Return the method this configures."""
-        from mapper.registration.kiss_matcher import KissMatcher
-
-        return KissMatcher(self)
-
 
 AnyRegistration = (
     HoughGicpConfig | HoughNdtConfig | IcpConfig | PlaneIcpConfig | GicpConfig | NdtConfig | KissMatcherConfig
@@ -125,15 +98,17 @@ RegistrationConfig = Annotated[AnyRegistration, Field(discriminator="kind")]
 
 
 class IsvdConfig(Config):
-    """Iterative SVD on matched 3D points (thesis alg. 7, eq. 4.1–4.2)."""
+    """Iterative SVD on matched 3D points (Somlyai, PhD thesis, alg. 7, eq. 4.1–4.2)."""
 
     kind: Literal["isvd"] = "isvd"
     threshold: Literal["power", "halving"] = "power"
     """How the largest pair distance shrinks: α·j^β (alg. 7), or by half from ``start_error_mm`` (alg. 6)."""
     alpha_mm: PositiveFloat = 1200.0
     beta: Annotated[float, Field(lt=0.0)] = -2.6
+    """α and β of the power law, as published. Larger ones where frames lie farther apart."""
     start_error_mm: PositiveFloat = 1000.0
-    """e_start of the halving threshold; the thesis leaves it open."""
+    """e_start of the halving threshold, which the thesis leaves open. Larger where frames lie farther
+    apart."""
     step: Literal["svd", "icp"] = "svd"
     """The motion in each iteration: the SVD of the pairs (alg. 6, 7), or ICP on their points (alg. 5)."""
     max_iterations: PositiveInt = 25
@@ -142,7 +117,7 @@ class IsvdConfig(Config):
     min_pairs: PositiveInt = 100
     """Stop before fewer pairs than this, or than half of a smaller set, would remain ("Auto")."""
     agreement_mm: PositiveFloat = 50.0
-    """Pairs this close after the motion are said to agree with it."""
+    """Pairs this close after the motion agree with it."""
     min_agreeing: Annotated[int, Field(ge=3)] = 20
     """A motion that fewer pairs agree with is refused."""
     min_agreement_ratio: Ratio = 0.25

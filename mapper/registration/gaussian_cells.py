@@ -7,7 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, is_rigid
-from mapper.registration.descent import FLATNESS, add_pair, inverse_of, moved, on_frame, turned
+from mapper.registration.gauss_newton import FLATNESS, add_pair, inverse_of, moved, on_frame, turned
 from mapper.registration.surfaces import Prepared
 
 _EMPTY = -1

@@ -11,7 +11,7 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, is_rigid, transform
 from mapper.registration.base import Alignment, failed
 from mapper.registration.config import KissMatcherConfig
-from mapper.registration.iterative import cloud_of, refined
+from mapper.registration.icp import cloud_of, refined
 from mapper.registration.surfaces import Prepared, prepared
 
 _CROWD = 5  # points this near together, in feature voxels, surely have a normal and a feature

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, apply, is_rigid
 from mapper.registration.base import Alignment, failed
-from mapper.registration.descent import GAUSSIAN, PLANE, POINT, descend_on_points
+from mapper.registration.gauss_newton import GAUSSIAN, PLANE, POINT, descend_on_points
 from mapper.registration.surfaces import Prepared
 
 Refiner = Literal["icp", "plane-icp", "gicp"]

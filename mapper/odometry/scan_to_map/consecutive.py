@@ -4,13 +4,14 @@ from mapper.core.geometry import Transform
 from mapper.odometry.scan_to_map.config import HoughOdometryConfig
 from mapper.odometry.scan_to_map.matching import Reach, Sweep
 from mapper.registration.base import Aligner
+from mapper.registration.factory import build_registration
 
 
 class ConsecutiveMatcher:
     """The map is the last scan."""
 
     def __init__(self, config: HoughOdometryConfig) -> None:
-        self._registration = config.registration.build()
+        self._registration = build_registration(config.registration)
         self.clear()
 
     def match(self, sweep: Sweep, T_world_body: Transform, *, reach: Reach) -> Transform | None:

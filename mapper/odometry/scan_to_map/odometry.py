@@ -20,6 +20,7 @@ from mapper.odometry.scan_to_map.matching import Matcher, Sweep
 from mapper.odometry.scan_to_map.observation import ScanObservation, observe_scan
 from mapper.registration.base import Aligner, Alignment
 from mapper.registration.degeneracy import degeneracy_of, projected
+from mapper.registration.factory import build_registration
 from mapper.registration.refining import measured
 from mapper.sources.base import FrameRef
 
@@ -65,7 +66,7 @@ class ScanOdometry:
     def __init__(self, config: ScanOdometryConfig, make_matcher: Callable[[], Matcher]) -> None:
         self._config = config
         self._matcher = make_matcher()
-        self._rescue = config.rescue.build() if config.rescue is not None else None
+        self._rescue = build_registration(config.rescue) if config.rescue is not None else None
         self._rescuer: tuple[int, Aligner] | None = None
         self._overlaps: deque[float] = deque(maxlen=_USUAL_OF)
         self._keyframe: _Keyframe | None = None

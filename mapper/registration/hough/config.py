@@ -3,14 +3,11 @@
 Every length in metres is a setting, also those that nobody turns: for depth cameras all are shrunk alike.
 """
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from mapper.core.config import Config, Ratio
-
-if TYPE_CHECKING:
-    from mapper.registration.base import Registration
 
 
 class LevellingConfig(Config):
@@ -171,12 +168,6 @@ class HoughConfig(Config):
     neighbours: Annotated[int, Field(ge=5)] = 10
     """Nearest points that give each of these its normal."""
     refinement: Annotated[GicpStagesConfig | NdtStagesConfig, Field(discriminator="kind")]
-
-    def build(self) -> "Registration":
-        """Return the method this configures."""
-        from mapper.registration.hough.aligner import Hough
-
-        return Hough(self)
 
 
 class HoughGicpConfig(HoughConfig):

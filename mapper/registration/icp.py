@@ -1,47 +1,49 @@
-"""ICP, point-to-plane ICP and GICP behind the seam: from coarse pairs to fine ones, then judged."""
+"""ICP, point-to-plane ICP and GICP: from coarse pairs to fine ones, then assessed."""
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform
 from mapper.registration.acceptance import assess
 from mapper.registration.base import Alignment
-from mapper.registration.config import IterativeConfig, RefinedConfig
+from mapper.registration.config import GicpConfig, IcpConfig, PlaneIcpConfig, RefinedConfig
 from mapper.registration.refining import Refiner, refine
 from mapper.registration.surfaces import Prepared, prepared
 
+AnyIcp = IcpConfig | PlaneIcpConfig | GicpConfig
 
-class Iterative:
-    """Registers scans by their nearest pairs."""
 
-    def __init__(self, config: IterativeConfig) -> None:
+class Icp:
+    """ICP and its variants: scans are registered by their nearest pairs."""
+
+    def __init__(self, config: AnyIcp) -> None:
         self._config = config
 
-    def prepare(self, target: Scan) -> "IterativeAligner":
+    def prepare(self, target: Scan) -> "IcpAligner":
         """Return the method bound to a target."""
-        return IterativeAligner(cloud_of(target, self._config), self._config)
+        return IcpAligner(cloud_of(target, self._config), self._config)
 
 
-class IterativeAligner:
-    """A target's cloud and how sources are brought onto it."""
+class IcpAligner:
+    """ICP bound to a target's cloud."""
 
-    def __init__(self, target: Prepared, config: IterativeConfig) -> None:
+    def __init__(self, target: Prepared, config: AnyIcp) -> None:
         self._target = target
         self._config = config
 
     def align(self, source: Scan, T_target_source: Transform) -> Alignment:
-        """Return the motion refined from a guess, judged."""
+        """Return the motion refined from a guess, assessed."""
         cloud = cloud_of(source, self._config)
         return refined(self._target, cloud, T_target_source, self._config, kind=self._config.kind)
 
 
 def cloud_of(scan: Scan, config: RefinedConfig) -> Prepared:
-    """Return a scan's cloud, as a configuration wants it."""
+    """Return a scan's cloud, prepared by the settings."""
     return prepared(scan.points_body, voxel_m=config.voxel_m, neighbours=config.neighbours)
 
 
 def refined(
     target: Prepared, source: Prepared, T_target_source: Transform, config: RefinedConfig, *, kind: Refiner
 ) -> Alignment:
-    """Return the motion refined at one pair distance after another, judged."""
+    """Return the motion refined at one pair distance after another, assessed."""
     alignment = refine(
         target,
         source,
