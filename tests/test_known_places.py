@@ -13,6 +13,7 @@ from mapper.core.timebase import NS_PER_S
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.loops.closure import discrepancy
 from mapper.loops.config import PlaceLoopsConfig
+from mapper.loops.factory import build_loop_detector
 
 T_OTHER_WORLD = exp(np.array([0.2, 0.1, 2.0]), np.array([7.0, -4.0, 0.5]))
 CLOSE_IN_TIME_NS = NS_PER_S // 100
@@ -27,7 +28,7 @@ def knowing(config, room):
     truth = walked()[:LAP]
     graph = PoseGraph(dict(enumerate(truth)), {k: k * CLOSE_IN_TIME_NS for k in range(LAP)})
     graph.add_factors(link(k, k + 1, truth[k], truth[k + 1]) for k in range(LAP - 1))
-    detector = config.build("batch")
+    detector = build_loop_detector(config, "batch")
     detector.preload(graph, {k: room.view(T, graph.stamps_ns[k]) for k, T in graph.T_world_node.items()})
     return detector
 

@@ -17,6 +17,7 @@ from mapper.graph.model import BetweenFactor, PoseSigmas
 from mapper.loops.closure import LoopClosure, discrepancy
 from mapper.loops.config import GateConfig, NoLoopsConfig, PlaceLoopsConfig, ThesisLoopsConfig
 from mapper.loops.detector import LoopDetector
+from mapper.loops.factory import build_loop_detector
 from mapper.places.config import PlacesConfig
 
 NODES, LAP = 60, 40
@@ -72,7 +73,7 @@ def worst_m(loops: Sequence[LoopClosure]) -> float:
 
 @pytest.mark.parametrize("propose", ["places", "nearby"])
 def test_the_second_lap_closes_on_the_first(propose):
-    detector = PlaceLoopsConfig(propose=propose, places=PLACES).build("batch")
+    detector = build_loop_detector(PlaceLoopsConfig(propose=propose, places=PLACES), "batch")
     walk(detector, Room(1))
     found = accepted(detector)
     assert len({loop.j for loop in found}) >= 0.8 * (NODES - LAP)
@@ -81,7 +82,7 @@ def test_the_second_lap_closes_on_the_first(propose):
 
 
 def test_loops_correct_what_is_believed():
-    detector = PlaceLoopsConfig(places=PLACES).build("batch")
+    detector = build_loop_detector(PlaceLoopsConfig(places=PLACES), "batch")
     walk(detector, Room(1))
     truth = walked()
     drifted = drifting(truth)
@@ -91,7 +92,7 @@ def test_loops_correct_what_is_believed():
 
 
 def test_every_candidate_gets_a_verdict():
-    detector = PlaceLoopsConfig(places=PLACES).build("batch")
+    detector = build_loop_detector(PlaceLoopsConfig(places=PLACES), "batch")
     walk(detector, Room(1))
     for loop in detector.closures():
         assert (loop.verdict == "rejected") == bool(loop.reason)
@@ -101,7 +102,7 @@ def test_every_candidate_gets_a_verdict():
 def test_two_runs_tell_the_same():
     runs = []
     for _ in range(2):
-        detector = PlaceLoopsConfig(places=PLACES).build("batch")
+        detector = build_loop_detector(PlaceLoopsConfig(places=PLACES), "batch")
         walk(detector, Room(1))
         runs.append([(loop.i, loop.j, loop.reason, loop.similarity) for loop in detector.closures()])
     assert runs[0] == runs[1]
@@ -111,27 +112,29 @@ def test_the_gate_refuses_what_odometry_rules_out():
     gate = GateConfig(
         slack_m=0.01, slack_rad=0.01, drift_ratio=0.0, drift_rad_per_m=0.0, drift_rad_per_rad=0.0
     )
-    detector = PlaceLoopsConfig(places=PLACES, gate=gate).build("batch")
+    detector = build_loop_detector(PlaceLoopsConfig(places=PLACES, gate=gate), "batch")
     walk(detector, Room(1))
     assert not accepted(detector)
     assert any(loop.reason.startswith("gate: ") for loop in detector.closures())
 
 
 def test_a_loop_without_company_is_not_believed():
-    detector = PlaceLoopsConfig(places=PLACES, min_agreeing=NODES).build("batch")
+    detector = build_loop_detector(PlaceLoopsConfig(places=PLACES, min_agreeing=NODES), "batch")
     walk(detector, Room(1))
     assert not accepted(detector)
     assert any(loop.reason.startswith("alone: ") for loop in detector.closures())
 
 
 def test_a_look_needs_motion():
-    detector = PlaceLoopsConfig(places=PLACES, min_motion_m=10.0, min_motion_rad=10.0).build("batch")
+    detector = build_loop_detector(
+        PlaceLoopsConfig(places=PLACES, min_motion_m=10.0, min_motion_rad=10.0), "batch"
+    )
     walk(detector, Room(1))
     assert not detector.closures()
 
 
 def test_words_need_orb_descriptors():
-    detector = PlaceLoopsConfig(propose="places").build("batch")
+    detector = build_loop_detector(PlaceLoopsConfig(propose="places"), "batch")
     view = Room(1).view(np.eye(4), 0)
     numbers = View(
         0,
@@ -148,7 +151,7 @@ def test_words_need_orb_descriptors():
 
 def test_the_thesis_looks_only_from_sharp_frames():
     sharp = [800 if k % 10 == 5 else 500 for k in range(NODES)]
-    detector = ThesisLoopsConfig(keyframe_interval=5).build("proportional")
+    detector = build_loop_detector(ThesisLoopsConfig(keyframe_interval=5), "proportional")
     walk(detector, Room(1), features=sharp)
     assert detector.closures()
     assert {loop.j % 10 for loop in detector.closures()} == {5}
@@ -156,14 +159,14 @@ def test_the_thesis_looks_only_from_sharp_frames():
 
 
 def test_the_thesis_finds_nothing_when_no_frame_is_sharp():
-    detector = ThesisLoopsConfig().build("proportional")
+    detector = build_loop_detector(ThesisLoopsConfig(), "proportional")
     walk(detector, Room(1))
     assert not detector.closures()
 
 
 def test_proportional_correction_puts_the_newest_node_where_its_loop_wants_it():
     sharp = [800 if k == 50 else 500 for k in range(NODES)]
-    detector = ThesisLoopsConfig(keyframe_interval=5).build("proportional")
+    detector = build_loop_detector(ThesisLoopsConfig(keyframe_interval=5), "proportional")
     walk(detector, Room(1), features=sharp)
     (closed,) = accepted(detector)
     assert closed.j == 50
@@ -172,7 +175,7 @@ def test_proportional_correction_puts_the_newest_node_where_its_loop_wants_it():
 
 
 def test_no_loops_finds_nothing():
-    detector = NoLoopsConfig().build("batch")
+    detector = build_loop_detector(NoLoopsConfig(), "batch")
     walk(detector, Room(1))
     assert detector.closures() == ()
 

@@ -19,10 +19,10 @@ from mapper.loops.closure import (
     read_closures,
     write_closures,
 )
-from mapper.loops.config import GateConfig, VerificationConfig
+from mapper.loops.config import GateConfig, ImageVerificationConfig
 from mapper.loops.consistency_check import ConsistencyCheck
+from mapper.loops.image_verification import ImageVerifier
 from mapper.loops.odometry_chain import OdometryChain, allowed
-from mapper.loops.verification import ImageVerifier
 from mapper.odometry.config import MatchConfig
 
 SURE = PoseSigmas(rotation_rad=0.01, translation_m=0.01).information
@@ -46,7 +46,7 @@ def loop(i: int, j: int, T_i_j: np.ndarray | None = None, **rest) -> LoopClosure
 def test_two_views_of_one_place_give_their_relative_pose():
     room = Room(1)
     T_world_i, T_world_j = at(0.2, 0.1, 0.1), at(0.5, -0.2, -0.15)
-    found = ImageVerifier(VerificationConfig()).verify(room.view(T_world_i, 0), room.view(T_world_j, 1))
+    found = ImageVerifier(ImageVerificationConfig()).verify(room.view(T_world_i, 0), room.view(T_world_j, 1))
     assert found.reason == ""
     miss = discrepancy(found.T_i_j, T_world_i, T_world_j)
     assert miss.translation_m < 0.01
@@ -58,15 +58,15 @@ def test_two_views_of_one_place_give_their_relative_pose():
 def test_isvd_can_be_the_measure_too():
     room = Room(1)
     views = room.view(at(0.2, 0.1, 0.1), 0), room.view(at(0.4), 1)
-    by_isvd = ImageVerifier(VerificationConfig(measure="isvd")).verify(*views)
-    by_pixels = ImageVerifier(VerificationConfig()).verify(*views)
+    by_isvd = ImageVerifier(ImageVerificationConfig(measure="isvd")).verify(*views)
+    by_pixels = ImageVerifier(ImageVerificationConfig()).verify(*views)
     assert by_isvd.reason == by_pixels.reason == ""
     assert not np.array_equal(by_isvd.T_i_j, by_pixels.T_i_j)
     assert discrepancy(by_isvd.T_i_j, np.eye(4), by_pixels.T_i_j).translation_m < 0.02
 
 
 def test_the_claimed_uncertainty_covers_the_error():
-    room, verifier = Room(3), ImageVerifier(VerificationConfig())
+    room, verifier = Room(3), ImageVerifier(ImageVerificationConfig())
     T_world_i = at(0.0)
     chi2 = []
     for k in range(20):
@@ -78,7 +78,9 @@ def test_the_claimed_uncertainty_covers_the_error():
 
 
 def test_views_of_two_rooms_are_not_one_place():
-    found = ImageVerifier(VerificationConfig()).verify(Room(1).view(at(0.0), 0), Room(2).view(at(0.0), 1))
+    found = ImageVerifier(ImageVerificationConfig()).verify(
+        Room(1).view(at(0.0), 0), Room(2).view(at(0.0), 1)
+    )
     assert found.T_i_j is None
     assert found.reason.startswith("matching: ")
     assert "want 45" in found.reason
@@ -87,7 +89,7 @@ def test_views_of_two_rooms_are_not_one_place():
 def test_the_same_things_standing_differently_are_not_one_place():
     room, mixed = Room(1), Room(1)
     mixed.points = np.random.default_rng(5).permutation(mixed.points)
-    config = VerificationConfig(min_matches=10)
+    config = ImageVerificationConfig(min_matches=10)
     found = ImageVerifier(config).verify(room.view(at(0.0), 0), mixed.view(at(0.0), 1))
     assert found.T_i_j is None
     assert found.reason.startswith(("isvd: ", "reprojection: "))
@@ -97,15 +99,15 @@ def test_reprojection_refuses_what_isvd_alone_would_take():
     room = Room(1)
     i, j = room.view(at(0.0), 0), room.view(at(0.1), 1)
     shifted = replace(j, pixels=j.pixels + np.random.default_rng(0).normal(0.0, 15.0, j.pixels.shape))
-    found = ImageVerifier(VerificationConfig()).verify(i, shifted)
+    found = ImageVerifier(ImageVerificationConfig()).verify(i, shifted)
     assert found.reason.startswith("reprojection: ")
     assert found.rmse_m is not None
 
 
 def test_a_homography_filters_the_pairs_when_asked():
-    config = VerificationConfig(match=MatchConfig(filter="homography"), min_matches=45)
+    config = ImageVerificationConfig(match=MatchConfig(filter="homography"), min_matches=45)
     room = Room(1)
-    plain = ImageVerifier(VerificationConfig()).verify(room.view(at(0.0), 0), room.view(at(0.3, 0.2), 1))
+    plain = ImageVerifier(ImageVerificationConfig()).verify(room.view(at(0.0), 0), room.view(at(0.3, 0.2), 1))
     filtered = ImageVerifier(config).verify(room.view(at(0.0), 0), room.view(at(0.3, 0.2), 1))
     assert filtered.matches < plain.matches
 

@@ -18,6 +18,8 @@ from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.loops.closure import LoopClosure, discrepancy
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig, ScanVerificationConfig, ThesisLoopsConfig
 from mapper.loops.detector import KeyframeLoopDetector
+from mapper.loops.factory import build_loop_detector
+from mapper.loops.scan_verification import ScanVerifier
 
 STEP_M = 3.0
 LINK = PoseSigmas(rotation_rad=0.002, translation_m=0.05).information
@@ -58,7 +60,7 @@ def feed(
 
 
 def driven(truth: Sequence[Transform], views: Sequence[ScanView], **config) -> KeyframeLoopDetector:
-    detector = ScanLoopsConfig(min_motion_m=1.0, **config).build("batch")
+    detector = build_loop_detector(ScanLoopsConfig(min_motion_m=1.0, **config), "batch")
     feed(detector, drifting(truth), views)
     return detector
 
@@ -97,7 +99,7 @@ def test_a_street_driven_back_on_the_other_lane_is_the_same_street():
 @pytest.mark.parametrize("tied", [True, False])
 def test_another_street_is_another_street(tied):
     (one, views_one), (other, views_other) = drive(1, 0, 60), drive(2, 0, 60)
-    detector = ScanLoopsConfig(min_motion_m=1.0).build("batch")
+    detector = build_loop_detector(ScanLoopsConfig(min_motion_m=1.0), "batch")
     feed(detector, one, views_one)
     told = [one[0] @ inverse(other[0]) @ T for T in other]
     if tied:
@@ -147,7 +149,7 @@ def test_an_earlier_drive_is_recognised_wherever_its_world_lies():
     graph.add_factors(
         BetweenFactor(k, k + 1, inverse(first[k]) @ first[k + 1], LINK) for k in range(len(first) - 1)
     )
-    detector = ScanLoopsConfig(min_motion_m=1.0).build("batch")
+    detector = build_loop_detector(ScanLoopsConfig(min_motion_m=1.0), "batch")
     detector.preload(graph, dict(enumerate(views_first)))
     T_other_world = exp(np.array([0.0, 0.0, 1.0]), np.array([500.0, -300.0, 20.0]))
     feed(detector, [T_other_world @ T for T in again], reobserve, first=len(first))
@@ -162,7 +164,7 @@ def test_an_earlier_drive_is_recognised_wherever_its_world_lies():
 
 
 def verified(T_i: Transform, T_j: Transform, *, seeds=(1, 1), **config):
-    verifier = ScanVerificationConfig(**config).build()
+    verifier = ScanVerifier(ScanVerificationConfig(**config))
     i, j = (
         verifier.describe(view(street(seed), T, seed=seed)) for seed, T in zip(seeds, (T_i, T_j), strict=True)
     )
@@ -212,7 +214,7 @@ def test_a_square_yard_looks_the_same_four_ways():
     turns = [exp(np.array([0.0, 0.0, k * np.pi / 2.0]), np.zeros(3))[:3, :3] for k in range(4)]
     floor = np.column_stack([rng.uniform(-12.0, 12.0, (12000, 2)), np.full(12000, -1.7)])
     yard = ScanView(0, np.vstack([floor, *(wall @ R.T for R in turns)]).astype(np.float32))
-    verifier = ScanVerificationConfig().build()
+    verifier = ScanVerifier(ScanVerificationConfig())
     found = verifier.verify(verifier.describe(yard), verifier.describe(yard))
     assert found.T_i_j is None
     assert found.reason.startswith("rival: ")
@@ -224,14 +226,14 @@ def test_a_corridor_does_not_say_how_far_along_it_one_is():
     walls = [np.column_stack([along, np.full(8000, y), rng.uniform(-1.7, 3.0, 8000)]) for y in (-4.0, 4.0)]
     floor = np.column_stack([along, rng.uniform(-4.0, 4.0, 8000), np.full(8000, -1.7)])
     corridor = ScanView(0, np.vstack([*walls, floor]).astype(np.float32))
-    verifier = ScanVerificationConfig(min_lead=0.0).build()
+    verifier = ScanVerifier(ScanVerificationConfig(min_lead=0.0))
     found = verifier.verify(verifier.describe(corridor), verifier.describe(corridor))
     assert found.T_i_j is None
     assert found.reason.startswith("degenerate: no surface shows translation along x")
 
 
 def test_a_place_is_kept_small():
-    place = ScanVerificationConfig().build().describe(view(street(1), on_street(street(1), 0.0)))
+    place = ScanVerifier(ScanVerificationConfig()).describe(view(street(1), on_street(street(1), 0.0)))
     assert place.points_body.nbytes <= 100_000
     assert place.points_body.dtype == np.float32
 
@@ -241,9 +243,9 @@ def test_every_kind_of_loops_refuses_the_other_sensor():
     first = track(0, 0, np.eye(4))
     for config in (PlaceLoopsConfig(), ThesisLoopsConfig()):
         with pytest.raises(ConfigError, match="compare images, and these are scans; want scans"):
-            config.build("batch").add(0, first, lambda: scan)
+            build_loop_detector(config, "batch").add(0, first, lambda: scan)
     with pytest.raises(ConfigError, match="compares scans, and these are images; want places or thesis"):
-        ScanLoopsConfig().build("batch").add(0, first, lambda: image)
+        build_loop_detector(ScanLoopsConfig(), "batch").add(0, first, lambda: image)
 
 
 def test_the_configuration_names_the_kind():

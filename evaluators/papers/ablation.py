@@ -12,6 +12,7 @@ from mapper.features.config import DetectorConfig
 from mapper.features.detectors import Features, build_detector
 from mapper.features.matching import Pairs
 from mapper.graph.model import PoseGraph
+from mapper.loops.factory import build_loop_detector
 from mapper.odometry.base import FrameResult
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
 from mapper.odometry.isvd import Compare, IsvdObservation, IsvdOdometry, matched_pairs, shared_points
@@ -123,7 +124,7 @@ class _Follower:
     def __init__(self, config: BuildConfig, odometry: IsvdOdometryConfig, eyes: _Eyes) -> None:
         self._config = config
         self._odometry = IsvdOdometry(odometry, detector=eyes, compare=eyes.comparing(odometry))
-        self._closer = config.loops.build(config.graph.solve)
+        self._closer = build_loop_detector(config.loops, config.graph.solve)
         self._graph = PoseGraph()
         self._tracks: list[FrameResult] = []
 

@@ -1,4 +1,4 @@
-"""The seam of loop closure: what is remembered of a place, who proposes one, and who compares two."""
+"""Interfaces of loop closure: proposers of known places, and verifiers of two places."""
 
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
@@ -9,7 +9,7 @@ from mapper.odometry.base import Seen
 
 
 class Stamped(Protocol):
-    """Has the time at which it was seen."""
+    """Anything with a time stamp."""
 
     @property
     def stamp_ns(self) -> int:
@@ -18,7 +18,7 @@ class Stamped(Protocol):
 
 
 Place = TypeVar("Place", bound=Stamped)
-"""What one sensor's loops remember of a keyframe."""
+"""Description of a keyframe, of one sensor's loops."""
 Known = TypeVar("Known", bound=Stamped, contravariant=True)
 """The same, where it is only handed over."""
 
@@ -29,8 +29,8 @@ class Proposal:
 
     Attributes:
         node: The place's node.
-        proposed_by: Who thought of it.
-        similarity: Of what the two look like, 0 … 1, if that was compared.
+        proposed_by: The kind of proposer.
+        similarity: Similarity of the two, 0 … 1, if it was computed.
     """
 
     node: int
@@ -39,20 +39,20 @@ class Proposal:
 
 
 class Proposer(Protocol[Known]):
-    """Remembers places, and proposes those that a new one might be."""
+    """Proposer of known places that a new one might be."""
 
     def propose(self, node: int, seen: Known, /, *, before: int, limit: int) -> list[Proposal]:
-        """Return the likeliest of the first ``before`` places that were remembered, the likeliest first."""
+        """Return the likeliest of the first ``before`` places that were added, the likeliest first."""
         ...
 
     def add(self, node: int, seen: Known) -> None:
-        """Take a place in; nodes come in time order."""
+        """Add a place; nodes come in time order."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verification:
-    """What comparing two places came to.
+    """Result of comparing two places.
 
     Attributes:
         matches: Pairs that were compared: of features, or of points.
@@ -74,23 +74,25 @@ class Verification:
 
 
 class Verifier(Protocol[Place]):
-    """Tells whether two places are one."""
+    """Verifier of loops: decides whether two places are one, and measures the motion between them."""
 
     def describe(self, seen: Seen, /) -> Place:
-        """Return what is to be remembered of a keyframe.
+        """Return the description of a keyframe that is kept.
 
         Raises:
-            ConfigError: It was seen by another sensor than these loops are for.
+            ConfigError: It is of another sensor than these loops are for.
         """
         ...
 
     def verify(self, i: Place, j: Place) -> Verification:
-        """Return how j lies to i, or why they are not one place. Pure."""
+        """Return the pose of j in i, or why they are not one place. Pure."""
         ...
 
 
-def measured(proposal: Proposal, node: int, i: Place, j: Place, verifier: Verifier[Place]) -> LoopClosure:
-    """Return what comparing a node's place j with a proposed place i came to."""
+def verify_proposal(
+    proposal: Proposal, node: int, i: Place, j: Place, verifier: Verifier[Place]
+) -> LoopClosure:
+    """Return the loop closure of a node's place j with a proposed place i, accepted or rejected."""
     found = verifier.verify(i, j)
     return LoopClosure(
         i=proposal.node,

@@ -1,4 +1,4 @@
-"""Temporal consistency: a loop is believed once loops found from other keyframes nearby tell the same."""
+"""Temporal consistency check: a loop is confirmed by loops from other keyframes nearby that agree with it."""
 
 from dataclasses import dataclass
 
@@ -8,12 +8,12 @@ from mapper.core.geometry import inverse
 from mapper.loops.closure import LoopClosure, discrepancy, exceeds
 from mapper.loops.config import GateConfig
 from mapper.loops.odometry_chain import NodePath, OdometryChain, allowed
-from mapper.loops.online_poses import OnlinePoseEstimator
+from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 
 
 @dataclass(slots=True)
 class _Hypothesis:
-    """A measured loop and how many others agree with it so far."""
+    """A measured loop and the number of others that agree with it so far."""
 
     closure: LoopClosure
     supporters: int = 0
@@ -21,7 +21,7 @@ class _Hypothesis:
 
 
 class ConsistencyCheck:
-    """Holds measured loops back until enough others agree."""
+    """Consistency check: measured loops are hypotheses until enough others agree."""
 
     def __init__(
         self,
@@ -35,37 +35,37 @@ class ConsistencyCheck:
         """Start without loops.
 
         Args:
-            chain: Which nodes are tied to which.
-            estimator: Where the nodes are.
-            gate: What the odometry may drift between neighbours.
-            min_agreeing: How many others must agree.
-            within_m: How far along the path the ends of two loops may lie to tell of one another.
+            chain: Factors between the nodes.
+            estimator: Poses of the nodes.
+            gate: Drift of the odometry between neighbours.
+            min_agreeing: Number of others that must agree.
+            within_m: How far along the path the ends of two loops may lie apart to be compared.
         """
         self._chain = chain
         self._estimator = estimator
         self._gate = gate
         self._min_agreeing = min_agreeing
         self._within_m = within_m
-        self._claims_from: dict[int, list[_Hypothesis]] = {}
+        self._hypotheses_from: dict[int, list[_Hypothesis]] = {}
 
     def add(self, closure: LoopClosure) -> list[LoopClosure]:
-        """Take a measured loop in; return all that are to be believed now and were not before."""
+        """Add a measured loop; return all that are confirmed now and were not before."""
         new = _Hypothesis(closure)
         near_i = self._chain.around(closure.i, within_m=self._within_m)
         near_j = self._chain.around(closure.j, within_m=self._within_m)
-        helped = []
+        supported = []
         for j in sorted(near_j.keys() - {closure.j}):
-            for hypothesis in self._claims_from.get(j, ()):
+            for hypothesis in self._hypotheses_from.get(j, ()):
                 if hypothesis.confirmed and new.supporters >= self._min_agreeing:
                     continue  # neither of the two needs the other
                 if self._agree(hypothesis.closure, closure, near_i, near_j):
                     new.supporters += 1
                     hypothesis.supporters += 1
-                    helped.append(hypothesis)
-        self._claims_from.setdefault(closure.j, []).append(new)
+                    supported.append(hypothesis)
+        self._hypotheses_from.setdefault(closure.j, []).append(new)
         newly_confirmed = [
             hypothesis
-            for hypothesis in (*helped, new)
+            for hypothesis in (*supported, new)
             if not hypothesis.confirmed and hypothesis.supporters >= self._min_agreeing
         ]
         for hypothesis in newly_confirmed:
@@ -81,6 +81,6 @@ class ConsistencyCheck:
         T_i_other = inverse(self._estimator.pose_of(new.i)) @ self._estimator.pose_of(other.i)
         T_other_j = inverse(self._estimator.pose_of(other.j)) @ self._estimator.pose_of(new.j)
         carried = T_i_other @ other.T_i_j @ T_other_j
-        chain = near_i[other.i], near_j[other.j]
-        both = NodePath(sum(path.path_m for path in chain), sum(path.turned_rad for path in chain))
+        paths = near_i[other.i], near_j[other.j]
+        both = NodePath(sum(path.path_m for path in paths), sum(path.turned_rad for path in paths))
         return not exceeds(discrepancy(new.T_i_j, np.eye(4), carried), allowed(self._gate, both))

@@ -12,7 +12,7 @@ from mapper.graph.noise import inflated
 from mapper.loops.base import Verification
 from mapper.loops.closure import Discrepancy, discrepancy, exceeds
 from mapper.loops.config import ScanVerificationConfig
-from mapper.loops.scans import ScanPlace
+from mapper.loops.scan_context_proposer import ScanPlace
 from mapper.odometry.base import Seen
 from mapper.registration.base import Alignment
 from mapper.registration.degeneracy import degeneracy_of
@@ -27,6 +27,8 @@ from mapper.registration.surfaces import Prepared, prepared
 
 DIRECTION_RAD = 0.035
 """Resolution of the range image, two degrees: the kept points are thin."""
+CACHED_PLACES = 16
+"""Places whose descriptions and search trees are kept: keyframes in a row are compared with the same ones."""
 GUESS_MARGIN_M = 1.5
 """Margin of the free-space check before GICP: a guess is off by up to a bin of the accumulator."""
 _SAME = Discrepancy(translation_m=3.0, rotation_rad=0.3)
@@ -56,9 +58,8 @@ class ScanVerifier:
     def __init__(self, config: ScanVerificationConfig) -> None:
         self._config = config
         self._coarse, self._fine = FreeSpaceCheck(GUESS_MARGIN_M), FreeSpaceCheck(config.margin_m)
-        # Keyframes in a row are compared with the same places.
-        self._description = lru_cache(config.remembered)(partial(_describe, config=config))
-        self._cloud = lru_cache(config.remembered)(partial(_cloud_of, config=config))
+        self._description = lru_cache(CACHED_PLACES)(partial(_describe, config=config))
+        self._cloud = lru_cache(CACHED_PLACES)(partial(_cloud_of, config=config))
 
     def describe(self, seen: Seen, /) -> ScanPlace:
         """Return the scan, thinned.

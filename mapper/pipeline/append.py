@@ -12,6 +12,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import KeyframeLoopsConfig
+from mapper.loops.factory import build_keyframe_loop_detector
 from mapper.odometry.base import Odometry
 from mapper.odometry.node_offset import NodeOffset
 from mapper.pipeline.components import component_of
@@ -122,7 +123,7 @@ def _after(
     """Return the start of a session, with the places of the earlier one preloaded."""
     assert isinstance(config.loops, KeyframeLoopsConfig)
     graph = before.graph
-    detector = config.loops.build(config.graph.solve)
+    detector = build_keyframe_loop_detector(config.loops, config.graph.solve)
     views = reobserve(first, before.trajectory, set(graph.stamps_ns.values()), config, progress=progress)
     detector.preload(graph, {node: views[stamp_ns] for node, stamp_ns in graph.stamps_ns.items()})
     odometry: Odometry[Any] = config.odometry.build(wheels)

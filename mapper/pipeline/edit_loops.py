@@ -10,9 +10,10 @@ from mapper.core.frames import Sensor
 from mapper.graph.components import components
 from mapper.graph.model import PoseGraph
 from mapper.graph.odometry_poses import by_odometry
-from mapper.loops.base import Proposal, Verifier, measured
+from mapper.loops.base import Proposal, Verifier, verify_proposal
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import NoLoopsConfig, PlaceLoopsConfig, ScanLoopsConfig
+from mapper.loops.factory import build_verifier
 from mapper.pipeline.fuse import fuse_changed
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
@@ -116,14 +117,14 @@ def _measured(
     loops = []
     for i, j in pairs:
         place_i, place_j = (places[graph.stamps_ns[node]] for node in (i, j))
-        loops.append(measured(Proposal(i, "hand"), j, place_i, place_j, verifier))
+        loops.append(verify_proposal(Proposal(i, "hand"), j, place_i, place_j, verifier))
         _refuse_rejected(loops[-1])
     return loops
 
 
 def _verifier(config: BuildConfig, sensor: Sensor) -> Verifier[Any]:
     loops = _LOOPS[sensor] if isinstance(config.loops, NoLoopsConfig) else config.loops
-    return loops.verification.build()
+    return build_verifier(loops.verification)
 
 
 def _refuse_rejected(loop: LoopClosure) -> None:

@@ -14,6 +14,7 @@ from mapper.graph.model import PoseGraph
 from mapper.graph.wheel_factors import wheel_factors
 from mapper.loops.closure import LoopClosure
 from mapper.loops.detector import LoopDetector
+from mapper.loops.factory import build_loop_detector
 from mapper.odometry.base import FrameResult, Odometry
 from mapper.run.frame_records import records_of
 from mapper.run.observers import NULL_OBSERVER, Observer, Step
@@ -90,7 +91,7 @@ def first_session(source: Log, config: BuildConfig) -> Start:
             "want loops.kind=places, scans or none"
         )
     odometry = config.odometry.build(source.wheels)
-    return Start(odometry, config.loops.build(config.graph.solve), PoseGraph())
+    return Start(odometry, build_loop_detector(config.loops, config.graph.solve), PoseGraph())
 
 
 def track_log(

@@ -1,4 +1,4 @@
-"""The thesis's loop closure (Somlyai, §4.1.4), step by step."""
+"""Loop closure of Somlyai (PhD thesis, §4.1.4), step by step."""
 
 from bisect import bisect_right
 from collections import deque
@@ -8,25 +8,27 @@ from statistics import median
 from mapper.core.geometry import Transform
 from mapper.core.timebase import NS_PER_S
 from mapper.features.view import View
-from mapper.loops.base import measured
+from mapper.loops.base import Verifier, verify_proposal
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import ThesisLoopsConfig
 from mapper.loops.detector import ViewOf
-from mapper.loops.online_poses import Correction, build_pose_estimator
-from mapper.loops.proposals import ByPose
+from mapper.loops.online_pose_estimator import OnlinePoseEstimator
+from mapper.loops.proposers import PoseProposer
 from mapper.odometry.base import FrameResult
 from mapper.odometry.keyframes import SharpestKeyframes
 
 
 class ThesisLoopDetector:
-    """Compares sharp frames with the keyframes that lie near their estimate."""
+    """Loop detector of the thesis: sharp frames are compared with the keyframes near their estimate."""
 
-    def __init__(self, config: ThesisLoopsConfig, *, correction: Correction) -> None:
+    def __init__(
+        self, config: ThesisLoopsConfig, verifier: Verifier[View], estimator: OnlinePoseEstimator
+    ) -> None:
         self._config = config
-        self._estimator = build_pose_estimator(correction)
-        self._verifier = config.verification.build()
-        self._proposer: ByPose[View] = ByPose(
-            self._estimator,
+        self._verifier = verifier
+        self._estimator = estimator
+        self._proposer: PoseProposer[View] = PoseProposer(
+            estimator,
             lambda view: view.T_body_camera,
             max_distance_m=config.max_distance_m,
             max_angle_rad=config.max_angle_rad,
@@ -39,13 +41,13 @@ class ThesisLoopDetector:
         self._closures: list[LoopClosure] = []
 
     def add(self, node: int, track: FrameResult, view: ViewOf, /) -> None:
-        """Look for a loop if the frame is sharp, and remember the sharpest of every so many."""
+        """Search loops if the frame is sharp, and keep the sharpest of every ``keyframe_interval`` frames."""
         self._estimator.add(node, track)
         seen, features = self._verifier.describe(view()), track.diagnostics.features
         self._features.append(features)
         self._recent.append((node, seen))
         if features > self._config.sharp_ratio * median(self._features):
-            self._look(node, seen)
+            self._search(node, seen)
         keyframe = self._sharpest.add(node, features)
         for recent, recent_view in self._recent:
             if recent == keyframe:
@@ -57,16 +59,16 @@ class ThesisLoopDetector:
         return tuple(self._closures)
 
     def current_estimate(self, node: int) -> Transform:
-        """Return where a node is believed to be now (4, 4), with the loops so far."""
+        """Return the (4, 4) current estimate of a node's pose, with the loops so far."""
         return self._estimator.pose_of(node)
 
-    def _look(self, node: int, seen: View) -> None:
+    def _search(self, node: int, seen: View) -> None:
         min_gap_ns = round(self._config.min_gap_s * NS_PER_S)
         old = bisect_right(
             [*self._views.values()], seen.stamp_ns - min_gap_ns, key=lambda view: view.stamp_ns
         )
         for proposal in self._proposer.propose(node, seen, before=old, limit=self._config.max_candidates):
-            closure = measured(proposal, node, self._views[proposal.node], seen, self._verifier)
+            closure = verify_proposal(proposal, node, self._views[proposal.node], seen, self._verifier)
             self._closures.append(closure)
             if closure.verdict == "accepted":
                 self._estimator.close(closure)

@@ -1,18 +1,17 @@
-"""Which known images look like one: by a bag of words, and by where they are believed to be."""
+"""Proposer of images with similar visual words, by a bag of words (Zhao et al. 2020, §2.5)."""
 
 from mapper.features.view import View
 from mapper.loops.base import Proposal, Proposer
 from mapper.loops.config import PlaceLoopsConfig
-from mapper.loops.odometry_chain import OdometryChain
-from mapper.loops.online_poses import OnlinePoseEstimator
-from mapper.loops.proposals import ByBoth, ByPose
+from mapper.loops.online_pose_estimator import OnlinePoseEstimator
+from mapper.loops.proposers import CombinedProposer, PoseProposer
 from mapper.places.config import PlacesConfig
 from mapper.places.index import PlaceIndex
 from mapper.places.vocabulary import WordVector, load_vocabulary
 
 
-class ByWords:
-    """Proposes what looks alike (Zhao et al. 2020, §2.5), wherever it is believed to be."""
+class VisualWordProposer:
+    """Visual word proposer: similar images at any distance."""
 
     def __init__(self, config: PlacesConfig) -> None:
         """Load the vocabulary.
@@ -37,21 +36,19 @@ class ByWords:
         return [Proposal(other, "places", similarity) for other, similarity in found]
 
     def add(self, node: int, seen: View) -> None:
-        """Take a place in."""
+        """Add a place."""
         self._index.add(node, self._vector(seen))
 
     def _vector(self, view: View) -> WordVector:
-        """Return the view's words; the last view's are kept, for who is compared is then remembered."""
+        """Return the view's words; the last view's are cached, as a place is queried and then added."""
         if self._described is None or self._described[0] is not view:
             self._described = view, self._vocabulary.vector(self._vocabulary.words_of(view.bits))
         return self._described[1]
 
 
-def image_proposer(
-    config: PlaceLoopsConfig, first: View, estimator: OnlinePoseEstimator, _chain: OdometryChain, /
-) -> Proposer[View]:
-    """Return the proposer of a log whose first keyframe looks so: only ORB's descriptors have words."""
-    by_pose: ByPose[View] = ByPose(
+def image_proposer(config: PlaceLoopsConfig, estimator: OnlinePoseEstimator, first: View) -> Proposer[View]:
+    """Return the proposer that fits a log's first keyframe: only ORB's descriptors have words."""
+    by_pose: PoseProposer[View] = PoseProposer(
         estimator,
         lambda view: view.T_body_camera,
         max_distance_m=config.max_distance_m,
@@ -60,5 +57,5 @@ def image_proposer(
     )
     if config.propose == "nearby" or (config.propose == "auto" and not first.is_orb):
         return by_pose
-    by_words = ByWords(config.places)
-    return by_words if config.propose == "places" else ByBoth(by_words, by_pose)
+    by_words = VisualWordProposer(config.places)
+    return by_words if config.propose == "places" else CombinedProposer(by_words, by_pose)

@@ -1,4 +1,4 @@
-"""Where the nodes are believed to be while a log is still being tracked, with the loops found so far."""
+"""Online estimators of the node poses, corrected by the loops found while a log is still being tracked."""
 
 from typing import Literal, Protocol
 
@@ -12,16 +12,22 @@ from mapper.odometry.base import FrameResult
 Correction = Literal["batch", "proportional", "none"]
 """How the graph is solved in the end (``graph.solve``)."""
 
+_WORTH_SOLVING = Discrepancy(translation_m=0.02, rotation_rad=0.01)
+"""A loop that moves no node farther waits to be solved with the next that does."""
+
 
 class OnlinePoseEstimator(Protocol):
-    """Node poses that loops correct; a new node hangs on the believed pose of the one it was tracked from."""
+    """Online pose estimator: node poses that loops correct.
+
+    A new node's pose follows from the current estimate of the node that it was tracked from.
+    """
 
     def add(self, node: int, track: FrameResult) -> None:
-        """Take in a new node, in time order."""
+        """Add a new node, in time order."""
         ...
 
     def preload(self, graph: PoseGraph) -> None:
-        """Take in an earlier session, solved, before anything else."""
+        """Add an earlier session, solved, before anything else."""
         ...
 
     def close(self, closure: LoopClosure) -> None:
@@ -29,23 +35,19 @@ class OnlinePoseEstimator(Protocol):
         ...
 
     def pose_of(self, node: int) -> Transform:
-        """Return the (4, 4) believed pose of a node."""
+        """Return the (4, 4) current estimate of a node's pose."""
         ...
 
 
-_NEWS = Discrepancy(translation_m=0.02, rotation_rad=0.01)
-"""A loop that moves nothing farther is no news; it waits to be solved with the next that is."""
-
-
 class IncrementalPoseEstimator:
-    """Belief by incremental smoothing (iSAM2, Kaess et al. 2012); it is solved when a loop brings news."""
+    """Pose estimator by incremental smoothing (iSAM2, Kaess et al. 2012), run when a loop moves enough."""
 
     def __init__(self) -> None:
         self._solver = IncrementalSolver()
         self._T_world_node: dict[int, Transform] = {}
 
     def preload(self, graph: PoseGraph) -> None:
-        """Take in an earlier session, solved, before anything else."""
+        """Add an earlier session, solved, before anything else."""
         for node, T_world_node in graph.T_world_node.items():
             self._solver.add_node(node, T_world_node)
         self._solver.add_factors(graph.factors)
@@ -53,7 +55,7 @@ class IncrementalPoseEstimator:
         self._T_world_node = self._solver.poses()
 
     def add(self, node: int, track: FrameResult) -> None:
-        """Take in a new node, in time order."""
+        """Add a new node, in time order."""
         self._T_world_node[node] = _first_estimate(track, self._T_world_node)
         self._solver.add_node(node, self._T_world_node[node])
         self._solver.add_factors(track.links)
@@ -63,40 +65,42 @@ class IncrementalPoseEstimator:
         factor = closure.factor
         self._solver.add_factors([factor])
         miss = discrepancy(factor.T_i_j, self._T_world_node[factor.i], self._T_world_node[factor.j])
-        if exceeds(miss, _NEWS):
+        if exceeds(miss, _WORTH_SOLVING):
             self._solver.update()
             self._T_world_node = self._solver.poses()
 
     def pose_of(self, node: int) -> Transform:
-        """Return the (4, 4) believed pose of a node."""
+        """Return the (4, 4) current estimate of a node's pose."""
         return self._T_world_node[node]
 
 
 class ProportionalPoseEstimator:
-    """Belief by the thesis's proportional correction (A9) of the path as the odometry averaged it (A7)."""
+    """Pose estimator by proportional correction of the odometry's path (Somlyai, PhD thesis, §4.1.4)."""
 
     def __init__(self) -> None:
         self._T_world_node: dict[int, Transform] = {}
-        self._told: tuple[int, Transform] | None = None
+        self._last: tuple[int, Transform] | None = None
 
     def preload(self, graph: PoseGraph) -> None:
-        """Take in an earlier session, solved, before anything else."""
+        """Add an earlier session, solved, before anything else."""
         self._T_world_node |= graph.T_world_node
 
     def add(self, node: int, track: FrameResult) -> None:
-        """Take in a new node, in time order; the motion since the last one is what the odometry tells."""
+        """Add a new node, in time order, at the odometry's motion since the last one."""
         self._T_world_node[node] = track.T_world_body
-        if self._told is not None:
-            last, T_told = self._told
-            self._T_world_node[node] = self._T_world_node[last] @ inverse(T_told) @ track.T_world_body
-        self._told = node, track.T_world_body
+        if self._last is not None:
+            last, T_odometry_last = self._last
+            self._T_world_node[node] = (
+                self._T_world_node[last] @ inverse(T_odometry_last) @ track.T_world_body
+            )
+        self._last = node, track.T_world_body
 
     def close(self, closure: LoopClosure) -> None:
         """Correct the path by a loop."""
         self._T_world_node = spread(self._T_world_node, closure.factor)
 
     def pose_of(self, node: int) -> Transform:
-        """Return the (4, 4) believed pose of a node."""
+        """Return the (4, 4) current estimate of a node's pose."""
         return self._T_world_node[node]
 
 
@@ -109,5 +113,5 @@ def _first_estimate(track: FrameResult, T_world_node: dict[int, Transform]) -> T
 
 
 def build_pose_estimator(correction: Correction) -> OnlinePoseEstimator:
-    """Return the belief that corrects as the graph will be solved."""
+    """Return the estimator that corrects as the graph will be solved."""
     return ProportionalPoseEstimator() if correction == "proportional" else IncrementalPoseEstimator()

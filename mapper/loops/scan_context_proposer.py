@@ -1,4 +1,4 @@
-"""What loops remember of a scan, and which known scans look like one or are believed to be near."""
+"""Proposer of similar scans among those that may be near, by Scan Context (Kim & Kim 2018)."""
 
 from dataclasses import dataclass
 
@@ -9,15 +9,18 @@ from mapper.core.geometry import Transform, apply
 from mapper.loops.base import Proposal, Proposer
 from mapper.loops.config import ScanLoopsConfig
 from mapper.loops.odometry_chain import OdometryChain
-from mapper.loops.online_poses import OnlinePoseEstimator
-from mapper.loops.proposals import ByBoth, ByPose
+from mapper.loops.online_pose_estimator import OnlinePoseEstimator
+from mapper.loops.proposers import CombinedProposer, PoseProposer
 from mapper.places.config import ScanContextConfig
 from mapper.places.scan_context import ScanContext, ScanContexts, scan_context
+
+MAX_SIMILAR = 2
+"""Largest number of candidates that are proposed for their similarity; the others are proposed as near."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanPlace:
-    """A scan, thin enough that ten thousand can be kept.
+    """Description of a scan, thin enough that ten thousand can be kept.
 
     Attributes:
         stamp_ns: The scan's stamp.
@@ -30,25 +33,23 @@ class ScanPlace:
     T_level_body: Transform
 
 
-class ByContext:
-    """Proposes what looks alike, whichever way it heads, of what may be near.
+class ScanContextProposer:
+    """Scan context proposer: similar scans, in any heading, among those that may be near.
 
-    Where a way leads to a place, the odometry's drift on it bounds how far off it can be; streets far apart
-    look alike more often than they are one.
+    Where a path leads to a place, the odometry's drift on it bounds its distance; streets far apart are
+    similar more often than they are one. Disconnected places may be anywhere.
     """
 
     def __init__(
-        self, config: ScanContextConfig, by_pose: ByPose[ScanPlace], chain: OdometryChain, *, most: int
+        self, config: ScanContextConfig, by_pose: PoseProposer[ScanPlace], chain: OdometryChain
     ) -> None:
         """Start without places.
 
         Args:
-            config: What looks alike.
-            by_pose: Tells how near is near; it has to remember the same places.
-            chain: Which nodes are tied to which.
-            most: How many it proposes at most, to leave room.
+            config: Scan contexts, and their least similarity.
+            by_pose: Gives the distance at which places count as near; the same places have to be added to it.
+            chain: Factors between the nodes.
         """
-        self._most = most
         self._config = config
         self._by_pose = by_pose
         self._chain = chain
@@ -58,23 +59,20 @@ class ByContext:
 
     def propose(self, node: int, seen: ScanPlace, /, *, before: int, limit: int) -> list[Proposal]:
         """Return the most similar places, the most similar first."""
-        part = self._chain.component_of(node)
-        untied = np.array(
-            [self._chain.component_of(place) != part for place in self._nodes[:before]], np.bool_
-        )
-        among = untied | self._by_pose.within_reach(node, seen, before=before)
+        disconnected = ~self._chain.connected(node, self._nodes[:before])
+        among = disconnected | self._by_pose.within_reach(node, seen, before=before)
         if not among.any():
             return []
-        found = self._index.query(self._context(seen), among, limit=min(limit, self._most))
+        found = self._index.query(self._context(seen), among, limit=min(limit, MAX_SIMILAR))
         return [Proposal(other, "scans", similarity) for other, similarity in found]
 
     def add(self, node: int, seen: ScanPlace) -> None:
-        """Take a place in."""
+        """Add a place."""
         self._index.add(node, self._context(seen))
         self._nodes.append(node)
 
     def _context(self, place: ScanPlace) -> ScanContext:
-        """Return what the place looks like; the last one is kept, for who is compared is then remembered."""
+        """Return the place's scan context; the last one is cached, as a place is queried and then added."""
         if self._described is None or self._described[0] is not place:
             points_level = apply(place.T_level_body, place.points_body.astype(np.float64))
             self._described = place, scan_context(points_level, self._config)
@@ -82,14 +80,14 @@ class ByContext:
 
 
 def scan_proposer(
-    config: ScanLoopsConfig, _first: ScanPlace, estimator: OnlinePoseEstimator, chain: OdometryChain, /
+    config: ScanLoopsConfig, estimator: OnlinePoseEstimator, chain: OdometryChain
 ) -> Proposer[ScanPlace]:
-    """Return the proposer of scans: by looks, which leave room, and by pose."""
-    by_pose: ByPose[ScanPlace] = ByPose(
+    """Return the proposer of scans: by similarity and by pose."""
+    by_pose: PoseProposer[ScanPlace] = PoseProposer(
         estimator,
-        lambda _: np.eye(4),  # a scanner looks all round: its heading is nothing, its upright axis is all
+        lambda _: np.eye(4),  # a scanner sees all around: its upright axis stands for a viewing direction
         max_distance_m=config.max_distance_m,
         max_angle_rad=config.max_tilt_rad,
         drift_ratio=config.gate.drift_ratio,
     )
-    return ByBoth(ByContext(config.context, by_pose, chain, most=config.max_lookalikes), by_pose)
+    return CombinedProposer(ScanContextProposer(config.context, by_pose, chain), by_pose)

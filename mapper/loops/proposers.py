@@ -1,4 +1,4 @@
-"""Which known places are believed to be near, and two proposers as one."""
+"""Proposer of places that are near by the current estimate of the poses, and two proposers combined."""
 
 from collections.abc import Callable
 from typing import Generic
@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform
 from mapper.loops.base import Place, Proposal, Proposer
-from mapper.loops.online_poses import OnlinePoseEstimator
+from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 
 
-class ByPose(Generic[Place]):
-    """Proposes what was seen from nearby, looking nearly the same way, as far as is believed (A9)."""
+class PoseProposer(Generic[Place]):
+    """Pose proposer: places seen from nearby in nearly the same direction (Somlyai, PhD thesis, §4.1.4)."""
 
     def __init__(
         self,
@@ -26,11 +26,11 @@ class ByPose(Generic[Place]):
         """Start without places.
 
         Args:
-            estimator: Where the nodes are.
-            pose_of_sensor: Returns T_body_sensor, of which z is the axis that the sensor looks along.
+            estimator: Poses of the nodes.
+            pose_of_sensor: Returns T_body_sensor, whose z is the viewing direction.
             max_distance_m: Largest distance between two positions.
             max_angle_rad: Largest angle between two viewing directions.
-            drift_ratio: How much farther to look per metre travelled since.
+            drift_ratio: Added to the distance per metre travelled since.
         """
         self._estimator = estimator
         self._pose_of_sensor = pose_of_sensor
@@ -42,7 +42,7 @@ class ByPose(Generic[Place]):
         self._travelled_m: list[float] = []
 
     def within_reach(self, node: int, seen: Place, /, *, before: int) -> NDArray[np.bool_]:
-        """Return which of the first ``before`` places may be nearby, however they look."""
+        """Return which of the first ``before`` places may be nearby, in any viewing direction."""
         distance_m, _ = self._apart(node, seen, before)
         return distance_m <= self._reach_m(before)
 
@@ -56,7 +56,7 @@ class ByPose(Generic[Place]):
         return [Proposal(self._nodes[k], "nearby") for k in nearest.tolist()]
 
     def add(self, node: int, seen: Place) -> None:
-        """Take a place in."""
+        """Add a place."""
         travelled_m = 0.0
         if self._nodes:
             step = self._estimator.pose_of(node)[:3, 3] - self._estimator.pose_of(self._nodes[-1])[:3, 3]
@@ -66,7 +66,7 @@ class ByPose(Generic[Place]):
         self._travelled_m.append(travelled_m)
 
     def _apart(self, node: int, seen: Place, before: int) -> tuple[Array, Array]:
-        """Return how far the places are believed to lie from a node's, and the angles between their views."""
+        """Return the distances of the places from a node's, metres, and the angles between their views."""
         if before == 0:
             return np.empty(0), np.empty(0)
         T_world_here = self._estimator.pose_of(node) @ self._pose_of_sensor(seen)
@@ -77,19 +77,19 @@ class ByPose(Generic[Place]):
         return distance_m, angle_rad
 
     def _reach_m(self, before: int) -> Array:
-        """Return how far away each place may be believed to be and still be nearby."""
+        """Return the largest distance, metres, at which each place counts as nearby."""
         since_m = np.array([self._travelled_m[-1] - path_m for path_m in self._travelled_m[:before]])
         return self._max_distance_m + self._drift_ratio * since_m
 
 
-class ByBoth(Generic[Place]):
-    """Proposes by looks and, where those leave room, by pose."""
+class CombinedProposer(Generic[Place]):
+    """Combined proposer: similar places and, up to the limit, those that are near."""
 
-    def __init__(self, looks: Proposer[Place], pose: ByPose[Place]) -> None:
-        self._proposers = (looks, pose)
+    def __init__(self, similar: Proposer[Place], near: PoseProposer[Place]) -> None:
+        self._proposers = (similar, near)
 
     def propose(self, node: int, seen: Place, /, *, before: int, limit: int) -> list[Proposal]:
-        """Return what looks alike, then what is believed to be near."""
+        """Return similar places, then near ones."""
         proposals: dict[int, Proposal] = {}
         for proposer in self._proposers:
             for proposal in proposer.propose(node, seen, before=before, limit=limit):
@@ -97,6 +97,6 @@ class ByBoth(Generic[Place]):
         return list(proposals.values())[:limit]
 
     def add(self, node: int, seen: Place) -> None:
-        """Take a place in."""
+        """Add a place."""
         for proposer in self._proposers:
             proposer.add(node, seen)

@@ -1,4 +1,4 @@
-"""Whether two images' views are of one place, and how they then lie to each other."""
+"""Geometric verification of a loop between two images: ISVD on points, then reprojection in pixels."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,27 +10,31 @@ from mapper.features.view import View
 from mapper.features.windowed import match_everywhere
 from mapper.graph.noise import with_model_error
 from mapper.loops.base import Verification
-from mapper.loops.config import VerificationConfig
+from mapper.loops.config import ImageVerificationConfig
 from mapper.odometry.base import Seen
 from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
 from mapper.registration.p3p import ransac_p3p
 from mapper.registration.reprojection import normal_matrix, refine_pose
 
+VIRTUAL_BASELINE_PX_M = 40.0
+"""bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017)."""
+MAX_SIGMA_M = 0.05
+"""A motion whose translation is less certain in any direction is no loop: far scenes leave it uncertain."""
 _LM_ROUNDS, _LM_ITERATIONS = 4, 10
 _MAX_HAMMING = 64
 _P3P_PAIRS, _P3P_TOLERANCE_PX, _P3P_ITERATIONS = 4, 4.0, 300
 
 
 class ImageVerifier:
-    """Pairs two views' features, fits a motion to their points by ISVD, and asks the image whether it holds.
+    """Verifier of loops between images: features are paired, and a motion has to fit their points and pixels.
 
-    The two tests err differently: ISVD (thesis alg. 7) needs depth on both sides and trusts points,
-    reprojection (Mur-Artal & Tardós 2017, §III-C) trusts pixels and would accept a far scene that hardly
-    moves in the image. A loop has to pass both.
+    The two tests err differently: ISVD (Somlyai, PhD thesis, alg. 7) needs depth on both sides and is as good
+    as the points; reprojection (Mur-Artal & Tardós 2017, §III-C) is as good as the pixels, and alone would
+    accept a far scene that hardly moves in the image. A loop has to pass both.
     """
 
-    def __init__(self, config: VerificationConfig) -> None:
+    def __init__(self, config: ImageVerificationConfig) -> None:
         self._config = config
         self._isvd = Isvd(config.registration)
 
@@ -38,14 +42,14 @@ class ImageVerifier:
         """Return the view as it is.
 
         Raises:
-            ConfigError: It is a scan's.
+            ConfigError: It is the view of a scan.
         """
         if not isinstance(seen, View):
             raise ConfigError("loops.kind=places and thesis compare images, and these are scans; want scans")
         return seen
 
     def verify(self, i: View, j: View) -> Verification:
-        """Return how view j lies to view i, or why they do not show one place."""
+        """Return the pose of view j in view i, or why they do not show one place."""
         config = self._config
         pairs = self._pairs(i, j)
         matches = len(pairs)
@@ -64,7 +68,7 @@ class ImageVerifier:
         return self._isvd.fit(i.points_camera[both[:, 0]], j.points_camera[both[:, 1]])
 
     def _consensus(self, i: View, j: View, pairs: Pairs) -> Pairs:
-        """Return the pairs that P3P finds to agree: ISVD begins with all, and drowns when most are wrong."""
+        """Return P3P's inlier pairs: ISVD begins with all pairs, and fails when most of them are wrong."""
         if len(pairs) < _P3P_PAIRS:
             return pairs[:0]
         found = ransac_p3p(
@@ -99,10 +103,10 @@ class ImageVerifier:
     def _reproject(
         self, i: View, j: View, pairs: Pairs, alignment: Alignment, *, matches: int
     ) -> Verification:
-        """Refine ISVD's motion in j's image, and count who agrees."""
+        """Refine ISVD's motion in j's image, and count the inliers."""
         config = self._config
         points = i.points_camera[pairs[:, 0]]
-        measured, weights, intrinsics = _measurements(j, pairs[:, 1], config.virtual_baseline_px_m)
+        measured, weights, intrinsics = _measurements(j, pairs[:, 1])
         T_j_i, agree, _ = refine_pose(
             inverse(alignment.T_target_source),
             points,
@@ -117,10 +121,10 @@ class ImageVerifier:
         if inliers < wanted:
             reason = f"reprojection: {inliers} of {len(pairs)} pairs agree, want {wanted:.0f}"
             return Verification(matches, reason, inliers, alignment.inlier_rmse_m)
-        seen = apply(T_j_i, points[agree])
-        miss_px = (seen[:, :2] / seen[:, 2:] * intrinsics[:2] + intrinsics[2:4] - measured[agree, :2]) * (
-            weights[agree, :1] ** 0.5
-        )
+        points_j = apply(T_j_i, points[agree])
+        miss_px = (
+            points_j[:, :2] / points_j[:, 2:] * intrinsics[:2] + intrinsics[2:4] - measured[agree, :2]
+        ) * (weights[agree, :1] ** 0.5)
         T_ci_cj, information = alignment.T_target_source, alignment.information
         if config.measure == "reprojection":
             T_ci_cj = inverse(T_j_i)
@@ -134,18 +138,18 @@ class ImageVerifier:
         information = with_model_error(to_camera.T @ information @ to_camera, T_i_j)
         residual_px = float(np.sqrt((miss_px**2).sum(axis=1).mean()))
         sigma_m = float(np.linalg.eigvalsh(np.linalg.inv(information)[3:, 3:])[-1] ** 0.5)
-        if sigma_m > config.max_sigma_m:
-            reason = f"loose: translation known to {sigma_m:.2f} m, want {config.max_sigma_m} m"
+        if sigma_m > MAX_SIGMA_M:
+            reason = f"loose: translation known to {sigma_m:.2f} m, want {MAX_SIGMA_M} m"
             return Verification(matches, reason, inliers, alignment.inlier_rmse_m, residual_px)
         return Verification(matches, "", inliers, alignment.inlier_rmse_m, residual_px, T_i_j, information)
 
 
-def _measurements(view: View, features: NDArray[np.intp], bf: float) -> tuple[Array, Array, Array]:
+def _measurements(view: View, features: NDArray[np.intp]) -> tuple[Array, Array, Array]:
     """Return (M, 3) u, v, bf/z, their (M, 3) inverse variances, and (5,) intrinsics."""
     depth_m = view.points_camera[features, 2]
     sigma_px = np.repeat(view.sigma_px[features, None], 3, axis=1)
     return (
-        np.column_stack([view.pixels[features], bf / depth_m]),
+        np.column_stack([view.pixels[features], VIRTUAL_BASELINE_PX_M / depth_m]),
         sigma_px**-2.0,
-        np.append(view.intrinsics, bf),
+        np.append(view.intrinsics, VIRTUAL_BASELINE_PX_M),
     )

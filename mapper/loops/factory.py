@@ -1,0 +1,76 @@
+"""Factory of the loop detectors and of their verifiers."""
+
+from functools import partial
+from typing import Any, assert_never
+
+from mapper.loops.base import Verifier
+from mapper.loops.config import (
+    AnyLoops,
+    ImageVerificationConfig,
+    NoLoopsConfig,
+    PlaceLoopsConfig,
+    ScanLoopsConfig,
+    ScanVerificationConfig,
+    ThesisLoopsConfig,
+)
+from mapper.loops.detector import KeyframeLoopDetector, LoopDetector, NoLoopDetector
+from mapper.loops.odometry_chain import OdometryChain
+from mapper.loops.online_pose_estimator import Correction, build_pose_estimator
+
+
+def build_loop_detector(config: AnyLoops, correction: Correction) -> LoopDetector:
+    """Return the loop detector that the settings choose.
+
+    Args:
+        config: Settings.
+        correction: How the graph is solved in the end; the detector's estimate of the poses is corrected
+            alike.
+    """
+    match config:
+        case NoLoopsConfig():
+            return NoLoopDetector()
+        case PlaceLoopsConfig() | ScanLoopsConfig():
+            return build_keyframe_loop_detector(config, correction)
+        case ThesisLoopsConfig():
+            from mapper.loops.thesis_loop_closure import ThesisLoopDetector
+
+            verifier, estimator = build_verifier(config.verification), build_pose_estimator(correction)
+            return ThesisLoopDetector(config, verifier, estimator)
+        case _:
+            assert_never(config)
+
+
+def build_keyframe_loop_detector(
+    config: PlaceLoopsConfig | ScanLoopsConfig, correction: Correction
+) -> KeyframeLoopDetector[Any]:
+    """Return the loop detector that compares keyframes; it can be preloaded with an earlier session."""
+    verifier, estimator = build_verifier(config.verification), build_pose_estimator(correction)
+    chain = OdometryChain()
+    match config:
+        case PlaceLoopsConfig():
+            from mapper.loops.visual_word_proposer import image_proposer
+
+            proposer_for = partial(image_proposer, config, estimator)
+            return KeyframeLoopDetector(config, verifier, proposer_for, estimator, chain)
+        case ScanLoopsConfig():
+            from mapper.loops.scan_context_proposer import scan_proposer
+
+            proposer = scan_proposer(config, estimator, chain)
+            return KeyframeLoopDetector(config, verifier, lambda _: proposer, estimator, chain)
+        case _:
+            assert_never(config)
+
+
+def build_verifier(config: ImageVerificationConfig | ScanVerificationConfig) -> Verifier[Any]:
+    """Return the verifier of two places by images or by scans."""
+    match config:
+        case ImageVerificationConfig():
+            from mapper.loops.image_verification import ImageVerifier
+
+            return ImageVerifier(config)
+        case ScanVerificationConfig():
+            from mapper.loops.scan_verification import ScanVerifier
+
+            return ScanVerifier(config)
+        case _:
+            assert_never(config)
