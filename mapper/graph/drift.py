@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from mapper.core.geometry import Array, Transform, adjoint, inverse, log
 from mapper.graph.model import BetweenFactor
@@ -92,28 +93,31 @@ class _Tree:
 
 
 def _spanning_tree(factors: Sequence[BetweenFactor]) -> _Tree:
-    """Grow a tree from the first node of each component by the surest factor at hand (Prim 1957)."""
-    beside: dict[int, list[tuple[float, int, int]]] = {}
-    spreads = np.linalg.inv(np.array([factor.information for factor in factors]).reshape(-1, 6, 6))
-    for k, factor in enumerate(factors):
-        unsure = float(np.trace(spreads[k]))
-        beside.setdefault(factor.i, []).append((unsure, k, factor.j))
-        beside.setdefault(factor.j, []).append((unsure, k, factor.i))
+    """Return the tree of the surest factors, grown from the first node of each component."""
     places: dict[int, _Place] = {}
-    for root in beside:
-        if root in places:
+    if not factors:
+        return _Tree(places)
+    spreads = np.linalg.inv(np.array([factor.information for factor in factors]))
+    nodes = list(dict.fromkeys(node for factor in factors for node in (factor.i, factor.j)))
+    index_of = {node: index for index, node in enumerate(nodes)}
+    # Ranks as weights, no two of which are equal, make the tree unique: of equally sure factors the first counts.
+    by_rank = np.argsort(np.trace(spreads, axis1=1, axis2=2), kind="stable").tolist()
+    ends = np.sort([(index_of[factors[k].i], index_of[factors[k].j]) for k in by_rank], axis=1)
+    _, surest = np.unique(ends, axis=0, return_index=True)  # of parallel factors
+    ranks = coo_array((surest + 1.0, tuple(ends[surest].T)), shape=(len(nodes), len(nodes)))
+    tree = minimum_spanning_tree(ranks)
+    factor_of = {frozenset(ends[rank].tolist()): by_rank[rank] for rank in tree.data.astype(np.intp) - 1}
+    for root, node in enumerate(nodes):
+        if node in places:
             continue
-        places[root] = _Place(root, root, 0, np.eye(4), np.zeros((6, 6)))
-        rim = [(unsure, k, node, root) for unsure, k, node in beside[root]]
-        heapq.heapify(rim)
-        while rim:
-            _, k, node, parent = heapq.heappop(rim)
-            if node in places:
-                continue
-            places[node] = _grown(places[parent], parent, node, factors[k], spreads[k])
-            for unsure, other, neighbour in beside[node]:
-                if neighbour not in places:
-                    heapq.heappush(rim, (unsure, other, neighbour, node))
+        places[node] = _Place(node, node, 0, np.eye(4), np.zeros((6, 6)))
+        reached, before = breadth_first_order(tree, root, directed=False)
+        for index in reached[1:].tolist():
+            parent = int(before[index])
+            k = factor_of[frozenset((index, parent))]
+            places[nodes[index]] = _grown(
+                places[nodes[parent]], nodes[parent], nodes[index], factors[k], spreads[k]
+            )
     return _Tree(places)
 
 
