@@ -17,6 +17,7 @@ from mapper.config.loading import load_config
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform
 from mapper.core.trajectory import Trajectory
+from mapper.odometry.factory import build_frame_odometry
 from mapper.sources import open_source
 
 Follow = Callable[[Scan], Transform | None]
@@ -24,7 +25,7 @@ Follow = Callable[[Scan], Transform | None]
 
 def ours(kind: str) -> Follow:
     """Return one of our odometries, without loops."""
-    odometry = load_config(None, [f"odometry.kind={kind}"], sensor="lidar").odometry.build()
+    odometry = build_frame_odometry(load_config(None, [f"odometry.kind={kind}"], sensor="lidar").odometry)
 
     def follow(scan: Scan) -> Transform | None:
         track = odometry.track(odometry.observe(scan))

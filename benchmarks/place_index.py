@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from mapper.features.config import UniformOrbConfig
+from mapper.features.factory import build_detector
 from mapper.features.windowed import match_everywhere, pack
 from mapper.places.config import PlacesConfig
 from mapper.places.guided import match_by_word
@@ -107,7 +108,7 @@ def frames(data: Path) -> tuple[str, list[Bits]]:
     else:
         config = SynthConfig(seed=3, frame_rate_hz=3.0, duration_s=15.0)
         entries = list(CameraSimulator(config).log().entries())
-    detector = UniformOrbConfig().build()
+    detector = build_detector(UniformOrbConfig())
     chosen = [entries[i * (len(entries) - 2) // PAIRS + j] for i in range(PAIRS) for j in range(2)]
     return data.name, [pack(detector.detect(entry.load(colour=False).gray).descriptors) for entry in chosen]
 

@@ -8,6 +8,7 @@ from mapper.config.compare import CompareConfig
 from mapper.core.errors import ConfigError
 from mapper.core.frames import Sensor
 from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig, PnpConfig
+from mapper.odometry.factory import build_frame_odometry
 from mapper.registration.config import NEED_NO_GUESS
 from mapper.registration.factory import build_registration
 from mapper.sources.base import Log
@@ -46,7 +47,10 @@ def _image_methods(max_depth_m: float) -> list[Method]:
         return HybridRgbd(max_depth_m=max_depth_m)
 
     return [
-        *(odometry_method(member.kind, member.build, sees_images=True) for member in odometries),
+        *(
+            odometry_method(one.kind, partial(build_frame_odometry, one), sees_images=True)
+            for one in odometries
+        ),
         registration_method("rgbd", hybrid, uses_guess=True, sees_images=True),
     ]
 
@@ -62,5 +66,5 @@ def _scan_methods(sensor: Sensor) -> list[Method]:
     kiss = kiss_icp(sensor)
     return [
         *sorted(registrations, key=lambda method: not method.uses_guess),
-        odometry_method(kiss.kind, kiss.build, sees_images=False),
+        odometry_method(kiss.kind, partial(build_frame_odometry, kiss), sees_images=False),
     ]

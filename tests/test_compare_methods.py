@@ -16,6 +16,7 @@ from mapper.core.geometry import angle_between, apply, exp, inverse
 from mapper.features.scan_view import ScanView
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.odometry.config import IsvdOdometryConfig
+from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.scan_to_map.config import KissOdometryConfig
 from mapper.registration.base import Alignment, failed
 from mapper.registration.config import VOXEL_M
@@ -235,6 +236,6 @@ def test_every_method_serves_as_odometry_and_on_pairs(desk_log):
 
 
 def test_an_image_odometry_refuses_scans_by_losing_them():
-    tracker = IsvdOdometryConfig().build()
+    tracker = build_frame_odometry(IsvdOdometryConfig())
     with pytest.raises(FrameError):
         tracker.observe(scan(0))

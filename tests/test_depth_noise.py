@@ -7,6 +7,7 @@ from mapper.config.loading import load_config
 from mapper.core.errors import ConfigError
 from mapper.core.frames import RgbdFrame
 from mapper.odometry.config import LocalMapConfig
+from mapper.odometry.factory import build_frame_odometry
 from mapper.sensing.config import DepthNoiseConfig
 from mapper.sensing.depth_noise import feature_depth_sigma_m
 from mapper.simulation.config import SynthConfig
@@ -73,7 +74,7 @@ def test_the_odometry_weighs_by_it_and_by_nothing_without_it():
     wall_m[:120] = 0.0
     frame = RgbdFrame(frame.stamp_ns, frame.image, wall_m, frame.camera)
     usual, known = (
-        LocalMapConfig(depth_noise=noise, disparity_sigma_px=0.5).build().observe(frame)
+        build_frame_odometry(LocalMapConfig(depth_noise=noise, disparity_sigma_px=0.5)).observe(frame)
         for noise in (None, NOISE)
     )
     np.testing.assert_allclose(usual.weights[:, 2] ** -0.5, 0.5 * usual.weights[:, 0] ** -0.5)

@@ -9,7 +9,8 @@ import pytest
 
 from mapper.core.errors import DataError
 from mapper.features.config import DetectorConfig, OrbConfig, SurfConfig, UniformOrbConfig
-from mapper.features.detectors import Features, build_detector
+from mapper.features.detectors import Features
+from mapper.features.factory import build_detector
 from mapper.features.fast import corners, fast_scores, orientations
 from mapper.features.hessian import interest_points
 from mapper.features.quadtree import spread

@@ -13,6 +13,7 @@ from mapper.graph.config import GraphConfig
 from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
 from mapper.odometry.config import LocalMapConfig
+from mapper.odometry.factory import build_frame_odometry
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.source import CameraSimulator
 
@@ -38,7 +39,7 @@ def blank(frame):
 
 def track(frames, config=None):
     """Track, solve as the pipeline does, and return tracks and trajectory."""
-    odometry = (config or LocalMapConfig()).build()
+    odometry = build_frame_odometry(config or LocalMapConfig())
     graph = PoseGraph()
     tracks = []
     for frame in frames:
@@ -127,7 +128,7 @@ def test_a_view_that_is_mostly_new_becomes_a_keyframe(frames):
 
 
 def test_factors_tie_every_keyframe_to_an_earlier_one(frames):
-    odometry = LocalMapConfig().build()
+    odometry = build_frame_odometry(LocalMapConfig())
     keyframes = sum(odometry.track(odometry.observe(frame)).is_keyframe for frame in frames)
     factors = odometry.finish()
     assert {factor.j for factor in factors} == set(range(1, keyframes))
@@ -140,10 +141,10 @@ def test_factors_tie_every_keyframe_to_an_earlier_one(frames):
 def test_a_bare_scan_is_refused():
     scan = Scan(7, np.zeros((3, 3), np.float32))
     with pytest.raises(FrameError, match="needs colour and depth"):
-        LocalMapConfig().build().observe(scan)
+        build_frame_odometry(LocalMapConfig()).observe(scan)
 
 
 def test_an_image_without_features_is_observed_as_empty():
     camera = PinholeCamera(64, 48, 60.0, 60.0, 31.5, 23.5)
     frame = RgbdFrame(0, np.zeros((48, 64), np.uint8), np.zeros((48, 64), np.float32), camera)
-    assert len(LocalMapConfig().build().observe(frame)) == 0
+    assert len(build_frame_odometry(LocalMapConfig()).observe(frame)) == 0

@@ -5,6 +5,7 @@ import pytest
 
 from mapper.features.config import OrbConfig
 from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig, WheelsOdometryConfig
+from mapper.odometry.factory import build_frame_odometry, build_odometry
 from mapper.odometry.node_offset import NodeOffset
 from mapper.sources import open_source
 
@@ -13,7 +14,7 @@ CONFIGS = {"local-map": LocalMapConfig(), "isvd": IsvdOdometryConfig(detector=Or
 
 def followed(config, log, count=8):
     """Odometry, track, view and matches after each frame."""
-    odometry = config.build()
+    odometry = build_frame_odometry(config)
     for entry in list(open_source(log).entries())[:count]:
         observation = odometry.read(entry)
         track = odometry.track(observation)
@@ -52,7 +53,7 @@ def test_isvd_matches_with_the_frame_just_before(desk_log):
 def test_the_first_frame_came_from_nowhere_and_a_lost_one_is_held_by_nothing(config, desk_log):
     ((_, _, matches),) = followed(config, desk_log, count=1)
     assert matches is None or np.isnan(matches.before_px).all()
-    odometry = NodeOffset(config.build(), first_node=7)
+    odometry = NodeOffset(build_frame_odometry(config), first_node=7)
     entries = list(open_source(desk_log).entries())
     odometry.track(odometry.read(entries[0]))
     assert odometry.track(odometry.read(entries[1])).node >= 7
@@ -77,6 +78,6 @@ class DarkEntry:
 
 def test_no_features_hold_what_wheels_tell(desk_log):
     source = open_source(desk_log)
-    odometry = WheelsOdometryConfig().build(source.truth)
+    odometry = build_odometry(WheelsOdometryConfig(), source.truth)
     assert odometry.track(odometry.read(next(source.entries()))).node == 0
     assert odometry.matches() is None

@@ -5,6 +5,7 @@ import pytest
 
 from mapper.core.errors import DataError
 from mapper.features.config import UniformOrbConfig
+from mapper.features.factory import build_detector
 from mapper.features.windowed import match_everywhere, pack
 from mapper.places.config import PlacesConfig, VocabularyConfig
 from mapper.places.guided import match_by_word
@@ -154,7 +155,7 @@ def two_laps():
     config = SynthConfig(
         seed=5, laps=2.0, frame_rate_hz=0.5, width_px=320, height_px=240, texture_px_per_m=128
     )
-    source, detector = CameraSimulator(config).log(), UniformOrbConfig().build()
+    source, detector = CameraSimulator(config).log(), build_detector(UniformOrbConfig())
     bits = [pack(detector.detect(entry.load(colour=False).gray).descriptors) for entry in source.entries()]
     return source.truth.T_world_body, bits
 

@@ -10,6 +10,7 @@ from mapper.config.loading import load_config
 from mapper.core.geometry import angle_between, apply, exp, inverse
 from mapper.core.trajectory import trajectory_from
 from mapper.odometry.config import PnpConfig
+from mapper.odometry.factory import build_frame_odometry
 from mapper.registration.p3p import ransac_p3p
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.source import CameraSimulator
@@ -33,7 +34,7 @@ def frames(source):
 
 
 def tracked(frames, config):
-    odometry = config.build()
+    odometry = build_frame_odometry(config)
     return [odometry.track(odometry.observe(frame)) for frame in frames]
 
 
@@ -114,7 +115,7 @@ def test_the_same_frames_give_the_same_bytes(frames):
 def test_pixels_alone_serve_too(source, frames):
     """Depth still makes landmarks, but no residual knows of it."""
     config = PnpConfig(depth_residual=False)
-    observation = config.build().observe(frames[0])
+    observation = build_frame_odometry(config).observe(frames[0])
     assert np.isnan(observation.measured[:, 2]).all()
     assert observation.has_depth.mean() > 0.5
     assert ate_rmse_m(tracked(frames, config), source) < 0.02

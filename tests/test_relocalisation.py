@@ -8,6 +8,7 @@ from mapper.core.geometry import angle_between, inverse
 from mapper.graph.components import components
 from mapper.graph.model import PoseGraph
 from mapper.odometry.config import LocalMapConfig, PnpConfig
+from mapper.odometry.factory import build_frame_odometry
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.source import CameraSimulator
 
@@ -62,7 +63,7 @@ def test_a_known_place_is_found_in_the_first_frame_that_shows_it(source, frames,
     dark = seconds(4.5, 5.5)
     log = [*frames[: dark.start], *map(covered, frames[dark]), *frames[dark.stop :]]
 
-    tracks = tracked(log, config.build())
+    tracks = tracked(log, build_frame_odometry(config))
 
     assert [i for i, t in enumerate(tracks) if t.node is None] == list(range(dark.start, dark.stop))
     back = tracks[dark.stop]
@@ -78,7 +79,7 @@ def test_a_known_place_is_found_in_the_first_frame_that_shows_it(source, frames,
 @BOTH
 def test_an_unknown_place_begins_a_map_of_its_own(frames, config):
     before, elsewhere = frames[seconds(0.0, 1.0)], frames[seconds(2.3, 3.3)]
-    odometry = config.model_copy(update={"max_lost_frames": 4}).build()
+    odometry = build_frame_odometry(config.model_copy(update={"max_lost_frames": 4}))
 
     tracks = tracked([*before, *elsewhere], odometry)
 
@@ -96,14 +97,14 @@ def test_an_unknown_place_begins_a_map_of_its_own(frames, config):
 
 
 def test_whoever_wants_no_second_map_stays_lost(frames):
-    odometry = LocalMapConfig(max_lost_frames=0).build()
+    odometry = build_frame_odometry(LocalMapConfig(max_lost_frames=0))
     before, elsewhere = frames[seconds(0.0, 1.0)], frames[seconds(2.3, 3.3)]
     assert all(t.node is None for t in tracked([*before, *elsewhere], odometry)[len(before) :])
 
 
 def test_darkness_is_no_place(frames):
     """Frames without features never begin a map, however many they are."""
-    odometry = LocalMapConfig(max_lost_frames=2).build()
+    odometry = build_frame_odometry(LocalMapConfig(max_lost_frames=2))
     tracks = tracked([*frames[:5], *map(covered, frames[5:9]), *frames[9:12]], odometry)
     assert all(t.node is None for t in tracks[5:9])
     assert tracks[9].diagnostics.method == "relocalised"
@@ -112,7 +113,7 @@ def test_darkness_is_no_place(frames):
 def test_one_second_turn_joins_the_first_ones_landmarks(frames):
     """After relocalisation keyframes share landmarks with those from before the loss: one component."""
     dark = seconds(4.5, 5.5)
-    odometry = LocalMapConfig().build()
+    odometry = build_frame_odometry(LocalMapConfig())
     tracks = tracked([*frames[: dark.start], *map(covered, frames[dark]), *frames[dark.stop :]], odometry)
     graph = graph_of(tracks, odometry)
     assert len(components(graph)) == 1
@@ -123,7 +124,7 @@ def test_one_second_turn_joins_the_first_ones_landmarks(frames):
 def test_the_better_of_two_weak_placements_wins(frames, order):
     """Nothing is strong here, so each keyframe is asked, in whatever order."""
     config = LocalMapConfig(weak_inliers=10_000)
-    odometry = config.build()
+    odometry = build_frame_odometry(config)
     tracked(frames[:12], odometry)
     relocalizer, observation = odometry._relocalizer, odometry.observe(frames[12])
     keyframes = range(len(odometry._map.keyframes))[::order]

@@ -10,13 +10,13 @@ from mapper.core.deskew import Twist, deskewed
 from mapper.core.errors import FrameError
 from mapper.core.frames import Scan
 from mapper.core.geometry import angle_between, exp, inverse
+from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.scan_to_map.config import (
     GicpOdometryConfig,
     HoughOdometryConfig,
     IcpOdometryConfig,
     KissOdometryConfig,
 )
-from mapper.odometry.scan_to_map.odometry import ScanOdometry
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import LidarSimulator
 
@@ -38,7 +38,7 @@ def scans(seed=0, *, motion_distortion=False):
 
 
 def tracked(config, log):
-    odometry = config.build()
+    odometry = build_frame_odometry(config)
     return [odometry.track(odometry.observe(scan)) for scan in log]
 
 
@@ -131,7 +131,7 @@ def test_a_map_begins_with_a_scan_that_is_no_place_until_its_motion_is_known():
 
 def test_a_view_is_deskewed_to_its_stamp():
     scan = scans(motion_distortion=True)[0]
-    odometry = GicpOdometryConfig().build()
+    odometry = build_frame_odometry(GicpOdometryConfig())
     observation = odometry.observe(scan)
     twist = Twist(np.zeros(3), np.array([5.0, 0.0, 0.0]))
 
@@ -192,7 +192,7 @@ def test_what_a_corridor_hides_is_told_and_left_open():
 
 
 def test_a_scan_of_next_to_nothing_is_refused():
-    odometry = ScanOdometry(GicpOdometryConfig(), GicpOdometryConfig().matcher)
+    odometry = build_frame_odometry(GicpOdometryConfig())
     few = Scan(5, np.full((40, 3), 7.0, np.float32))
 
     with pytest.raises(FrameError, match="40 points, of which 1 are left"):

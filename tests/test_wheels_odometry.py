@@ -17,6 +17,7 @@ from mapper.features.view import View
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.odometry.config import WheelsOdometryConfig
+from mapper.odometry.factory import build_odometry
 from mapper.pipeline.track import refuse_a_fragment, track_log
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT
@@ -173,13 +174,13 @@ def test_loops_look_at_keyframes_only_and_pass_a_damaged_one_by(flat):
 
 
 def test_keyframes_are_recognised_by_what_their_sensor_saw(flat):
-    odometry = WheelsOdometryConfig().build(flat.wheels)
+    odometry = build_odometry(WheelsOdometryConfig(), flat.wheels)
     entry = next(flat.entries())
     seen = odometry.view(odometry.read(entry), odometry.track(entry).twist)
     assert isinstance(seen, View)
     assert seen.is_orb
     street = LidarSimulator(STREET_ON_WHEELS).log()
-    odometry = WheelsOdometryConfig().build(street.wheels)
+    odometry = build_odometry(WheelsOdometryConfig(), street.wheels)
     entries = list(street.entries())
     track = [odometry.track(odometry.read(entry)) for entry in entries][10]
     true = twist_at(street.truth, 10)

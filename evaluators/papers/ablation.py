@@ -9,7 +9,8 @@ from mapper.core.errors import ConfigError, FrameError, MapperError
 from mapper.core.frames import Frame, Image
 from mapper.core.trajectory import Trajectory
 from mapper.features.config import DetectorConfig
-from mapper.features.detectors import Features, build_detector
+from mapper.features.detectors import Features
+from mapper.features.factory import build_detector
 from mapper.features.matching import Pairs
 from mapper.graph.model import PoseGraph
 from mapper.loops.factory import build_loop_detector

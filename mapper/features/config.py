@@ -1,13 +1,10 @@
 """Detectors of image features."""
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt
 
 from mapper.core.config import Config
-
-if TYPE_CHECKING:
-    from mapper.features.detectors import Detector
 
 ScaleFactor = Annotated[float, Field(gt=1.0)]
 """Size of a pixel on one pyramid level relative to the level below."""
@@ -24,12 +21,6 @@ class SurfConfig(Config):
     min_features: PositiveInt = 300
     octaves: PositiveInt = 4
 
-    def build(self) -> "Detector":
-        """Return the detector."""
-        from mapper.features.surf import Surf  # imported only when asked for
-
-        return Surf(self)
-
 
 class SiftConfig(Config):
     """SIFT (Lowe 2004) by OpenCV."""
@@ -41,12 +32,6 @@ class SiftConfig(Config):
     min_threshold: PositiveFloat = 0.01
     min_features: PositiveInt = 300
 
-    def build(self) -> "Detector":
-        """Return the detector."""
-        from mapper.features.opencv import Sift  # imported only when asked for
-
-        return Sift(self)
-
 
 class AkazeConfig(Config):
     """AKAZE (Alcantarilla et al. 2013) by OpenCV."""
@@ -57,12 +42,6 @@ class AkazeConfig(Config):
     """Detector response threshold to start from; halved while an image gives too few features."""
     min_threshold: PositiveFloat = 0.0001
     min_features: PositiveInt = 300
-
-    def build(self) -> "Detector":
-        """Return the detector."""
-        from mapper.features.opencv import Akaze  # imported only when asked for
-
-        return Akaze(self)
 
 
 class OrbConfig(Config):
@@ -77,12 +56,6 @@ class OrbConfig(Config):
     levels: PositiveInt = 8
     scale_factor: ScaleFactor = 1.2
 
-    def build(self) -> "Detector":
-        """Return the detector."""
-        from mapper.features.opencv import Orb  # imported only when asked for
-
-        return Orb(self)
-
 
 class UniformOrbConfig(Config):
     """ORB spread evenly over the image by a quadtree (B1; Mur-Artal & Tardós 2017)."""
@@ -96,12 +69,6 @@ class UniformOrbConfig(Config):
     cell_px: PositiveInt = 30
     levels: PositiveInt = 8
     scale_factor: ScaleFactor = 1.2
-
-    def build(self) -> "Detector":
-        """Return the detector."""
-        from mapper.features.uniform_orb import UniformOrb  # imported only when asked for
-
-        return UniformOrb(self)
 
 
 DetectorConfig = Annotated[

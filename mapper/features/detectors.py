@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.frames import Image
-from mapper.features.config import DetectorConfig
 
 Descriptors = NDArray[np.uint8] | NDArray[np.float32]
 """(N, D) bits, compared by Hamming distance, or numbers, compared by Euclidean distance."""
@@ -65,8 +64,3 @@ class Detector(Protocol):
     def detect(self, gray: Image) -> Features:
         """Return the features of an (H, W) uint8 image; none where it has no texture."""
         ...
-
-
-def build_detector(config: DetectorConfig) -> Detector:
-    """Return the detector that a configuration names."""
-    return config.build()

@@ -1,8 +1,7 @@
 """Odometry methods and the ISVD registration inside the thesis's one."""
 
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 
@@ -17,12 +16,6 @@ from mapper.odometry.scan_to_map.config import (
 )
 from mapper.registration.config import IsvdConfig
 from mapper.sensing.config import DepthNoiseConfig
-
-if TYPE_CHECKING:
-    from mapper.core.trajectory import Trajectory
-    from mapper.odometry.isvd import IsvdOdometry
-    from mapper.odometry.local_map.odometry import KeyframeOdometry
-    from mapper.odometry.wheel_odometry import WheelsOdometry
 
 
 class MatchConfig(Config):
@@ -63,12 +56,6 @@ class IsvdOdometryConfig(Config):
     """At least one keyframe, the sharpest, in this many frames (A8)."""
     relocalisation_keyframes: PositiveInt = 20
     """How many of the nearest keyframes, and as many of the others in turn, a lost frame is compared with."""
-
-    def build(self, _wheels: "Trajectory | None" = None, /) -> "IsvdOdometry":
-        """Return the odometry this configures."""
-        from mapper.odometry.isvd import IsvdOdometry  # imported only when asked for
-
-        return IsvdOdometry(self)
 
 
 class KeyframeConfig(Config):
@@ -144,25 +131,11 @@ class LocalMapConfig(KeyframeConfig):
     max_predicted_steps: PositiveFloat = 10.0
     """Longer gaps, in frame intervals, are not extrapolated over."""
 
-    def build(self, _wheels: "Trajectory | None" = None, /) -> "KeyframeOdometry":
-        """Return the odometry this configures."""
-        from mapper.odometry.local_map.motion import MotionPoseTracker
-        from mapper.odometry.local_map.odometry import KeyframeOdometry
-
-        return KeyframeOdometry(self, partial(MotionPoseTracker, self))
-
 
 class PnpConfig(KeyframeConfig):
     """The second source's odometry: each frame by P3P and Levenberg–Marquardt on its pixels (B3)."""
 
     kind: Literal["pnp"] = "pnp"
-
-    def build(self, _wheels: "Trajectory | None" = None, /) -> "KeyframeOdometry":
-        """Return the odometry this configures."""
-        from mapper.odometry.local_map.odometry import KeyframeOdometry
-        from mapper.odometry.local_map.pnp import PnpPoseTracker
-
-        return KeyframeOdometry(self, partial(PnpPoseTracker, self))
 
 
 class WheelsOdometryConfig(WheelNoiseConfig):
@@ -175,25 +148,16 @@ class WheelsOdometryConfig(WheelNoiseConfig):
     detector: Annotated[OrbConfig | UniformOrbConfig, Field(discriminator="kind")] = UniformOrbConfig()
     """What loops recognise images by; scans are recognised by their points."""
 
-    def build(self, wheels: "Trajectory | None" = None, /) -> "WheelsOdometry":
-        """Return the odometry this configures.
 
-        Raises:
-            ConfigError: There are no wheels.
-        """
-        from mapper.odometry.wheel_odometry import WheelsOdometry
-
-        return WheelsOdometry(self, wheels)
-
-
-OdometryConfig = Annotated[
+FrameOdometryConfig = (
     IsvdOdometryConfig
     | LocalMapConfig
     | PnpConfig
-    | WheelsOdometryConfig
     | GicpOdometryConfig
     | IcpOdometryConfig
     | KissOdometryConfig
-    | HoughOdometryConfig,
-    Field(discriminator="kind"),
-]
+    | HoughOdometryConfig
+)
+"""Settings of the methods that use the frames' images or scans."""
+
+OdometryConfig = Annotated[FrameOdometryConfig | WheelsOdometryConfig, Field(discriminator="kind")]

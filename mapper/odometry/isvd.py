@@ -11,7 +11,8 @@ from mapper.core.deskew import Twist
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, PinholeCamera, RgbdFrame
 from mapper.core.geometry import Array, Points, Transform, apply, inverse, mean_rotation, transform
-from mapper.features.detectors import Detector, Features, build_detector
+from mapper.features.detectors import Detector, Features
+from mapper.features.factory import build_detector
 from mapper.features.matching import Pairs, homography_inliers, match_mutual
 from mapper.features.view import View
 from mapper.graph.model import BetweenFactor

@@ -2,21 +2,23 @@
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from mapper.core.deskew import Twist, twist_at
-from mapper.core.errors import ConfigError
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, angle_between, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
+from mapper.features.factory import build_detector
 from mapper.graph.model import BetweenFactor
 from mapper.graph.wheel_factors import WheelNode, wheel_factor
-from mapper.odometry.base import Diagnostics, FrameOdometry, FrameResult, Seen
+from mapper.odometry.base import Diagnostics, FrameResult, Seen
 from mapper.odometry.config import LocalMapConfig, WheelsOdometryConfig
+from mapper.odometry.local_map.observation import observe
 from mapper.odometry.scan_to_map.config import GicpOdometryConfig
+from mapper.odometry.scan_to_map.observation import observe_scan
+from mapper.places.vocabulary import Vocabulary, load_vocabulary
 from mapper.sensing.wheel_kinematics import Odometer, pose_at
 from mapper.sources.base import FrameRef
 
@@ -28,22 +30,15 @@ class WheelsOdometry:
     are lost, but the wheels counted on: what comes after it is tied to what came before.
     """
 
-    def __init__(self, config: WheelsOdometryConfig, wheels: Trajectory | None) -> None:
+    def __init__(self, config: WheelsOdometryConfig, wheels: Trajectory) -> None:
         """Start before the first frame.
 
         Args:
-            config: Every knob.
-            wheels: T_odom_body, as the log tells.
-
-        Raises:
-            ConfigError: It does not.
+            config: Settings.
+            wheels: T_odom_body of the log's wheel odometry.
         """
-        if wheels is None:
-            raise ConfigError(
-                "odometry.kind=wheels: the log has no wheel odometry; put wheels.txt or encoders.txt into "
-                "its folder, or name a recording's topic: --set source.topics.wheels=/odom"
-            )
         self._config = config
+        self._detector = build_detector(config.detector)
         self._wheels = wheels
         self._odometer = Odometer(wheels)
         self._T_world_odom: Transform | None = None
@@ -92,8 +87,9 @@ class WheelsOdometry:
             FrameError: It cannot be read, or not be used.
         """
         frame = observation.load(colour=False)
-        eyes = self._scan_eyes if isinstance(frame, Scan) else self._image_eyes
-        return eyes.view(eyes.observe(frame), twist)
+        if isinstance(frame, Scan):
+            return observe_scan(frame, GicpOdometryConfig()).view(twist)
+        return observe(frame, self._detector, self._vocabulary, LocalMapConfig()).view()
 
     def matches(self) -> None:
         """Return nothing: no features hold the pose."""
@@ -103,12 +99,8 @@ class WheelsOdometry:
         return ()
 
     @cached_property
-    def _image_eyes(self) -> FrameOdometry[Any]:
-        return LocalMapConfig(detector=self._config.detector).build()
-
-    @cached_property
-    def _scan_eyes(self) -> FrameOdometry[Any]:
-        return GicpOdometryConfig().build()
+    def _vocabulary(self) -> Vocabulary:
+        return load_vocabulary()
 
     def _is_far(self, T_key_body: Transform) -> bool:
         config = self._config

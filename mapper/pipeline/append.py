@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Sequence, Set
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, LoopError
@@ -13,7 +12,7 @@ from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import KeyframeLoopsConfig
 from mapper.loops.factory import build_keyframe_loop_detector
-from mapper.odometry.base import Odometry
+from mapper.odometry.factory import build_odometry
 from mapper.odometry.node_offset import NodeOffset
 from mapper.pipeline.components import component_of
 from mapper.pipeline.fuse import carry_times, fuse_into
@@ -126,7 +125,7 @@ def _after(
     detector = build_keyframe_loop_detector(config.loops, config.graph.solve)
     views = reobserve(first, before.trajectory, set(graph.stamps_ns.values()), config, progress=progress)
     detector.preload(graph, {node: views[stamp_ns] for node, stamp_ns in graph.stamps_ns.items()})
-    odometry: Odometry[Any] = config.odometry.build(wheels)
+    odometry = build_odometry(config.odometry, wheels)
     offset_odometry = NodeOffset(odometry, first_node=max(graph.T_world_node) + 1)
     known = [factor for factor in graph.factors if factor.origin != "loop"]
     return Start(

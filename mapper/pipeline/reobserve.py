@@ -1,12 +1,12 @@
 """Frames that were tracked long ago, seen again: what a finished run does not keep of them."""
 
 from collections.abc import Collection
-from typing import Any
 
 from mapper.config.build import BuildConfig
 from mapper.core.deskew import twist_at
 from mapper.core.trajectory import Trajectory
-from mapper.odometry.base import Odometry, Seen
+from mapper.odometry.base import Seen
+from mapper.odometry.factory import build_odometry
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import FrameRef, Log
@@ -32,7 +32,7 @@ def reobserve(
     Raises:
         FrameError: A frame cannot be read.
     """
-    odometry: Odometry[Any] = config.odometry.build(source.wheels)
+    odometry = build_odometry(config.odometry, source.wheels)
     index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
 
     def view(entry: FrameRef) -> tuple[int, Seen]:

@@ -16,6 +16,7 @@ from mapper.loops.closure import LoopClosure
 from mapper.loops.detector import LoopDetector
 from mapper.loops.factory import build_loop_detector
 from mapper.odometry.base import FrameResult, Odometry
+from mapper.odometry.factory import build_odometry
 from mapper.run.frame_records import records_of
 from mapper.run.observers import NULL_OBSERVER, Observer, Step
 from mapper.run.stored_tracking import StoredTracking
@@ -90,7 +91,7 @@ def first_session(source: Log, config: BuildConfig) -> Start:
             "loops.kind=thesis looks from frames with many features, and odometry.kind=wheels counts none; "
             "want loops.kind=places, scans or none"
         )
-    odometry = config.odometry.build(source.wheels)
+    odometry = build_odometry(config.odometry, source.wheels)
     return Start(odometry, build_loop_detector(config.loops, config.graph.solve), PoseGraph())
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from mapper.core.errors import FrameError, VocabularyError
 from mapper.core.frames import RgbdFrame
+from mapper.features.factory import build_detector
 from mapper.features.windowed import pack
 from mapper.places.config import VocabularyConfig
 from mapper.places.tree import Bits
@@ -24,7 +25,7 @@ def descriptors_of(source: Log, config: VocabularyConfig, *, progress: Progress 
     Raises:
         VocabularyError: The log has no images.
     """
-    detector = config.detector.build()
+    detector = build_detector(config.detector)
 
     def detect(entry: FrameRef) -> Bits | Skipped:
         try:

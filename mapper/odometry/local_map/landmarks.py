@@ -64,7 +64,7 @@ class LandmarkMap:
             measured=((3,), np.float64),
             weights=((3,), np.float64),
         )
-        self._scale_factor = scale_factor
+        self.scale_factor = scale_factor
         self._first_landmark: list[int] = []
 
     def add_keyframe(
@@ -99,7 +99,7 @@ class LandmarkMap:
             direction=0.0,
             bits=observation.bits[features],
             reach_m=np.linalg.norm(observation.points_camera[features], axis=1)
-            * self._scale_factor ** observation.octave[features],
+            * self.scale_factor ** observation.octave[features],
             newest=-1,
             visible=1,
             found=1,

@@ -19,10 +19,9 @@ _MAX_RATIO = 0.8
 class LocalSearch:
     """Searches the landmarks of the keyframes around a first pose."""
 
-    def __init__(self, config: KeyframeConfig, landmark_map: LandmarkMap, *, scale_factor: float) -> None:
+    def __init__(self, config: KeyframeConfig, landmark_map: LandmarkMap) -> None:
         self._config = config
         self._map = landmark_map
-        self._scale_factor = scale_factor
 
     def placed(
         self,
@@ -58,7 +57,7 @@ class LocalSearch:
             T_camera_world,
             observation.intrinsics,
             np.array(observation.size_px),
-            math.log(self._scale_factor),
+            math.log(self._map.scale_factor),
             config.detector.levels,
         )
         visible = nearby[rows]
@@ -111,7 +110,7 @@ class LocalSearch:
         matched: Ids = match_windows(
             pixels,
             octave,
-            search_px * self._scale_factor ** octave.astype(np.float64),
+            search_px * self._map.scale_factor ** octave.astype(np.float64),
             bits,
             observation.pixels,
             observation.octave,

@@ -17,12 +17,10 @@ _MAX_RATIO = 0.9
 class MotionPoseTracker:
     """Predicts, and lets matching without a prediction compete where the prediction found little."""
 
-    def __init__(
-        self, config: LocalMapConfig, landmark_map: LandmarkMap, search: LocalSearch, relocalizer: Relocalizer
-    ) -> None:
+    def __init__(self, config: LocalMapConfig, landmark_map: LandmarkMap, relocalizer: Relocalizer) -> None:
         self._config = config
         self._map = landmark_map
-        self._search = search
+        self._search = LocalSearch(config, landmark_map)
         self._relocalizer = relocalizer
 
     def place(

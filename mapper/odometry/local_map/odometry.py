@@ -9,21 +9,20 @@ from numpy.typing import NDArray
 from mapper.core.deskew import Twist
 from mapper.core.frames import Frame
 from mapper.core.geometry import Transform, inverse
-from mapper.features.detectors import build_detector
+from mapper.features.factory import build_detector
 from mapper.features.view import View
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
 from mapper.odometry.base import Diagnostics, FrameResult, Matches
 from mapper.odometry.config import KeyframeConfig
 from mapper.odometry.local_map.landmarks import LandmarkMap
-from mapper.odometry.local_map.local_search import LocalSearch
 from mapper.odometry.local_map.observation import Observation, observe
 from mapper.odometry.local_map.pose_tracker import PoseTracker, TrackedPose, unmatched
 from mapper.odometry.local_map.relocalizer import Relocalizer
 from mapper.places.vocabulary import load_vocabulary
 from mapper.sources.base import FrameRef
 
-MakePlacing = Callable[[LandmarkMap, LocalSearch, Relocalizer], PoseTracker]
+MakePoseTracker = Callable[[LandmarkMap, Relocalizer], PoseTracker]
 
 
 class KeyframeOdometry:
@@ -33,14 +32,13 @@ class KeyframeOdometry:
     so all factors are handed out by ``finish``.
     """
 
-    def __init__(self, config: KeyframeConfig, make_placing: MakePlacing) -> None:
+    def __init__(self, config: KeyframeConfig, make_tracker: MakePoseTracker) -> None:
         self._config = config
         self._detector = build_detector(config.detector)
         self._map = LandmarkMap(scale_factor=self._detector.scale_factor)
         self._vocabulary = load_vocabulary(config.vocabulary)
-        search = LocalSearch(config, self._map, scale_factor=self._detector.scale_factor)
-        self._relocalizer = Relocalizer(config, self._map, search, self._vocabulary)
-        self._tracker = make_placing(self._map, search, self._relocalizer)
+        self._relocalizer = Relocalizer(config, self._map, self._vocabulary)
+        self._tracker = make_tracker(self._map, self._relocalizer)
         self._last: TrackedPose | None = None
         self._before_last: TrackedPose | None = None
         self._most_inliers = 0  # since the last keyframe

@@ -3,9 +3,7 @@
 from collections.abc import Iterator
 
 from mapper.core.geometry import inverse
-from mapper.odometry.config import PnpConfig
 from mapper.odometry.local_map.landmarks import LandmarkMap
-from mapper.odometry.local_map.local_search import LocalSearch
 from mapper.odometry.local_map.observation import Observation
 from mapper.odometry.local_map.pose_tracker import TrackedPose
 from mapper.odometry.local_map.relocalizer import Relocalizer
@@ -14,9 +12,7 @@ from mapper.odometry.local_map.relocalizer import Relocalizer
 class PnpPoseTracker:
     """Predicts nothing: each frame is matched by visual words and found by P3P."""
 
-    def __init__(
-        self, _config: PnpConfig, landmark_map: LandmarkMap, _search: LocalSearch, relocalizer: Relocalizer, /
-    ) -> None:
+    def __init__(self, landmark_map: LandmarkMap, relocalizer: Relocalizer) -> None:
         self._map = landmark_map
         self._relocalizer = relocalizer
 

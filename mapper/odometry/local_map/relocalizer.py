@@ -21,12 +21,10 @@ _MAX_RATIO = 0.85
 class Relocalizer:
     """Finds a frame among the keyframes; None is the answer "not found"."""
 
-    def __init__(
-        self, config: KeyframeConfig, landmark_map: LandmarkMap, search: LocalSearch, vocabulary: Vocabulary
-    ) -> None:
+    def __init__(self, config: KeyframeConfig, landmark_map: LandmarkMap, vocabulary: Vocabulary) -> None:
         self._config = config
         self._map = landmark_map
-        self._search = search
+        self._search = LocalSearch(config, landmark_map)
         self._vocabulary = vocabulary
         self._index = PlaceIndex(vocabulary)
 

@@ -1,16 +1,11 @@
 """Odometry methods for scans."""
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
 from mapper.core.config import Config, Ratio
 from mapper.registration.hough.config import HoughGicpConfig, HoughNdtConfig
-
-if TYPE_CHECKING:
-    from mapper.core.trajectory import Trajectory
-    from mapper.odometry.scan_to_map.matching import Matcher
-    from mapper.odometry.scan_to_map.odometry import ScanOdometry
 
 
 class ScanOdometryConfig(Config):
@@ -39,16 +34,6 @@ class ScanOdometryConfig(Config):
     max_pair_distance_m: PositiveFloat = 0.5
     """A point this near to one of the last keyframe's overlaps with it."""
 
-    def build(self, _wheels: "Trajectory | None" = None, /) -> "ScanOdometry":
-        """Return the odometry this configures."""
-        from mapper.odometry.scan_to_map.odometry import ScanOdometry
-
-        return ScanOdometry(self, self.matcher)
-
-    def matcher(self) -> "Matcher":
-        """Return what places scans in the map, before its first scan."""
-        raise NotImplementedError
-
 
 class GicpOdometryConfig(ScanOdometryConfig):
     """Scan to map by voxelised GICP (Koide et al. 2021)."""
@@ -61,12 +46,6 @@ class GicpOdometryConfig(ScanOdometryConfig):
     map_keyframes: PositiveInt = 100
     """Cells that as many keyframes in a row have not touched are forgotten."""
     max_iterations: PositiveInt = 30
-
-    def matcher(self) -> "Matcher":
-        """Return what places scans in the map, before its first scan."""
-        from mapper.odometry.scan_to_map.gicp import GicpMatcher
-
-        return GicpMatcher(self)
 
 
 class IcpOdometryConfig(ScanOdometryConfig):
@@ -81,12 +60,6 @@ class IcpOdometryConfig(ScanOdometryConfig):
     map_keyframes: PositiveInt = 10
     """How many keyframes the map is made of."""
     max_iterations: PositiveInt = 40
-
-    def matcher(self) -> "Matcher":
-        """Return what places scans in the map, before its first scan."""
-        from mapper.odometry.scan_to_map.icp import IcpMatcher
-
-        return IcpMatcher(self)
 
 
 class KissOdometryConfig(ScanOdometryConfig):
@@ -103,12 +76,6 @@ class KissOdometryConfig(ScanOdometryConfig):
     max_iterations: PositiveInt = 500
     convergence: PositiveFloat = 1e-4
 
-    def matcher(self) -> "Matcher":
-        """Return what places scans in the map, before its first scan."""
-        from mapper.odometry.scan_to_map.kiss import KissMatcher
-
-        return KissMatcher(self)
-
 
 class HoughOdometryConfig(ScanOdometryConfig):
     """Each scan against the one before it, without a guess, by Hough and NDT (C6)."""
@@ -117,8 +84,5 @@ class HoughOdometryConfig(ScanOdometryConfig):
     registration: HoughNdtConfig = HoughNdtConfig()
     rescue: HoughGicpConfig | None = None
 
-    def matcher(self) -> "Matcher":
-        """Return what places each scan by the last one, before the first."""
-        from mapper.odometry.scan_to_map.consecutive import ConsecutiveMatcher
 
-        return ConsecutiveMatcher(self)
+ScanToMapConfig = GicpOdometryConfig | IcpOdometryConfig | KissOdometryConfig | HoughOdometryConfig

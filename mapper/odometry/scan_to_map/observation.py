@@ -4,10 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapper.core.deskew import Twist, deskewed
+from mapper.core.deskew import STILL, Twist, deskewed
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, Points32, Scan
 from mapper.core.voxel_grid import thin
+from mapper.features.scan_view import ScanView
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.odometry.scan_to_map.matching import Sweep
 from mapper.registration.surfaces import prepared
@@ -43,6 +44,10 @@ class ScanObservation:
         """Return (M, 3) points as taken all at once at the stamp, one per voxel."""
         points = self._deskewed(twist, moment_s=0.0).points_body
         return points[thin(points, self.voxel_m)]
+
+    def view(self, twist: Twist | None) -> ScanView:
+        """Return the points as taken all at once at the stamp, for place recognition; None is no motion."""
+        return ScanView(self.scan.stamp_ns, self.points_at_stamp(twist or STILL))
 
     def _deskewed(self, twist: Twist, *, moment_s: float) -> Scan:
         if self.scan.times_s is None:

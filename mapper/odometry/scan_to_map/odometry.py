@@ -1,7 +1,7 @@
 """Scan by scan against a map of those before, by any method that can place one."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
@@ -63,9 +63,9 @@ class ScanOdometry:
     tell: motions that they leave open stay open in the factor.
     """
 
-    def __init__(self, config: ScanOdometryConfig, make_matcher: Callable[[], Matcher]) -> None:
+    def __init__(self, config: ScanOdometryConfig, matcher: Matcher) -> None:
         self._config = config
-        self._matcher = make_matcher()
+        self._matcher = matcher
         self._rescue = build_registration(config.rescue) if config.rescue is not None else None
         self._rescuer: tuple[int, Aligner] | None = None
         self._overlaps: deque[float] = deque(maxlen=_USUAL_OF)
@@ -113,7 +113,7 @@ class ScanOdometry:
 
     def view(self, observation: ScanObservation, twist: Twist | None = None, /) -> ScanView:
         """Return what a place is recognised by. Pure."""
-        return ScanView(observation.scan.stamp_ns, observation.points_at_stamp(twist or STILL))
+        return observation.view(twist)
 
     def matches(self) -> None:
         """Return nothing: no features hold the pose."""

@@ -1,0 +1,95 @@
+"""Odometry factory."""
+
+from functools import partial
+from typing import TYPE_CHECKING, Any, assert_never
+
+from mapper.core.errors import ConfigError
+from mapper.core.trajectory import Trajectory
+from mapper.odometry.base import FrameOdometry, Odometry
+from mapper.odometry.config import (
+    FrameOdometryConfig,
+    IsvdOdometryConfig,
+    LocalMapConfig,
+    OdometryConfig,
+    PnpConfig,
+    WheelsOdometryConfig,
+)
+from mapper.odometry.scan_to_map.config import (
+    GicpOdometryConfig,
+    HoughOdometryConfig,
+    IcpOdometryConfig,
+    KissOdometryConfig,
+    ScanToMapConfig,
+)
+
+if TYPE_CHECKING:
+    from mapper.odometry.scan_to_map.matching import Matcher
+
+
+def build_odometry(config: OdometryConfig, wheels: Trajectory | None = None) -> Odometry[Any]:
+    """Return the odometry that the settings choose, before its first frame; its module is imported only now.
+
+    Args:
+        config: Settings of one method.
+        wheels: T_odom_body of the log's wheel odometry; None if it has none.
+
+    Raises:
+        ConfigError: Wheel odometry is chosen, and the log has none.
+    """
+    if not isinstance(config, WheelsOdometryConfig):
+        return build_frame_odometry(config)
+    if wheels is None:
+        raise ConfigError(
+            "odometry.kind=wheels: the log has no wheel odometry; put wheels.txt or encoders.txt into "
+            "its folder, or name a recording's topic: --set source.topics.wheels=/odom"
+        )
+    from mapper.odometry.wheel_odometry import WheelsOdometry
+
+    return WheelsOdometry(config, wheels)
+
+
+def build_frame_odometry(config: FrameOdometryConfig) -> FrameOdometry[Any]:
+    """Return the odometry that the settings choose among those that use the frames' images or scans."""
+    match config:
+        case IsvdOdometryConfig():
+            from mapper.odometry.isvd import IsvdOdometry
+
+            return IsvdOdometry(config)
+        case LocalMapConfig():
+            from mapper.odometry.local_map.motion import MotionPoseTracker
+            from mapper.odometry.local_map.odometry import KeyframeOdometry
+
+            return KeyframeOdometry(config, partial(MotionPoseTracker, config))
+        case PnpConfig():
+            from mapper.odometry.local_map.odometry import KeyframeOdometry
+            from mapper.odometry.local_map.pnp import PnpPoseTracker
+
+            return KeyframeOdometry(config, PnpPoseTracker)
+        case GicpOdometryConfig() | IcpOdometryConfig() | KissOdometryConfig() | HoughOdometryConfig():
+            from mapper.odometry.scan_to_map.odometry import ScanOdometry
+
+            return ScanOdometry(config, _build_matcher(config))
+        case _:
+            assert_never(config)
+
+
+def _build_matcher(config: ScanToMapConfig) -> "Matcher":
+    match config:
+        case GicpOdometryConfig():
+            from mapper.odometry.scan_to_map.gicp import GicpMatcher
+
+            return GicpMatcher(config)
+        case IcpOdometryConfig():
+            from mapper.odometry.scan_to_map.icp import IcpMatcher
+
+            return IcpMatcher(config)
+        case KissOdometryConfig():
+            from mapper.odometry.scan_to_map.kiss import KissMatcher
+
+            return KissMatcher(config)
+        case HoughOdometryConfig():
+            from mapper.odometry.scan_to_map.consecutive import ConsecutiveMatcher
+
+            return ConsecutiveMatcher(config)
+        case _:
+            assert_never(config)
