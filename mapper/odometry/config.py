@@ -66,8 +66,6 @@ class KeyframeConfig(Config):
     """Spread features survive views in which plain ORB crowds into one far corner."""
     max_depth_m: PositiveFloat = 4.0
     """Deeper features are tracked, but become landmarks only where near ones are few."""
-    min_keyframe_landmarks: PositiveInt = 200
-    """Keyframes that see fewer landmarks take deeper ones in, the nearest first."""
     virtual_baseline_px_m: PositiveFloat = 40.0
     """bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017); a Kinect's is 40 to 43."""
     disparity_sigma_px: PositiveFloat = 1.0
@@ -80,8 +78,6 @@ class KeyframeConfig(Config):
     """Search radius around the projected landmarks of the local map in the finest octave."""
     local_keyframes: NonNegativeInt = 15
     """How many covisible keyframes' landmarks are searched; 0 leaves it at what matching found."""
-    min_start_features: PositiveInt = 100
-    """Features with depth that the first frame must have."""
     min_matches: Annotated[int, Field(ge=8)] = 20
     """Fewer matches to the last frame, or to a keyframe, say nothing about the motion."""
     min_inliers: PositiveInt = 30
@@ -92,24 +88,13 @@ class KeyframeConfig(Config):
     """After so many frames that show enough but nothing known, a new sub-map begins; 0 never begins one."""
     keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.75
     """Keyframe when the inliers fall below this share of the most since the last keyframe."""
-    hasty_keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
-    """The same share while the last keyframe is young and the inliers are not weak: for fast motion."""
     mapped_ratio: Ratio = 0.5
     """Keyframe when the inliers are a smaller share of the near features: much of the view is new."""
-    min_keyframe_gap: PositiveInt = 4
-    """Frames for which a keyframe is young."""
     max_keyframe_gap: PositiveInt = 20
     bundle_keyframes: PositiveInt = 10
     """Window of the local bundle adjustment."""
-    min_shared_landmarks: PositiveInt = 15
-    """Keyframes that share fewer are not covisible."""
-    min_found_ratio: Ratio = 0.25
-    """Young landmarks found in a smaller share of the frames that should show them are forgotten."""
-    factors_per_keyframe: PositiveInt = 4
     vocabulary: Path | None = None
     """File of the visual words; None is what comes with the toolkit, trained on synthetic logs."""
-    matching_level: NonNegativeInt = 2
-    """Only descriptors under one node this many steps below the vocabulary's root are compared (B2)."""
     ransac_iterations: PositiveInt = 100
     """M: draws of four pairs for P3P, at most (B3)."""
     ransac_tolerance_px: PositiveFloat = 4.0
@@ -128,8 +113,6 @@ class LocalMapConfig(KeyframeConfig):
     kind: Literal["local-map"] = "local-map"
     search_px: PositiveFloat = 15.0
     """Search radius around the predicted pixel in the finest octave; doubled once when too little matches."""
-    max_predicted_steps: PositiveFloat = 10.0
-    """Longer gaps, in frame intervals, are not extrapolated over."""
 
 
 class PnpConfig(KeyframeConfig):

@@ -17,6 +17,10 @@ Ids = NDArray[np.int32]
 
 _WEAK_PRIOR = np.diag([1.0] * 3 + [0.01] * 3)
 """1 rad and 10 m: keeps the information positive definite where a few landmarks leave directions open."""
+MIN_SHARED_LANDMARKS = 15
+"""Keyframes that share fewer are not covisible (Mur-Artal, Montiel & Tardós 2015, §III-D)."""
+_MIN_FOUND_RATIO = 0.25
+"""Young landmarks found in a smaller share of the frames that should show them are removed (ibid., §VI-B)."""
 _BUNDLE_ROUNDS, _BUNDLE_ITERATIONS = 2, 5
 _NEWEST = 3
 
@@ -170,13 +174,14 @@ class LandmarkMap:
         order = np.lexsort((-others, -counts[others]))
         return [(int(k), int(counts[k])) for k in others[order]]
 
-    def refine(self, index: int, *, window: int, min_shared: int) -> None:
+    def refine(self, index: int, *, window: int) -> None:
         """Adjust a keyframe, its most covisible ones and all they see; drop observations that then disagree.
 
         Keyframes outside the window that see the same landmarks hold them in place; a sub-map's first never
         moves.
         """
-        members = [index, *(k for k, _ in self.covisible(index, min_shared=min_shared)[: window - 1])]
+        covisible = self.covisible(index, min_shared=MIN_SHARED_LANDMARKS)
+        members = [index, *(k for k, _ in covisible[: window - 1])]
         movable = sorted(k for k in members if k != self.keyframes[k].origin)
         if not movable:
             return
@@ -215,7 +220,7 @@ class LandmarkMap:
         keyframes[observations] = -1
         np.subtract.at(self.landmarks["observers"], np.array(landmarks, dtype=np.intp), 1)
 
-    def cull(self, *, min_found_ratio: float) -> None:
+    def cull(self) -> None:
         """Forget landmarks past their probation that no second keyframe confirmed or tracking rarely finds.
 
         Two keyframes after its birth a landmark must have a second observer; mismatches and depth errors at
@@ -225,7 +230,7 @@ class LandmarkMap:
         recent = np.arange(self._first_landmark[max(index - 3, 0)], self._first_landmark[max(index - 1, 0)])
         unconfirmed = self.landmarks["observers"][recent] == 1
         found, visible = self.landmarks["found"][recent], self.landmarks["visible"][recent]
-        forgotten = recent[unconfirmed | (found < min_found_ratio * visible)].astype(np.int32)
+        forgotten = recent[unconfirmed | (found < _MIN_FOUND_RATIO * visible)].astype(np.int32)
         _, observations = observations_of(
             forgotten, self.landmarks["newest"], self._observations["older"], self._observations["keyframe"]
         )

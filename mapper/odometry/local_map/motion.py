@@ -12,6 +12,8 @@ from mapper.odometry.local_map.pose_tracker import TrackedPose, project, refined
 from mapper.odometry.local_map.relocalizer import Relocalizer
 
 _MAX_RATIO = 0.9
+_MAX_PREDICTED_STEPS = 10.0
+"""Over longer gaps, in frame intervals, constant velocity predicts worse than no motion."""
 
 
 class MotionPoseTracker:
@@ -72,7 +74,7 @@ class MotionPoseTracker:
             return last.T_camera_world
         t0, t1 = before_last.observation.stamp_ns, last.observation.stamp_ns
         steps = (stamp_ns - t1) / (t1 - t0)
-        if steps > self._config.max_predicted_steps:
+        if steps > _MAX_PREDICTED_STEPS:
             return last.T_camera_world
         rotation_rad, translation_m = log(last.T_camera_world @ inverse(before_last.T_camera_world))
         T_camera_world: Transform = exp(steps * rotation_rad, steps * translation_m) @ last.T_camera_world

@@ -15,12 +15,24 @@ from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
 from mapper.odometry.base import Diagnostics, FrameResult, Matches
 from mapper.odometry.config import KeyframeConfig
-from mapper.odometry.local_map.landmarks import LandmarkMap
+from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
 from mapper.odometry.local_map.observation import Observation, observe
 from mapper.odometry.local_map.pose_tracker import PoseTracker, TrackedPose, unmatched
 from mapper.odometry.local_map.relocalizer import Relocalizer
 from mapper.places.vocabulary import load_vocabulary
 from mapper.sources.base import FrameRef
+
+_MIN_START_FEATURES = 100
+"""Near features that a sub-map's first frame must have: a few times ``min_inliers``."""
+_MIN_KEYFRAME_LANDMARKS = 200
+"""Keyframes with fewer landmarks take deeper ones in, the nearest first: more than ``weak_inliers``, so that
+the next frame does not begin weak."""
+_FACTORS_PER_KEYFRAME = 4
+"""Factors of each keyframe, to the earlier ones that share most landmarks with it."""
+_MIN_KEYFRAME_GAP = 4
+"""Frames for which a keyframe is young."""
+_HASTY_KEYFRAME_RATIO = 0.5
+"""``keyframe_ratio`` while the last keyframe is young and the inliers are not weak: for fast motion."""
 
 MakePoseTracker = Callable[[LandmarkMap, Relocalizer], PoseTracker]
 
@@ -107,9 +119,9 @@ class KeyframeOdometry:
             if j == keyframe.origin:
                 continue
             earlier = [(k, shared) for k, shared in self._map.covisible(j, min_shared=1) if k < j]
-            strong = [k for k, shared in earlier if shared >= self._config.min_shared_landmarks]
+            strong = [k for k, shared in earlier if shared >= MIN_SHARED_LANDMARKS]
             weak = [k for k, _ in earlier[:1]] or [self._map.before(j)]
-            factors += [self._factor(i, j) for i in strong[: self._config.factors_per_keyframe] or weak]
+            factors += [self._factor(i, j) for i in strong[:_FACTORS_PER_KEYFRAME] or weak]
         return factors
 
     def _factor(self, i: int, j: int) -> BetweenFactor:
@@ -123,7 +135,7 @@ class KeyframeOdometry:
 
     def _not_found(self, observation: Observation) -> FrameResult:
         """Give the frame up, or begin a new sub-map with it once enough frames showed nothing known."""
-        if self._near(observation) >= self._config.min_start_features:
+        if self._near(observation) >= _MIN_START_FEATURES:
             self._stray_frames += 1
             if self._last is None or 0 < self._config.max_lost_frames < self._stray_frames:
                 return self._begin(observation)
@@ -154,8 +166,8 @@ class KeyframeOdometry:
             return True
         kept_ratio = tracked_pose.inliers / self._most_inliers
         weak = tracked_pose.inliers < config.weak_inliers
-        if self._frames_since_keyframe < config.min_keyframe_gap and not weak:
-            return kept_ratio < config.hasty_keyframe_ratio
+        if self._frames_since_keyframe < _MIN_KEYFRAME_GAP and not weak:
+            return kept_ratio < _HASTY_KEYFRAME_RATIO
         # Landmarks left behind at one edge of a view hold its pose badly, however many they are.
         mapped = tracked_pose.inliers / max(self._near(tracked_pose.observation), 1)
         return kept_ratio < config.keyframe_ratio or mapped < config.mapped_ratio
@@ -178,8 +190,8 @@ class KeyframeOdometry:
             beside=beside,
         )
         self._relocalizer.add(index)
-        self._map.refine(index, window=config.bundle_keyframes, min_shared=config.min_shared_landmarks)
-        self._map.cull(min_found_ratio=config.min_found_ratio)
+        self._map.refine(index, window=config.bundle_keyframes)
+        self._map.cull()
         self._most_inliers, self._frames_since_keyframe = 0, 0
         keyframe = self._map.keyframes[index]
         return replace(
@@ -194,7 +206,7 @@ class KeyframeOdometry:
         depth_m = tracked_pose.observation.points_camera[:, 2]
         unmapped = tracked_pose.observation.has_depth & (tracked_pose.landmark_of_feature < 0)
         worth = unmapped & (depth_m <= self._config.max_depth_m)
-        missing = self._config.min_keyframe_landmarks - tracked_pose.inliers - int(worth.sum())
+        missing = _MIN_KEYFRAME_LANDMARKS - tracked_pose.inliers - int(worth.sum())
         if missing > 0:
             deep = np.flatnonzero(unmapped & ~worth)
             worth[deep[np.argsort(depth_m[deep], kind="stable")[:missing]]] = True

@@ -16,6 +16,9 @@ from mapper.places.vocabulary import Vocabulary
 from mapper.registration.p3p import ransac_p3p
 
 _MAX_RATIO = 0.85
+_MATCHING_LEVEL = 2
+"""Only descriptors under one node this many steps below the vocabulary's root are compared (Zhao et al. 2020,
+§1.1): the toolkit's own vocabulary has 169 such nodes, so that a frame has a few features under each."""
 
 
 class Relocalizer:
@@ -110,4 +113,4 @@ class Relocalizer:
         return pairs[hits], keyframe.landmark_of_feature[seen[hits]]
 
     def _nodes(self, words: Ids) -> Ids:
-        return self._vocabulary.ancestors_of(words, level=self._config.matching_level)
+        return self._vocabulary.ancestors_of(words, level=_MATCHING_LEVEL)

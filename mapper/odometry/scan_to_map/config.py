@@ -21,8 +21,6 @@ class ScanOdometryConfig(Config):
     keyframe_distance_m: PositiveFloat = 1.0
     keyframe_angle_rad: PositiveFloat = 0.2
     """A scan this far, or turned this much, from the last keyframe is one itself."""
-    min_points: PositiveInt = 100
-    """A thinned scan of fewer points cannot be used."""
     usual_ratio: Ratio = 0.8
     """A scan that overlaps with the last keyframe by a smaller share of what is usual is looked at again."""
     lost_ratio: Ratio = 0.5
@@ -43,8 +41,6 @@ class GicpOdometryConfig(ScanOdometryConfig):
     """The map keeps one Gaussian in each such cell."""
     coarse_cell_m: PositiveFloat = 2.0
     """The same in a second map, in which scans are placed first."""
-    map_keyframes: PositiveInt = 100
-    """Cells that as many keyframes in a row have not touched are forgotten."""
     max_iterations: PositiveInt = 30
 
 
@@ -57,8 +53,6 @@ class IcpOdometryConfig(ScanOdometryConfig):
     partner itself (Besl & McKay 1992), which the rings on the road hold back."""
     pair_distances_m: tuple[PositiveFloat, ...] = (2.0, 1.0, 0.5)
     """Largest distance between the points of a pair, from coarse to fine."""
-    map_keyframes: PositiveInt = 10
-    """How many keyframes the map is made of."""
     max_iterations: PositiveInt = 40
 
 
@@ -68,13 +62,12 @@ class KissOdometryConfig(ScanOdometryConfig):
     kind: Literal["kiss-icp"] = "kiss-icp"
     map_voxel_m: PositiveFloat = 1.0
     """Voxel size of the map; scans are thinned to 0.5 and then 1.5 of it."""
-    max_points_per_voxel: PositiveInt = 20
     initial_threshold_m: PositiveFloat = 2.0
-    """Largest pair distance before any motion has been seen, over three."""
+    """A third of the largest pair distance until the motion model's error is known; lower it with the map's
+    voxels for a smaller scene."""
     min_motion_m: PositiveFloat = 0.1
     """Smaller deviations from the predicted motion teach the threshold nothing."""
     max_iterations: PositiveInt = 500
-    convergence: PositiveFloat = 1e-4
 
 
 class HoughOdometryConfig(ScanOdometryConfig):

@@ -5,6 +5,8 @@ from mapper.odometry.scan_to_map.config import GicpOdometryConfig
 from mapper.odometry.scan_to_map.matching import Reach, Sweep
 from mapper.registration.gaussian_cells import GaussianCells
 
+_MAP_KEYFRAMES = 100
+"""Cells that so many keyframes in a row have not touched are removed, so that the map stays local."""
 _STEP_CELLS = 0.01  # shorter steps end the refinement: what they would add is below a scan's noise
 _STEP_RAD = 0.002
 
@@ -36,8 +38,8 @@ class GicpMatcher:
 
     def clear(self) -> None:
         """Forget the maps."""
-        self._fine = GaussianCells(self._config.cell_m, remembered=self._config.map_keyframes)
-        self._coarse = GaussianCells(self._config.coarse_cell_m, remembered=self._config.map_keyframes)
+        self._fine = GaussianCells(self._config.cell_m, remembered=_MAP_KEYFRAMES)
+        self._coarse = GaussianCells(self._config.coarse_cell_m, remembered=_MAP_KEYFRAMES)
 
     def _aligned(self, cells: GaussianCells, sweep: Sweep, T_world_body: Transform) -> Transform | None:
         return cells.align(

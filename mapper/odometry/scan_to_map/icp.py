@@ -10,13 +10,16 @@ from mapper.odometry.scan_to_map.matching import Reach, Sweep
 from mapper.registration.refining import refine
 from mapper.registration.surfaces import Prepared, prepared
 
+_MAP_KEYFRAMES = 10
+"""How many keyframes the map is made of; its search tree is built anew for each."""
+
 
 class IcpMatcher:
     """A cloud of the last keyframes, in their world."""
 
     def __init__(self, config: IcpOdometryConfig) -> None:
         self._config = config
-        self._keyframes: deque[Points] = deque(maxlen=config.map_keyframes)
+        self._keyframes: deque[Points] = deque(maxlen=_MAP_KEYFRAMES)
         self._map: Prepared | None = None
 
     def match(self, sweep: Sweep, T_world_body: Transform, *, reach: Reach) -> Transform | None:

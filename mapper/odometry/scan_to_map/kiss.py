@@ -6,6 +6,8 @@ from mapper.core.geometry import Array, Points, Transform, inverse, is_rigid
 from mapper.odometry.scan_to_map.config import KissOdometryConfig
 from mapper.odometry.scan_to_map.matching import Reach, Sweep
 
+_MAX_POINTS_PER_VOXEL, _CONVERGENCE = 20, 1e-4  # the library's defaults
+
 
 class KissMatcher:
     """The library's map, registration and adaptive threshold; deskewing and prediction are the odometry's."""
@@ -17,9 +19,9 @@ class KissMatcher:
         self._settings = KISSConfig()
         self._settings.data.max_range = config.max_range_m
         self._settings.mapping.voxel_size = config.map_voxel_m
-        self._settings.mapping.max_points_per_voxel = config.max_points_per_voxel
+        self._settings.mapping.max_points_per_voxel = _MAX_POINTS_PER_VOXEL
         self._settings.registration.max_num_iterations = config.max_iterations
-        self._settings.registration.convergence_criterion = config.convergence
+        self._settings.registration.convergence_criterion = _CONVERGENCE
         self._settings.registration.max_num_threads = 1  # sums are added up in the order of the points
         self._settings.adaptive_threshold.initial_threshold = config.initial_threshold_m
         self._settings.adaptive_threshold.min_motion_th = config.min_motion_m

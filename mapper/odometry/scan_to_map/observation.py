@@ -13,6 +13,8 @@ from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.odometry.scan_to_map.matching import Sweep
 from mapper.registration.surfaces import prepared
 
+_MIN_POINTS = 100
+"""Fewer points left after thinning do not constrain a pose."""
 _FINER = 0.5  # a prepared point is the mean of those thinned to this part of its voxel
 
 
@@ -66,11 +68,11 @@ def observe_scan(frame: Frame, config: ScanOdometryConfig) -> ScanObservation:
     in_range = np.flatnonzero((range_m >= config.min_range_m) & (range_m <= config.max_range_m))
     points_body = scan.points_body[in_range]
     kept = thin(points_body, _FINER * config.voxel_m)
-    if len(kept) < config.min_points:
+    if len(kept) < _MIN_POINTS:
         raise FrameError(
             f"scan {scan.stamp_ns}: {len(scan.points_body)} points, of which {len(kept)} are left between "
             f"{config.min_range_m:g} m and {config.max_range_m:g} m and {_FINER * config.voxel_m:g} m apart; "
-            f"want {config.min_points} (odometry.min_points, min_range_m, max_range_m, voxel_m)"
+            f"want {_MIN_POINTS} (odometry.min_range_m, max_range_m, voxel_m)"
         )
     thinned = replace(scan, points_body=points_body[kept], colors=None, times_s=None)
     if scan.times_s is None:
