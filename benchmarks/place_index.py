@@ -4,8 +4,8 @@
 
 Times are CPU time. Keyframes are bags of words drawn as often as the shipped vocabulary's training images had
 them; queries look like the first keyframes again, and have to find them. The peer of the index is a
-scan of all vectors with the compiled ``similarity``; guided matching is compared with ``match_everywhere`` on
-neighbouring frames of fr1/xyz, or of a synthetic walk where that is missing.
+scan of all vectors with the compiled ``similarity``; matching by word is compared with ``match_mutual_bits``
+on neighbouring frames of fr1/xyz, or of a synthetic walk where that is missing.
 """
 
 import argparse
@@ -17,12 +17,11 @@ import numpy as np
 
 from mapper.features.config import UniformOrbConfig
 from mapper.features.factory import build_detector
-from mapper.features.windowed import match_everywhere, pack
+from mapper.features.hamming import Bits, match_mutual_bits, pack
 from mapper.places.config import PlacesConfig
-from mapper.places.guided import match_by_word
 from mapper.places.index import PlaceIndex
-from mapper.places.tree import Bits
 from mapper.places.vocabulary import Vocabulary, WordVector, load_vocabulary, similarity
+from mapper.places.word_matching import match_by_word
 from mapper.simulation import CameraSimulator
 from mapper.simulation.config import SynthConfig
 from mapper.sources import open_source
@@ -116,12 +115,12 @@ def frames(data: Path) -> tuple[str, list[Bits]]:
 def compare_matching(vocabulary: Vocabulary, bits: list[Bits]) -> None:
     """Print the time of words and, per level, time and recall of guided matching."""
     vocabulary.words_of(bits[0][:1])  # compiled now, not when it is timed
-    match_everywhere(bits[0][:1], bits[1], MAX_HAMMING, MAX_RATIO)
+    match_mutual_bits(bits[0][:1], bits[1], MAX_HAMMING, MAX_RATIO)
     words_ms = cpu_ms(lambda: [vocabulary.words_of(image) for image in bits]) / len(bits)
     print(f"words of {len(bits[0])} descriptors: {words_ms:.3f} ms")
     pairs = list(zip(bits[::2], bits[1::2], strict=True))
-    everywhere = [match_everywhere(a, b, MAX_HAMMING, MAX_RATIO) for a, b in pairs]
-    all_ms = cpu_ms(lambda: [match_everywhere(a, b, MAX_HAMMING, MAX_RATIO) for a, b in pairs]) / len(pairs)
+    everywhere = [match_mutual_bits(a, b, MAX_HAMMING, MAX_RATIO) for a, b in pairs]
+    all_ms = cpu_ms(lambda: [match_mutual_bits(a, b, MAX_HAMMING, MAX_RATIO) for a, b in pairs]) / len(pairs)
     total = sum(int((matched >= 0).sum()) for matched in everywhere)
     print(f"{'matching':>10} {'ms':>8} {'faster':>8} {'matches':>8} {'recall':>7} {'same':>6}")
     print(f"{'everywhere':>10} {all_ms:8.3f} {'':8} {total:8}")

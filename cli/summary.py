@@ -61,7 +61,7 @@ def _loops_text(loops: Sequence[LoopClosure]) -> str:
 
 def _left_open(records: Sequence[FrameRecord]) -> list[tuple[str, str]]:
     """Return a row on the motions that no surface showed, if there were any."""
-    unseen = Counter(record.diagnostics.unseen for record in records if record.diagnostics.unseen)
+    unseen = Counter(record.diagnostics.unobservable for record in records if record.diagnostics.unobservable)
     if not unseen:
         return []
     text, _ = unseen.most_common(1)[0]

@@ -18,7 +18,7 @@ from mapper.config.seeds import seeded
 from mapper.config.sweep import ConfigurationConfig, MethodConfig, SweepConfig
 from mapper.core.errors import ConfigError
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig, ThesisLoopsConfig
-from mapper.odometry.config import IsvdOdometryConfig, KeyframeConfig
+from mapper.odometry.config import IsvdOdometryConfig, KeyframeOdometryConfig
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.run.fingerprint import fingerprint
 from mapper.runtime.atomic import resumable_folder, write_text
@@ -174,7 +174,7 @@ def _resolved(
 def _misfit(config: BuildConfig, source: Log) -> str:
     """Return why a log cannot be built so; empty if it can."""
     odometry, loops = config.odometry, config.loops
-    if source.sensor == "lidar" and isinstance(odometry, IsvdOdometryConfig | KeyframeConfig):
+    if source.sensor == "lidar" and isinstance(odometry, IsvdOdometryConfig | KeyframeOdometryConfig):
         return f"odometry.kind={odometry.kind} needs images"
     if odometry.kind == "wheels" and source.wheels is None:
         return "odometry.kind=wheels needs wheels"

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 
 from mapper.core.geometry import Transform, rotation_exp, transform
-from mapper.features.scan_view import ScanView
+from mapper.features.frame_view import ScanView
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import OutdoorScene, make_outdoor_scene, render_scan
 

@@ -13,7 +13,7 @@ from mapper.config.compare import CompareConfig, RgbdCompareConfig
 from mapper.core.errors import FrameError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.core.geometry import angle_between, apply, exp, inverse
-from mapper.features.scan_view import ScanView
+from mapper.features.frame_view import ScanView
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.odometry.factory import build_frame_odometry

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import DataError
+from mapper.features.base import Features
 from mapper.features.config import DetectorConfig, OrbConfig, SurfConfig, UniformOrbConfig
-from mapper.features.detectors import Features
 from mapper.features.factory import build_detector
 from mapper.features.fast import corners, fast_scores, orientations
-from mapper.features.hessian import interest_points
+from mapper.features.fast_hessian import interest_points
 from mapper.features.quadtree import spread
 
 EVERY_DETECTOR = [member() for member in get_args(get_args(DetectorConfig)[0])]

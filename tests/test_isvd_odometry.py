@@ -6,8 +6,8 @@ import pytest
 from mapper.core.errors import FrameError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.core.geometry import apply, exp, inverse, mean_rotation
+from mapper.features.base import Features
 from mapper.features.config import OrbConfig
-from mapper.features.detectors import Features
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.odometry.isvd import IsvdObservation, IsvdOdometry
 

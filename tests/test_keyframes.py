@@ -3,7 +3,7 @@
 import pytest
 
 from mapper.core.errors import ConfigError
-from mapper.odometry.keyframes import SharpestKeyframes
+from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 
 
 def test_names_the_frame_with_most_features_of_every_interval():

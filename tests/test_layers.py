@@ -23,7 +23,7 @@ HOMES = {
     "rich": ("cli/",),
     "open3d": ("mapper/export/mesh.py", "mapper/registration/ndt.py", "mapper/registration/rgbd.py"),
     "small_gicp": (),
-    "kiss_icp": ("mapper/odometry/scan_to_map/kiss.py",),
+    "kiss_icp": ("mapper/odometry/scan_to_map/kiss_icp.py",),
     "kiss_matcher": ("mapper/registration/kiss_matcher.py",),
     "pyoctomap": (),
     "evo": (),

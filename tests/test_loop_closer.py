@@ -12,7 +12,7 @@ from mapper.config.loading import load_config
 from mapper.core.errors import DataError
 from mapper.core.geometry import Transform, exp, inverse
 from mapper.core.timebase import NS_PER_S
-from mapper.features.view import View
+from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor, PoseSigmas
 from mapper.loops.closure import LoopClosure, discrepancy
 from mapper.loops.config import GateConfig, NoLoopsConfig, PlaceLoopsConfig, ThesisLoopsConfig
@@ -48,7 +48,7 @@ def drifting(truth: Sequence[Transform]) -> list[Transform]:
 
 def walk(
     detector: LoopDetector, room: Room, *, told: Sequence[Transform] | None = None, features=None
-) -> list[View]:
+) -> list[ImageView]:
     """Feed a closer with the walk; ``told`` is what the odometry says of it."""
     truth = walked()
     told = drifting(truth) if told is None else told
@@ -136,7 +136,7 @@ def test_a_look_needs_motion():
 def test_words_need_orb_descriptors():
     detector = build_loop_detector(PlaceLoopsConfig(propose="places"), "batch")
     view = Room(1).view(np.eye(4), 0)
-    numbers = View(
+    numbers = ImageView(
         0,
         view.pixels,
         view.sigma_px,

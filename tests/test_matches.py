@@ -30,12 +30,12 @@ def test_features_that_hold_the_pose_were_seen_where_they_are_said_to_have_been(
     seen, told = [], 0
     for track, view, matches in followed(config, desk_log):
         if seen:
-            assert matches.agreeing.sum() == track.diagnostics.inliers or track.is_keyframe
-            has_way = np.isfinite(matches.before_px[:, 0])
-            assert not (has_way & ~matches.agreeing).any()
-            before = matches.before_px[has_way]
+            assert matches.is_inlier.sum() == track.diagnostics.inliers or track.is_keyframe
+            has_way = np.isfinite(matches.previous_px[:, 0])
+            assert not (has_way & ~matches.is_inlier).any()
+            before = matches.previous_px[has_way]
             assert rows(before) <= set().union(*map(rows, seen))
-            assert len(before) > 0.3 * matches.agreeing.sum()
+            assert len(before) > 0.3 * matches.is_inlier.sum()
             steps_px = np.linalg.norm(view.pixels[has_way] - before, axis=1)
             assert np.median(steps_px) < 20.0  # of a hand that sways; features at random are 100 px apart
             told += len(before)
@@ -45,19 +45,19 @@ def test_features_that_hold_the_pose_were_seen_where_they_are_said_to_have_been(
 
 def test_isvd_matches_with_the_frame_just_before(desk_log):
     (_, before, _), (track, _, matches) = followed(CONFIGS["isvd"], desk_log, count=2)
-    assert matches.agreeing.sum() == track.diagnostics.inliers
-    assert rows(matches.before_px[matches.agreeing]) <= rows(before.pixels)
+    assert matches.is_inlier.sum() == track.diagnostics.inliers
+    assert rows(matches.previous_px[matches.is_inlier]) <= rows(before.pixels)
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
 def test_the_first_frame_came_from_nowhere_and_a_lost_one_is_held_by_nothing(config, desk_log):
     ((_, _, matches),) = followed(config, desk_log, count=1)
-    assert matches is None or np.isnan(matches.before_px).all()
+    assert matches is None or np.isnan(matches.previous_px).all()
     odometry = NodeOffset(build_frame_odometry(config), first_node=7)
     entries = list(open_source(desk_log).entries())
     odometry.track(odometry.read(entries[0]))
     assert odometry.track(odometry.read(entries[1])).node >= 7
-    assert len(odometry.matches().agreeing) > 0
+    assert len(odometry.matches().is_inlier) > 0
     dark = DarkEntry(entries[2])
     assert odometry.track(odometry.read(dark)).node is None
     assert odometry.matches() is None

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import DataError
-from mapper.features.detectors import Features
+from mapper.features.base import Features
 from mapper.features.matching import homography_inliers, match_mutual
 
 

@@ -6,12 +6,12 @@ import pytest
 from mapper.core.errors import DataError
 from mapper.features.config import UniformOrbConfig
 from mapper.features.factory import build_detector
-from mapper.features.windowed import match_everywhere, pack
+from mapper.features.hamming import match_mutual_bits, pack
 from mapper.places.config import PlacesConfig, VocabularyConfig
-from mapper.places.guided import match_by_word
 from mapper.places.index import PlaceIndex
 from mapper.places.training import train
 from mapper.places.vocabulary import ONE, WordVector, load_vocabulary, similarity
+from mapper.places.word_matching import match_by_word
 from mapper.simulation import CameraSimulator
 from mapper.simulation.config import SynthConfig
 
@@ -120,7 +120,7 @@ def test_matching_under_the_root_is_matching_everywhere():
     matched = match_by_word(a, root_a, b, root_b, **MATCHING)
 
     assert (matched >= 0).sum() == 60
-    assert (matched == match_everywhere(a, b, *MATCHING.values())).all()
+    assert (matched == match_mutual_bits(a, b, *MATCHING.values())).all()
 
 
 def test_only_what_shares_a_node_is_compared():
@@ -185,7 +185,7 @@ def test_guided_matches_of_images_agree_with_everywhere_s(two_laps):
     vocabulary = load_vocabulary()
     distance_m = np.linalg.norm(T_world_camera[0, :3, 3] - T_world_camera[4:, :3, 3], axis=1)
     a, b = bits[0], bits[4 + int(distance_m.argmin())]
-    everywhere = match_everywhere(a, b, *MATCHING.values())
+    everywhere = match_mutual_bits(a, b, *MATCHING.values())
 
     nodes = (vocabulary.nodes_of(image, level=1) for image in (a, b))
     guided = match_by_word(a, next(nodes), b, next(nodes), **MATCHING)

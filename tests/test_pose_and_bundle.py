@@ -5,7 +5,7 @@ import pytest
 
 from mapper.core.geometry import angle_between, apply, exp, inverse
 from mapper.core.linear import twist_exp
-from mapper.odometry.local_map.bundle import adjust
+from mapper.odometry.local_map.bundle_adjustment import adjust
 from mapper.registration.reprojection import normal_matrix, refine_pose
 
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5, 40.0])

@@ -144,6 +144,18 @@ def test_records_survive_the_disk(tmp_path):
     assert read_frame_ms(tmp_path / "ms.csv") == {10: 1.25, 30: 2.5}
 
 
+@pytest.mark.parametrize(("column", "expected"), [("unobservable", "yaw"), ("unseen", "yaw"), ("other", "")])
+def test_records_of_older_runs_are_read(tmp_path, column, expected):
+    how = Diagnostics(9, 8, 7, 0.5, "m", "map", unobservable="yaw")
+    write_records(tmp_path / "frames.csv", [FrameRecord(10, "tracked", 0, True, how)])
+    text = (tmp_path / "frames.csv").read_text()
+    (tmp_path / "frames.csv").write_text(text.replace("unobservable", column))
+
+    (record,) = read_records(tmp_path / "frames.csv")
+
+    assert record.diagnostics.unobservable == expected
+
+
 def test_a_fingerprint_follows_names_sizes_and_lists_but_not_the_place(tmp_path):
     def make(name, *, listed="1 a.png\n", image=b"123"):
         folder = tmp_path / name

@@ -13,7 +13,7 @@ from mapper.config.loading import load_config
 from mapper.core.errors import ConfigError
 from mapper.core.geometry import Transform, exp, inverse
 from mapper.core.timebase import NS_PER_S
-from mapper.features.scan_view import ScanView
+from mapper.features.frame_view import ScanView
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.loops.closure import LoopClosure, discrepancy
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig, ScanVerificationConfig, ThesisLoopsConfig

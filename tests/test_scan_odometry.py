@@ -186,7 +186,7 @@ def test_what_a_corridor_hides_is_told_and_left_open():
 
     tracks = tracked(config, log)
 
-    assert "translation along x" in tracks[1].diagnostics.unseen
+    assert "translation along x" in tracks[1].diagnostics.unobservable
     information = tracks[1].factors[0].information
     assert information[3, 3] < 1e-3 * information[4, 4]
 

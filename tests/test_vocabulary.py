@@ -9,12 +9,12 @@ from logs_made import MemoryEntry, log_in_memory
 
 from mapper.core.errors import DataError, VocabularyError
 from mapper.core.frames import Scan
-from mapper.features.windowed import pack
+from mapper.features.hamming import pack
 from mapper.places.config import VocabularyConfig
-from mapper.places.images import descriptors_of
 from mapper.places.training import grow, train
-from mapper.places.tree import WordTree
+from mapper.places.training_images import descriptors_of
 from mapper.places.vocabulary import ONE, Vocabulary, WordVector, load_vocabulary, similarity
+from mapper.places.word_tree import WordTree
 
 SMALL = VocabularyConfig(branching=4, levels=3)
 

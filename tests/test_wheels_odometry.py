@@ -12,8 +12,7 @@ from mapper.core.deskew import twist_at
 from mapper.core.errors import ConfigError, FrameError, TrackingError
 from mapper.core.geometry import angle_between, inverse
 from mapper.core.timebase import NS_PER_S
-from mapper.features.scan_view import ScanView
-from mapper.features.view import View
+from mapper.features.frame_view import ImageView, ScanView
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.odometry.config import WheelsOdometryConfig
@@ -177,7 +176,7 @@ def test_keyframes_are_recognised_by_what_their_sensor_saw(flat):
     odometry = build_odometry(WheelsOdometryConfig(), flat.wheels)
     entry = next(flat.entries())
     seen = odometry.view(odometry.read(entry), odometry.track(entry).twist)
-    assert isinstance(seen, View)
+    assert isinstance(seen, ImageView)
     assert seen.is_orb
     street = LidarSimulator(STREET_ON_WHEELS).log()
     odometry = build_odometry(WheelsOdometryConfig(), street.wheels)

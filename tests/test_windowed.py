@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from mapper.features.windowed import hamming, match_everywhere, match_windows, pack, sort_into_grid
+from mapper.features.hamming import hamming, match_mutual_bits, pack
+from mapper.features.window_matching import match_windows, sort_into_grid
 
 WIDTH, HEIGHT = 320, 240
 
@@ -91,7 +92,7 @@ def test_exhaustive_matching_is_mutual_and_survives_noise():
     words = pack(rng.integers(0, 256, (200, 32), dtype=np.uint8))
     shuffled = rng.permutation(200)
 
-    matched = match_everywhere(words, flipped(words, 25, rng)[shuffled], 64, 0.85)
+    matched = match_mutual_bits(words, flipped(words, 25, rng)[shuffled], 64, 0.85)
 
     assert (shuffled[matched] == np.arange(200)).all()
 
@@ -100,8 +101,8 @@ def test_exhaustive_matching_refuses_what_is_not_there():
     rng = np.random.default_rng(5)
     a = pack(rng.integers(0, 256, (50, 32), dtype=np.uint8))
     b = pack(rng.integers(0, 256, (50, 32), dtype=np.uint8))
-    assert (match_everywhere(a, b, 64, 0.85) == -1).all()
-    assert match_everywhere(a, b[:0], 64, 0.85).tolist() == [-1] * 50
+    assert (match_mutual_bits(a, b, 64, 0.85) == -1).all()
+    assert match_mutual_bits(a, b[:0], 64, 0.85).tolist() == [-1] * 50
 
 
 @pytest.mark.parametrize("place", [(-3e4, 100.0), (3e4, 100.0), (100.0, -3e4), (100.0, 3e4), (-1e6, -1e6)])

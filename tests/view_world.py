@@ -3,7 +3,7 @@
 import numpy as np
 
 from mapper.core.geometry import Transform, apply, inverse
-from mapper.features.view import View
+from mapper.features.frame_view import ImageView
 from mapper.odometry.base import Diagnostics, FrameResult
 
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5])
@@ -21,7 +21,7 @@ class Room:
         self.points = self._rng.uniform(-0.5, 0.5, (points, 3)) * [size_m, size_m, 3.0]
         self.bits = self._rng.integers(0, 256, (points, 32), dtype=np.uint8)
 
-    def view(self, T_world_body: Transform, stamp_ns: int, *, noise_px: float = 0.3) -> View:
+    def view(self, T_world_body: Transform, stamp_ns: int, *, noise_px: float = 0.3) -> ImageView:
         """Return what is seen between 0.5 and 4 m, with a few pixels of noise and some wrong bits."""
         points_camera = apply(inverse(T_world_body @ BODY_CAMERA), self.points)
         z = np.maximum(points_camera[:, 2:], 1e-6)
@@ -33,7 +33,7 @@ class Room:
         noisy = pixels[seen] + self._rng.normal(0.0, noise_px, (n, 2))
         depth_m = points_camera[seen, 2:] * (1.0 + self._rng.normal(0.0, 0.002, (n, 1)))
         rays = np.column_stack([(noisy - INTRINSICS[2:]) / INTRINSICS[:2], np.ones(n)])
-        return View(
+        return ImageView(
             stamp_ns=stamp_ns,
             pixels=noisy,
             sigma_px=np.ones(n),

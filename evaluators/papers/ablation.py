@@ -8,15 +8,15 @@ from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, FrameError, MapperError
 from mapper.core.frames import Frame, Image
 from mapper.core.trajectory import Trajectory
+from mapper.features.base import Features
 from mapper.features.config import DetectorConfig
-from mapper.features.detectors import Features
 from mapper.features.factory import build_detector
 from mapper.features.matching import Pairs
 from mapper.graph.model import PoseGraph
 from mapper.loops.factory import build_loop_detector
 from mapper.odometry.base import FrameResult
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
-from mapper.odometry.isvd import Compare, IsvdObservation, IsvdOdometry, matched_pairs, shared_points
+from mapper.odometry.isvd import IsvdObservation, IsvdOdometry, RegisterPair, matched_pairs, shared_points
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import TrackingResult, refuse_a_fragment
 from mapper.registration.base import Alignment
@@ -95,7 +95,7 @@ class _Eyes:
             self._compared.clear()
         return self._features
 
-    def comparing(self, config: IsvdOdometryConfig) -> Compare:
+    def comparing(self, config: IsvdOdometryConfig) -> RegisterPair:
         """Return what compares an earlier frame and the newest as an odometry does."""
         isvd = Isvd(config.registration)
         how = (config.registration, config.depth_filter, config.undistort, config.max_depth_m)
@@ -124,7 +124,7 @@ class _Follower:
 
     def __init__(self, config: BuildConfig, odometry: IsvdOdometryConfig, eyes: _Eyes) -> None:
         self._config = config
-        self._odometry = IsvdOdometry(odometry, detector=eyes, compare=eyes.comparing(odometry))
+        self._odometry = IsvdOdometry(odometry, detector=eyes, register=eyes.comparing(odometry))
         self._closer = build_loop_detector(config.loops, config.graph.solve)
         self._graph = PoseGraph()
         self._tracks: list[FrameResult] = []

@@ -1,1 +1,1 @@
-"""Image features: detection, spreading, matching."""
+"""Image features: detection, even distribution over the image, matching."""

@@ -1,4 +1,4 @@
-"""Detectors of image features."""
+"""Settings of feature detectors."""
 
 from typing import Annotated, Literal
 
@@ -7,17 +7,18 @@ from pydantic import Field, PositiveFloat, PositiveInt
 from mapper.core.config import Config
 
 ScaleFactor = Annotated[float, Field(gt=1.0)]
-"""Size of a pixel on one pyramid level relative to the level below."""
+"""Size of a pixel on one pyramid level relative to the next finer one."""
 
 
 class SurfConfig(Config):
-    """SURF (Bay et al. 2008), described by mahotas; the thesis's choice (A4)."""
+    """SURF (Bay et al. 2008), described by mahotas; chosen by Somlyai (PhD thesis)."""
 
     kind: Literal["surf"] = "surf"
     max_features: PositiveInt = 1000
     threshold: PositiveFloat = 100.0
-    """Determinant of the Hessian, grey levels², to start from; halved while there are too few features."""
+    """First threshold of the Hessian's determinant, grey levels²; halved while there are too few features."""
     min_threshold: PositiveFloat = 1.0
+    """Last threshold; raise it where noise gives features."""
     min_features: PositiveInt = 300
     octaves: PositiveInt = 4
 
@@ -28,8 +29,9 @@ class SiftConfig(Config):
     kind: Literal["sift"] = "sift"
     max_features: PositiveInt = 1000
     threshold: PositiveFloat = 0.04
-    """Contrast threshold to start from; halved while an image gives too few features."""
+    """First contrast threshold; halved while there are too few features."""
     min_threshold: PositiveFloat = 0.01
+    """Last threshold; raise it where noise gives features."""
     min_features: PositiveInt = 300
 
 
@@ -39,8 +41,9 @@ class AkazeConfig(Config):
     kind: Literal["akaze"] = "akaze"
     max_features: PositiveInt = 1000
     threshold: PositiveFloat = 0.001
-    """Detector response threshold to start from; halved while an image gives too few features."""
+    """First threshold of the detector's response; halved while there are too few features."""
     min_threshold: PositiveFloat = 0.0001
+    """Last threshold; raise it where noise gives features."""
     min_features: PositiveInt = 300
 
 
@@ -50,22 +53,23 @@ class OrbConfig(Config):
     kind: Literal["orb"] = "orb"
     max_features: PositiveInt = 1000
     threshold: PositiveInt = 20
-    """FAST threshold (grey levels) to start from; halved while an image gives too few features."""
+    """First FAST threshold, grey levels; halved while there are too few features."""
     min_threshold: PositiveInt = 5
+    """Last threshold; raise it where noise gives features."""
     min_features: PositiveInt = 300
     levels: PositiveInt = 8
     scale_factor: ScaleFactor = 1.2
 
 
 class UniformOrbConfig(Config):
-    """ORB spread evenly over the image by a quadtree (B1; Mur-Artal & Tardós 2017)."""
+    """ORB distributed evenly over the image by a quadtree (Zhao et al. 2020, §1.1)."""
 
     kind: Literal["uniform-orb"] = "uniform-orb"
     max_features: PositiveInt = 1000
     threshold: PositiveInt = 20
-    """FAST threshold (grey levels) tried first in every cell."""
+    """FAST threshold, grey levels, tried first in every cell."""
     min_threshold: PositiveInt = 7
-    """FAST threshold of cells in which the first finds nothing."""
+    """FAST threshold of cells in which the first finds nothing; raise it where noise gives features."""
     cell_px: PositiveInt = 30
     levels: PositiveInt = 8
     scale_factor: ScaleFactor = 1.2

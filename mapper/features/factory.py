@@ -2,6 +2,7 @@
 
 from typing import assert_never
 
+from mapper.features.base import Detector
 from mapper.features.config import (
     AkazeConfig,
     DetectorConfig,
@@ -10,7 +11,6 @@ from mapper.features.config import (
     SurfConfig,
     UniformOrbConfig,
 )
-from mapper.features.detectors import Detector
 
 
 def build_detector(config: DetectorConfig) -> Detector:

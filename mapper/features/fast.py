@@ -27,8 +27,7 @@ _CIRCLE = np.array(
 )  # fmt: skip
 RADIUS_PX = 3
 PATCH_RADIUS_PX = 15
-_BLOCK = 512  # pixels worked on at once; the buffers stay in the first-level cache
-
+_BLOCK = 512  # pixels per step; the buffers stay in the first-level cache
 
 _OFFSETS = np.arange(-PATCH_RADIUS_PX, PATCH_RADIUS_PX + 1)
 _DISC = (np.add.outer(_OFFSETS**2, _OFFSETS**2) <= PATCH_RADIUS_PX**2).astype(np.uint8)
@@ -39,8 +38,8 @@ def fast_scores(image: Image, threshold: int, margin_px: int) -> Image:
     """Return the score of every FAST-9 corner of an image, 0 elsewhere (Rosten & Drummond 2006).
 
     A corner has nine contiguous pixels of its circle all brighter, or all darker, than its centre by more
-    than the threshold; the score is the largest threshold at which it still is one. Whole rows are worked
-    on at once and without a branch, which compiles to vector instructions.
+    than the threshold; the score is the largest threshold at which it still is one. Whole rows are
+    processed at once without a branch, which compiles to vector instructions.
 
     Args:
         image: (H, W) uint8.
@@ -59,8 +58,8 @@ def fast_scores(image: Image, threshold: int, margin_px: int) -> Image:
     end = (height - margin_px) * width - margin_px
     for start in range(margin_px * width + margin_px, end, _BLOCK):
         n = min(_BLOCK, end - start)
-        # Extremes over arcs of 2, 4 and 8 pixels that begin at odd places are built from each other. The two
-        # arcs of nine around an arc of eight then differ in one end only, and the better end is enough.
+        # Extremes over arcs of 2, 4 and 8 pixels that begin at odd positions are built from each other. The
+        # two arcs of nine around an arc of eight differ in one end only, and the better end is enough.
         for k in range(8):
             a, b = start + around[2 * k + 1], start + around[(2 * k + 2) % 16]
             _join(low[k], high[k], flat[a : a + n], flat[a : a + n], flat[b : b + n], flat[b : b + n])
@@ -78,7 +77,7 @@ def fast_scores(image: Image, threshold: int, margin_px: int) -> Image:
         _score(
             flat_scores[start : start + n], flat[start : start + n], brightest, darkest, np.uint8(threshold)
         )
-    scores[:, :margin_px] = 0  # rows were run through as one line, so its turns hold nonsense
+    scores[:, :margin_px] = 0  # rows were processed as one line, whose row ends are not valid
     scores[:, width - margin_px :] = 0
     return scores
 
@@ -108,15 +107,16 @@ def _score(scores: Image, centre: Image, brightest: Image, darkest: Image, limit
 
 @njit(cache=True, nogil=True)
 def corners(scores: Image, threshold: int, cell_px: int, margin_px: int) -> tuple[Pixels, NDArray[np.uint8]]:
-    """Return the corners above their neighbours, weak ones only from cells without strong ones.
+    """Return the local maxima of the scores, weak ones only from cells without strong ones.
 
     In square cells in which no corner reaches the threshold every corner is kept (Mur-Artal & Tardós 2017).
+    Of equal neighbours the first is the maximum.
 
     Args:
         scores: (H, W) uint8 of ``fast_scores``, taken at the lower threshold.
         threshold: Score of a strong corner.
         cell_px: Side of a cell.
-        margin_px: Where the first cell begins, and at least 1.
+        margin_px: First row and column of the first cell, at least 1.
 
     Returns:
         (N, 2) int32 column and row, row by row, and their (N,) uint8 scores.
@@ -125,7 +125,7 @@ def corners(scores: Image, threshold: int, cell_px: int, margin_px: int) -> tupl
     best = np.zeros((height // cell_px + 1, width // cell_px + 1), np.uint8)
     found = np.empty((height * width // 4 + 1, 2), np.int32)  # no two maxima touch
     peaks = np.zeros((width + 7) // 8 * 8, np.uint8)
-    words = peaks.view(np.uint64)  # eight pixels at a glance: peaks are rare
+    words = peaks.view(np.uint64)  # eight pixels per test, as peaks are rare
     count = 0
     for y in range(margin_px, height - margin_px):
         _mark_peaks(peaks[1 : width - 1], scores[y - 1], scores[y], scores[y + 1])
@@ -150,7 +150,7 @@ def corners(scores: Image, threshold: int, cell_px: int, margin_px: int) -> tupl
 
 @njit(inline="always")
 def _mark_peaks(peaks: Image, above: Image, row: Image, below: Image) -> None:
-    """Keep the scores of a row, less its two ends, that are maxima; of equal neighbours the first one is."""
+    """Write the scores of a row, less its two ends, where they are local maxima, and 0 elsewhere."""
     for i in range(len(peaks)):
         before = max(max(above[i], above[i + 1]), max(above[i + 2], row[i]))
         after = max(max(below[i], below[i + 1]), max(below[i + 2], row[i + 2]))
@@ -159,7 +159,7 @@ def _mark_peaks(peaks: Image, above: Image, row: Image, below: Image) -> None:
 
 @njit(cache=True, nogil=True)
 def orientations(image: Image, pixels: Pixels) -> NDArray[np.float32]:
-    """Return (N,) radians from each pixel to the intensity centroid around it (Rosin 1999; ORB's eq. 1 to 3).
+    """Return (N,) radians from each pixel to the intensity centroid (Rublee et al. 2011, eq. 1–3).
 
     Args:
         image: (H, W) uint8.

@@ -1,4 +1,4 @@
-"""Pairs of mutually nearest features, and the homography by which thesis alg. 8 filters them."""
+"""Mutual nearest matching of any descriptors, and the homography filter of Somlyai (PhD thesis), alg. 8."""
 
 from typing import Protocol
 
@@ -8,8 +8,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
-from mapper.features.bits import popcount
-from mapper.features.detectors import Descriptors
+from mapper.features.base import Descriptors
+from mapper.features.hamming import popcount
 
 Pairs = NDArray[np.intp]
 """(M, 2) indices into the first and the second image's features."""
@@ -19,7 +19,7 @@ _CONFIDENCE = 0.995
 
 
 class Described(Protocol):
-    """Whatever has descriptors, one per row: an image's features, a keyframe's view."""
+    """Anything with descriptors, one per row: an image's features, a keyframe's view."""
 
     @property
     def descriptors(self) -> Descriptors:
@@ -28,7 +28,7 @@ class Described(Protocol):
 
 
 def match_mutual(a: Described, b: Described, *, max_ratio: float) -> Pairs:
-    """Return the pairs of mutually nearest descriptors that pass Lowe's ratio test (Lowe 2004, §7.1).
+    """Return the pairs of mutually nearest descriptors that pass the ratio test (Lowe 2004, §7.1).
 
     Every descriptor is compared with every other: Hamming distance for bits, Euclidean for numbers.
 
@@ -62,16 +62,16 @@ def match_mutual(a: Described, b: Described, *, max_ratio: float) -> Pairs:
 def homography_inliers(
     a: NDArray[np.float32], b: NDArray[np.float32], *, tolerance_px: float, iterations: int, seed: int = 0
 ) -> NDArray[np.bool_]:
-    """Return which pairs agree with the homography that most pairs agree with (thesis alg. 8).
+    """Return the inliers of the homography that most pairs agree with (Somlyai, PhD thesis, alg. 8).
 
     RANSAC over four pairs (Fischler & Bolles 1981), by OpenCV.
 
     Args:
         a: (M, 2) pixels in the first image.
         b: (M, 2) their partners in the second.
-        tolerance_px: How far from its partner a pixel may be mapped.
-        iterations: Most samples to try; fewer are needed when many pairs agree.
-        seed: Of the samples; see ``drawing_order``.
+        tolerance_px: Largest distance between a mapped pixel and its partner.
+        iterations: Largest number of samples; fewer are drawn when many pairs agree.
+        seed: Seed of the samples; see ``drawing_order``.
 
     Returns:
         (M,) mask; all False when no homography exists.
@@ -89,9 +89,9 @@ def homography_inliers(
 
 
 def drawing_order(count: int, seed: int) -> NDArray[np.intp]:
-    """Return the order in which OpenCV's RANSAC is given its pairs: their own for seed 0, else shuffled.
+    """Return the order of the pairs for OpenCV's RANSAC: unchanged for seed 0, else shuffled.
 
-    Its random numbers are the same every time, so that another order is what makes another sample.
+    OpenCV draws the same random numbers every time, so only another order gives other samples.
     """
     if seed == 0:
         return np.arange(count, dtype=np.intp)
@@ -100,7 +100,7 @@ def drawing_order(count: int, seed: int) -> NDArray[np.intp]:
 
 
 def _words(descriptors: Descriptors) -> NDArray[np.uint64]:
-    """Return the bits as (N, W) whole words, filled up with zeros."""
+    """Return the bits as (N, W) whole words, padded with zeros."""
     n, width = descriptors.shape
     padded = np.zeros((n, -(-width // 8) * 8), np.uint8)
     padded[:, :width] = descriptors
@@ -134,7 +134,7 @@ def _match_numbers(
     squares_b: NDArray[np.float32],
     max_ratio: float,
 ) -> Pairs:
-    """Return the mutual nearest of (N, M) scalar products: |a - b|² = |a|² + |b|² - 2 a·b."""
+    """Return the mutually nearest rows from (N, M) scalar products: |a - b|² = |a|² + |b|² - 2 a·b."""
     squared = np.empty_like(products)
     for i in range(len(squares_a)):
         for j in range(len(squares_b)):
@@ -147,7 +147,7 @@ def _match_numbers(
 
 @njit(cache=True, nogil=True)
 def _match_distances(distances: NDArray[np.float32], max_ratio: float) -> Pairs:
-    """Return the mutual best entries of a (N, M) table; among equals the first one counts."""
+    """Return the entries of an (N, M) table that are smallest in row and column, the first among equals."""
     rows, columns = distances.shape
     column_best = np.full(columns, np.inf, np.float32)
     column_row = np.zeros(columns, np.intp)

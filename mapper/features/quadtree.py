@@ -1,4 +1,4 @@
-"""Points spread evenly over an image by a quadtree (Zhao et al. 2020, steps 4 to 7)."""
+"""Even distribution of key points over an image by a quadtree (Zhao et al. 2020, §1.1, steps 4–7)."""
 
 import numpy as np
 from numba import njit

@@ -1,22 +1,22 @@
-"""SURF features: our interest points, described by mahotas."""
+"""SURF features: key points of our own detector, described by mahotas."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.frames import Image
+from mapper.features.base import Features
 from mapper.features.config import SurfConfig
-from mapper.features.detectors import Features
-from mapper.features.hessian import interest_points
+from mapper.features.fast_hessian import interest_points
 
 _DIMENSIONS = 64
-_SCALE_OF_OCTAVE_0 = 2.4  # of its two layers' filters, 15 and 21 px, the middle one's σ
+_SCALE_OF_OCTAVE_0 = 2.4  # σ between those of its two inner layers, filters of 15 and 21 px
 _REACH_SCALES = 16.0  # mahotas drops points whose descriptor would leave the image
 
 
 class Surf:
-    """SURF (Bay, Ess, Tuytelaars & Van Gool 2008).
+    """SURF detector (Bay, Ess, Tuytelaars & Van Gool 2008).
 
-    mahotas describes the points but does not find them: up to its release 1.4.18 the interpolated places
+    mahotas only describes the points: up to its release 1.4.18 its own interpolated key points
     lie on the wrong side of the sampled maximum, 0.5 px off on average and more in coarse octaves.
     """
 
@@ -27,7 +27,7 @@ class Surf:
 
     def detect(self, gray: Image) -> Features:
         """Return the features of an (H, W) uint8 image; none where it has no texture."""
-        from mahotas.features import surf  # imported only when asked for: half a second
+        from mahotas.features import surf  # takes half a second to import
 
         config = self._config
         points = interest_points(gray, config.octaves, config.min_threshold)

@@ -1,4 +1,4 @@
-"""ORB features spread evenly over the image."""
+"""Uniform ORB: ORB features distributed evenly over the image."""
 
 from collections.abc import Iterator
 
@@ -7,22 +7,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.frames import Image
+from mapper.features.base import Features
 from mapper.features.config import UniformOrbConfig
-from mapper.features.detectors import Features
 from mapper.features.fast import Pixels, corners, fast_scores, orientations
 from mapper.features.quadtree import spread
 
-_MARGIN_PX = 19  # the rotated descriptor's tests reach this far
+_MARGIN_PX = 19  # reach of the rotated descriptor's tests
 _PATCH_PX = 31
 _DESCRIPTOR_BYTES = 32
 
 
 class UniformOrb:
-    """Oriented FAST corners from every part of every pyramid level, described by OpenCV's ORB.
+    """Uniform ORB detector: oriented FAST corners of all pyramid levels, described by OpenCV's ORB.
 
-    Zhao et al. 2020, §2.1, after Mur-Artal & Tardós 2017: FAST in cells with two thresholds, then one
-    quadtree per level. A level's share of the features falls with its side length; what a coarse level
-    cannot fill, the finer ones get.
+    Zhao et al. 2020, §1.1, after Mur-Artal & Tardós 2017: FAST in cells with two thresholds, then one
+    quadtree per level. A level's share of the features is proportional to its side length; what a coarse
+    level cannot fill goes to the finer ones.
     """
 
     def __init__(self, config: UniformOrbConfig) -> None:
@@ -30,7 +30,7 @@ class UniformOrb:
 
     @property
     def scale_factor(self) -> float:
-        """How much larger a pixel gets from one octave to the next."""
+        """Size of a pixel in one octave relative to the next finer one."""
         return self._config.scale_factor
 
     def detect(self, gray: Image) -> Features:
@@ -73,7 +73,7 @@ class UniformOrb:
             cv2.KeyPoint(x, y, _PATCH_PX, angle)
             for (x, y), angle in zip(pixels.astype(np.float32).tolist(), degrees, strict=True)
         ]
-        # Each level is described on its own: OpenCV would build the pyramid again.
+        # One level at a time, as OpenCV would build the pyramid again.
         orb = cv2.ORB.create(nlevels=1, edgeThreshold=_MARGIN_PX, patchSize=_PATCH_PX)
         descriptors = orb.compute(level, keypoints)[1] if keypoints else None
         return Features(

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 from mapper.core.geometry import Array, Transform
+from mapper.features.frame_view import FrameView
 from mapper.loops.closure import LoopClosure, ProposedBy
-from mapper.odometry.base import Seen
 
 
 class Stamped(Protocol):
@@ -76,7 +76,7 @@ class Verification:
 class Verifier(Protocol[Place]):
     """Verifier of loops: decides whether two places are one, and measures the motion between them."""
 
-    def describe(self, seen: Seen, /) -> Place:
+    def describe(self, seen: FrameView, /) -> Place:
         """Return the description of a keyframe that is kept.
 
         Raises:

@@ -10,6 +10,7 @@ import numpy as np
 from mapper.core.errors import ConfigError, FrameError
 from mapper.core.geometry import Transform
 from mapper.core.timebase import NS_PER_S
+from mapper.features.frame_view import FrameView
 from mapper.graph.model import PoseGraph
 from mapper.loops.base import Place, Proposer, Verifier, verify_proposal
 from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy, exceeds
@@ -18,9 +19,9 @@ from mapper.loops.consistency_check import ConsistencyCheck
 from mapper.loops.odometry_chain import OdometryChain, allowed
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 from mapper.loops.proposers import PoseProposer
-from mapper.odometry.base import FrameResult, Seen
+from mapper.odometry.base import FrameResult
 
-ViewOf = Callable[[], Seen]
+ViewOf = Callable[[], FrameView]
 
 _ALONE = "alone: no loop found from nearby tells the same"
 
@@ -113,7 +114,7 @@ class KeyframeLoopDetector(Generic[Place]):
         self._closures: dict[tuple[int, int], LoopClosure] = {}
         self._disconnected: Set[int] = frozenset()
 
-    def preload(self, graph: PoseGraph, views: Mapping[int, Seen]) -> None:
+    def preload(self, graph: PoseGraph, views: Mapping[int, FrameView]) -> None:
         """Add the places of an earlier session, before anything else.
 
         Their poses relative to this session are unknown until a loop connects the two: until then they are

@@ -5,13 +5,12 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import ConfigError
 from mapper.core.geometry import Array, adjoint, apply, inverse
+from mapper.features.frame_view import FrameView, ImageView
+from mapper.features.hamming import match_mutual_bits
 from mapper.features.matching import Pairs, homography_inliers, match_mutual
-from mapper.features.view import View
-from mapper.features.windowed import match_everywhere
 from mapper.graph.noise import with_model_error
 from mapper.loops.base import Verification
 from mapper.loops.config import ImageVerificationConfig
-from mapper.odometry.base import Seen
 from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
 from mapper.registration.p3p import ransac_p3p
@@ -38,17 +37,17 @@ class ImageVerifier:
         self._config = config
         self._isvd = Isvd(config.registration)
 
-    def describe(self, seen: Seen, /) -> View:
+    def describe(self, seen: FrameView, /) -> ImageView:
         """Return the view as it is.
 
         Raises:
             ConfigError: It is the view of a scan.
         """
-        if not isinstance(seen, View):
+        if not isinstance(seen, ImageView):
             raise ConfigError("loops.kind=places and thesis compare images, and these are scans; want scans")
         return seen
 
-    def verify(self, i: View, j: View) -> Verification:
+    def verify(self, i: ImageView, j: ImageView) -> Verification:
         """Return the pose of view j in view i, or why they do not show one place."""
         config = self._config
         pairs = self._pairs(i, j)
@@ -63,11 +62,11 @@ class ImageVerifier:
             return Verification(matches, f"isvd: {alignment.reason}")
         return self._reproject(i, j, pairs, alignment, matches=matches)
 
-    def _align(self, i: View, j: View, pairs: Pairs) -> Alignment:
+    def _align(self, i: ImageView, j: ImageView, pairs: Pairs) -> Alignment:
         both = pairs[j.has_depth(max_depth_m=self._config.max_depth_m)[pairs[:, 1]]]
         return self._isvd.fit(i.points_camera[both[:, 0]], j.points_camera[both[:, 1]])
 
-    def _consensus(self, i: View, j: View, pairs: Pairs) -> Pairs:
+    def _consensus(self, i: ImageView, j: ImageView, pairs: Pairs) -> Pairs:
         """Return P3P's inlier pairs: ISVD begins with all pairs, and fails when most of them are wrong."""
         if len(pairs) < _P3P_PAIRS:
             return pairs[:0]
@@ -81,10 +80,10 @@ class ImageVerifier:
         )
         return pairs[:0] if found is None else pairs[found[1]]
 
-    def _pairs(self, i: View, j: View) -> Pairs:
+    def _pairs(self, i: ImageView, j: ImageView) -> Pairs:
         match = self._config.match
         if i.is_orb and j.is_orb:
-            partner = match_everywhere(i.bits, j.bits, _MAX_HAMMING, match.max_ratio)
+            partner = match_mutual_bits(i.bits, j.bits, _MAX_HAMMING, match.max_ratio)
             paired = np.flatnonzero(partner >= 0)
             pairs: Pairs = np.column_stack([paired, partner[paired]])
         else:
@@ -101,7 +100,7 @@ class ImageVerifier:
         return pairs[agree]
 
     def _reproject(
-        self, i: View, j: View, pairs: Pairs, alignment: Alignment, *, matches: int
+        self, i: ImageView, j: ImageView, pairs: Pairs, alignment: Alignment, *, matches: int
     ) -> Verification:
         """Refine ISVD's motion in j's image, and count the inliers."""
         config = self._config
@@ -144,7 +143,7 @@ class ImageVerifier:
         return Verification(matches, "", inliers, alignment.inlier_rmse_m, residual_px, T_i_j, information)
 
 
-def _measurements(view: View, features: NDArray[np.intp]) -> tuple[Array, Array, Array]:
+def _measurements(view: ImageView, features: NDArray[np.intp]) -> tuple[Array, Array, Array]:
     """Return (M, 3) u, v, bf/z, their (M, 3) inverse variances, and (5,) intrinsics."""
     depth_m = view.points_camera[features, 2]
     sigma_px = np.repeat(view.sigma_px[features, None], 3, axis=1)

@@ -7,13 +7,12 @@ import numpy as np
 
 from mapper.core.errors import ConfigError
 from mapper.core.geometry import Array, Transform, inverse
-from mapper.features.scan_view import ScanView
+from mapper.features.frame_view import FrameView, ScanView
 from mapper.graph.noise import inflated
 from mapper.loops.base import Verification
 from mapper.loops.closure import Discrepancy, discrepancy, exceeds
 from mapper.loops.config import ScanVerificationConfig
 from mapper.loops.scan_context_proposer import ScanPlace
-from mapper.odometry.base import Seen
 from mapper.registration.base import Alignment
 from mapper.registration.degeneracy import degeneracy_of
 from mapper.registration.free_space import FreeSpaceCheck, FreeSpaceCounts, ScanDescription, range_image
@@ -61,7 +60,7 @@ class ScanVerifier:
         self._description = lru_cache(CACHED_PLACES)(partial(_describe, config=config))
         self._cloud = lru_cache(CACHED_PLACES)(partial(_cloud_of, config=config))
 
-    def describe(self, seen: Seen, /) -> ScanPlace:
+    def describe(self, seen: FrameView, /) -> ScanPlace:
         """Return the scan, thinned.
 
         Raises:

@@ -7,7 +7,7 @@ from statistics import median
 
 from mapper.core.geometry import Transform
 from mapper.core.timebase import NS_PER_S
-from mapper.features.view import View
+from mapper.features.frame_view import ImageView
 from mapper.loops.base import Verifier, verify_proposal
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import ThesisLoopsConfig
@@ -15,7 +15,7 @@ from mapper.loops.detector import ViewOf
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 from mapper.loops.proposers import PoseProposer
 from mapper.odometry.base import FrameResult
-from mapper.odometry.keyframes import SharpestKeyframes
+from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 
 
 class ThesisLoopDetector:
@@ -27,7 +27,7 @@ class ThesisLoopDetector:
         self._config = config
         self._verifier = verifier
         self._estimator = estimator
-        self._proposer: PoseProposer[View] = PoseProposer(
+        self._proposer: PoseProposer[ImageView] = PoseProposer(
             estimator,
             lambda view: view.T_body_camera,
             max_distance_m=config.max_distance_m,
@@ -36,8 +36,8 @@ class ThesisLoopDetector:
         )
         self._sharpest = SharpestKeyframes(config.keyframe_interval)
         self._features: deque[int] = deque(maxlen=config.median_frames)
-        self._recent: deque[tuple[int, View]] = deque(maxlen=config.keyframe_interval)
-        self._views: dict[int, View] = {}
+        self._recent: deque[tuple[int, ImageView]] = deque(maxlen=config.keyframe_interval)
+        self._views: dict[int, ImageView] = {}
         self._closures: list[LoopClosure] = []
 
     def add(self, node: int, track: FrameResult, view: ViewOf, /) -> None:
@@ -62,7 +62,7 @@ class ThesisLoopDetector:
         """Return the (4, 4) current estimate of a node's pose, with the loops so far."""
         return self._estimator.pose_of(node)
 
-    def _search(self, node: int, seen: View) -> None:
+    def _search(self, node: int, seen: ImageView) -> None:
         min_gap_ns = round(self._config.min_gap_s * NS_PER_S)
         old = bisect_right(
             [*self._views.values()], seen.stamp_ns - min_gap_ns, key=lambda view: view.stamp_ns

@@ -1,6 +1,6 @@
 """Proposer of images with similar visual words, by a bag of words (Zhao et al. 2020, §2.5)."""
 
-from mapper.features.view import View
+from mapper.features.frame_view import ImageView
 from mapper.loops.base import Proposal, Proposer
 from mapper.loops.config import PlaceLoopsConfig
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
@@ -22,9 +22,9 @@ class VisualWordProposer:
         self._config = config
         self._vocabulary = load_vocabulary(config.path)
         self._index = PlaceIndex(self._vocabulary)
-        self._described: tuple[View, WordVector] | None = None
+        self._described: tuple[ImageView, WordVector] | None = None
 
-    def propose(self, _node: int, seen: View, /, *, before: int, limit: int) -> list[Proposal]:
+    def propose(self, _node: int, seen: ImageView, /, *, before: int, limit: int) -> list[Proposal]:
         """Return the most similar places, the most similar first."""
         found = self._index.query(
             self._vector(seen),
@@ -35,20 +35,22 @@ class VisualWordProposer:
         )
         return [Proposal(other, "places", similarity) for other, similarity in found]
 
-    def add(self, node: int, seen: View) -> None:
+    def add(self, node: int, seen: ImageView) -> None:
         """Add a place."""
         self._index.add(node, self._vector(seen))
 
-    def _vector(self, view: View) -> WordVector:
+    def _vector(self, view: ImageView) -> WordVector:
         """Return the view's words; the last view's are cached, as a place is queried and then added."""
         if self._described is None or self._described[0] is not view:
             self._described = view, self._vocabulary.vector(self._vocabulary.words_of(view.bits))
         return self._described[1]
 
 
-def image_proposer(config: PlaceLoopsConfig, estimator: OnlinePoseEstimator, first: View) -> Proposer[View]:
+def image_proposer(
+    config: PlaceLoopsConfig, estimator: OnlinePoseEstimator, first: ImageView
+) -> Proposer[ImageView]:
     """Return the proposer that fits a log's first keyframe: only ORB's descriptors have words."""
-    by_pose: PoseProposer[View] = PoseProposer(
+    by_pose: PoseProposer[ImageView] = PoseProposer(
         estimator,
         lambda view: view.T_body_camera,
         max_distance_m=config.max_distance_m,

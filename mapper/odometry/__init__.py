@@ -1,1 +1,1 @@
-"""Tracking a log frame by frame."""
+"""Odometry: frame-by-frame tracking of a log."""

@@ -1,4 +1,4 @@
-"""The seam between a log and the pose graph: what tracking one frame yields."""
+"""Interface of the odometries: the result of tracking one frame, and the methods that produce it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,24 +10,23 @@ from numpy.typing import NDArray
 from mapper.core.deskew import Twist
 from mapper.core.frames import Frame
 from mapper.core.geometry import Array, Transform
-from mapper.features.scan_view import ScanView
-from mapper.features.view import View
+from mapper.features.frame_view import FrameView
 from mapper.graph.model import BetweenFactor
 from mapper.sources.base import FrameRef
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnostics:
-    """How tracking one frame went.
+    """Figures on the tracking of one frame.
 
     Attributes:
-        features: Features found in the image.
-        matches: Pairs proposed by matching.
-        inliers: Pairs that agree with the pose.
+        features: Number of features found in the image, or of points of the thinned scan.
+        matches: Number of pairs proposed by matching.
+        inliers: Number of pairs that agree with the pose.
         residual: Root mean square residual of the inliers.
         residual_unit: "m" or "px".
-        method: What placed the frame, e.g. "map", "fallback", "relocalised", "lost".
-        unseen: Motions that the surfaces left open, e.g. "translation along x"; empty when none.
+        method: Step that found the pose, e.g. "map", "fallback", "relocalised", "lost".
+        unobservable: Motions that the surfaces do not constrain, e.g. "translation along x"; empty if none.
     """
 
     features: int
@@ -36,7 +35,7 @@ class Diagnostics:
     residual: float
     residual_unit: str
     method: str
-    unseen: str = ""
+    unobservable: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,16 +44,16 @@ class FrameResult:
 
     Attributes:
         stamp_ns: The frame's stamp.
-        node: Graph node that the frame's pose hangs on, or None when the frame is lost.
+        node: Graph node relative to which the frame's pose is known; None if the frame is lost.
         T_node_body: (4, 4) pose of the body in that node.
-        T_world_body: (4, 4) the odometry's own running estimate; the last good one while lost.
+        T_world_body: (4, 4) the odometry's own running estimate; while lost, that of the last tracked frame.
         is_keyframe: The frame itself became ``node``.
-        factors: Measurements that became final with this frame; their nodes are known by now.
-        diagnostics: How it went.
-        links: Where the new node lies from earlier ones, as far as is known now; ``factors`` may come later
-            and better, but until then this is what ties the node to the path.
-        twist: How the body is taken to have moved while a scan was swept; None where nothing was deskewed.
-        is_sharp: False of what nobody should recognise a place by: a scan swept in unknown motion.
+        factors: Measurements that became final with this frame; their nodes exist by now.
+        diagnostics: Figures on how it was tracked.
+        links: Preliminary measurements of a new node relative to earlier ones. ``factors`` may come later and
+            be more accurate; until then these connect the node to the path.
+        twist: Assumed motion of the body during a scan's sweep; None if nothing was deskewed.
+        is_sharp: False if the frame is unfit for place recognition: a scan swept in unknown motion.
     """
 
     stamp_ns: int
@@ -70,27 +69,24 @@ class FrameResult:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Matches:
-    """How the features of a frame's view hold its pose.
+class FeatureMatches:
+    """Matches behind the pose of a frame, one row per feature of its view.
 
     Attributes:
-        agreeing: (N,) which agree with it.
-        before_px: (N, 2) undistorted pixels: where they were in the frame before, or in a keyframe; NaN where
-            neither showed them.
+        is_inlier: (N,) which features agree with the pose.
+        previous_px: (N, 2) undistorted pixels of the same points in the frame before, or in a keyframe; NaN
+            if neither has them.
     """
 
-    agreeing: NDArray[np.bool_]
-    before_px: Array
+    is_inlier: NDArray[np.bool_]
+    previous_px: Array
 
 
 Observation = TypeVar("Observation")
 
-Seen = View | ScanView
-"""What a place is recognised by, of one sensor or the other."""
-
 
 class Odometry(Protocol[Observation]):
-    """Frame-by-frame tracking, split so that the costly, stateless half can run ahead in threads."""
+    """Frame-by-frame tracking in two steps, the first of them stateless, so that threads can run it ahead."""
 
     def read(self, entry: FrameRef) -> Observation:
         """Reduce a log's frame to what tracking needs, and read no more. Pure: no state is read or written.
@@ -101,25 +97,25 @@ class Odometry(Protocol[Observation]):
         ...
 
     def track(self, observation: Observation) -> FrameResult:
-        """Place the next observation, in time order."""
+        """Track the next frame, in time order."""
         ...
 
-    def view(self, observation: Observation, twist: Twist | None = None, /) -> Seen:
-        """Return what a place is recognised by. Pure.
+    def view(self, observation: Observation, twist: Twist | None = None, /) -> FrameView:
+        """Return the view for place recognition. Pure.
 
         Args:
             observation: Of the frame.
-            twist: How the body moved while a scan was swept; images do not look at it.
+            twist: Motion of the body during a scan's sweep; not used for images.
 
         Raises:
             FrameError: The frame was not needed before, and cannot be read.
         """
         ...
 
-    def matches(self) -> Matches | None:
-        """Return what holds the frame that was tracked last; None if it was lost, or is held by no features.
+    def matches(self) -> FeatureMatches | None:
+        """Return the matches of the last frame; None if it was lost or its pose is not from features.
 
-        It is for looking, and so made when it is asked for.
+        They are for display only, and so are computed on request.
         """
         ...
 
@@ -129,7 +125,15 @@ class Odometry(Protocol[Observation]):
 
 
 class FrameOdometry(Odometry[Observation], Protocol[Observation]):
-    """An odometry that sees each frame, and so can be given one that is no log's."""
+    """Odometry from images or scans, which accepts frames that are of no log."""
+
+    def read(self, entry: FrameRef) -> Observation:
+        """Observe a log's frame, without its colours. Pure.
+
+        Raises:
+            FrameError: The frame cannot be read, or is of a kind that this method cannot use.
+        """
+        return self.observe(entry.load(colour=False))
 
     def observe(self, frame: Frame) -> Observation:
         """Reduce a frame to what tracking needs. Pure: no state is read or written.

@@ -15,15 +15,15 @@ from mapper.odometry.config import (
     WheelsOdometryConfig,
 )
 from mapper.odometry.scan_to_map.config import (
+    AnyScanOdometryConfig,
     GicpOdometryConfig,
     HoughOdometryConfig,
     IcpOdometryConfig,
     KissOdometryConfig,
-    ScanToMapConfig,
 )
 
 if TYPE_CHECKING:
-    from mapper.odometry.scan_to_map.matching import Matcher
+    from mapper.odometry.scan_to_map.scan_matcher import ScanMatcher
 
 
 def build_odometry(config: OdometryConfig, wheels: Trajectory | None = None) -> Odometry[Any]:
@@ -56,13 +56,13 @@ def build_frame_odometry(config: FrameOdometryConfig) -> FrameOdometry[Any]:
 
             return IsvdOdometry(config)
         case LocalMapConfig():
-            from mapper.odometry.local_map.motion import MotionPoseTracker
+            from mapper.odometry.local_map.motion_tracker import MotionPoseTracker
             from mapper.odometry.local_map.odometry import KeyframeOdometry
 
             return KeyframeOdometry(config, partial(MotionPoseTracker, config))
         case PnpConfig():
             from mapper.odometry.local_map.odometry import KeyframeOdometry
-            from mapper.odometry.local_map.pnp import PnpPoseTracker
+            from mapper.odometry.local_map.pnp_tracker import PnpPoseTracker
 
             return KeyframeOdometry(config, PnpPoseTracker)
         case GicpOdometryConfig() | IcpOdometryConfig() | KissOdometryConfig() | HoughOdometryConfig():
@@ -73,7 +73,8 @@ def build_frame_odometry(config: FrameOdometryConfig) -> FrameOdometry[Any]:
             assert_never(config)
 
 
-def _build_matcher(config: ScanToMapConfig) -> "Matcher":
+def _build_matcher(config: AnyScanOdometryConfig) -> "ScanMatcher":
+    """Return the scan matcher that the settings choose, before its first scan."""
     match config:
         case GicpOdometryConfig():
             from mapper.odometry.scan_to_map.gicp import GicpMatcher
@@ -84,12 +85,12 @@ def _build_matcher(config: ScanToMapConfig) -> "Matcher":
 
             return IcpMatcher(config)
         case KissOdometryConfig():
-            from mapper.odometry.scan_to_map.kiss import KissMatcher
+            from mapper.odometry.scan_to_map.kiss_icp import KissMatcher
 
             return KissMatcher(config)
         case HoughOdometryConfig():
-            from mapper.odometry.scan_to_map.consecutive import ConsecutiveMatcher
+            from mapper.odometry.scan_to_map.scan_to_scan import ScanToScanMatcher
 
-            return ConsecutiveMatcher(config)
+            return ScanToScanMatcher(config)
         case _:
             assert_never(config)

@@ -1,4 +1,4 @@
-"""The thesis's odometry: each frame registered against the frames before it ("ISLAM", alg. 7)."""
+"""ISVD odometry: each frame registered against the frames before it (Somlyai, PhD thesis, alg. 7)."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -11,30 +11,29 @@ from mapper.core.deskew import Twist
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, PinholeCamera, RgbdFrame
 from mapper.core.geometry import Array, Points, Transform, apply, inverse, mean_rotation, transform
-from mapper.features.detectors import Detector, Features
+from mapper.features.base import Detector, Features
 from mapper.features.factory import build_detector
+from mapper.features.frame_view import ImageView
 from mapper.features.matching import Pairs, homography_inliers, match_mutual
-from mapper.features.view import View
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
-from mapper.odometry.base import Diagnostics, FrameResult, Matches
+from mapper.odometry.base import Diagnostics, FeatureMatches, FrameOdometry, FrameResult
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
-from mapper.odometry.keyframes import SharpestKeyframes
+from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
 from mapper.sensing.depth_filter import dif
-from mapper.sources.base import FrameRef
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IsvdObservation:
-    """A frame's features and where they are.
+    """A frame's features with their 3D points.
 
     Attributes:
         stamp_ns: The frame's stamp.
-        features: Of the image.
+        features: Features of the image.
         points_body: (N, 3) metres, body frame; NaN where the depth image has no measurement.
-        camera: What took the image.
+        camera: Camera of the image.
         T_body_camera: (4, 4) pose of the camera in the body frame.
     """
 
@@ -45,13 +44,13 @@ class IsvdObservation:
     T_body_camera: Transform
 
 
-Compare = Callable[[IsvdObservation, IsvdObservation, MatchConfig], tuple[Alignment, float, int]]
-"""What ``compared`` does, by an ISVD of its own."""
+RegisterPair = Callable[[IsvdObservation, IsvdObservation, MatchConfig], tuple[Alignment, float, int]]
+"""Registration of two observations (target, source), as ``register_pair`` with an ISVD bound."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Placed:
-    """A frame that has its place: node, what it saw, and T_world_body as estimated then."""
+class TrackedFrame:
+    """A tracked frame: its node, its observation, and T_world_body as estimated when it was tracked."""
 
     node: int
     observation: IsvdObservation
@@ -59,30 +58,30 @@ class Placed:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
-    """A frame's registration against an earlier one.
+class PoseCandidate:
+    """Registration of a new frame against an earlier one.
 
     Attributes:
-        earlier: The frame it was registered against.
-        alignment: The motion found, earlier ← new.
+        earlier: The earlier frame, the target.
+        alignment: The motion, earlier ← new.
         weight: Its quality W, 1/m (eq. 4.1).
-        matches: Feature pairs it began with, with or without depth.
-        T_world_body: The new frame's pose as this registration sees it.
+        matches: Number of matched features, with or without depth.
+        T_world_body: (4, 4) pose of the new frame by this registration.
     """
 
-    earlier: Placed
+    earlier: TrackedFrame
     alignment: Alignment
     weight: float
     matches: int
     T_world_body: Transform
 
 
-class IsvdOdometry:
-    """Registers every frame against the MP frames before it and averages what they say.
+class IsvdOdometry(FrameOdometry[IsvdObservation]):
+    """Odometry that registers every frame against the MP frames before it and averages the poses.
 
-    Every frame that finds its place is a node, and every registration that led to it is a factor. Their
-    information is that of the rigid fit; it counts pairs as independent, although frames in a row share
-    features and depth errors, so it is right in proportion rather than in size.
+    Every tracked frame is a node, and every registration that succeeded is a factor. Its information is that
+    of the rigid fit: it takes pairs as independent although consecutive frames share features and depth
+    errors, so it is right in proportion but too large.
     """
 
     def __init__(
@@ -90,33 +89,27 @@ class IsvdOdometry:
         config: IsvdOdometryConfig,
         *,
         detector: Detector | None = None,
-        compare: Compare | None = None,
+        register: RegisterPair | None = None,
     ) -> None:
         """Start before the first frame.
 
         Args:
-            config: Every knob.
-            detector: Stands in for the configured one, so that odometries that look at the same frames
-                need not detect again.
-            compare: Stands in for ``compared``, so that those that register alike need not register again.
+            config: Settings.
+            detector: Replaces the configured one, so that several odometries on the same frames can share
+                the detection.
+            register: Replaces ``register_pair``, so that they can share registrations as well.
         """
         self._config = config
         self._detector = detector or build_detector(config.detector)
-        self._compare = compare or partial(compared, Isvd(config.registration))
-        self._recent: deque[Placed] = deque(maxlen=max(config.previous_frames, config.keyframe_interval))
-        self._keyframes: list[Placed] = []
+        self._register_pair = register or partial(register_pair, Isvd(config.registration))
+        self._recent: deque[TrackedFrame] = deque(
+            maxlen=max(config.previous_frames, config.keyframe_interval)
+        )
+        self._keyframes: list[TrackedFrame] = []
         self._sharpest = SharpestKeyframes(config.keyframe_interval)
         self._next_node = 0
         self._turn = 0
-        self._held: tuple[IsvdObservation, Candidate, MatchConfig] | None = None
-
-    def read(self, entry: FrameRef) -> IsvdObservation:
-        """Observe a frame of a log, without its colours. Pure.
-
-        Raises:
-            FrameError: It cannot be read, or not be used.
-        """
-        return self.observe(entry.load(colour=False))
+        self._nearest_match: tuple[IsvdObservation, PoseCandidate, MatchConfig] | None = None
 
     def observe(self, frame: Frame) -> IsvdObservation:
         """Return a frame's features with their 3D points. Pure.
@@ -131,29 +124,29 @@ class IsvdOdometry:
         return IsvdObservation(frame.stamp_ns, features, points_body, frame.camera, frame.T_body_camera)
 
     def track(self, observation: IsvdObservation) -> FrameResult:
-        """Place the next observation, in time order."""
-        self._held = None
+        """Track the next frame, in time order."""
+        self._nearest_match = None
         if not self._recent:
-            return self._place(observation, np.eye(4), [], method="start")
+            return self._add_node(observation, np.eye(4), [], method="start")
         recent = list(self._recent)[-self._config.previous_frames :][::-1]
         for match, method in ((self._config.match, "isvd"), (self._config.fallback, "fallback")):
             candidates = self._register(observation, recent, match)
             if candidates:
-                self._held = observation, candidates[0], match
-                return self._place(observation, self._combine(candidates), candidates, method=method)
+                self._nearest_match = observation, candidates[0], match
+                return self._add_node(observation, self._combine(candidates), candidates, method=method)
         candidates = self._relocalise(observation)
         if candidates:
-            self._held = observation, candidates[0], self._config.match
-            return self._place(observation, self._combine(candidates), candidates, method="relocalised")
+            self._nearest_match = observation, candidates[0], self._config.match
+            return self._add_node(observation, self._combine(candidates), candidates, method="relocalised")
         diagnostics = Diagnostics(len(observation.features), 0, 0, 0.0, "m", "lost")
         return FrameResult(
             observation.stamp_ns, None, np.eye(4), self._recent[-1].T_world_body, False, diagnostics
         )
 
-    def view(self, observation: IsvdObservation, _twist: Twist | None = None, /) -> View:
-        """Return what a place is recognised by. Pure."""
+    def view(self, observation: IsvdObservation, _twist: Twist | None = None, /) -> ImageView:
+        """Return the view for place recognition. Pure."""
         features, camera = observation.features, observation.camera
-        return View(
+        return ImageView(
             stamp_ns=observation.stamp_ns,
             pixels=self._pixels(observation),
             sigma_px=self._detector.scale_factor ** features.octave.astype(np.float64),
@@ -163,20 +156,20 @@ class IsvdOdometry:
             T_body_camera=observation.T_body_camera,
         )
 
-    def matches(self) -> Matches | None:
-        """Match the last frame once more with the nearest that it was registered against."""
-        if self._held is None:
+    def matches(self) -> FeatureMatches | None:
+        """Return the matches of the last frame with the nearest earlier one, matched again."""
+        if self._nearest_match is None:
             return None
-        observation, candidate, match = self._held
+        observation, candidate, match = self._nearest_match
         earlier = candidate.earlier.observation
         then, now = matched_pairs(earlier, observation, match).T
         moved = apply(candidate.alignment.T_target_source, observation.points_body[now])
         miss_m = np.linalg.norm(earlier.points_body[then] - moved, axis=1)
-        agreeing = miss_m <= self._config.registration.agreement_mm / 1e3  # what has no depth does not
+        agreeing = miss_m <= self._config.registration.agreement_mm / 1e3  # False without depth
         now, then = now[agreeing], then[agreeing]
         before_px = np.full((len(observation.features), 2), np.nan)
         before_px[now] = self._pixels(earlier)[then]
-        return Matches(np.isfinite(before_px[:, 0]), before_px)
+        return FeatureMatches(np.isfinite(before_px[:, 0]), before_px)
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return nothing: every measurement was final when its frame was tracked."""
@@ -189,7 +182,7 @@ class IsvdOdometry:
     def _points_body(self, frame: RgbdFrame, features: Features) -> Points:
         config, camera = self._config, frame.camera
         depth_m = dif(frame.depth_m) if config.depth_filter else frame.depth_m
-        # Depth is registered to the raw image, so it is looked up before the lens is corrected for.
+        # Depth is registered to the raw image, so it is looked up before undistortion.
         nearest = np.rint(features.pixels).astype(np.intp)
         columns = np.clip(nearest[:, 0], 0, camera.width_px - 1)
         rows = np.clip(nearest[:, 1], 0, camera.height_px - 1)
@@ -200,19 +193,19 @@ class IsvdOdometry:
         return apply(frame.T_body_camera, np.column_stack([rays * z[:, None], z]))
 
     def _register(
-        self, observation: IsvdObservation, earlier: Iterable[Placed], match: MatchConfig
-    ) -> list[Candidate]:
+        self, observation: IsvdObservation, earlier: Iterable[TrackedFrame], match: MatchConfig
+    ) -> list[PoseCandidate]:
         """Return the registrations that succeeded, in the order of the earlier frames."""
         candidates = []
-        for placed in earlier:
-            alignment, weight, matches = self._compare(placed.observation, observation, match)
+        for frame in earlier:
+            alignment, weight, matches = self._register_pair(frame.observation, observation, match)
             if alignment.converged:
-                T_world_body = placed.T_world_body @ alignment.T_target_source
-                candidates.append(Candidate(placed, alignment, weight, matches, T_world_body))
+                T_world_body = frame.T_world_body @ alignment.T_target_source
+                candidates.append(PoseCandidate(frame, alignment, weight, matches, T_world_body))
         return candidates
 
-    def _combine(self, candidates: Sequence[Candidate]) -> Transform:
-        """Return one T_world_body; the nearest earlier frame comes first (alg. 7, lines 21 to 27)."""
+    def _combine(self, candidates: Sequence[PoseCandidate]) -> Transform:
+        """Return T_world_body; the nearest earlier frame comes first (alg. 7, lines 21–27)."""
         weights = np.array([candidate.weight for candidate in candidates])
         if self._config.average == "mean":
             weights = np.ones(len(candidates))
@@ -223,13 +216,13 @@ class IsvdOdometry:
             R_world_body = mean_rotation(poses[:, :3, :3], weights)
         return transform(R_world_body, translation)
 
-    def _relocalise(self, observation: IsvdObservation) -> list[Candidate]:
-        """Return the registration against the keyframe that most features match, if one succeeds."""
+    def _relocalise(self, observation: IsvdObservation) -> list[PoseCandidate]:
+        """Return the registration against a keyframe that most pairs agree with; none if all failed."""
         candidates = self._register(observation, self._keyframes_to_try(), self._config.match)
         return sorted(candidates, key=lambda candidate: -candidate.alignment.pairs)[:1]
 
-    def _keyframes_to_try(self) -> list[Placed]:
-        """Return the keyframes nearest to where tracking ended, and some of the others in turn."""
+    def _keyframes_to_try(self) -> list[TrackedFrame]:
+        """Return the keyframes nearest to the last tracked pose, and some of the others in turn."""
         count = self._config.relocalisation_keyframes
         last_world = self._recent[-1].T_world_body[:3, 3]
         by_distance = sorted(
@@ -240,20 +233,20 @@ class IsvdOdometry:
         self._turn += len(in_turn)
         return by_distance[:count] + in_turn
 
-    def _place(
+    def _add_node(
         self,
         observation: IsvdObservation,
         T_world_body: Transform,
-        candidates: Sequence[Candidate],
+        candidates: Sequence[PoseCandidate],
         *,
         method: str,
     ) -> FrameResult:
-        """Make the frame a node, remember it, and report its measurements."""
+        """Make the frame a node, with a factor from each candidate."""
         node = self._next_node
         self._next_node += 1
-        self._recent.append(Placed(node, observation, T_world_body))
+        self._recent.append(TrackedFrame(node, observation, T_world_body))
         keyframe = self._sharpest.add(node, len(observation.features))
-        self._keyframes.extend(placed for placed in self._recent if placed.node == keyframe)
+        self._keyframes.extend(frame for frame in self._recent if frame.node == keyframe)
         nearest = candidates[0].alignment if candidates else None
         factors = tuple(
             BetweenFactor(
@@ -284,16 +277,16 @@ class IsvdOdometry:
         )
 
 
-def compared(
+def register_pair(
     isvd: Isvd, target: IsvdObservation, source: IsvdObservation, match: MatchConfig
 ) -> tuple[Alignment, float, int]:
-    """Return the source's motion to the target, its quality W (eq. 4.1), and how many features matched."""
+    """Return the source's alignment to the target, its quality W (eq. 4.1), and the number of matches."""
     pairs = matched_pairs(target, source, match)
     return *isvd.fit_weighted(*shared_points(target, source, pairs)), len(pairs)
 
 
 def matched_pairs(target: IsvdObservation, source: IsvdObservation, match: MatchConfig) -> Pairs:
-    """Return the features that two frames share (thesis alg. 8)."""
+    """Return the features that two frames share (Somlyai, PhD thesis, alg. 8)."""
     pairs = match_mutual(target.features, source.features, max_ratio=match.max_ratio)
     if match.filter == "homography":
         pairs = pairs[
@@ -309,7 +302,7 @@ def matched_pairs(target: IsvdObservation, source: IsvdObservation, match: Match
 
 
 def shared_points(target: IsvdObservation, source: IsvdObservation, pairs: Pairs) -> tuple[Points, Points]:
-    """Return the (M, 3) points of the pairs with depth on both sides, each in its own body frame."""
+    """Return the (M, 3) points of the pairs with depth in both frames, each in its own body frame."""
     points_target, points_source = target.points_body[pairs[:, 0]], source.points_body[pairs[:, 1]]
     measured = np.isfinite(points_target[:, 2]) & np.isfinite(points_source[:, 2])
     return points_target[measured], points_source[measured]

@@ -1,4 +1,4 @@
-"""The wheels alone: every frame lies where they say the body was (thesis 2.6.3)."""
+"""Wheel odometry alone: every frame has the pose of the wheels at its stamp (Somlyai, PhD thesis, §2.6.3)."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -7,27 +7,29 @@ import numpy as np
 
 from mapper.core.deskew import Twist, twist_at
 from mapper.core.frames import Scan
-from mapper.core.geometry import Transform, angle_between, inverse
+from mapper.core.geometry import Transform, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.features.factory import build_detector
+from mapper.features.frame_view import FrameView
 from mapper.graph.model import BetweenFactor
 from mapper.graph.wheel_factors import WheelNode, wheel_factor
-from mapper.odometry.base import Diagnostics, FrameResult, Seen
+from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.odometry.config import LocalMapConfig, WheelsOdometryConfig
-from mapper.odometry.local_map.observation import observe
+from mapper.odometry.keyframe_distance import is_far
+from mapper.odometry.local_map.image_observation import observe_image
 from mapper.odometry.scan_to_map.config import GicpOdometryConfig
-from mapper.odometry.scan_to_map.observation import observe_scan
+from mapper.odometry.scan_to_map.scan_observation import observe_scan
 from mapper.places.vocabulary import Vocabulary, load_vocabulary
 from mapper.sensing.wheel_kinematics import Odometer, pose_at
 from mapper.sources.base import FrameRef
 
 
 class WheelsOdometry:
-    """Places frames of either sensor by their stamps; see :class:`mapper.odometry.base.Odometry`.
+    """Odometry of either sensor's frames by their stamps; see :class:`mapper.odometry.base.Odometry`.
 
-    Keyframes are the nodes, numbered from 0, each tied to the one before it. In a gap of the readings frames
-    are lost, but the wheels counted on: what comes after it is tied to what came before.
+    Keyframes are the nodes, numbered from 0, each with a factor to the one before it. In a gap of the
+    readings frames are lost, but the wheels kept counting: the next keyframe has a factor across the gap.
     """
 
     def __init__(self, config: WheelsOdometryConfig, wheels: Trajectory) -> None:
@@ -46,16 +48,16 @@ class WheelsOdometry:
         self._keyframe: WheelNode | None = None
 
     def read(self, entry: FrameRef) -> FrameRef:
-        """Read nothing: the stamp tells where the body was."""
+        """Return the entry itself: its stamp is enough."""
         return entry
 
     def track(self, observation: FrameRef) -> FrameResult:
-        """Place the next frame, in time order."""
+        """Track the next frame, in time order."""
         stamp_ns = observation.stamp_ns
         max_gap_ns = round(self._config.max_gap_s * NS_PER_S)
         T_odom_body = pose_at(self._wheels, stamp_ns, max_gap_ns=max_gap_ns)
         if T_odom_body is None:
-            return self._lose(stamp_ns)
+            return self._lost(stamp_ns)
         if self._T_world_odom is None:
             self._T_world_odom = inverse(T_odom_body)
         self._T_world_body = self._T_world_odom @ T_odom_body
@@ -63,7 +65,11 @@ class WheelsOdometry:
         factors: tuple[BetweenFactor, ...] = ()
         if last is None:
             keyframe = WheelNode(0, stamp_ns, T_odom_body)
-        elif self._is_far(inverse(last.T_odom_body) @ T_odom_body):
+        elif is_far(
+            inverse(last.T_odom_body) @ T_odom_body,
+            distance_m=self._config.keyframe_distance_m,
+            angle_rad=self._config.keyframe_angle_rad,
+        ):
             keyframe = WheelNode(last.node + 1, stamp_ns, T_odom_body)
             factors = (wheel_factor(last, keyframe, self._odometer, self._config, origin="odometry"),)
         assert keyframe is not None
@@ -80,19 +86,19 @@ class WheelsOdometry:
             twist=twist_at(self._wheels, int(np.searchsorted(self._wheels.stamps_ns, stamp_ns))),
         )
 
-    def view(self, observation: FrameRef, twist: Twist | None = None, /) -> Seen:
-        """Read the frame after all, and return what a place is recognised by. Pure.
+    def view(self, observation: FrameRef, twist: Twist | None = None, /) -> FrameView:
+        """Read the frame now, and return the view for place recognition. Pure.
 
         Raises:
-            FrameError: It cannot be read, or not be used.
+            FrameError: The frame cannot be read or used.
         """
         frame = observation.load(colour=False)
         if isinstance(frame, Scan):
             return observe_scan(frame, GicpOdometryConfig()).view(twist)
-        return observe(frame, self._detector, self._vocabulary, LocalMapConfig()).view()
+        return observe_image(frame, self._detector, self._vocabulary, LocalMapConfig()).view()
 
     def matches(self) -> None:
-        """Return nothing: no features hold the pose."""
+        """Return None: the pose is not from features."""
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return nothing: every measurement was final when its frame was tracked."""
@@ -102,15 +108,8 @@ class WheelsOdometry:
     def _vocabulary(self) -> Vocabulary:
         return load_vocabulary()
 
-    def _is_far(self, T_key_body: Transform) -> bool:
-        config = self._config
-        return (
-            float(np.linalg.norm(T_key_body[:3, 3])) >= config.keyframe_distance_m
-            or angle_between(np.eye(3), T_key_body[:3, :3]) >= config.keyframe_angle_rad
-        )
-
-    def _lose(self, stamp_ns: int) -> FrameResult:
-        """Give up a frame at whose time the wheels said nothing."""
+    def _lost(self, stamp_ns: int) -> FrameResult:
+        """Return the result of a frame at whose stamp there are no readings."""
         first_ns, last_ns = self._wheels.stamps_ns[[0, -1]]
         where = "in a gap of" if first_ns < stamp_ns < last_ns else "outside"
         return FrameResult(

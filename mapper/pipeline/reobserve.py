@@ -5,7 +5,7 @@ from collections.abc import Collection
 from mapper.config.build import BuildConfig
 from mapper.core.deskew import twist_at
 from mapper.core.trajectory import Trajectory
-from mapper.odometry.base import Seen
+from mapper.features.frame_view import FrameView
 from mapper.odometry.factory import build_odometry
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
@@ -19,7 +19,7 @@ def reobserve(
     config: BuildConfig,
     *,
     progress: Progress = SILENT,
-) -> dict[int, Seen]:
+) -> dict[int, FrameView]:
     """Return what the odometry of a configuration sees in some frames of a log, by stamp.
 
     Args:
@@ -35,7 +35,7 @@ def reobserve(
     odometry = build_odometry(config.odometry, source.wheels)
     index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
 
-    def view(entry: FrameRef) -> tuple[int, Seen]:
+    def view(entry: FrameRef) -> tuple[int, FrameView]:
         twist = twist_at(trajectory, index_of[entry.stamp_ns])
         return entry.stamp_ns, odometry.view(odometry.read(entry), twist)
 

@@ -1,1 +1,1 @@
-"""Places recognised by the visual words that their images share."""
+"""Place recognition: by the visual words of images, and by the heights around a scanner."""

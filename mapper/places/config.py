@@ -1,4 +1,4 @@
-"""Place recognition: by visual words, and by the heights around a scanner."""
+"""Settings of place recognition."""
 
 from pathlib import Path
 from typing import Annotated
@@ -10,43 +10,44 @@ from mapper.features.config import OrbConfig, UniformOrbConfig
 
 
 class VocabularyConfig(Config):
-    """Training of a vocabulary: a tree of k-means++ clusters (B2; Arthur & Vassilvitskii 2007)."""
+    """Training of a vocabulary: a tree of k-means++ clusters (Zhao et al. 2020, §1.1)."""
 
     detector: Annotated[OrbConfig | UniformOrbConfig, Field(discriminator="kind")] = UniformOrbConfig()
     frames_per_log: PositiveInt = 200
     """This many frames of a log are used, evenly spread."""
     branching: Annotated[int, Field(ge=2, le=255)] = 13
-    """k: parts that a cluster is split into."""
+    """k: number of parts that a cluster is split into (Arthur & Vassilvitskii 2007)."""
     levels: Annotated[int, Field(ge=1, le=8)] = 3
-    """d: how often. More words (k^d) make all similarities smaller: with about 2200 the published 0.32 tells
-    the same place from others, with 10 000 no two images reach it."""
+    """d: number of splits from the root to a word. More words (k^d) make all similarities smaller: with about
+    2200 the published 0.32 separates the same place from others, with 10 000 no two images reach it."""
     max_iterations: PositiveInt = 12
-    """Of each split."""
+    """Largest number of iterations of each split."""
 
 
 class PlacesConfig(Config):
-    """When two images are taken to show the same place (B5)."""
+    """Decision whether two images show the same place (Zhao et al. 2020, §1.3)."""
 
     path: Path | None = None
     """File of the vocabulary; None is the one trained on synthetic logs that comes with the toolkit."""
     min_similarity: Ratio = 0.32
-    """Of two images' words (eq. 10), as published. It suits images of about 1000 features; 0.22 would do for
-    500, 0.45 for 2000."""
+    """Similarity of two images' words (eq. 10), as published. It suits images of about 1000 features; 0.22
+    suits 500, 0.45 suits 2000."""
     min_deviations: PositiveFloat = 3.0
-    """Whatever its similarity, a place is proposed that stands out from all others by this many standard
-    deviations: so images with few features find theirs as well."""
+    """A place of any similarity is proposed if it exceeds the median of all by this many standard deviations,
+    so that images with few features are recognised as well."""
 
 
 class ScanContextConfig(Config):
-    """When two scans are taken to show the same place (Kim & Kim 2018)."""
+    """Scan Context: decision whether two scans show the same place (Kim & Kim 2018)."""
 
     rings: PositiveInt = 20
     sectors: PositiveInt = 60
+    """Fewer are faster; more resolve the heading better."""
     reach_m: PositiveFloat = 48.0
-    """Radius of the outermost ring; 80 m as published, but loops keep no farther points."""
+    """Radius of the outermost ring; 80 m as published, but loop detection keeps no farther points."""
     max_height_m: PositiveFloat = 15.0
-    """What is higher counts as this high."""
+    """Higher points count as this high."""
     shortlist: PositiveInt = 50
-    """So many places with the nearest ring keys are turned to where they fit best."""
+    """Number of places with the nearest ring keys that are compared at all headings."""
     min_similarity: Ratio = 0.4
-    """Mean cosine between the sectors of two places, from which on one is proposed."""
+    """Smallest mean cosine between the sectors of two places for a proposal."""

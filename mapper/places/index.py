@@ -1,4 +1,4 @@
-"""Finds the places whose images share words with a given one."""
+"""Inverted index of places by the visual words of their images."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,10 @@ _SIGMA_PER_MAD = 1.4826
 
 
 class PlaceIndex:
-    """An inverted index: for every word, how much it weighs in each node, in the order they were added.
+    """Inverted index: the weight of every word in each node, in the order in which the nodes were added.
 
-    A query visits its own words only. With each it also visits the nodes that do not have it, for that is
-    faster than skipping them: of 2200 words an image has every third, and lists of postings took six times as
-    long. Two bytes per word and node are kept.
+    A query visits its own words only, but all nodes of each: of 2200 words an image has every third, so that
+    lists of postings, which skip nodes, took six times as long. It takes two bytes per word and node.
     """
 
     def __init__(self, vocabulary: Vocabulary) -> None:
@@ -29,7 +28,7 @@ class PlaceIndex:
         return len(self._nodes)
 
     def add(self, node: int, vector: WordVector) -> None:
-        """Remember what a node looks like.
+        """Add a node.
 
         Raises:
             DataError: The node has been added before, or the vector is of a larger vocabulary.
@@ -55,12 +54,14 @@ class PlaceIndex:
         """Return the most similar nodes with their similarity, best first; of equals, the earlier.
 
         Args:
-            vector: What is seen now.
-            min_similarity: Less is not returned, unless it stands out; nor ever a node that shares no word.
-            limit: How many nodes are returned at most.
-            before: Only the first so many nodes take part, for the latest look alike anyway; None is all.
-            min_deviations: A node stands out when it is this many standard deviations more similar than the
-                median node. Both are told robustly, so a few true revisits do not hide each other.
+            vector: Words of the image to recognise.
+            min_similarity: Nodes of less similarity are returned only if they are outstanding; those that
+                share no word never are.
+            limit: Largest number of nodes to return.
+            before: Number of nodes, from the first, that are compared; the latest are similar in any case.
+                None is all.
+            min_deviations: A node is outstanding if its similarity exceeds the median by this many standard
+                deviations, estimated robustly so that a few true revisits do not hide each other.
 
         Raises:
             DataError: The vector is of a larger vocabulary.
@@ -81,7 +82,7 @@ class PlaceIndex:
 
 
 def _outstanding(similarity: NDArray[np.float64], deviations: float) -> float:
-    """Return from which similarity on a node stands out; never where there are few to stand out from."""
+    """Return the similarity from which on a node is outstanding; infinite among few nodes."""
     if len(similarity) < _ENOUGH_TO_COMPARE or not np.isfinite(deviations):
         return np.inf
     median = float(np.median(similarity))

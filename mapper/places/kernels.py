@@ -1,9 +1,9 @@
-"""Compiled loops over binary descriptors, visual words and postings."""
+"""Compiled loops over binary descriptors and visual words."""
 
 import numpy as np
 from numba import njit
 
-from mapper.features.windowed import drop_unrequited, hamming, nearest_among
+from mapper.features.hamming import drop_one_sided, hamming, nearest_among
 
 _BITS = 256
 _FARTHER = _BITS + 1
@@ -11,13 +11,13 @@ _FARTHER = _BITS + 1
 
 @njit(cache=True, nogil=True)
 def descend(bits, centres, first_child, children, word):
-    """Return (N,) int32, the word of each descriptor: always on to the nearest child, the first of equals.
+    """Return (N,) int32, the word of each descriptor, by descent to the nearest child, the first of equals.
 
     Args:
         bits: (N, 4) uint64 descriptors.
         centres: (T, 4) uint64 centre of every node; node 0 is the root.
         first_child: (T,) int32.
-        children: (T,) uint8 how many children each node has; they lie side by side.
+        children: (T,) uint8 number of children of each node; they are adjacent.
         word: (T,) int32 word of every leaf.
     """
     words = np.empty(len(bits), np.int32)
@@ -38,8 +38,8 @@ def descend(bits, centres, first_child, children, word):
 def seed_centres(bits, draws):
     """Return up to len(draws) rows of bits spread by k-means++ (Arthur & Vassilvitskii 2007).
 
-    Each next centre is drawn with the probability of its squared Euclidean distance to the nearest one so
-    far, which for bits is the Hamming distance. There are fewer centres where there are fewer distinct rows.
+    Each next centre is drawn with a probability proportional to the squared Euclidean distance to the nearest
+    centre so far, which for bits is the Hamming distance. Fewer distinct rows give fewer centres.
 
     Args:
         bits: (N, 4) uint64 descriptors, N ≥ 1.
@@ -69,13 +69,13 @@ def seed_centres(bits, draws):
 def k_majority(bits, seeds, max_iterations):
     """Return the centres (k, 4) of Lloyd's iteration on bits, and the cluster (N,) int32 of each row.
 
-    A centre takes each bit that most of its rows have, and keeps it where they are even (Grana et al. 2013),
-    so the summed distance never grows. A centre may end without rows.
+    Each bit of a centre becomes that of most of its rows, and is kept at a tie (Grana et al. 2013), so that
+    the summed distance never grows. A centre may end without rows.
 
     Args:
         bits: (N, 4) uint64 descriptors.
         seeds: (k, 4) uint64 centres to start from.
-        max_iterations: Stop here even if rows still change clusters.
+        max_iterations: Largest number of iterations.
     """
     centres = seeds.copy()
     cluster = np.full(len(bits), -1, np.int32)
@@ -127,25 +127,25 @@ def shared_weight(ids_a, weights_a, ids_b, weights_b):
 
 @njit(cache=True, nogil=True)
 def shared_weights(ids, weights, weights_of_word, count):
-    """Return (count,) uint16, the ``shared_weight`` of a vector with each of the first vectors of an index.
+    """Return (count,) uint16, the ``shared_weight`` of a vector and each of the first vectors of an index.
 
     Args:
         ids: (M,) int32 words of the vector.
         weights: (M,) uint16.
         weights_of_word: (W, R) uint16 weight of every word in every vector.
-        count: How many vectors take part.
+        count: Number of vectors to compare.
     """
     totals = np.zeros(count, np.uint16)
     for m in range(len(ids)):
         weight, others = weights[m], weights_of_word[ids[m]]
-        for i in range(count):  # a few vector instructions, as there is nothing to skip
+        for i in range(count):  # without a branch, which compiles to vector instructions
             totals[i] += min(weight, others[i])
     return totals
 
 
 @njit(cache=True, nogil=True)
 def match_sorted(bits_a, nodes_a, bits_b, nodes_b, max_hamming, max_ratio):
-    """Return, per row of a, its mutually nearest row of b under the same node, or −1.
+    """Return (Na,) int32, per row of a its mutually nearest row of b under the same node, or −1.
 
     Args:
         bits_a: (Na, 4) uint64 descriptors, sorted by node.
@@ -168,5 +168,5 @@ def match_sorted(bits_a, nodes_a, bits_b, nodes_b, max_hamming, max_ratio):
         best, second, best_j = nearest_among(bits_a, i, bits_b, start, end, best_of_b, owner)
         if best <= max_hamming and best <= max_ratio * second:
             matched[i] = best_j
-    drop_unrequited(matched, owner)
+    drop_one_sided(matched, owner)
     return matched

@@ -1,4 +1,4 @@
-"""What a place looks like to a scanner, whichever way it heads: Scan Context (Kim & Kim 2018)."""
+"""Scan Context: a descriptor of scans that does not depend on the heading (Kim & Kim 2018)."""
 
 from dataclasses import dataclass
 
@@ -14,13 +14,13 @@ _FIRST_CAPACITY = 256
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanContext:
-    """The highest point in every ring and sector around a sensor.
+    """Descriptor: the highest point in every ring and sector around a sensor.
 
     Attributes:
-        ring_key: (R,) float32 metres: each ring's mean height, which turning the sensor does not change.
-        spectrum: (R, S // 2 + 1) complex64: each ring's heights around the sensor, Fourier-transformed, once
-            every sector is a unit vector and the filled sectors' total is one. Two of them correlate for all
-            turns at once.
+        ring_key: (R,) float32 metres: each ring's mean height, which does not depend on the heading.
+        spectrum: (R, S // 2 + 1) complex64: Fourier transform of each ring's heights around the sensor, after
+            every sector is made a unit vector and divided by the root of the number of filled sectors. The
+            product of two gives their correlation at all headings.
     """
 
     ring_key: NDArray[np.float32]
@@ -28,11 +28,11 @@ class ScanContext:
 
 
 def scan_context(points_level: Points, config: ScanContextConfig) -> ScanContext:
-    """Return what a scan looks like.
+    """Return the descriptor of a scan.
 
     Args:
         points_level: (N, 3) metres, z up, the ground below the sensor at 0 and the sensor above the origin.
-        config: Rings, sectors and how far and high they reach.
+        config: Rings, sectors, largest range and height.
     """
     x, y, z = points_level.T
     range_m = np.hypot(x, y)
@@ -51,7 +51,7 @@ def scan_context(points_level: Points, config: ScanContextConfig) -> ScanContext
 
 
 class ScanContexts:
-    """Finds the places that look like a given one: by ring keys first, then turned to where they fit best."""
+    """Index of places by their descriptors: candidates by ring keys, then compared at all headings."""
 
     def __init__(self, config: ScanContextConfig) -> None:
         self._config = config
@@ -64,7 +64,7 @@ class ScanContexts:
         return len(self._nodes)
 
     def add(self, node: int, context: ScanContext) -> None:
-        """Remember what a node looks like.
+        """Add a node.
 
         Raises:
             DataError: The context has other rings or sectors.
@@ -84,9 +84,9 @@ class ScanContexts:
         """Return the most similar nodes with their similarity, best first; of equals, the earlier.
 
         Args:
-            context: What is seen now.
-            among: (N,) which of the first N nodes take part, in the order they were added.
-            limit: How many nodes are returned at most.
+            context: Descriptor of the scan to recognise.
+            among: (N,) which of the first N nodes, in the order they were added, are compared.
+            limit: Largest number of nodes to return.
         """
         rows = np.flatnonzero(among)
         apart = np.linalg.norm(self._keys[rows] - context.ring_key, axis=1)
@@ -100,7 +100,7 @@ class ScanContexts:
         ]
 
     def _similarities(self, context: ScanContext, rows: NDArray[np.intp]) -> NDArray[np.float32]:
-        """Return the mean cosine between sectors at the turn where it is largest (eq. 6 and 7)."""
+        """Return the mean cosine between sectors at the heading where it is largest (eq. 6, 7)."""
         product = (self._spectra[rows].conj() * context.spectrum).sum(axis=1)
         turned = np.fft.irfft(product, self._config.sectors, axis=1)
         best: NDArray[np.float32] = turned.max(axis=1).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Vocabularies made from images: hierarchical k-means++ on bits (B2)."""
+"""Training of a vocabulary by hierarchical k-means++ on bits (Nistér & Stewénius 2006)."""
 
 from collections.abc import Sequence
 
@@ -6,14 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import VocabularyError
+from mapper.features.hamming import Bits
 from mapper.places.config import VocabularyConfig
 from mapper.places.kernels import k_majority, seed_centres
-from mapper.places.tree import Bits, WordTree
 from mapper.places.vocabulary import Vocabulary
+from mapper.places.word_tree import WordTree
 from mapper.runtime.progress import SILENT, Progress
 
 MIN_IMAGES = 2
-"""Of one image alone, every word would be in all images and tell nothing."""
+"""With one image every word would be in all images and weigh nothing."""
 
 
 def train(
@@ -24,14 +25,14 @@ def train(
     rng: np.random.Generator,
     progress: Progress = SILENT,
 ) -> Vocabulary:
-    """Return a vocabulary of the descriptors of some images, weighted by how few images have each word.
+    """Return a vocabulary of the images' descriptors, weighted by inverse document frequency.
 
     Args:
         images: (N_i, 4) uint64 descriptors of each image.
         config: Shape of the tree.
-        trained_on: A line that says what the images are.
-        rng: Draws the seeds of k-means++.
-        progress: Who watches.
+        trained_on: One line that describes the images.
+        rng: Source of the seeds of k-means++.
+        progress: Receiver of progress reports.
 
     Raises:
         VocabularyError: Fewer than two images have descriptors.
@@ -48,7 +49,7 @@ def train(
 def grow(
     bits: Bits, *, config: VocabularyConfig, rng: np.random.Generator, progress: Progress = SILENT
 ) -> WordTree:
-    """Return the tree that splits (N, 4) descriptors into clusters of clusters, level by level."""
+    """Return the tree of clusters of (N, 4) descriptors, split level by level."""
     centres, children = [np.zeros((1, 4), np.uint64)], []
     clusters = [np.arange(len(bits))]
     with progress.stage("cluster") as report:
@@ -70,7 +71,7 @@ def grow(
 def _split(
     bits: Bits, members: NDArray[np.intp], *, config: VocabularyConfig, rng: np.random.Generator
 ) -> tuple[Bits, list[NDArray[np.intp]]]:
-    """Return the centres and the members of a cluster's parts; none where all members are equal."""
+    """Return the centres and the members of a cluster's parts; none if all members are equal."""
     own = bits[members]
     seeds = seed_centres(own, rng.random(config.branching))
     if len(seeds) == 1:
@@ -82,7 +83,7 @@ def _split(
 
 
 def _inverse_document_frequency(tree: WordTree, images: Sequence[Bits]) -> NDArray[np.float64]:
-    """Return ln(N / N_w); a word that no image ends in weighs as if one did."""
+    """Return (W,) ln(N / N_w) for N images, of which N_w have the word; at least one counts."""
     having = np.zeros(len(tree.leaves), np.int64)
     for bits in images:
         having[np.unique(tree.words_of(bits))] += 1

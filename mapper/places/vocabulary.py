@@ -1,8 +1,8 @@
-"""Images as bags of visual words (B2; Sivic & Zisserman 2003, Nistér & Stewénius 2006).
+"""Vocabulary of visual words, and images as bags of words (Sivic & Zisserman 2003; Nistér & Stewénius 2006).
 
-A vocabulary's file: ``_MAGIC``; version, header length and CRC-32 of all that follows (little-endian uint32
-each); a JSON header; then columns: child counts (uint8) and centres (4 × uint64) of the nodes, weights
-(float64) of the words.
+A vocabulary's file: ``_MAGIC``; version, header length and CRC-32 of the rest (little-endian uint32 each); a
+JSON header; then columns: child counts (uint8) and centres (4 × uint64) of the nodes, weights (float64) of
+the words.
 """
 
 import struct
@@ -16,18 +16,19 @@ from pydantic import NonNegativeInt, ValidationError
 
 from mapper.core.config import Config
 from mapper.core.errors import DataError, VocabularyError
+from mapper.features.hamming import Bits
 from mapper.places.kernels import shared_weight
-from mapper.places.tree import Bits, Ids, WordTree
+from mapper.places.word_tree import Ids, WordTree
 from mapper.runtime import atomic
 
 DESCRIPTOR = "orb"
-"""What the bits are: detectors "orb" and "uniform-orb" both describe with it."""
+"""Kind of the descriptors: of detectors "orb" and "uniform-orb"."""
 DESCRIPTOR_BYTES = 32
 ONE = 32_768
-"""What the weights of an image add up to."""
+"""Sum of an image's weights."""
 
 _MAGIC = b"\x89mapper-words\r\n"
-"""Not text, and damaged by whoever takes it for text."""
+"""Not text, and recognisably damaged by any program that converts it as text."""
 _VERSION = 1
 SHIPPED = Path(__file__).with_name("orb.words")
 """Trained on synthetic logs by ``scripts/train_vocabulary.py``."""
@@ -45,12 +46,12 @@ class _Header(Config):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WordVector:
-    """What an image looks like: how much each word weighs in it, all weights together 1.
+    """Bag of words of an image: the weight of each word, normalised to the sum 1.
 
     Attributes:
         ids: (M,) int32 ascending words.
-        weights: (M,) uint16 positive, in units of 1 / ``ONE``, so that sums are exact in any order. There are
-            none in an image without features.
+        weights: (M,) uint16 positive, in units of 1 / ``ONE``, so that sums are exact in any order. M is 0
+            for an image without features.
     """
 
     ids: Ids
@@ -67,12 +68,12 @@ class WordVector:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vocabulary:
-    """Words of 256-bit binary descriptors, and how telling each word is.
+    """Words of 256-bit binary descriptors with their weights.
 
     Attributes:
-        tree: Finds words.
+        tree: Search tree of the words.
         idf: (W,) float64 inverse document frequency ln(N / N_w) of each word.
-        trained_on: What it was trained on, in one line.
+        trained_on: One line that describes the training images.
     """
 
     tree: WordTree
@@ -88,12 +89,12 @@ class Vocabulary:
 
     @property
     def words(self) -> int:
-        """How many words there are."""
+        """Number of words."""
         return len(self.idf)
 
     @property
     def levels(self) -> int:
-        """How many steps the deepest word is below the root."""
+        """Number of steps from the root to the deepest word."""
         return int(self.tree.depth.max())
 
     def words_of(self, bits: Bits) -> Ids:
@@ -103,12 +104,12 @@ class Vocabulary:
     def nodes_of(self, bits: Bits, *, level: int) -> Ids:
         """Return (N,) the node of each of (N, 4) descriptors, ``level`` steps below the root.
 
-        Whoever needs words too asks ``ancestors_of(words, level=level)`` and descends once.
+        ``ancestors_of(words, level=level)`` gives the same from known words without another descent.
         """
         return self.ancestors_of(self.words_of(bits), level=level)
 
     def ancestors_of(self, words: Ids, *, level: int) -> Ids:
-        """Return (N,) the node ``level`` steps below the root that each word lies under."""
+        """Return (N,) the ancestor of each word ``level`` steps below the root."""
         return self.tree.ancestors_of(words, level=level)
 
     def vector(self, words: Ids) -> WordVector:
@@ -118,11 +119,11 @@ class Vocabulary:
         total = reached[-1] if len(reached) and reached[-1] > 0.0 else 1.0
         # Rounding the running sum keeps the total exact.
         weights = np.diff(np.rint(ONE * (reached / total)), prepend=0.0).astype(np.uint16)
-        told = weights > 0
-        return WordVector(ids[told].astype(np.int32), weights[told])
+        positive = weights > 0
+        return WordVector(ids[positive].astype(np.int32), weights[positive])
 
     def save(self, path: Path) -> None:
-        """Write it to a file; the same vocabulary gives the same bytes. Atomic."""
+        """Write a file, atomically; the same vocabulary gives the same bytes."""
         header = _Header(
             descriptor=DESCRIPTOR,
             descriptor_bytes=DESCRIPTOR_BYTES,
@@ -137,9 +138,9 @@ class Vocabulary:
 
 
 def similarity(a: WordVector, b: WordVector) -> float:
-    """Return s = ½ Σ (|fA| + |fB| − |fA − fB|), from 0 to 1 (B5; Zhao et al. 2020, eq. 10).
+    """Return s = ½ Σ (|fA| + |fB| − |fA − fB|), from 0 to 1 (Zhao et al. 2020, eq. 10).
 
-    Weights are not negative, so that each term is the smaller of the two.
+    As weights are not negative, each term is the smaller of the two.
     """
     return int(shared_weight(a.ids, a.weights, b.ids, b.weights)) / ONE
 
@@ -148,8 +149,8 @@ def load_vocabulary(path: Path | None = None) -> Vocabulary:
     """Return the vocabulary of a file; None is the one that comes with the toolkit.
 
     Raises:
-        VocabularyError: There is no such file, or it is foreign, damaged, of another version or of other
-            descriptors than ORB's.
+        VocabularyError: The file is missing, no vocabulary, damaged, of another version, or of descriptors
+            other than ORB's.
     """
     path = path or SHIPPED
     try:

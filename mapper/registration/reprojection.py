@@ -6,22 +6,22 @@ from numba import njit
 from mapper.core.linear import solve_positive, twist_exp
 
 CHI2_2DOF, CHI2_3DOF = 5.991, 7.815
-"""95 % points of χ²: an image point without and with depth."""
+"""95 % quantiles of χ²: of an image point without and with depth."""
 
 HUBER_2DOF, HUBER_3DOF = np.sqrt(CHI2_2DOF), np.sqrt(CHI2_3DOF)
-"""Residual lengths at which Huber's kernel turns linear."""
+"""Residual lengths at which Huber's kernel becomes linear."""
 
 
 @njit(cache=True, nogil=True)
 def residual(T, point, measured, intrinsics, out):
-    """Write the residual (3,) of a world point in a camera, and return its camera-frame position.
+    """Write the residual (3,) of a world point in a camera, and return the point (x, y, z) in its frame.
 
     Args:
         T: (4, 4) T_camera_world.
         point: (3,) metres, world.
         measured: (3,) u, v in pixels and virtual disparity bf / z in pixels, NaN without depth.
         intrinsics: (5,) fx, fy, cx, cy and bf.
-        out: (3,) receives measured − predicted, 0 in the third place without depth.
+        out: (3,) measured − predicted, 0 in the third element without depth.
     """
     x = T[0, 0] * point[0] + T[0, 1] * point[1] + T[0, 2] * point[2] + T[0, 3]
     y = T[1, 0] * point[0] + T[1, 1] * point[1] + T[1, 2] * point[2] + T[1, 3]
@@ -68,7 +68,7 @@ def pose_jacobian(x, y, z, J, J_pose):
 
 @njit(cache=True, nogil=True)
 def _linearise(T, points, measured, weights, intrinsics, inlier, robust, H, g):
-    """Fill the normal equations and return the robust cost (Huber 1964)."""
+    """Write the normal equations and return the robust cost (Huber 1964)."""
     H[:, :] = 0.0
     g[:] = 0.0
     r = np.empty(3)
@@ -136,11 +136,11 @@ def refine_pose(T_camera_world, points, measured, weights, intrinsics, rounds, i
     Args:
         T_camera_world: (4, 4) first guess.
         points: (N, 3) metres, world.
-        measured: (N, 3) u, v, bf/z in pixels; NaN in the third place without depth.
+        measured: (N, 3) u, v, bf/z in pixels; NaN in the third column without depth.
         weights: (N, 3) inverse variances of the three, px⁻².
         intrinsics: (5,) fx, fy, cx, cy, bf.
-        rounds: Number of times the inliers are chosen.
-        iterations: Steps per round.
+        rounds: Number of times inliers are classified.
+        iterations: Largest number of steps per round.
     """
     T = T_camera_world.copy()
     inlier = np.ones(len(points), np.bool_)

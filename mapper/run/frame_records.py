@@ -25,7 +25,7 @@ _COLUMNS = (
     "inliers",
     "residual",
     "residual_unit",
-    "unseen",
+    "unobservable",
 )
 _NOTHING = Diagnostics(features=0, matches=0, inliers=0, residual=0.0, residual_unit="", method="")
 
@@ -84,7 +84,7 @@ def write_records(path: Path, records: Iterable[FrameRecord]) -> None:
                 how.inliers,
                 repr(float(how.residual)),
                 how.residual_unit,
-                how.unseen,
+                how.unobservable,
             ]
         )
     write_text(path, text.getvalue())
@@ -143,6 +143,7 @@ def _record(row: dict[str, str]) -> FrameRecord:
             residual=float(row["residual"]),
             residual_unit=row["residual_unit"],
             method=row["method"],
-            unseen=row.get("unseen", ""),  # runs of before 2026-11-21 have no such column
+            # Older runs have this column as "unseen", or not at all.
+            unobservable=row.get("unobservable", row.get("unseen", "")),
         ),
     )

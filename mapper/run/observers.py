@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 from mapper.core.geometry import Transform
+from mapper.features.frame_view import FrameView
 from mapper.loops.detector import LoopDetector
-from mapper.odometry.base import FrameResult, Matches, Seen
+from mapper.odometry.base import FeatureMatches, FrameResult
 from mapper.sources.base import FrameRef
 
 if TYPE_CHECKING:
@@ -29,8 +30,8 @@ class Step:
 
     entry: FrameRef
     track: FrameResult
-    view: Callable[[], Seen]
-    matches: Callable[[], Matches | None]
+    view: Callable[[], FrameView]
+    matches: Callable[[], FeatureMatches | None]
     detector: LoopDetector
 
 

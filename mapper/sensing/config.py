@@ -1,4 +1,4 @@
-"""How a sensor's depth scatters."""
+"""Settings of a depth sensor's noise."""
 
 import math
 from typing import TYPE_CHECKING, Self
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class DepthNoiseConfig(Config):
-    """σ_z = a + b·z + c·z², as ``mapper sensor depth`` fits it to planes.
+    """Depth noise σ_z = a + b·z + c·z², as ``mapper sensor depth`` fits it to planes.
 
     A sensor that triangulates has a = b = 0 and c = σ_disparity / bf (Khoshelham & Elberink 2012, eq. 10).
     """

@@ -1,4 +1,4 @@
-"""DIF, the depth image filter of the thesis."""
+"""DIF, the depth image filter of Somlyai (PhD thesis), alg. 4."""
 
 import numpy as np
 from numba import njit
@@ -9,15 +9,14 @@ from mapper.core.frames import DepthImage
 
 
 def dif(depth_m: DepthImage) -> DepthImage:
-    """Return every pixel's mean over the measured pixels of its 3×3 neighbourhood, itself included.
+    """Return the mean of the measured pixels in the 3×3 neighbourhood of every pixel, itself included.
 
-    Somlyai, PhD thesis, Óbuda University, algorithm 4 (A2). Zeros are no measurements and do not enter the
-    mean, so edges of holes keep their depth and holes one pixel deep are filled; a pixel with no measurement
-    around it stays 0.
+    Zeros are no measurements and do not enter the mean, so edges of holes keep their depth and holes one
+    pixel deep are filled; a pixel with no measurement around it stays 0.
 
     Args:
-        depth_m: (H, W) float32 depth, metres; 0 is no measurement. At the border, which the thesis leaves
-            out, the part of the neighbourhood inside the image counts.
+        depth_m: (H, W) float32 depth, metres; 0 is no measurement. At the border, which the thesis does not
+            define, the part of the neighbourhood inside the image is used.
 
     Raises:
         DataError: The image is not (H, W) float32.
@@ -32,9 +31,9 @@ def dif(depth_m: DepthImage) -> DepthImage:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _mean_3x3(depth_m: NDArray[np.float32], filtered: NDArray[np.float32]) -> None:
-    """Add up columns of three first, then three of those: six additions a pixel in place of sixteen."""
+    """Sum columns of three first, then three columns: six additions per pixel instead of sixteen."""
     height, width = depth_m.shape
-    # A column of zeros on either side stands for "nothing measured" beyond the border.
+    # A column of zeros on either side is "not measured" beyond the border.
     sums = np.zeros(width + 2, np.float32)
     counts = np.zeros(width + 2, np.float32)
     for y in range(height):

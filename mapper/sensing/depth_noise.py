@@ -1,4 +1,4 @@
-"""How well the depth of a feature is known."""
+"""Standard deviation of the depth of a feature."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,17 +19,16 @@ def feature_depth_sigma_m(
 ) -> Array:
     """Return (N,) standard deviations of the depths of features: the sensor's noise, and the slope.
 
-    A depth is read where a feature was found. By what the feature misses its place in the image, the
-    depth is that of another point: on a slope, or beside an edge, this is more than the noise. How
-    the depth varies within one σ along either axis is looked up in the image after DIF, so that
-    noise is not counted twice.
+    The depth is read at the detected pixel. Through the error of that pixel it is the depth of another point,
+    and on a slope or beside an edge the difference exceeds the noise. The variation of the depth within one
+    σ along either axis is taken from the image after DIF, so that noise is not counted twice.
 
     Args:
         depth_m: (H, W) depth image, 0 is no measurement.
         columns: (N,) pixels of the features.
         rows: (N,).
-        sigma_px: (N,) standard deviation of a feature's place, along both axes.
-        noise: The sensor's.
+        sigma_px: (N,) standard deviation of a feature's pixel, along both axes.
+        noise: Depth noise of the sensor.
     """
     smooth_m = dif(depth_m)
     height, width = depth_m.shape
@@ -41,6 +40,6 @@ def feature_depth_sigma_m(
         column = np.clip(columns + across * reach_px, 0, width - 1)
         there_m = smooth_m[row, column].astype(np.float64)
         squares += np.where(there_m > 0.0, (there_m - here_m) ** 2, 0.0)
-    slope_m = np.sqrt(0.5 * squares) * sigma_px / reach_px  # two looks along each axis; the axes add up
+    slope_m = np.sqrt(0.5 * squares) * sigma_px / reach_px  # mean of both sides of an axis; the axes add up
     sigma_m: Array = np.hypot(noise.sigma_m(depth_m[rows, columns].astype(np.float64)), slope_m)
     return sigma_m

@@ -1,4 +1,4 @@
-"""Wheel odometry: from encoders and steering to poses, and the pose at any time in between."""
+"""Wheel kinematics: poses from encoders and steering, and the pose and the path at any time."""
 
 from itertools import pairwise
 
@@ -12,12 +12,12 @@ from mapper.core.trajectory import Trajectory
 def driven(stamps_ns: Stamps, path_m: Array, steering_rad: Array, *, wheelbase_m: float) -> Trajectory:
     """Integrate the bicycle model: the turn per metre is tan(steering) / wheelbase (LaValle 2006, §13.1.2.1).
 
-    Between two readings the turn per metre is the mean of theirs, so that the way is an arc.
+    Between two readings the turn per metre is the mean of theirs, so that the path is an arc.
 
     Args:
         stamps_ns: (N,) increasing times of the readings.
-        path_m: (N,) driven by the rear axle since whenever the encoder began; less when driving back.
-        steering_rad: (N,) angle of the front wheel, to the left positive.
+        path_m: (N,) encoder's distance of the rear axle, from any origin; it decreases in reverse.
+        steering_rad: (N,) angle of the front wheel, positive to the left.
         wheelbase_m: Distance between the axles.
 
     Returns:
@@ -52,10 +52,10 @@ def pose_at(wheels: Trajectory, stamp_ns: int, *, max_gap_ns: int) -> Transform 
 
 
 class Odometer:
-    """Counts the metres that wheels drove and the radians they turned, to and fro."""
+    """Path length and total turn of the wheels' poses, in either direction."""
 
     def __init__(self, wheels: Trajectory) -> None:
-        """Add up the ways between the poses."""
+        """Sum the distances and angles between consecutive poses."""
         steps_m = np.linalg.norm(np.diff(wheels.positions_world, axis=0), axis=1)
         chords = np.linalg.norm(np.diff(wheels.T_world_body[:, :3, :3], axis=0), axis=(1, 2))
         steps_rad = 2.0 * np.arcsin(

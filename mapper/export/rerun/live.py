@@ -18,10 +18,10 @@ from mapper.core.geometry import Array, Transform, inverse
 from mapper.export.palette import ACCEPTED, ESTIMATE, FACTORS, REJECTED, Rgb
 from mapper.export.rerun.finished import extent, in_words, log_run
 from mapper.export.rerun.recording import RerunLog, recorded, transform_of
-from mapper.features.view import View
+from mapper.features.frame_view import ImageView
 from mapper.mapping.fusion import Maps
 from mapper.mapping.thumbnails import encode_jpeg, shrunk_camera
-from mapper.odometry.base import FrameResult, Matches
+from mapper.odometry.base import FeatureMatches, FrameResult
 from mapper.run.folder import Run
 from mapper.run.observers import Step
 from mapper.run.results import RunResults
@@ -112,23 +112,25 @@ class LiveRerun:
         image = rr.EncodedImage(contents=jpeg, media_type="image/jpeg")
         self._log.log(self._log.camera, image, stamp_ns=frame.stamp_ns)
         view = step.view()
-        if isinstance(view, View):
+        if isinstance(view, ImageView):
             scale = camera.width_px / frame.camera.width_px
             self._show_features(view, step.matches(), lambda px: (frame.camera.distort(px) + 0.5) * scale)
 
-    def _show_features(self, view: View, matches: Matches | None, drawn: Callable[[Array], Array]) -> None:
+    def _show_features(
+        self, view: ImageView, matches: FeatureMatches | None, drawn: Callable[[Array], Array]
+    ) -> None:
         """Log the features, those that hold the pose in another colour, and the ways that these came."""
-        nothing = Matches(np.zeros(len(view), np.bool_), np.full((len(view), 2), np.nan))
+        nothing = FeatureMatches(np.zeros(len(view), np.bool_), np.full((len(view), 2), np.nan))
         held = matches or nothing
         dots = rr.Points2D(
             drawn(view.pixels),
             colors=np.where(
-                held.agreeing[:, None], np.array(_MATCHED, np.uint8), np.array(_UNMATCHED, np.uint8)
+                held.is_inlier[:, None], np.array(_MATCHED, np.uint8), np.array(_UNMATCHED, np.uint8)
             ),
             radii=rr.Radius.ui_points(1.5),
         )
-        moved = np.isfinite(held.before_px[:, 0])
-        chain = np.stack([drawn(held.before_px[moved]), drawn(view.pixels[moved])], axis=1)
+        moved = np.isfinite(held.previous_px[:, 0])
+        chain = np.stack([drawn(held.previous_px[moved]), drawn(view.pixels[moved])], axis=1)
         lines = rr.LineStrips2D(chain, colors=[_MATCHED], radii=rr.Radius.ui_points(0.7))
         self._log.log(f"{self._log.camera}/features", dots, stamp_ns=view.stamp_ns)
         self._log.log(f"{self._log.camera}/matches", lines, stamp_ns=view.stamp_ns)

@@ -1,1 +1,1 @@
-"""Tracking against a local map of keyframes, refined by local bundle adjustment."""
+"""Visual odometry against a local map of keyframes, refined by local bundle adjustment."""

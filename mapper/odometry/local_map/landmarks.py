@@ -1,4 +1,4 @@
-"""The map that frames are tracked against: keyframes, landmarks, and which sees which."""
+"""Local map: keyframes, landmarks, and the observations of landmarks in keyframes."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -7,16 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, adjoint, apply, inverse
-from mapper.odometry.local_map.bundle import adjust
-from mapper.odometry.local_map.gather import count_observers, observations_of
-from mapper.odometry.local_map.observation import Observation
-from mapper.odometry.local_map.table import Table
+from mapper.odometry.local_map.bundle_adjustment import adjust
+from mapper.odometry.local_map.growing_table import GrowingTable
+from mapper.odometry.local_map.image_observation import ImageObservation
+from mapper.odometry.local_map.landmark_kernels import count_observers, observations_of
 from mapper.registration.reprojection import normal_matrix
 
 Ids = NDArray[np.int32]
 
 _WEAK_PRIOR = np.diag([1.0] * 3 + [0.01] * 3)
-"""1 rad and 10 m: keeps the information positive definite where a few landmarks leave directions open."""
+"""1 rad and 10 m: keeps the information positive definite where few landmarks leave it singular."""
 MIN_SHARED_LANDMARKS = 15
 """Keyframes that share fewer are not covisible (Mur-Artal, Montiel & Tardós 2015, §III-D)."""
 _MIN_FOUND_RATIO = 0.25
@@ -32,26 +32,26 @@ class Keyframe:
     Attributes:
         observation: Its features.
         T_camera_world: (4, 4) current estimate.
-        landmark_of_feature: (N,) int32 landmark that each feature shows, −1 for none.
-        origin: First keyframe of the sub-map it belongs to; nothing ties sub-maps to each other.
+        landmark_of_feature: (N,) int32 landmark of each feature, −1 for none.
+        origin: First keyframe of its sub-map; sub-maps are not connected to each other.
     """
 
-    observation: Observation
+    observation: ImageObservation
     T_camera_world: Transform
     landmark_of_feature: Ids
     origin: int
 
 
 class LandmarkMap:
-    """Keyframes and landmarks, refined together in windows.
+    """Map of keyframes and landmarks, refined together in windows.
 
     A landmark's observations form a linked list, newest first, so that adding one is cheap and compiled code
-    can walk them without Python objects.
+    can traverse them without Python objects.
     """
 
     def __init__(self, *, scale_factor: float) -> None:
         self.keyframes: list[Keyframe] = []
-        self.landmarks = Table(
+        self.landmarks = GrowingTable(
             position=((3,), np.float64),
             direction=((3,), np.float64),
             bits=((4,), np.uint64),
@@ -61,7 +61,7 @@ class LandmarkMap:
             found=((), np.int32),
             observers=((), np.int32),
         )
-        self._observations = Table(
+        self._observations = GrowingTable(
             older=((), np.int32),
             keyframe=((), np.int32),
             feature=((), np.int32),
@@ -73,21 +73,21 @@ class LandmarkMap:
 
     def add_keyframe(
         self,
-        observation: Observation,
+        observation: ImageObservation,
         T_camera_world: Transform,
         landmark_of_feature: Ids,
         *,
         new: NDArray[np.bool_],
-        beside: int | None,
+        neighbour: int | None,
     ) -> int:
-        """Add a keyframe that sees known landmarks, and create landmarks from its ``new`` features.
+        """Add a keyframe that observes known landmarks, and create landmarks from its ``new`` features.
 
         Args:
             observation: The frame's features.
             T_camera_world: (4, 4).
             landmark_of_feature: (N,) known landmark of each feature, −1 for none.
             new: (N,) features with depth that become landmarks.
-            beside: A keyframe of the same sub-map; None begins a new one.
+            neighbour: A keyframe of the same sub-map; None begins a new one.
 
         Returns:
             The keyframe's index.
@@ -109,7 +109,7 @@ class LandmarkMap:
             found=1,
             observers=0,
         )
-        origin = index if beside is None else self.keyframes[beside].origin
+        origin = index if neighbour is None else self.keyframes[neighbour].origin
         self.keyframes.append(Keyframe(observation, T_camera_world, landmark_of_feature, origin))
         self._link(index)
         return index
@@ -119,9 +119,9 @@ class LandmarkMap:
         features = np.flatnonzero(keyframe.landmark_of_feature >= 0)
         ids = keyframe.landmark_of_feature[features]
         centre_world = inverse(keyframe.T_camera_world)[:3, 3]
-        view = self.landmarks["position"][ids] - centre_world
+        ray = self.landmarks["position"][ids] - centre_world
         self.landmarks["observers"][ids] += 1
-        self.landmarks["direction"][ids] += view / np.linalg.norm(view, axis=1, keepdims=True)
+        self.landmarks["direction"][ids] += ray / np.linalg.norm(ray, axis=1, keepdims=True)
         self.landmarks["newest"][ids] = self._observations.append(
             len(features),
             older=self.landmarks["newest"][ids],
@@ -131,8 +131,8 @@ class LandmarkMap:
             weights=keyframe.observation.weights[features],
         )
 
-    def shared(self, landmarks: Ids) -> NDArray[np.int64]:
-        """Return (K,) how many of the landmarks each keyframe sees."""
+    def shared_counts(self, landmarks: Ids) -> NDArray[np.int64]:
+        """Return (K,) how many of the landmarks each keyframe observes."""
         counts: NDArray[np.int64] = count_observers(
             landmarks,
             self.landmarks["newest"],
@@ -143,49 +143,49 @@ class LandmarkMap:
         return counts
 
     def latest(self, reference: int) -> list[int]:
-        """Return a keyframe and the newest ones, newest first: those that tracking knows to be near."""
+        """Return a keyframe and then the newest ones, newest first."""
         newest = range(len(self.keyframes) - 1, max(len(self.keyframes) - 1 - _NEWEST, -1), -1)
         return list(dict.fromkeys([reference, *newest]))
 
-    def before(self, index: int) -> int:
-        """Return the keyframe of the same sub-map that came last before one that is not its first."""
+    def previous(self, index: int) -> int:
+        """Return the keyframe before another one of the same sub-map, of which it is not the first."""
         origin = self.keyframes[index].origin
         return max(k for k in range(index) if self.keyframes[k].origin == origin)
 
-    def seen_by(self, index: int) -> Ids:
-        """Return the landmarks that a keyframe sees, in feature order."""
+    def landmarks_of(self, index: int) -> Ids:
+        """Return the landmarks that a keyframe observes, in feature order."""
         ids = self.keyframes[index].landmark_of_feature
         return ids[ids >= 0]
 
-    def seen_by_any(self, keyframes: Iterable[int], *, except_for: Ids) -> Ids:
-        """Return, in increasing order, the landmarks that any of the keyframes sees."""
-        seen = np.zeros(self.landmarks.size + 1, np.bool_)
+    def landmarks_of_any(self, keyframes: Iterable[int], *, except_for: Ids) -> Ids:
+        """Return, in increasing order, the landmarks that any of the keyframes observes."""
+        observed = np.zeros(self.landmarks.size + 1, np.bool_)
         for k in keyframes:
-            seen[self.keyframes[k].landmark_of_feature] = True  # −1, "none", marks the spare last place
-        seen[-1] = False
-        seen[except_for] = False
-        return np.flatnonzero(seen).astype(np.int32)
+            observed[self.keyframes[k].landmark_of_feature] = True  # −1, none, marks the spare last entry
+        observed[-1] = False
+        observed[except_for] = False
+        return np.flatnonzero(observed).astype(np.int32)
 
     def covisible(self, index: int, *, min_shared: int) -> list[tuple[int, int]]:
-        """Return (keyframe, shared landmarks) of those that share enough; most first, newer wins a tie."""
-        counts = self.shared(self.seen_by(index))
+        """Return (keyframe, shared landmarks) of those that share enough: most first, of equals the newer."""
+        counts = self.shared_counts(self.landmarks_of(index))
         counts[index] = 0
         others = np.flatnonzero(counts >= min_shared)
         order = np.lexsort((-others, -counts[others]))
         return [(int(k), int(counts[k])) for k in others[order]]
 
     def refine(self, index: int, *, window: int) -> None:
-        """Adjust a keyframe, its most covisible ones and all they see; drop observations that then disagree.
+        """Adjust a keyframe, its most covisible ones and their landmarks; drop observations that disagree.
 
-        Keyframes outside the window that see the same landmarks hold them in place; a sub-map's first never
-        moves.
+        Keyframes outside the window that observe these landmarks take part but stay fixed, as does the first
+        of a sub-map.
         """
         covisible = self.covisible(index, min_shared=MIN_SHARED_LANDMARKS)
         members = [index, *(k for k, _ in covisible[: window - 1])]
         movable = sorted(k for k in members if k != self.keyframes[k].origin)
         if not movable:
             return
-        landmarks = self.seen_by_any(members, except_for=np.empty(0, np.int32))
+        landmarks = self.landmarks_of_any(members, except_for=np.empty(0, np.int32))
         first, observations = observations_of(
             landmarks, self.landmarks["newest"], self._observations["older"], self._observations["keyframe"]
         )
@@ -221,30 +221,30 @@ class LandmarkMap:
         np.subtract.at(self.landmarks["observers"], np.array(landmarks, dtype=np.intp), 1)
 
     def cull(self) -> None:
-        """Forget landmarks past their probation that no second keyframe confirmed or tracking rarely finds.
+        """Remove young landmarks that no second keyframe observes or that tracking rarely finds.
 
-        Two keyframes after its birth a landmark must have a second observer; mismatches and depth errors at
-        object edges rarely get one (Mur-Artal & Tardós 2017, §VI-B).
+        Two keyframes after its creation a landmark must have a second observer; mismatches and depth errors
+        at object edges rarely get one (Mur-Artal, Montiel & Tardós 2015, §VI-B).
         """
         index = len(self.keyframes) - 1
         recent = np.arange(self._first_landmark[max(index - 3, 0)], self._first_landmark[max(index - 1, 0)])
         unconfirmed = self.landmarks["observers"][recent] == 1
         found, visible = self.landmarks["found"][recent], self.landmarks["visible"][recent]
-        forgotten = recent[unconfirmed | (found < _MIN_FOUND_RATIO * visible)].astype(np.int32)
+        removed = recent[unconfirmed | (found < _MIN_FOUND_RATIO * visible)].astype(np.int32)
         _, observations = observations_of(
-            forgotten, self.landmarks["newest"], self._observations["older"], self._observations["keyframe"]
+            removed, self.landmarks["newest"], self._observations["older"], self._observations["keyframe"]
         )
         self._unlink(observations)
 
     def information(self, target: int, source: int) -> Array:
-        """Return the (6, 6) information that shared landmarks give about the source's pose in the target.
+        """Return the (6, 6) information of the source's pose in the target from shared landmarks.
 
         The landmarks are taken as fixed in the target. They were measured no better than the source's
         features, so the information is halved. Tangent of the source's body, (rotation, translation).
         """
         keyframe = self.keyframes[source]
         shared, _, features = np.intersect1d(
-            self.seen_by(target), keyframe.landmark_of_feature, return_indices=True
+            self.landmarks_of(target), keyframe.landmark_of_feature, return_indices=True
         )
         observation = keyframe.observation
         H_camera = 0.5 * normal_matrix(

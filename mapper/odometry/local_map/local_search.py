@@ -1,4 +1,4 @@
-"""The second half of placing a frame: what the local map should show is sought near its projection."""
+"""Local map search: landmarks of covisible keyframes are matched near their projections."""
 
 import math
 
@@ -6,26 +6,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform
-from mapper.features.windowed import Words, match_windows
-from mapper.odometry.config import KeyframeConfig
-from mapper.odometry.local_map.gather import project_visible
+from mapper.features.hamming import Bits
+from mapper.features.window_matching import match_windows
+from mapper.odometry.config import KeyframeOdometryConfig
+from mapper.odometry.local_map.image_observation import ImageObservation
+from mapper.odometry.local_map.landmark_kernels import project_visible
 from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
-from mapper.odometry.local_map.observation import Observation
 from mapper.odometry.local_map.pose_tracker import MAX_HAMMING, TrackedPose, refined, rms_px
 
 _MAX_RATIO = 0.8
 
 
 class LocalSearch:
-    """Searches the landmarks of the keyframes around a first pose."""
+    """Search for the landmarks of the keyframes around a first pose."""
 
-    def __init__(self, config: KeyframeConfig, landmark_map: LandmarkMap) -> None:
+    def __init__(self, config: KeyframeOdometryConfig, landmark_map: LandmarkMap) -> None:
         self._config = config
         self._map = landmark_map
 
-    def placed(
+    def refine(
         self,
-        observation: Observation,
+        observation: ImageObservation,
         T_camera_world: Transform,
         landmark_of_feature: Ids,
         *,
@@ -37,18 +38,18 @@ class LocalSearch:
         Args:
             observation: The frame.
             T_camera_world: (4, 4) first pose, good to a few pixels.
-            landmark_of_feature: (N,) what led to it: the landmark of each feature, −1 for none.
-            reference: Keyframe to search if none of the features shows a landmark.
-            method: What the placement is to say of how it was found.
+            landmark_of_feature: (N,) landmark of each feature matched so far, −1 for none.
+            reference: Keyframe to search if no feature is matched.
+            method: Step that found the first pose, for ``TrackedPose.method``.
 
         Returns:
-            None when too few landmarks agree.
+            The refined pose; None if too few landmarks agree.
         """
         config, landmarks = self._config, self._map.landmarks
         matched = landmark_of_feature[landmark_of_feature >= 0]
-        counts = self._map.shared(matched)
+        counts = self._map.shared_counts(matched)
         order = [int(k) for k in np.argsort(-counts, kind="stable") if counts[k] > 0] or [reference]
-        nearby = self._map.seen_by_any(order[: config.local_keyframes], except_for=matched)
+        nearby = self._map.landmarks_of_any(order[: config.local_keyframes], except_for=matched)
         rows, pixels, octave = project_visible(
             nearby,
             landmarks["position"],
@@ -96,16 +97,16 @@ class LocalSearch:
 
     def match_near(
         self,
-        observation: Observation,
+        observation: ImageObservation,
         pixels: Array,
         octave: NDArray[np.int32],
-        bits: Words,
+        bits: Bits,
         *,
         search_px: float,
         taken: NDArray[np.bool_],
         max_ratio: float,
     ) -> Ids:
-        """Return, per predicted pixel, the matching feature or −1; coarser octaves search wider."""
+        """Return, per predicted pixel, the matching feature or −1; the radius grows with the octave."""
         grid = observation.grid
         matched: Ids = match_windows(
             pixels,

@@ -1,4 +1,4 @@
-"""Frame by frame against a local map of keyframes (after Mur-Artal & Tardós 2017; Zhao et al. 2020)."""
+"""Odometry against a local map of keyframes and landmarks (Mur-Artal & Tardós 2017; Zhao et al. 2020)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -10,17 +10,17 @@ from mapper.core.deskew import Twist
 from mapper.core.frames import Frame
 from mapper.core.geometry import Transform, inverse
 from mapper.features.factory import build_detector
-from mapper.features.view import View
+from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
-from mapper.odometry.base import Diagnostics, FrameResult, Matches
-from mapper.odometry.config import KeyframeConfig
+from mapper.odometry.base import Diagnostics, FeatureMatches, FrameOdometry, FrameResult
+from mapper.odometry.config import KeyframeOdometryConfig
+from mapper.odometry.local_map.image_observation import ImageObservation, observe_image
+from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
 from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
-from mapper.odometry.local_map.observation import Observation, observe
 from mapper.odometry.local_map.pose_tracker import PoseTracker, TrackedPose, unmatched
 from mapper.odometry.local_map.relocalizer import Relocalizer
 from mapper.places.vocabulary import load_vocabulary
-from mapper.sources.base import FrameRef
 
 _MIN_START_FEATURES = 100
 """Near features that a sub-map's first frame must have: a few times ``min_inliers``."""
@@ -29,22 +29,18 @@ _MIN_KEYFRAME_LANDMARKS = 200
 the next frame does not begin weak."""
 _FACTORS_PER_KEYFRAME = 4
 """Factors of each keyframe, to the earlier ones that share most landmarks with it."""
-_MIN_KEYFRAME_GAP = 4
-"""Frames for which a keyframe is young."""
-_HASTY_KEYFRAME_RATIO = 0.5
-"""``keyframe_ratio`` while the last keyframe is young and the inliers are not weak: for fast motion."""
 
 MakePoseTracker = Callable[[LandmarkMap, Relocalizer], PoseTracker]
 
 
-class KeyframeOdometry:
-    """Tracks against keyframes' landmarks and refines both by local bundle adjustment.
+class KeyframeOdometry(FrameOdometry[ImageObservation]):
+    """Odometry against keyframes' landmarks, both refined by local bundle adjustment.
 
     Keyframes are the graph's nodes, numbered from 0. Their poses keep improving while they are in the window,
-    so all factors are handed out by ``finish``.
+    so ``finish`` returns all factors.
     """
 
-    def __init__(self, config: KeyframeConfig, make_tracker: MakePoseTracker) -> None:
+    def __init__(self, config: KeyframeOdometryConfig, make_tracker: MakePoseTracker) -> None:
         self._config = config
         self._detector = build_detector(config.detector)
         self._map = LandmarkMap(scale_factor=self._detector.scale_factor)
@@ -53,66 +49,58 @@ class KeyframeOdometry:
         self._tracker = make_tracker(self._map, self._relocalizer)
         self._last: TrackedPose | None = None
         self._before_last: TrackedPose | None = None
-        self._most_inliers = 0  # since the last keyframe
-        self._frames_since_keyframe = 0
-        self._lost_frames = 0  # since the last one that was placed
-        self._stray_frames = 0  # those of them that show enough to begin with
+        self._decision = KeyframeDecision(config)
+        self._lost_frames = 0  # since the last tracked one
+        self._unknown_frames = 0  # those of them with enough features to begin a sub-map
 
-    def read(self, entry: FrameRef) -> Observation:
-        """Observe a frame of a log, without its colours. Pure.
-
-        Raises:
-            FrameError: It cannot be read, or not be used.
-        """
-        return self.observe(entry.load(colour=False))
-
-    def observe(self, frame: Frame) -> Observation:
+    def observe(self, frame: Frame) -> ImageObservation:
         """Detect features and look up their depth. Pure; safe in any thread.
 
         Raises:
             FrameError: The frame is a bare scan.
         """
-        return observe(frame, self._detector, self._vocabulary, self._config)
+        return observe_image(frame, self._detector, self._vocabulary, self._config)
 
-    def track(self, observation: Observation) -> FrameResult:
-        """Place the next frame, in time order."""
-        tracked_pose = None if self._last is None else self._place(observation, self._last)
+    def track(self, observation: ImageObservation) -> FrameResult:
+        """Track the next frame, in time order."""
+        tracked_pose = None if self._last is None else self._find_pose(observation, self._last)
         if tracked_pose is None:
             return self._not_found(observation)
-        # What came before a gap says nothing about the motion after it.
+        # The motion before a gap does not predict the motion after it.
         before_last = None if self._lost_frames else self._last
-        self._lost_frames = self._stray_frames = 0
-        self._frames_since_keyframe += 1
-        self._most_inliers = max(self._most_inliers, tracked_pose.inliers)
-        is_keyframe, seen_from = self._wants_keyframe(tracked_pose), tracked_pose.reference
+        self._lost_frames = self._unknown_frames = 0
+        reference = tracked_pose.reference
+        is_keyframe = self._decision.is_due(tracked_pose, self._near_features(observation))
         if is_keyframe:
-            tracked_pose = self._keep(tracked_pose, beside=seen_from)
+            tracked_pose = self._add_keyframe(tracked_pose, neighbour=reference)
         self._before_last, self._last = before_last, tracked_pose
-        links = [self._factor(seen_from, tracked_pose.reference)] if is_keyframe else []
-        return self._track(tracked_pose, is_keyframe=is_keyframe, links=links)
+        links = [self._factor(reference, tracked_pose.reference)] if is_keyframe else []
+        return self._result(tracked_pose, is_keyframe=is_keyframe, links=links)
 
-    def view(self, observation: Observation, _twist: Twist | None = None, /) -> View:
-        """Return what a place is recognised by. Pure."""
+    def view(self, observation: ImageObservation, _twist: Twist | None = None, /) -> ImageView:
+        """Return the view for place recognition. Pure."""
         return observation.view()
 
-    def matches(self) -> Matches | None:
-        """Return which features show landmarks, and where the last frame, or else a keyframe, had them."""
-        here = self._last
-        if here is None or self._lost_frames:
+    def matches(self) -> FeatureMatches | None:
+        """Return the features matched to landmarks, and these landmarks' pixels in an earlier frame."""
+        last = self._last
+        if last is None or self._lost_frames:
             return None
-        landmarks = here.landmark_of_feature
-        before_px = np.full((len(landmarks), 2), np.nan)
-        for seen in (self._map.keyframes[here.reference], self._before_last):
-            if seen is not None and seen.observation is not here.observation:
-                common, now, then = np.intersect1d(landmarks, seen.landmark_of_feature, return_indices=True)
+        landmarks = last.landmark_of_feature
+        previous_px = np.full((len(landmarks), 2), np.nan)
+        for earlier in (self._map.keyframes[last.reference], self._before_last):
+            if earlier is not None and earlier.observation is not last.observation:
+                common, now, then = np.intersect1d(
+                    landmarks, earlier.landmark_of_feature, return_indices=True
+                )
                 now, then = now[common >= 0], then[common >= 0]
-                before_px[now] = seen.observation.pixels[then]
-        return Matches(landmarks >= 0, before_px)
+                previous_px[now] = earlier.observation.pixels[then]
+        return FeatureMatches(landmarks >= 0, previous_px)
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return a factor from every keyframe to those earlier ones that share most landmarks with it.
 
-        A sub-map's first keyframe has none: nothing says where it lies.
+        The first keyframe of a sub-map has none, as its pose in other sub-maps is unknown.
         """
         factors = []
         for j, keyframe in enumerate(self._map.keyframes):
@@ -120,12 +108,12 @@ class KeyframeOdometry:
                 continue
             earlier = [(k, shared) for k, shared in self._map.covisible(j, min_shared=1) if k < j]
             strong = [k for k, shared in earlier if shared >= MIN_SHARED_LANDMARKS]
-            weak = [k for k, _ in earlier[:1]] or [self._map.before(j)]
+            weak = [k for k, _ in earlier[:1]] or [self._map.previous(j)]
             factors += [self._factor(i, j) for i in strong[:_FACTORS_PER_KEYFRAME] or weak]
         return factors
 
     def _factor(self, i: int, j: int) -> BetweenFactor:
-        """Return how two keyframes lie to each other by the map as it is."""
+        """Return the relative pose of two keyframes in the current map."""
         T_world_i, T_world_j = (
             _body_pose(keyframe.observation, keyframe.T_camera_world)
             for keyframe in (self._map.keyframes[i], self._map.keyframes[j])
@@ -133,66 +121,53 @@ class KeyframeOdometry:
         T_i_j = inverse(T_world_i) @ T_world_j
         return BetweenFactor(i, j, T_i_j, with_model_error(self._map.information(i, j), T_i_j))
 
-    def _not_found(self, observation: Observation) -> FrameResult:
-        """Give the frame up, or begin a new sub-map with it once enough frames showed nothing known."""
-        if self._near(observation) >= _MIN_START_FEATURES:
-            self._stray_frames += 1
-            if self._last is None or 0 < self._config.max_lost_frames < self._stray_frames:
-                return self._begin(observation)
+    def _not_found(self, observation: ImageObservation) -> FrameResult:
+        """Return a lost frame, or begin a new sub-map with it once enough frames matched no landmarks."""
+        if self._near_features(observation) >= _MIN_START_FEATURES:
+            self._unknown_frames += 1
+            if self._last is None or 0 < self._config.max_lost_frames < self._unknown_frames:
+                return self._begin_sub_map(observation)
         return self._lost(observation)
 
-    def _begin(self, observation: Observation) -> FrameResult:
-        """Make the frame a sub-map's first keyframe: the world's origin, or where the camera was last."""
+    def _begin_sub_map(self, observation: ImageObservation) -> FrameResult:
+        """Make the frame a sub-map's first keyframe, at the world's origin or the last tracked pose."""
         last = self._last
         T_camera_world = inverse(observation.T_body_camera) if last is None else last.T_camera_world
         start = TrackedPose(observation, T_camera_world, unmatched(observation), 0, 0, 0.0, "start")
-        self._lost_frames = self._stray_frames = 0
-        self._before_last, self._last = None, self._keep(start, beside=None)
-        return self._track(self._last, is_keyframe=True)
+        self._lost_frames = self._unknown_frames = 0
+        self._before_last, self._last = None, self._add_keyframe(start, neighbour=None)
+        return self._result(self._last, is_keyframe=True)
 
-    def _place(self, observation: Observation, last: TrackedPose) -> TrackedPose | None:
-        """Follow the motion; once that fails, look through the keyframes that look alike."""
+    def _find_pose(self, observation: ImageObservation, last: TrackedPose) -> TrackedPose | None:
+        """Track from the last frame; if that fails, or it was lost, relocalise among similar keyframes."""
         if self._lost_frames == 0:
-            tracked_pose = self._tracker.place(observation, last, self._before_last)
+            tracked_pose = self._tracker.track(observation, last, self._before_last)
             if tracked_pose is not None:
                 return tracked_pose
-        here_world = inverse(last.T_camera_world)[:3, 3]
-        candidates = self._relocalizer.candidates(observation, here_world)
-        return self._relocalizer.among(candidates, observation, method="relocalised")
+        candidates = self._relocalizer.candidates(observation, inverse(last.T_camera_world)[:3, 3])
+        return self._relocalizer.best_among(candidates, observation, method="relocalised")
 
-    def _wants_keyframe(self, tracked_pose: TrackedPose) -> bool:
-        config = self._config
-        if self._frames_since_keyframe >= config.max_keyframe_gap:
-            return True
-        kept_ratio = tracked_pose.inliers / self._most_inliers
-        weak = tracked_pose.inliers < config.weak_inliers
-        if self._frames_since_keyframe < _MIN_KEYFRAME_GAP and not weak:
-            return kept_ratio < _HASTY_KEYFRAME_RATIO
-        # Landmarks left behind at one edge of a view hold its pose badly, however many they are.
-        mapped = tracked_pose.inliers / max(self._near(tracked_pose.observation), 1)
-        return kept_ratio < config.keyframe_ratio or mapped < config.mapped_ratio
-
-    def _near(self, observation: Observation) -> int:
-        """Return how many features are near enough to become landmarks."""
+    def _near_features(self, observation: ImageObservation) -> int:
+        """Return the number of features near enough to become landmarks."""
         return int((observation.points_camera[:, 2] <= self._config.max_depth_m).sum())
 
-    def _keep(self, tracked_pose: TrackedPose, *, beside: int | None) -> TrackedPose:
-        """Turn a placed frame into a keyframe, refine the map around it, and return it as refined.
+    def _add_keyframe(self, tracked_pose: TrackedPose, *, neighbour: int | None) -> TrackedPose:
+        """Turn a tracked frame into a keyframe, refine the map around it, and return its refined pose.
 
-        ``beside`` is a keyframe of the sub-map it was placed in; None begins a new one.
+        ``neighbour`` is a keyframe of the sub-map in which it was tracked; None begins a new one.
         """
         config, observation = self._config, tracked_pose.observation
         index = self._map.add_keyframe(
             observation,
             tracked_pose.T_camera_world,
             tracked_pose.landmark_of_feature,
-            new=self._worth_mapping(tracked_pose),
-            beside=beside,
+            new=self._new_landmarks(tracked_pose),
+            neighbour=neighbour,
         )
         self._relocalizer.add(index)
         self._map.refine(index, window=config.bundle_keyframes)
         self._map.cull()
-        self._most_inliers, self._frames_since_keyframe = 0, 0
+        self._decision.restart()
         keyframe = self._map.keyframes[index]
         return replace(
             tracked_pose,
@@ -201,18 +176,18 @@ class KeyframeOdometry:
             reference=index,
         )
 
-    def _worth_mapping(self, tracked_pose: TrackedPose) -> NDArray[np.bool_]:
-        """Return (N,) which features become landmarks: the near ones, and deeper ones while those are few."""
+    def _new_landmarks(self, tracked_pose: TrackedPose) -> NDArray[np.bool_]:
+        """Return (N,) which features become landmarks: the near ones, and deeper ones if those are few."""
         depth_m = tracked_pose.observation.points_camera[:, 2]
         unmapped = tracked_pose.observation.has_depth & (tracked_pose.landmark_of_feature < 0)
-        worth = unmapped & (depth_m <= self._config.max_depth_m)
-        missing = _MIN_KEYFRAME_LANDMARKS - tracked_pose.inliers - int(worth.sum())
+        new = unmapped & (depth_m <= self._config.max_depth_m)
+        missing = _MIN_KEYFRAME_LANDMARKS - tracked_pose.inliers - int(new.sum())
         if missing > 0:
-            deep = np.flatnonzero(unmapped & ~worth)
-            worth[deep[np.argsort(depth_m[deep], kind="stable")[:missing]]] = True
-        return worth
+            deep = np.flatnonzero(unmapped & ~new)
+            new[deep[np.argsort(depth_m[deep], kind="stable")[:missing]]] = True
+        return new
 
-    def _track(
+    def _result(
         self, tracked_pose: TrackedPose, *, is_keyframe: bool, links: Sequence[BetweenFactor] = ()
     ) -> FrameResult:
         T_world_body = _body_pose(tracked_pose.observation, tracked_pose.T_camera_world)
@@ -236,7 +211,7 @@ class KeyframeOdometry:
             links=links,
         )
 
-    def _lost(self, observation: Observation) -> FrameResult:
+    def _lost(self, observation: ImageObservation) -> FrameResult:
         self._lost_frames += 1
         last = self._last
         return FrameResult(
@@ -249,6 +224,6 @@ class KeyframeOdometry:
         )
 
 
-def _body_pose(observation: Observation, T_camera_world: Transform) -> Transform:
+def _body_pose(observation: ImageObservation, T_camera_world: Transform) -> Transform:
     """Return T_world_body."""
     return inverse(observation.T_body_camera @ T_camera_world)

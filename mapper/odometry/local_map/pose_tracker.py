@@ -1,4 +1,4 @@
-"""Where a frame was found, and the seam between the ways of finding it."""
+"""Interface of the pose trackers: the pose of a frame in the local map, and the methods that find it."""
 
 import math
 from dataclasses import dataclass
@@ -8,31 +8,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points, Transform, apply
+from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import Ids
-from mapper.odometry.local_map.observation import Observation
 from mapper.registration.reprojection import refine_pose
 
 MAX_HAMMING = 64
-"""Descriptors that differ in more of their 256 bits never match."""
+"""Descriptors that differ in more of their 256 bits do not match."""
 
 _LM_ROUNDS, _LM_ITERATIONS = 3, 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedPose:
-    """Where a frame was found.
+    """Pose of a frame in the local map, with the landmarks that support it.
 
     Attributes:
         observation: The frame.
         T_camera_world: (4, 4).
-        landmark_of_feature: (N,) int32 landmark that each feature shows, −1 for none; inliers only.
-        reference: Keyframe that sees most of these landmarks.
-        matches: Pairs that were proposed.
+        landmark_of_feature: (N,) int32 landmark of each feature, −1 for none; inliers only.
+        reference: Keyframe that observes most of these landmarks.
+        matches: Number of proposed pairs.
         residual_px: Root mean square image residual of the inliers.
-        method: What found it, e.g. "map", "fallback" or "relocalised".
+        method: Step that found the pose, e.g. "map", "fallback" or "relocalised".
     """
 
-    observation: Observation
+    observation: ImageObservation
     T_camera_world: Transform
     landmark_of_feature: Ids
     reference: int
@@ -42,27 +42,27 @@ class TrackedPose:
 
     @property
     def inliers(self) -> int:
-        """How many features agree with the pose."""
+        """Number of features that agree with the pose."""
         return int((self.landmark_of_feature >= 0).sum())
 
 
 class PoseTracker(Protocol):
-    """How a frame is placed while tracking has not lost its thread."""
+    """Method that finds the pose of a frame while the frame before it was tracked."""
 
-    def place(
-        self, observation: Observation, last: TrackedPose, before_last: TrackedPose | None, /
+    def track(
+        self, observation: ImageObservation, last: TrackedPose, before_last: TrackedPose | None, /
     ) -> TrackedPose | None:
-        """Return where the frame was found, given the two placed before it; None means "not found"."""
+        """Return the pose of a frame, given those of the two frames before it; None if it is not found."""
         ...
 
 
-def unmatched(observation: Observation) -> Ids:
-    """Return (N,) landmark −1, "none", of every feature."""
+def unmatched(observation: ImageObservation) -> Ids:
+    """Return (N,) landmark −1, which is none, for every feature."""
     return np.full(len(observation), -1, np.int32)
 
 
 def project(T_camera_world: Transform, points_world: Points, intrinsics: Array) -> Array:
-    """Return the pixels of world points; those behind the camera land far outside the image."""
+    """Return the pixels of world points; those behind the camera are far outside the image."""
     points_camera = apply(T_camera_world, points_world)
     z = np.where(points_camera[:, 2] > 0.05, points_camera[:, 2], np.nan)
     pixels = points_camera[:, :2] / z[:, None] * intrinsics[:2] + intrinsics[2:4]
@@ -70,17 +70,20 @@ def project(T_camera_world: Transform, points_world: Points, intrinsics: Array) 
 
 
 def rms_px(
-    T_camera_world: Transform, points_world: Points, observation: Observation, features: NDArray[np.integer]
+    T_camera_world: Transform,
+    points_world: Points,
+    observation: ImageObservation,
+    features: NDArray[np.integer],
 ) -> float:
-    """Return the root mean square distance, in pixels, of points from the features that show them."""
-    miss_px = project(T_camera_world, points_world, observation.intrinsics) - observation.pixels[features]
-    return math.sqrt(float((miss_px**2).sum(axis=1).mean()))
+    """Return the root mean square distance, in pixels, between projected points and their features."""
+    residual_px = project(T_camera_world, points_world, observation.intrinsics) - observation.pixels[features]
+    return math.sqrt(float((residual_px**2).sum(axis=1).mean()))
 
 
 def refined(
     T_camera_world: Transform,
     points_world: Points,
-    observation: Observation,
+    observation: ImageObservation,
     features: NDArray[np.integer],
 ) -> tuple[Transform, NDArray[np.bool_]]:
     """Return the refined T_camera_world and which pairs agree with it."""

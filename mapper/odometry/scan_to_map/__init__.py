@@ -1,1 +1,1 @@
-"""Odometry for scans: each is placed in a map of those before it."""
+"""LiDAR odometry: each scan is registered to a map of those before it."""

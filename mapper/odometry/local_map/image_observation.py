@@ -1,4 +1,4 @@
-"""What tracking keeps of one RGB-D frame: features with depth, ready for the compiled kernels."""
+"""Observation of one RGB-D frame: features with depth, as arrays for the compiled kernels."""
 
 from dataclasses import dataclass
 
@@ -8,16 +8,17 @@ from numpy.typing import NDArray
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, RgbdFrame
 from mapper.core.geometry import Array, Points, Transform
-from mapper.features.detectors import Detector
-from mapper.features.view import View
-from mapper.features.windowed import FeatureGrid, Words, pack, sort_into_grid
-from mapper.odometry.config import KeyframeConfig
+from mapper.features.base import Detector
+from mapper.features.frame_view import ImageView
+from mapper.features.hamming import Bits, pack
+from mapper.features.window_matching import FeatureGrid, sort_into_grid
+from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.places.vocabulary import Vocabulary
 from mapper.sensing.depth_noise import feature_depth_sigma_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Observation:
+class ImageObservation:
     """The features of one frame.
 
     Attributes:
@@ -25,12 +26,12 @@ class Observation:
         pixels: (N, 2) undistorted pixels.
         octave: (N,) int32 pyramid level.
         bits: (N, 4) uint64 descriptors.
-        words: (N,) int32 visual word of each.
-        measured: (N, 3) u, v and virtual disparity bf / z in pixels; NaN in the third place without depth, or
-            where it is not to count.
+        words: (N,) int32 visual words.
+        measured: (N, 3) u, v and virtual disparity bf / z in pixels; NaN in the third column without depth
+            or if it is not used.
         weights: (N, 3) inverse variances of the three, px⁻².
         points_camera: (N, 3) metres; NaN without depth.
-        grid: Which of the features, sorted by cell, lie where.
+        grid: Index of the features, which are sorted by its cells.
         intrinsics: (5,) fx, fy, cx, cy, bf in pixels (bf in pixel metres).
         size_px: Image width and height.
         T_body_camera: (4, 4) pose of the camera in the body frame.
@@ -39,7 +40,7 @@ class Observation:
     stamp_ns: int
     pixels: Array
     octave: NDArray[np.int32]
-    bits: Words
+    bits: Bits
     words: NDArray[np.int32]
     measured: Array
     weights: Array
@@ -57,9 +58,9 @@ class Observation:
         """(N,) which features have depth."""
         return ~np.isnan(self.points_camera[:, 2])
 
-    def view(self) -> View:
-        """Return what a place is recognised by."""
-        return View(
+    def view(self) -> ImageView:
+        """Return the view for place recognition."""
+        return ImageView(
             stamp_ns=self.stamp_ns,
             pixels=self.pixels,
             sigma_px=self.weights[:, 0] ** -0.5,
@@ -70,8 +71,10 @@ class Observation:
         )
 
 
-def observe(frame: Frame, detector: Detector, vocabulary: Vocabulary, config: KeyframeConfig) -> Observation:
-    """Detect features, look their depth up at the raw pixel, and undistort them.
+def observe_image(
+    frame: Frame, detector: Detector, vocabulary: Vocabulary, config: KeyframeOdometryConfig
+) -> ImageObservation:
+    """Detect features, look up their depth at the raw pixels, and undistort them.
 
     Raises:
         FrameError: The frame is a bare scan, or the detector's descriptors are not 256 bits.
@@ -107,11 +110,11 @@ def observe(frame: Frame, detector: Detector, vocabulary: Vocabulary, config: Ke
         sigma_m = feature_depth_sigma_m(
             frame.depth_m, column, row, sigma_px=sigma_px, noise=config.depth_noise
         )
-        # Without a depth the weight is not used, but enters sums as a factor.
+        # Without depth the weight is not used, but it is a factor in sums.
         known_px = config.virtual_baseline_px_m / depth_m**2 * sigma_m
         disparity_sigma_px = np.where(np.isnan(depth_m), disparity_sigma_px, known_px)
     rays = (pixels - intrinsics[2:4]) / intrinsics[:2]
-    return Observation(
+    return ImageObservation(
         stamp_ns=frame.stamp_ns,
         pixels=pixels,
         octave=octave,

@@ -1,22 +1,23 @@
-"""Matching that compares only descriptors under the same node of the vocabulary (B2)."""
+"""Matching of descriptors under the same node of the vocabulary (Zhao et al. 2020, §1.1)."""
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.features.hamming import Bits
 from mapper.places.kernels import match_sorted
-from mapper.places.tree import Bits, Ids
+from mapper.places.word_tree import Ids
 
 
 def match_by_word(
     bits_a: Bits, nodes_a: Ids, bits_b: Bits, nodes_b: Ids, *, max_hamming: int, max_ratio: float
 ) -> NDArray[np.int32]:
-    """Return (Na,) the row of b that each row of a is mutually nearest to under its node, or −1.
+    """Return (Na,) int32, per row of a its mutually nearest row of b under the same node, or −1.
 
     Args:
         bits_a: (Na, 4) uint64 descriptors.
         nodes_a: (Na,) their nodes; see ``Vocabulary.nodes_of``.
         bits_b: (Nb, 4) uint64 descriptors.
-        nodes_b: (Nb,) their nodes, of the same level.
+        nodes_b: (Nb,) their nodes, on the same level.
         max_hamming: Largest distance in bits.
         max_ratio: Largest ratio of best to second-best distance under the node (Lowe 2004).
     """

@@ -1,4 +1,4 @@
-"""What a scan is reduced to before it is placed."""
+"""Observation of one scan: the points in range, thinned."""
 
 from dataclasses import dataclass, replace
 
@@ -6,16 +6,16 @@ import numpy as np
 
 from mapper.core.deskew import STILL, Twist, deskewed
 from mapper.core.errors import FrameError
-from mapper.core.frames import Frame, Points32, Scan
+from mapper.core.frames import Frame, Scan
 from mapper.core.voxel_grid import thin
-from mapper.features.scan_view import ScanView
+from mapper.features.frame_view import ScanView
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
-from mapper.odometry.scan_to_map.matching import Sweep
+from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan
 from mapper.registration.surfaces import prepared
 
 _MIN_POINTS = 100
 """Fewer points left after thinning do not constrain a pose."""
-_FINER = 0.5  # a prepared point is the mean of those thinned to this part of its voxel
+_FINER = 0.5  # voxel size of the first thinning, of whose points each prepared point is the mean
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,35 +23,31 @@ class ScanObservation:
     """A thinned scan.
 
     Attributes:
-        scan: Points in range, body frame, with their times where the log has them.
+        scan: Points in range, body frame, with their times if the log has them.
         middle_s: Middle of the sweep, seconds after the scan's stamp; 0 without times.
-        sweep: The scan as taken all at once; None while that waits for the motion during the sweep.
-        voxel_m: Voxels that a sweep is prepared with.
+        deskewed: The scan as taken all at once; None if that depends on the motion during the sweep.
+        voxel_m: Voxel size of the prepared points.
     """
 
     scan: Scan
     middle_s: float
-    sweep: Sweep | None
+    deskewed: DeskewedScan | None
     voxel_m: float
 
-    def as_swept(self, twist: Twist) -> Sweep:
-        """Return the scan as taken all at once in the middle of the sweep, if the body moved like this.
+    def deskew(self, twist: Twist) -> DeskewedScan:
+        """Return the scan as taken all at once in the middle of the sweep, under a constant velocity.
 
-        There an error of the motion cancels: half of the points move one way and half the other. At the
-        sweep's start it would move the pose, and so come back larger in the next motion.
+        In the middle an error of the velocity cancels: half of the points move one way and half the other. At
+        the start of the sweep it would move the pose, and so increase the next velocity's error.
         """
-        return self.sweep or _sweep(self._deskewed(twist, moment_s=self.middle_s), self.voxel_m)
-
-    def points_at_stamp(self, twist: Twist) -> Points32:
-        """Return (M, 3) points as taken all at once at the stamp, one per voxel."""
-        points = self._deskewed(twist, moment_s=0.0).points_body
-        return points[thin(points, self.voxel_m)]
+        return self.deskewed or _prepared(self._scan_at(self.middle_s, twist), self.voxel_m)
 
     def view(self, twist: Twist | None) -> ScanView:
-        """Return the points as taken all at once at the stamp, for place recognition; None is no motion."""
-        return ScanView(self.scan.stamp_ns, self.points_at_stamp(twist or STILL))
+        """Return the points as taken all at once at the stamp, one per voxel; no twist is no motion."""
+        points = self._scan_at(0.0, twist or STILL).points_body
+        return ScanView(self.scan.stamp_ns, points[thin(points, self.voxel_m)])
 
-    def _deskewed(self, twist: Twist, *, moment_s: float) -> Scan:
+    def _scan_at(self, moment_s: float, twist: Twist) -> Scan:
         if self.scan.times_s is None:
             return self.scan
         return deskewed(replace(self.scan, times_s=self.scan.times_s - np.float32(moment_s)), twist)
@@ -76,11 +72,11 @@ def observe_scan(frame: Frame, config: ScanOdometryConfig) -> ScanObservation:
         )
     thinned = replace(scan, points_body=points_body[kept], colors=None, times_s=None)
     if scan.times_s is None:
-        return ScanObservation(thinned, 0.0, _sweep(thinned, config.voxel_m), config.voxel_m)
+        return ScanObservation(thinned, 0.0, _prepared(thinned, config.voxel_m), config.voxel_m)
     times_s = scan.times_s[in_range][kept]
     middle_s = 0.5 * float(times_s.min() + times_s.max())
     return ScanObservation(replace(thinned, times_s=times_s), middle_s, None, config.voxel_m)
 
 
-def _sweep(scan: Scan, voxel_m: float) -> Sweep:
-    return Sweep(scan, prepared(scan.points_body, voxel_m=voxel_m))
+def _prepared(scan: Scan, voxel_m: float) -> DeskewedScan:
+    return DeskewedScan(scan, prepared(scan.points_body, voxel_m=voxel_m))

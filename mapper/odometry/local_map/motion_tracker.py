@@ -1,13 +1,13 @@
-"""Placing a frame by predicted motion: what the last frame saw is sought where constant velocity puts it."""
+"""Pose tracker by constant velocity: the last frame's points are searched near their predicted pixels."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Points, Transform, apply, exp, inverse, log
 from mapper.odometry.config import LocalMapConfig
+from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
-from mapper.odometry.local_map.observation import Observation
 from mapper.odometry.local_map.pose_tracker import TrackedPose, project, refined, unmatched
 from mapper.odometry.local_map.relocalizer import Relocalizer
 
@@ -17,7 +17,7 @@ _MAX_PREDICTED_STEPS = 10.0
 
 
 class MotionPoseTracker:
-    """Predicts, and lets matching without a prediction compete where the prediction found little."""
+    """Pose tracker by predicted motion, and by matching without a prediction where that finds little."""
 
     def __init__(self, config: LocalMapConfig, landmark_map: LandmarkMap, relocalizer: Relocalizer) -> None:
         self._config = config
@@ -25,31 +25,33 @@ class MotionPoseTracker:
         self._search = LocalSearch(config, landmark_map)
         self._relocalizer = relocalizer
 
-    def place(
-        self, observation: Observation, last: TrackedPose, before_last: TrackedPose | None
+    def track(
+        self, observation: ImageObservation, last: TrackedPose, before_last: TrackedPose | None
     ) -> TrackedPose | None:
         """Try the predicted motion, then the latest keyframes."""
         predicted = self._by_motion(observation, last, before_last)
         if predicted is not None and predicted.inliers >= self._config.weak_inliers:
             return predicted
-        # A weak answer may be a wrong one: let a placement that owes nothing to the prediction compete.
-        matched = self._relocalizer.among(self._map.latest(last.reference), observation, method="fallback")
+        # A pose with few inliers may be wrong, so a pose that does not depend on the prediction competes.
+        matched = self._relocalizer.best_among(
+            self._map.latest(last.reference), observation, method="fallback"
+        )
         found = [tracked_pose for tracked_pose in (predicted, matched) if tracked_pose is not None]
         return max(found, key=lambda tracked_pose: tracked_pose.inliers, default=None)
 
     def _by_motion(
-        self, observation: Observation, last: TrackedPose, before_last: TrackedPose | None
+        self, observation: ImageObservation, last: TrackedPose, before_last: TrackedPose | None
     ) -> TrackedPose | None:
-        """Look for what the last frame saw where constant velocity predicts it."""
+        """Search the last frame's points near the pixels that constant velocity predicts."""
         T_camera_world = self._predicted(observation.stamp_ns, last, before_last)
-        seen, points_world, landmark = self._seen_in(last)
+        known, points_world, landmark = self._known_points(last)
         pixels = project(T_camera_world, points_world, observation.intrinsics)
         for search_px in (self._config.search_px, 2.0 * self._config.search_px):
             feature = self._search.match_near(
                 observation,
                 pixels,
-                last.observation.octave[seen],
-                last.observation.bits[seen],
+                last.observation.octave[known],
+                last.observation.bits[known],
                 search_px=search_px,
                 taken=np.zeros(len(observation), np.bool_),
                 max_ratio=_MAX_RATIO,
@@ -64,12 +66,12 @@ class MotionPoseTracker:
             return None
         landmark_of_feature = unmatched(observation)
         landmark_of_feature[feature[hits[agree]]] = landmark[hits[agree]]
-        return self._search.placed(
+        return self._search.refine(
             observation, T_camera_world, landmark_of_feature, reference=last.reference, method="map"
         )
 
     def _predicted(self, stamp_ns: int, last: TrackedPose, before_last: TrackedPose | None) -> Transform:
-        """Return T_camera_world under constant velocity, which dropped frames do not disturb."""
+        """Return T_camera_world under constant velocity, also across dropped frames."""
         if before_last is None:
             return last.T_camera_world
         t0, t1 = before_last.observation.stamp_ns, last.observation.stamp_ns
@@ -80,16 +82,16 @@ class MotionPoseTracker:
         T_camera_world: Transform = exp(steps * rotation_rad, steps * translation_m) @ last.T_camera_world
         return T_camera_world
 
-    def _seen_in(self, tracked_pose: TrackedPose) -> tuple[NDArray[np.intp], Points, Ids]:
-        """Return the features whose place is known: indices, (M, 3) world points, landmark or −1.
+    def _known_points(self, tracked_pose: TrackedPose) -> tuple[NDArray[np.intp], Points, Ids]:
+        """Return the features with a known 3D point: indices, (M, 3) world points, landmark or −1.
 
-        Features that are no landmarks help to find the motion: they stand where the depth image puts them.
+        Features that are no landmarks help to find the motion: their points are from the depth image.
         """
         observation, ids = tracked_pose.observation, tracked_pose.landmark_of_feature
         landmarks = self._map.landmarks
-        known = (ids >= 0) & (landmarks["observers"][ids] > 0)
-        near = observation.points_camera[:, 2] <= self._config.max_depth_m
+        is_landmark = (ids >= 0) & (landmarks["observers"][ids] > 0)
+        is_near = observation.points_camera[:, 2] <= self._config.max_depth_m
         points_world = apply(inverse(tracked_pose.T_camera_world), observation.points_camera)
-        points_world[known] = landmarks["position"][ids[known]]
-        seen = np.flatnonzero(known | near)
-        return seen, points_world[seen], np.where(known, ids, -1)[seen].astype(np.int32)
+        points_world[is_landmark] = landmarks["position"][ids[is_landmark]]
+        known = np.flatnonzero(is_landmark | is_near)
+        return known, points_world[known], np.where(is_landmark, ids, -1)[known].astype(np.int32)

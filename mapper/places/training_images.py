@@ -1,4 +1,4 @@
-"""Descriptors of a log's images, for a vocabulary to be trained on."""
+"""Descriptors of a log's images, from which a vocabulary is trained."""
 
 from itertools import compress
 
@@ -7,9 +7,8 @@ import numpy as np
 from mapper.core.errors import FrameError, VocabularyError
 from mapper.core.frames import RgbdFrame
 from mapper.features.factory import build_detector
-from mapper.features.windowed import pack
+from mapper.features.hamming import Bits, pack
 from mapper.places.config import VocabularyConfig
-from mapper.places.tree import Bits
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import FrameRef, Log, Skipped
@@ -18,9 +17,9 @@ _WORKERS = 2
 
 
 def descriptors_of(source: Log, config: VocabularyConfig, *, progress: Progress = SILENT) -> list[Bits]:
-    """Return (N_i, 4) uint64 descriptors of each of up to ``frames_per_log`` frames, evenly spread.
+    """Return (N_i, 4) uint64 descriptors of each of up to ``frames_per_log`` evenly spaced frames.
 
-    Frames that cannot be read are noted and left out.
+    Frames that cannot be read are reported and left out.
 
     Raises:
         VocabularyError: The log has no images.

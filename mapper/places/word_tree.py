@@ -1,4 +1,4 @@
-"""The k-ary tree of binary centres whose leaves are the visual words."""
+"""Search tree of binary cluster centres whose leaves are the visual words."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -7,21 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
+from mapper.features.hamming import Bits
 from mapper.places.kernels import descend
 
-Bits = NDArray[np.uint64]
-"""(N, 4) uint64: 256-bit binary descriptors, as ``mapper.features.windowed.pack`` makes them."""
 Ids = NDArray[np.int32]
 """(N,) int32: words or nodes."""
 
 
 @dataclass(frozen=True, eq=False)
 class WordTree:
-    """Nodes level by level from the root, node 0; siblings lie side by side.
+    """k-ary tree: nodes level by level from the root, node 0; siblings are adjacent.
 
     Attributes:
-        centres: (T, 4) uint64 centre of every node; the root's has no meaning.
-        children: (T,) uint8 how many children each node has; those with none are the words, in this order.
+        centres: (T, 4) uint64 centre of every node; the root's is not used.
+        children: (T,) uint8 number of children of each node; those without are the words, in this order.
     """
 
     centres: Bits
@@ -34,7 +33,7 @@ class WordTree:
                 f"word tree: {nodes} nodes with centres {self.centres.shape} of {self.centres.dtype}, "
                 "want (nodes, 4) of uint64"
             )
-        known = 1 + np.cumsum(self.children, dtype=np.int64)  # nodes that have a parent by then, and the root
+        known = 1 + np.cumsum(self.children, dtype=np.int64)  # the root and nodes whose parent came before
         if nodes == 0 or known[-1] != nodes or (known[:-1] <= np.arange(1, nodes)).any():
             raise DataError(f"word tree: the child counts of {nodes} nodes do not make one tree")
 
@@ -45,7 +44,7 @@ class WordTree:
 
     @cached_property
     def depth(self) -> NDArray[np.int32]:
-        """(T,) how many steps each node is below the root."""
+        """(T,) number of steps from the root to each node."""
         depth = np.zeros(len(self.children), np.int32)
         for node in range(1, len(depth)):
             depth[node] = depth[self._parent[node]] + 1
@@ -79,7 +78,7 @@ class WordTree:
         return words
 
     def ancestors_of(self, words: Ids, *, level: int) -> Ids:
-        """Return (N,) the node ``level`` steps below the root that each word lies under; at most itself."""
+        """Return (N,) the ancestor of each word ``level`` steps below the root; a shallower word itself."""
         return self._ancestors(level)[words]
 
     def _ancestors(self, level: int) -> Ids:

@@ -1,4 +1,4 @@
-"""Compiled walks over the map's observations: who sees what, and what should be visible now."""
+"""Compiled loops over the local map: observers of landmarks, and landmarks visible from a pose."""
 
 import numpy as np
 from numba import njit
@@ -7,19 +7,19 @@ from mapper.core.linear import turned
 
 MIN_DEPTH_M = 0.1
 MIN_VIEW_COSINE = 0.5
-"""A landmark is searched for while its viewing direction is within 60° of those it was seen from."""
+"""A landmark is searched for if its viewing direction is within 60° of the mean of its observations'."""
 
 
 @njit(cache=True, nogil=True)
 def count_observers(landmarks, newest, older, keyframe_of, keyframes):
-    """Return (keyframes,) int64: how many of the landmarks each keyframe observes.
+    """Return (keyframes,) int64, how many of the landmarks each keyframe observes.
 
     Args:
         landmarks: (M,) int32 ids.
         newest: (L,) int32: each landmark's newest observation, −1 for none.
         older: (E,) int32: each observation's predecessor of the same landmark, −1 for none.
         keyframe_of: (E,) int32, −1 where an observation was removed.
-        keyframes: How many keyframes there are.
+        keyframes: Number of keyframes.
     """
     counts = np.zeros(keyframes, np.int64)
     for landmark in landmarks:
@@ -64,12 +64,12 @@ def project_visible(
         landmarks: (M,) int32 ids.
         positions: (L, 3) metres, world.
         directions: (L, 3) sums of unit viewing directions, world.
-        reach_m: (L,) distance at which the landmark would appear in octave 0.
+        reach_m: (L,) distance at which the landmark would be found in octave 0.
         T_camera_world: (4, 4).
         intrinsics: (5,) fx, fy, cx, cy, bf.
         size_px: Image width and height.
         log_scale: Natural logarithm of the pyramid's scale factor.
-        octaves: How many octaves the detector has.
+        octaves: Number of the detector's octaves.
     """
     rows = np.empty(len(landmarks), np.int32)
     pixels = np.empty((len(landmarks), 2))

@@ -1,5 +1,6 @@
-"""SURF's interest points: maxima of the determinant of the Hessian over place and scale, compiled."""
+"""SURF's key points (fast Hessian detector): maxima of the determinant over pixels and scales, compiled."""
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -7,57 +8,34 @@ from numpy.typing import NDArray
 from mapper.core.frames import Image
 
 LAYERS = 4  # filter sizes per octave; extrema are sought in the middle two
-_DXY_WEIGHT = 0.81  # 0.9², how far box filters misjudge the mixed derivative (Bay et al. 2008, eq. 3)
+_DXY_WEIGHT = 0.81  # 0.9², corrects box filters for the mixed derivative (Bay et al. 2008, eq. 3)
 _SCALE_PER_PX = 1.2 / 9.0  # a 9-pixel filter approximates a Gaussian of σ = 1.2
 _BORDER = 2
 
 
-@njit(cache=True, nogil=True)
 def interest_points(gray: Image, octaves: int, threshold: float) -> NDArray[np.float64]:
     """Return (N, 6) row, column, scale, response, sign of the Laplacian, octave of every maximum.
 
-    Fast-Hessian detector (Bay, Ess, Tuytelaars & Van Gool 2008, §3), places and scales interpolated as in
+    Fast Hessian detector (Bay, Ess, Tuytelaars & Van Gool 2008, §3), pixels and scales interpolated as in
     Brown & Lowe 2002. Octave o samples every 2ᵒ pixels with filters of (9 + 6·layer)·2ᵒ pixels.
 
     Args:
         gray: (H, W) uint8.
-        octaves: How many; those whose filters exceed the image stay empty.
+        octaves: Number of octaves; those whose filters exceed the image stay empty.
         threshold: Smallest response, grey levels squared.
     """
-    integral = _integral(gray)
-    parts = [np.empty((0, 6), np.float64)]
+    integral = cv2.integral(gray)
+    parts = [np.empty((0, 6))]
     for octave in range(octaves):
         step, largest = 1 << octave, (9 + 6 * (LAYERS - 1)) << octave
-        rows, columns = gray.shape[0] // step, gray.shape[1] // step
         if largest + 2 * step * _BORDER >= min(gray.shape):
             break
-        responses = np.zeros((LAYERS, rows, columns), np.float32)
-        bright = np.zeros((LAYERS, rows, columns), np.bool_)
+        shape = (LAYERS, gray.shape[0] // step, gray.shape[1] // step)
+        responses, bright = np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
         for layer in range(LAYERS):
             _respond(responses[layer], bright[layer], integral, (9 + 6 * layer) << octave, step)
         parts.append(_maxima(responses, bright, octave, threshold))
-    total = 0
-    for part in parts:
-        total += len(part)
-    points = np.empty((total, 6), np.float64)
-    count = 0
-    for part in parts:
-        points[count : count + len(part)] = part
-        count += len(part)
-    return points
-
-
-@njit(cache=True, nogil=True)
-def _integral(gray: Image) -> NDArray[np.int32]:
-    """Return (H + 1, W + 1) sums of all pixels above and to the left."""
-    height, width = gray.shape
-    integral = np.zeros((height + 1, width + 1), np.int32)
-    for y in range(height):
-        total = np.int32(0)
-        for x in range(width):
-            total += gray[y, x]
-            integral[y + 1, x + 1] = integral[y, x + 1] + total
-    return integral
+    return np.concatenate(parts)
 
 
 @njit(cache=True, nogil=True)
@@ -68,7 +46,7 @@ def _respond(
     size: int,
     step: int,
 ) -> None:
-    """Fill in the determinant of the Hessian, and whether its trace is positive, on a grid of pixels."""
+    """Write the determinant of the Hessian, and whether its trace is positive, on a grid of pixels."""
     lobe, half = size // 3, size // 2
     across, inner = lobe - 1, lobe // 2  # half extents of the second-derivative boxes
     area_inv = np.float32(1.0 / (size * size))
@@ -140,9 +118,9 @@ def _is_maximum(responses: NDArray[np.float32], layer: int, row: int, column: in
 
 @njit(cache=True, nogil=True)
 def _peak(cube: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return where the quadratic through a (3, 3, 3) cube peaks: layer, row, column relative to its middle.
+    """Return the peak (layer, row, column) of the quadratic through a (3, 3, 3) cube, relative to its middle.
 
-    Cramer's rule on H·offset = -gradient; an offset out of reach where H is singular.
+    Cramer's rule on H·offset = -gradient; infinite where H is singular.
     """
     middle = cube[1, 1, 1]
     gs, gy, gx = (

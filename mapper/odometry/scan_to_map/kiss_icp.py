@@ -1,16 +1,16 @@
-"""KISS-ICP (Vizzo et al. 2023) by its authors' library, one scan at a time."""
+"""Scan matcher by KISS-ICP's own library (Vizzo et al. 2023)."""
 
 import numpy as np
 
 from mapper.core.geometry import Array, Points, Transform, inverse, is_rigid
 from mapper.odometry.scan_to_map.config import KissOdometryConfig
-from mapper.odometry.scan_to_map.matching import Reach, Sweep
+from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan, Reach
 
 _MAX_POINTS_PER_VOXEL, _CONVERGENCE = 20, 1e-4  # the library's defaults
 
 
 class KissMatcher:
-    """The library's map, registration and adaptive threshold; deskewing and prediction are the odometry's."""
+    """Matcher with the library's map, registration and adaptive threshold, but without its motion model."""
 
     def __init__(self, config: KissOdometryConfig) -> None:
         from kiss_icp.config import KISSConfig
@@ -22,16 +22,16 @@ class KissMatcher:
         self._settings.mapping.max_points_per_voxel = _MAX_POINTS_PER_VOXEL
         self._settings.registration.max_num_iterations = config.max_iterations
         self._settings.registration.convergence_criterion = _CONVERGENCE
-        self._settings.registration.max_num_threads = 1  # sums are added up in the order of the points
+        self._settings.registration.max_num_threads = 1  # more threads would add sums in a varying order
         self._settings.adaptive_threshold.initial_threshold = config.initial_threshold_m
         self._settings.adaptive_threshold.min_motion_th = config.min_motion_m
         self._registration = get_registration(self._settings)
         self._T_world_guess: Transform | None = None
         self.clear()
 
-    def match(self, sweep: Sweep, T_world_body: Transform, *, reach: Reach) -> Transform | None:
-        """Return the T_world_body of a scan from a guess; None if the method cannot say."""
-        source = self._thinned(self._thinned(sweep.scan.points_body.astype(np.float64), 0.5), 1.5)
+    def match(self, deskewed: DeskewedScan, T_world_body: Transform, *, reach: Reach) -> Transform | None:
+        """Return the refined T_world_body of a scan from a guess; None if it is not rigid."""
+        source = self._thinned(self._thinned(deskewed.scan.points_body.astype(np.float64), 0.5), 1.5)
         sigma_m = self._settings.adaptive_threshold.initial_threshold
         if reach == "near":
             sigma_m = self._threshold.get_threshold()
@@ -47,15 +47,15 @@ class KissMatcher:
         self._T_world_guess = T_world_body
         return T_found
 
-    def add(self, sweep: Sweep, T_world_body: Transform, *, is_keyframe: bool) -> None:  # noqa: ARG002
-        """Take any placed scan into the map, and learn from how far it lay from where it was expected."""
+    def add(self, deskewed: DeskewedScan, T_world_body: Transform, *, is_keyframe: bool) -> None:  # noqa: ARG002
+        """Add any tracked scan to the map, and the error of its predicted pose to the adaptive threshold."""
         if self._T_world_guess is not None:
             self._threshold.update_model_deviation(inverse(self._T_world_guess) @ T_world_body)
             self._T_world_guess = None
-        self._map.update(self._thinned(sweep.scan.points_body.astype(np.float64), 0.5), T_world_body)
+        self._map.update(self._thinned(deskewed.scan.points_body.astype(np.float64), 0.5), T_world_body)
 
     def clear(self) -> None:
-        """Forget the map."""
+        """Empty the map."""
         from kiss_icp.mapping import get_voxel_hash_map
         from kiss_icp.threshold import get_threshold_estimator
 

@@ -1,4 +1,4 @@
-"""Local bundle adjustment: compiled Levenberg–Marquardt, points eliminated (Triggs et al. 2000, §6.1)."""
+"""Local bundle adjustment: compiled Levenberg–Marquardt with points eliminated (Triggs et al. 2000, §6.1)."""
 
 import numpy as np
 from numba import njit
@@ -37,7 +37,7 @@ def _cost(poses, points, edges, measured, weights, intrinsics, active, robust):
 def _linearise(
     poses, free, points, edges, measured, weights, intrinsics, active, robust, Hcc, bc, Hpp, bp, W
 ):
-    """Fill the blocks of the normal equations: cameras (6, 6), points (3, 3), and one (6, 3) per edge."""
+    """Write the blocks of the normal equations: cameras (6, 6), points (3, 3), and one (6, 3) per edge."""
     Hcc[:] = 0.0
     bc[:] = 0.0
     Hpp[:] = 0.0
@@ -159,19 +159,19 @@ def _step(free, first_edge, edges, active, Hcc, bc, Hpp, bp, W, damping):
 
 @njit(cache=True, nogil=True)
 def adjust(poses, free, points, first_edge, edges, measured, weights, intrinsics, rounds, iterations):
-    """Return refined poses and points, and which edges passed the last χ² test.
+    """Return refined poses and points, and which edges pass the last χ² test.
 
     Args:
         poses: (K, 4, 4) T_camera_world of free and fixed keyframes.
         free: (K,) int32: rank among the free keyframes, −1 for a fixed one.
         points: (P, 3) metres, world.
-        first_edge: (P + 1,) int32: where each point's edges begin; edges are grouped by point.
+        first_edge: (P + 1,) int32: first edge of each point; edges are grouped by point.
         edges: (E, 2) int32 keyframe and point of each observation.
-        measured: (E, 3) u, v, bf/z in pixels; NaN in the third place without depth.
+        measured: (E, 3) u, v, bf/z in pixels; NaN in the third column without depth.
         weights: (E, 3) inverse variances, px⁻².
         intrinsics: (5,) fx, fy, cx, cy, bf.
-        rounds: How often outlying edges are chosen; only the first round is robust.
-        iterations: Steps per round.
+        rounds: How often outliers are classified; only the first round is robust.
+        iterations: Largest number of steps per round.
     """
     poses, points = poses.copy(), points.copy()
     cameras = int(free.max()) + 1
@@ -196,9 +196,9 @@ def adjust(poses, free, points, first_edge, edges, measured, weights, intrinsics
             trial_points = points + step_points
             trial = _cost(trial_poses, trial_points, edges, measured, weights, intrinsics, active, robust)
             if trial <= cost:
-                settled = cost - trial < 1e-4 * cost
+                converged = cost - trial < 1e-4 * cost
                 poses, points, cost, damping = trial_poses, trial_points, trial, damping * 0.2
-                if settled:
+                if converged:
                     break
                 _linearise(
                     poses,

@@ -1,28 +1,28 @@
-"""Placing a frame by its pixels alone, against the latest keyframes (Zhao et al. 2020, §1.2)."""
+"""Pose tracker by P3P against the latest keyframes (Zhao et al. 2020, §1.2)."""
 
 from collections.abc import Iterator
 
 from mapper.core.geometry import inverse
+from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import LandmarkMap
-from mapper.odometry.local_map.observation import Observation
 from mapper.odometry.local_map.pose_tracker import TrackedPose
 from mapper.odometry.local_map.relocalizer import Relocalizer
 
 
 class PnpPoseTracker:
-    """Predicts nothing: each frame is matched by visual words and found by P3P."""
+    """Pose tracker without prediction: frames are matched by visual words and their pose is found by P3P."""
 
     def __init__(self, landmark_map: LandmarkMap, relocalizer: Relocalizer) -> None:
         self._map = landmark_map
         self._relocalizer = relocalizer
 
-    def place(
-        self, observation: Observation, last: TrackedPose, _before_last: TrackedPose | None, /
+    def track(
+        self, observation: ImageObservation, last: TrackedPose, _before_last: TrackedPose | None, /
     ) -> TrackedPose | None:
-        """Try the latest keyframes, and those that look like the frame while the answer is weak."""
-        return self._relocalizer.among(self._candidates(observation, last), observation, method="pnp")
+        """Match the latest keyframes, and the similar ones as well while few landmarks agree."""
+        return self._relocalizer.best_among(self._candidates(observation, last), observation, method="pnp")
 
-    def _candidates(self, observation: Observation, last: TrackedPose) -> Iterator[int]:
+    def _candidates(self, observation: ImageObservation, last: TrackedPose) -> Iterator[int]:
         latest = self._map.latest(last.reference)
         yield from latest
         here_world = inverse(last.T_camera_world)[:3, 3]

@@ -1,4 +1,4 @@
-"""Columns that grow: plain arrays for compiled code, appended to by Python."""
+"""Table of arrays that grows by appending rows."""
 
 from typing import Any
 
@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-class Table:
-    """Columns of equal length that grow by doubling, so that compiled code sees plain arrays."""
+class GrowingTable:
+    """Columns of equal length that grow by doubling; compiled code reads them as plain arrays."""
 
     def __init__(self, **columns: tuple[tuple[int, ...], type]) -> None:
         self.size = 0

@@ -1,4 +1,4 @@
-"""Image features and the seam behind which every detector hides."""
+"""Features of an image, and the interface of the detectors that find them."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -15,7 +15,7 @@ Descriptors = NDArray[np.uint8] | NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Features:
-    """Keypoints of one image with their descriptors, one row each.
+    """Key points of one image with their descriptors, one row each.
 
     Attributes:
         pixels: (N, 2) float32 column and row, pixels of the raw (distorted) image.
@@ -54,11 +54,11 @@ class Features:
 
 
 class Detector(Protocol):
-    """Finds features. Stateless: safe in any thread, and the answer depends on the image alone."""
+    """Feature detector. Stateless: safe in any thread, and the result depends on the image alone."""
 
     @property
     def scale_factor(self) -> float:
-        """How much larger a pixel gets from one octave to the next."""
+        """Size of a pixel in one octave relative to the next finer one."""
         ...
 
     def detect(self, gray: Image) -> Features:

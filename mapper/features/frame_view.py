@@ -1,4 +1,4 @@
-"""What a place looked like from one pose: the features by which it is recognised and measured again."""
+"""Views: the features or points of one frame by which a place is recognised and a loop is measured."""
 
 from dataclasses import dataclass
 
@@ -6,21 +6,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
+from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, Transform
-from mapper.features.detectors import Descriptors
-from mapper.features.windowed import Words, pack
+from mapper.features.base import Descriptors
+from mapper.features.hamming import Bits, pack
 
 _ORB_BYTES = 32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """The features of one frame with their 3D points.
+class ImageView:
+    """The features of one RGB-D frame with their 3D points.
 
     Attributes:
         stamp_ns: The frame's stamp.
         pixels: (N, 2) undistorted pixels.
-        sigma_px: (N,) how far from its true place a feature's pixel may lie: one σ.
+        sigma_px: (N,) standard deviation of a feature's pixel, along both axes.
         descriptors: (N, D) uint8 bits or float32.
         points_camera: (N, 3) metres; NaN without depth.
         intrinsics: (4,) fx, fy, cx, cy in pixels.
@@ -44,7 +45,7 @@ class View:
         return self.descriptors.dtype == np.uint8 and self.descriptors.shape[1] == _ORB_BYTES
 
     @property
-    def bits(self) -> Words:
+    def bits(self) -> Bits:
         """(N, 4) uint64 descriptors.
 
         Raises:
@@ -61,3 +62,19 @@ class View:
         """Return (N,) which features have depth up to a limit."""
         near: NDArray[np.bool_] = self.points_camera[:, 2] <= max_depth_m
         return near
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanView:
+    """The points of one scan, thinned and deskewed.
+
+    Attributes:
+        stamp_ns: The scan's stamp.
+        points_body: (N, 3) float32 metres, body frame, z roughly up.
+    """
+
+    stamp_ns: int
+    points_body: Points32
+
+
+FrameView = ImageView | ScanView

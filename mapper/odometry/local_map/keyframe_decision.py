@@ -1,0 +1,41 @@
+"""Keyframe decision of the local map: by the inliers of a frame's pose."""
+
+from mapper.odometry.config import KeyframeOdometryConfig
+from mapper.odometry.local_map.pose_tracker import TrackedPose
+
+_MIN_GAP = 4
+"""Frames for which the last keyframe is young."""
+_YOUNG_RATIO = 0.5
+"""``keyframe_ratio`` while the last keyframe is young and the inliers are not weak: for fast motion."""
+
+
+class KeyframeDecision:
+    """Decision whether a tracked frame becomes a keyframe (after Mur-Artal & Tardós 2017, §III-E)."""
+
+    def __init__(self, config: KeyframeOdometryConfig) -> None:
+        self._config = config
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew after a keyframe."""
+        self._most_inliers = 0
+        self._frames = 0
+
+    def is_due(self, tracked_pose: TrackedPose, near_features: int) -> bool:
+        """Return whether the next tracked frame becomes a keyframe.
+
+        Args:
+            tracked_pose: Of the frame.
+            near_features: How many of its features are near enough to become landmarks.
+        """
+        config, inliers = self._config, tracked_pose.inliers
+        self._frames += 1
+        self._most_inliers = max(self._most_inliers, inliers)
+        if self._frames >= config.max_keyframe_gap:
+            return True
+        kept_ratio = inliers / self._most_inliers
+        if self._frames < _MIN_GAP and inliers >= config.weak_inliers:
+            return kept_ratio < _YOUNG_RATIO
+        # Landmarks at one edge of the image constrain the pose badly, however many they are.
+        mapped_ratio = inliers / max(near_features, 1)
+        return kept_ratio < config.keyframe_ratio or mapped_ratio < config.mapped_ratio
