@@ -1,4 +1,4 @@
-"""A sensor's depth noise in the configuration, and what the odometry makes of it."""
+"""Depth noise of a sensor in the settings, and its effect on the odometry."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def test_a_slope_counts_by_how_uncertain_the_pixel_is():
     np.testing.assert_allclose(with_noise, np.hypot(NOISE.sigma_m(np.array([2.1])), 0.005), rtol=1e-4)
 
 
-def test_beside_an_edge_the_depth_is_hardly_known():
+def test_beside_an_edge_the_depth_is_uncertain():
     edge_m = np.full((20, 30), 1.0)
     edge_m[:, 15:] = 3.0
     beside, away = sigmas_m(edge_m, [(14, 10), (5, 10)], [1.0, 1.0], NOISE)

@@ -60,7 +60,7 @@ def test_an_image_too_small_for_any_feature_has_none(config):
 
 
 @every_detector
-def test_answer_is_the_same_in_any_thread_and_order(config):
+def test_features_are_the_same_in_any_thread_and_order(config):
     detector = build_detector(config)
     images = [texture(seed, contrast=0.2 + 0.2 * seed) for seed in range(4)]
     alone = [detector.detect(image) for image in images]
@@ -180,7 +180,7 @@ def test_uniform_orb_reaches_parts_that_orb_leaves_out():
 
 
 @pytest.mark.parametrize("sigma_px", [2.5, 3.5, 7.0])
-def test_surf_places_a_blob_between_pixels(sigma_px):
+def test_surf_locates_a_blob_between_pixels(sigma_px):
     y, x = np.mgrid[0:200, 0:220]
     column, row = 110.3, 101.6
     blob = 20 + 200 * np.exp(-((x - column) ** 2 + (y - row) ** 2) / (2 * sigma_px**2))

@@ -1,4 +1,4 @@
-"""The thesis's odometry on features made to order: a wall of landmarks seen by a moving camera."""
+"""ISVD odometry on made features: a wall of landmarks before a moving camera."""
 
 import numpy as np
 import pytest
@@ -111,7 +111,7 @@ def test_weighted_mean_is_equation_4_1s():
     )
 
 
-def test_a_loss_is_noticed_and_never_passed_on_as_motion():
+def test_a_lost_frame_is_reported_and_adds_no_motion():
     wall, poses = Wall(3), path(14)
     odometry = IsvdOdometry(config())
     before = follow(odometry, wall, poses[:10])
@@ -129,10 +129,10 @@ def test_a_loss_is_noticed_and_never_passed_on_as_motion():
     assert np.allclose(back.T_world_body, poses[13], atol=0.02)
 
 
-def test_returns_to_a_known_place_by_a_keyframe():
+def test_relocalises_at_a_keyframe():
     wall = Wall(4)
     odometry = IsvdOdometry(config(keyframe_interval=5))
-    follow(odometry, wall, path(60, step_m=0.08))  # 4.7 m on: the start is out of sight
+    follow(odometry, wall, path(60, step_m=0.08))  # 4.7 m on: the start is out of view
     start = exp(np.zeros(3), np.array([0.1, 0.0, 0.0]))
 
     odometry.track(strangers(60))

@@ -1,4 +1,4 @@
-"""The default odometry on a short synthetic log: accurate, repeatable, and honest about being lost."""
+"""The default odometry on a short synthetic log: accurate, repeatable, and lost where it should be."""
 
 import numpy as np
 import pytest
@@ -65,7 +65,7 @@ def test_it_follows_the_truth(source, frames):
     assert 1 < sum(step.is_keyframe for step in tracks) < len(frames) // 2
 
 
-def test_plain_orb_serves_as_well(source, frames):
+def test_plain_orb_works_as_well(source, frames):
     _, trajectory = track(frames, LocalMapConfig(detector=OrbConfig()))
     assert len(trajectory) == len(frames)
     assert ate_rmse_m(trajectory, source) < 0.01
@@ -106,7 +106,7 @@ def test_a_sudden_jump_is_bridged_by_matching(source, frames):
     assert ate_rmse_m(trajectory, source) < 0.01
 
 
-def test_another_place_is_not_taken_for_motion(frames):
+def test_a_jump_to_another_place_is_no_motion(frames):
     """Noise matches nothing: the honest answer is "lost"."""
     rng = np.random.default_rng(0)
     noise = rng.integers(0, 256, frames[0].image.shape, dtype=np.uint8)
@@ -127,7 +127,7 @@ def test_a_view_that_is_mostly_new_becomes_a_keyframe(frames):
     assert sum(step.is_keyframe for step in few) < sum(step.is_keyframe for step in many)
 
 
-def test_factors_tie_every_keyframe_to_an_earlier_one(frames):
+def test_factors_connect_every_keyframe_to_an_earlier_one(frames):
     odometry = build_frame_odometry(LocalMapConfig())
     keyframes = sum(odometry.track(odometry.observe(frame)).is_keyframe for frame in frames)
     factors = odometry.finish()

@@ -1,4 +1,4 @@
-"""What holds a frame: which of its features agree with its pose, and where these were before."""
+"""Matches of a frame: which features agree with its pose, and their pixels in an earlier frame."""
 
 import numpy as np
 import pytest
@@ -26,21 +26,21 @@ def rows(pixels):
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
-def test_features_that_hold_the_pose_were_seen_where_they_are_said_to_have_been(config, desk_log):
-    seen, told = [], 0
+def test_matched_features_have_the_pixels_of_an_earlier_frame(config, desk_log):
+    seen, pixels = [], 0
     for track, view, matches in followed(config, desk_log):
         if seen:
             assert matches.is_inlier.sum() == track.diagnostics.inliers or track.is_keyframe
-            has_way = np.isfinite(matches.previous_px[:, 0])
-            assert not (has_way & ~matches.is_inlier).any()
-            before = matches.previous_px[has_way]
+            has_previous = np.isfinite(matches.previous_px[:, 0])
+            assert not (has_previous & ~matches.is_inlier).any()
+            before = matches.previous_px[has_previous]
             assert rows(before) <= set().union(*map(rows, seen))
             assert len(before) > 0.3 * matches.is_inlier.sum()
-            steps_px = np.linalg.norm(view.pixels[has_way] - before, axis=1)
+            steps_px = np.linalg.norm(view.pixels[has_previous] - before, axis=1)
             assert np.median(steps_px) < 20.0  # of a hand that sways; features at random are 100 px apart
-            told += len(before)
+            pixels += len(before)
         seen.append(view.pixels)
-    assert told > 300
+    assert pixels > 300
 
 
 def test_isvd_matches_with_the_frame_just_before(desk_log):
@@ -50,7 +50,7 @@ def test_isvd_matches_with_the_frame_just_before(desk_log):
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
-def test_the_first_frame_came_from_nowhere_and_a_lost_one_is_held_by_nothing(config, desk_log):
+def test_the_first_frame_has_no_earlier_pixels_and_a_lost_one_no_matches(config, desk_log):
     ((_, _, matches),) = followed(config, desk_log, count=1)
     assert matches is None or np.isnan(matches.previous_px).all()
     odometry = NodeOffset(build_frame_odometry(config), first_node=7)
@@ -76,7 +76,7 @@ class DarkEntry:
         )
 
 
-def test_no_features_hold_what_wheels_tell(desk_log):
+def test_wheel_odometry_has_no_matches(desk_log):
     source = open_source(desk_log)
     odometry = build_odometry(WheelsOdometryConfig(), source.truth)
     assert odometry.track(odometry.read(next(source.entries()))).node == 0

@@ -66,7 +66,7 @@ def test_a_shuffled_copy_is_matched_completely(make):
     assert (order[pairs[:, 1]] == pairs[:, 0]).all()
 
 
-def test_a_repeated_pattern_is_not_told_apart():
+def test_a_repeated_pattern_has_no_matches():
     descriptors = random_bits(4, 50)
     doubled = np.vstack([descriptors, descriptors])
 
@@ -85,7 +85,7 @@ def test_descriptors_of_two_detectors_are_refused():
         match_mutual(features(random_bits(0, 5)), features(random_numbers(0, 5)), max_ratio=0.8)
 
 
-def test_homography_tells_true_pairs_from_false_ones():
+def test_homography_separates_true_pairs_from_false_ones():
     rng = np.random.default_rng(5)
     H = np.array([[1.02, 0.05, 8.0], [-0.04, 0.98, -5.0], [1e-5, 2e-5, 1.0]])
     a = rng.uniform(0, 600, (200, 2))

@@ -1,4 +1,4 @@
-"""Places found again by their words, and features matched by them."""
+"""Places recognised by visual words, and features matched under them."""
 
 import numpy as np
 import pytest
@@ -69,7 +69,7 @@ def test_every_node_finds_itself_first(index, vectors):
         assert index.query(vector, min_similarity=0.9, limit=1) == [(1000 + number, 1.0)]
 
 
-def test_what_stands_out_is_found_however_unlike(vocabulary, index, vectors):
+def test_an_outstanding_place_is_found_at_any_similarity(vocabulary, index, vectors):
     strangers = np.setdiff1d(np.arange(vocabulary.words), vectors[7].ids)[:12]
     mixed = vocabulary.vector(np.concatenate([vectors[7].ids[:18], strangers]))
     assert index.query(mixed, min_similarity=0.9, limit=3) == []
@@ -77,7 +77,7 @@ def test_what_stands_out_is_found_however_unlike(vocabulary, index, vectors):
     assert index.query(mixed, min_similarity=0.9, limit=1, min_deviations=50.0) == []
 
 
-def test_nothing_stands_out_from_a_few(index, vectors):
+def test_among_a_few_places_none_is_outstanding(index, vectors):
     assert index.query(vectors[5], min_similarity=1.1, limit=1, min_deviations=0.0, before=29) == []
     assert index.query(vectors[5], min_similarity=1.1, limit=1, min_deviations=0.0, before=30)
 
@@ -89,7 +89,7 @@ def test_of_equals_the_earlier_comes_first(vocabulary, vectors):
     assert [node for node, _ in index.query(vectors[0], min_similarity=0.5, limit=2)] == [7, 3]
 
 
-def test_an_image_without_features_is_like_no_other(vocabulary, vectors):
+def test_an_image_without_features_is_similar_to_none(vocabulary, vectors):
     index = PlaceIndex(vocabulary)
     blank = vocabulary.vector(np.empty(0, np.int32))
     index.add(0, blank)
@@ -160,7 +160,7 @@ def two_laps():
     return source.truth.T_world_body, bits
 
 
-def test_the_shipped_vocabulary_knows_a_place_again(two_laps):
+def test_the_shipped_vocabulary_recognises_a_place(two_laps):
     T_world_camera, bits = two_laps
     vocabulary = load_vocabulary()
     index = PlaceIndex(vocabulary)

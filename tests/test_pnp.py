@@ -1,4 +1,4 @@
-"""The second source's odometry: P3P on known points, and a short synthetic log tracked with it."""
+"""P3P on known points, and PnP odometry on a short synthetic log (Zhao et al. 2020)."""
 
 from pathlib import Path
 
@@ -70,7 +70,7 @@ def test_p3p_finds_the_pose_among_as_many_wrong_pairs_as_right_ones(seed):
     assert angle_between(miss[:3, :3], np.eye(3)) < 0.01
 
 
-def test_p3p_draws_the_same_every_time():
+def test_p3p_draws_the_same_samples_every_time():
     points_world, pixels, _ = pairs(np.random.default_rng(7))
     pixels[:120] += 60.0
     first, second = (
@@ -112,8 +112,8 @@ def test_the_same_frames_give_the_same_bytes(frames):
     assert [t.T_world_body.tobytes() for t in first] == [t.T_world_body.tobytes() for t in second]
 
 
-def test_pixels_alone_serve_too(source, frames):
-    """Depth still makes landmarks, but no residual knows of it."""
+def test_pixels_alone_suffice(source, frames):
+    """Depth still makes landmarks, but is in no residual."""
     config = PnpConfig(depth_residual=False)
     observation = build_frame_odometry(config).observe(frames[0])
     assert np.isnan(observation.measured[:, 2]).all()

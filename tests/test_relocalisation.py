@@ -1,4 +1,4 @@
-"""After a loss: a known place is found by what it looks like, an unknown one begins a map of its own."""
+"""Relocalisation after a loss: a known place is recognised, an unknown one begins a sub-map."""
 
 import numpy as np
 import pytest
@@ -59,7 +59,7 @@ def graph_of(tracks, odometry):
 
 
 @BOTH
-def test_a_known_place_is_found_in_the_first_frame_that_shows_it(source, frames, config):
+def test_a_known_place_is_recognised_in_its_first_frame(source, frames, config):
     dark = seconds(4.5, 5.5)
     log = [*frames[: dark.start], *map(covered, frames[dark]), *frames[dark.stop :]]
 
@@ -77,7 +77,7 @@ def test_a_known_place_is_found_in_the_first_frame_that_shows_it(source, frames,
 
 
 @BOTH
-def test_an_unknown_place_begins_a_map_of_its_own(frames, config):
+def test_an_unknown_place_begins_a_sub_map(frames, config):
     before, elsewhere = frames[seconds(0.0, 1.0)], frames[seconds(2.3, 3.3)]
     odometry = build_frame_odometry(config.model_copy(update={"max_lost_frames": 4}))
 
@@ -96,7 +96,7 @@ def test_an_unknown_place_begins_a_map_of_its_own(frames, config):
     assert [part[0] for part in parts] == [0, first.node]
 
 
-def test_whoever_wants_no_second_map_stays_lost(frames):
+def test_without_sub_maps_frames_stay_lost(frames):
     odometry = build_frame_odometry(LocalMapConfig(max_lost_frames=0))
     before, elsewhere = frames[seconds(0.0, 1.0)], frames[seconds(2.3, 3.3)]
     assert all(t.node is None for t in tracked([*before, *elsewhere], odometry)[len(before) :])
@@ -110,7 +110,7 @@ def test_darkness_is_no_place(frames):
     assert tracks[9].diagnostics.method == "relocalised"
 
 
-def test_one_second_turn_joins_the_first_ones_landmarks(frames):
+def test_a_second_turn_is_tracked_with_the_first_ones_landmarks(frames):
     """After relocalisation keyframes share landmarks with those from before the loss: one component."""
     dark = seconds(4.5, 5.5)
     odometry = build_frame_odometry(LocalMapConfig())
@@ -121,16 +121,16 @@ def test_one_second_turn_joins_the_first_ones_landmarks(frames):
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_the_better_of_two_weak_placements_wins(frames, order):
-    """Nothing is strong here, so each keyframe is asked, in whatever order."""
+def test_of_two_weak_poses_that_of_more_inliers_counts(frames, order):
+    """No pose has enough inliers here, so each keyframe is tried, in any order."""
     config = LocalMapConfig(weak_inliers=10_000)
     odometry = build_frame_odometry(config)
     tracked(frames[:12], odometry)
     relocalizer, observation = odometry._relocalizer, odometry.observe(frames[12])
     keyframes = range(len(odometry._map.keyframes))[::order]
-    alone = [relocalizer.among([k], observation, method="alone") for k in keyframes]
+    alone = [relocalizer.best_among([k], observation, method="alone") for k in keyframes]
 
-    best = relocalizer.among(keyframes, observation, method="all")
+    best = relocalizer.best_among(keyframes, observation, method="all")
 
     assert sum(tracked_pose is not None for tracked_pose in alone) > 1
     assert best.inliers == max(tracked_pose.inliers for tracked_pose in alone if tracked_pose is not None)

@@ -1,4 +1,4 @@
-"""Scan Context: the same whichever way the scanner heads, another at another place."""
+"""Scan Context: the same for every heading, another at another place."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def test_turning_the_scanner_by_whole_sectors_changes_nothing(yaw_deg):
 
 
 @pytest.mark.parametrize("yaw_rad", [0.05, 1.0, np.pi, -2.0])
-def test_the_same_place_looks_alike_from_the_other_lane_and_heading_anywhere(yaw_rad):
+def test_the_same_place_is_similar_from_the_other_lane_and_any_heading(yaw_rad):
     scene = street(1)
     here = context(scene, 40.0)
     again = similarity(here, context(scene, 41.0, yaw_rad=yaw_rad, left_m=1.0, seed=1))
@@ -86,7 +86,7 @@ def test_many_places_are_kept():
     assert index.query(contexts[270], np.ones(300, np.bool_), limit=1)[0][0] == 270
 
 
-def test_an_empty_scan_looks_like_nothing():
+def test_an_empty_scan_is_similar_to_none():
     empty = scan_context(np.empty((0, 3)), CONFIG)
     assert not empty.ring_key.any()
     assert similarity(empty, context(street(1), 0.0)) == 0.0

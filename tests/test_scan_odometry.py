@@ -1,4 +1,4 @@
-"""Every odometry for scans, on streets that do not exist."""
+"""Every LiDAR odometry, on synthetic streets."""
 
 from functools import cache
 from itertools import pairwise
@@ -58,7 +58,7 @@ def test_follows_a_street(config):
     tracks = tracked(config, scans())
 
     assert all(track.node is not None for track in tracks)
-    # KISS-ICP, the library itself too, needs its first few scans to believe that it moves.
+    # KISS-ICP, the library itself too, needs its first few scans to detect a motion.
     distance_m, angle_rad = misses(tracks, street(), since=6).max(axis=0)
     limit_m, limit_deg = LIMITS[config.kind]
     assert distance_m < limit_m
@@ -95,7 +95,7 @@ def test_the_same_scans_give_the_same_bytes(config):
 
 
 @pytest.mark.parametrize("config", EVERY_KIND, ids=lambda config: config.kind)
-def test_keyframes_are_tied_in_a_chain(config):
+def test_keyframes_are_connected_in_a_chain(config):
     tracks = tracked(config, scans()[:12])
 
     keyframes = [track for track in tracks if track.is_keyframe]
@@ -122,7 +122,7 @@ def test_motion_during_the_sweep_is_undone():
     assert deskewed_m < 0.5 * ignored_m
 
 
-def test_a_map_begins_with_a_scan_that_is_no_place_until_its_motion_is_known():
+def test_the_first_scan_is_unfit_for_place_recognition_until_its_motion_is_known():
     tracks = tracked(GicpOdometryConfig(), scans(motion_distortion=True)[:3])
 
     assert [track.is_sharp for track in tracks] == [False, True, True]
@@ -143,7 +143,7 @@ def test_a_view_is_deskewed_to_its_stamp():
     assert {tuple(point) for point in seen.points_body.tolist()} <= exact
 
 
-def test_a_jump_that_no_map_explains_is_found_without_a_guess():
+def test_a_jump_beyond_the_map_is_registered_without_a_guess():
     log = scans()
     turned = exp(np.array([0.0, 0.0, np.radians(120.0)]), np.array([2.0, 1.0, 0.0]))
     here = log[8].points_body @ turned[:3, :3].T.astype(np.float32) + turned[:3, 3].astype(np.float32)
@@ -156,7 +156,7 @@ def test_a_jump_that_no_map_explains_is_found_without_a_guess():
     np.testing.assert_allclose(T_jumped_body, turned, atol=0.05)
 
 
-def test_elsewhere_is_lost_and_then_a_part_of_its_own():
+def test_another_street_is_lost_and_then_begins_a_sub_map():
     config = GicpOdometryConfig(max_lost_scans=2, rescue=None)
     elsewhere = [
         Scan(scan.stamp_ns + 10_000_000_000, (scan.points_body * [1.0, -1.0, 1.0]).astype(np.float32))
@@ -171,7 +171,7 @@ def test_elsewhere_is_lost_and_then_a_part_of_its_own():
     assert tracks[8].factors == ()
 
 
-def test_what_a_corridor_hides_is_told_and_left_open():
+def test_a_corridor_reports_an_unobservable_motion_and_leaves_it_open():
     rng = np.random.default_rng(3)
     log = []
     for index in range(4):
@@ -191,7 +191,7 @@ def test_what_a_corridor_hides_is_told_and_left_open():
     assert information[3, 3] < 1e-3 * information[4, 4]
 
 
-def test_a_scan_of_next_to_nothing_is_refused():
+def test_a_scan_of_few_points_is_refused():
     odometry = build_frame_odometry(GicpOdometryConfig())
     few = Scan(5, np.full((40, 3), 7.0, np.float32))
 

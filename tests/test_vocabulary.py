@@ -121,7 +121,7 @@ def test_a_vector_holds_tf_idf_that_sums_to_one(vocabulary):
     np.testing.assert_allclose(vector.weights / ONE, expected / expected.sum(), atol=1 / ONE)
 
 
-def test_words_that_all_images_have_tell_nothing(vocabulary):
+def test_words_that_all_images_have_weigh_nothing(vocabulary):
     mute = Vocabulary(vocabulary.tree, np.zeros(vocabulary.words), "")
     vector = mute.vector(np.array([3, 5, 5], np.int32))
     assert len(vector.ids) == 0
@@ -232,7 +232,7 @@ def test_files_that_cannot_be_used_are_refused_in_one_line(saved, edit, message)
     assert message in str(caught.value)
 
 
-def test_a_missing_vocabulary_says_how_to_make_one(tmp_path):
+def test_the_error_of_a_missing_vocabulary_names_the_command(tmp_path):
     with pytest.raises(VocabularyError, match="No such file or directory; make one with mapper vocabulary"):
         load_vocabulary(tmp_path / "none.words")
 

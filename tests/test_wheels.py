@@ -1,4 +1,4 @@
-"""Wheel odometry: from encoders and files to factors that tie what the camera lost."""
+"""Wheel odometry: from encoders and files to factors that connect what the camera lost."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -50,7 +50,7 @@ def test_a_held_wheel_drives_an_exact_arc_at_any_rate():
         np.testing.assert_allclose(wheels.T_world_body[-1], quarter, atol=1e-12)
 
 
-def test_driving_back_the_same_way_ends_where_it_began():
+def test_driving_back_the_same_path_ends_where_it_began():
     path_m = np.array([0.0, 1.0, 2.5, 1.0, 0.0])
     steering_rad = np.array([0.1, -0.3, 0.2, -0.3, 0.1])
     wheels = driven(np.arange(5, dtype=np.int64), path_m, steering_rad, wheelbase_m=0.5)
@@ -67,7 +67,7 @@ def test_poses_are_interpolated_but_never_guessed():
     assert pose_at(wheels, S // 40, max_gap_ns=S // 10 - 1) is None
 
 
-def test_factors_follow_time_and_are_less_sure_the_longer_the_way():
+def test_factors_follow_time_and_are_less_certain_the_longer_the_path():
     wheels = on_a_line(11, turn_rad=0.1)
     stamps_ns = {7: 0, 3: S // 10, 5: S, 9: 2 * S}  # node 9 comes after the wheels stopped
     config = WheelFactorsConfig()
@@ -83,7 +83,7 @@ def test_factors_follow_time_and_are_less_sure_the_longer_the_way():
     assert near.information[5, 5] > far.information[5, 5]
 
 
-def test_there_and_back_is_a_long_way():
+def test_there_and_back_is_a_long_path():
     wheels = on_a_line(11)
     there_and_back = replace(wheels, T_world_body=wheels.T_world_body[[*range(6), 4, 3, 2, 1, 0]])
     (factor,) = wheel_factors({0: 0, 1: S}, there_and_back, WheelFactorsConfig())
@@ -91,7 +91,7 @@ def test_there_and_back_is_a_long_way():
     assert factor.information[5, 5] ** -0.5 == pytest.approx(0.01 + 0.05 * 5.0)
 
 
-def test_without_wheels_or_when_told_so_there_are_no_factors():
+def test_without_wheels_or_when_switched_off_there_are_no_factors():
     stamps_ns = {0: 0, 1: S // 10}
     assert wheel_factors(stamps_ns, None, WheelFactorsConfig()) == []
     assert wheel_factors(stamps_ns, on_a_line(3), WheelFactorsConfig(use=False)) == []
@@ -176,7 +176,7 @@ def mapped(source, config):
     return replace(tracking, graph=solved.graph).trajectory()
 
 
-def test_wheels_tie_what_lies_before_and_after_a_covered_lens(interrupted):
+def test_wheels_connect_what_is_before_and_after_a_covered_lens(interrupted):
     config: BuildConfig = load_config(None, ["loops.kind=none"])
     alone = mapped(
         interrupted,
@@ -184,13 +184,13 @@ def test_wheels_tie_what_lies_before_and_after_a_covered_lens(interrupted):
             update={"graph": config.graph.model_copy(update={"wheels": WheelFactorsConfig(use=False)})}
         ),
     )
-    tied = mapped(interrupted, config)
+    connected = mapped(interrupted, config)
     covered, begun_anew_after = 30, config.odometry.max_lost_frames
     assert len(alone) < 60
-    assert len(tied) == len(interrupted) - covered - begun_anew_after
-    first, last = (np.searchsorted(interrupted.truth.stamps_ns, tied.stamps_ns[k]) for k in (0, -1))
+    assert len(connected) == len(interrupted) - covered - begun_anew_after
+    first, last = (np.searchsorted(interrupted.truth.stamps_ns, connected.stamps_ns[k]) for k in (0, -1))
     truth = interrupted.truth.T_world_body
     want = inverse(truth[first]) @ truth[last]
-    got = inverse(tied.T_world_body[0]) @ tied.T_world_body[-1]
+    got = inverse(connected.T_world_body[0]) @ connected.T_world_body[-1]
     assert np.linalg.norm(got[:3, 3] - want[:3, 3]) < 0.15
     assert angle_between(got[:3, :3], want[:3, :3]) < 0.05

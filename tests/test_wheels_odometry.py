@@ -1,4 +1,4 @@
-"""Maps by wheels alone: no frame is looked at to place it, and walls stand where they are."""
+"""Wheel odometry alone: no frame is read for its pose, and walls stand where they are."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -144,8 +144,8 @@ def test_frames_without_a_reading_are_lost_and_the_path_goes_on_after_a_gap(flat
     assert {how for s, how in lost.items() if s < 6.0} == {"lost in a gap of the wheels' readings"}
     assert {how for s, how in lost.items() if s > 6.0} == {"lost outside the wheels' readings"}
     path, truth = tracking.trajectory(), flat.truth
-    told, true = inverse(path.T_world_body[0]) @ path.T_world_body[-1], inverse(truth.T_world_body[0])
-    np.testing.assert_allclose(told, true @ truth.T_world_body[41], atol=2e-3)
+    estimated, true = inverse(path.T_world_body[0]) @ path.T_world_body[-1], inverse(truth.T_world_body[0])
+    np.testing.assert_allclose(estimated, true @ truth.T_world_body[41], atol=2e-3)
 
 
 def test_readings_of_another_time_are_named_as_what_is_wrong(flat):
@@ -163,7 +163,7 @@ def test_a_log_without_wheels_is_refused_with_the_remedy(flat):
         track_log(flat, by_wheels("loops.kind=thesis"), progress=SILENT)
 
 
-def test_loops_look_at_keyframes_only_and_pass_a_damaged_one_by(flat):
+def test_loops_read_keyframes_only_and_skip_a_damaged_one(flat):
     watched = Watched(flat, damaged={0})
     tracking = track_log(watched.log, by_wheels("loops.kind=places"), progress=SILENT)
     nodes = set(tracking.graph.stamps_ns.values())
@@ -172,7 +172,7 @@ def test_loops_look_at_keyframes_only_and_pass_a_damaged_one_by(flat):
     assert len(tracking.placed) == len(flat)
 
 
-def test_keyframes_are_recognised_by_what_their_sensor_saw(flat):
+def test_keyframes_are_recognised_by_images_or_scans(flat):
     odometry = build_odometry(WheelsOdometryConfig(), flat.wheels)
     entry = next(flat.entries())
     seen = odometry.view(odometry.read(entry), odometry.track(entry).twist)
@@ -217,7 +217,7 @@ def test_a_later_session_keeps_its_wheels_on_the_common_clock(flat):
     assert len(path) == len(flat)
 
 
-def test_the_configuration_that_is_shipped_looks_at_nothing(flat):
+def test_the_configuration_that_is_shipped_reads_no_frame(flat):
     config = load_config(Path(__file__).parents[1] / "configs/wheels.toml")
     watched = Watched(flat)
     assert len(track_log(watched.log, config, progress=SILENT).placed) == len(flat)

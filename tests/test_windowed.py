@@ -45,7 +45,7 @@ def test_hamming_counts_differing_bits():
         assert hamming(pack(a), i, pack(b), i) == np.unpackbits(a[i] ^ b[i]).sum()
 
 
-def test_every_feature_is_found_near_its_own_place(scene):
+def test_every_feature_is_found_near_its_own_pixel(scene):
     pixels, octave, words, _ = scene
     rng = np.random.default_rng(1)
 
@@ -80,7 +80,7 @@ def test_the_closer_of_two_rivals_gets_the_feature(scene):
     assert matched.tolist() == [-1, 0, -1]
 
 
-def test_pixels_outside_the_image_join_the_border_cells():
+def test_pixels_outside_the_image_are_in_the_border_cells():
     pixels = np.array([[-3.0, 5.0], [WIDTH + 9.0, HEIGHT + 9.0], [50.0, 50.0]])
     order, grid = sort_into_grid(pixels, width_px=WIDTH, height_px=HEIGHT)
     assert sorted(order) == [0, 1, 2]

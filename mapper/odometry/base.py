@@ -68,6 +68,19 @@ class FrameResult:
     is_sharp: bool = True
 
 
+def lost_frame(
+    stamp_ns: int,
+    T_world_body: Transform,
+    *,
+    features: int = 0,
+    residual_unit: str = "m",
+    method: str = "lost",
+) -> FrameResult:
+    """Return the result of a frame that was not found; ``T_world_body`` is that of the last tracked frame."""
+    diagnostics = Diagnostics(features, 0, 0, 0.0, residual_unit, method)
+    return FrameResult(stamp_ns, None, np.eye(4), T_world_body, False, diagnostics)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureMatches:
     """Matches behind the pose of a frame, one row per feature of its view.
@@ -134,6 +147,10 @@ class FrameOdometry(Odometry[Observation], Protocol[Observation]):
             FrameError: The frame cannot be read, or is of a kind that this method cannot use.
         """
         return self.observe(entry.load(colour=False))
+
+    def finish(self) -> Sequence[BetweenFactor]:
+        """Return nothing: every measurement was final when its frame was tracked."""
+        return ()
 
     def observe(self, frame: Frame) -> Observation:
         """Reduce a frame to what tracking needs. Pure: no state is read or written.

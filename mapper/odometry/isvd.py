@@ -17,12 +17,13 @@ from mapper.features.frame_view import ImageView
 from mapper.features.matching import Pairs, homography_inliers, match_mutual
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
-from mapper.odometry.base import Diagnostics, FeatureMatches, FrameOdometry, FrameResult
+from mapper.odometry.base import Diagnostics, FeatureMatches, FrameOdometry, FrameResult, lost_frame
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
 from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
 from mapper.sensing.depth_filter import dif
+from mapper.sensing.depth_noise import feature_depth_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,10 +139,8 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         if candidates:
             self._nearest_match = observation, candidates[0], self._config.match
             return self._add_node(observation, self._combine(candidates), candidates, method="relocalised")
-        diagnostics = Diagnostics(len(observation.features), 0, 0, 0.0, "m", "lost")
-        return FrameResult(
-            observation.stamp_ns, None, np.eye(4), self._recent[-1].T_world_body, False, diagnostics
-        )
+        last_world = self._recent[-1].T_world_body
+        return lost_frame(observation.stamp_ns, last_world, features=len(observation.features))
 
     def view(self, observation: IsvdObservation, _twist: Twist | None = None, /) -> ImageView:
         """Return the view for place recognition. Pure."""
@@ -171,10 +170,6 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         before_px[now] = self._pixels(earlier)[then]
         return FeatureMatches(np.isfinite(before_px[:, 0]), before_px)
 
-    def finish(self) -> Sequence[BetweenFactor]:
-        """Return nothing: every measurement was final when its frame was tracked."""
-        return ()
-
     def _pixels(self, observation: IsvdObservation) -> Array:
         pixels: Array = observation.features.pixels.astype(np.float64)
         return observation.camera.undistort(pixels) if self._config.undistort else pixels
@@ -182,12 +177,8 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
     def _points_body(self, frame: RgbdFrame, features: Features) -> Points:
         config, camera = self._config, frame.camera
         depth_m = dif(frame.depth_m) if config.depth_filter else frame.depth_m
-        # Depth is registered to the raw image, so it is looked up before undistortion.
-        nearest = np.rint(features.pixels).astype(np.intp)
-        columns = np.clip(nearest[:, 0], 0, camera.width_px - 1)
-        rows = np.clip(nearest[:, 1], 0, camera.height_px - 1)
-        z = depth_m[rows, columns].astype(np.float64)
-        z[(z <= 0.0) | (z > config.max_depth_m)] = np.nan
+        z, _, _ = feature_depth_m(depth_m, features.pixels)
+        z[z > config.max_depth_m] = np.nan
         pixels = camera.undistort(features.pixels) if config.undistort else features.pixels
         rays = (pixels - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
         return apply(frame.T_body_camera, np.column_stack([rays * z[:, None], z]))

@@ -14,7 +14,7 @@ from mapper.features.factory import build_detector
 from mapper.features.frame_view import FrameView
 from mapper.graph.model import BetweenFactor
 from mapper.graph.wheel_factors import WheelNode, wheel_factor
-from mapper.odometry.base import Diagnostics, FrameResult
+from mapper.odometry.base import Diagnostics, FrameResult, lost_frame
 from mapper.odometry.config import LocalMapConfig, WheelsOdometryConfig
 from mapper.odometry.keyframe_distance import is_far
 from mapper.odometry.local_map.image_observation import observe_image
@@ -80,7 +80,7 @@ class WheelsOdometry:
             T_node_body=inverse(keyframe.T_odom_body) @ T_odom_body,
             T_world_body=self._T_world_body,
             is_keyframe=keyframe is not last,
-            diagnostics=_diagnostics("wheels"),
+            diagnostics=Diagnostics(0, 0, 0, 0.0, "m", "wheels"),
             factors=factors,
             links=factors,
             twist=twist_at(self._wheels, int(np.searchsorted(self._wheels.stamps_ns, stamp_ns))),
@@ -112,15 +112,4 @@ class WheelsOdometry:
         """Return the result of a frame at whose stamp there are no readings."""
         first_ns, last_ns = self._wheels.stamps_ns[[0, -1]]
         where = "in a gap of" if first_ns < stamp_ns < last_ns else "outside"
-        return FrameResult(
-            stamp_ns=stamp_ns,
-            node=None,
-            T_node_body=np.eye(4),
-            T_world_body=self._T_world_body,
-            is_keyframe=False,
-            diagnostics=_diagnostics(f"lost {where} the wheels' readings"),
-        )
-
-
-def _diagnostics(method: str) -> Diagnostics:
-    return Diagnostics(features=0, matches=0, inliers=0, residual=0.0, residual_unit="m", method=method)
+        return lost_frame(stamp_ns, self._T_world_body, method=f"lost {where} the wheels' readings")

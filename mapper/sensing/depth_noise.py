@@ -1,4 +1,4 @@
-"""Standard deviation of the depth of a feature."""
+"""Depth of image features, and its standard deviation."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,6 +7,22 @@ from mapper.core.frames import DepthImage
 from mapper.core.geometry import Array
 from mapper.sensing.config import DepthNoiseConfig
 from mapper.sensing.depth_filter import dif
+
+
+def feature_depth_m(
+    depth_m: DepthImage, pixels: NDArray[np.floating]
+) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
+    """Return (N,) depths of features, NaN without a measurement, and the (N,) columns and rows read.
+
+    Args:
+        depth_m: (H, W) depth image, registered to the raw image; 0 is no measurement.
+        pixels: (N, 2) column and row in the raw image.
+    """
+    nearest = np.rint(pixels).astype(np.intp)
+    columns, rows = (nearest[:, k].clip(0, depth_m.shape[1 - k] - 1) for k in (0, 1))
+    z = depth_m[rows, columns].astype(np.float64)
+    z[z <= 0.0] = np.nan
+    return z, columns, rows
 
 
 def feature_depth_sigma_m(

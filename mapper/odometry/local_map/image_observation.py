@@ -14,7 +14,7 @@ from mapper.features.hamming import Bits, pack
 from mapper.features.window_matching import FeatureGrid, sort_into_grid
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.places.vocabulary import Vocabulary
-from mapper.sensing.depth_noise import feature_depth_sigma_m
+from mapper.sensing.depth_noise import feature_depth_m, feature_depth_sigma_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,10 +93,7 @@ def observe_image(
     pixels = camera.undistort(features.pixels)
     order, grid = sort_into_grid(pixels, width_px=camera.width_px, height_px=camera.height_px)
     pixels, octave = pixels[order], features.octave[order]
-    raw = np.rint(features.pixels[order]).astype(np.intp)
-    column, row = raw[:, 0].clip(0, camera.width_px - 1), raw[:, 1].clip(0, camera.height_px - 1)
-    depth_m = frame.depth_m[row, column].astype(np.float64)
-    depth_m[depth_m <= 0.0] = np.nan
+    depth_m, column, row = feature_depth_m(frame.depth_m, features.pixels[order])
     intrinsics = np.array(
         [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, config.virtual_baseline_px_m]
     )

@@ -13,7 +13,7 @@ from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
-from mapper.odometry.base import Diagnostics, FeatureMatches, FrameOdometry, FrameResult
+from mapper.odometry.base import Diagnostics, FeatureMatches, FrameOdometry, FrameResult, lost_frame
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.image_observation import ImageObservation, observe_image
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
@@ -214,14 +214,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
     def _lost(self, observation: ImageObservation) -> FrameResult:
         self._lost_frames += 1
         last = self._last
-        return FrameResult(
-            stamp_ns=observation.stamp_ns,
-            node=None,
-            T_node_body=np.eye(4),
-            T_world_body=np.eye(4) if last is None else _body_pose(last.observation, last.T_camera_world),
-            is_keyframe=False,
-            diagnostics=Diagnostics(len(observation), 0, 0, 0.0, "px", "lost"),
-        )
+        T_world_body = np.eye(4) if last is None else _body_pose(last.observation, last.T_camera_world)
+        return lost_frame(observation.stamp_ns, T_world_body, features=len(observation), residual_unit="px")
 
 
 def _body_pose(observation: ImageObservation, T_camera_world: Transform) -> Transform:

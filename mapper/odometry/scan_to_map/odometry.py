@@ -1,7 +1,6 @@
 """Scan-to-map odometry by any scan matcher, with checks of each pose against the last keyframe."""
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
@@ -14,7 +13,7 @@ from mapper.core.timebase import NS_PER_S
 from mapper.features.frame_view import ScanView
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
-from mapper.odometry.base import Diagnostics, FrameOdometry, FrameResult
+from mapper.odometry.base import Diagnostics, FrameOdometry, FrameResult, lost_frame
 from mapper.odometry.keyframe_distance import is_far
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan, ScanMatcher
@@ -110,10 +109,6 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
 
     def matches(self) -> None:
         """Return None: the pose is not from features."""
-
-    def finish(self) -> Sequence[BetweenFactor]:
-        """Return nothing: every measurement was final when its scan was tracked."""
-        return ()
 
     def _begin_again(
         self, first: ScanObservation, second: ScanObservation, elapsed_s: float
@@ -244,14 +239,8 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         self._lost_scans += 1
         if 0 < self._config.max_lost_scans < self._lost_scans:
             return self._start(observation, self._T_world_last, method="new sub-map")
-        return FrameResult(
-            stamp_ns=observation.scan.stamp_ns,
-            node=None,
-            T_node_body=np.eye(4),
-            T_world_body=self._T_world_last,
-            is_keyframe=False,
-            diagnostics=Diagnostics(len(observation.scan.points_body), 0, 0, 0.0, "m", "lost"),
-        )
+        scan = observation.scan
+        return lost_frame(scan.stamp_ns, self._T_world_last, features=len(scan.points_body))
 
     def _add_keyframe(
         self, observation: ScanObservation, deskewed: DeskewedScan, T_world_middle: Transform
