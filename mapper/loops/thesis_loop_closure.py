@@ -22,7 +22,7 @@ class ThesisLoopDetector:
     """Loop detector of the thesis: sharp frames are compared with the keyframes near their estimate."""
 
     def __init__(
-        self, config: ThesisLoopsConfig, verifier: Verifier[View], estimator: OnlinePoseEstimator
+        self, config: ThesisLoopsConfig, verifier: Verifier[ImageView], estimator: OnlinePoseEstimator
     ) -> None:
         self._config = config
         self._verifier = verifier
