@@ -1,4 +1,4 @@
-"""What a registration could not see is named, and carried into the noise."""
+"""Unobservable motions are named, and carried into the information."""
 
 import numpy as np
 import pytest
@@ -41,8 +41,8 @@ def room(rng):
     return np.concatenate(sides)
 
 
-def seen(scene, *, T_turned=None, noise_m=0.02):
-    """Register two noisy samples of a scene; return the information and what was open in it."""
+def registered(scene, *, T_turned=None, noise_m=0.02):
+    """Register two noisy samples of a scene; return the information and its degeneracy."""
     rng = np.random.default_rng(7)
     clouds = []
     for _ in range(2):
@@ -62,21 +62,21 @@ def seen(scene, *, T_turned=None, noise_m=0.02):
         (room, ""),
     ],
 )
-def test_the_open_motions_are_named(scene, text):
-    _, degeneracy = seen(scene)
+def test_unobservable_motions_are_named(scene, text):
+    _, degeneracy = registered(scene)
     assert degeneracy.text == text
     assert degeneracy.is_degenerate == bool(text)
 
 
 def test_a_corridor_turned_half_right_is_named_by_its_direction():
-    _, degeneracy = seen(corridor, T_turned=exp(np.array([0.0, 0.0, np.pi / 4]), np.zeros(3)))
+    _, degeneracy = registered(corridor, T_turned=exp(np.array([0.0, 0.0, np.pi / 4]), np.zeros(3)))
     assert degeneracy.text in ("translation along (0.71, 0.71, 0.00)", "translation along (0.70, 0.71, 0.00)")
 
 
 def test_shares_do_not_depend_on_where_the_sensor_stands_nor_on_metres():
-    information, degeneracy = seen(tunnel)
+    information, degeneracy = registered(tunnel)
     T_other_body = transform(np.eye(3), np.array([30.0, -20.0, 5.0]))
-    _, shifted = seen(tunnel, T_turned=T_other_body)
+    _, shifted = registered(tunnel, T_turned=T_other_body)
     assert np.allclose(degeneracy.shares, shifted.shares, atol=5e-3)
     assert degeneracy.text == shifted.text
 
@@ -87,34 +87,34 @@ def test_shares_do_not_depend_on_where_the_sensor_stands_nor_on_metres():
     assert np.allclose(metres, kilometres)
 
 
-def test_unseen_motions_move_the_cloud_by_a_metre_and_no_surface_notices():
+def test_unobservable_motions_move_the_cloud_by_a_metre_and_no_surface_notices():
     rng = np.random.default_rng(1)
     points = tunnel(rng)
-    _, degeneracy = seen(tunnel)
-    assert len(degeneracy.unseen) == 2
+    _, degeneracy = registered(tunnel)
+    assert len(degeneracy.unobservable) == 2
     radius_before = np.hypot(points[:, 1] - 1.5, points[:, 2])
-    for tangent in degeneracy.unseen:
+    for tangent in degeneracy.unobservable:
         moved = apply(exp(0.01 * tangent[:3], 0.01 * tangent[3:]), points)
         assert np.sqrt(((moved - points) ** 2).sum(axis=1).mean()) == pytest.approx(0.01, rel=0.02)
         assert np.abs(np.hypot(moved[:, 1] - 1.5, moved[:, 2]) - radius_before).max() < 2e-3
 
 
 @pytest.mark.parametrize("scene", [corridor, plain, tunnel])
-def test_the_noise_grows_along_what_was_open_and_only_there(scene):
-    information, degeneracy = seen(scene)
-    open_ = projected(information, degeneracy)
+def test_the_noise_grows_along_unobservable_motions_and_only_there(scene):
+    information, degeneracy = registered(scene)
+    without = projected(information, degeneracy)
 
-    assert np.linalg.eigvalsh(open_)[0] > 0.0
+    assert np.linalg.eigvalsh(without)[0] > 0.0
     for k, motion in enumerate(degeneracy.motions):
-        before, after = motion @ information @ motion, motion @ open_ @ motion
-        if k < degeneracy.open_motions:
+        before, after = motion @ information @ motion, motion @ without @ motion
+        if k < degeneracy.unobservable_count:
             assert after <= degeneracy.extent_m**-2 * 1.001 < before
         else:
             assert after == pytest.approx(before)
 
 
 def test_a_room_keeps_its_information():
-    information, degeneracy = seen(room)
+    information, degeneracy = registered(room)
     assert np.allclose(projected(information, degeneracy), information)
 
 

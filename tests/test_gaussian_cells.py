@@ -28,7 +28,7 @@ def test_a_scan_is_placed_where_small_gicp_places_it(far):
     rng = np.random.default_rng(3)
     first, second = room(rng), room(rng, MOTION)
     T_world_first = exp(np.array([0.0, 0.0, 1.0]), np.array([far, -far, 0.0]))
-    cells, theirs = GaussianCells(CELL_M, remembered=5), small_gicp.GaussianVoxelMap(CELL_M)
+    cells, theirs = GaussianCells(CELL_M, kept_clouds=5), small_gicp.GaussianVoxelMap(CELL_M)
     cells.insert(prepared(first, voxel_m=VOXEL_M), T_world_first)
     theirs.insert(small_gicp.preprocess_points(first, VOXEL_M, 10, 1)[0], T_world_first)
 
@@ -55,7 +55,7 @@ def test_a_map_is_the_same_whether_its_tables_had_to_grow_or_not(monkeypatch):
     answers = []
     for capacity in (1 << 14, 16):
         monkeypatch.setattr("mapper.registration.gaussian_cells._FIRST_CAPACITY", capacity)
-        cells = GaussianCells(CELL_M, remembered=5)
+        cells = GaussianCells(CELL_M, kept_clouds=5)
         for cloud, pose in zip(clouds, poses, strict=True):
             cells.insert(cloud, pose)
         answers.append((len(cells), cells.align(clouds[0], MOTION, **STEPS).tobytes()))
@@ -66,7 +66,7 @@ def test_cells_that_nothing_touched_for_long_are_forgotten():
     rng = np.random.default_rng(5)
     here = prepared(room(rng, n=4000), voxel_m=VOXEL_M)
     there = exp(np.zeros(3), np.array([100.0, 0.0, 0.0]))
-    cells = GaussianCells(CELL_M, remembered=3)
+    cells = GaussianCells(CELL_M, kept_clouds=3)
     cells.insert(here, np.eye(4))
     alone = len(cells)
     for _ in range(8):
@@ -79,6 +79,6 @@ def test_cells_that_nothing_touched_for_long_are_forgotten():
 
 
 def test_a_scan_beside_the_map_has_no_place():
-    cells = GaussianCells(CELL_M, remembered=3)
+    cells = GaussianCells(CELL_M, kept_clouds=3)
     cloud = prepared(room(np.random.default_rng(6), n=2000), voxel_m=VOXEL_M)
     assert cells.align(cloud, np.eye(4), **STEPS) is None

@@ -26,7 +26,7 @@ def moved(scan, T_new_body):
 
 
 def pair_of(log, i, j, *, yaw_rad, shift_m):
-    """Return two scans, the second told in a frame turned and set off, and the motion between them."""
+    """Return two scans, the second in a frame turned and set off, and the motion between them."""
     T_source_new = transform(rotation_exp(yaw_rad * UP), np.array(shift_m))
     T_i_j = inverse(log.truth.T_world_body[i]) @ log.truth.T_world_body[j]
     return log.observe(i), moved(log.observe(j), inverse(T_source_new)), T_i_j @ T_source_new
@@ -100,7 +100,7 @@ def test_same_answer_whatever_the_guess_and_the_order(street):
     assert np.array_equal(source.points_body, before)
 
 
-def test_tells_its_stages(street):
+def test_returns_its_stages(street):
     target, source, T_target_source = street
     stages = Hough(HoughGicpConfig()).prepare(target).stages(source)
 
@@ -115,7 +115,7 @@ def test_tells_its_stages(street):
 
 @pytest.mark.parametrize("seeds", [(0, 1), (2, 3), (4, 6)])
 @pytest.mark.parametrize("config", [STREET, COURTYARD], ids=lambda c: c.scene)
-def test_strangers_are_refused(config, seeds):
+def test_scans_of_different_places_are_refused(config, seeds):
     a, b = (source_of(config, seed).observe(4) for seed in seeds)
 
     found = build_registration(HoughGicpConfig()).prepare(a).align(b, np.eye(4))
@@ -136,7 +136,7 @@ def test_two_motions_as_good_as_each_other_are_none():
     x, y = rng.uniform(-20.0, 20.0, (2, 40_000))
     field = np.column_stack([x, y, rng.normal(-1.7, 0.01, x.shape)])
     posts = []
-    for k in range(8):  # a ring of eight posts looks the same every 45°
+    for k in range(8):  # a ring of eight posts is the same every 45°
         angle = k * np.pi / 4.0
         height = rng.uniform(-1.7, 2.0, 600)
         around = rng.uniform(0.0, 2.0 * np.pi, 600)
@@ -194,7 +194,7 @@ def test_bad_scans_are_refused_with_a_reason(street, make, config):
         assert found.reason
 
 
-def test_trust_can_be_asked_for_more(street):
+def test_stricter_acceptance_refuses(street):
     target, source, _ = street
     config = HoughGicpConfig(acceptance=HoughAcceptanceConfig(min_agreeing_ratio=0.99))
 
@@ -204,7 +204,7 @@ def test_trust_can_be_asked_for_more(street):
     assert "overlap" in found.reason
 
 
-def test_along_a_corridor_nothing_is_known():
+def test_a_corridor_is_refused():
     def corridor(seed):
         rng = np.random.default_rng(seed)
         x, y = rng.uniform(-25.0, 25.0, 30_000), rng.uniform(-4.0, 4.0, 30_000)

@@ -152,7 +152,7 @@ def test_information_predicts_the_scatter_of_repeated_fits():
     ],
     ids=["none", "few", "unrelated", "collinear"],
 )
-def test_says_why_it_cannot_tell(target, source, why):
+def test_no_answer_has_a_reason(target, source, why):
     found, weight = Isvd(IsvdConfig()).fit_weighted(target, source)
 
     assert not found.converged

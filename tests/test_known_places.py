@@ -23,8 +23,8 @@ def link(i, j, T_world_i, T_world_j):
     return BetweenFactor(i, j, inverse(T_world_i) @ T_world_j, LINK)
 
 
-def knowing(config, room):
-    """A closer that knows one lap of the room."""
+def preloaded(config, room):
+    """A loop detector preloaded with one lap of the room."""
     truth = walked()[:LAP]
     graph = PoseGraph(dict(enumerate(truth)), {k: k * CLOSE_IN_TIME_NS for k in range(LAP)})
     graph.add_factors(link(k, k + 1, truth[k], truth[k + 1]) for k in range(LAP - 1))
@@ -36,17 +36,17 @@ def knowing(config, room):
 def come_back(detector, room):
     """Walk the lap again, as seen from a world of its own that begins where the camera is."""
     truth = walked()[:LAP]
-    told = [T_OTHER_WORLD @ T for T in truth]
+    poses = [T_OTHER_WORLD @ T for T in truth]
     for k in range(LAP):
         node, stamp_ns = LAP + k, (LAP + k) * CLOSE_IN_TIME_NS
-        links = [link(node - 1, node, told[k - 1], told[k])] if k else []
+        links = [link(node - 1, node, poses[k - 1], poses[k])] if k else []
         view = partial(room.view, truth[k], stamp_ns)
-        detector.add(node, track(node, stamp_ns, told[k], links), view)
+        detector.add(node, track(node, stamp_ns, poses[k], links), view)
 
 
 def test_what_was_seen_before_is_recognised_however_little_time_lies_between():
     truth, room = walked(), Room(1)
-    detector = knowing(PlaceLoopsConfig(places=PLACES, min_motion_m=0.0), room)
+    detector = preloaded(PlaceLoopsConfig(places=PLACES, min_motion_m=0.0), room)
     come_back(detector, room)
     held = [loop for loop in detector.closures() if loop.verdict == "accepted"]
     assert len(held) >= 0.8 * LAP
@@ -56,9 +56,9 @@ def test_what_was_seen_before_is_recognised_however_little_time_lies_between():
         assert loop.stamp_j_ns - loop.stamp_i_ns < NS_PER_S, "the stamps are the frames' own"
 
 
-def test_the_later_session_is_believed_in_the_earlier_one_s_world():
+def test_the_later_session_is_estimated_in_the_earlier_one_s_world():
     room = Room(1)
-    detector = knowing(PlaceLoopsConfig(places=PLACES), room)
+    detector = preloaded(PlaceLoopsConfig(places=PLACES), room)
     come_back(detector, room)
     for k, T_world_body in enumerate(walked()[:LAP]):
         np.testing.assert_allclose(detector.current_estimate(k), T_world_body, atol=0.05)
@@ -66,7 +66,7 @@ def test_the_later_session_is_believed_in_the_earlier_one_s_world():
 
 
 def test_nothing_is_proposed_by_pose_before_a_loop_ties_the_sessions():
-    detector = knowing(PlaceLoopsConfig(places=PLACES, max_distance_m=100.0, max_angle_rad=3.1), Room(1))
+    detector = preloaded(PlaceLoopsConfig(places=PLACES, max_distance_m=100.0, max_angle_rad=3.1), Room(1))
     come_back(detector, Room(2))
     assert not any(loop.proposed_by == "nearby" for loop in detector.closures() if loop.i < LAP)
     assert not any(loop.verdict == "accepted" for loop in detector.closures())
@@ -74,4 +74,4 @@ def test_nothing_is_proposed_by_pose_before_a_loop_ties_the_sessions():
 
 def test_pose_alone_recognises_no_other_session():
     with pytest.raises(ConfigError, match=r"want loops\.propose=auto or places, and an ORB detector"):
-        knowing(PlaceLoopsConfig(propose="nearby"), Room(1))
+        preloaded(PlaceLoopsConfig(propose="nearby"), Room(1))

@@ -38,7 +38,7 @@ def walked() -> list[Transform]:
 
 
 def drifting(truth: Sequence[Transform]) -> list[Transform]:
-    """The same walk as an odometry tells it that turns 1 % too far and climbs a little."""
+    """The same walk by an odometry that turns 1 % too far and climbs a little."""
     poses = [truth[0]]
     for before, after in pairwise(truth):
         step = inverse(before) @ after @ exp(np.array([0.0, 0.0, 0.0015]), np.array([0.0, 0.0, 0.004]))
@@ -47,14 +47,14 @@ def drifting(truth: Sequence[Transform]) -> list[Transform]:
 
 
 def walk(
-    detector: LoopDetector, room: Room, *, told: Sequence[Transform] | None = None, features=None
+    detector: LoopDetector, room: Room, *, poses: Sequence[Transform] | None = None, features=None
 ) -> list[ImageView]:
-    """Feed a closer with the walk; ``told`` is what the odometry says of it."""
+    """Feed a loop detector with the walk; ``poses`` are the odometry's."""
     truth = walked()
-    told = drifting(truth) if told is None else told
+    poses = drifting(truth) if poses is None else poses
     views = [room.view(T, k * NS_PER_S // 2) for k, T in enumerate(truth)]
-    for k, T_world_body in enumerate(told):
-        links = [BetweenFactor(k - 1, k, inverse(told[k - 1]) @ T_world_body, LINK)] if k else []
+    for k, T_world_body in enumerate(poses):
+        links = [BetweenFactor(k - 1, k, inverse(poses[k - 1]) @ T_world_body, LINK)] if k else []
         count = 500 if features is None else features[k]
         detector.add(
             k, track(k, views[k].stamp_ns, T_world_body, links, features=count), partial(views.__getitem__, k)
@@ -81,7 +81,7 @@ def test_the_second_lap_closes_on_the_first(propose):
     assert {loop.proposed_by for loop in found} == {propose}
 
 
-def test_loops_correct_what_is_believed():
+def test_loops_correct_the_current_estimate():
     detector = build_loop_detector(PlaceLoopsConfig(places=PLACES), "batch")
     walk(detector, Room(1))
     truth = walked()
@@ -99,7 +99,7 @@ def test_every_candidate_gets_a_verdict():
         assert loop.stamp_j_ns - loop.stamp_i_ns >= 5 * NS_PER_S
 
 
-def test_two_runs_tell_the_same():
+def test_two_runs_find_the_same():
     runs = []
     for _ in range(2):
         detector = build_loop_detector(PlaceLoopsConfig(places=PLACES), "batch")
@@ -118,7 +118,7 @@ def test_the_gate_refuses_what_odometry_rules_out():
     assert any(loop.reason.startswith("gate: ") for loop in detector.closures())
 
 
-def test_a_loop_without_company_is_not_believed():
+def test_a_loop_that_no_other_confirms_is_rejected():
     detector = build_loop_detector(PlaceLoopsConfig(places=PLACES, min_agreeing=NODES), "batch")
     walk(detector, Room(1))
     assert not accepted(detector)

@@ -1,4 +1,4 @@
-"""Verification, drift gates, agreement and the file of loop closures."""
+"""Image verification, drift gate, consistency check and the file of loop closures."""
 
 from dataclasses import replace
 
@@ -128,7 +128,7 @@ def steps(length: int) -> list[BetweenFactor]:
     return [BetweenFactor(k, k + 1, at(1.0, 0.0, 0.1), SURE) for k in range(length)]
 
 
-def test_the_way_between_two_nodes_is_as_long_as_the_path():
+def test_the_path_between_two_nodes_is_as_long_as_its_steps():
     chain = OdometryChain()
     chain.add(steps(10))
     path = chain.between(2, 9)
@@ -137,18 +137,29 @@ def test_the_way_between_two_nodes_is_as_long_as_the_path():
     assert chain.between(9, 2) == path
 
 
-def test_a_loop_shortens_every_way_over_it():
+def test_a_loop_shortens_every_path_over_it():
     chain = OdometryChain()
     chain.add(steps(10))
     chain.add([BetweenFactor(0, 10, at(0.1), SURE, "loop")])
     assert chain.between(1, 9).path_m == pytest.approx(2.1)
 
 
-def test_what_nothing_ties_has_no_way():
+def test_disconnected_nodes_have_no_path():
     chain = OdometryChain()
     chain.add(steps(3))
     chain.add([BetweenFactor(20, 21, at(1.0), SURE)])
     assert chain.between(0, 21) is None
+
+
+def test_connected_nodes_are_those_with_a_path():
+    chain = OdometryChain()
+    assert chain.connected(3, [3, 4]).tolist() == [True, False]
+    chain.add(steps(3))
+    chain.add([BetweenFactor(20, 21, at(1.0), SURE)])
+    assert chain.connected(0, [3, 20, 21, 40]).tolist() == [True, False, False, False]
+    assert chain.connected(40, []).tolist() == []
+    chain.add([BetweenFactor(21, 2, at(1.0), SURE, "loop")])
+    assert chain.connected(0, [3, 20, 21, 40]).tolist() == [True, True, True, False]
 
 
 def test_around_a_node_lie_those_within_reach():
@@ -157,7 +168,7 @@ def test_around_a_node_lie_those_within_reach():
     assert sorted(chain.around(5, within_m=2.0)) == [3, 4, 5, 6, 7]
 
 
-def test_the_gate_widens_with_the_way():
+def test_the_gate_widens_with_the_path():
     chain = OdometryChain()
     chain.add(steps(40))
     gate = GateConfig()
@@ -169,11 +180,11 @@ def test_the_gate_widens_with_the_way():
     assert exceeds(Discrepancy(0.0, 3.0), far)
 
 
-# Agreement
+# Consistency check
 
 
-class Still:
-    """A belief that no loop changes."""
+class FixedPoses:
+    """An estimator whose poses no loop changes."""
 
     def __init__(self, poses: dict[int, np.ndarray]) -> None:
         self._poses = poses
@@ -183,40 +194,40 @@ class Still:
 
 
 @pytest.fixture
-def agreement():
+def check():
     """Nodes 0 … 40 on a line, a metre apart; one other must agree."""
     chain = OdometryChain()
     chain.add([BetweenFactor(k, k + 1, at(1.0), SURE) for k in range(40)])
-    estimator = Still({k: at(float(k)) for k in range(41)})
+    estimator = FixedPoses({k: at(float(k)) for k in range(41)})
     return ConsistencyCheck(chain, estimator, GateConfig(), min_agreeing=1, within_m=3.0)
 
 
-def test_a_lone_loop_waits_until_another_tells_the_same(agreement):
+def test_a_lone_loop_waits_until_another_agrees(check):
     first, second = loop(2, 30, at(0.5)), loop(3, 31, at(0.5))
-    assert agreement.add(first) == []
-    assert agreement.add(second) == [first, second]
+    assert check.add(first) == []
+    assert check.add(second) == [first, second]
 
 
-def test_a_loop_that_tells_otherwise_is_no_support(agreement):
-    assert agreement.add(loop(2, 30, at(0.5))) == []
-    assert agreement.add(loop(3, 31, at(2.5))) == []
+def test_a_loop_that_disagrees_is_no_support(check):
+    assert check.add(loop(2, 30, at(0.5))) == []
+    assert check.add(loop(3, 31, at(2.5))) == []
 
 
-def test_another_loop_of_the_same_keyframe_is_no_support(agreement):
-    assert agreement.add(loop(2, 30, at(0.5))) == []
-    assert agreement.add(loop(3, 30, at(-0.5))) == []
+def test_another_loop_of_the_same_keyframe_is_no_support(check):
+    assert check.add(loop(2, 30, at(0.5))) == []
+    assert check.add(loop(3, 30, at(-0.5))) == []
 
 
-def test_a_loop_far_along_the_path_is_no_support(agreement):
-    assert agreement.add(loop(2, 30, at(0.5))) == []
-    assert agreement.add(loop(12, 40, at(0.5))) == []
+def test_a_loop_far_along_the_path_is_no_support(check):
+    assert check.add(loop(2, 30, at(0.5))) == []
+    assert check.add(loop(12, 40, at(0.5))) == []
 
 
-def test_a_third_loop_joins_those_believed(agreement):
-    agreement.add(loop(2, 30, at(0.5)))
-    agreement.add(loop(3, 31, at(0.5)))
+def test_a_third_loop_joins_those_confirmed(check):
+    check.add(loop(2, 30, at(0.5)))
+    check.add(loop(3, 31, at(0.5)))
     third = loop(4, 32, at(0.5))
-    assert agreement.add(third) == [third]
+    assert check.add(third) == [third]
 
 
 # Closures
@@ -224,7 +235,7 @@ def test_a_third_loop_joins_those_believed(agreement):
 
 def test_the_file_of_closures_comes_back_whole(tmp_path):
     path = tmp_path / "loops.jsonl"
-    told = loop(
+    accepted = loop(
         1,
         5,
         at(0.3, 0.2, 0.7),
@@ -239,11 +250,15 @@ def test_the_file_of_closures_comes_back_whole(tmp_path):
     )
     refused = loop(2, 6, verdict="rejected", reason="isvd: 3 pairs", information=None, T_i_j=None)
     refused = replace(refused, T_i_j=None)
-    write_closures(path, [told, refused])
+    write_closures(path, [accepted, refused])
     first, second = read_closures(path)
-    np.testing.assert_allclose(first.T_i_j, told.T_i_j, atol=1e-12)
-    np.testing.assert_array_equal(first.information, told.information)
-    assert (first.before, first.after, first.similarity) == (told.before, told.after, told.similarity)
+    np.testing.assert_allclose(first.T_i_j, accepted.T_i_j, atol=1e-12)
+    np.testing.assert_array_equal(first.information, accepted.information)
+    assert (first.before, first.after, first.similarity) == (
+        accepted.before,
+        accepted.after,
+        accepted.similarity,
+    )
     assert (second.verdict, second.reason, second.T_i_j) == ("rejected", "isvd: 3 pairs", None)
 
 

@@ -1,4 +1,4 @@
-"""Wrong motions are told from right ones, where plain overlap would believe them."""
+"""Wrong motions are refused and right ones accepted, where plain overlap would accept both."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def clouds():
     return tuple(prepared(yard(rng, points=n), voxel_m=VOXEL_M) for n in (200_000, 40_000))
 
 
-def test_the_right_motion_is_believed(clouds):
+def test_the_right_motion_is_accepted(clouds):
     alignment = assess(*clouds, np.eye(4), AcceptanceConfig())
     assert alignment.converged, alignment.reason
     assert alignment.inlier_ratio > 0.9

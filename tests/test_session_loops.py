@@ -1,4 +1,4 @@
-"""Loops between two sessions, in doubt, where odometry drifts more than it admits."""
+"""Loops between two sessions where odometry drifts more than it claims, and some of the loops are wrong."""
 
 import numpy as np
 import pytest

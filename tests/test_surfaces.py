@@ -1,4 +1,4 @@
-"""Prepared clouds: small_gicp prepares the same; and what it would not say."""
+"""Prepared clouds: the same as small_gicp's; and points without a surface."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def test_points_and_normals_are_those_of_small_gicp():
     assert (dots > 0.9999).mean() > 0.9
 
 
-def test_normals_look_to_the_origin_and_have_unit_length():
+def test_normals_point_to_the_origin_and_have_unit_length():
     cloud = prepared(yard(np.random.default_rng(2)), voxel_m=VOXEL_M)
     assert np.allclose(np.linalg.norm(cloud.normals, axis=1), 1.0)
     assert ((cloud.normals * cloud.points).sum(axis=1) <= 0.0).all()

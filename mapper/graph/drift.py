@@ -100,7 +100,6 @@ def _spanning_tree(factors: Sequence[BetweenFactor]) -> _Tree:
     spreads = np.linalg.inv(np.array([factor.information for factor in factors]))
     nodes = list(dict.fromkeys(node for factor in factors for node in (factor.i, factor.j)))
     index_of = {node: index for index, node in enumerate(nodes)}
-    # Distinct ranks as weights make the tree unique: of factors with equal traces the first counts.
     by_rank = np.argsort(np.trace(spreads, axis1=1, axis2=2), kind="stable").tolist()
     ends = np.sort([(index_of[factors[k].i], index_of[factors[k].j]) for k in by_rank], axis=1)
     _, surest = np.unique(ends, axis=0, return_index=True)  # of parallel factors

@@ -1,1 +1,1 @@
-"""Loop closure: who might be the same place, whether it is, and what was made of it."""
+"""Loop closure: candidates for places seen before, their verification, and their verdicts."""

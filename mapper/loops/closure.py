@@ -1,4 +1,4 @@
-"""Loop closures: what was proposed, what came of it, and the file that tells."""
+"""Loop closures: every candidate with its measurement and its verdict, and the file of them."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,7 +20,7 @@ Verdict = Literal["accepted", "rejected"]
 
 @dataclass(frozen=True, slots=True)
 class Discrepancy:
-    """How far two poses lie from where a loop closure wants them to each other."""
+    """Distance of two poses from the relative pose that a loop closure measured."""
 
     translation_m: float
     rotation_rad: float
@@ -35,8 +35,9 @@ class LoopClosure:
         j: Later node, from which the loop was found.
         stamp_i_ns: Stamp of i's frame.
         stamp_j_ns: Stamp of j's frame.
-        proposed_by: Who thought of it.
-        similarity: Of two images' words (eq. 10) or of two scans' heights; None if they were not compared.
+        proposed_by: The kind of proposer.
+        similarity: Of two images' words (Zhao et al. 2020, eq. 10) or of two scans' heights; None if they
+            were not compared.
         matches: Features paired by descriptor, or upright points compared.
         inliers: Pairs that agree with the motion, in the image or in space.
         rmse_m: Root mean square distance of the agreeing points; None if none agreed.
@@ -44,10 +45,10 @@ class LoopClosure:
         T_i_j: (4, 4) measured pose of j in i; None if there is no measurement.
         information: (6, 6) of j's tangent (rotation, translation); None if there is no measurement.
         verdict: Whether it is a constraint of the graph.
-        reason: Why not; empty when accepted.
+        reason: Why it was rejected; empty when accepted.
         before: Discrepancy before the solve; None unless it was accepted until then.
         after: Discrepancy after the solve.
-        weight: What the solver let it count, 0 … 1.
+        weight: Weight that the solver gave it, 0 … 1.
     """
 
     i: int
@@ -79,7 +80,7 @@ class LoopClosure:
 
     @property
     def factor(self) -> BetweenFactor:
-        """The constraint that it is.
+        """Constraint of the graph.
 
         Raises:
             DataError: Nothing was measured.
@@ -90,7 +91,7 @@ class LoopClosure:
 
 
 def discrepancy(T_i_j: Transform, T_world_i: Transform, T_world_j: Transform) -> Discrepancy:
-    """Return how far node j lies from where a measurement from node i puts it."""
+    """Return the distance of node j from the pose that a measurement from node i gives it."""
     miss = inverse(T_i_j) @ inverse(T_world_i) @ T_world_j
     return Discrepancy(float(np.linalg.norm(miss[:3, 3])), float(np.linalg.norm(rotation_log(miss[:3, :3]))))
 
@@ -107,7 +108,7 @@ def apply_solution(
     *,
     min_weight: float,
 ) -> tuple[LoopClosure, ...]:
-    """Return the loops with what the solver made of them; those that it did not believe are rejected.
+    """Return the loops with their discrepancies and weights; those with too little weight are rejected.
 
     Args:
         loops: Every candidate; the accepted ones are the solved graph's last factors, in this order.
@@ -133,16 +134,16 @@ def _apply_solution(
     min_weight: float,
 ) -> LoopClosure:
     assert loop.T_i_j is not None
-    told = replace(
+    solved = replace(
         loop,
         before=discrepancy(loop.T_i_j, T_world_before[loop.i], T_world_before[loop.j]),
         after=discrepancy(loop.T_i_j, T_world_after[loop.i], T_world_after[loop.j]),
         weight=weight,
     )
     if weight >= min_weight:
-        return told
+        return solved
     return replace(
-        told, verdict="rejected", reason=f"solver: contradicts the rest of the graph, weight {weight:.2f}"
+        solved, verdict="rejected", reason=f"solver: contradicts the rest of the graph, weight {weight:.2f}"
     )
 
 

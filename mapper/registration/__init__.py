@@ -1,1 +1,1 @@
-"""The motion between two observations."""
+"""Registration: the motion between two scans, two images, or matched points."""

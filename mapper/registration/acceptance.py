@@ -1,4 +1,4 @@
-"""Whether a motion found between two scans is believed."""
+"""Acceptance of a motion found between two scans, by the surfaces that agree with it."""
 
 from dataclasses import replace
 
@@ -12,24 +12,24 @@ from mapper.registration.degeneracy import degeneracy_of
 from mapper.registration.refining import measured
 from mapper.registration.surfaces import Prepared
 
-_FEW = 0.01  # of all surface; of fewer that face a direction, degeneracy speaks
+_FEW = 0.01  # of all surface; a direction that fewer face is left to the degeneracy check
 
 
 def assess(
     target: Prepared, source: Prepared, T_target_source: Transform, config: AcceptanceConfig
 ) -> Alignment:
-    """Return what a motion is worth; not converged when surfaces contradict it, or none shows it.
+    """Return a motion, assessed; not converged when surfaces contradict it or leave it degenerate.
 
     Most of a scan is ground, and any ground agrees with any other: under a wrong motion up to 95 % of the
-    points can lie on a dense map. So the points are asked by what they face. They vote for the three main
-    directions of the normals, each by its normal's squared cosine, and the motion is believed when enough
-    agree on the direction in which fewest do.
+    points can lie on a dense map. So the share of agreeing points is taken in each of the three main
+    directions of the normals, a point counting by its normal's squared cosine, and the least of the three is
+    compared.
 
     Args:
         target: Cloud that stays.
-        source: Cloud that moves; the one with the smaller view, which the other should explain.
+        source: Cloud that moves; the one with the smaller view, all of which the other should contain.
         T_target_source: (4, 4) motion in question.
-        config: What is asked of it, in voxels of the source.
+        config: Thresholds, in voxels of the source.
     """
     near_m, surface_m = config.near_voxels * source.voxel_m, config.surface_voxels * source.voxel_m
     alignment = measured(
@@ -45,7 +45,7 @@ def assess(
             f"lie on the target's, less than {config.min_agreeing_ratio:.0%}"
         )
         return replace(alignment, converged=False, reason=reason)
-    assert alignment.information is not None  # measured and converged
+    assert alignment.information is not None  # it converged
     degeneracy = degeneracy_of(alignment.information, points=source.points)
     if degeneracy.is_degenerate:
         return replace(alignment, converged=False, reason=f"degenerate: no surface shows {degeneracy.text}")

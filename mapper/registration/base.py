@@ -1,4 +1,4 @@
-"""The seam of registration: two scans and a guess in, a motion and its trust out."""
+"""Interface of registration: two scans and a guess in, a motion and its assessment out."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -12,11 +12,11 @@ from mapper.core.geometry import Array, Transform, is_rigid
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """The motion found between two observations, and how far it can be trusted.
+    """The motion found between two observations, and its assessment.
 
     Attributes:
         T_target_source: (4, 4) pose of the source in the target.
-        converged: False means "no answer"; ``reason`` says why.
+        converged: False means "no answer", for the given ``reason``.
         inlier_ratio: Share of the pairs that agree with the motion, 0 … 1.
         inlier_rmse_m: Root mean square distance of those pairs, metres.
         pairs: How many pairs agree.
@@ -40,7 +40,7 @@ class Alignment:
 
 
 def failed(reason: str) -> Alignment:
-    """Return the answer "I don't know": identity, not converged, with the reason."""
+    """Return no answer: identity, not converged, with the reason."""
     return Alignment(np.eye(4), converged=False, inlier_ratio=0.0, inlier_rmse_m=float("inf"), reason=reason)
 
 
@@ -52,7 +52,7 @@ class Aligner(Protocol):
 
         Args:
             source: Its points are aligned to the target's.
-            T_target_source: (4, 4) guess. A global method needs none and does not look at it.
+            T_target_source: (4, 4) guess. A global method does not use it.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""Which motions a registration could not see: along a corridor, over a plain, about a tunnel's axis."""
+"""Degeneracy: motions that a registration cannot observe, as along a corridor or about a tunnel's axis."""
 
 from dataclasses import dataclass
 
@@ -16,47 +16,47 @@ _AXES = "xyz"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Degeneracy:
-    """What the surfaces told about six independent motions, and which of them they left open.
+    """Observability of six independent motions.
 
     Attributes:
-        shares: (6,) ascending, 0 … 1: how much of a motion's displacements goes along the normals.
+        shares: (6,) ascending, 0 … 1: share of a motion's displacements that goes along the normals.
         motions: (6, 6) tangents (rotation, translation) of the source as rows, in the same order; each
             displaces the cloud by 1 m root mean square.
         extent_m: Root mean square distance of the points from their centroid.
-        open_motions: How many of them, from the first, were not seen.
-        text: Their names, as in "translation along x"; empty when all were seen.
+        unobservable_count: Number of them, from the first, that are unobservable.
+        text: Their names, as in "translation along x"; empty when all are observable.
     """
 
     shares: Array
     motions: Array
     extent_m: float
-    open_motions: int
+    unobservable_count: int
     text: str
 
     @property
     def is_degenerate(self) -> bool:
-        """Whether any motion was left open."""
-        return self.open_motions > 0
+        """Whether any motion is unobservable."""
+        return self.unobservable_count > 0
 
     @property
-    def unseen(self) -> Array:
-        """(K, 6) tangents (rotation, translation) that were not seen, as ``motions`` has them."""
-        return self.motions[: self.open_motions]
+    def unobservable(self) -> Array:
+        """(K, 6) the unobservable tangents (rotation, translation), as ``motions`` has them."""
+        return self.motions[: self.unobservable_count]
 
 
 def degeneracy_of(information: Array, *, points: Points, min_share: float = _MIN_SHARE) -> Degeneracy:
-    """Return which motions an information matrix leaves open.
+    """Return which motions an information matrix leaves unobservable.
 
-    Zhang, Kaess & Singh (2016, §III) hold the eigenvalues of JᵀJ against a threshold. Radians and metres
-    make those depend on units and on where the origin lies, so here they are relative to what the same
-    points would tell if every surface faced the motion (the point-to-point JᵀJ): Σ(n·δ)² / Σ|δ|² over the
-    displacements δ. A cube seen from within has a third for each translation, a corridor 0 along itself.
+    Zhang, Kaess & Singh (2016, §III) compare the eigenvalues of JᵀJ with a threshold. Radians and metres
+    make those depend on units and on the origin, so here they are divided by those of the same points if
+    every surface faced the motion (the point-to-point JᵀJ): Σ(n·δ)² / Σ|δ|² over the displacements δ. A cube
+    seen from within has a third for each translation, a corridor 0 along itself.
 
     Args:
         information: (6, 6) of the source's tangent (rotation, translation), from point-to-plane distances.
         points: (N, 3) source points, metres, source frame.
-        min_share: A motion of which less is seen counts as not seen. Noise of 2 cm in 20 cm voxels gives
-            0.002 where nothing is seen; an open yard with five boxes has 0.009, a street 0.15.
+        min_share: A motion with a smaller share is unobservable. Noise of 2 cm in 20 cm voxels gives 0.002
+            where no surface shows it; an open yard with five boxes has 0.009, a street 0.15.
 
     Raises:
         DataError: The information is not finite or there is none, or there are no points.
@@ -72,29 +72,29 @@ def degeneracy_of(information: Array, *, points: Points, min_share: float = _MIN
     metre[:3, :3] = (axes / np.sqrt(np.maximum(arms, _MIN_ARM_M**2))) @ axes.T
     tangents = adjoint(transform(np.eye(3), centroid)) @ metre
     shares, vectors = np.linalg.eigh(tangents.T @ information @ tangents / total)
-    open_motions = int((shares < min_share).sum())
+    count = int((shares < min_share).sum())
     return Degeneracy(
         shares,
         (tangents @ vectors).T,
         float(np.sqrt(np.trace(squares))),
-        open_motions,
-        _text(vectors[:, :open_motions]),
+        count,
+        _text(vectors[:, :count]),
     )
 
 
 def projected(information: Array, degeneracy: Degeneracy) -> Array:
-    """Return the information with the unseen motions left open: unknown to within the cloud's extent.
+    """Return the information without that of the unobservable motions: unknown to within the cloud's extent.
 
-    What noise pretends to know of them is dropped; the motions that were seen keep theirs.
+    What they had is noise's; the observable motions keep theirs.
 
     Args:
         information: (6, 6) that the degeneracy was found in.
-        degeneracy: Its answer.
+        degeneracy: Its degeneracy.
 
     Returns:
         (6, 6) positive definite information.
     """
-    motions, count = degeneracy.motions, degeneracy.open_motions
+    motions, count = degeneracy.motions, degeneracy.unobservable_count
     eigenvalues = np.einsum("ki,ij,kj->k", motions, information, motions)
     eigenvalues[:count] = np.minimum(eigenvalues[:count], degeneracy.extent_m**-2)
     eigenvalues = np.maximum(eigenvalues, np.finfo(float).eps * eigenvalues.max())
@@ -103,10 +103,10 @@ def projected(information: Array, degeneracy: Degeneracy) -> Array:
     return 0.5 * (result + result.T)
 
 
-def _text(open_: Array) -> str:
-    """Name the (6, K) open motions about the centroid; any basis of the same space gets the same names."""
+def _text(unobservable: Array) -> str:
+    """Return the names of (6, K) motions about the centroid; any basis of one space gets the same names."""
     names = []
-    for name, block in (("translation along", open_[3:]), ("rotation about", open_[:3])):
+    for name, block in (("translation along", unobservable[3:]), ("rotation about", unobservable[:3])):
         if block.size:
             lines, weights, _ = np.linalg.svd(block, full_matrices=False)
             lines = lines[:, weights**2 >= _PART]
@@ -116,9 +116,9 @@ def _text(open_: Array) -> str:
 
 
 def _lines(lines: Array) -> str:
-    """Name the space that (3, K) orthonormal columns span, by axes where it holds them."""
-    held = (lines**2).sum(axis=1)
-    axes = [axis for axis, part in zip(_AXES, held, strict=True) if part >= _SAME_DIRECTION]
+    """Return the name of the space that (3, K) orthonormal columns span, by axes where it contains them."""
+    contained = (lines**2).sum(axis=1)
+    axes = [axis for axis, part in zip(_AXES, contained, strict=True) if part >= _SAME_DIRECTION]
     if len(axes) == lines.shape[1]:
         return " and ".join(axes)
     if lines.shape[1] == 2:

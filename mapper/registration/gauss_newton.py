@@ -1,4 +1,4 @@
-"""Gauss–Newton on pairs of points with uncertain places: compiled, so that threads need not wait for it.
+"""Gauss–Newton on pairs of points with uncertain positions, compiled without the interpreter's lock.
 
 A step is a twist of the source about its own origin, seen along the target's axes: far from the target's
 origin its rotation and its translation would otherwise be nearly one.
@@ -11,13 +11,13 @@ from mapper.core.linear import solve_positive, twist_exp
 from mapper.registration.kd_tree import STACK, search
 
 POINT, PLANE, GAUSSIAN = 0, 1, 2
-"""What is made small: distances between points, to planes (Chen & Medioni 1992), between Gaussians."""
+"""What is minimised: distances between points, to planes (Chen & Medioni 1992), between Gaussians."""
 
 FLATNESS = 1.0 - 1e-3
 """A surface's covariance is I − FLATNESS · n nᵀ: a thousandth as thick as wide (Segal et al. 2009)."""
 
 _DAMPING = 1e-6
-"""Of the pairs; a direction that no plane sees stays where it was."""
+"""Per pair; along a direction that no plane observes the motion stays as it was."""
 
 
 @njit(cache=True, nogil=True)
@@ -35,9 +35,9 @@ def descend_on_points(  # type: ignore[no-untyped-def]
         source_normals: (M, 3).
         T: (4, 4) T_target_source to begin with.
         kind: POINT, PLANE or GAUSSIAN.
-        max_distance: Points without a partner this near take no part.
-        iterations: At most so many.
-        steps: (2,) radians and metres of the step that ends it.
+        max_distance: Points without a partner this near are left out.
+        iterations: Largest number of steps.
+        steps: (2,) radians and metres; a shorter step is the last.
     """
     branches, offsets = np.empty((STACK, 3), np.int64), np.empty((STACK, 4))
     index, squared = np.zeros(1, np.int64), np.empty(1)
@@ -71,7 +71,7 @@ def descend_on_points(  # type: ignore[no-untyped-def]
             for k in range(3):
                 n[k] = points[partner, k] - p[k]
             add_pair(sums, T, p, n[0], n[1], n[2], weight)
-        T, is_last = on_frame(sums, pairs, T, steps)
+        T, is_last = gauss_newton_step(sums, pairs, T, steps)
         if is_last:
             break
     return T
@@ -149,7 +149,7 @@ def add_pair(sums, T, p, x, y, z, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def on_frame(sums, pairs, T, steps):  # type: ignore[no-untyped-def]
+def gauss_newton_step(sums, pairs, T, steps):  # type: ignore[no-untyped-def]
     """Return T after one step of Gauss–Newton, and whether the step was short enough to be the last."""
     H, g = np.empty((6, 6)), np.empty(6)
     k = 0
@@ -165,5 +165,5 @@ def on_frame(sums, pairs, T, steps):  # type: ignore[no-untyped-def]
     moved = twist_exp(step, about_source)
     moved[:3, 3] += T[:3, 3]
     turn = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
-    way = np.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
-    return moved, turn < steps[0] and way < steps[1]
+    shift = np.sqrt(step[3] ** 2 + step[4] ** 2 + step[5] ** 2)
+    return moved, turn < steps[0] and shift < steps[1]

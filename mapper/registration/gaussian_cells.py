@@ -1,4 +1,4 @@
-"""A map of Gaussians, one a cell, in which scans are placed: voxelised GICP (Koide et al. 2021)."""
+"""Map of Gaussians, one per cell, to which scans are aligned: voxelised GICP (Koide et al. 2021)."""
 
 from typing import NamedTuple
 
@@ -7,40 +7,40 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, is_rigid
-from mapper.registration.gauss_newton import FLATNESS, add_pair, inverse_of, moved, on_frame, turned
+from mapper.registration.gauss_newton import FLATNESS, add_pair, gauss_newton_step, inverse_of, moved, turned
 from mapper.registration.surfaces import Prepared
 
 _EMPTY = -1
 _FIRST_CAPACITY = 1 << 14
 _CLEAR_CYCLE = 10
 _BITS = 21
-"""Of each coordinate of a cell in its key; cells 2²¹ apart would be taken for one."""
+"""Of each coordinate of a cell in its key; cells 2²¹ apart would share one."""
 
 
 class GaussianCells:
-    """Where the surfaces of clouds lie: the mean and the mean covariance of the points in each cell.
+    """Map of Gaussians: the mean and the mean covariance of the points in each cell.
 
-    Cells that as many clouds in a row have not touched are forgotten, every so often.
+    Every tenth cloud, cells that no recent cloud has touched are removed.
     """
 
-    def __init__(self, cell_m: float, *, remembered: int) -> None:
+    def __init__(self, cell_m: float, *, kept_clouds: int) -> None:
         """Make an empty map.
 
         Args:
             cell_m: Edge of the cells, metres.
-            remembered: How many clouds long a cell is kept that none of them touches.
+            kept_clouds: Number of clouds for which a cell is kept that none of them touches.
         """
         self.cell_m = cell_m
-        self._remembered = remembered
+        self._kept_clouds = kept_clouds
         self._clouds = self._count = 0
         self._cells = _room_for(_FIRST_CAPACITY)
 
     def __len__(self) -> int:
-        """Return how many cells there are."""
+        """Return the number of cells."""
         return self._count
 
     def insert(self, cloud: Prepared, T_world_cloud: Transform) -> None:
-        """Take in a cloud where it lies."""
+        """Add a cloud at its pose."""
         capacity = len(self._cells.keys)
         while capacity < self._count + len(cloud.points):
             capacity *= 2
@@ -52,7 +52,7 @@ class GaussianCells:
         )
         if self._clouds % _CLEAR_CYCLE == 0:
             touched = self._cells.touched[: self._count]
-            self._keep(np.flatnonzero(touched + self._remembered >= self._clouds), capacity)
+            self._keep(np.flatnonzero(touched + self._kept_clouds >= self._clouds), capacity)
 
     def align(
         self,
@@ -63,12 +63,12 @@ class GaussianCells:
         step_rad: float,
         step_m: float,
     ) -> Transform | None:
-        """Return where a cloud lies, from a guess; None if nothing of it lies in any cell.
+        """Return T_world_cloud from a guess; None if no point lies in any cell.
 
         Args:
-            cloud: What is placed.
+            cloud: The cloud.
             T_world_cloud: (4, 4) guess.
-            max_iterations: At most so many.
+            max_iterations: Largest number of steps.
             step_rad: A step that turns less and
             step_m: moves less than this is the last.
         """
@@ -86,7 +86,7 @@ class GaussianCells:
         return T_found if pairs > 0 and is_rigid(T_found) else None
 
     def _keep(self, kept: NDArray[np.intp], capacity: int) -> None:
-        """Keep some cells, with room for more."""
+        """Keep some cells, in tables of another capacity."""
         before, self._cells, self._count = self._cells, _room_for(capacity), len(kept)
         for now, then in zip(self._cells[1:], before[1:], strict=True):
             now[: len(kept)] = then[kept]
@@ -100,7 +100,7 @@ class _Cells(NamedTuple):
         table: Open-addressing hash table of their indices, at most half full.
         keys: (C,) of their coordinates.
         sums: (C, 10) of positions, of covariances (xx, xy, xz, yy, yz, zz) and of ones.
-        gaussians: (C, 9) the same, as means.
+        gaussians: (C, 9) the same sums as means.
         touched: (C,) number of the last cloud that had a point in them.
     """
 
@@ -133,7 +133,7 @@ def _key(x, y, z):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _slot(table, keys, key):  # type: ignore[no-untyped-def]
-    """Return where a key is in the table, or where it would be."""
+    """Return the slot of a key in the table, or the free slot for it."""
     slot = (key * 0x9E3779B97F4A7C1 >> 20) & (len(table) - 1)
     while table[slot] != _EMPTY and keys[table[slot]] != key:
         slot = (slot + 1) & (len(table) - 1)
@@ -150,7 +150,7 @@ def _index(table, keys, count):  # type: ignore[no-untyped-def]
 def _insert(  # type: ignore[no-untyped-def]
     table, keys, sums, gaussians, touched, count, cloud, cell_m, points, normals, T
 ):
-    """Add points and their surfaces' covariances to their cells; return how many cells there are."""
+    """Add points and their surfaces' covariances to their cells; return the number of cells."""
     p, m = np.empty(3), np.empty(3)
     for i in range(len(points)):
         moved(T, points[i], p)
@@ -177,9 +177,9 @@ def _insert(  # type: ignore[no-untyped-def]
 def _descend(  # type: ignore[no-untyped-def]
     table, keys, gaussians, cell_m, points, normals, T, iterations, steps
 ):
-    """Return T_world_source after Gauss–Newton on points and their cells' Gaussians, and how many pairs.
+    """Return T_world_source after Gauss–Newton on points and their cells' Gaussians, and the number of pairs.
 
-    Points farther from the mean of their cell than its edge take no part.
+    Points farther from the mean of their cell than its edge are left out.
     """
     p, m, pairs = np.empty(3), np.empty(3), 0
     for _ in range(iterations):
@@ -206,7 +206,7 @@ def _descend(  # type: ignore[no-untyped-def]
                 mean_and_covariance[8] + 1.0 - FLATNESS * m[2] * m[2],
             )
             add_pair(sums, T, p, x, y, z, weight)
-        T, is_last = on_frame(sums, pairs, T, steps)
+        T, is_last = gauss_newton_step(sums, pairs, T, steps)
         if is_last:
             break
     return T, pairs

@@ -1,4 +1,4 @@
-"""A first guess of a motion, as a user writes it."""
+"""First guess of a motion, parsed from a user's text or file."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from mapper.core.rotations import rotation_from_euler, rotation_from_quaternion
 
 
 def parse_guess(text: str | None) -> Transform:
-    """Return T_target_source of a guess; None is the same place.
+    """Return the (4, 4) T_target_source of a guess; identity for None.
 
     Args:
         text: Six numbers, x y z in metres and roll pitch yaw in degrees; or a file with a 4×4 or 3×4 matrix,

@@ -1,4 +1,4 @@
-"""Iterative SVD on matched points (Somlyai, PhD thesis, Óbuda University, alg. 5 to 7)."""
+"""ISVD: iterative SVD on matched points (Somlyai, PhD thesis, alg. 5–7, eq. 4.1–4.2)."""
 
 from collections.abc import Iterator
 
@@ -10,13 +10,13 @@ from mapper.registration.base import Alignment, failed
 from mapper.registration.config import IsvdConfig
 
 _MM_PER_M = 1000.0
-_MIN_SPREAD_M = 0.01  # points nearer than this to a common line leave a rotation about it open
-_MIN_SIGMA_M = 1e-3  # trimming must not make the pairs look better than the sensor
+_MIN_SPREAD_M = 0.01  # about a common line, points nearer to it than this leave the rotation unobservable
+_MIN_SIGMA_M = 1e-3  # trimming must not make the pairs better than the sensor
 _ICP_STEPS = 20
 
 
 class Isvd:
-    """Fits a motion to matched points and drops the pairs farther apart than an ever smaller threshold."""
+    """ISVD: fit a motion to matched points, drop the pairs beyond a shrinking threshold, fit again."""
 
     def __init__(self, config: IsvdConfig) -> None:
         self._config = config
@@ -30,7 +30,7 @@ class Isvd:
 
         Returns:
             The alignment. Its ratio, residual and information are those of all pairs within
-            ``agreement_mm``; it has not converged when too few of them remain to tell.
+            ``agreement_mm``; it has not converged when there are too few of them.
         """
         return self.fit_weighted(target, source)[0]
 
@@ -63,7 +63,7 @@ class Isvd:
         return alignment, weight
 
     def _trim(self, target: Points, source: Points) -> tuple[Transform, NDArray[np.intp]]:
-        """Return the motion of the last iteration and the indices of the pairs that it rests on."""
+        """Return the motion of the last iteration and the indices of the pairs it was fitted to."""
         T_target_source = np.eye(4)
         used = kept = np.arange(len(target), dtype=np.intp)
         enough = min(self._config.min_pairs, len(target) // 2)
@@ -80,6 +80,7 @@ class Isvd:
         return T_target_source, used
 
     def _thresholds_m(self) -> Iterator[float]:
+        """Yield each iteration's largest pair distance: the power law (eq. 4.2) or the halving (alg. 6)."""
         config = self._config
         for j in range(1, config.max_iterations + 1):
             if config.threshold == "power":
@@ -93,8 +94,8 @@ def rigid_fit_information(source: Points, distances_m: Array) -> Array:
 
     A pair's residual d - T·s changes by -R·(ω × s + v) when T is multiplied by exp(ω, v) on the right.
     With equal, independent noise σ on each axis the pairs' information is Σ JᵀJ / σ², where J = [-[s]×, I];
-    σ² is what 3N - 6 degrees of freedom leave unexplained. Points spread wide fix the rotation, many
-    points the translation, and what they leave loose stays loose in the pose graph.
+    σ² is the residual variance at 3N - 6 degrees of freedom. Points spread wide fix the rotation, many
+    points the translation, and directions that they leave uncertain stay uncertain in the pose graph.
 
     Args:
         source: (N, 3) points in the source frame, metres.

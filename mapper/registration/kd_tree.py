@@ -1,7 +1,7 @@
-"""A k-d tree (Bentley 1975) over points in space, compiled without the interpreter's lock.
+"""K-d tree (Bentley 1975) over points in space, compiled without the interpreter's lock.
 
-The tree is balanced and implicit: a node halves its range of the points at the median of their widest axis,
-so what is kept are the points in the order of the leaves, and for every inner node its axis and its cut.
+The tree is balanced and implicit: a node halves its range of the points at the median of their widest axis.
+It consists of the points in the order of the leaves, and of every inner node's axis and cut.
 """
 
 from dataclasses import dataclass
@@ -16,17 +16,17 @@ from mapper.core.geometry import Array, Points
 
 _LEAF_POINTS = 8
 STACK = 64
-"""Deeper than any tree: each of its levels leaves one branch to come back to."""
+"""Deeper than any tree: each of its levels leaves one branch to search later."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KdTree:
-    """Points that can be asked which of them are near.
+    """K-d tree of points.
 
     Attributes:
-        points: (N, 3) in the order of the leaves; indices that queries return count in it.
-        axes: (M,) along which the inner nodes are cut; node i has the children 2i and 2i + 1, the root is 1.
-        cuts: (M,) where.
+        points: (N, 3) in the order of the leaves; queries return indices into it.
+        axes: (M,) axes of the inner nodes' cuts; node i has the children 2i and 2i + 1, the root is 1.
+        cuts: (M,) coordinates of the cuts on these axes.
     """
 
     points: Points
@@ -34,7 +34,7 @@ class KdTree:
     cuts: Array
 
     def nearest(self, queries: Points) -> tuple[NDArray[np.int64], Array]:
-        """Return which point is nearest to each of (Q, 3) positions, and how far it is, metres."""
+        """Return the (Q,) indices of the points nearest to (Q, 3) positions, and their distances, metres."""
         indices, squared = neighbours_of(self.points, self.axes, self.cuts, queries, 1)
         return indices[:, 0], np.sqrt(squared[:, 0])
 
@@ -135,9 +135,9 @@ def neighbours_of(points, axes, cuts, queries, count):  # type: ignore[no-untype
 
 @njit(cache=True, nogil=True)
 def search(points, axes, cuts, query, indices, squared, branches, offsets):  # type: ignore[no-untyped-def]
-    """Fill in the points nearest to a query, ascending, of those nearer than what ``squared`` begins with.
+    """Fill in the points nearest to a query, ascending, of those nearer than the initial ``squared``.
 
-    How far a branch lies is added up from how far it lies along each axis (Arya & Mount 1993).
+    The distance of a branch is updated from its distances along each axis (Arya & Mount 1993).
 
     Args:
         points: The tree's.
@@ -145,13 +145,13 @@ def search(points, axes, cuts, query, indices, squared, branches, offsets):  # t
         cuts: The tree's.
         query: (3,).
         indices: (K,) is filled in.
-        squared: (K,) holds the squared distance that interests, and is filled in.
-        branches: (64, 3) to work in.
-        offsets: (64, 4) to work in.
+        squared: (K,) largest squared distance of interest on entry; is filled in.
+        branches: (64, 3) working memory.
+        offsets: (64, 4) working memory.
     """
     inner, last, waiting = len(axes), len(squared) - 1, 0
     node, begin, end, bound = 1, 0, len(points), 0.0
-    x = y = z = 0.0  # how far the node's box lies from the query along each axis
+    x = y = z = 0.0  # distance of the node's box from the query along each axis
     while True:
         while node < inner:
             axis = axes[node]
@@ -176,11 +176,11 @@ def search(points, axes, cuts, query, indices, squared, branches, offsets):  # t
             dx, dy, dz = points[i, 0] - query[0], points[i, 1] - query[1], points[i, 2] - query[2]
             distance = dx * dx + dy * dy + dz * dz
             if distance < squared[last]:
-                place = last
-                while place > 0 and squared[place - 1] > distance:
-                    squared[place], indices[place] = squared[place - 1], indices[place - 1]
-                    place -= 1
-                squared[place], indices[place] = distance, i
+                slot = last
+                while slot > 0 and squared[slot - 1] > distance:
+                    squared[slot], indices[slot] = squared[slot - 1], indices[slot - 1]
+                    slot -= 1
+                squared[slot], indices[slot] = distance, i
         while waiting > 0 and offsets[waiting - 1, 3] >= squared[last]:
             waiting -= 1
         if waiting == 0:

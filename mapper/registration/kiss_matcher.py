@@ -1,4 +1,4 @@
-"""KISS-Matcher (Lim et al. 2025): a motion from matched features without any guess; GICP refines it."""
+"""KISS-Matcher (Lim et al. 2025): a motion from matched features without a first guess, refined by GICP."""
 
 import os
 import sys
@@ -14,16 +14,16 @@ from mapper.registration.config import KissMatcherConfig
 from mapper.registration.icp import cloud_of, refined
 from mapper.registration.surfaces import Prepared, prepared
 
-_CROWD = 5  # points this near together, in feature voxels, surely have a normal and a feature
+_CROWD = 5  # points this near together, in feature voxels, are certain to have a normal and a feature
 _CROWD_VOXELS = 1.5
 _MIN_FEATURES = 20
-_MAX_MATCHES = 5000  # of more the library draws so many, unseeded
+_MAX_MATCHES = 5000  # of more the library draws so many at random, unseeded
 _GROWTH = 1.25
-_MAX_NOISE_M = 1.0  # the library takes no more, and prints that
+_MAX_NOISE_M = 1.0  # the library accepts no more, and prints that
 
 
 class KissMatcher:
-    """Registers scans by their features."""
+    """KISS-Matcher: scans are registered by their features."""
 
     def __init__(self, config: KissMatcherConfig) -> None:
         self._config = config
@@ -34,14 +34,14 @@ class KissMatcher:
 
 
 class KissMatcherAligner:
-    """A target's cloud, for the features and for the refinement."""
+    """KISS-Matcher bound to a target's cloud, which serves the features and the refinement."""
 
     def __init__(self, target: Prepared, config: KissMatcherConfig) -> None:
         self._target = target
         self._config = config
 
-    def align(self, source: Scan, T_target_source: Transform) -> Alignment:  # noqa: ARG002 - needs no guess
-        """Return the motion that most matches agree on, refined and judged."""
+    def align(self, source: Scan, T_target_source: Transform) -> Alignment:  # noqa: ARG002
+        """Return the motion that most matches agree on, refined and assessed."""
         config = self._config
         cloud = cloud_of(source, config)
         thinned = _thinned(self._target, cloud, config.feature_voxels * config.voxel_m)
@@ -64,7 +64,7 @@ def _thinned(target: Prepared, source: Prepared, voxel_m: float) -> tuple[Prepar
 
 
 def _crowded(cloud: Prepared) -> int:
-    """Return how many points have neighbours enough. The library crashes on clouds where none has."""
+    """Return the number of points with enough neighbours. The library crashes on clouds where none has."""
     if cloud.tree is None or len(cloud.points) < _CROWD:
         return 0
     _, distances_m = cloud.tree.nearest_few(cloud.points, _CROWD)
@@ -91,9 +91,9 @@ def _matched(target: Prepared, source: Prepared) -> Transform | None:
 
 @cache
 def _library() -> Any:
-    """Return the library, held to one thread: with more, the order of its points and so its answer vary.
+    """Return the library, limited to one thread: with more, the order of its points and so its answer vary.
 
-    Its thread pool is sized when first used, by the cores that it may run on then.
+    Its thread pool is sized at the first use, by the cores that the process may run on then.
     """
     import kiss_matcher
 

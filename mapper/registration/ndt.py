@@ -1,4 +1,4 @@
-"""The normal distributions transform (Magnusson 2009, as Open3D has it), judged by the surfaces."""
+"""NDT: the normal distributions transform (Magnusson 2009) of Open3D, assessed by the surfaces."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,7 +14,7 @@ from mapper.registration.surfaces import Prepared, prepared
 
 
 class Ndt:
-    """Registers scans by the Gaussians of the target's cells."""
+    """NDT: scans are registered by the Gaussians of the target's cells."""
 
     def __init__(self, config: NdtConfig) -> None:
         self._config = config
@@ -27,7 +27,7 @@ class Ndt:
 
 
 class NdtAligner:
-    """A target's points, and its surfaces for the judgement."""
+    """NDT bound to a target: its points, and its surfaces for the assessment."""
 
     def __init__(self, points_target: Points, target: Prepared, config: NdtConfig) -> None:
         self._points_target = points_target
@@ -35,7 +35,7 @@ class NdtAligner:
         self._config = config
 
     def align(self, source: Scan, T_target_source: Transform) -> Alignment:
-        """Return the motion refined from a guess at one cell size after another, judged."""
+        """Return the motion refined from a guess at one cell size after another, assessed."""
         config = self._config
         cloud = prepared(source.points_body, voxel_m=config.voxel_m, neighbours=config.neighbours)
         found = refine_by_cells(

@@ -1,4 +1,4 @@
-"""A motion refined by the nearest pairs of two clouds, by ICP, plane ICP or GICP; and what it is worth."""
+"""Refinement of a motion by nearest pairs, by ICP, plane ICP or GICP, and its assessment."""
 
 from collections.abc import Mapping, Sequence
 from typing import Literal
@@ -16,7 +16,7 @@ Refiner = Literal["icp", "plane-icp", "gicp"]
 _MIN_PAIRS = 20
 _STEP_VOXELS = 0.003  # steps shorter than this end the refinement: 1 mm at 0.3 m
 _STEP_RAD = 3.5e-4
-_MIN_SIGMA_VOXELS = 0.03  # a scan against itself must not look infinitely certain
+_MIN_SIGMA_VOXELS = 0.03  # a scan against itself must not be infinitely certain
 _DISTANCES: Mapping[Refiner, int] = {"icp": POINT, "plane-icp": PLANE, "gicp": GAUSSIAN}
 
 
@@ -103,22 +103,22 @@ def measured(
     max_pair_distance_m: float,
     max_surface_distance_m: float = np.inf,
 ) -> Alignment:
-    """Return what a motion is worth, by whatever method it was found.
+    """Return a motion with its assessment, by whatever method it was found.
 
     A pair is a source point and the target point nearest to it. The information is that of point-to-plane
     distances, Σ JᵀJ / σ² with J = [(s × m)ᵀ, mᵀ] and m = Rᵀn (the source's tangent, multiplied on the
-    right): what the surfaces can fix, by whichever residual the motion was found. (Point-to-point residuals
-    would claim to see the motion along a wall.) σ is what the residuals show. Points that share a normal are
-    not independent, so as many count once as went into each normal.
+    right): what the surfaces can fix, whichever residual was minimised. (Point-to-point residuals would make
+    the motion along a wall observable.) σ is that of the residuals. Points that share a normal are not
+    independent, so as many count once as went into each normal.
 
     Args:
         target: Cloud that stays.
         source: Cloud that moves.
         T_target_source: (4, 4) motion in question.
-        max_pair_distance_m: How near the points of a pair must be to agree.
-        max_surface_distance_m: How near the source point must be to the target's surface. Finite, it tells
-            wrong motions from right ones better than the distance between points, which is mostly that
-            between samples; points with no surface about them then do not agree.
+        max_pair_distance_m: Largest distance between the points of a pair that agrees.
+        max_surface_distance_m: Largest distance of the source point from the target's surface. Finite, it
+            separates wrong motions from right ones better than the distance between points, which is mostly
+            that between samples; points with no surface about them then do not agree.
     """
     indices, distances_m = target.nearest(apply(T_target_source, source.points))
     near = distances_m <= max_pair_distance_m
@@ -128,10 +128,10 @@ def measured(
             f"fewer than {_MIN_PAIRS}: the clouds do not overlap"
         )
     jacobian, residuals_m = _plane_rows(target, source, T_target_source, indices[near], near)
-    known = jacobian.any(axis=1)
-    rms_m = float(np.sqrt((residuals_m**2).sum() / max(known.sum(), 1)))
+    has_normal = jacobian.any(axis=1)
+    rms_m = float(np.sqrt((residuals_m**2).sum() / max(has_normal.sum(), 1)))
     sigma_m = max(rms_m, _MIN_SIGMA_VOXELS * source.voxel_m)
-    agree = np.where(known, np.abs(residuals_m), np.inf) <= max_surface_distance_m
+    agree = np.where(has_normal, np.abs(residuals_m), np.inf) <= max_surface_distance_m
     pairs = int(agree.sum())
     return Alignment(
         T_target_source,

@@ -1,4 +1,4 @@
-"""Open3D's hybrid photometric and geometric odometry between two RGB-D images (Park, Zhou & Koltun 2017)."""
+"""Hybrid photometric and geometric registration of two RGB-D images (Park, Zhou & Koltun 2017), by Open3D."""
 
 from functools import lru_cache
 from typing import Any
@@ -12,22 +12,22 @@ from mapper.core.frames import NO_DISTORTION, PinholeCamera, RgbdFrame
 from mapper.core.geometry import Transform, inverse, nearest_rotation, transform
 from mapper.registration.base import Alignment, failed
 
-_O3D: Any = open3d  # its stubs know no buffers
+_O3D: Any = open3d  # its stubs lack buffers
 _MIN_PAIRS = 100
-_DECIMALS = 10  # Open3D adds up in threads of its own, in any order: the last digits are never the same
+_DECIMALS = 10  # Open3D sums in the order its threads finish: the last digits vary
 
 
 class HybridRgbd:
-    """Registers RGB-D frames by their grey values and depths, from a guess.
+    """Hybrid RGB-D registration: frames are aligned by their grey values and depths, from a guess.
 
-    Open3D's own iterations and thresholds are kept. It knows no lens, so images are undistorted first.
+    Open3D's own iterations and thresholds are kept. It has no lens model, so images are undistorted first.
     """
 
     def __init__(self, *, max_depth_m: float = 4.0) -> None:
-        """Start.
+        """Set the options.
 
         Args:
-            max_depth_m: Drop deeper measurements.
+            max_depth_m: Deeper measurements are dropped.
         """
         self._option = _O3D.pipelines.odometry.OdometryOption(depth_max=max_depth_m)
 
@@ -47,8 +47,8 @@ class HybridRgbdAligner:
     def align(self, source: RgbdFrame, T_target_source: Transform) -> Alignment:
         """Return the motion refined from a guess, between frames of one camera.
 
-        Open3D tells neither residual nor share of inliers, only how many pixels it paired: the residual is
-        NaN, and the ratio is that of all pixels with depth.
+        Open3D returns neither residual nor share of inliers, only the number of paired pixels: the residual
+        is NaN, and the ratio is that of all pixels with depth.
         """
         camera, T_body_camera = source.camera, source.T_body_camera
         intrinsics = _O3D.camera.PinholeCameraIntrinsic(
@@ -83,7 +83,7 @@ def _image(frame: RgbdFrame) -> Any:
     if frame.camera.distortion != NO_DISTORTION:
         columns, rows = _undistorting_map(frame.camera)
         gray = cv2.remap(gray, columns, rows, cv2.INTER_LINEAR)
-        depth_m = cv2.remap(depth_m, columns, rows, cv2.INTER_NEAREST)  # depths on both sides of an edge
+        depth_m = cv2.remap(depth_m, columns, rows, cv2.INTER_NEAREST)  # which mixes no depths across an edge
     return _O3D.geometry.RGBDImage.create_from_color_and_depth(
         _O3D.geometry.Image(np.ascontiguousarray(gray)),
         _O3D.geometry.Image(np.ascontiguousarray(depth_m)),
@@ -95,7 +95,7 @@ def _image(frame: RgbdFrame) -> Any:
 
 @lru_cache(maxsize=8)
 def _undistorting_map(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return where in the raw image every pixel of the undistorted one is, columns and rows."""
+    """Return the column and the row in the raw image of every pixel of the undistorted one."""
     columns, rows = cv2.initUndistortRectifyMap(
         camera.matrix,
         np.array(camera.distortion),

@@ -1,4 +1,4 @@
-"""Clouds prepared for registration: one point a voxel, the normals of their surfaces, a search tree."""
+"""Clouds prepared for registration: one point per voxel, surface normals, a search tree."""
 
 from dataclasses import dataclass
 
@@ -16,18 +16,19 @@ _NEIGHBOURS = 10
 _FEWEST_NEIGHBOURS = 5
 _VOXELS_ACROSS = 2**20  # within, positions in voxels are exact to a millionth of one
 _LINE = 1e-12
-"""Share of a spread's square that a normal has to stand out by; points on one line have none."""
+"""Least squared length of a normal before it is normalised, relative to the spread's; points on a line have
+none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
-    """A downsampled cloud, ready to be either side of any number of registrations.
+    """Prepared cloud: downsampled, ready for either side of any number of registrations.
 
     Attributes:
-        normals: (N, 3) unit normals that look to the origin; zero where the neighbours are too few to tell.
+        normals: (N, 3) unit normals towards the origin; zero where there are too few neighbours.
         voxel_m: Edge of the voxels, metres.
-        neighbours: Points that each normal rests on.
-        tree: Of the points; None of none.
+        neighbours: Number of points that each normal is fitted to.
+        tree: Search tree of the points; None without points.
     """
 
     normals: Array
@@ -41,14 +42,14 @@ class Prepared:
         return np.empty((0, 3)) if self.tree is None else self.tree.points
 
     def nearest(self, points: Points) -> tuple[NDArray[np.int64], Array]:
-        """Return which prepared point is nearest to each of (M, 3) points, and how far it is."""
+        """Return the indices of the prepared points nearest to (M, 3) points, and their distances, metres."""
         if self.tree is None:
             return np.zeros(len(points), np.int64), np.full(len(points), np.inf)
         return self.tree.nearest(points)
 
 
 def prepared(points: Points32 | Points, *, voxel_m: float, neighbours: int = _NEIGHBOURS) -> Prepared:
-    """Return a cloud with one point a voxel, its normals and search tree.
+    """Return a cloud with one point per voxel, its normals and search tree.
 
     Args:
         points: (N, 3) finite positions, metres.
@@ -74,13 +75,13 @@ def _normals(tree: KdTree, neighbours: int) -> Array:
     normals = np.zeros_like(tree.points)
     if neighbours >= _FEWEST_NEIGHBOURS:
         about, _ = neighbours_of(tree.points, tree.axes, tree.cuts, tree.points, neighbours)
-        _look_to_the_origin(tree.points, about, normals)
+        _fit_normals(tree.points, about, normals)
     return normals
 
 
 @njit(cache=True, nogil=True)
-def _look_to_the_origin(points, about, normals):  # type: ignore[no-untyped-def]
-    """Fill in the normals of the planes that fit the points about each point best."""
+def _fit_normals(points, about, normals):  # type: ignore[no-untyped-def]
+    """Fill in the normals, towards the origin, of the planes that fit the points about each point best."""
     count = about.shape[1]
     for i in range(len(points)):
         mx = my = mz = 0.0
@@ -101,8 +102,8 @@ def _look_to_the_origin(points, about, normals):  # type: ignore[no-untyped-def]
 def _least_axis(xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]
     """Return the unit eigenvector of a symmetric matrix's least eigenvalue (Smith 1961); 0 if it has none.
 
-    The rows of the matrix without that eigenvalue span a plane: the eigenvector is normal to it, and the
-    longest of their three products is the surest.
+    The rows of the matrix less that eigenvalue span a plane: the eigenvector is normal to it, and the longest
+    of their three cross products is the most accurate.
     """
     mean = (xx + yy + zz) / 3.0
     a, b, c = xx - mean, yy - mean, zz - mean

@@ -38,8 +38,8 @@ class GicpMatcher:
 
     def clear(self) -> None:
         """Empty the maps."""
-        self._fine = GaussianCells(self._config.cell_m, remembered=_MAP_KEYFRAMES)
-        self._coarse = GaussianCells(self._config.coarse_cell_m, remembered=_MAP_KEYFRAMES)
+        self._fine = GaussianCells(self._config.cell_m, kept_clouds=_MAP_KEYFRAMES)
+        self._coarse = GaussianCells(self._config.coarse_cell_m, kept_clouds=_MAP_KEYFRAMES)
 
     def _aligned(
         self, cells: GaussianCells, deskewed: DeskewedScan, T_world_body: Transform

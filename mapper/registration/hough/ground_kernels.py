@@ -13,7 +13,7 @@ def thin(points, cell_m, reach_m):
     unbounded.
     """
     edge = int64(np.ceil(2.0 * reach_m / cell_m))
-    seen = np.zeros(edge * edge * edge, np.bool_)
+    occupied = np.zeros(edge * edge * edge, np.bool_)
     chosen = np.empty(len(points), int64)
     count = 0
     scale = 1.0 / cell_m
@@ -24,8 +24,8 @@ def thin(points, cell_m, reach_m):
         if min(x, y, z) < 0.0 or max(x, y, z) >= edge:
             continue
         cell = (int64(x) * edge + int64(y)) * edge + int64(z)
-        if not seen[cell]:
-            seen[cell] = True
+        if not occupied[cell]:
+            occupied[cell] = True
             chosen[count] = i
             count += 1
     return chosen[:count]
@@ -35,8 +35,8 @@ def thin(points, cell_m, reach_m):
 def score_planes(points, triples, min_cosine, low_m, high_m, tolerance_m, below_weight):
     """Return the best plane (nx, ny, nz, d) with n·p + d = 0, n up, and its score; a score < 0 is none.
 
-    A plane scores its inliers less ``below_weight`` times the points that lie clearly below it: nothing
-    lies below the ground. ``d`` is the origin's height above the plane and stays within low … high.
+    A plane's score is its number of inliers less ``below_weight`` times the number of points clearly below
+    it: nothing lies below the ground. ``d`` is the origin's height above the plane, within low … high.
     """
     best = np.zeros(4)
     best_score = -1.0

@@ -20,7 +20,7 @@ class Peak:
         dy_m: Offset along its y.
         alpha_rad: Turn about up, counter-clockwise, −π … π.
         votes: Pairs of centres in the peak's bin and the eight around it.
-        score: votes / √(n_target · n_source); like scenes have some tenths, whatever their size.
+        score: votes / √(n_target · n_source); similar scenes have some tenths, whatever their size.
     """
 
     dx_m: float

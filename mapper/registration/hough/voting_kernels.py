@@ -14,10 +14,10 @@ _LANES = 8
 def vote_slices(target, source, cosines, sines, half_bins, bin_m, per_angle):
     """Return the highest smoothed bins of every angle's slice of the accumulator A[dx, dy, α].
 
-    A source centre, once rotated, votes for its offset to every target centre in reach: it adds the target's
-    picture around itself to the slice. Of that picture, summed over 3×3 bins, copies shifted by a fraction
-    of a bin are drawn once, so offsets are rounded to that fraction before they are binned. One slice at a
-    time is filled and searched, so the three-dimensional array is never there.
+    A rotated source centre votes for its offset to every target centre in reach: it adds a picture of the
+    target around itself to the slice. Of that picture, summed over 3×3 bins, copies shifted by a fraction of
+    a bin are drawn once, so offsets are rounded to that fraction before they are binned. One slice at a time
+    is filled and searched, so the three-dimensional array is never stored.
 
     Args:
         target: (N, 2) centres, N ≥ 1.
@@ -49,9 +49,9 @@ def vote_slices(target, source, cosines, sines, half_bins, bin_m, per_angle):
             picture = pictures[(fine_y % _PHASES) * _PHASES + fine_x % _PHASES]
             row, column = fine_y // _PHASES, fine_x // _PHASES
             for i in range(edge):
-                sums, seen = accumulator[i], picture[row + i, column : column + width]
+                sums, drawn = accumulator[i], picture[row + i, column : column + width]
                 for j in range(width):
-                    sums[j] += seen[j]
+                    sums[j] += drawn[j]
         _maxima(accumulator[:, :edge], votes[a], offsets[a], half_bins)
     return votes, offsets
 
@@ -116,7 +116,7 @@ def _is_maximum(smooth, row, column):
 
 @njit(cache=True, nogil=True)
 def _summit(line, k):
-    """Return where, −½ … ½ bins from a maximum, the parabola through it and its neighbours peaks."""
+    """Return the offset, −½ … ½ bins, from a maximum to the peak of the parabola about it."""
     if k == 0 or k == len(line) - 1:
         return 0.0
     left, here, right = line[k - 1], line[k], line[k + 1]
@@ -126,7 +126,7 @@ def _summit(line, k):
 
 @njit(cache=True, nogil=True)
 def distinct(offsets, turns, most, distance, angle):
-    """Return the indices, at most ``most``, of those that no kept one before them is near in both measures.
+    """Return the indices, at most ``most``, of the motions that are not near a kept one before them.
 
     Args:
         offsets: (N, 2), the best first.
