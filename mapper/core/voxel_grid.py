@@ -6,8 +6,7 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import Points32
 from mapper.core.geometry import Points
-
-_EMPTY = -1
+from mapper.core.voxel_index import cell_key, claim_row, voxel_index
 
 
 def thin(points: Points32, voxel_m: float) -> NDArray[np.intp]:
@@ -19,7 +18,7 @@ def thin(points: Points32, voxel_m: float) -> NDArray[np.intp]:
         points: (N, 3) finite, metres.
         voxel_m: Edge of a voxel.
     """
-    firsts: NDArray[np.intp] = _voxels(points, 1.0 / voxel_m, _table_size(points))[1]
+    firsts: NDArray[np.intp] = _voxels(points, 1.0 / voxel_m, voxel_index(len(points)))[1]
     return firsts
 
 
@@ -30,38 +29,23 @@ def voxel_means(points: Points | Points32, voxel_m: float) -> Points:
         points: (N, 3) finite, metres.
         voxel_m: Edge of a voxel.
     """
-    voxel_of, firsts = _voxels(points, 1.0 / voxel_m, _table_size(points))
+    voxel_of, firsts = _voxels(points, 1.0 / voxel_m, voxel_index(len(points)))
     means: Points = _means(points, voxel_of, len(firsts))
     return means
 
 
-def _table_size(points: Points | Points32) -> int:
-    return 1 << max(4, int(2 * len(points)).bit_length())
-
-
 @njit(cache=True, nogil=True)
-def _voxels(points, voxels_per_m, size):  # type: ignore[no-untyped-def]
-    """Return (N,) each point's voxel, numbered as they are met, and (M,) the first point of each."""
-    slots = np.full(size, _EMPTY, np.int64)
-    cells = np.empty((len(points), 3), np.int64)
+def _voxels(points, voxels_per_m, index):  # type: ignore[no-untyped-def]
+    """Return (N,) each point's voxel, numbered in order of first points, and (M,) those first points."""
     voxel_of, firsts = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
     count = 0
-    for index in range(len(points)):
-        x = np.int64(np.floor(points[index, 0] * voxels_per_m))
-        y = np.int64(np.floor(points[index, 1] * voxels_per_m))
-        z = np.int64(np.floor(points[index, 2] * voxels_per_m))
-        slot = ((x * 73856093) ^ (y * 19349669) ^ (z * 83492791)) & (size - 1)
-        while slots[slot] != _EMPTY:
-            other = slots[slot]
-            if cells[other, 0] == x and cells[other, 1] == y and cells[other, 2] == z:
-                break
-            slot = (slot + 1) & (size - 1)
-        if slots[slot] == _EMPTY:
-            slots[slot] = count
-            cells[count] = (x, y, z)
-            firsts[count] = index
+    for i in range(len(points)):
+        key = cell_key(points[i, 0] * voxels_per_m, points[i, 1] * voxels_per_m, points[i, 2] * voxels_per_m)
+        voxel = claim_row(index, key, count)
+        if voxel == count:
+            firsts[count] = i
             count += 1
-        voxel_of[index] = slots[slot]
+        voxel_of[i] = voxel
     return voxel_of, firsts[:count].copy()
 
 

@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.frames import Points32
+from mapper.core.voxel_index import AXIS_BITS, cell_key, claim_row, voxel_index
 
 Colors = NDArray[np.uint8]
 """(N, 3) uint8 RGB."""
 
-_KEY_BITS = 21
-_HALF_SPAN = 1 << (_KEY_BITS - 1)  # voxels on either side of the world's origin
+_HALF_SPAN = 1 << (AXIS_BITS - 1)  # voxels on either side of the world's origin
 _BATCH = 1 << 16  # points folded in at once: bounds how far ahead of need memory is reserved
 _SUMS = 7  # x, y, z, red, green, blue, count
 
@@ -36,9 +36,8 @@ class CloudBuilder:
             raise DataError(f"cloud: voxel of {voxel_m} m; want a finite edge > 0")
         self.voxel_m = voxel_m
         self._size = 0
-        self._keys = np.empty(_BATCH, np.int64)
         self._sums = np.empty((_BATCH, _SUMS))
-        self._slots = np.full(4 * _BATCH, -1, np.int32)
+        self._index = voxel_index(_BATCH)
 
     def __len__(self) -> int:
         """Return how many voxels hold a point."""
@@ -74,8 +73,7 @@ class CloudBuilder:
                 points_world[batch],
                 colors[batch],
                 1.0 / self.voxel_m,
-                self._slots,
-                self._keys,
+                self._index,
                 self._sums,
                 self._size,
             )
@@ -88,51 +86,24 @@ class CloudBuilder:
 
     def _reserve(self, more: int) -> None:
         need = self._size + more
-        if need > len(self._keys):
-            capacity = max(need, 3 * len(self._keys) // 2)
-            self._keys = np.concatenate([self._keys, np.empty(capacity - len(self._keys), np.int64)])
-            self._sums = np.concatenate([self._sums, np.empty((capacity - len(self._sums), _SUMS))])
-        if 2 * need > len(self._slots):
-            slots = np.full(2 * len(self._slots), -1, np.int32)
-            _rehash(slots, self._keys, self._size)
-            self._slots = slots
+        if need > len(self._sums):
+            spare = max(need, 3 * len(self._sums) // 2) - len(self._sums)
+            self._sums = np.concatenate([self._sums, np.empty((spare, _SUMS))])
+            self._index = voxel_index(len(self._sums), self._index.keys[: self._size])
 
 
 @njit(cache=True, nogil=True)
-def _slot_of(slots, keys, key):  # type: ignore[no-untyped-def]
-    """Return the slot that holds the key, or the empty one where it belongs (linear probing)."""
-    mask = len(slots) - 1
-    # Fibonacci hashing (Knuth, TAOCP vol. 3, §6.4): neighbouring voxels spread over the table.
-    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    slot = np.int64(mixed >> np.uint64(32)) & mask
-    while slots[slot] >= 0 and keys[slots[slot]] != key:
-        slot = (slot + 1) & mask
-    return slot
-
-
-@njit(cache=True, nogil=True)
-def _rehash(slots, keys, size):  # type: ignore[no-untyped-def]
-    for voxel in range(size):
-        slots[_slot_of(slots, keys, keys[voxel])] = voxel
-
-
-@njit(cache=True, nogil=True)
-def _fold(points, colors, voxels_per_m, slots, keys, sums, size):  # type: ignore[no-untyped-def]
+def _fold(points, colors, voxels_per_m, index, sums, size):  # type: ignore[no-untyped-def]
     """Add each point to its voxel's sums and return how many voxels there are now."""
     last_key, voxel = np.int64(-1), np.int64(-1)
     for i in range(len(points)):
-        key = np.int64(0)
-        for axis in range(3):
-            cell = np.int64(np.floor(np.float64(points[i, axis]) * voxels_per_m))
-            key = (key << _KEY_BITS) | (cell + _HALF_SPAN)
+        key = cell_key(points[i, 0] * voxels_per_m, points[i, 1] * voxels_per_m, points[i, 2] * voxels_per_m)
         if key != last_key:  # neighbouring pixels mostly share a voxel, and a look-up is what costs
-            slot = _slot_of(slots, keys, key)
-            if slots[slot] < 0:
-                slots[slot] = size
-                keys[size] = key
+            voxel = claim_row(index, key, size)
+            if voxel == size:
                 sums[size] = 0.0
                 size += 1
-            last_key, voxel = key, np.int64(slots[slot])
+            last_key = key
         for axis in range(3):
             sums[voxel, axis] += points[i, axis]
             sums[voxel, 3 + axis] += colors[i, axis]

@@ -1,4 +1,9 @@
-"""A sparse grid of voxels: an open-addressing hash from Morton codes to 8³ blocks of log-odds."""
+"""A sparse grid of voxels: a hash table from Morton codes to 8³ blocks of log-odds.
+
+Its layout is not that of ``mapper.core.voxel_index``: a code and its slot lie side by side, so that a query
+of a random point costs one cache miss. With the shared index insertion is as fast, but queries of a room's
+map take 1.5 times as long (14.4 ns against 9.6 ns, 10⁶ random points in fr1_xyz at 5 cm).
+"""
 
 import os
 from typing import NamedTuple
@@ -8,6 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.errors import MapSizeError
+from mapper.core.voxel_index import FIBONACCI
 from mapper.octree.keys import BLOCK_VOXELS
 
 BLOCK_BYTES = BLOCK_VOXELS * 4
@@ -15,7 +21,6 @@ _FIRST_BLOCKS = 64
 _GROWTH = 1.25
 """A pool that doubles would hold half its memory in reserve."""
 _VACANT = -1
-_FIBONACCI = -7046029254386353131  # 2⁶⁴/φ as int64 (Knuth, TAOCP 3, §6.4): spreads neighbouring codes
 
 
 class BlockTable(NamedTuple):
@@ -109,7 +114,7 @@ def _table(count: int, *, values: NDArray[np.float32]) -> BlockTable:
 def _probe(entries, code):
     """Return where in the hash a code is, or the vacant place where it belongs (linear probing)."""
     mask = len(entries) - 1
-    place = ((code * _FIBONACCI) >> 24) & mask
+    place = ((code * FIBONACCI) >> 24) & mask
     while entries[place, 0] != code and entries[place, 0] != _VACANT:
         place = (place + 1) & mask
     return place

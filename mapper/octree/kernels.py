@@ -11,12 +11,12 @@ import numpy as np
 from numba import njit
 from numpy import float32, float64, int32, int64
 
+from mapper.core.voxel_index import FIBONACCI
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_COUNT, KEY_ZERO, centre_of, key_of
 from mapper.octree.window import FREE, OCCUPIED, UNTOUCHED, cell_of
 
 _CHUNK = 256  # points worked on at a time: their scratch arrays stay in the first-level cache
 _RECENT = 1 << 15  # entries of the table of recent voxels: 256 KiB
-_FIBONACCI = -7046029254386353131
 _NEVER = float64(np.finfo(np.float64).max)  # OctoMap's tMax along an axis that the ray does not move on
 
 
@@ -96,7 +96,7 @@ def end_voxels(points_body, T_world_body, resolution_m):
             distinct += packed[j + 1] != packed[j]
         packed[0] = packed[size]
         for j in range(distinct):
-            place = ((runs[j] * _FIBONACCI) >> 40) & (_RECENT - 1)
+            place = ((runs[j] * FIBONACCI) >> 40) & (_RECENT - 1)
             found[count] = runs[j]
             count += recent[place] != runs[j]
             recent[place] = runs[j]

@@ -7,14 +7,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, is_rigid
+from mapper.core.voxel_index import VoxelIndex, cell_key, claim_row, row_of, voxel_index
 from mapper.registration.gauss_newton import FLATNESS, add_pair, gauss_newton_step, inverse_of, moved, turned
 from mapper.registration.surfaces import Prepared
 
-_EMPTY = -1
 _FIRST_CAPACITY = 1 << 14
 _CLEAR_CYCLE = 10
-_BITS = 21
-"""Of each coordinate of a cell in its key; cells 2²¹ apart would share one."""
 
 
 class GaussianCells:
@@ -41,10 +39,10 @@ class GaussianCells:
 
     def insert(self, cloud: Prepared, T_world_cloud: Transform) -> None:
         """Add a cloud at its pose."""
-        capacity = len(self._cells.keys)
+        capacity = len(self._cells.sums)
         while capacity < self._count + len(cloud.points):
             capacity *= 2
-        if capacity > len(self._cells.keys):
+        if capacity > len(self._cells.sums):
             self._keep(np.arange(self._count), capacity)
         self._clouds += 1
         self._count = _insert(
@@ -73,8 +71,7 @@ class GaussianCells:
             step_m: moves less than this is the last.
         """
         T_found, pairs = _descend(
-            self._cells.table,
-            self._cells.keys,
+            self._cells.numbers,
             self._cells.gaussians,
             self.cell_m,
             cloud.points,
@@ -87,34 +84,32 @@ class GaussianCells:
 
     def _keep(self, kept: NDArray[np.intp], capacity: int) -> None:
         """Keep some cells, in tables of another capacity."""
-        before, self._cells, self._count = self._cells, _room_for(capacity), len(kept)
+        before, self._count = self._cells, len(kept)
+        self._cells = _room_for(capacity, before.numbers.keys[kept])
         for now, then in zip(self._cells[1:], before[1:], strict=True):
             now[: len(kept)] = then[kept]
-        _index(self._cells.table, self._cells.keys, self._count)
 
 
 class _Cells(NamedTuple):
     """Cells in the order in which they were met.
 
     Attributes:
-        table: Open-addressing hash table of their indices, at most half full.
-        keys: (C,) of their coordinates.
+        numbers: Index of the cells' numbers by their keys.
         sums: (C, 10) of positions, of covariances (xx, xy, xz, yy, yz, zz) and of ones.
         gaussians: (C, 9) the same sums as means.
         touched: (C,) number of the last cloud that had a point in them.
     """
 
-    table: NDArray[np.int64]
-    keys: NDArray[np.int64]
+    numbers: VoxelIndex
     sums: Array
     gaussians: Array
     touched: NDArray[np.int64]
 
 
-def _room_for(capacity: int) -> _Cells:
+def _room_for(capacity: int, keys: NDArray[np.int64] | None = None) -> _Cells:
+    """Return room for cells, of which the first have these keys."""
     return _Cells(
-        np.full(2 * capacity, _EMPTY, np.int64),
-        np.zeros(capacity, np.int64),
+        voxel_index(capacity, keys),
         np.zeros((capacity, 10)),
         np.zeros((capacity, 9)),
         np.zeros(capacity, np.int64),
@@ -122,45 +117,16 @@ def _room_for(capacity: int) -> _Cells:
 
 
 @njit(cache=True, nogil=True)
-def _key(x, y, z):  # type: ignore[no-untyped-def]
-    mask = (1 << _BITS) - 1
-    return (
-        ((np.int64(np.floor(x)) & mask) << (2 * _BITS))
-        | ((np.int64(np.floor(y)) & mask) << _BITS)
-        | (np.int64(np.floor(z)) & mask)
-    )
-
-
-@njit(cache=True, nogil=True)
-def _slot(table, keys, key):  # type: ignore[no-untyped-def]
-    """Return the slot of a key in the table, or the free slot for it."""
-    slot = (key * 0x9E3779B97F4A7C1 >> 20) & (len(table) - 1)
-    while table[slot] != _EMPTY and keys[table[slot]] != key:
-        slot = (slot + 1) & (len(table) - 1)
-    return slot
-
-
-@njit(cache=True, nogil=True)
-def _index(table, keys, count):  # type: ignore[no-untyped-def]
-    for cell in range(count):
-        table[_slot(table, keys, keys[cell])] = cell
-
-
-@njit(cache=True, nogil=True)
 def _insert(  # type: ignore[no-untyped-def]
-    table, keys, sums, gaussians, touched, count, cloud, cell_m, points, normals, T
+    numbers, sums, gaussians, touched, count, cloud, cell_m, points, normals, T
 ):
     """Add points and their surfaces' covariances to their cells; return the number of cells."""
     p, m = np.empty(3), np.empty(3)
     for i in range(len(points)):
         moved(T, points[i], p)
         turned(T, normals[i], m)
-        key = _key(p[0] / cell_m, p[1] / cell_m, p[2] / cell_m)
-        slot = _slot(table, keys, key)
-        if table[slot] == _EMPTY:
-            table[slot], keys[count] = count, key
-            count += 1
-        cell, k = table[slot], 3
+        cell, k = claim_row(numbers, cell_key(p[0] / cell_m, p[1] / cell_m, p[2] / cell_m), count), 3
+        count += cell == count
         for row in range(3):
             sums[cell, row] += p[row]
             for column in range(row, 3):
@@ -175,7 +141,7 @@ def _insert(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _descend(  # type: ignore[no-untyped-def]
-    table, keys, gaussians, cell_m, points, normals, T, iterations, steps
+    numbers, gaussians, cell_m, points, normals, T, iterations, steps
 ):
     """Return T_world_source after Gauss–Newton on points and their cells' Gaussians, and the number of pairs.
 
@@ -186,8 +152,8 @@ def _descend(  # type: ignore[no-untyped-def]
         sums, pairs = np.zeros(27), 0
         for i in range(len(points)):
             moved(T, points[i], p)
-            cell = table[_slot(table, keys, _key(p[0] / cell_m, p[1] / cell_m, p[2] / cell_m))]
-            if cell == _EMPTY:
+            cell = row_of(numbers, cell_key(p[0] / cell_m, p[1] / cell_m, p[2] / cell_m))
+            if cell < 0:
                 continue
             mean_and_covariance = gaussians[cell]
             x = mean_and_covariance[0] - p[0]

@@ -1,0 +1,85 @@
+"""Voxel index: a compiled hash table from the int64 keys of voxels to row numbers.
+
+Open addressing with linear probing. Rows number the keys in the order in which they were added, so what is
+stored by row does not depend on the hash; neighbouring voxels mostly have neighbouring rows, which is why the
+keys are kept by row and the table holds rows alone.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+AXIS_BITS = 21
+"""Bits of each coordinate in a ``cell_key``; cells 2²¹ apart along an axis have the same key."""
+
+FIBONACCI = -7046029254386353131
+"""2⁶⁴/φ as int64: a product with it spreads neighbouring keys (Knuth, TAOCP vol. 3, §6.4)."""
+
+_VACANT = -1
+
+
+class VoxelIndex(NamedTuple):
+    """The arrays that compiled code needs to find rows by key.
+
+    Attributes:
+        rows: (C,) int32 rows by the hash of their keys, −1 where vacant. C is a power of two, at least twice
+            the capacity.
+        keys: (capacity,) int64 keys by row.
+    """
+
+    rows: NDArray[np.int32]
+    keys: NDArray[np.int64]
+
+
+def voxel_index(capacity: int, keys: NDArray[np.int64] | None = None) -> VoxelIndex:
+    """Return an index with room for so many keys, of which (N,) distinct ones get the rows 0 … N − 1."""
+    rows = np.full(1 << (2 * capacity - 1).bit_length(), _VACANT, np.int32)
+    index = VoxelIndex(rows, np.empty(capacity, np.int64))
+    if keys is not None:
+        _add(index, keys)
+    return index
+
+
+@njit(cache=True, nogil=True)
+def cell_key(x, y, z):  # type: ignore[no-untyped-def]
+    """Return the key of the cell around a point whose coordinates are counted in cells."""
+    mask = (1 << AXIS_BITS) - 1
+    return (
+        ((np.int64(np.floor(x)) & mask) << (2 * AXIS_BITS))
+        | ((np.int64(np.floor(y)) & mask) << AXIS_BITS)
+        | (np.int64(np.floor(z)) & mask)
+    )
+
+
+@njit(cache=True, nogil=True)
+def _slot_of(index, key):  # type: ignore[no-untyped-def]
+    """Return where in the table a key's row is, or the vacant place where it belongs."""
+    mask = len(index.rows) - 1
+    # Folded, since the product's middle bits do not depend on the key's highest ones.
+    slot = (((key ^ (key >> 32)) * FIBONACCI) >> 32) & mask
+    while index.rows[slot] != _VACANT and index.keys[index.rows[slot]] != key:
+        slot = (slot + 1) & mask
+    return slot
+
+
+@njit(cache=True, nogil=True)
+def row_of(index, key):  # type: ignore[no-untyped-def]
+    """Return the row of a key, or −1."""
+    return np.int64(index.rows[_slot_of(index, key)])
+
+
+@njit(cache=True, nogil=True)
+def claim_row(index, key, count):  # type: ignore[no-untyped-def]
+    """Return the row of a key; an absent key is added with the row ``count``, the number of keys so far."""
+    slot = _slot_of(index, key)
+    if index.rows[slot] == _VACANT:
+        index.rows[slot], index.keys[count] = count, key
+    return np.int64(index.rows[slot])
+
+
+@njit(cache=True, nogil=True)
+def _add(index, keys):  # type: ignore[no-untyped-def]
+    for row in range(len(keys)):
+        claim_row(index, keys[row], row)
