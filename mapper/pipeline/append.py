@@ -83,7 +83,7 @@ def append(
         later = from_tracking(replace(tracking, graph=solved.graph, loops=solved.loops), None)
         save_tracking(writer, before.solved(solved.graph, solved.loops).then(later, truth=source.truth))
         writer.update(solve=solved.report)
-        fuse_into(writer, source, joined, progress, before=run.path / files.SCAN_UPDATES)
+        fuse_into(writer, source, joined, progress, before=files.scan_updates_path(run.path))
     return load_run(out)
 
 

@@ -110,7 +110,7 @@ def fuse_changed(
                 (writer.folder / name).unlink(missing_ok=True)
         if solve is not None:
             writer.update(solve=solve)
-        fuse_into(writer, source, run.config, progress, before=run.path / files.SCAN_UPDATES)
+        fuse_into(writer, source, run.config, progress, before=files.scan_updates_path(run.path))
     return load_run(run.path)
 
 

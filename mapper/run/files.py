@@ -1,6 +1,7 @@
 """The files of a run folder: what each is called, what it holds, and which step writes it."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from mapper.runtime.atomic import MANIFEST_NAME
@@ -103,3 +104,9 @@ RUN_FILES = (
 def names_of(*depends_on: str) -> frozenset[str]:
     """Return the names of all files that depend on any of these."""
     return frozenset(name for files in RUN_FILES if files.depends_on in depends_on for name in files.names)
+
+
+def scan_updates_path(folder: Path) -> Path:
+    """Return the path of a run's ``scan_updates.bin``; by its former name if the run has only that."""
+    path, former = folder / SCAN_UPDATES, folder / FORMER_SCAN_UPDATES
+    return former if former.exists() and not path.exists() else path
