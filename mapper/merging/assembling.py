@@ -14,7 +14,7 @@ from mapper.merging.steps import JoinedTile, Site
 from mapper.octree.attributes import UNSET
 from mapper.octree.color_tree import COLOR_NODE, parent_color
 from mapper.octree.octomap_file import LEAF_ROOT, write_tree
-from mapper.octree.tree import NODE, UpperNodes, children_in, upper_nodes, word_of
+from mapper.octree.tree import NODE, UpperNodes, children_in, preorder, upper_nodes, word_of
 
 Tiles = Mapping[int, JoinedTile]
 
@@ -30,7 +30,7 @@ def write_whole_ot(path: Path, site: Site, tiles: Tiles, *, has_colors: bool) ->
     """
     ordered = list(tiles)
     upper = _upper(site, tiles, [joined.top for joined in tiles.values()])
-    visited = list(_preorder(upper, len(tiles)))
+    visited = preorder(upper).tolist()
     colors = _colors(upper, tiles) if has_colors else None
 
     def payload() -> Iterator[NDArray[np.generic]]:
@@ -59,7 +59,7 @@ def write_whole_bt(path: Path, site: Site, tiles: Tiles) -> None:
     """Write all tiles, each voxel free or occupied, as one ``.bt`` file; atomic."""
     ordered = list(tiles)
     upper = _upper(site, tiles, [joined.state for joined in tiles.values()])
-    visited = list(_preorder(upper, len(tiles)))
+    visited = preorder(upper).tolist()
     words = {
         node: word_of(upper, node) for node in visited if node >= len(tiles) and upper.nodes[node]["mask"]
     }
@@ -81,18 +81,6 @@ def write_whole_bt(path: Path, site: Site, tiles: Tiles) -> None:
 def _upper(site: Site, tiles: Tiles, tops: list[tuple[float, int]]) -> UpperNodes:
     codes = np.fromiter(tiles, np.int64, len(tiles))
     return upper_nodes(codes, np.array(tops, NODE), np.arange(len(tiles) + 1), levels=site.tiling.depth)
-
-
-def _preorder(upper: UpperNodes, tiles: int) -> Iterator[int]:
-    """Yield the nodes down to the tops of tiles; below one that was pruned nothing is left."""
-    stack = [len(upper.nodes) - 1]
-    while stack:
-        node = stack.pop()
-        yield node
-        if node >= tiles:
-            first = int(upper.first_children[node])
-            children = int(upper.nodes[node]["mask"]).bit_count()
-            stack.extend(range(first + children - 1, first - 1, -1))
 
 
 def _colors(upper: UpperNodes, tiles: Tiles) -> NDArray[np.uint8]:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from mapper.octree.attributes import UNSET, AttributeLayer
 from mapper.octree.blocks import BlockStore
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS
+from mapper.octree.tree_reader import enter_next_child
 
 COLOR_NODE = np.dtype([("value", "<f4"), ("rgb", "u1", 3), ("mask", "u1")])
 """A node as a ColorOcTree's ``.ot`` file lists it: log-odds, RGB, and a bit for each child that exists."""
@@ -90,12 +91,7 @@ def _colors_in_preorder(masks, codes, colors, root_depth, root_code, rgb):
                 for channel in range(3):
                     sums[depth, channel] += rgb[node, channel]
         if depth >= root_depth:
-            child = 0
-            while not (pending[depth] >> child) & 1:
-                child += 1
-            pending[depth] &= ~(1 << child)
-            prefix[depth + 1] = (prefix[depth] << 3) | child
-            depth += 1
+            depth = enter_next_child(pending, prefix, depth)
 
 
 @njit(cache=True, nogil=True)

@@ -111,6 +111,27 @@ def word_of(upper: UpperNodes, node: int) -> NDArray[np.uint16]:
 
 
 @njit(cache=True, nogil=True)
+def preorder(upper):
+    """Return the indices of the upper nodes in preorder, without those below a node that was pruned."""
+    order, stack = np.empty(len(upper.nodes), int64), np.empty(_STACK, int64)
+    stack[0] = len(upper.nodes) - 1
+    top, count = 1, 0
+    while top:
+        top -= 1
+        node = order[count] = stack[top]
+        count += 1
+        if node < len(upper.starts) - 1:
+            continue
+        children = 0
+        for child in range(8):
+            children += (upper.nodes[node].mask >> child) & 1
+        for i in range(children):  # the lowest comes off the stack first
+            stack[top + i] = upper.first_children[node] + children - 1 - i
+        top += children
+    return order[:count]
+
+
+@njit(cache=True, nogil=True)
 def _join(values, masks, first):
     """Return (value, mask) of the parent of eight nodes; a NaN value is an absent node, here and there."""
     mask, leaves = 0, 0
@@ -225,55 +246,36 @@ def _parents(codes, nodes, offset):
 
 
 @njit(cache=True, nogil=True)
-def _push_children(upper, node, stack, top):
-    """Put a node's children on the stack so that the lowest comes off first; return the stack's new top."""
-    count = 0
-    for child in range(8):
-        count += (upper.nodes[node].mask >> child) & 1
-    for i in range(count):
-        stack[top + i] = upper.first_children[node] + count - 1 - i
-    return top + count
-
-
-@njit(cache=True, nogil=True)
 def _assemble_nodes(upper, parts, payload):
     """Write all nodes in preorder; return how many there are."""
-    blocks = len(upper.starts) - 1
-    stack = np.empty(_STACK, int64)
-    stack[0] = len(upper.nodes) - 1
-    top, at = 1, 0
-    while top:
-        top -= 1
-        node = stack[top]
+    blocks, at = len(upper.starts) - 1, 0
+    for node in preorder(upper):
         if node < blocks:
-            for i in range(upper.starts[node], upper.starts[node + 1]):
-                payload[at] = parts[i]
-                at += 1
+            at = _copy_part(upper, node, parts, payload, at)
         else:
             payload[at] = upper.nodes[node]
             at += 1
-            top = _push_children(upper, node, stack, top)
     return at
 
 
 @njit(cache=True, nogil=True)
 def _assemble_words(upper, parts, payload):
     """Write the words of all inner nodes in preorder; return how many there are."""
-    blocks = len(upper.starts) - 1
+    blocks, at = len(upper.starts) - 1, 0
     values, masks = np.empty(8, float32), np.empty(8, uint8)
-    stack = np.empty(_STACK, int64)
-    stack[0] = len(upper.nodes) - 1
-    top, at = 1, 0
-    while top:
-        top -= 1
-        node = stack[top]
+    for node in preorder(upper):
         if node < blocks:
-            for i in range(upper.starts[node], upper.starts[node + 1]):
-                payload[at] = parts[i]
-                at += 1
+            at = _copy_part(upper, node, parts, payload, at)
         elif upper.nodes[node].mask:
             at = _write_upper_word(upper, node, payload, at, values, masks)
-            top = _push_children(upper, node, stack, top)
+    return at
+
+
+@njit(cache=True, nogil=True)
+def _copy_part(upper, block, parts, payload, at):
+    for i in range(upper.starts[block], upper.starts[block + 1]):
+        payload[at] = parts[i]
+        at += 1
     return at
 
 

@@ -67,14 +67,26 @@ def leaves_of_nodes(values, masks):
         while depth >= 0 and pending[depth] == 0:
             depth -= 1
         if depth >= 0:
-            child = 0
-            while not (pending[depth] >> child) & 1:
-                child += 1
-            pending[depth] &= ~(1 << child)
-            prefix[depth + 1] = (prefix[depth] << 3) | child
-            depth += 1
+            depth = enter_next_child(pending, prefix, depth)
     leaves = TreeLeaves(codes[:count], depths[:count], found[:count])
     return leaves, WHOLE if depth < 0 else CUT_SHORT
+
+
+@njit(cache=True, nogil=True)
+def enter_next_child(pending, prefix, depth):
+    """Go down from a node to its lowest child that is still to come; return the child's depth.
+
+    Args:
+        pending: By depth on the path, a bit for each child that is still to come; the child's is cleared.
+        prefix: By depth, the Morton code of the node on the path; the child's is written.
+        depth: Of the node.
+    """
+    child = 0
+    while not (pending[depth] >> child) & 1:
+        child += 1
+    pending[depth] &= ~(1 << child)
+    prefix[depth + 1] = (prefix[depth] << 3) | child
+    return depth + 1
 
 
 @njit(cache=True, nogil=True)
