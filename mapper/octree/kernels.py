@@ -188,7 +188,9 @@ def cast_rays(stops, hits, origin, resolution_m, window):
         while True:
             cells[cell] = FREE
             touched[cell >> (3 * BLOCK_BITS)] = 1
-            if x_time < y_time:  # one comparison a branch: "x < y and x < z" without the second z takes 5 % more
+            if (
+                x_time < y_time
+            ):  # one comparison a branch: "x < y and x < z" without the second z takes 5 % more
                 if x_time < z_time:
                     x = (x + x_step) & x_bits
                     x_time += x_delta

@@ -1,15 +1,13 @@
-"""Our own map file: everything that a map knows, compressed, checked, and the same bytes for the same map.
+"""Map files (``.octree``): all of a map, compressed and checked; the same map gives the same bytes.
 
-Layout, little-endian: ``MAGIC``, version (uint32), length of the header (uint32), CRC-32 of header and body
-(uint32), header (JSON), body (Zstandard). The body holds, one after the other: Morton codes of the blocks as
-differences (int64), which of their voxels are known (64 bytes per block) and those voxels' log-odds
-(float32); then, if the map has attributes, the same two for voxels that have any, and these voxels' red,
-green and blue sums, colour weights, hits (uint32) and last stamps (int64).
+Layout: that of ``runtime.checked_file`` with a header in JSON and a body compressed by Zstandard. The body
+holds, little-endian, one after the other: Morton codes of the blocks as differences (int64), which of their
+voxels are known (64 bytes per block) and those voxels' log-odds (float32); then, if the map has attributes,
+the same two for voxels that have any, and these voxels' red, green and blue sums, colour weights, hits
+(uint32) and last stamps (int64).
 """
 
 import json
-import struct
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +22,11 @@ from mapper.octree.blocks import BLOCK_BYTES, check_memory, find_slots
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import BLOCK_VOXELS
 from mapper.octree.map import OctreeMap
-from mapper.runtime import atomic
+from mapper.runtime.checked_file import CheckedFormat
 
 MAGIC = b"\x89mapper-octree\r\n"
-"""Not text, and damaged by whoever takes it for text."""
-VERSION = 1
 
-_FIXED = struct.Struct("<III")
+_FORMAT = CheckedFormat(MAGIC, version=1, remedy="update mapper", error=MapFileError)
 _LEVEL = 3  # Zstandard's default
 _MASK_BYTES = BLOCK_VOXELS // 8
 _COUNTS = ("blocks", "voxels", "attribute_blocks", "attribute_voxels")
@@ -51,8 +47,7 @@ def write_map(path: Path, octree: OctreeMap) -> None:
     plain = b"".join(
         column.astype(column.dtype.newbyteorder("<"), copy=False).tobytes() for column in columns
     )
-    rest = head + zstandard.ZstdCompressor(level=_LEVEL).compress(plain)
-    atomic.write_bytes(path, MAGIC + _FIXED.pack(VERSION, len(head), zlib.crc32(rest)) + rest)
+    _FORMAT.write(path, head, zstandard.ZstdCompressor(level=_LEVEL).compress(plain))
 
 
 def _attribute_columns(
@@ -84,15 +79,8 @@ def parse_map(path: Path, data: bytes, config: OctreeConfig | None) -> OctreeMap
         MapFileError: The file is of another version, truncated or damaged.
         MapSizeError: The map would not fit into memory.
     """
-    start = len(MAGIC) + _FIXED.size
-    if len(data) < start:
-        raise MapFileError(f"{path}: ends inside its header; it is truncated")
-    version, head_bytes, checksum = _FIXED.unpack_from(data, len(MAGIC))
-    if version != VERSION:
-        raise MapFileError(f"{path}: is of version {version}, only {VERSION} can be read; update mapper")
-    if zlib.crc32(memoryview(data)[start:]) != checksum:
-        raise MapFileError(f"{path}: its checksum does not match; it is truncated or damaged")
-    counts, own_config = _parse_header(path, data[start : start + head_bytes])
+    head, body = _FORMAT.split(path, data)
+    counts, own_config = _parse_header(path, head)
     blocks, voxels, attribute_blocks, attribute_voxels = counts
     sizes = [
         *((blocks, "<i8"), (blocks * _MASK_BYTES, "u1"), (voxels, "<f4")),
@@ -102,7 +90,7 @@ def parse_map(path: Path, data: bytes, config: OctreeConfig | None) -> OctreeMap
     ]
     check_memory(blocks * BLOCK_BYTES, f"the map in {path}")
     plain_bytes = sum(count * np.dtype(kind).itemsize for count, kind in sizes)
-    plain = _decompressed(path, data[start + head_bytes :], plain_bytes)
+    plain = _decompressed(path, body, plain_bytes)
     columns: list[NDArray[Any]] = []
     at = 0
     for count, kind in sizes:
@@ -132,7 +120,7 @@ def _parse_header(path: Path, head: bytes) -> tuple[list[int], OctreeConfig]:
     return counts, config
 
 
-def _decompressed(path: Path, body: bytes, size: int) -> bytes:
+def _decompressed(path: Path, body: memoryview, size: int) -> bytes:
     try:
         if zstandard.frame_content_size(body) != size:
             raise MapFileError(f"{path}: its body is not the {size} bytes that its header describes")

@@ -1,12 +1,9 @@
 """Vocabulary of visual words, and images as bags of words (Sivic & Zisserman 2003; Nistér & Stewénius 2006).
 
-A vocabulary's file: ``_MAGIC``; version, header length and CRC-32 of the rest (little-endian uint32 each); a
-JSON header; then columns: child counts (uint8) and centres (4 × uint64) of the nodes, weights (float64) of
-the words.
+A vocabulary's file has the layout of ``runtime.checked_file``: a JSON header; then columns: child counts
+(uint8) and centres (4 × uint64) of the nodes, weights (float64) of the words.
 """
 
-import struct
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +16,7 @@ from mapper.core.errors import DataError, VocabularyError
 from mapper.features.hamming import Bits
 from mapper.places.kernels import shared_weight
 from mapper.places.word_tree import Ids, WordTree
-from mapper.runtime import atomic
+from mapper.runtime.checked_file import CheckedFormat
 
 DESCRIPTOR = "orb"
 """Kind of the descriptors: of detectors "orb" and "uniform-orb"."""
@@ -27,13 +24,9 @@ DESCRIPTOR_BYTES = 32
 ONE = 32_768
 """Sum of an image's weights."""
 
-_MAGIC = b"\x89mapper-words\r\n"
-"""Not text, and recognisably damaged by any program that converts it as text."""
-_VERSION = 1
+_FORMAT = CheckedFormat(b"\x89mapper-words\r\n", version=1, remedy="train it again", error=VocabularyError)
 SHIPPED = Path(__file__).with_name("orb.words")
 """Trained on synthetic logs by ``scripts/train_vocabulary.py``."""
-
-_FIXED = struct.Struct("<III")
 
 
 class _Header(Config):
@@ -133,8 +126,7 @@ class Vocabulary:
         )
         head = header.model_dump_json().encode()
         columns = self.tree.children, self.tree.centres.astype("<u8"), self.idf.astype("<f8")
-        rest = head + b"".join(column.tobytes() for column in columns)
-        atomic.write_bytes(path, _MAGIC + _FIXED.pack(_VERSION, len(head), zlib.crc32(rest)) + rest)
+        _FORMAT.write(path, head, b"".join(column.tobytes() for column in columns))
 
 
 def similarity(a: WordVector, b: WordVector) -> float:
@@ -159,17 +151,9 @@ def load_vocabulary(path: Path | None = None) -> Vocabulary:
         raise VocabularyError(
             f"{path}: no vocabulary can be read: {error.strerror}; make one with mapper vocabulary train"
         ) from None
-    if not data.startswith(_MAGIC):
+    if not data.startswith(_FORMAT.magic):
         raise VocabularyError(f"{path}: is not a vocabulary; make one with mapper vocabulary train")
-    start = len(_MAGIC) + _FIXED.size
-    if len(data) < start:
-        raise VocabularyError(f"{path}: ends inside its header; it is truncated")
-    version, head_bytes, checksum = _FIXED.unpack_from(data, len(_MAGIC))
-    if version != _VERSION:
-        raise VocabularyError(f"{path}: is of version {version}, only {_VERSION} can be read; train it again")
-    if zlib.crc32(memoryview(data)[start:]) != checksum:
-        raise VocabularyError(f"{path}: its checksum does not match; it is truncated or damaged")
-    return _parsed(path, data[start : start + head_bytes], memoryview(data)[start + head_bytes :])
+    return _parsed(path, *_FORMAT.split(path, data))
 
 
 def _parsed(path: Path, head: bytes, body: memoryview) -> Vocabulary:

@@ -1,0 +1,56 @@
+"""Binary files whose version and checksum are checked before anything in them is used."""
+
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from mapper.core.errors import MapperError
+from mapper.runtime import atomic
+
+_FIXED = struct.Struct("<III")
+
+
+@dataclass(frozen=True, slots=True)
+class CheckedFormat:
+    """Layout: magic; version, length of the header, CRC-32 of header and body (little-endian uint32); both.
+
+    Attributes:
+        magic: First bytes of a file: not text, and damaged by whatever takes it for text.
+        version: The only one that can be read.
+        remedy: What to do with a file of another version.
+        error: Raised for a file that cannot be read.
+    """
+
+    magic: bytes
+    version: int
+    remedy: str
+    error: type[MapperError]
+
+    def write(self, path: Path, head: bytes, body: bytes) -> None:
+        """Write a header and a body; atomic."""
+        rest = head + body
+        atomic.write_bytes(path, self.magic + _FIXED.pack(self.version, len(head), zlib.crc32(rest)) + rest)
+
+    def split(self, path: Path, data: bytes) -> tuple[bytes, memoryview]:
+        """Return header and body of a file's bytes, which begin with the magic.
+
+        Args:
+            path: Names the file in errors.
+            data: All of it.
+
+        Raises:
+            MapperError: ``error``: the file is of another version, truncated or damaged.
+        """
+        start = len(self.magic) + _FIXED.size
+        if len(data) < start:
+            raise self.error(f"{path}: ends inside its header; it is truncated")
+        version, head_bytes, checksum = _FIXED.unpack_from(data, len(self.magic))
+        if version != self.version:
+            raise self.error(
+                f"{path}: is of version {version}, only {self.version} can be read; {self.remedy}"
+            )
+        rest = memoryview(data)[start:]
+        if zlib.crc32(rest) != checksum:
+            raise self.error(f"{path}: its checksum does not match; it is truncated or damaged")
+        return bytes(rest[:head_bytes]), rest[head_bytes:]
