@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from mapper.navigation.distance import DistanceField, signed_distances
+from mapper.navigation.distance_transform import squares_to_centres
 from mapper.navigation.line_of_sight import path_length, shortened
 from mapper.navigation.search import shortest_path
-from mapper.navigation.transform import squares_to_centres
 
 EDGE_CELLS = 1000
 REPEATS = 3

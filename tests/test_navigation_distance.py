@@ -3,7 +3,7 @@ import pytest
 
 from mapper.core.errors import DataError, MapSizeError
 from mapper.navigation.distance import distance_2d, distance_3d, signed_distances
-from mapper.navigation.transform import NONE, squares_to_boxes, squares_to_centres
+from mapper.navigation.distance_transform import NONE, squares_to_boxes, squares_to_centres
 from mapper.navigation.voxels import Box, cut_box, known_box
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap

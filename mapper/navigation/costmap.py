@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array
-from mapper.navigation.transform import NONE, squares_to_centres
+from mapper.navigation.distance_transform import NONE, squares_to_centres
 from mapper.octree.slice import OCCUPIED, UNKNOWN, OccupancyGrid
 
 NO_INFORMATION, LETHAL, INSCRIBED, FREE_SPACE = 255, 254, 253, 0

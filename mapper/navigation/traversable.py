@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array
 from mapper.navigation.config import TraversableConfig
-from mapper.navigation.transform import NONE, squares_to_boxes
+from mapper.navigation.distance_transform import NONE, squares_to_boxes
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_MASK, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
