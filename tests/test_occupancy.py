@@ -40,23 +40,23 @@ def wall_seen(at_x_m):
     return octree
 
 
-def sights_of(source):
+def updates_of(source):
     caster = Caster(OctreeConfig())
     poses = source.truth.T_world_body
     return [pack(caster.cast(entry.scan(), poses[i])) for i, entry in enumerate(source.log().entries())]
 
 
-def merged(sights, **knobs):
+def merged(updates, **knobs):
     octree = OctreeMap(OctreeConfig(**knobs))
-    for sight in sights:
-        octree.merge(sight)
+    for update in updates:
+        octree.merge(update)
     return octree
 
 
 @pytest.fixture(scope="module")
 def busy():
     source = CameraSimulator(BUSY)
-    return source, sights_of(source)
+    return source, updates_of(source)
 
 
 def test_a_wall_where_it_is_scores_one_and_a_wall_where_it_is_not_is_noticed():
@@ -86,7 +86,7 @@ def test_an_empty_map_cannot_be_judged():
 
 def test_a_noisy_log_with_true_poses_maps_the_world_to_a_voxel():
     source = CameraSimulator(PLAIN)
-    values = values_of(merged(sights_of(source)), source.scene.boxes.signed_distance_m)
+    values = values_of(merged(updates_of(source)), source.scene.boxes.signed_distance_m)
     assert min(values.values()) >= 0.97, values
 
 
@@ -111,9 +111,9 @@ def test_what_moves_is_seen_where_it_is_and_leaves_the_truth_alone(busy):
 
 
 def test_the_policy_leaves_fewer_ghosts_and_spares_the_walls(busy):
-    source, sights = busy
+    source, updates = busy
     truth = source.scene.boxes.signed_distance_m
-    plain, policy = merged(sights), merged(sights, dynamic="seen-through")
+    plain, policy = merged(updates), merged(updates, dynamic="seen-through")
 
     assert ghosts(plain, truth) > 200
     assert ghosts(policy, truth) < 0.9 * ghosts(plain, truth)

@@ -76,14 +76,14 @@ def test_queries_agree_with_leaves_and_nothing_is_known_elsewhere():
     octree = mapped()
     centres, found = octree.leaves().centres_world, octree.attributes.of_leaves()
 
-    colors, colored = octree.attributes.colors_at(centres)
+    at = octree.attributes.at(centres)
 
-    np.testing.assert_array_equal(colors, found.colors)
-    np.testing.assert_array_equal(colored, found.colored)
-    np.testing.assert_array_equal(octree.attributes.hits_at(centres), found.hits)
-    np.testing.assert_array_equal(octree.attributes.last_seen_ns_at(centres), found.last_seen_ns)
+    np.testing.assert_array_equal(at.colors, found.colors)
+    np.testing.assert_array_equal(at.colored, found.colored)
+    np.testing.assert_array_equal(at.hits, found.hits)
+    np.testing.assert_array_equal(at.last_seen_ns, found.last_seen_ns)
     nowhere = np.array([[50.0, 0.0, 0.0], [1e9, 0.0, 0.0], [np.nan, 0.0, 0.0]])
-    assert octree.attributes.hits_at(nowhere).tolist() == [0, 0, 0]
+    assert octree.attributes.at(nowhere).hits.tolist() == [0, 0, 0]
 
 
 def test_log_odds_do_not_depend_on_the_layer():
@@ -113,8 +113,9 @@ def test_points_without_a_stamp_count_as_hits():
     octree = OctreeMap(OctreeConfig(attributes=True))
     octree.insert_points(np.full((3, 3), 0.51, np.float32), np.zeros(3))
 
-    assert octree.attributes.hits_at(np.full((1, 3), 0.51)).tolist() == [3]
-    assert octree.attributes.last_seen_ns_at(np.full((1, 3), 0.51)).tolist() == [NEVER_SEEN]
+    found = octree.attributes.at(np.full((1, 3), 0.51))
+    assert found.hits.tolist() == [3]
+    assert found.last_seen_ns.tolist() == [NEVER_SEEN]
 
 
 def test_sums_never_overflow():
@@ -130,7 +131,7 @@ def test_sums_never_overflow():
     octree.insert(Scan(1, points, colors=np.full((1000, 3), 100, np.uint8)), np.eye(4))
 
     assert layer.color_weights[row, voxel] == (1 << 23) + 1000
-    assert octree.attributes.colors_at(np.full((1, 3), 0.51))[0].tolist() == [[200, 200, 200]]
+    assert octree.attributes.at(np.full((1, 3), 0.51)).colors.tolist() == [[200, 200, 200]]
 
 
 def test_a_layer_too_large_for_memory_is_refused_before_anything_changes(monkeypatch):

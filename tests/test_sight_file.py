@@ -1,4 +1,4 @@
-"""Moving what was mapped: a map made again from what frames saw, and from those alone that moved."""
+"""Fusing again from stored scan updates: only frames that moved are read, and the bits are the same."""
 
 from dataclasses import replace
 
@@ -62,7 +62,7 @@ def source():
 
 @pytest.fixture(scope="module")
 def first(source, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("sights")
+    folder = tmp_path_factory.mktemp("scan_updates")
     fused(source, source.truth, folder / "first.bin")
     return folder / "first.bin"
 
@@ -177,7 +177,7 @@ def test_the_displacement_bounds_every_point_in_range(seed):
 
 
 @pytest.mark.parametrize("discretize", [True, False])
-def test_merging_a_sight_is_inserting_its_scan(discretize):
+def test_merging_a_scan_update_is_inserting_its_scan(discretize):
     rng = np.random.default_rng(3)
     config = OctreeConfig(discretize=discretize, max_range_m=2.5)
     inserted, merged, caster = OctreeMap(config), OctreeMap(config), Caster(config)
@@ -205,5 +205,5 @@ def test_damaged_files_are_refused_in_one_line(first, tmp_path):
     with pytest.raises(MapFileError, match="cannot be read"):
         open_scan_updates(tmp_path / "missing.bin")
     for garbled in (b"garbled", b"x\x9c\x03\x00\x00\x00\x00\x01"):
-        with pytest.raises(DataError, match="sight of 3 blocks: damaged"):
+        with pytest.raises(DataError, match="scan update of 3 blocks: damaged"):
             decompressed(garbled, blocks=3)

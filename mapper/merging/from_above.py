@@ -17,7 +17,7 @@ from mapper.merging.jobs import Foreman
 from mapper.merging.merged_map import MapManifest
 from mapper.merging.placing import Placed
 from mapper.merging.steps import JoinedTile, SeenColumn, Site, save_ground, see_column
-from mapper.octree.ground_height import NOTHING, find_ground
+from mapper.octree.ground_height import NOTHING, ground_from_lowest
 from mapper.octree.slice import OccupancyGrid, grid_of, shrunk
 
 _MOST_CELLS = 2000  # more than a page has pixels
@@ -42,7 +42,7 @@ def look_from_above(
         rows[y].append(tile)
     ground_path = None
     if manifest.slice.above == "ground":
-        ground = find_ground(
+        ground = ground_from_lowest(
             _Lowest(site, rows, first, shape),
             first=first,
             resolution_m=manifest.octree.resolution_m,

@@ -19,7 +19,7 @@ from mapper.merging.tiling import Tiling
 from mapper.octree.attributes import UNSET
 from mapper.octree.color_tree import colored
 from mapper.octree.config import OctreeConfig, SliceConfig
-from mapper.octree.ground_height import Ground, lowest_occupied
+from mapper.octree.ground_height import GroundHeights, lowest_occupied
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import read_map
@@ -232,16 +232,16 @@ def see_column(
     return SeenColumn(known_columns=int(np.count_nonzero(known)), effort=_effort(began))
 
 
-def save_ground(path: Path, ground: Ground) -> None:
+def save_ground(path: Path, ground: GroundHeights) -> None:
     """Write the ground for the jobs that follow it."""
     with atomic_file(path) as part, part.open("wb") as file:
         np.savez(file, heights_m=ground.heights_m, first=ground.first, columns=ground.columns)
 
 
-def load_ground(path: Path) -> Ground:
+def load_ground(path: Path) -> GroundHeights:
     """Return what ``save_ground`` wrote."""
     with np.load(path) as arrays:
-        return Ground(arrays["heights_m"], arrays["first"], int(arrays["columns"]))
+        return GroundHeights(arrays["heights_m"], arrays["first"], int(arrays["columns"]))
 
 
 def _save(path: Path, array: NDArray[np.generic]) -> None:

@@ -1,7 +1,7 @@
-"""What else is known about voxels where rays ended: mean colour, hit count, when last seen.
+"""Voxel attributes where rays ended: mean colour, hit count, time of the last hit.
 
-A layer beside the log-odds, kept for those blocks only that have such a voxel: 14 KiB for each, of 2 KiB
-log-odds. Sums are whole numbers, so the order of scans does not show in a colour.
+A layer beside the log-odds, kept for those blocks only that have such a voxel: 14 KiB each, beside 2 KiB of
+log-odds. Sums are whole numbers, so colours do not depend on the order of scans.
 """
 
 from dataclasses import dataclass
@@ -41,13 +41,13 @@ _FIRST_ROWS = 64
 
 
 class LayerArrays(NamedTuple):
-    """The layer as compiled code sees it.
+    """The arrays of a layer, for compiled code.
 
     Attributes:
         rows: (S,) int32 row of each of the map's blocks, by slot; −1 has none.
         color_sums: (R, 512, 3) uint32 sums of RGB.
-        color_weights: (R, 512) uint32 how many measurements are in the sums. At 2²⁴ both are halved.
-        hits: (R, 512) uint32 how many measurements ended in a voxel, coloured or not.
+        color_weights: (R, 512) uint32 number of measurements in the sums. At 2²⁴ both are halved.
+        hits: (R, 512) uint32 number of measurements that ended in a voxel, coloured or not.
         last_seen_ns: (R, 512) int64 latest stamp of those.
     """
 
@@ -65,7 +65,7 @@ class VoxelAttributes:
     Attributes:
         colors: (N, 3) uint8 mean RGB, rounded; white where there is none.
         colored: (N,) bool.
-        hits: (N,) uint32 how many measurements ended there.
+        hits: (N,) uint32 number of measurements that ended there.
         last_seen_ns: (N,) int64 stamp of the latest scan that ended there, ``NEVER_SEEN`` where none did.
     """
 
@@ -76,7 +76,7 @@ class VoxelAttributes:
 
 
 class AttributeLayer:
-    """Attributes of the voxels of one map."""
+    """Attributes of the voxels of one map, stored by block."""
 
     def __init__(self, blocks: BlockStore, resolution_m: float) -> None:
         self._blocks = blocks
@@ -106,7 +106,7 @@ class AttributeLayer:
         return self._arrays
 
     def claim(self, slots: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Return the rows of blocks; those that had none get one, empty.
+        """Return the rows of blocks; blocks without one get an empty row.
 
         Raises:
             MapSizeError: The layer would not fit into this machine's memory; nothing has changed then.
@@ -143,7 +143,7 @@ class AttributeLayer:
             config: Rays longer than its range have no end; if it discretizes, a ray's length is that to the
                 centre of its end voxel.
             colors: (N, 3) uint8 RGB.
-            stamp_ns: When.
+            stamp_ns: Stamp of the scan.
         """
         _add(
             np.ascontiguousarray(points_body, dtype=np.float32),
@@ -159,12 +159,12 @@ class AttributeLayer:
         )
 
     def add_layer(self, other: "AttributeLayer", slots: NDArray[np.int64], own: NDArray[np.int64]) -> None:
-        """Add what another map knows about the same voxels.
+        """Add another map's attributes of the same voxels.
 
         Args:
-            other: Its layer.
-            slots: (B,) of its blocks.
-            own: (B,) slots of this map's blocks at the same places.
+            other: The other map's layer.
+            slots: (B,) slots of the other map's blocks.
+            own: (B,) slots of the same blocks in this map.
 
         Raises:
             MapSizeError: The layer would not fit into this machine's memory; nothing has changed then.
@@ -175,7 +175,7 @@ class AttributeLayer:
         _add_rows(self.claim(own[held]), self._arrays, rows[slots[held]], other.arrays)
 
     def block_colors(self, slots: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return the (B, 512, 3) uint8 mean RGB of blocks that have attributes, white where there is none."""
+        """Return the (B, 512, 3) uint8 mean RGB of blocks with attributes, white where there is none."""
         rows = np.repeat(self._arrays.rows[slots], BLOCK_VOXELS)
         voxels = np.tile(np.arange(BLOCK_VOXELS), len(slots))
         return self._gather(rows, voxels).colors.reshape(-1, BLOCK_VOXELS, 3)
@@ -198,29 +198,16 @@ class AttributeLayer:
         blocks, which = np.unique(voxels >> (3 * BLOCK_BITS), return_inverse=True)
         slots = np.empty(len(blocks), np.int64)
         find_slots(self._blocks.table, blocks, slots)
-        places = self.claim(slots)[which], voxels & (BLOCK_VOXELS - 1)
-        self._arrays.color_sums[places] = colors[leaf]
-        self._arrays.color_weights[places] = 1
+        index = self.claim(slots)[which], voxels & (BLOCK_VOXELS - 1)
+        self._arrays.color_sums[index] = colors[leaf]
+        self._arrays.color_weights[index] = 1
 
     def at(self, points_world: Points) -> VoxelAttributes:
-        """Return the attributes of the voxels that (N, 3) points, metres, lie in."""
+        """Return the attributes of the N voxels around (N, 3) points, metres; none outside the map."""
         points = np.ascontiguousarray(points_world, dtype=np.float64)
         return self._gather(
-            *_places(self._blocks.table, self._arrays.rows, codes_of(points, self._resolution_m))
+            *_rows_and_voxels(self._blocks.table, self._arrays.rows, codes_of(points, self._resolution_m))
         )
-
-    def colors_at(self, points_world: Points) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Return (N, 3) uint8 mean RGB at points, white where there is none, and (N,) whether there is."""
-        found = self.at(points_world)
-        return found.colors, found.colored
-
-    def hits_at(self, points_world: Points) -> NDArray[np.uint32]:
-        """Return (N,) uint32 how many measurements ended in the voxels of (N, 3) points."""
-        return self.at(points_world).hits
-
-    def last_seen_ns_at(self, points_world: Points) -> NDArray[np.int64]:
-        """Return the (N,) int64 stamps of the latest scans that ended in the voxels of (N, 3) points."""
-        return self.at(points_world).last_seen_ns
 
     def of_leaves(self) -> VoxelAttributes:
         """Return the attributes of all known voxels, in the order of the map's ``leaves()``."""
@@ -268,9 +255,9 @@ def _add(
     table,
     layer,
 ):
-    """Add the end of every ray that ``kernels.clip_rays`` would give an occupied one, by the same arithmetic.
+    """Add the end of every ray that has an occupied one, by the arithmetic of ``kernels.clip_rays``.
 
-    Neighbouring pixels mostly share a voxel, so sums go to the layer when a voxel is left.
+    Neighbouring pixels mostly share a voxel, so sums go to the layer when the voxel changes.
     """
     inverse_resolution = 1.0 / resolution_m
     T = T_world_body
@@ -350,7 +337,7 @@ def _add_rows(own_rows, own, rows, other):
 
 @njit(cache=True, nogil=True)
 def ended_blocks(cells, positions):
-    """Return (B,) bool, which blocks of a window hold an occupied cell."""
+    """Return the (B,) mask of the blocks of a window that hold an occupied cell."""
     ended = np.empty(len(positions), np.bool_)
     for i in range(len(positions)):
         highest = np.uint8(0)
@@ -361,8 +348,8 @@ def ended_blocks(cells, positions):
 
 
 @njit(cache=True, nogil=True)
-def _places(table, rows, codes):
-    """Return the (N,) rows and places in their blocks of voxels; row −1 has no attributes."""
+def _rows_and_voxels(table, rows, codes):
+    """Return (N,) rows of voxels' blocks, −1 without attributes, and (N,) their numbers in the blocks."""
     found, voxels = np.full(len(codes), -1, np.int32), np.empty(len(codes), int64)
     for i in range(len(codes)):
         voxels[i] = codes[i] & (BLOCK_VOXELS - 1)

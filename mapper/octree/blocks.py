@@ -24,7 +24,7 @@ _VACANT = -1
 
 
 class BlockTable(NamedTuple):
-    """The arrays that compiled code needs to find a voxel.
+    """The arrays of a block store, for compiled code.
 
     Attributes:
         entries: (C, 2) int64 block codes by hash, −1 where vacant, each beside its row in ``values``: one
@@ -37,7 +37,7 @@ class BlockTable(NamedTuple):
 
 
 class BlockStore:
-    """Blocks that are never given back; slots number them in the order of their birth."""
+    """Store of blocks, which are never removed; slots number them in the order in which they were added."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -62,7 +62,7 @@ class BlockStore:
         return np.argsort(self.codes)
 
     def claim(self, codes: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the slots of distinct block codes; blocks that did not exist are born unknown.
+        """Return the slots of distinct block codes; absent blocks are added, all unknown.
 
         Raises:
             MapSizeError: The map would not fit into this machine's memory; nothing has changed then.
@@ -91,7 +91,7 @@ class BlockStore:
 def check_memory(
     needed_bytes: int, what: str, *, remedy: str = "raise resolution_m or lower max_range_m"
 ) -> None:
-    """Refuse what could not fit before anything is allocated.
+    """Refuse what cannot fit into memory before anything is allocated.
 
     Raises:
         MapSizeError: More is needed than the machine has.
@@ -112,12 +112,12 @@ def _table(count: int, *, values: NDArray[np.float32]) -> BlockTable:
 
 @njit(cache=True, nogil=True)
 def _probe(entries, code):
-    """Return where in the hash a code is, or the vacant place where it belongs (linear probing)."""
+    """Return the number of a code's entry, or of the vacant one where it belongs (linear probing)."""
     mask = len(entries) - 1
-    place = ((code * FIBONACCI) >> 24) & mask
-    while entries[place, 0] != code and entries[place, 0] != _VACANT:
-        place = (place + 1) & mask
-    return place
+    entry = ((code * FIBONACCI) >> 24) & mask
+    while entries[entry, 0] != code and entries[entry, 0] != _VACANT:
+        entry = (entry + 1) & mask
+    return entry
 
 
 @njit(cache=True, nogil=True)
@@ -141,8 +141,8 @@ def _add_missing(table, codes, slots, codes_by_slot, count):
     """Give every code whose slot is −1 the next slot, filled with NaN; return the new count."""
     for i in range(len(codes)):
         if slots[i] < 0:
-            place = _probe(table.entries, codes[i])
-            table.entries[place, 0], table.entries[place, 1] = codes[i], count
+            entry = _probe(table.entries, codes[i])
+            table.entries[entry, 0], table.entries[entry, 1] = codes[i], count
             table.values[count] = np.nan
             codes_by_slot[count] = codes[i]
             slots[i] = count
@@ -153,5 +153,5 @@ def _add_missing(table, codes, slots, codes_by_slot, count):
 @njit(cache=True, nogil=True)
 def _index(table, codes_by_slot):
     for slot in range(len(codes_by_slot)):
-        place = _probe(table.entries, codes_by_slot[slot])
-        table.entries[place, 0], table.entries[place, 1] = codes_by_slot[slot], slot
+        entry = _probe(table.entries, codes_by_slot[slot])
+        table.entries[entry, 0], table.entries[entry, 1] = codes_by_slot[slot], slot

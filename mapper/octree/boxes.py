@@ -1,4 +1,4 @@
-"""What axis-aligned boxes contain."""
+"""Counts of occupied, free and unknown voxels in axis-aligned boxes."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ _EDGE = 1 << BLOCK_BITS
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoxCounts:
-    """How many voxels of each kind the boxes overlap.
+    """Number of voxels of each state that N boxes overlap.
 
     Attributes:
         occupied: (N,) int64.
@@ -31,13 +31,13 @@ class BoxCounts:
 
     @property
     def any_occupied(self) -> NDArray[np.bool_]:
-        """(N,) whether there is an obstacle."""
+        """(N,) bool, true where a box overlaps an occupied voxel."""
         found: NDArray[np.bool_] = self.occupied > 0
         return found
 
     @property
     def all_free(self) -> NDArray[np.bool_]:
-        """(N,) whether every voxel has been seen free."""
+        """(N,) bool, true where a box overlaps free voxels only."""
         found: NDArray[np.bool_] = (self.free > 0) & (self.occupied == 0) & (self.unknown == 0)
         return found
 
@@ -45,9 +45,9 @@ class BoxCounts:
 def count_boxes(
     store: BlockStore, lower_world: Points, upper_world: Points, *, resolution_m: float, threshold: np.float32
 ) -> BoxCounts:
-    """Count the voxels that boxes overlap; a box that is a point overlaps the voxel that it lies in.
+    """Count the voxels that boxes overlap; a box that is a point overlaps the voxel around it.
 
-    The time grows with the voxels of a box, and at most with those of the map.
+    The time grows with the number of voxels in a box, up to the number in the map.
 
     Args:
         store: The voxels.
@@ -99,7 +99,7 @@ def _count(table, codes, first, last, threshold):
 
 @njit(cache=True, nogil=True)
 def _count_block(block, x, y, z, first, last, threshold, counts):
-    """Add a block's voxels between inclusive keys to ``counts``; x, y, z number the block."""
+    """Add a block's voxels between inclusive keys to ``counts``; x, y, z are the block's keys >> 3."""
     for k in range(max(first[2] - z * _EDGE, 0), min(last[2] - z * _EDGE, _EDGE - 1) + 1):
         for j in range(max(first[1] - y * _EDGE, 0), min(last[1] - y * _EDGE, _EDGE - 1) + 1):
             for i in range(max(first[0] - x * _EDGE, 0), min(last[0] - x * _EDGE, _EDGE - 1) + 1):

@@ -1,4 +1,4 @@
-"""From one scan at its pose to the voxels that its rays saw, before any map is touched."""
+"""Ray casting of a scan at its pose: the free and occupied voxels, before a map is updated with them."""
 
 from typing import NamedTuple
 
@@ -15,12 +15,12 @@ from mapper.octree.window import Window, WindowBuffer, block_codes, take_touched
 
 
 class Cast(NamedTuple):
-    """A scan rasterised into a window; whoever reads the cells leaves them UNTOUCHED.
+    """A scan rasterised into a window; reading the cells must reset them to UNTOUCHED.
 
     Attributes:
-        window: Where it lies.
-        positions: (B,) int64 the window's touched blocks.
-        codes: (B,) int64 the same blocks' Morton codes.
+        window: The window around the scan.
+        positions: (B,) int64 positions of the touched blocks in the window.
+        codes: (B,) int64 Morton codes of the same blocks.
     """
 
     window: Window
@@ -29,7 +29,7 @@ class Cast(NamedTuple):
 
 
 class Caster:
-    """Casts scans, one at a time, into working memory that is kept from scan to scan."""
+    """Ray caster: rasterises scans, one at a time, in working memory that it keeps from scan to scan."""
 
     def __init__(self, config: OctreeConfig) -> None:
         self.config = config
@@ -41,11 +41,11 @@ class Caster:
         return self._buffer.memory_bytes
 
     def forget(self) -> None:
-        """Drop the working memory, with a cast in it that nobody will read."""
+        """Drop the working memory, together with a cast in it that is not going to be read."""
         self._buffer = WindowBuffer()
 
     def cast(self, scan: Scan, T_world_body: Transform) -> Cast:
-        """Return what a scan saw: free along every ray, occupied at its end, and occupied wins.
+        """Rasterise a scan: free along every ray, occupied at its end; occupied wins.
 
         Raises:
             DataError: A point or the origin has no key.
@@ -58,7 +58,7 @@ class Caster:
         return self._rays(kernels.to_world(points_body, T), origin_world)
 
     def cast_points(self, points_world: Points32, origin_world: Array) -> Cast:
-        """Return what (N, 3) world points saw from (3,) their origin, metres.
+        """Rasterise rays from a (3,) origin to (N, 3) world points, metres.
 
         Raises:
             DataError: The points are not (N, 3), or one of them or the origin has no key.
@@ -100,10 +100,10 @@ class Caster:
 
 
 def origin_key(origin: NDArray[np.float32], resolution_m: float) -> NDArray[np.int64]:
-    """Return the (3,) key of where rays begin, (3,) metres.
+    """Return the (3,) key of the origin of rays, (3,) metres.
 
     Raises:
-        DataError: It has none.
+        DataError: The origin has no key.
     """
     keys = np.floor((1.0 / resolution_m) * origin.astype(np.float64)) + KEY_ZERO
     if not ((keys >= 0) & (keys < KEY_COUNT)).all():

@@ -1,4 +1,4 @@
-"""Colours of the nodes of a ColorOcTree, as OctoMap works them out when it prunes and updates inner nodes."""
+"""Colours of the nodes of a ColorOcTree, as OctoMap computes them when it prunes and updates inner nodes."""
 
 import numpy as np
 from numba import njit
@@ -25,8 +25,8 @@ def colored(
     """Return (N,) COLOR_NODE: the nodes of a pruned tree in preorder, with their colours.
 
     A leaf above the voxels has the mean colour of the voxels that were pruned into it, and an inner node that
-    of its children, level by level, fractions dropped, white being no colour. OctoMap leaves a pruned node
-    white if its first child was, and so do we.
+    of its children, level by level, rounded down; white is no colour. As in OctoMap, a pruned node is white
+    if its first child was.
 
     Args:
         nodes: (N,) NODE of the same map.
@@ -51,7 +51,7 @@ def parent_color(children: NDArray[np.uint8], *, pruned: bool) -> NDArray[np.uin
 
     Args:
         children: uint8 RGB.
-        pruned: The children are gone, since they were leaves of equal value.
+        pruned: The children were leaves of equal value and are no longer stored.
     """
     if pruned:
         return np.asarray(_pruned(children.copy()))
@@ -66,10 +66,10 @@ def _colors_in_preorder(masks, codes, colors, root_depth, root_code, rgb):
     Args:
         masks: (N,) uint8 of the nodes in preorder.
         codes: (B,) int64 increasing codes of the blocks that have colours.
-        colors: (B, 512, 3) uint8 those.
+        colors: (B, 512, 3) uint8 colours of their voxels.
         root_depth: Depth of the first node.
-        root_code: Its Morton code there.
-        rgb: What is written.
+        root_code: Its Morton code at that depth.
+        rgb: (N, 3) uint8 result.
     """
     pending, index = np.zeros(KEY_BITS + 1, int64), np.zeros(KEY_BITS + 1, int64)
     prefix = np.zeros(KEY_BITS + 2, int64)

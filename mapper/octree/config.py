@@ -1,4 +1,4 @@
-"""The occupancy octree, levelling and the slice."""
+"""Settings of the occupancy octree and of the 2D slice."""
 
 from typing import Annotated, Literal, Self
 
@@ -23,15 +23,15 @@ class OctreeConfig(Config):
     discretize: bool = True
     """Cast one ray per end voxel (fast), not one per point; both are OctoMap's own modes."""
     attributes: bool = False
-    """Keep mean colour, hit count and last sight of the voxels where rays end, beside their log-odds."""
+    """Keep mean colour, hit count and time of the last hit of the voxels where rays end."""
     stays_within_m: NonNegativeFloat = 1e-9
-    """Fusing again along another trajectory leaves a frame as it was fused if no end of a ray moves further;
-    the default forgives the rounding of poses that were text."""
+    """Fusing again along another trajectory keeps a frame's cached update if no end of a ray moves further;
+    the default tolerates the rounding of poses that were text."""
     dynamic: Literal["none", "seen-through"] = "none"
     """"none" is OctoMap. "seen-through": see ``seen_through_scans``."""
     seen_through_scans: Annotated[int, Field(ge=1, le=255)] = 3
-    """When so many scans in a row saw an occupied voxel free, what stood there is gone: its log-odds are
-    those of the misses alone. Only with ``dynamic = "seen-through"``."""
+    """After so many consecutive scans with an occupied voxel free, its log-odds are those of these misses
+    alone: the object has left. Only with ``dynamic = "seen-through"``."""
 
 
 class SliceConfig(Config):
@@ -44,11 +44,11 @@ class SliceConfig(Config):
     above: Literal["floor", "ground"] = "floor"
     """"floor": the band is level; "ground": it follows streets that rise and fall."""
     min_cluster_cells: PositiveInt = 1
-    """Smaller 8-connected groups of occupied cells are taken for noise; 1 keeps all."""
+    """Smaller 8-connected groups of occupied cells count as noise; 1 keeps all."""
 
     @model_validator(mode="after")
     def _refuse_an_empty_band(self) -> Self:
-        """Refuse before a log is fused what could not be cut after it."""
+        """Refuse an empty band before a log is fused, not after."""
         if self.max_height_m <= self.min_height_m:
             raise ValueError(
                 f"max_height_m {self.max_height_m} must be above min_height_m {self.min_height_m}"

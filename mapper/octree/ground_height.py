@@ -1,4 +1,4 @@
-"""The height of the ground under every column of the map, where streets rise and fall."""
+"""Height of the ground under every column of the map, where streets rise and fall."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -18,11 +18,11 @@ _LOW_PERCENT = 20.0  # below it are reflections
 _START_M = 0.5
 _MIN_COLUMNS = 4
 NOTHING = np.iinfo(np.int32).max
-"""Top of the lowest occupied voxel of a column that has none."""
+"""Value of ``lowest_occupied`` for a column without an occupied voxel."""
 
 
 class Rows(Protocol):
-    """An (H, W) int32 raster of which some rows are asked for at a time, so it need not be in memory."""
+    """An (H, W) int32 raster that is read some rows at a time, so that it need not be in memory."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -30,16 +30,16 @@ class Rows(Protocol):
         ...
 
     def __getitem__(self, rows: slice, /) -> NDArray[np.int32]:
-        """Return some rows."""
+        """Return a slice of rows."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ground:
-    """The ground's height in square cells of a few metres, and linearly between their middles.
+class GroundHeights:
+    """Heights of the ground in square cells of a few metres, linearly interpolated between their centres.
 
     Attributes:
-        heights_m: (R, C) of the ground in the world at the cells' middles.
+        heights_m: (R, C) heights in the world at the cells' centres.
         first: (2,) x and y key of the first column of cell (0, 0).
         columns: Edge of a cell in voxels.
     """
@@ -49,17 +49,17 @@ class Ground:
     columns: int
 
     def under(self, *, first: NDArray[np.int64], shape: tuple[int, int]) -> Array:
-        """Return (H, W) metres: the height under each column of a grid whose first has these x and y keys."""
+        """Return the (H, W) height, metres, under each column of a grid; ``first`` are its x and y keys."""
         (x, y), (height, width) = first - self.first, shape
         by_row = _between(self.heights_m, (np.arange(y, y + height) + 0.5) / self.columns - 0.5)
         return _between(by_row.T, (np.arange(x, x + width) + 0.5) / self.columns - 0.5).T
 
 
-def _between(values: Array, places: Array) -> Array:
-    """Return the rows at fractional places; beyond the first and the last row these go on."""
-    places = np.clip(places, 0.0, len(values) - 1.0)
-    below = np.minimum(places.astype(np.int64), max(len(values) - 2, 0))
-    share = (places - below)[:, np.newaxis]
+def _between(values: Array, positions: Array) -> Array:
+    """Return the rows at fractional positions; beyond the first and the last row their values hold."""
+    positions = np.clip(positions, 0.0, len(values) - 1.0)
+    below = np.minimum(positions.astype(np.int64), max(len(values) - 2, 0))
+    share = (positions - below)[:, np.newaxis]
     above = np.minimum(below + 1, len(values) - 1)
     found: Array = values[below] * (1.0 - share) + values[above] * share
     return found
@@ -68,28 +68,29 @@ def _between(values: Array, places: Array) -> Array:
 def ground_heights(
     octree: OctreeMap, *, first: NDArray[np.int64], shape: tuple[int, int], floor_z_m: float
 ) -> Array:
-    """Return (H, W) metres: the ground's height in the world under each column of a grid.
+    """Return the (H, W) height of the ground in the world, metres, under each column of a grid.
 
-    In cells of a few metres the ground is where low occupied voxels are. It is followed from the floor
-    outwards, no steeper than streets are: what jumps is a roof or a wall, and the ground goes on below it.
+    In each cell of a few metres the ground is a low percentile of the lowest occupied voxels. It is followed
+    from the floor outwards, no steeper than a street: at a larger step (a roof, a wall) the height of the
+    neighbour is kept.
 
     Args:
         octree: The map in a world with z up.
         first: (2,) x and y keys of the column of row 0 and column 0.
         shape: H, W.
-        floor_z_m: Height of the floor that the ground is followed from, near x = y = 0.
+        floor_z_m: Height of the floor near x = y = 0, from which the ground is followed.
     """
     lowest = lowest_occupied(octree, first=first, shape=shape)
-    ground = find_ground(lowest, first=first, resolution_m=octree.resolution_m, floor_z_m=floor_z_m)
+    ground = ground_from_lowest(lowest, first=first, resolution_m=octree.resolution_m, floor_z_m=floor_z_m)
     return ground.under(first=first, shape=shape)
 
 
 def lowest_occupied(
     octree: OctreeMap, *, first: NDArray[np.int64], shape: tuple[int, int]
 ) -> NDArray[np.int32]:
-    """Return (H, W) tops of each column's lowest occupied voxel, in voxels above z = 0.
+    """Return the (H, W) top of each column's lowest occupied voxel, in voxels above z = 0.
 
-    Where nothing is occupied stands ``NOTHING``, so the minimum joins several maps.
+    A column without one has ``NOTHING``, so that the minimum joins several maps.
     """
     lowest = np.full(shape, NOTHING, dtype=np.int32)
     slots = octree.blocks.sorted_slots()
@@ -98,13 +99,15 @@ def lowest_occupied(
     return lowest
 
 
-def find_ground(lowest: Rows, *, first: NDArray[np.int64], resolution_m: float, floor_z_m: float) -> Ground:
-    """Return the ground below what ``lowest_occupied`` found; see ``ground_heights``."""
+def ground_from_lowest(
+    lowest: Rows, *, first: NDArray[np.int64], resolution_m: float, floor_z_m: float
+) -> GroundHeights:
+    """Return the ground from the result of ``lowest_occupied``; see ``ground_heights``."""
     columns = max(1, round(_CELL_M / resolution_m))
     low_m = _cells(lowest, columns) * resolution_m
     origin = (KEY_ZERO - first[::-1]) // columns
     heights_m = _followed(low_m, origin, floor_z_m, max_step_m=_MAX_SLOPE * columns * resolution_m)
-    return Ground(heights_m, first, columns)
+    return GroundHeights(heights_m, first, columns)
 
 
 @njit(cache=True, nogil=True)
@@ -121,21 +124,21 @@ def _lowest_occupied(codes, slots, values, threshold, first, lowest):
 
 
 def _cells(lowest: Rows, columns: int) -> Array:
-    """Return a low percentile of the lowest voxels in squares of so many columns; NaN where few are seen."""
+    """Return a low percentile of the lowest voxels in squares of so many columns; NaN where they are few."""
     rows_of, columns_of = (-(-size // columns) for size in lowest.shape)
     cells = np.full((rows_of, columns_of), np.nan)
     for row in range(rows_of):
         band = lowest[row * columns : (row + 1) * columns]
         for column in range(columns_of):
-            seen = band[:, column * columns : (column + 1) * columns]
-            seen = seen[seen != NOTHING]
-            if len(seen) >= _MIN_COLUMNS:
-                cells[row, column] = np.percentile(seen, _LOW_PERCENT)
+            tops = band[:, column * columns : (column + 1) * columns]
+            tops = tops[tops != NOTHING]
+            if len(tops) >= _MIN_COLUMNS:
+                cells[row, column] = np.percentile(tops, _LOW_PERCENT)
     return cells
 
 
 def _followed(low_m: Array, origin: NDArray[np.int64], floor_z_m: float, *, max_step_m: float) -> Array:
-    """Return the ground in every cell, breadth first from the nearest to the origin that shows the floor."""
+    """Return the ground in every cell, breadth first from the cell nearest to the origin with the floor."""
     heights_m = np.full(low_m.shape, np.nan)
     floors = np.argwhere(np.abs(low_m - floor_z_m) <= _START_M)
     if not len(floors):
@@ -150,7 +153,6 @@ def _followed(low_m: Array, origin: NDArray[np.int64], floor_z_m: float, *, max_
             if not (0 <= beside[0] < low_m.shape[0] and 0 <= beside[1] < low_m.shape[1]):
                 continue
             if np.isnan(heights_m[beside]):
-                there_m = low_m[beside]
-                heights_m[beside] = there_m if abs(there_m - here_m) <= max_step_m else here_m
+                heights_m[beside] = low_m[beside] if abs(low_m[beside] - here_m) <= max_step_m else here_m
                 queue.append(beside)
     return heights_m

@@ -20,8 +20,8 @@ _RECENT = 1 << 15  # entries of the table of recent voxels: 256 KiB
 _NEVER = float64(np.finfo(np.float64).max)  # OctoMap's tMax along an axis that the ray does not move on
 
 
-class Sensor(NamedTuple):
-    """OctoMap's float32 log-odds: what a hit or a miss adds, and the clamps."""
+class SensorModel(NamedTuple):
+    """OctoMap's sensor model in float32 log-odds: the increments of a hit and a miss, and the clamps."""
 
     hit: np.float32
     miss: np.float32
@@ -43,10 +43,10 @@ def to_world(points_body, T_world_body):
 
 @njit(cache=True, nogil=True)
 def end_voxels(points_body, T_world_body, resolution_m):
-    """Return the centres of the voxels that a scan's points fall into.
+    """Return the centres of the voxels around a scan's points.
 
-    A voxel that comes back after its entry in the table of recent ones was overwritten is listed again:
-    casting the same ray twice changes nothing, and a lossy table costs a fraction of an exact one.
+    A voxel is listed again if its entry in the table of recent ones was overwritten in between: casting a ray
+    twice changes nothing, and a lossy table costs a fraction of an exact one.
 
     Args:
         points_body: (N, 3) float32 metres, C-contiguous.
@@ -54,7 +54,7 @@ def end_voxels(points_body, T_world_body, resolution_m):
         resolution_m: Voxel edge.
 
     Returns:
-        (K, 3) float32 voxel centres, world frame, and how many points have no key.
+        (K, 3) float32 voxel centres, world frame, and the number of points that have no key.
     """
     n = len(points_body)
     inverse_resolution = 1.0 / resolution_m
@@ -96,10 +96,10 @@ def end_voxels(points_body, T_world_body, resolution_m):
             distinct += packed[j + 1] != packed[j]
         packed[0] = packed[size]
         for j in range(distinct):
-            place = ((runs[j] * FIBONACCI) >> 40) & (_RECENT - 1)
+            entry = ((runs[j] * FIBONACCI) >> 40) & (_RECENT - 1)
             found[count] = runs[j]
-            count += recent[place] != runs[j]
-            recent[place] = runs[j]
+            count += recent[entry] != runs[j]
+            recent[entry] = runs[j]
     centres = np.empty((count, 3), float32)
     for i in range(count):
         for axis in range(3):
@@ -109,17 +109,17 @@ def end_voxels(points_body, T_world_body, resolution_m):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def clip_rays(ends, origin, resolution_m, max_range_m):
-    """Return where rays really stop.
+    """Return the stops of rays, which are not longer than the maximum range.
 
     Args:
         ends: (N, 3) float32 measured ends, world frame, metres.
-        origin: (3,) float32 where they begin.
+        origin: (3,) float32 origin of the rays.
         resolution_m: Voxel edge.
-        max_range_m: A longer ray only frees space, and only up to here.
+        max_range_m: A longer ray only frees space, up to this range.
 
     Returns:
-        (N, 3) float32 stops; (N,) bool whether a ray has an occupied end; (3,) int64 smallest and (3,) int64
-        largest key that stepping along the rays can reach; how many ends have no key.
+        (N, 3) float32 stops; (N,) bool, true for rays with an occupied end; (3,) int64 smallest and (3,)
+        int64 largest key that stepping along the rays can reach; number of ends that have no key.
     """
     inverse_resolution = 1.0 / resolution_m
     stops = np.empty_like(ends)
@@ -145,7 +145,7 @@ def clip_rays(ends, origin, resolution_m, max_range_m):
         highest[0], highest[1], highest[2] = max(highest[0], x), max(highest[1], y), max(highest[2], z)
     low_key, high_key = np.empty(3, int64), np.empty(3, int64)
     for axis in range(3):
-        # A ray that ends on a voxel's border may step one voxel too far before it notices its length.
+        # A ray that ends on a voxel's border may step one voxel too far before its length is checked.
         low_key[axis] = key_of(lowest[axis], inverse_resolution) - 1
         high_key[axis] = key_of(highest[axis], inverse_resolution) + 1
     return stops, hits, low_key, high_key, outside
@@ -155,14 +155,14 @@ def clip_rays(ends, origin, resolution_m, max_range_m):
 def cast_rays(stops, hits, origin, resolution_m, window):
     """Rasterise rays into a window: FREE along them, then OCCUPIED at their ends (Amanatides & Woo 1987).
 
-    The voxel where a ray stops is not freed by it. Where it meets two borders at once the later axis steps.
+    A ray does not free the voxel where it stops. Where it meets two borders at once the later axis steps.
 
     Args:
-        stops: (N, 3) float32 where rays stop, world frame, metres.
-        hits: (N,) bool whether the stop is an obstacle.
-        origin: (3,) float32 where they begin.
+        stops: (N, 3) float32 stops of the rays, world frame, metres.
+        hits: (N,) bool, true where the stop is an obstacle.
+        origin: (3,) float32 origin of the rays.
         resolution_m: Voxel edge.
-        window: Placed around the rays.
+        window: Window around the rays.
     """
     inverse_resolution = 1.0 / resolution_m
     cells, touched = window.cells, window.touched
@@ -188,9 +188,7 @@ def cast_rays(stops, hits, origin, resolution_m, window):
         while True:
             cells[cell] = FREE
             touched[cell >> (3 * BLOCK_BITS)] = 1
-            if (
-                x_time < y_time
-            ):  # one comparison a branch: "x < y and x < z" without the second z takes 5 % more
+            if x_time < y_time:  # nested: joining this test and the next takes 5 % more time
                 if x_time < z_time:
                     x = (x + x_step) & x_bits
                     x_time += x_delta
@@ -225,7 +223,7 @@ def _stop_cell(window, stops, i, inverse_resolution):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _axis(direction, origin, key, bits, resolution_m):
-    """Return what a step adds to an axis's bits, the length to the first border, and that between borders."""
+    """Return the increment of an axis's bits by a step, and the lengths to the first and between borders."""
     if direction == 0:
         return int64(0), _NEVER, _NEVER
     # Subtracting the mask adds one in the masked bits: the carry runs through all the others.
@@ -238,17 +236,17 @@ def _axis(direction, origin, key, bits, resolution_m):
 
 @njit(cache=True, nogil=True)
 def merge(cells, positions, slots, values, sensor):
-    """Add what a scan saw to the map and leave its cells UNTOUCHED.
+    """Update the map's log-odds by a rasterised scan, and reset the scan's cells to UNTOUCHED.
 
     Args:
-        cells: (C,) uint8 of the window where the scan has been rasterised.
-        positions: (B,) int64 its touched blocks.
-        slots: (B,) int32 the same blocks' rows in ``values``.
+        cells: (C,) uint8 cells of the window with the scan.
+        positions: (B,) int64 positions of the touched blocks in the window.
+        slots: (B,) int64 rows of the same blocks in ``values``.
         values: (capacity, 512) float32 log-odds; NaN is unknown.
-        sensor: What to add, and the clamps.
+        sensor: Increments and clamps.
 
     Returns:
-        How many voxels became known.
+        Number of voxels that became known.
     """
     hit, miss, lowest, highest = sensor.hit, sensor.miss, sensor.lowest, sensor.highest
     born = 0
@@ -265,9 +263,9 @@ def merge(cells, positions, slots, values, sensor):
             new = value + (hit if seen == OCCUPIED else miss)
             new = lowest if new < lowest else new
             new = highest if new > highest else new
-            # OctoMap leaves a voxel alone that is at or beyond the clamp already, as one from a file may be.
-            settled = value >= highest if seen == OCCUPIED else value <= lowest
-            new = value if settled else new
+            # OctoMap does not change a voxel at or beyond the clamp, as one from a file may be.
+            clamped = value >= highest if seen == OCCUPIED else value <= lowest
+            new = value if clamped else new
             block[j] = old if seen == UNTOUCHED else new
             block_born += int32(unknown & (seen != UNTOUCHED))
         born += block_born

@@ -67,7 +67,7 @@ def morton(x, y, z):
 
 
 def codes_of_blocks(blocks: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the (B,) Morton codes of (B, 3) blocks, counted from the lowest there can be."""
+    """Return the (B,) Morton codes of blocks from their (B, 3) numbers, keys >> 3."""
     x, y, z = (spread.py_func(blocks[:, axis]) for axis in range(3))
     codes: NDArray[np.int64] = x | (y << 1) | (z << 2)
     return codes

@@ -1,4 +1,4 @@
-"""The map at coarser levels: what the inner nodes of the octree hold."""
+"""The map at coarser levels: log-odds of the octree's inner nodes."""
 
 from typing import Literal
 
@@ -13,8 +13,8 @@ from mapper.octree.blocks import BlockStore
 from mapper.octree.keys import BLOCK_BITS, BLOCK_DEPTH, BLOCK_VOXELS, KEY_BITS, codes_of, gather
 
 Parent = Literal["max", "mean"]
-"""What a node makes of the log-odds of its known children: the highest, as OctoMap does (Hornung et al. 2013,
-eq. 7: nothing occupied is overlooked), or their mean (ALGORITHMS B6, eq. 14)."""
+"""Log-odds of a node from its known children: the highest, as in OctoMap (Hornung et al. 2013, eq. 7:
+nothing occupied is overlooked), or their mean (Zhao et al. 2020, eq. 14)."""
 
 
 def nodes_at(
@@ -25,10 +25,10 @@ def nodes_at(
     Args:
         store: The voxels.
         depth: 0, the root, … 16, the voxels.
-        parent: How children are joined.
+        parent: Rule that joins children.
 
     Raises:
-        DataError: No such depth or way to join.
+        DataError: No such depth or rule.
     """
     if not 0 <= depth <= KEY_BITS:
         raise DataError(f"octree: depth {depth}, want 0 (root) … {KEY_BITS} (voxels)")

@@ -28,10 +28,10 @@ class Leaves:
     """Known voxels, or nodes above them, in Morton order.
 
     Attributes:
-        keys: (N, 3) uint16, OctoMap's; above the voxels they count nodes.
+        keys: (N, 3) uint16 keys as in OctoMap; above the voxels they count nodes.
         log_odds: (N,) float32.
         resolution_m: Edge of a voxel.
-        depth: Of the nodes in the tree; 16 are the voxels.
+        depth: Depth of the nodes in the tree; 16 is that of the voxels.
     """
 
     keys: NDArray[np.uint16]
@@ -53,12 +53,12 @@ class Leaves:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RayEnds:
-    """Where rays through the map ended.
+    """Ends of rays cast through the map.
 
     Attributes:
         centres_world: (N, 3) float64 centre of the last voxel, metres.
         distances_m: (N,) float64 from the ray's origin to that centre.
-        hits: (N,) bool, whether that voxel is occupied.
+        hits: (N,) bool, true where that voxel is occupied.
     """
 
     centres_world: Points
@@ -67,10 +67,10 @@ class RayEnds:
 
 
 class OctreeMap:
-    """Log-odds per voxel; an absent voxel is unknown.
+    """Occupancy octree: log-odds per voxel; an absent voxel is unknown.
 
-    The map is an octree of depth 16 whose lowest three levels are stored as dense 8³ blocks. Upper levels are
-    implied, and computed when a file is written.
+    The tree has depth 16; its lowest three levels are stored as dense 8³ blocks. Upper levels are computed
+    when a file is written.
     """
 
     def __init__(self, config: OctreeConfig) -> None:
@@ -91,7 +91,7 @@ class OctreeMap:
         return self.config.resolution_m
 
     def __len__(self) -> int:
-        """Return how many voxels are known, all at the finest level."""
+        """Return the number of known voxels, all at the finest level."""
         return self._known
 
     @property
@@ -101,7 +101,7 @@ class OctreeMap:
 
     @property
     def working_bytes(self) -> int:
-        """Bytes of address space of the scan window; only what rays have crossed is backed by memory."""
+        """Bytes of address space of the scan window; only pages that rays crossed are backed by memory."""
         return self._caster.memory_bytes
 
     def insert(self, scan: Scan, T_world_body: Transform) -> None:
@@ -145,7 +145,7 @@ class OctreeMap:
             )
 
     def merge(self, update: ScanUpdate) -> None:
-        """Fuse what a frame saw: the same as inserting its scan, to the last bit, but without attributes.
+        """Fuse a scan's update: the same as inserting the scan, to the last bit, but without attributes.
 
         Raises:
             MapSizeError: The map would be too large; it has not changed then.
@@ -167,9 +167,9 @@ class OctreeMap:
         merge = kernels.merge if self._seen_through is None else self._seen_through.merge
         self._known += merge(cells, positions, slots, self.blocks.table.values, self._sensor())
 
-    def _sensor(self) -> kernels.Sensor:
+    def _sensor(self) -> kernels.SensorModel:
         config = self.config
-        return kernels.Sensor(
+        return kernels.SensorModel(
             hit=log_odds(config.hit_probability),
             miss=log_odds(config.miss_probability),
             lowest=log_odds(config.clamp_min_probability),
@@ -178,19 +178,19 @@ class OctreeMap:
 
     @property
     def occupied_log_odds(self) -> np.float32:
-        """Log-odds from which a voxel counts as occupied."""
+        """Least log-odds of an occupied voxel."""
         return log_odds(self.config.occupied_probability)
 
     def query(
         self, points_world: Points, *, depth: int = KEY_BITS, parent: Parent = "max"
     ) -> NDArray[np.float32]:
-        """Return the (N,) log-odds of (N, 3) points in metres; NaN where nothing is known or can be.
+        """Return the (N,) log-odds of (N, 3) points in metres; NaN where unknown or out of range.
 
         Args:
             points_world: Any points.
-            depth: Level of the tree that is asked, 0 (root) … 16 (voxels). Others than 16 are worked out for
-                the whole map, at every call.
-            parent: What a node above the voxels holds: ``max`` or ``mean`` of its known children.
+            depth: Level of the tree, 0 (root) … 16 (voxels). Others than 16 are computed for the whole map at
+                every call.
+            parent: Log-odds of a node above the voxels: ``max`` or ``mean`` of its known children.
 
         Raises:
             DataError: No such depth or parent.
@@ -206,13 +206,13 @@ class OctreeMap:
     def cast_rays(
         self, origins_world: Points, directions_world: Points, *, max_range_m: float, through_unknown: bool
     ) -> RayEnds:
-        """Return where rays first meet an occupied voxel, as OctoMap's ``castRay`` does.
+        """Return the first occupied voxel along rays, as OctoMap's ``castRay`` does.
 
         Args:
             origins_world: (N, 3) metres.
             directions_world: (N, 3) of any length but zero.
             max_range_m: Rays end without a hit once a voxel's centre is further away.
-            through_unknown: Go on through unknown voxels; otherwise a ray ends, without a hit, in the first.
+            through_unknown: Pass unknown voxels; otherwise a ray ends, without a hit, in the first.
 
         Raises:
             DataError: Shapes differ, a direction is zero or not finite, or an origin has no key.
@@ -239,7 +239,7 @@ class OctreeMap:
         return RayEnds(centres_world, distances_m, outcomes == queries.HIT)
 
     def count_boxes(self, lower_world: Points, upper_world: Points) -> BoxCounts:
-        """Return what (N,) boxes between (N, 3) corners in metres overlap; see :mod:`mapper.octree.boxes`."""
+        """Count the voxels in N boxes between (N, 3) corners, metres; see :mod:`mapper.octree.boxes`."""
         return count_boxes(
             self.blocks,
             lower_world,
@@ -259,10 +259,10 @@ class OctreeMap:
         )
 
     def restore(self, leaves: TreeLeaves) -> None:
-        """Take over the leaves of a file; the map must be empty.
+        """Fill an empty map with the leaves of a file.
 
         Raises:
-            DataError: The map already holds voxels.
+            DataError: The map already has voxels.
             MapSizeError: Expanded to voxels, the leaves would not fit into memory.
         """
         if self._known:
@@ -272,15 +272,15 @@ class OctreeMap:
     def restore_blocks(
         self, codes: NDArray[np.int64], known: NDArray[np.bool_], values: NDArray[np.float32]
     ) -> None:
-        """Take over whole blocks; the map must be empty.
+        """Fill an empty map with whole blocks.
 
         Args:
             codes: (B,) distinct Morton codes of the blocks.
-            known: (B, 512) which of their voxels are known.
-            values: (K,) log-odds of those, block after block.
+            known: (B, 512) mask of their known voxels.
+            values: (K,) log-odds of the known voxels, block after block.
 
         Raises:
-            MapSizeError: They would not fit into memory.
+            MapSizeError: The blocks would not fit into memory.
         """
         slots = self.blocks.claim(codes)
         blocks, voxels = np.nonzero(known)
@@ -295,7 +295,7 @@ class OctreeMap:
 
         Args:
             other: A map of the same resolution; with attributes if this one has them.
-            slots: Of its blocks those that are added; None adds all.
+            slots: Slots of the other map's blocks that are added; None adds all.
 
         Raises:
             MapSizeError: The map would be too large; it has not changed then.
@@ -311,16 +311,16 @@ class OctreeMap:
         return Overlap(*overlap)
 
     def clamp(self) -> None:
-        """Bring all log-odds back between the sensor model's limits."""
+        """Clip all log-odds to the sensor model's limits."""
         sensor = self._sensor()
         values = self.blocks.table.values[: len(self.blocks)]
         np.clip(values, sensor.lowest, sensor.highest, out=values)
 
     def leaves(self, *, depth: int = KEY_BITS, parent: Parent = "max") -> Leaves:
-        """Return every known voxel, in Morton order: the order does not depend on that of the scans.
+        """Return every known voxel in Morton order, which does not depend on the order of the scans.
 
         Args:
-            depth: 16, or that of the nodes to return instead: see :meth:`query`.
+            depth: 16, or the depth of the nodes to return instead: see :meth:`query`.
             parent: See :meth:`query`.
 
         Raises:

@@ -37,7 +37,7 @@ def write_map(path: Path, octree: OctreeMap) -> None:
     slots = octree.blocks.sorted_slots()
     values = octree.blocks.table.values[slots]
     known = ~np.isnan(values)
-    columns: list[NDArray[Any]] = [*_places(octree.blocks.codes[slots], known), values[known]]
+    columns: list[NDArray[Any]] = [*_block_columns(octree.blocks.codes[slots], known), values[known]]
     counts = [len(slots), int(np.count_nonzero(known)), 0, 0]
     if octree.attributes is not None:
         attribute_columns, counts[2:] = _attribute_columns(octree, octree.attributes)
@@ -56,14 +56,17 @@ def _attribute_columns(
     slots, arrays = layer.slots, layer.arrays
     rows = arrays.rows[slots]
     held = (arrays.hits[rows] > 0) | (arrays.color_weights[rows] > 0)
-    places = _places(octree.blocks.codes[slots], held)
     sums = arrays.color_sums[rows][held]
-    columns: list[NDArray[Any]] = [*places, *(np.ascontiguousarray(sums[:, channel]) for channel in range(3))]
+    columns: list[NDArray[Any]] = [*_block_columns(octree.blocks.codes[slots], held)]
+    columns += [np.ascontiguousarray(sums[:, channel]) for channel in range(3)]
     columns += [array[rows][held] for array in (arrays.color_weights, arrays.hits, arrays.last_seen_ns)]
     return columns, (len(slots), int(np.count_nonzero(held)))
 
 
-def _places(codes: NDArray[np.int64], held: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+def _block_columns(
+    codes: NDArray[np.int64], held: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    """Return steps between (B,) block codes, and the (B, 64) bits of a (B, 512) mask of their voxels."""
     return np.diff(codes, prepend=np.int64(0)), np.packbits(held, axis=1, bitorder="little")
 
 
@@ -71,9 +74,9 @@ def parse_map(path: Path, data: bytes, config: OctreeConfig | None) -> OctreeMap
     """Return the map of a file's bytes, which begin with ``MAGIC``.
 
     Args:
-        path: Names the file in errors.
-        data: All of it.
-        config: Replaces the file's sensor model for what is inserted later, the resolution excepted.
+        path: Path of the file, for errors.
+        data: All of its bytes.
+        config: Sensor model, in place of the file's, for scans inserted later; the resolution is the file's.
 
     Raises:
         MapFileError: The file is of another version, truncated or damaged.
@@ -157,8 +160,8 @@ def _fill_attributes(
         raise MapFileError(f"{path}: has attributes of blocks that it does not have; it is damaged")
     rows = layer.claim(slots)
     blocks, voxels = np.nonzero(held)
-    places = rows[blocks], voxels
-    layer.arrays.color_sums[places] = np.column_stack([red, green, blue])
-    layer.arrays.color_weights[places] = weights
-    layer.arrays.hits[places] = hits
-    layer.arrays.last_seen_ns[places] = last_seen_ns
+    index = rows[blocks], voxels
+    layer.arrays.color_sums[index] = np.column_stack([red, green, blue])
+    layer.arrays.color_weights[index] = weights
+    layer.arrays.hits[index] = hits
+    layer.arrays.last_seen_ns[index] = last_seen_ns

@@ -1,4 +1,4 @@
-"""The obstacle nearest to a point, found in the blocks themselves, without a distance field."""
+"""Nearest obstacle of a point, searched in the map's blocks, without a distance field."""
 
 from dataclasses import dataclass
 
@@ -23,11 +23,11 @@ _OFFSETS: NDArray[np.int64] = np.column_stack(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Nearest:
-    """The nearest obstacles of points.
+    """Nearest obstacles of N points.
 
     Attributes:
         centres_world: (N, 3) float64 centre of the nearest occupied voxel, metres; NaN if none is in range.
-            Of several equally near ones it is the first in Morton order.
+            Of equally near ones it is the first in Morton order.
         distances_m: (N,) float64 to that centre; inf where none is in range.
     """
 
@@ -44,7 +44,7 @@ def nearest_occupied(
         store: The voxels.
         points_world: (N, 3) metres, inside the map or not.
         resolution_m: Edge of a voxel.
-        max_range_m: How far to look; inf looks everywhere.
+        max_range_m: Range of the search; inf searches everywhere.
         threshold: Log-odds from which a voxel is occupied.
 
     Raises:
@@ -55,7 +55,7 @@ def nearest_occupied(
         raise DataError(f"octree: nearest obstacles of points {points.shape}, want (N, 3), all finite")
     if not max_range_m >= 0.0:
         raise DataError(f"octree: nearest obstacles within {max_range_m} m, want a range ≥ 0")
-    # Filled for a block when a search first comes by: what no search reaches costs nothing.
+    # Filled for a block when a search first reaches it: other blocks cost nothing.
     counts = np.full(len(store), _NOT_LISTED, np.int16)
     members = np.empty((len(store), BLOCK_VOXELS), np.int16)
     codes, squares = _search(
@@ -78,7 +78,7 @@ def _search(table, block_codes, counts, members, points, reach, threshold):
     """Return (N,) int64 Morton codes, −1 where there is none, and (N,) squared distances.
 
     Lengths are in voxels, and points in keys: a voxel's centre lies at its key. Shells of blocks around a
-    point are searched from the inside, until one is further away than what has been found.
+    point are searched from the inside, until one is further away than the nearest voxel so far.
     """
     found, squares = np.full(len(points), -1, int64), np.full(len(points), np.inf)
     home = np.empty(3, int64)
@@ -90,7 +90,7 @@ def _search(table, block_codes, counts, members, points, reach, threshold):
         best, nearest = reach * reach, int64(-1)
         shell = 0
         while True:
-            # The shell is at least this far away, and further from a point off the map.
+            # Lower bound of the shell's distance; from a point off the map it is further away.
             gap = max(shell - 1, 0) * float64(_EDGE)
             if gap * gap > best:
                 break
@@ -124,7 +124,7 @@ def _search(table, block_codes, counts, members, points, reach, threshold):
 
 @njit(cache=True, nogil=True)
 def _gap_square(point, x, y, z):
-    """Return the squared distance from a point to a block, its voxels taken whole."""
+    """Return the squared distance from a point to a block's faces."""
     gap_x = max(x * _EDGE - 0.5 - point[0], point[0] - (x * _EDGE + _EDGE - 0.5), 0.0)
     gap_y = max(y * _EDGE - 0.5 - point[1], point[1] - (y * _EDGE + _EDGE - 0.5), 0.0)
     gap_z = max(z * _EDGE - 0.5 - point[2], point[2] - (z * _EDGE + _EDGE - 0.5), 0.0)
@@ -133,7 +133,7 @@ def _gap_square(point, x, y, z):
 
 @njit(cache=True, nogil=True)
 def _visit(table, slot, code, counts, members, point, threshold, best, nearest):
-    """Return squared distance and code of the nearest so far, a block's occupied voxels included."""
+    """Return squared distance and code of the nearest voxel so far, after a block's occupied voxels."""
     if counts[slot] == _NOT_LISTED:
         counts[slot] = _list_occupied(table.values[slot], threshold, members[slot])
     if counts[slot] == 0:
@@ -155,7 +155,7 @@ def _visit(table, slot, code, counts, members, point, threshold, best, nearest):
 
 @njit(cache=True, nogil=True)
 def _list_occupied(block, threshold, members):
-    """Write which voxels of a block are occupied; return how many."""
+    """Write the numbers of a block's occupied voxels; return their count."""
     count = 0
     for voxel in range(BLOCK_VOXELS):
         members[count] = int16(voxel)

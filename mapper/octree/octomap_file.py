@@ -21,7 +21,7 @@ from mapper.runtime import atomic
 _FULL = b"# Octomap OcTree file"
 _BINARY = b"# Octomap OcTree binary file"
 LEAF_ROOT = np.zeros(1, "<u2")
-"""The words of a ``.bt`` file whose root is a leaf: it has one all the same."""
+"""The one word of a ``.bt`` file whose root is a leaf."""
 _TREE_NAMES = {"OcTree": "OcTree", "1": "OcTree", "ColorOcTree": "ColorOcTree"}
 
 _FAULTS = {
@@ -75,13 +75,13 @@ def write_tree(
     resolution_m: float,
     tree_name: str = "OcTree",
 ) -> None:
-    """Write a tree whose nodes are there already; atomic.
+    """Write a tree from its encoded nodes; atomic.
 
     Args:
         path: File to write.
-        payload: What follows the header, piece after piece, so that a tree need not fit into memory.
+        payload: Bytes after the header, piece by piece, so that a tree need not fit into memory.
         binary: A ``.bt`` file, of words; otherwise an ``.ot`` file, of nodes.
-        node_count: How many nodes the payload describes.
+        node_count: Number of nodes that the payload describes.
         resolution_m: Edge of a voxel.
         tree_name: OctoMap's name for the kind of tree.
     """
@@ -99,15 +99,15 @@ def _header_bytes(first_line: bytes, node_count: int, resolution_m: float, tree_
 
 
 def read_map(path: Path, config: OctreeConfig | None = None) -> OctreeMap:
-    """Return the map of a ``.bt`` or ``.ot`` file of an OcTree or a ColorOcTree, or of our own ``.octree``.
+    """Return the map of a ``.bt`` or ``.ot`` file of an OcTree or a ColorOcTree, or of an ``.octree`` file.
 
     Leaves of a ``.bt`` file take the clamping values of the sensor model. A file with colours makes a map
-    with attributes. The file says which kind it is, not its name.
+    with attributes. The kind of file follows from its first bytes, not from its name.
 
     Args:
         path: The file.
-        config: Sensor model for what is inserted later; None takes our own file's, or OctoMap's defaults. The
-            resolution is always the file's.
+        config: Sensor model for scans inserted later; None takes that of an ``.octree`` file, or OctoMap's
+            defaults. The resolution is always the file's.
 
     Raises:
         MapFileError: The file cannot be read, is truncated, foreign or damaged.
@@ -141,7 +141,7 @@ def read_map(path: Path, config: OctreeConfig | None = None) -> OctreeMap:
 
 
 def _parse_header(path: Path, data: bytes) -> tuple[_Header, int]:
-    """Return the header and where the payload starts; keys come in any order, unknown ones are skipped."""
+    """Return the header and the start of the payload; keys come in any order, unknown ones are skipped."""
     first_line, _, _ = data.partition(b"\n")
     binary = first_line.startswith(_BINARY)
     if not binary and not first_line.startswith(_FULL):
@@ -182,7 +182,7 @@ def _parse_header(path: Path, data: bytes) -> tuple[_Header, int]:
 def _binary_leaves(
     path: Path, header: _Header, payload: memoryview, config: OctreeConfig
 ) -> tree_reader.TreeLeaves:
-    # A word describes at most eight nodes, so a damaged count cannot make us allocate much.
+    # A word describes at most eight nodes, which bounds the memory that a damaged count asks for.
     if len(payload) % 2 or header.node_count > 1 + 4 * len(payload):
         raise MapFileError(
             f"{path}: {len(payload)} bytes cannot hold {header.node_count} nodes; it is truncated"

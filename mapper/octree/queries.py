@@ -10,7 +10,7 @@ from mapper.octree.blocks import slot_of
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_COUNT, KEY_ZERO, centre_of, gather, morton
 
 HIT, STOPPED_UNKNOWN, STOPPED_RANGE = 1, 2, 3
-"""How a ray ended: in an occupied voxel, in an unknown one, or at the maximum range or the map's border."""
+"""Outcomes of a ray: it ended in an occupied voxel, in an unknown one, or at the range or map's border."""
 
 _CHUNK = 256  # points worked on at a time: their codes stay in the first-level cache
 _NOWHERE = int64(1) << 60  # a Morton code that no voxel has
@@ -63,10 +63,10 @@ def first_obstacles(table, origins, directions, resolution_m, max_range_m, thres
         resolution_m: Voxel edge.
         max_range_m: From the origin to the last voxel's centre.
         threshold: Log-odds from which a voxel is occupied.
-        through_unknown: Whether rays go on through unknown voxels.
+        through_unknown: Whether rays pass unknown voxels.
 
     Returns:
-        (N, 3) int64 key of the last voxel and (N,) uint8 how the ray ended.
+        (N, 3) int64 key of the last voxel and (N,) uint8 outcome of the ray.
     """
     n = len(origins)
     last = np.empty((n, 3), int64)
@@ -120,7 +120,7 @@ def known_voxels(codes, slots, values, count):
         codes: (B,) int64 Morton codes of the blocks.
         slots: (B,) int64 their rows in ``values``.
         values: (capacity, 512) float32.
-        count: K, how many there are.
+        count: K.
     """
     keys = np.empty((count, 3), np.uint16)
     log_odds = np.empty(count, float32)

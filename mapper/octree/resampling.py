@@ -1,7 +1,7 @@
-"""A map seen from another frame: every voxel there takes what lies at its centre, so there are no holes.
+"""Resampling of a map into another frame by nearest neighbours: every voxel takes the value at its centre.
 
-Nearest neighbour: nothing is mixed, and what is one voxel thick stays closed, but an edge may lie up to half
-a voxel's diagonal beside its place.
+There are no holes, log-odds are not mixed, and a wall one voxel thick stays closed; an edge may be displaced
+by up to half a voxel's diagonal.
 """
 
 from math import floor
@@ -34,14 +34,14 @@ _EDGE = 1 << BLOCK_BITS
 
 
 def blocks_reached(octree: OctreeMap, T_map_world: Transform) -> NDArray[np.int64]:
-    """Return increasing codes of the blocks in the map's frame that may show something of a run's map.
+    """Return increasing codes of the blocks in the map's frame that a run's map may overlap.
 
     Args:
         octree: The run's map, in its world.
-        T_map_world: (4, 4) where that lies.
+        T_map_world: (4, 4) pose of that world in the map.
 
     Raises:
-        MapSizeError: It would reach beyond what keys can number.
+        MapSizeError: The run's map would reach beyond the range of keys.
     """
     middles = block_keys(octree.blocks.codes) - KEY_ZERO + _EDGE // 2
     moved = middles @ T_map_world[:3, :3].T + T_map_world[:3, 3] / octree.resolution_m
@@ -54,58 +54,58 @@ def blocks_reached(octree: OctreeMap, T_map_world: Transform) -> NDArray[np.int6
             f"origin; an octree of {octree.resolution_m:g} m ends at {KEY_ZERO * octree.resolution_m:g} m"
         )
     found = []
-    for step in np.ndindex(3, 3, 3):  # a turned block is at most √3 blocks wide
-        place = lowest + step
-        found.append(np.unique(codes_of_blocks(place[(place <= highest).all(axis=1)] + limit)))
+    for step in np.ndindex(3, 3, 3):  # a rotated block is at most √3 blocks wide
+        blocks = lowest + step
+        found.append(np.unique(codes_of_blocks(blocks[(blocks <= highest).all(axis=1)] + limit)))
     return np.unique(np.concatenate(found))
 
 
 def resampled(
     octree: OctreeMap, T_world_map: Transform, codes: NDArray[np.int64], config: OctreeConfig
 ) -> OctreeMap:
-    """Return a map of those of the blocks that show anything of another map.
+    """Return another map's voxels resampled into blocks; blocks without a known voxel are left out.
 
     Args:
         octree: The other map, in its own world.
-        T_world_map: (4, 4) takes centres of voxels there.
-        codes: (B,) increasing codes of blocks.
-        config: Of the map that is returned; if it has attributes, those come along.
+        T_world_map: (4, 4) pose of the map's frame in that world.
+        codes: (B,) increasing codes of blocks in the map's frame.
+        config: Settings of the result; with attributes, they are resampled too.
     """
-    places = _sources(octree.blocks.table, codes, np.ascontiguousarray(T_world_map), octree.resolution_m)
-    values = octree.blocks.table.values.reshape(-1)[np.maximum(places, 0)]
-    known = (places >= 0) & ~np.isnan(values)
-    shown = known.any(axis=1)
-    places, known = places[shown], known[shown]
+    sources = _sources(octree.blocks.table, codes, np.ascontiguousarray(T_world_map), octree.resolution_m)
+    values = octree.blocks.table.values.reshape(-1)[np.maximum(sources, 0)]
+    known = (sources >= 0) & ~np.isnan(values)
+    kept = known.any(axis=1)
+    sources, known = sources[kept], known[kept]
     moved = OctreeMap(config)
-    moved.restore_blocks(codes[shown], known, values[shown][known])
+    moved.restore_blocks(codes[kept], known, values[kept][known])
     if moved.attributes is not None and octree.attributes is not None:
         rows = np.full(len(octree.blocks), -1, np.int32)
         rows[: len(octree.attributes.arrays.rows)] = octree.attributes.arrays.rows
-        rows = np.where(known, rows[places // BLOCK_VOXELS], np.int32(-1))
-        _take_attributes(moved, moved.attributes, octree.attributes, rows, places % BLOCK_VOXELS)
+        rows = np.where(known, rows[sources // BLOCK_VOXELS], np.int32(-1))
+        _copy_attributes(moved, moved.attributes, octree.attributes, rows, sources % BLOCK_VOXELS)
     return moved
 
 
-def _take_attributes(
+def _copy_attributes(
     moved: OctreeMap,
     own: AttributeLayer,
     other: AttributeLayer,
     rows: NDArray[np.int32],
     voxels: NDArray[np.int64],
 ) -> None:
-    """Take over the attributes of (B, 512) voxels, given their rows, −1 for none, and places there."""
+    """Copy the attributes of (B, 512) voxels from their (B, 512) rows, −1 for none, and voxel numbers."""
     held = (rows >= 0).any(axis=1)
     into = own.claim(moved.blocks.sorted_slots()[held])
-    blocks, places = np.nonzero(rows[held] >= 0)
-    source = rows[held][blocks, places], voxels[held][blocks, places]
+    blocks, targets = np.nonzero(rows[held] >= 0)
+    source = rows[held][blocks, targets], voxels[held][blocks, targets]
     for name in LayerArrays._fields[1:]:
-        getattr(own.arrays, name)[into[blocks], places] = getattr(other.arrays, name)[source]
+        getattr(own.arrays, name)[into[blocks], targets] = getattr(other.arrays, name)[source]
 
 
 @njit(cache=True, nogil=True)
 def _sources(table, codes, T_world_map, resolution_m):
-    """Return (B, 512) int64: slot · 512 + voxel of the source at each voxel's centre; −1 is nowhere."""
-    places = np.full((len(codes), BLOCK_VOXELS), -1, int64)
+    """Return (B, 512) int64: slot · 512 + voxel of the source at each voxel's centre; −1 is none."""
+    sources = np.full((len(codes), BLOCK_VOXELS), -1, int64)
     T, inverse_resolution = T_world_map, 1.0 / resolution_m
     key = np.empty(3, int64)
     last, slot = int64(-1), int64(-1)
@@ -126,5 +126,5 @@ def _sources(table, codes, T_world_map, resolution_m):
                     last = source >> (3 * BLOCK_BITS)
                     slot = slot_of(table, last)
                 if slot >= 0:
-                    places[b, voxel] = slot * BLOCK_VOXELS + (source & (BLOCK_VOXELS - 1))
-    return places
+                    sources[b, voxel] = slot * BLOCK_VOXELS + (source & (BLOCK_VOXELS - 1))
+    return sources

@@ -1,4 +1,4 @@
-"""What one frame saw of the map's voxels, packed: enough to merge it again without the frame."""
+"""Scan update: the free and occupied voxels of one scan, packed, to be merged again without the scan."""
 
 import zlib
 from dataclasses import dataclass
@@ -16,17 +16,17 @@ from mapper.octree.window import FREE, OCCUPIED, UNTOUCHED
 PACKED_BYTES = BLOCK_VOXELS // 8
 """Bytes of one bit per voxel of a block."""
 
-_QUICK = 1  # cells are mostly runs, which more effort shrinks little further
+_LEVEL = 1  # of compression: cells are mostly runs, which higher levels shrink little further
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanUpdate:
-    """The voxels that a frame saw, by block.
+    """Free and occupied voxels of one scan, by block.
 
     Attributes:
         codes: (B,) int64 Morton codes of the blocks, increasing.
-        free: (B, 64) uint8, bit v of a block set where voxel v, in Morton order, was seen free.
-        occupied: (B, 64) uint8, the same where it was seen occupied.
+        free: (B, 64) uint8, bit v of a block set where voxel v, in Morton order, is free.
+        occupied: (B, 64) uint8, the same where it is occupied.
     """
 
     codes: NDArray[np.int64]
@@ -36,31 +36,31 @@ class ScanUpdate:
     def __post_init__(self) -> None:
         planes = (len(self.codes), PACKED_BYTES)
         if self.free.shape != planes or self.occupied.shape != planes:
-            raise DataError(f"sight: planes {self.free.shape} and {self.occupied.shape}, want {planes}")
+            raise DataError(f"scan update: planes {self.free.shape} and {self.occupied.shape}, want {planes}")
 
     def __len__(self) -> int:
-        """Return how many blocks were seen."""
+        """Return the number of blocks."""
         return len(self.codes)
 
     def cells(self) -> NDArray[np.uint8]:
-        """Return the (B · 512,) uint8 cells, as a scan leaves them in its window."""
+        """Return the (B · 512,) uint8 cells, as casting writes them into a window."""
         cells = np.empty(len(self) * BLOCK_VOXELS, np.uint8)
         _unpack(self.free.reshape(-1), self.occupied.reshape(-1), cells)
         return cells
 
     def within(self, codes: NDArray[np.int64]) -> "ScanUpdate":
-        """Return what was seen of some blocks alone, given their increasing codes."""
+        """Return the update of some blocks alone, given their increasing codes."""
         kept = np.isin(self.codes, codes, assume_unique=True)
         return ScanUpdate(self.codes[kept], self.free[kept], self.occupied[kept])
 
     def compressed(self) -> bytes:
-        """Return the sight as a short string of bytes, the same for the same sight."""
+        """Return the update as compressed bytes, the same for the same update."""
         steps = np.diff(self.codes, prepend=np.int64(0)).astype("<i8")
-        return isal_zlib.compress(steps.tobytes() + self.free.tobytes() + self.occupied.tobytes(), _QUICK)
+        return isal_zlib.compress(steps.tobytes() + self.free.tobytes() + self.occupied.tobytes(), _LEVEL)
 
 
 def pack(cast: Cast) -> ScanUpdate:
-    """Return what a cast scan saw, and leave its window's cells UNTOUCHED."""
+    """Return the update of a cast scan, and reset its window's cells to UNTOUCHED."""
     order = np.argsort(cast.codes)
     free, occupied = (np.empty((len(order), PACKED_BYTES), np.uint8) for _ in range(2))
     _pack(cast.window.cells, cast.positions[order], free, occupied)
@@ -68,17 +68,17 @@ def pack(cast: Cast) -> ScanUpdate:
 
 
 def decompressed(data: bytes, *, blocks: int) -> ScanUpdate:
-    """Return the sight of so many blocks that ``ScanUpdate.compressed`` wrote.
+    """Return the update of so many blocks from the bytes of ``ScanUpdate.compressed``.
 
     Raises:
-        DataError: It is damaged.
+        DataError: The bytes are damaged.
     """
     try:
         plain = zlib.decompress(data)
     except zlib.error as error:
-        raise DataError(f"sight of {blocks} blocks: damaged: {error}") from None
+        raise DataError(f"scan update of {blocks} blocks: damaged: {error}") from None
     if len(plain) != blocks * (8 + 2 * PACKED_BYTES):
-        raise DataError(f"sight of {blocks} blocks: damaged: {len(plain)} bytes")
+        raise DataError(f"scan update of {blocks} blocks: damaged: {len(plain)} bytes")
     steps = np.frombuffer(plain, "<i8", count=blocks)
     free, occupied = np.frombuffer(plain, np.uint8, offset=8 * blocks).reshape(2, blocks, PACKED_BYTES)
     return ScanUpdate(np.cumsum(steps), free, occupied)

@@ -1,8 +1,9 @@
-"""The file of all frames' sights, from which a map is made again without reading frames that did not move.
+"""File of all frames' scan updates, from which a map is fused again without reading frames that did not move.
 
-One line of JSON says what the rays depended on. Then each frame in time order: a little-endian head (stamp,
-T_world_body, number of blocks, number of bytes) and its sight, compressed. A map is a fold over sights, so
-replaying those that are still true and casting the others afresh gives the same bits as fusing from scratch.
+One line of JSON has the settings that the rays depend on. Then each frame in time order: a little-endian head
+(stamp, T_world_body, number of blocks, number of bytes) and its compressed update. A map is a fold over
+updates, so merging those that still hold and casting the others again gives the same bits as fusing from
+scratch.
 """
 
 import json
@@ -20,21 +21,21 @@ from mapper.core.geometry import Transform, angle_between
 from mapper.octree.config import OctreeConfig
 from mapper.octree.scan_update import ScanUpdate, decompressed
 
-_FORMAT = "mapper sights 1"
-_RAY_KNOBS = frozenset({"resolution_m", "max_range_m", "discretize"})
-"""What casting depends on; probabilities only matter when sights are merged."""
+_FORMAT = "mapper sights 1"  # the updates' former name: files with it are still read
+_RAY_SETTINGS = {"resolution_m", "max_range_m", "discretize"}
+"""Settings that casting depends on; probabilities only matter when updates are merged."""
 _HEAD = np.dtype([("stamp_ns", "<i8"), ("T_world_body", "<f8", (4, 4)), ("blocks", "<u4"), ("size", "<u4")])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CachedUpdate:
-    """What a frame saw, and where from.
+    """A frame's scan update, compressed, with the pose at which it was cast.
 
     Attributes:
         stamp_ns: The frame's stamp.
         T_world_body: (4, 4) pose at which it was cast.
-        blocks: How many blocks it saw.
-        data: Its sight, compressed.
+        blocks: Number of blocks in the update.
+        data: The update, compressed.
     """
 
     stamp_ns: int
@@ -43,7 +44,7 @@ class CachedUpdate:
     data: bytes = field(repr=False)
 
     def update(self) -> ScanUpdate:
-        """Return the sight.
+        """Return the update, decompressed.
 
         Raises:
             DataError: It is damaged.
@@ -52,12 +53,12 @@ class CachedUpdate:
 
 
 def cache_update(stamp_ns: int, T_world_body: Transform, update: ScanUpdate) -> CachedUpdate:
-    """Return a sight ready to be written."""
+    """Return a frame's update, compressed to be written."""
     return CachedUpdate(stamp_ns, T_world_body, len(update), update.compressed())
 
 
 class ScanUpdateWriter:
-    """Appends frames to a new file; a context manager."""
+    """Writer of a new file, frame by frame; a context manager."""
 
     def __init__(self, path: Path, config: OctreeConfig) -> None:
         self._file = path.open("wb")
@@ -79,7 +80,7 @@ class ScanUpdateWriter:
 
 
 class ScanUpdateFile:
-    """Random access by stamp, safe in any thread; a context manager. Only the heads are held in memory."""
+    """Reader with access by stamp, from any thread; a context manager. Only heads are kept in memory."""
 
     def __init__(self, path: Path, first_line: bytes, heads: dict[int, tuple[NDArray[np.void], int]]) -> None:
         self.path = path
@@ -96,20 +97,20 @@ class ScanUpdateFile:
         os.close(self._descriptor)
 
     def __len__(self) -> int:
-        """Return how many frames there are."""
+        """Return the number of frames."""
         return len(self._heads)
 
     def holds_for(self, config: OctreeConfig) -> bool:
-        """Tell whether rays cast with this configuration would see the same."""
+        """Return whether the updates were cast with the same settings."""
         return self._first_line == _first_line(config)
 
     def lookup(self, stamp_ns: int, T_world_body: Transform, *, config: OctreeConfig) -> CachedUpdate | None:
-        """Return a frame's sight if it still holds: no ray's end has moved further than ``stays_within_m``.
+        """Return a frame's update if it still holds: no ray's end has moved further than ``stays_within_m``.
 
         Args:
-            stamp_ns: The frame.
-            T_world_body: (4, 4) where it is believed to have been by now.
-            config: Says how long rays are and how far they may stray.
+            stamp_ns: The frame's stamp.
+            T_world_body: (4, 4) current estimate of its pose.
+            config: Gives the maximum range and ``stays_within_m``.
         """
         if not self.holds(stamp_ns, T_world_body, config=config):
             return None
@@ -118,7 +119,7 @@ class ScanUpdateFile:
         return CachedUpdate(stamp_ns, head["T_world_body"], int(head["blocks"]), data)
 
     def holds(self, stamp_ns: int, T_world_body: Transform, *, config: OctreeConfig) -> bool:
-        """Tell whether a frame is known, and still where it was; see ``lookup``."""
+        """Return whether a frame has an update that still holds; see ``lookup``."""
         if stamp_ns not in self._heads:
             return False
         head, _ = self._heads[stamp_ns]
@@ -128,7 +129,7 @@ class ScanUpdateFile:
 
 
 def displacement_m(T_a_body: Transform, T_b_body: Transform, *, range_m: float) -> float:
-    """Return a bound on how far apart two poses put a point within a range; 0 only if they are the same."""
+    """Return a bound on the distance between a point within range at two poses; 0 only for equal poses."""
     if np.array_equal(T_a_body, T_b_body):
         return 0.0
     shift_m = float(np.linalg.norm(T_a_body[:3, 3] - T_b_body[:3, 3]))
@@ -137,10 +138,10 @@ def displacement_m(T_a_body: Transform, T_b_body: Transform, *, range_m: float) 
 
 
 def open_scan_updates(path: Path) -> ScanUpdateFile:
-    """Open a file that ``ScanUpdateWriter`` wrote.
+    """Open a file of ``ScanUpdateWriter``.
 
     Raises:
-        MapFileError: It cannot be read, is foreign or truncated.
+        MapFileError: The file cannot be read, is foreign or truncated.
     """
     try:
         with path.open("rb") as file:
@@ -170,5 +171,5 @@ def _head(raw: bytes) -> NDArray[np.void]:
 
 
 def _first_line(config: OctreeConfig) -> bytes:
-    knobs = {"format": _FORMAT, **config.model_dump(mode="json", include=set(_RAY_KNOBS))}
-    return json.dumps(knobs).encode() + b"\n"
+    settings = {"format": _FORMAT, **config.model_dump(mode="json", include=_RAY_SETTINGS)}
+    return json.dumps(settings).encode() + b"\n"

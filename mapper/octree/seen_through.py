@@ -1,9 +1,9 @@
-"""Voxels that something has left: a policy for places where things move.
+"""Release of voxels that an object has left: an update policy for dynamic environments.
 
-OctoMap weighs all scans alike, so what stood somewhere for long takes as many scans to be forgotten. Here a
-run of scans that all see an occupied voxel free marks the moment when its content left. Evidence from before
-that moment is about something else; what remains is the log-odds of the run alone. A hit ends the run, so a
-surface that is missed now and then is as safe as before. The rest of the map is OctoMap's to the last bit.
+OctoMap weighs all scans alike, so an object that stood for long takes as many scans to be cleared. Here a run
+of scans in which an occupied voxel is free ends the object's time there: evidence from before the run no
+longer counts, and the voxel's log-odds become those of the run alone. A hit ends the run, so a surface that
+is missed now and then stays. All other voxels are OctoMap's to the last bit.
 """
 
 import numpy as np
@@ -11,17 +11,17 @@ from numba import njit
 from numpy import float32, int32
 from numpy.typing import NDArray
 
-from mapper.octree.kernels import Sensor
+from mapper.octree.kernels import SensorModel
 from mapper.octree.keys import BLOCK_VOXELS
 from mapper.octree.window import OCCUPIED, UNTOUCHED
 
 
 class SeenThrough:
-    """Counts, for every voxel, the scans in a row that saw it free.
+    """Map update that counts, for every voxel, the consecutive scans in which it was free.
 
     Args:
-        scans: How many of them release an occupied voxel.
-        occupied_log_odds: From where a voxel is occupied.
+        scans: Length of a run that releases an occupied voxel.
+        occupied_log_odds: Least log-odds of an occupied voxel.
     """
 
     def __init__(self, scans: int, *, occupied_log_odds: np.float32) -> None:
@@ -40,9 +40,9 @@ class SeenThrough:
         positions: NDArray[np.int64],
         slots: NDArray[np.int64],
         values: NDArray[np.float32],
-        sensor: Sensor,
+        sensor: SensorModel,
     ) -> int:
-        """Do what ``kernels.merge`` does, and release what was seen through."""
+        """Update the map as ``kernels.merge`` does, and release voxels after runs of free scans."""
         missing = len(values) - len(self._runs)
         if missing > 0:
             self._runs = np.concatenate([self._runs, np.zeros((missing, BLOCK_VOXELS), np.uint8)])

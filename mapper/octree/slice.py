@@ -1,4 +1,4 @@
-"""The 2D navigation map: a horizontal band of the octree looked at from above."""
+"""2D navigation map: a horizontal band of the octree projected onto the ground plane."""
 
 from dataclasses import dataclass
 
@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array
 from mapper.octree.config import SliceConfig
-from mapper.octree.ground_height import Ground, find_ground, lowest_occupied
+from mapper.octree.ground_height import GroundHeights, ground_from_lowest, lowest_occupied
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100
-"""ROS OccupancyGrid codes, ordered by how much they matter: the maximum over a column is its state."""
+"""ROS OccupancyGrid codes, ordered so that the maximum over a column is its state."""
 
 _SEEN_FREE, _SEEN_OCCUPIED = 1, 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OccupancyGrid:
-    """What a robot may drive over, seen from above.
+    """2D occupancy grid in the ground plane.
 
     Attributes:
         cells: (H, W) int8 of UNKNOWN, FREE and OCCUPIED; row 0 has the lowest y, column 0 the lowest x.
@@ -50,7 +50,7 @@ class OccupancyGrid:
 
 
 def shrunk(grid: OccupancyGrid, most_cells: int) -> OccupancyGrid:
-    """Return a grid of no more cells along an edge, for a picture: a cell shows what matters most in it."""
+    """Return a grid of no more cells along an edge, for a picture: a cell is the maximum of those in it."""
     factor = -(-max(grid.cells.shape) // most_cells)
     if factor == 1:
         return grid
@@ -65,7 +65,7 @@ def cut_slice(octree: OctreeMap, config: SliceConfig, *, floor_z_m: float = 0.0)
     """Return the band between two heights above the floor as a grid just large enough for it.
 
     A voxel belongs to the band if its centre does. A cell is occupied if any voxel of its column is, else
-    free if any is, else unknown. Occupied cells in too small a group become what else their columns saw.
+    free if any is, else unknown. In too small a group of occupied cells, occupied voxels do not count.
 
     Args:
         octree: The map in a world with z up.
@@ -73,20 +73,22 @@ def cut_slice(octree: OctreeMap, config: SliceConfig, *, floor_z_m: float = 0.0)
         floor_z_m: Height of the floor in the world.
 
     Raises:
-        DataError: The band is empty or nothing is known inside it.
+        DataError: The band has no voxels, or none that is known.
     """
     first, last = block_extent(octree)
     shape = int(last[1] - first[1]), int(last[0] - first[0])
     ground = None
     if config.above == "ground":
         lowest = lowest_occupied(octree, first=first, shape=shape)
-        ground = find_ground(lowest, first=first, resolution_m=octree.resolution_m, floor_z_m=floor_z_m)
+        ground = ground_from_lowest(
+            lowest, first=first, resolution_m=octree.resolution_m, floor_z_m=floor_z_m
+        )
     seen = see_band(octree, config, first=first, shape=shape, ground=ground, floor_z_m=floor_z_m)
     return grid_of(seen, config, first=first, resolution_m=octree.resolution_m, floor_z_m=floor_z_m)
 
 
 def block_extent(octree: OctreeMap) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the (2,) x and y keys of the first column of any block, and those just after the last."""
+    """Return the (2,) x and y keys of the first column of any block, and those after the last column."""
     keys = block_keys(octree.blocks.codes)[:, :2]
     if not len(keys):
         return np.full(2, KEY_ZERO), np.full(2, KEY_ZERO)
@@ -99,17 +101,17 @@ def see_band(
     *,
     first: NDArray[np.int64],
     shape: tuple[int, int],
-    ground: Ground | None,
+    ground: GroundHeights | None,
     floor_z_m: float,
 ) -> NDArray[np.uint8]:
-    """Return (H, W) uint8 flags of what the band's voxels show in each column; ``or`` joins several maps.
+    """Return (H, W) uint8 flags of the states of the band's voxels in each column; ``or`` joins several maps.
 
     Args:
         octree: A map, or a part of one, that lies inside the grid.
         config: Heights.
         first: (2,) x and y keys of the column of row 0 and column 0.
         shape: H, W.
-        ground: What the band follows; None if it is level.
+        ground: Ground that the band follows; None if it is level.
         floor_z_m: Height of the floor in the world.
 
     Raises:
@@ -140,10 +142,10 @@ def grid_of(
     resolution_m: float,
     floor_z_m: float,
 ) -> OccupancyGrid:
-    """Return what ``see_band`` saw as a grid just large enough for it.
+    """Return the flags of ``see_band`` as a grid, cropped to its known cells.
 
     Raises:
-        DataError: Nothing was seen.
+        DataError: No voxel of the band is known.
     """
     if not seen.any():
         raise DataError(
@@ -164,7 +166,7 @@ def grid_of(
 def _band(config: SliceConfig, resolution_m: float, floor_z_m: float) -> tuple[int, int]:
     """Return the lowest and the highest z key whose voxel centres lie in the band."""
     bottom_m, top_m = floor_z_m + config.min_height_m, floor_z_m + config.max_height_m
-    # The allowance keeps a centre that lies on the edge, as 0.075 m at 5 cm, from hanging on a rounding.
+    # The allowance includes centres on the edge, such as 0.075 m at 5 cm, whatever the rounding.
     lowest = int(np.ceil(bottom_m / resolution_m - 0.5 - 1e-9)) + KEY_ZERO
     highest = int(np.floor(top_m / resolution_m - 0.5 + 1e-9)) + KEY_ZERO
     if lowest > highest:
@@ -177,7 +179,7 @@ def _band(config: SliceConfig, resolution_m: float, floor_z_m: float) -> tuple[i
 
 @njit(cache=True, nogil=True)
 def _flatten(codes, slots, values, threshold, first, lowest, highest, bases, seen):
-    """Or what every voxel of the band says into its column of ``seen`` (H, W) uint8."""
+    """Add the flags of the band's voxels to their columns of ``seen`` (H, W) uint8."""
     for b in range(len(codes)):
         for voxel in range(BLOCK_VOXELS):
             value = values[slots[b], voxel]

@@ -1,4 +1,4 @@
-"""Independent maps of the same voxels, added."""
+"""Sum of independent maps: log-odds of the same voxels are added."""
 
 from typing import NamedTuple
 
@@ -9,12 +9,12 @@ from mapper.octree.keys import BLOCK_VOXELS
 
 
 class Overlap(NamedTuple):
-    """What two maps say about the voxels that both know.
+    """Agreement of two maps about their common voxels.
 
     Attributes:
-        shared: Voxels that both know.
+        shared: Number of voxels that are known in both maps.
         both_occupied: Those that are occupied in both.
-        either_occupied: Those that are occupied in one of them at least.
+        either_occupied: Those that are occupied in at least one.
     """
 
     shared: int
@@ -24,17 +24,17 @@ class Overlap(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def add_blocks(stored, slots, others, other_slots, threshold):
-    """Add log-odds block by block; where one map knows nothing the other's stay.
+    """Add another map's log-odds block by block; a voxel that is known in one map keeps that value.
 
     Args:
-        stored: (capacity, 512) float32 log-odds that are added to; NaN is unknown.
+        stored: (capacity, 512) float32 log-odds, updated; NaN is unknown.
         slots: (B,) rows of the blocks.
-        others: (C, 512) float32 of the other map.
+        others: (C, 512) float32 log-odds of the other map.
         other_slots: (B,) rows of the same blocks there.
         threshold: Log-odds from which a voxel is occupied.
 
     Returns:
-        How many voxels became known, and the three counts of an Overlap.
+        Number of voxels that became known, and the three counts of an Overlap.
     """
     born, shared, both, either = 0, 0, 0, 0
     for b in range(len(slots)):

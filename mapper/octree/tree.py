@@ -2,8 +2,8 @@
 
 OctoMap's tree is canonical: an inner node holds the maximum of its children, and eight children that are
 leaves of equal value become one leaf. So the voxels alone determine it, and files come out equal to the byte.
-In preorder the blocks follow one another in Morton order. So each block's part is written once, one after the
-other, and the few nodes above the blocks are put between them at the end.
+In preorder the blocks follow one another in Morton order. So each block's part is written once, one after
+another, and the few nodes above the blocks are put between them at the end.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from mapper.octree.blocks import BlockStore
 from mapper.octree.keys import BLOCK_DEPTH, BLOCK_VOXELS
 
 NODE = np.dtype([("value", "<f4"), ("mask", "u1")])
-"""A node as an ``.ot`` file lists it: log-odds, and a bit for each child that exists."""
+"""A node as in an ``.ot`` file: log-odds, and a bit for each child that exists."""
 
 _VOXELS, _PAIRS, _QUADS, _TOP = 0, 512, 576, 584
 """Where nodes of edge 1, 2, 4 and 8 voxels begin in the pyramid of a block."""
@@ -35,7 +35,7 @@ class UpperNodes(NamedTuple):
     Attributes:
         nodes: (M,) NODE; the first B are the tops, the last is the root.
         first_children: (M,) int64 index of the lowest child, which the others follow; −1 for a top.
-        starts: (B + 1,) int64 where each subtree's part begins and the last one ends.
+        starts: (B + 1,) int64 start of each subtree's part, and the end of the last.
     """
 
     nodes: NDArray[np.void]
@@ -61,10 +61,10 @@ def nodes_in_preorder(store: BlockStore, *, root_depth: int = 0) -> NDArray[np.v
 def words_in_preorder(
     store: BlockStore, threshold: np.float32, *, root_depth: int = 0
 ) -> tuple[NDArray[np.uint16], np.void]:
-    """Return (W,) uint16, a word for each inner node as a ``.bt`` file lists them, and the root's NODE.
+    """Return (W,) uint16, the words of a ``.bt`` file, one for each inner node, and the root's NODE.
 
     Args:
-        store: Has at least one block.
+        store: At least one block.
         threshold: Log-odds from which a voxel is occupied.
         root_depth: Depth of a node above all blocks that takes the root's place.
     """
@@ -78,7 +78,7 @@ def words_in_preorder(
 
 
 def children_in(words: NDArray[np.uint16]) -> int:
-    """Return how many nodes the words of a ``.bt`` file describe: all but the root."""
+    """Return the number of nodes that the words of a ``.bt`` file describe: all but the root."""
     return int(np.bitwise_count((words | (words >> 1)) & 0x5555).sum(dtype=np.int64))
 
 
@@ -90,8 +90,8 @@ def upper_nodes(
     Args:
         codes: (B,) increasing Morton codes of the tops, at their own depth.
         tops: (B,) NODE.
-        starts: (B + 1,) where each subtree's part of a payload begins.
-        levels: How far up the root is.
+        starts: (B + 1,) start of each subtree's part of a payload.
+        levels: Levels from the tops to the root.
     """
     above = [(codes, tops, np.full(len(codes), -1))]
     first = 0
@@ -133,7 +133,7 @@ def preorder(upper):
 
 @njit(cache=True, nogil=True)
 def _join(values, masks, first):
-    """Return (value, mask) of the parent of eight nodes; a NaN value is an absent node, here and there."""
+    """Return (value, mask) of the parent of eight nodes; a NaN value is an absent node."""
     mask, leaves = 0, 0
     equal = True
     highest = float32(-np.inf)
@@ -158,7 +158,7 @@ def _raise_pyramid(values, masks):
 
 @njit(cache=True, nogil=True)
 def _write_nodes(stored, slots, parts, starts):
-    """Write each block's nodes in preorder; ``starts`` gets where each begins."""
+    """Write each block's nodes in preorder, and the start of each block's part to ``starts``."""
     values, masks = np.empty(_PYRAMID, float32), np.zeros(_PYRAMID, uint8)
     at = 0
     for b in range(len(slots)):
@@ -247,7 +247,7 @@ def _parents(codes, nodes, offset):
 
 @njit(cache=True, nogil=True)
 def _assemble_nodes(upper, parts, payload):
-    """Write all nodes in preorder; return how many there are."""
+    """Write all nodes in preorder; return their number."""
     blocks, at = len(upper.starts) - 1, 0
     for node in preorder(upper):
         if node < blocks:
@@ -260,7 +260,7 @@ def _assemble_nodes(upper, parts, payload):
 
 @njit(cache=True, nogil=True)
 def _assemble_words(upper, parts, payload):
-    """Write the words of all inner nodes in preorder; return how many there are."""
+    """Write the words of all inner nodes in preorder; return their number."""
     blocks, at = len(upper.starts) - 1, 0
     values, masks = np.empty(8, float32), np.empty(8, uint8)
     for node in preorder(upper):

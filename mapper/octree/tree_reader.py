@@ -1,4 +1,4 @@
-"""Leaves out of the node records of OctoMap files, and back into blocks."""
+"""Reading of OctoMap trees: leaves from the node records of files, and blocks from leaves."""
 
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from mapper.octree.blocks import BLOCK_BYTES, BlockStore, check_memory
 from mapper.octree.keys import BLOCK_BITS, BLOCK_DEPTH, BLOCK_VOXELS, KEY_BITS
 
 WHOLE, CUT_SHORT, TRAILING, TOO_DEEP, CHILDLESS = 0, 1, 2, 3, 4
-"""What can be found out about the records: all is well, or what is wrong."""
+"""Verdicts on the records of a file: a whole tree, or the fault that was found."""
 
 
 class TreeLeaves(NamedTuple):
@@ -29,7 +29,7 @@ class TreeLeaves(NamedTuple):
 
 
 def fill(store: BlockStore, leaves: TreeLeaves) -> int:
-    """Write leaves into an empty store at the finest level; return how many voxels that makes known.
+    """Write leaves into an empty store at the finest level; return the number of voxels that become known.
 
     Raises:
         MapSizeError: Expanded, the map would not fit into this machine's memory.
@@ -46,7 +46,7 @@ def fill(store: BlockStore, leaves: TreeLeaves) -> int:
 
 @njit(cache=True, nogil=True)
 def leaves_of_nodes(values, masks):
-    """Return the leaves of an ``.ot`` file's (M,) preorder records, and what was found out about them."""
+    """Return the leaves of an ``.ot`` file's (M,) records in preorder, and the verdict on them."""
     n = len(masks)
     codes, depths, found = np.empty(n, int64), np.empty(n, uint8), np.empty(n, float32)
     pending = np.zeros(KEY_BITS + 1, int64)  # per depth on the path: children still to come
@@ -91,20 +91,20 @@ def enter_next_child(pending, prefix, depth):
 
 @njit(cache=True, nogil=True)
 def leaves_of_words(words, node_count, free, occupied):
-    """Return the leaves of the words of a ``.bt`` file, how many nodes they describe, and what was found out.
+    """Return the leaves of a ``.bt`` file's words, the number of nodes they describe, and the verdict.
 
     Args:
         words: (W,) uint16 in preorder.
-        node_count: What the header promises; bounds the leaves.
-        free: Log-odds that free leaves take.
-        occupied: Log-odds that occupied leaves take.
+        node_count: Number of nodes by the header; bounds the leaves.
+        free: Log-odds of free leaves.
+        occupied: Log-odds of occupied leaves.
     """
     codes, depths, values = (
         np.empty(node_count, int64),
         np.empty(node_count, uint8),
         np.empty(node_count, float32),
     )
-    pending = np.zeros(KEY_BITS + 1, int64)  # per depth on the path: the word, children that are done zeroed
+    pending = np.zeros(KEY_BITS + 1, int64)  # per depth on the path: the word, finished children zeroed
     prefix = np.zeros(KEY_BITS + 2, int64)
     count, nodes, at = 0, 1, 1
     pending[0] = words[0]
@@ -142,7 +142,7 @@ def leaves_of_words(words, node_count, free, occupied):
 
 @njit(cache=True, nogil=True)
 def _block_codes(leaves, count):
-    """Return the distinct (count,) block codes that leaves lie in; Morton order keeps equal ones together."""
+    """Return the (count,) distinct block codes of leaves; Morton order keeps equal ones together."""
     codes = np.empty(count, int64)
     at = 0
     for i in range(len(leaves.codes)):
