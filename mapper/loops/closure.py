@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -173,35 +173,23 @@ def read_closures(path: Path) -> list[LoopClosure]:
 
 
 def _fields(closure: LoopClosure) -> dict[str, Any]:
-    T_i_j, information = closure.T_i_j, closure.information
-    return {
-        "i": closure.i,
-        "j": closure.j,
-        "stamp_i_ns": closure.stamp_i_ns,
-        "stamp_j_ns": closure.stamp_j_ns,
-        "proposed_by": closure.proposed_by,
-        "verdict": closure.verdict,
-        "reason": closure.reason,
-        "similarity": closure.similarity,
-        "matches": closure.matches,
-        "inliers": closure.inliers,
-        "rmse_m": closure.rmse_m,
-        "residual_px": closure.residual_px,
-        "translation_m": None if T_i_j is None else T_i_j[:3, 3].tolist(),
-        "rotation_xyzw": None if T_i_j is None else quaternion_from_rotation(T_i_j[:3, :3]).tolist(),
-        "information": None if information is None else information.tolist(),
-        "before": None if closure.before is None else _discrepancy_fields(closure.before),
-        "after": None if closure.after is None else _discrepancy_fields(closure.after),
-        "weight": closure.weight,
-    }
+    values: dict[str, Any] = {}
+    for field in fields(closure):
+        value = getattr(closure, field.name)
+        if field.name == "T_i_j":
+            values["translation_m"] = None if value is None else value[:3, 3].tolist()
+            values["rotation_xyzw"] = (
+                None if value is None else quaternion_from_rotation(value[:3, :3]).tolist()
+            )
+        elif isinstance(value, Discrepancy):
+            values[field.name] = asdict(value)
+        else:
+            values[field.name] = value.tolist() if isinstance(value, np.ndarray) else value
+    return values
 
 
-def _discrepancy_fields(value: Discrepancy) -> dict[str, float]:
-    return {"translation_m": value.translation_m, "rotation_rad": value.rotation_rad}
-
-
-def _closure(fields: dict[str, Any]) -> LoopClosure:
-    rest = dict(fields)
+def _closure(values: dict[str, Any]) -> LoopClosure:
+    rest = dict(values)
     translation_m, rotation_xyzw = rest.pop("translation_m"), rest.pop("rotation_xyzw")
     information = rest.pop("information")
     before, after = rest.pop("before"), rest.pop("after")

@@ -1,6 +1,7 @@
 """Proposer of similar scans among those that may be near, by Scan Context (Kim & Kim 2018)."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -55,7 +56,7 @@ class ScanContextProposer:
         self._chain = chain
         self._index = ScanContexts(config)
         self._nodes: list[int] = []
-        self._described: tuple[ScanPlace, ScanContext] | None = None
+        self._context = lru_cache(1)(self._context_of)  # a place is queried and then added
 
     def propose(self, node: int, seen: ScanPlace, /, *, before: int, limit: int) -> list[Proposal]:
         """Return the most similar places, the most similar first."""
@@ -71,12 +72,9 @@ class ScanContextProposer:
         self._index.add(node, self._context(seen))
         self._nodes.append(node)
 
-    def _context(self, place: ScanPlace) -> ScanContext:
-        """Return the place's scan context; the last one is cached, as a place is queried and then added."""
-        if self._described is None or self._described[0] is not place:
-            points_level = apply(place.T_level_body, place.points_body.astype(np.float64))
-            self._described = place, scan_context(points_level, self._config)
-        return self._described[1]
+    def _context_of(self, place: ScanPlace) -> ScanContext:
+        points_level = apply(place.T_level_body, place.points_body.astype(np.float64))
+        return scan_context(points_level, self._config)
 
 
 def scan_proposer(

@@ -141,8 +141,8 @@ class ScanVerifier:
         config = self._config
         assert alignment.information is not None  # GICP converged
         degeneracy = degeneracy_of(alignment.information, points=source.points)
-        if degeneracy.is_degenerate:
-            return replace(found, reason=f"degenerate: no surface shows {degeneracy.text}")
+        if degeneracy.reason:
+            return replace(found, reason=degeneracy.reason)
         information = inflated(alignment.information, sigma_rad=config.sigma_rad, sigma_m=config.sigma_m)
         return replace(found, T_i_j=alignment.T_target_source, information=information)
 

@@ -1,5 +1,7 @@
 """Proposer of images with similar visual words, by a bag of words (Zhao et al. 2020, §2.5)."""
 
+from functools import lru_cache
+
 from mapper.features.frame_view import ImageView
 from mapper.loops.base import Proposal, Proposer
 from mapper.loops.config import PlaceLoopsConfig
@@ -22,7 +24,7 @@ class VisualWordProposer:
         self._config = config
         self._vocabulary = load_vocabulary(config.path)
         self._index = PlaceIndex(self._vocabulary)
-        self._described: tuple[ImageView, WordVector] | None = None
+        self._vector = lru_cache(1)(self._vector_of)  # a place is queried and then added
 
     def propose(self, _node: int, seen: ImageView, /, *, before: int, limit: int) -> list[Proposal]:
         """Return the most similar places, the most similar first."""
@@ -39,11 +41,8 @@ class VisualWordProposer:
         """Add a place."""
         self._index.add(node, self._vector(seen))
 
-    def _vector(self, view: ImageView) -> WordVector:
-        """Return the view's words; the last view's are cached, as a place is queried and then added."""
-        if self._described is None or self._described[0] is not view:
-            self._described = view, self._vocabulary.vector(self._vocabulary.words_of(view.bits))
-        return self._described[1]
+    def _vector_of(self, view: ImageView) -> WordVector:
+        return self._vocabulary.vector(self._vocabulary.words_of(view.bits))
 
 
 def image_proposer(

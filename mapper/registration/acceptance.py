@@ -47,9 +47,7 @@ def assess(
         return replace(alignment, converged=False, reason=reason)
     assert alignment.information is not None  # it converged
     degeneracy = degeneracy_of(alignment.information, points=source.points)
-    if degeneracy.is_degenerate:
-        return replace(alignment, converged=False, reason=f"degenerate: no surface shows {degeneracy.text}")
-    return alignment
+    return replace(alignment, converged=not degeneracy.reason, reason=degeneracy.reason)
 
 
 def _agreeing(

@@ -24,11 +24,12 @@ image has fewer, it has holes."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanDescription:
-    """Obstacles and rays of one scan.
+    """Points and rays of one scan.
 
     Attributes:
-        T_level_body: (4, 4) from the body frame to the frame of the obstacles.
-        obstacles_level: (M, 3) float32 metres, level frame.
+        T_level_body: (4, 4) from the body frame to the level frame.
+        points_level: (M, 3) float32 metres, level frame: the points to be checked, its obstacles or its
+            ground.
         ranges_m: (elevations, azimuths) float32 range image, body axes: the least range in each direction
             from ``origin_body``, +inf without a return.
         direction_rad: Edge of a pixel of the range image.
@@ -36,7 +37,7 @@ class ScanDescription:
     """
 
     T_level_body: Transform
-    obstacles_level: Points32
+    points_level: Points32
     ranges_m: NDArray[np.float32]
     direction_rad: float
     origin_body: Array
@@ -44,7 +45,7 @@ class ScanDescription:
 
 @dataclass(frozen=True, slots=True)
 class FreeSpaceCounts:
-    """Points of one scan, held against the rays of another.
+    """Points of one scan, compared with the rays of another.
 
     Attributes:
         points: Number of points.
@@ -83,8 +84,8 @@ class FreeSpaceResult:
     """Result of a free-space check.
 
     Attributes:
-        source: The source's obstacles, held against the target's rays.
-        target: The target's obstacles, held against the source's rays.
+        source: The source's points, compared with the target's rays.
+        target: The target's points, compared with the source's rays.
     """
 
     source: FreeSpaceCounts
@@ -105,7 +106,7 @@ class FreeSpaceCheck:
     def compare(
         self, target: ScanDescription, source: ScanDescription, T_target_source: Transform
     ) -> FreeSpaceResult:
-        """Return how the obstacles of each scan fit the rays of the other.
+        """Return how the points of each scan fit the rays of the other.
 
         Args:
             target: One scan.
@@ -115,8 +116,8 @@ class FreeSpaceCheck:
         T_target_level = T_target_source @ inverse(source.T_level_body)
         T_source_level = inverse(T_target_source) @ inverse(target.T_level_body)
         return FreeSpaceResult(
-            source=self.count(target, source.obstacles_level, T_target_level),
-            target=self.count(source, target.obstacles_level, T_source_level),
+            source=self.count(target, source.points_level, T_target_level),
+            target=self.count(source, target.points_level, T_source_level),
         )
 
     def count(self, scan: ScanDescription, points: Points32, T_body_points: Transform) -> FreeSpaceCounts:

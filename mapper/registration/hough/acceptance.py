@@ -6,12 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.core.geometry import Transform, angle_between
-from mapper.registration.base import Alignment
-from mapper.registration.degeneracy import degeneracy_of
 from mapper.registration.free_space import FreeSpaceResult
 from mapper.registration.hough.config import HoughConfig
-from mapper.registration.hough.description import HoughDescription
-from mapper.registration.surfaces import Prepared
 
 MIN_CENTRES = 5
 """A scan with fewer centres shows no objects."""
@@ -20,8 +16,7 @@ MIN_SCORE = 0.0
 different streets −0.4 and less."""
 MIN_GROUND_RATIO = 0.15
 """Share of a scan's ground that the other scan measured, too. Where two views have but a wall in common, any
-wall
-fits: wrong answers that nothing contradicted had 0.07 and less, right ones 0.31 and more."""
+wall fits: wrong answers that nothing contradicted had 0.07 and less, right ones 0.31 and more."""
 MAX_CONTRADICTING_RATIO = 0.015
 """Share of the obstacles in the other scan's free space, the mean of both. Right answers had 0.008 and less,
 or 0.014 where a cloud's origin was not where its rays began; answers in other, similar courtyards 0.016 and
@@ -40,52 +35,39 @@ class Candidate:
 
     Attributes:
         T_target_source: (4, 4) the motion.
-        free_space: Free-space check of the obstacles.
-        ground_ratio: Share of the ground on surfaces that the other scan measured; the larger of both scans'.
+        obstacles: Free-space check of the obstacles.
+        ground: Free-space check of the ground.
     """
 
     T_target_source: Transform
-    free_space: FreeSpaceResult
-    ground_ratio: float
+    obstacles: FreeSpaceResult
+    ground: FreeSpaceResult
 
     @property
     def agreeing_ratio(self) -> float:
         """Share of obstacles that agree, the smaller of both scans'."""
-        return min(self.free_space.source.agreeing_ratio, self.free_space.target.agreeing_ratio)
+        return min(self.obstacles.source.agreeing_ratio, self.obstacles.target.agreeing_ratio)
 
     @property
     def contradicting_ratio(self) -> float:
         """Share of obstacles that contradict, the mean of both scans'."""
-        return 0.5 * (self.free_space.source.contradicting_ratio + self.free_space.target.contradicting_ratio)
+        return 0.5 * (self.obstacles.source.contradicting_ratio + self.obstacles.target.contradicting_ratio)
+
+    @property
+    def ground_ratio(self) -> float:
+        """Share of the ground on surfaces that the other scan measured, the larger of both scans'."""
+        return max(self.ground.source.agreeing_ratio, self.ground.target.agreeing_ratio)
 
     @property
     def score(self) -> float:
         """Mean share that agrees, less the weighted mean share that contradicts."""
-        agreeing = 0.5 * (self.free_space.source.agreeing_ratio + self.free_space.target.agreeing_ratio)
+        agreeing = 0.5 * (self.obstacles.source.agreeing_ratio + self.obstacles.target.agreeing_ratio)
         return agreeing - CONTRADICTION_WEIGHT * self.contradicting_ratio
 
     def gap_to(self, other: "Candidate") -> tuple[float, float]:
         """Return how far two motions place the source apart, in metres and radians."""
         gap_m = float(np.linalg.norm(self.T_target_source[:3, 3] - other.T_target_source[:3, 3]))
         return gap_m, angle_between(self.T_target_source[:3, :3], other.T_target_source[:3, :3])
-
-
-def too_few_centres(target: HoughDescription, source: HoughDescription) -> str:
-    """Return which scan has too few centres to vote with; empty if none has."""
-    for name, side in (("target", target), ("source", source)):
-        if (count := len(side.centres_level)) < MIN_CENTRES:
-            return f"{name}: {count} objects stand on the ground, fewer than {MIN_CENTRES}"
-    return ""
-
-
-def hopeless(best: Candidate) -> str:
-    """Return why the best verified candidate is not worth refining; empty if it is."""
-    if best.score >= MIN_SCORE:
-        return ""
-    return (
-        f"under the best motion {best.agreeing_ratio:.0%} of a scan's obstacles are where the other "
-        f"saw any, and {best.contradicting_ratio:.0%} where it looked through: different places"
-    )
 
 
 def rejection(
@@ -128,10 +110,3 @@ def rejection(
                 f"{other.score:.2f}, within {acceptance.min_lead:g} of the best"
             )
     return ""
-
-
-def degenerate(alignment: Alignment, source: Prepared) -> str:
-    """Return which motions the refined clouds leave unobservable; empty if none."""
-    assert alignment.information is not None  # it converged
-    degeneracy = degeneracy_of(alignment.information, points=source.points)
-    return f"degenerate: no surface shows {degeneracy.text}" if degeneracy.is_degenerate else ""

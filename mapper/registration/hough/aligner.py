@@ -1,26 +1,21 @@
 """Registration without a first guess: Hough voting, verified, then refined (Nagy, Gálai & Benedek 2016)."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, inverse
 from mapper.registration.base import Alignment, failed
+from mapper.registration.degeneracy import degeneracy_of
 from mapper.registration.free_space import FreeSpaceCheck
-from mapper.registration.hough.acceptance import (
-    Candidate,
-    degenerate,
-    hopeless,
-    rejection,
-    too_few_centres,
-)
+from mapper.registration.hough.acceptance import MIN_CENTRES, MIN_SCORE, Candidate, rejection
 from mapper.registration.hough.config import HoughConfig
 from mapper.registration.hough.description import HoughDescription, describe
 from mapper.registration.hough.planar_refinement import PlanarFit, align_grounds, refine_planar
 from mapper.registration.hough.point_refinement import RefinementCloud, refine_on_points, refinement_cloud
 from mapper.registration.hough.voting import Peak, vote
 from mapper.registration.refining import measured
+from mapper.runtime.timing import Stopwatch
 
 NEAR_SCORE = 0.3
 """Candidates are refined whose scores are this near to the best."""
@@ -71,28 +66,35 @@ class HoughAligner:
 
     def stages(self, source: Scan) -> Stages:
         """Return the motion of a source, and how it was found."""
-        clock = _Clock()
-        config = self._config
-        description = describe(source, config)
-        clock.lap("describe")
-        if reason := too_few_centres(self._target, description):
-            return Stages([], None, None, failed(reason), clock.seconds)
-        peaks = vote(self._target.centres_level, description.centres_level, config.voting)
-        clock.lap("vote")
-        candidates = self._verified(description, peaks)
-        clock.lap("verify")
+        watch = Stopwatch()
+        target, config = self._target, self._config
+        with watch.stage("describe"):
+            description = describe(source, config)
+        for name, side in (("target", target), ("source", description)):
+            if (count := len(side.centres_level)) < MIN_CENTRES:
+                reason = f"{name}: {count} objects stand on the ground, fewer than {MIN_CENTRES}"
+                return Stages([], None, None, failed(reason), watch.seconds)
+        with watch.stage("vote"):
+            peaks = vote(target.centres_level, description.centres_level, config.voting)
+        with watch.stage("verify"):
+            candidates = self._verified(description, peaks)
         if not candidates:
             reason = "no offset within the accumulator joins any two centres"
-            return Stages(peaks, None, None, failed(reason), clock.seconds)
-        if reason := hopeless(candidates[0]):
-            return Stages(peaks, candidates[0], None, failed(reason), clock.seconds)
-        cloud = refinement_cloud(source, description, config)
-        clock.lap("prepare source")
-        refined, reason = self._refined(description, cloud, candidates)
-        best = max(refined, key=lambda candidate: candidate.score, default=None)
-        alignment = failed(reason) if best is None else self._assessed(description, cloud, best, refined)
-        clock.lap("refine")
-        return Stages(peaks, candidates[0], best, alignment, clock.seconds)
+            return Stages(peaks, None, None, failed(reason), watch.seconds)
+        hough = candidates[0]
+        if hough.score < MIN_SCORE:
+            reason = (
+                f"under the best motion {hough.agreeing_ratio:.0%} of a scan's obstacles are where the other "
+                f"saw any, and {hough.contradicting_ratio:.0%} where it looked through: different places"
+            )
+            return Stages(peaks, hough, None, failed(reason), watch.seconds)
+        with watch.stage("prepare source"):
+            cloud = refinement_cloud(source, description, config)
+        with watch.stage("refine"):
+            refined, reason = self._refined(description, cloud, candidates)
+            best = max(refined, key=lambda candidate: candidate.score, default=None)
+            alignment = failed(reason) if best is None else self._assessed(description, cloud, best, refined)
+        return Stages(peaks, hough, best, alignment, watch.seconds)
 
     def _verified(self, source: HoughDescription, peaks: Sequence[Peak]) -> list[Candidate]:
         """Return the distinct motions near the peaks that overlap most, the best score first."""
@@ -109,19 +111,14 @@ class HoughAligner:
 
     def _in_space(self, source: HoughDescription, fit: PlanarFit) -> Transform:
         T_level_level = align_grounds(self._target.ground, source.ground, fit)
-        return inverse(self._target.free_space.T_level_body) @ T_level_level @ source.free_space.T_level_body
+        return inverse(self._target.T_level_body) @ T_level_level @ source.T_level_body
 
     def _candidate(self, source: HoughDescription, T_target_source: Transform) -> Candidate:
-        target, check = self._target, self._check
-        T_target_level = T_target_source @ inverse(source.free_space.T_level_body)
-        T_source_level = inverse(T_target_source) @ inverse(target.free_space.T_level_body)
+        target, compare = self._target, self._check.compare
         return Candidate(
             T_target_source,
-            check.compare(target.free_space, source.free_space, T_target_source),
-            ground_ratio=max(
-                check.count(target.free_space, source.ground_level, T_target_level).agreeing_ratio,
-                check.count(source.free_space, target.ground_level, T_source_level).agreeing_ratio,
-            ),
+            compare(target.checked_obstacles, source.checked_obstacles, T_target_source),
+            compare(target.checked_ground, source.checked_ground, T_target_source),
         )
 
     def _refined(
@@ -153,19 +150,7 @@ class HoughAligner:
             return alignment
         fewest_centres = min(len(self._target.centres_level), len(source.centres_level))
         reason = rejection(best, refined, self._config, fewest_centres=fewest_centres)
-        reason = reason or degenerate(alignment, cloud.thinned)
+        if not reason:
+            assert alignment.information is not None  # it converged
+            reason = degeneracy_of(alignment.information, points=cloud.thinned.points).reason
         return replace(alignment, converged=not reason, reason=reason)
-
-
-class _Clock:
-    """Wall seconds from lap to lap."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._since = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        """Note the time since the last lap under a name."""
-        now = time.perf_counter()
-        self.seconds[name] = now - self._since
-        self._since = now

@@ -53,7 +53,7 @@ def refine_planar(
     overlap = config.overlap
     (dx_m, dy_m, alpha_rad), total = hill_climb(
         target.volume,
-        source.free_space.obstacles_level,
+        source.checked_obstacles.points_level,
         source.heights_m,
         np.array(motion),
         overlap.voxel_m,
