@@ -65,7 +65,7 @@ def registered(scene, *, T_turned=None, noise_m=0.02):
 def test_unobservable_motions_are_named(scene, text):
     _, degeneracy = registered(scene)
     assert degeneracy.text == text
-    assert degeneracy.is_degenerate == bool(text)
+    assert (degeneracy.unobservable_count > 0) == bool(degeneracy.reason) == bool(text)
 
 
 def test_a_corridor_turned_half_right_is_named_by_its_direction():
@@ -91,9 +91,9 @@ def test_unobservable_motions_move_the_cloud_by_a_metre_and_no_surface_notices()
     rng = np.random.default_rng(1)
     points = tunnel(rng)
     _, degeneracy = registered(tunnel)
-    assert len(degeneracy.unobservable) == 2
+    assert degeneracy.unobservable_count == 2
     radius_before = np.hypot(points[:, 1] - 1.5, points[:, 2])
-    for tangent in degeneracy.unobservable:
+    for tangent in degeneracy.motions[:2]:
         moved = apply(exp(0.01 * tangent[:3], 0.01 * tangent[3:]), points)
         assert np.sqrt(((moved - points) ** 2).sum(axis=1).mean()) == pytest.approx(0.01, rel=0.02)
         assert np.abs(np.hypot(moved[:, 1] - 1.5, moved[:, 2]) - radius_before).max() < 2e-3

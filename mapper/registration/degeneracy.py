@@ -34,19 +34,9 @@ class Degeneracy:
     text: str
 
     @property
-    def is_degenerate(self) -> bool:
-        """Whether any motion is unobservable."""
-        return self.unobservable_count > 0
-
-    @property
     def reason(self) -> str:
         """Why an answer with this degeneracy is refused; empty when every motion is observable."""
         return f"degenerate: no surface shows {self.text}" if self.text else ""
-
-    @property
-    def unobservable(self) -> Array:
-        """(K, 6) the unobservable tangents (rotation, translation), as ``motions`` has them."""
-        return self.motions[: self.unobservable_count]
 
 
 def degeneracy_of(information: Array, *, points: Points, min_share: float = _MIN_SHARE) -> Degeneracy:
