@@ -34,10 +34,9 @@ def _cost(poses, points, edges, measured, weights, intrinsics, active, robust):
 
 
 @njit(cache=True, nogil=True)
-def _linearise(
-    poses, free, points, edges, measured, weights, intrinsics, active, robust, Hcc, bc, Hpp, bp, W
-):
+def _linearise(poses, free, points, edges, measured, weights, intrinsics, active, robust, blocks):
     """Write the blocks of the normal equations: cameras (6, 6), points (3, 3), and one (6, 3) per edge."""
+    Hcc, bc, Hpp, bp, W = blocks
     Hcc[:] = 0.0
     bc[:] = 0.0
     Hpp[:] = 0.0
@@ -101,8 +100,9 @@ def _inverse3(M, out):
 
 
 @njit(cache=True, nogil=True)
-def _step(free, first_edge, edges, active, Hcc, bc, Hpp, bp, W, damping):
+def _step(free, first_edge, edges, active, blocks, damping):
     """Return the damped step of cameras (C, 6) and points (P, 3) through the Schur complement."""
+    Hcc, bc, Hpp, bp, W = blocks
     cameras, points = len(Hcc), len(Hpp)
     S = np.zeros((6 * cameras, 6 * cameras))
     rhs = np.empty(6 * cameras)
@@ -178,17 +178,16 @@ def adjust(poses, free, points, first_edge, edges, measured, weights, intrinsics
     Hcc, bc = np.empty((cameras, 6, 6)), np.empty((cameras, 6))
     Hpp, bp = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
     W = np.zeros((len(edges), 6, 3))
+    blocks = Hcc, bc, Hpp, bp, W
     active = np.ones(len(edges), np.bool_)
     r = np.empty(3)
     for k in range(rounds):
         robust = k == 0
         damping = 1e-4
         cost = _cost(poses, points, edges, measured, weights, intrinsics, active, robust)
-        _linearise(
-            poses, free, points, edges, measured, weights, intrinsics, active, robust, Hcc, bc, Hpp, bp, W
-        )
+        _linearise(poses, free, points, edges, measured, weights, intrinsics, active, robust, blocks)
         for _ in range(iterations):
-            step_cameras, step_points = _step(free, first_edge, edges, active, Hcc, bc, Hpp, bp, W, damping)
+            step_cameras, step_points = _step(free, first_edge, edges, active, blocks, damping)
             trial_poses = poses.copy()
             for c in range(len(poses)):
                 if free[c] >= 0:
@@ -200,22 +199,7 @@ def adjust(poses, free, points, first_edge, edges, measured, weights, intrinsics
                 poses, points, cost, damping = trial_poses, trial_points, trial, damping * 0.2
                 if converged:
                     break
-                _linearise(
-                    poses,
-                    free,
-                    points,
-                    edges,
-                    measured,
-                    weights,
-                    intrinsics,
-                    active,
-                    robust,
-                    Hcc,
-                    bc,
-                    Hpp,
-                    bp,
-                    W,
-                )
+                _linearise(poses, free, points, edges, measured, weights, intrinsics, active, robust, blocks)
             else:
                 damping *= 10.0
                 if damping > 1e3:
