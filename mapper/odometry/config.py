@@ -87,7 +87,7 @@ class KeyframeOdometryConfig(Config):
     weak_inliers: PositiveInt = 150
     """With fewer, a pose competes with those from other keyframes and without a prediction."""
     max_lost_frames: NonNegativeInt = 15
-    """After so many frames with enough features but no known landmarks a new sub-map begins; 0: never."""
+    """A new sub-map begins after so many frames with enough features but no known landmarks; 0: never."""
     keyframe_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.75
     """Keyframe when the inliers fall below this share of the most since the last keyframe; raise it for
     more keyframes."""

@@ -26,7 +26,7 @@ class ScanOdometryConfig(Config):
     lost_ratio: Ratio = 0.5
     """A scan whose overlap is still less than this share of the usual one is lost."""
     max_lost_scans: NonNegativeInt = 10
-    """After so many lost scans in a row a new sub-map begins; 0 turns this off."""
+    """After so many lost scans in a row a new sub-map begins; 0 disables it."""
     rescue: HoughGicpConfig | None = HoughGicpConfig()
     """Registration without a guess, to the last keyframe, of scans with too little overlap."""
     max_pair_distance_m: PositiveFloat = 0.5
