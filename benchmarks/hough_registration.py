@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluators.cloud_distance import DistanceTo
-from evaluators.scan_pairs import fewer_rings, merged, perturbed
+from evaluators.metrics.cloud_distance import DistanceTo
+from evaluators.papers.scan_pairs import fewer_rings, merged, perturbed
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, angle_between, inverse
 from mapper.registration.base import Registration

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluators.trajectory import align, associate, ate
+from evaluators.metrics.trajectory import align, associate, ate
 from mapper.config.loading import load_config
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform

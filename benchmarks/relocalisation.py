@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from evaluators.trajectory import align, associate, ate
+from evaluators.metrics.trajectory import align, associate, ate
 from mapper.config.loading import load_config
 from mapper.core.geometry import angle_between
 from mapper.core.timebase import NS_PER_S

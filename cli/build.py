@@ -24,7 +24,7 @@ from cli.options import (
 from cli.stepping import Stepping
 
 if TYPE_CHECKING:
-    from evaluators.metric import Metric
+    from evaluators.metrics.metric import Metric
     from mapper.config.build import BuildConfig
     from mapper.run.folder import Run
     from mapper.run.observers import Observer
@@ -100,7 +100,7 @@ def built(
     onlooker: "Onlooker | None" = None,
 ) -> "tuple[Run, list[Metric]]":
     """Build a run and judge its trajectory by the truth, if the log has any."""
-    from evaluators.evaluate import evaluate
+    from evaluators.metrics.evaluate import evaluate
     from mapper.config.loading import load_config, load_source_config
     from mapper.pipeline.build import build as build_run
     from mapper.run.observers import NULL_OBSERVER
@@ -154,7 +154,7 @@ def appended(
     log: Path, onto: Path, overrides: "Sequence[str]", out: Path, *, overwrite: bool, quiet: bool
 ) -> "tuple[Run, list[Metric]]":
     """Build a run from a run and a later log of the same place, by the run's configuration."""
-    from evaluators.evaluate import evaluate
+    from evaluators.metrics.evaluate import evaluate
     from mapper.config.loading import overridden
     from mapper.pipeline.append import append
     from mapper.run.folder import load_run

@@ -36,10 +36,10 @@ def compare(
 
     Example: mapper compare rgbd_dataset_freiburg1_xyz --method isvd --method gicp --out runs/compared
     """
-    from evaluators.compare import compare as compare_methods
-    from evaluators.compare_files import write_comparison
-    from evaluators.compare_tables import tables_text
-    from mapper.config.compare import CompareConfig
+    from evaluators.compare.comparison import compare as compare_methods
+    from evaluators.compare.config import CompareConfig
+    from evaluators.compare.files import write_comparison
+    from evaluators.compare.tables import tables_text
     from mapper.config.loading import overridden
     from mapper.runtime.atomic import atomic_folder
     from mapper.sources import open_source

@@ -10,9 +10,9 @@ from cli.console import progress_for
 from cli.environment import prepare_libraries
 
 if TYPE_CHECKING:
-    from evaluators.evaluate import Judged
-    from evaluators.map_quality import MapQuality
-    from evaluators.metric import Metric
+    from evaluators.metrics.evaluate import Judged
+    from evaluators.metrics.map_quality import MapQuality
+    from evaluators.metrics.metric import Metric
     from mapper.core.timebase import Stamps
     from mapper.core.trajectory import Trajectory
     from mapper.run.folder import Run
@@ -105,7 +105,7 @@ def evaluate(
     Example: mapper eval runs/xyz --align yaw --plot plots, or: mapper eval 00.txt --truth poses/00.txt, or:
     mapper eval runs/flat --map logs/flat --sharpness
     """
-    from evaluators.evaluate import ALIGNED, judged
+    from evaluators.metrics.evaluate import ALIGNED, judged
     from mapper.core.errors import DataError
 
     prepare_libraries()
@@ -141,7 +141,7 @@ def evaluate(
         metrics += _sharpness_of(sharp_log, trajectory)
     print(_text(metrics, found, Format.JSON if json else format_))
     if plot is not None:
-        from evaluators.plots import write_map_errors, write_trajectory_errors
+        from evaluators.pictures.evaluation import write_map_errors, write_trajectory_errors
 
         if held is None or found.matched is not None:
             write_trajectory_errors(plot, found, title=f"{name}, {ALIGNED[align.value]}")
@@ -152,7 +152,7 @@ def evaluate(
 def _loaded(
     estimate: Path, truth: Path | None, times: Path | None
 ) -> "tuple[Run | None, Trajectory, Trajectory | None]":
-    from evaluators.poses import is_kitti, read_poses
+    from evaluators.metrics.pose_files import is_kitti, read_poses
     from mapper.core.errors import DataError
     from mapper.run.folder import load_run
 
@@ -179,8 +179,8 @@ def _needed(run: "Run | None", path: Path, option: str) -> "Run":
 def _held_against(
     run: "Run", path: Path, *, world: World | None, register: bool, tolerance: int
 ) -> "MapQuality":
-    from evaluators.map_quality import map_quality
-    from evaluators.map_reference import read_reference
+    from evaluators.metrics.map_quality import map_quality
+    from evaluators.metrics.map_reference import read_reference
 
     reference = read_reference(path, voxel_m=run.config.octree.resolution_m)
     return map_quality(
@@ -195,7 +195,7 @@ def _log_of(run: "Run", log: Path | None) -> "Log":
 
 
 def _sharpness_of(source: "Log", trajectory: "Trajectory") -> "list[Metric]":
-    from evaluators.sharpness import RADIUS_M, sharpness_metrics, views_of
+    from evaluators.metrics.sharpness import RADIUS_M, sharpness_metrics, views_of
 
     views = views_of(source, trajectory, progress=progress_for(quiet=False))
     return sharpness_metrics(views, radius_m=RADIUS_M[source.sensor])
@@ -227,7 +227,7 @@ def _numbers(text: str) -> list[float]:
 
 
 def _loops_of(run: "Run", truth: "Trajectory") -> "list[Metric]":
-    from evaluators.loops import loop_metrics
+    from evaluators.metrics.loops import loop_metrics
     from mapper.run.files import KEYFRAMES
     from mapper.sources.trajectory_files import read_tum
 
@@ -240,8 +240,9 @@ def _loops_of(run: "Run", truth: "Trajectory") -> "list[Metric]":
 def _text(metrics: "list[Metric]", found: "Judged", format_: Format) -> str:
     from dataclasses import asdict
 
-    from evaluators import metric, tables
-    from evaluators.segments import LENGTH_COLUMNS, length_records, segment_metrics
+    from evaluators.metrics import metric
+    from evaluators.metrics.segments import LENGTH_COLUMNS, length_records, segment_metrics
+    from evaluators.tables import table as tables
 
     if format_ in (Format.JSON, Format.CSV):
         if len(found.lengths) > 1:

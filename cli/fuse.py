@@ -26,7 +26,7 @@ def fuse(
     Example: mapper fuse runs/xyz --set octree.resolution_m=0.1 --set slice.max_height_m=1.8
     """
     from cli.summary import summary_text
-    from evaluators.evaluate import evaluate
+    from evaluators.metrics.evaluate import evaluate
     from mapper.config.loading import overridden
     from mapper.pipeline.fuse import fuse as fuse_run
     from mapper.run.folder import load_run, moved_log, open_log

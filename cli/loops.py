@@ -51,7 +51,7 @@ def loops(
     built = load_run(run)
     if add or remove:
         from cli.summary import summary_text
-        from evaluators.evaluate import evaluate
+        from evaluators.metrics.evaluate import evaluate
         from mapper.pipeline.edit_loops import edit_loops
 
         prepare_libraries()

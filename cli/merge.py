@@ -87,7 +87,7 @@ def _placed(runs: "list[Run]", place: Place, poses: Path | None) -> "list[Placed
 
 
 def _summary(merged: "Merged") -> str:
-    from evaluators.tables import MISSING, Column, text_table
+    from evaluators.tables.table import MISSING, Column, text_table
 
     manifest = merged.map.manifest
     records = [{**run.model_dump(), "name": Path(run.path).name} for run in manifest.runs]

@@ -9,7 +9,7 @@ from cli.environment import prepare_libraries
 from cli.options import Overrides, Quiet
 
 if TYPE_CHECKING:
-    from evaluators.register import Registered
+    from evaluators.register.registration import Registered
     from mapper.core.frames import Frame, Scan, Sensor
     from mapper.sources.config import SourceConfig
 
@@ -51,10 +51,10 @@ def register(
 
     Example: mapper register scan_10.bin scan_00.bin --method hough-gicp --out registered
     """
-    from evaluators.register import register as register_frames
-    from evaluators.register_files import registration_text, write_registration
+    from evaluators.register.config import check_method, register_config
+    from evaluators.register.files import registration_text, write_registration
+    from evaluators.register.registration import register as register_frames
     from mapper.config.loading import overridden
-    from mapper.config.register import check_method, register_config
     from mapper.core.errors import RegistrationError
     from mapper.registration.guess import parse_guess
     from mapper.runtime.atomic import atomic_folder

@@ -48,9 +48,9 @@ def _names(runs: Sequence[Path]) -> list[str]:
 def _figures(run: "Run") -> "list[Figure]":
     import numpy as np
 
-    from evaluators.evaluate import judged
-    from evaluators.loops import loop_metrics
-    from evaluators.metric import shown
+    from evaluators.metrics.evaluate import judged
+    from evaluators.metrics.loops import loop_metrics
+    from evaluators.metrics.metric import shown
     from mapper.export.report.data import Figure
     from mapper.run.files import KEYFRAMES
     from mapper.sources.trajectory_files import read_tum

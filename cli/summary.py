@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import median
 from textwrap import wrap
 
-from evaluators.metric import Metric
+from evaluators.metrics.metric import Metric
 from mapper.loops.closure import LoopClosure
 from mapper.run.folder import Run
 from mapper.run.frame_records import FrameRecord

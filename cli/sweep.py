@@ -34,9 +34,9 @@ def sweep(
 
     Example: mapper sweep sweep.toml --out sweeps/first --processes 4
     """
-    from evaluators.sweep import plan_sweep, run_sweep
-    from evaluators.sweep_files import FILES, write_sweep
-    from evaluators.sweep_tables import summary_text
+    from evaluators.sweep.files import FILES, write_sweep
+    from evaluators.sweep.plan import plan_sweep, run_sweep
+    from evaluators.sweep.tables import summary_text
 
     workers = workers_here(processes, scheduler, default=os.cpu_count() or 1)
     prepare_libraries()

@@ -8,7 +8,7 @@ import pytest
 from test_cli_loops import mapper
 
 from cli.summary import summary_text
-from evaluators.trajectory import align, associate, ate
+from evaluators.metrics.trajectory import align, associate, ate
 from mapper.config.loading import load_config, overridden
 from mapper.core.errors import ConfigError, RunError
 from mapper.loops.config import NoLoopsConfig

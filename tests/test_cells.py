@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from workers_made import Work, told, until
 
-from evaluators.cells import Cell, run_cells
+from evaluators.study.cells import Cell, run_cells
 from mapper.core.errors import DataError, RunError
 from mapper.runtime.atomic import locked
 
@@ -124,7 +124,7 @@ def test_killed_in_the_middle_it_goes_on_and_runs_nothing_finished_twice(diary, 
     script = tmp_path / "sweep.py"
     script.write_text(
         "from pathlib import Path\n"
-        "from evaluators.cells import Cell, run_cells\n"
+        "from evaluators.study.cells import Cell, run_cells\n"
         "from workers_made import Work\n"
         "if __name__ == '__main__':\n"
         f"    diary, folder = Path({str(diary)!r}), Path({str(tmp_path / 'cells')!r})\n"

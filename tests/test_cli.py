@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from cli.console import Bars, Lines
 from cli.evaluate import evaluate as evaluate_verb
 from cli.main import app
-from evaluators.evaluate import judged
+from evaluators.metrics.evaluate import judged
 from mapper.run.folder import load_run
 from mapper.sources.trajectory_files import read_tum
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from evaluators.cloud_distance import DistanceTo
+from evaluators.metrics.cloud_distance import DistanceTo
 from mapper.core.errors import DataError
 from mapper.core.geometry import exp, inverse
 

@@ -13,13 +13,13 @@ from logs_made import MemoryEntry
 from mcap.reader import make_reader
 from test_cli import mapper
 
-from evaluators import compare as compare_module
-from evaluators.catalogue import methods_for
-from evaluators.compare import compare
-from evaluators.compare_files import write_comparison
-from evaluators.compare_tables import odometry_records, registration_records, tables_text, trial_records
-from evaluators.methods import registration_method
-from mapper.config.compare import CompareConfig, LidarCompareConfig
+from evaluators.compare import comparison as compare_module
+from evaluators.compare.catalogue import methods_for
+from evaluators.compare.comparison import compare
+from evaluators.compare.config import CompareConfig, LidarCompareConfig
+from evaluators.compare.files import write_comparison
+from evaluators.compare.methods import registration_method
+from evaluators.compare.tables import odometry_records, registration_records, tables_text, trial_records
 from mapper.core.errors import ConfigError, DataError, FrameError
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import LidarSimulator

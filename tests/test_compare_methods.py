@@ -5,11 +5,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from evaluators.catalogue import methods_for
-from evaluators.methods import FrameToFrame, OdometryPairs
-from evaluators.moments import Reader
-from evaluators.scales import kiss_icp, registrations_for
-from mapper.config.compare import CompareConfig, RgbdCompareConfig
+from evaluators.compare.catalogue import methods_for
+from evaluators.compare.config import CompareConfig, RgbdCompareConfig
+from evaluators.compare.frames import Reader
+from evaluators.compare.methods import FrameToFrame, OdometryPairs
+from evaluators.compare.scales import kiss_icp, registrations_for
 from mapper.core.errors import FrameError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.core.geometry import angle_between, apply, exp, inverse

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from evaluators.coverage import frame_coverage, time_coverage
-from evaluators.evaluate import judged
+from evaluators.metrics.coverage import frame_coverage, time_coverage
+from evaluators.metrics.evaluate import judged
 from mapper.core.geometry import transform
 from mapper.core.trajectory import Trajectory
 

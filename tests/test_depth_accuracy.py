@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from logs_made import MemoryEntry, log_in_memory
 
-from evaluators.depth_accuracy import study_depth
+from evaluators.depth_camera.accuracy import Patch, accuracy_of, quantisation_step_m
+from evaluators.depth_camera.noise_fit import fit_noise
+from evaluators.depth_camera.planes import fit_planes
+from evaluators.depth_camera.still import depth_at
+from evaluators.depth_camera.study import study_depth
+from evaluators.depth_camera.tiles import depth_of_planes
 from mapper.core.errors import DataError, SourceError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan, ray_table
-from mapper.sensing.depth_accuracy import Patch, accuracy_of, quantisation_step_m
-from mapper.sensing.depth_fit import fit_noise
-from mapper.sensing.depth_planes import fit_planes
-from mapper.sensing.depth_still import depth_at
-from mapper.sensing.depth_tiles import depth_of_planes
 from mapper.simulation.config import SensorConfig, SynthConfig
 from mapper.simulation.source import CameraSimulator
 from mapper.sources import open_source

@@ -6,8 +6,8 @@ import pytest
 from evo.core import metrics, sync
 from evo.core.trajectory import PoseTrajectory3D
 
-from evaluators.evaluate import evaluate
-from evaluators.trajectory import Matched, align, associate, ate, rpe, start_end_offset
+from evaluators.metrics.evaluate import evaluate
+from evaluators.metrics.trajectory import Matched, align, associate, ate, rpe, start_end_offset
 from mapper.core.errors import DataError
 from mapper.core.geometry import exp, inverse, rotation_exp, transform
 from mapper.core.trajectory import Trajectory

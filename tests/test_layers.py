@@ -29,7 +29,7 @@ HOMES = {
     "evo": (),
     "rerun": ("mapper/export/rerun/",),
     "distributed": ("mapper/runtime/executor.py",),
-    "pyarrow": ("evaluators/parquet.py",),
+    "pyarrow": ("evaluators/tables/parquet.py",),
 }
 
 

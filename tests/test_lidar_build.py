@@ -7,7 +7,7 @@ import pytest
 from mcap.reader import make_reader
 
 from cli.summary import summary_text
-from evaluators.evaluate import evaluate
+from evaluators.metrics.evaluate import evaluate
 from mapper.config.loading import load_config, overridden
 from mapper.core.errors import TrackingError
 from mapper.export.grid import read_grid

@@ -7,9 +7,9 @@ import pytest
 from typer.testing import CliRunner
 
 from cli.main import app
-from evaluators import line_laser_study
-from evaluators.line_laser import TABLE_2_1, count
-from evaluators.line_laser_labels import range_records, read_labels
+from evaluators.line_laser import study as line_laser_study
+from evaluators.line_laser.labels import range_records, read_labels
+from evaluators.line_laser.scores import TABLE_2_1, count
 from mapper.config.loading import read_config
 from mapper.core.errors import SourceError
 from mapper.export.grid import read_grid

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from evaluators.trajectory import align, associate, ate
+from evaluators.metrics.trajectory import align, associate, ate
 from mapper.core.errors import FrameError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.core.geometry import exp, inverse

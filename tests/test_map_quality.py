@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from evaluators.map_reference import held_against, read_reference
-from evaluators.occupancy import judged_by_points, verdict_metrics
-from evaluators.plots import write_map_errors
-from evaluators.scenes import outdoor_distance_m, scene_distance
-from evaluators.sharpness import Views, sharpness_metrics
+from evaluators.metrics.map_reference import held_against, read_reference
+from evaluators.metrics.occupancy import judged_by_points, verdict_metrics
+from evaluators.metrics.scenes import outdoor_distance_m, scene_distance
+from evaluators.metrics.sharpness import Views, sharpness_metrics
+from evaluators.pictures.evaluation import write_map_errors
 from mapper.core.errors import DataError, MapperError
 from mapper.core.geometry import exp, inverse, transform
 from mapper.export.ply import write_ply
@@ -79,7 +79,7 @@ def test_a_map_meets_itself_at_any_resolution(resolution_m, tmp_path):
 
 def test_a_map_too_coarse_to_be_cut_up_is_refused(tmp_path, monkeypatch):
     write_bt(tmp_path / "coarse.bt", mapped(wall(2.02), resolution_m=0.1))
-    monkeypatch.setattr("evaluators.map_reference._MOST_POINTS", 1000)
+    monkeypatch.setattr("evaluators.metrics.map_reference._MOST_POINTS", 1000)
     with pytest.raises(DataError, match=r"voxels of 0.1 m are too coarse for a map of 0.05 m"):
         read_reference(tmp_path / "coarse.bt", voxel_m=EDGE_M)
 

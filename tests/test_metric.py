@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from evaluators.metric import Metric, json_text, markdown_table, text_table
+from evaluators.metrics.metric import Metric, json_text, markdown_table, text_table
 from mapper.core.errors import DataError
 
 METRICS = [

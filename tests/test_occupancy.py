@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from evaluators.occupancy import ghosts, occupancy_metrics
+from evaluators.metrics.occupancy import ghosts, occupancy_metrics
 from mapper.core.errors import DataError
 from mapper.octree.casting import Caster
 from mapper.octree.config import OctreeConfig

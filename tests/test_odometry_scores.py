@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from evaluators.odometry_scores import (
+from evaluators.metrics.odometry import (
     ONE_FRAME,
     ONE_SECOND,
     OdometryRun,

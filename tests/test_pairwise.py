@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from evaluators.pairwise import (
+from evaluators.compare.config import GuessConfig, LidarCompareConfig, RgbdCompareConfig
+from evaluators.compare.pairwise import (
     NO_GUESS,
     Pair,
     Trial,
@@ -12,7 +13,6 @@ from evaluators.pairwise import (
     pairs_of,
     registration_scores,
 )
-from mapper.config.compare import GuessConfig, LidarCompareConfig, RgbdCompareConfig
 from mapper.core.geometry import exp, inverse, rotation_log
 from mapper.core.trajectory import Trajectory
 from mapper.registration.base import Alignment, failed

@@ -8,7 +8,7 @@ import pytest
 from evaluators.papers.files import tables_text, write_reproduction
 from evaluators.papers.layout import as_printed, compared, everything
 from evaluators.papers.model import PaperCell, PaperPath, PaperTable, Reproduction
-from evaluators.tables import Column, latex_table, latex_text, markdown_table, shown_cells
+from evaluators.tables.table import Column, latex_table, latex_text, markdown_table, shown_cells
 from mapper.core.trajectory import trajectory_from
 from mapper.sources.trajectory_files import write_tum
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scan_world import on_street, street, view
 
-from evaluators.cells import CellResult
 from evaluators.papers.hough import METHODS, HoughTrial, hough_cells
 from evaluators.papers.hough_pairs import ALL_RINGS, FEW_RINGS, Clouds, LogPair, find_pairs
 from evaluators.papers.hough_tables import hough_reproduction
-from evaluators.scan_pairs import fewer_rings, merged, perturbed
+from evaluators.papers.scan_pairs import fewer_rings, merged, perturbed
+from evaluators.study.cells import CellResult
 from mapper.core.errors import ConfigError, SourceError
 from mapper.core.frames import Scan
 from mapper.core.geometry import apply, rotation_exp, transform

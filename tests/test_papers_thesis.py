@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluators.cells import CellResult
 from evaluators.papers.ablation import follow
 from evaluators.papers.book import Cut
 from evaluators.papers.measured import CONFIGS, cell_for, cells_of
 from evaluators.papers.model import PaperCell
 from evaluators.papers.thesis import BOOK, ThesisJob, table_of
 from evaluators.papers.thesis_tables import tables
+from evaluators.study.cells import CellResult
+from evaluators.study.seeds import seeded
 from mapper.config.loading import load_config
-from mapper.config.seeds import seeded
 from mapper.core.errors import ConfigError, DataError
 from mapper.core.geometry import exp
 from mapper.core.trajectory import trajectory_from

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from evaluators.trajectory import align, associate, ate
+from evaluators.metrics.trajectory import align, associate, ate
 from mapper.config.loading import load_config, overridden
 from mapper.core.errors import ConfigError, RunError, TrackingError
 from mapper.export.grid import read_grid

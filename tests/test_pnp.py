@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluators.trajectory import align, associate, ate
+from evaluators.metrics.trajectory import align, associate, ate
 from mapper.config.loading import load_config
 from mapper.core.geometry import angle_between, apply, exp, inverse
 from mapper.core.trajectory import trajectory_from

@@ -8,9 +8,9 @@ from mcap.reader import make_reader
 from typer.testing import CliRunner
 
 from cli.main import app
-from evaluators.register import register
-from evaluators.register_files import registration_text
-from mapper.config.register import register_config
+from evaluators.register.config import register_config
+from evaluators.register.files import registration_text
+from evaluators.register.registration import register
 from mapper.core.errors import ConfigError
 from mapper.core.frames import Scan
 from mapper.core.geometry import apply, exp, inverse

@@ -9,7 +9,7 @@ from chromium import CHROMIUM, MISSING, Page
 from typer.testing import CliRunner
 
 from cli.main import app
-from evaluators.evaluate import evaluate
+from evaluators.metrics.evaluate import evaluate
 from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError
 from mapper.export.report.data import Figure, chapter_of, drawn

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from evaluators.evaluate import judged
-from evaluators.plots import write_trajectory_errors
-from evaluators.run_summary import summary
+from evaluators.metrics.evaluate import judged
+from evaluators.metrics.run_summary import summary
+from evaluators.pictures.evaluation import write_trajectory_errors
 from mapper.config.build import BuildConfig
 from mapper.core.errors import DataError
 from mapper.core.geometry import exp, transform

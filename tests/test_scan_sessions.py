@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from evaluators.trajectory import align, associate, ate
+from evaluators.metrics.trajectory import align, associate, ate
 from mapper.config.loading import load_config, overridden
 from mapper.core.errors import ConfigError, LoopError
 from mapper.loops.closure import discrepancy

@@ -6,9 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluators.evaluate import judged
-from evaluators.segments import KITTI_LENGTHS_M, length_records, lengths_for, segment_errors, segment_metrics
-from evaluators.trajectory import Matched, associate
+from evaluators.metrics.evaluate import judged
+from evaluators.metrics.segments import (
+    KITTI_LENGTHS_M,
+    length_records,
+    lengths_for,
+    segment_errors,
+    segment_metrics,
+)
+from evaluators.metrics.trajectory import Matched, associate
 from mapper.core.errors import DataError
 from mapper.core.geometry import angle_between, exp, inverse, transform
 from mapper.core.trajectory import Trajectory

@@ -10,11 +10,11 @@ from chromium import CHROMIUM, MISSING, Page
 from pyarrow import parquet
 from test_cli import mapper
 
-from evaluators.cells import Cell, CellResult
-from evaluators.sweep import plan_sweep, run_sweep
-from evaluators.sweep_chart import Line, dot_chart
-from evaluators.sweep_files import write_sweep
-from evaluators.sweep_tables import QUANTITIES, best_of, grouped, summary_text, sweep_records
+from evaluators.study.cells import Cell, CellResult
+from evaluators.sweep.chart import Line, dot_chart
+from evaluators.sweep.files import write_sweep
+from evaluators.sweep.plan import plan_sweep, run_sweep
+from evaluators.sweep.tables import QUANTITIES, best_of, grouped, summary_text, sweep_records
 from mapper.core.errors import ConfigError, RunError, SourceError
 
 FEW = "source.last_frame=11"

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluators.occupancy import occupancy_metrics
+from evaluators.metrics.occupancy import occupancy_metrics
 from mapper.config.loading import load_config
 from mapper.core.deskew import twist_at
 from mapper.core.errors import ConfigError, FrameError, TrackingError

@@ -13,7 +13,7 @@ from cli.environment import prepare_libraries
 from cli.options import First, Last, Overrides, Quiet, Stride, merged, selection
 
 if TYPE_CHECKING:
-    from mapper.sensing.depth_accuracy import Patch
+    from evaluators.depth_camera.accuracy import Patch
 
 _FITTED_FRAMES = 100
 
@@ -65,7 +65,7 @@ def depth(
     sensor depth rgbd_dataset_freiburg1_xyz --fit-plane --out kinect, then: mapper build LOG --out RUN
     --config kinect/sensor.toml
     """
-    from evaluators.depth_accuracy import SENSOR, depth_text, study_depth, write_depth_study
+    from evaluators.depth_camera.study import SENSOR, depth_text, study_depth, write_depth_study
     from mapper.config.loading import load_config
     from mapper.runtime.atomic import atomic_folder
     from mapper.sources import open_source
@@ -115,8 +115,8 @@ def _distances(
 
 
 def _patch(text: str) -> "Patch":
+    from evaluators.depth_camera.accuracy import Patch
     from mapper.core.errors import ConfigError
-    from mapper.sensing.depth_accuracy import Patch
 
     try:
         column, row, width, height = (int(word) for word in text.split(","))

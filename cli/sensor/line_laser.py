@@ -50,8 +50,10 @@ def line_laser(
 
     Example: mapper sensor line-laser drive/images --calibration C.toml --wheels drive/encoders.txt --out seen
     """
-    from evaluators.line_laser_labels import judge, read_labels
-    from mapper.config.loading import overridden, read_config
+    from evaluators.line_laser.labels import judge
+    from evaluators.line_laser.labels import read_labels
+    from mapper.config.loading import overridden
+    from mapper.config.loading import read_config
     from mapper.line_laser.config import THESIS, LineLaserCalibration, LineLaserConfig
     from mapper.line_laser.files import find_images
     from mapper.line_laser.products import write_drive, write_scans
@@ -111,8 +113,8 @@ def calibrate(
     Example: mapper sensor line-laser-calibrate drive/shots --wheelbase 0.26 --sensor-x 0.2 --out C.toml
     """
     from mapper.config.loading import overridden
+from evaluators.pictures.line_laser import write_calibration_picture
     from mapper.core.errors import RunError
-    from mapper.export.line_laser_picture import write_calibration_picture
     from mapper.line_laser.calibration import calibrate as fit_laws
     from mapper.line_laser.calibration import calibration_text
     from mapper.line_laser.config import LineLaserConfig, VehicleConfig
@@ -155,8 +157,13 @@ def accuracy(
     """
     from contextlib import nullcontext
 
-    from evaluators.line_laser_study import STUDY_COLUMNS, TABLE_COLUMNS, detections, study, table_2_1
-    from evaluators.tables import csv_text, text_table
+    from evaluators.line_laser.study import STUDY_COLUMNS
+    from evaluators.line_laser.study import TABLE_COLUMNS
+    from evaluators.line_laser.study import detections
+    from evaluators.line_laser.study import study
+    from evaluators.line_laser.study import table_2_1
+    from evaluators.tables.table import csv_text
+    from evaluators.tables.table import text_table
     from mapper.config.loading import overridden
     from mapper.line_laser.config import LineLaserConfig
     from mapper.runtime.atomic import MANIFEST_NAME, atomic_folder, write_text
@@ -181,7 +188,7 @@ def _draw(
     labels: "Mapping[str, tuple[Array, Array]]",
 ) -> None:
     """Draw the detections in the first image, in the last, and between."""
-    from mapper.export.line_laser_picture import write_detections
+    from evaluators.pictures.line_laser import write_detections
     from mapper.sources.images import read_colour
 
     for place in sorted({k * (len(paths) - 1) // (_SHOWN - 1) for k in range(_SHOWN)}):

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from evaluators.cells import CellResult
 from evaluators.papers.measured import Measurement
 from evaluators.papers.model import PaperPath, PaperTable
+from evaluators.study.cells import CellResult
 from mapper.core.errors import ConfigError
 
 

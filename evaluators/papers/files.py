@@ -10,7 +10,7 @@ from textwrap import fill
 from evaluators.papers.layout import as_printed, compared, compares, counted, everything, failures, headline
 from evaluators.papers.model import RULE, PaperTable, Reproduction
 from evaluators.papers.plots import write_plots
-from evaluators.tables import (
+from evaluators.tables.table import (
     Column,
     Record,
     csv_text,

@@ -11,18 +11,18 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluators.cells import Cell
-from evaluators.cloud_distance import DistanceTo
+from evaluators.metrics.cloud_distance import DistanceTo
 from evaluators.papers.hough_pairs import Clouds, Pair, find_pairs
 from evaluators.papers.layout import file_name
-from evaluators.register import thinned
-from evaluators.scan_pairs import perturbed
-from evaluators.sweep_cell import environment
-from evaluators.tables import Record, Value
+from evaluators.papers.scan_pairs import perturbed
+from evaluators.pictures.registration import write_before_and_after
+from evaluators.register.registration import thinned
+from evaluators.study.cells import Cell
+from evaluators.sweep.build_job import environment
+from evaluators.tables.table import Record, Value
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, angle_between, inverse
 from mapper.core.rotations import euler_from_rotation
-from mapper.export.registration_picture import write_before_and_after
 from mapper.registration.hough.aligner import Hough, Stages
 from mapper.registration.hough.config import HoughConfig, HoughGicpConfig, HoughNdtConfig
 

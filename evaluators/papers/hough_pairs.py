@@ -9,7 +9,7 @@ from typing import Annotated, Protocol
 import numpy as np
 from pydantic import Field, PositiveFloat
 
-from evaluators.scan_pairs import fewer_rings, merged, moved
+from evaluators.papers.scan_pairs import fewer_rings, merged, moved
 from mapper.config.loading import read_config
 from mapper.core.config import Config
 from mapper.core.errors import MapperError, SourceError

@@ -8,7 +8,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from statistics import mean, median
 
-from evaluators.cells import CellResult
 from evaluators.papers.hough import DISTANCES, METHODS, OFFSET_M, picture_of
 from evaluators.papers.hough_pairs import (
     ALL_RINGS,
@@ -21,7 +20,8 @@ from evaluators.papers.hough_pairs import (
 )
 from evaluators.papers.model import PaperCell, PaperTable, Reproduction
 from evaluators.papers.published import published
-from evaluators.tables import Record, Value
+from evaluators.study.cells import CellResult
+from evaluators.tables.table import Record, Value
 
 NEAR_M = 0.03
 """A final MPD below it is the paper's success."""

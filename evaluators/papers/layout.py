@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from statistics import median
 
 from evaluators.papers.model import PaperCell, PaperTable, Reproduction
-from evaluators.tables import Column, Record
+from evaluators.tables.table import Column, Record
 
 _DIGITS = 3
 """Of figures that have no printed one beside them to show how many make sense."""

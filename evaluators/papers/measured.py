@@ -8,12 +8,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from evaluators.cells import Cell, CellResult
+from evaluators.metrics.trajectory import align, associate, ate
 from evaluators.papers.model import PaperCell
 from evaluators.papers.published import Figures
-from evaluators.sweep_cell import environment
-from evaluators.tables import Record
-from evaluators.trajectory import align, associate, ate
+from evaluators.study.cells import Cell, CellResult
+from evaluators.sweep.build_job import environment
+from evaluators.tables.table import Record
 from mapper.config.build import BuildConfig
 from mapper.core.trajectory import Trajectory
 from mapper.run.fingerprint import fingerprint

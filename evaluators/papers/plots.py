@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evaluators.odometry_scores import position_errors_m
+from evaluators.metrics.odometry import position_errors_m
+from evaluators.metrics.trajectory import associate
 from evaluators.papers.layout import compares, file_name
 from evaluators.papers.model import PaperCell, PaperPath, PaperTable, Reproduction
-from evaluators.trajectory import associate
+from evaluators.pictures.path_errors import add_color_bar, draw_path
 from mapper.core.geometry import Array
-from mapper.export.errors_picture import add_color_bar, draw_path
 from mapper.export.page import FAINT, INK, LINE, hex_of, save
 from mapper.export.palette import ESTIMATE, TRUTH
 from mapper.export.panels import draw_boxes, page, panel

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from evaluators.cells import Cell, CellResult, run_cells
 from evaluators.papers import thesis, zhao
 from evaluators.papers.book import Book, Cut
 from evaluators.papers.files import write_reproduction
@@ -15,6 +14,7 @@ from evaluators.papers.hough_tables import hough_reproduction
 from evaluators.papers.measured import cell_for
 from evaluators.papers.model import Reproduction
 from evaluators.papers.sequences import Found, find_sequences
+from evaluators.study.cells import Cell, CellResult, run_cells
 from mapper.core.errors import ConfigError, DataError
 from mapper.runtime.atomic import resumable_folder, write_text
 from mapper.runtime.progress import SILENT, Progress

@@ -4,17 +4,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from evaluators.cells import CellResult
+from evaluators.metrics.trajectory import align, associate, ate
 from evaluators.papers.ablation import Followed, follow
 from evaluators.papers.book import Book, Cut
 from evaluators.papers.measured import Place, cells_of, failed, measured, notes_of
 from evaluators.papers.model import PaperCell, PaperPath, PaperTable
 from evaluators.papers.sequences import slug
 from evaluators.papers.thesis_tables import Setting, tables
-from evaluators.tables import Record
-from evaluators.trajectory import align, associate, ate
+from evaluators.study.cells import CellResult
+from evaluators.study.seeds import seeded
+from evaluators.tables.table import Record
 from mapper.config.build import BuildConfig
-from mapper.config.seeds import seeded
 from mapper.core.errors import DataError
 from mapper.core.trajectory import Trajectory
 from mapper.sources import open_source

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evaluators.metrics.trajectory import associate, rpe
 from evaluators.papers.measured import CONFIGS, ate_rmse_m
 from evaluators.papers.published import Figures, figures, published
-from evaluators.trajectory import associate, rpe
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_config
 from mapper.core.geometry import inverse, rotation_log

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from evaluators.cells import CellResult
 from evaluators.papers.book import Book, Cut
 from evaluators.papers.measured import CONFIGS, Place, ate_rmse_m, cells_of, measured, notes_of
 from evaluators.papers.model import PaperCell, PaperTable
 from evaluators.papers.published import figures, published
 from evaluators.papers.sequences import slug
-from evaluators.tables import Record
+from evaluators.study.cells import CellResult
+from evaluators.study.seeds import seeded
+from evaluators.tables.table import Record
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_config
-from mapper.config.seeds import seeded
 from mapper.core.errors import DataError
 from mapper.pipeline.build import build
 from mapper.run.files import CLOUD, OCTREE_BT

@@ -1,0 +1,70 @@
+"""The methods that `mapper compare` knows, set up for a log's sensor."""
+
+from functools import partial
+
+from evaluators.compare.config import CompareConfig
+from evaluators.compare.methods import AnyRegistration, Method, odometry_method, registration_method
+from evaluators.compare.scales import kiss_icp, registrations_for
+from mapper.core.errors import ConfigError
+from mapper.core.frames import Sensor
+from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig, PnpConfig
+from mapper.odometry.factory import build_frame_odometry
+from mapper.registration.config import NEED_NO_GUESS
+from mapper.registration.factory import build_registration
+from mapper.sources.base import Log
+
+
+def methods_for(source: Log, config: CompareConfig) -> tuple[list[Method], list[str]]:
+    """Return the chosen methods that can use a log, and a sentence on those that cannot.
+
+    Raises:
+        ConfigError: No method of such a name, or none of them can use the log.
+    """
+    images, scans = _image_methods(config.rgbd.max_depth_m), _scan_methods(source.sensor)
+    names = [method.name for method in (*images, *scans)]
+    for name in config.methods:
+        if name not in names:
+            raise ConfigError(f"no method {name!r}; want one of {', '.join(names)}")
+    chosen = config.methods or names
+    blind = [m.name for m in images if m.name in chosen and source.sensor != "rgbd"]
+    methods = [m for m in (*images, *scans) if m.name in chosen and m.name not in blind]
+    notes = [f"{', '.join(blind)}: left out, for the log has no images"] if blind else []
+    if not methods:
+        raise ConfigError(f"{source.path}: {notes[0]}; choose others of {', '.join(m.name for m in scans)}")
+    return methods, notes
+
+
+def _image_methods(max_depth_m: float) -> list[Method]:
+    odometries = (
+        LocalMapConfig(max_depth_m=max_depth_m),
+        IsvdOdometryConfig(max_depth_m=max_depth_m),
+        PnpConfig(max_depth_m=max_depth_m),
+    )
+
+    def hybrid() -> AnyRegistration:
+        from mapper.registration.rgbd import HybridRgbd  # Open3D takes seconds to load
+
+        return HybridRgbd(max_depth_m=max_depth_m)
+
+    return [
+        *(
+            odometry_method(one.kind, partial(build_frame_odometry, one), sees_images=True)
+            for one in odometries
+        ),
+        registration_method("rgbd", hybrid, uses_guess=True, sees_images=True),
+    ]
+
+
+def _scan_methods(sensor: Sensor) -> list[Method]:
+    """Return every registration of scans, those that need a guess first, and KISS-ICP."""
+    registrations = [
+        registration_method(
+            one.kind, partial(build_registration, one), uses_guess=one.kind not in NEED_NO_GUESS
+        )
+        for one in registrations_for(sensor)
+    ]
+    kiss = kiss_icp(sensor)
+    return [
+        *sorted(registrations, key=lambda method: not method.uses_guess),
+        odometry_method(kiss.kind, partial(build_frame_odometry, kiss), sees_images=False),
+    ]

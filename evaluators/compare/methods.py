@@ -1,0 +1,216 @@
+"""What `mapper compare` sets side by side: odometries, and registrations that serve as odometries."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from evaluators.compare.frames import Moment
+from mapper.core.errors import FrameError
+from mapper.core.frames import Frame, RgbdFrame, Scan
+from mapper.core.geometry import Transform, apply, interpolate, inverse, nearest_rotation, transform
+from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.graph.model import PoseGraph
+from mapper.odometry.base import FrameOdometry, FrameResult
+from mapper.pipeline.components import largest_component
+from mapper.pipeline.track import TrackingResult
+from mapper.registration.base import Alignment, failed
+from mapper.runtime.progress import SILENT
+
+
+class AnyAligner(Protocol):
+    """A method bound to one target, of frames or of scans."""
+
+    def align(self, source: Any, T_target_source: Transform, /) -> Alignment:
+        """Return the motion, refined from a guess if the method has use for one."""
+        ...
+
+
+class AnyRegistration(Protocol):
+    """A method of registering pairs of frames, or of scans."""
+
+    def prepare(self, target: Any, /) -> AnyAligner:
+        """Return the method bound to a target."""
+        ...
+
+
+class Tracker(Protocol):
+    """A method at work on a whole log."""
+
+    def add(self, frame: Any, /) -> bool:
+        """Place the next frame, in time order, and tell whether the method found where it is."""
+        ...
+
+    def trajectory(self) -> Trajectory:
+        """Return the poses of all frames that have one, the first at the origin or near it."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Method:
+    """One row of the comparison.
+
+    Attributes:
+        name: What it is called, on the command line too.
+        sees_images: It gets the log's frames; otherwise the scans that are the same for all.
+        uses_guess: Its registration begins at the guess; otherwise it has no use for one.
+        tracker: Makes one for a log.
+        registration: Makes one for pairs.
+    """
+
+    name: str
+    sees_images: bool
+    uses_guess: bool
+    tracker: Callable[[], Tracker]
+    registration: Callable[[], AnyRegistration]
+
+    def view(self, moment: Moment) -> Frame:
+        """Return what the method gets of a frame."""
+        return moment.frame if self.sees_images else moment.scan
+
+
+def odometry_method(name: str, build: Callable[[], FrameOdometry[Any]], *, sees_images: bool) -> Method:
+    """Return a row for an odometry of the project."""
+    return Method(
+        name,
+        sees_images=sees_images,
+        uses_guess=not sees_images,
+        tracker=lambda: OdometryTracker(build()),
+        registration=lambda: OdometryPairs(build),
+    )
+
+
+def registration_method(
+    name: str, build: Callable[[], AnyRegistration], *, uses_guess: bool, sees_images: bool = False
+) -> Method:
+    """Return a row for a registration; as an odometry it registers each frame to the one before it."""
+    return Method(
+        name,
+        sees_images=sees_images,
+        uses_guess=uses_guess,
+        tracker=lambda: FrameToFrame(build()),
+        registration=build,
+    )
+
+
+def reason_of(error: Exception) -> str:
+    """Return what broke, in one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+class OdometryTracker:
+    """An odometry of the project with its own estimates: no loops, and nothing solved afterwards."""
+
+    def __init__(self, odometry: FrameOdometry[Any]) -> None:
+        self._odometry = odometry
+        self._tracks: list[FrameResult] = []
+
+    def add(self, frame: Frame) -> bool:
+        """Observe and track the frame; one that cannot be used is lost."""
+        try:
+            observation = self._odometry.observe(frame)
+        except FrameError:
+            return False
+        track = self._odometry.track(observation)
+        self._tracks.append(track)
+        return track.node is not None
+
+    def trajectory(self) -> Trajectory:
+        """Return the largest part of the path that hangs together."""
+        graph = PoseGraph()
+        for track in self._tracks:
+            if track.is_keyframe and track.node is not None:
+                graph.add_node(track.node, track.stamp_ns, track.T_world_body)
+        graph.add_factors(factor for track in self._tracks for factor in track.factors)
+        graph.add_factors(self._odometry.finish())
+        tracking = TrackingResult(tuple(self._tracks), (), graph, (), {})
+        return largest_component(tracking, progress=SILENT).trajectory()
+
+
+class OdometryPairs:
+    """An odometry as a registration: it sees the target, then the source, and nothing else.
+
+    It takes no guess. A scan is moved by the guess before it is shown, which comes to the same; what a scan's
+    image would look like from elsewhere, nobody knows.
+    """
+
+    def __init__(self, build: Callable[[], FrameOdometry[Any]]) -> None:
+        self._build = build
+
+    def prepare(self, target: Frame) -> "OdometryPair":
+        """Return an odometry that has seen the target."""
+        return OdometryPair(self._build(), target)
+
+
+class OdometryPair:
+    """An odometry that has seen one frame; good for one alignment, for it remembers that too."""
+
+    def __init__(self, odometry: FrameOdometry[Any], target: Frame) -> None:
+        self._odometry = odometry
+        self._target = odometry.track(odometry.observe(target))
+
+    def align(self, source: Frame, T_target_source: Transform) -> Alignment:
+        """Return where the odometry finds the second frame."""
+        if self._target.node is None:
+            return failed("the target alone was lost")
+        guess = T_target_source if isinstance(source, Scan) else np.eye(4)
+        track = self._odometry.track(self._odometry.observe(_seen_from(guess, source)))
+        if track.node is None:
+            return failed("the source was lost")
+        return Alignment(
+            inverse(self._target.T_world_body) @ track.T_world_body @ guess,
+            converged=True,
+            inlier_ratio=track.diagnostics.inliers / max(track.diagnostics.matches, 1),
+            inlier_rmse_m=track.diagnostics.residual if track.diagnostics.residual_unit == "m" else np.nan,
+            pairs=track.diagnostics.inliers,
+        )
+
+
+def _seen_from(T_target_source: Transform, source: Frame) -> Frame:
+    """Return a scan's points in the target's frame; an image stays what it is."""
+    if isinstance(source, RgbdFrame):
+        return source
+    points = apply(T_target_source, source.points_body.astype(np.float64)).astype(np.float32)
+    origin = T_target_source[:3, :3] @ source.origin_body + T_target_source[:3, 3]
+    return Scan(source.stamp_ns, points, origin, times_s=source.times_s)
+
+
+class FrameToFrame:
+    """Registers every frame to the one before it, from the motion before it.
+
+    Where that does not converge, the motion before carries on: every frame has a pose.
+    """
+
+    def __init__(self, registration: AnyRegistration) -> None:
+        self._registration = registration
+        self._aligner: AnyAligner | None = None
+        self._poses: list[tuple[int, Transform]] = []
+        self._T_before_last = np.eye(4)
+        self._before_ns = 0  # from the frame before the last to the last
+
+    def add(self, frame: Frame) -> bool:
+        """Register the frame to the last one, and make it the next one's target."""
+        if self._aligner is None:
+            self._aligner = self._registration.prepare(frame)
+            self._poses.append((frame.stamp_ns, np.eye(4)))
+            return True
+        last_ns, T_world_last = self._poses[-1]
+        guess = self._guess(frame.stamp_ns - last_ns)
+        alignment = self._aligner.align(frame, guess)
+        T_last_this = alignment.T_target_source if alignment.converged else guess
+        T = T_world_last @ T_last_this
+        self._poses.append((frame.stamp_ns, transform(nearest_rotation(T[:3, :3]), T[:3, 3])))
+        self._T_before_last, self._before_ns = T_last_this, frame.stamp_ns - last_ns
+        self._aligner = self._registration.prepare(frame)
+        return alignment.converged
+
+    def trajectory(self) -> Trajectory:
+        """Return every frame's pose in the first frame."""
+        return trajectory_from(self._poses)
+
+    def _guess(self, gap_ns: int) -> Transform:
+        """Return the motion of so long a time at the velocity before it."""
+        if self._before_ns == 0:
+            return np.eye(4)
+        return interpolate(np.eye(4), self._T_before_last, gap_ns / self._before_ns)

@@ -1,0 +1,1 @@
+"""A depth camera's errors and noise, measured on planes."""

@@ -1,0 +1,1 @@
+"""The line-laser sensor's detections and ranges against labels and rendered truth."""

@@ -1,0 +1,143 @@
+"""A line-laser sensor's images against labels: every method's stripe, and the ranges."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from evaluators.line_laser.scores import (
+    DETECTION_COLUMNS,
+    TABLE_2_1,
+    Counts,
+    count_all,
+    detection_records,
+    percent,
+    summed,
+)
+from evaluators.tables.table import Column, Record, csv_text, text_table
+from mapper.core.errors import SourceError
+from mapper.core.geometry import Array
+from mapper.line_laser.config import StripeConfig
+from mapper.line_laser.detection import Method
+from mapper.line_laser.ranging import LineScan
+from mapper.runtime.atomic import write_text
+from mapper.sources.images import read_colour
+from mapper.sources.text import parse_numbers, rows
+
+_NEAR_M = 0.1
+
+_RANGE_COLUMNS = (
+    Column("range_m", "range m"),
+    Column("columns", "columns"),
+    Column("median_error_ratio", "median error %", percent),
+    Column("p90_error_ratio", "90th percentile %", percent),
+    Column("thesis_error_ratio", "thesis %", percent),
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judgement:
+    """How right a sensor was about labelled images.
+
+    Attributes:
+        images: How many.
+        counts: What every method found.
+        true_m: (N,) ranges in all columns in which a stripe was and was found.
+        found_m: (N,) what was measured there.
+    """
+
+    images: int
+    counts: Mapping[Method, Counts]
+    true_m: Array
+    found_m: Array
+
+    @property
+    def text(self) -> str:
+        """Both tables, for a terminal."""
+        detections = text_table(DETECTION_COLUMNS, detection_records(self.counts))
+        return f"{detections}\n\n{text_table(_RANGE_COLUMNS, range_records(self.true_m, self.found_m))}"
+
+    def write(self, folder: Path) -> None:
+        """Write both tables as ``detections.csv`` and ``range_errors.csv``."""
+        write_text(folder / "detections.csv", csv_text(detection_records(self.counts)))
+        write_text(folder / "range_errors.csv", csv_text(range_records(self.true_m, self.found_m)))
+
+
+def judge(
+    scans: Mapping[Path, LineScan], labels: Mapping[str, tuple[Array, Array]], config: StripeConfig
+) -> Judgement:
+    """Return how right scans are whose images have labels; the others do not count.
+
+    Args:
+        scans: By their images.
+        labels: As :func:`read_labels` gives them.
+        config: How a stripe is found.
+
+    Raises:
+        FrameError: An image can no longer be read.
+    """
+    labelled = {path: scan for path, scan in scans.items() if path.name in labels}
+    counts = summed(count_all(read_colour(path), labels[path.name][0], config) for path in labelled)
+    true_m = np.concatenate([labels[path.name][1][scan.columns] for path, scan in labelled.items()])
+    found_m = np.concatenate([scan.points_sensor[:, 0] for scan in labelled.values()])
+    both = np.isfinite(true_m)
+    return Judgement(len(labelled), counts, true_m[both], found_m[both])
+
+
+def range_records(true_m: Array, found_m: Array) -> list[Record]:
+    """Return one record for each range of Table 2.1, from the columns that are truly as far within 10 cm.
+
+    Args:
+        true_m: (N,) where the stripe was.
+        found_m: (N,) where it was measured.
+    """
+    records: list[Record] = []
+    for range_m, published_m in TABLE_2_1.items():
+        near = np.abs(true_m - range_m) <= _NEAR_M
+        errors = np.abs(found_m[near] - true_m[near]) / true_m[near]
+        records.append(
+            {
+                "range_m": range_m,
+                "columns": int(near.sum()),
+                "median_error_ratio": float(np.median(errors)) if near.any() else None,
+                "p90_error_ratio": float(np.percentile(errors, 90)) if near.any() else None,
+                "thesis_error_ratio": abs(published_m - range_m) / range_m,
+            }
+        )
+    return records
+
+
+def read_labels(path: Path, *, images: Sequence[Path], width_px: int) -> dict[str, tuple[Array, Array]]:
+    """Return (W,) true rows and (W,) true ranges, NaN where there is no stripe, by the name of the image.
+
+    Args:
+        path: Lines ``image,column,row_px,range_m``; an image without a stripe has none.
+        images: Of which one at least has to have labels.
+        width_px: W.
+
+    Raises:
+        SourceError: The file is missing or malformed, or tells of other images.
+    """
+    labels: dict[str, tuple[Array, Array]] = {}
+    for number, words in rows(path, separator=","):
+        where = f"{path}:{number}"
+        if words[0] == "image":
+            continue
+        if len(words) != 4:
+            raise SourceError(f"{where}: {len(words)} columns, want 4: image,column,row_px,range_m")
+        column, row_px, range_m = parse_numbers(words[1:], where=where)
+        if not (0.0 <= column < width_px and column == int(column)):
+            raise SourceError(f"{where}: column {words[1]}, want a whole number from 0 to {width_px - 1}")
+        if words[0] not in labels:
+            labels[words[0]] = (np.full(width_px, np.nan), np.full(width_px, np.nan))
+        true_rows, ranges_m = labels[words[0]]
+        true_rows[int(column)], ranges_m[int(column)] = row_px, range_m
+    if not labels:
+        raise SourceError(f"{path}: no labels; want lines of image,column,row_px,range_m")
+    if labels.keys().isdisjoint(image.name for image in images):
+        raise SourceError(
+            f"{path}: of {next(iter(labels))} and others, but images are {images[0].name} and others: "
+            "none has labels; do the names agree?"
+        )
+    return labels

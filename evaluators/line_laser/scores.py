@@ -1,0 +1,127 @@
+"""How well each method finds a laser's stripe, and what the thesis's sensor measured."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluators.tables.table import Column, Record
+from mapper.core.frames import Image
+from mapper.core.geometry import Array
+from mapper.line_laser.config import StripeConfig
+from mapper.line_laser.detection import METHODS, Method, Response, responses, stripe_rows
+
+TABLE_2_1: Mapping[float, float] = {0.5: 0.50, 1.0: 0.99, 1.5: 1.45, 1.7: 1.65}
+"""Metres: what was true, and what the thesis's sensor measured."""
+
+TOLERANCE_PX = 3.0
+"""A pixel within this distance of the stripe's true middle shows the stripe."""
+
+
+def percent(share: float) -> str:
+    """Return a share as a table shows it."""
+    return f"{100.0 * share:.1f}"
+
+
+DETECTION_COLUMNS = (
+    Column("method", "method"),
+    Column("precision", "precision %", percent),
+    Column("recall", "recall %", percent),
+    Column("f_score", "F %", percent),
+    Column("pixel_precision", "pixels' precision %", percent),
+    Column("pixel_recall", "pixels' recall %", percent),
+    Column("pixel_f_score", "pixels' F %", percent),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """What a method found in some images; counts of several images add up.
+
+    Attributes:
+        stripe_columns: Columns with a stripe.
+        marked: Pixels the method kept.
+        right: Those of them that show the stripe.
+        reached: Columns whose stripe has such a pixel.
+        rows: Columns for which the method gives one row.
+        right_rows: Those of them whose row is the stripe's.
+    """
+
+    stripe_columns: int = 0
+    marked: int = 0
+    right: int = 0
+    reached: int = 0
+    rows: int = 0
+    right_rows: int = 0
+
+    def __add__(self, other: "Counts") -> "Counts":
+        return Counts(
+            self.stripe_columns + other.stripe_columns,
+            self.marked + other.marked,
+            self.right + other.right,
+            self.reached + other.reached,
+            self.rows + other.rows,
+            self.right_rows + other.right_rows,
+        )
+
+    @property
+    def pixels(self) -> tuple[float, float, float]:
+        """Precision, recall and F of the pixels: what share is right, what share of the stripe they reach."""
+        return _scores(self.right, self.marked, self.reached, self.stripe_columns)
+
+    @property
+    def columns(self) -> tuple[float, float, float]:
+        """Precision, recall and F of the one row that each column gives."""
+        return _scores(self.right_rows, self.rows, self.right_rows, self.stripe_columns)
+
+
+def count(response: Response, true_rows: Array, *, join_px: int) -> Counts:
+    """Return what a method's (H, W) response says of (W,) true rows, NaN where there is no stripe."""
+    found = stripe_rows(response, join_px=join_px)
+    right = (response > 0) & is_right(np.arange(float(len(response)))[:, None], true_rows)
+    return Counts(
+        stripe_columns=int(np.isfinite(true_rows).sum()),
+        marked=int(np.count_nonzero(response)),
+        right=int(right.sum()),
+        reached=int(right.any(axis=0).sum()),
+        rows=int(np.isfinite(found).sum()),
+        right_rows=int(is_right(found, true_rows).sum()),
+    )
+
+
+def count_all(image: Image, true_rows: Array, config: StripeConfig) -> dict[Method, Counts]:
+    """Return what every method finds in an (H, W, 3) RGB image with its (W,) true rows."""
+    return {
+        method: count(response, true_rows, join_px=config.join_px)
+        for method, response in responses(image, config).items()
+    }
+
+
+def summed(counts: Iterable[Mapping[Method, Counts]]) -> dict[Method, Counts]:
+    """Return the counts of several images together."""
+    total = dict.fromkeys(METHODS, Counts())
+    for one in counts:
+        total = {method: total[method] + one[method] for method in METHODS}
+    return total
+
+
+def is_right(found: Array, true_rows: Array) -> NDArray[np.bool_]:
+    """Tell in which of (W,) columns the row that was found is the stripe's."""
+    right: NDArray[np.bool_] = np.abs(found - true_rows) <= TOLERANCE_PX  # False where NaN
+    return right
+
+
+def detection_records(counts: Mapping[Method, Counts]) -> list[Record]:
+    """Return one record for each method."""
+    return [
+        {"method": method}
+        | dict(zip(("precision", "recall", "f_score"), found.columns, strict=True))
+        | dict(zip(("pixel_precision", "pixel_recall", "pixel_f_score"), found.pixels, strict=True))
+        for method, found in counts.items()
+    ]
+
+
+def _scores(right: int, found: int, reached: int, wanted: int) -> tuple[float, float, float]:
+    precision, recall = right / max(found, 1), reached / max(wanted, 1)
+    return precision, recall, 2.0 * precision * recall / max(precision + recall, 1e-12)

@@ -1,0 +1,128 @@
+"""What a run's map is worth, held against a reference."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from evaluators.metrics.cloud_distance import CloudDistance, DistanceTo
+from evaluators.metrics.map_reference import Reference, held_against
+from evaluators.metrics.metric import Metric
+from evaluators.metrics.occupancy import Verdict, verdict_metrics
+from evaluators.metrics.trajectory import associate
+from mapper.core.errors import DataError
+from mapper.core.frames import Points32
+from mapper.core.geometry import Transform, apply, inverse, mean_rotation, transform
+from mapper.octree.octomap_file import read_map
+from mapper.registration.refining import refined_motion
+from mapper.registration.surfaces import prepared
+from mapper.run import files
+from mapper.run.folder import Run
+from mapper.sources.cloud_files import read_cloud
+
+_PAIR_VOXELS = 3.0
+"""How far apart the points of a pair may be while a reference is registered."""
+
+World = Literal["truth", "map"]
+"""In which world a reference lies: that of the log's truth, or the run's own, which is levelled."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapQuality:
+    """A map held against a reference.
+
+    Attributes:
+        metrics: Every number; the first says how the reference was laid.
+        verdict: The voxels that they come from.
+    """
+
+    metrics: tuple[Metric, ...]
+    verdict: Verdict
+
+
+def map_quality(
+    run: Run, reference: Reference, *, world: World | None = None, voxels: int = 1, register: bool = False
+) -> MapQuality:
+    """Return how right a run's octree and cloud are.
+
+    Args:
+        run: A finished run.
+        reference: What to hold it against.
+        world: In which the reference lies; None is the truth's for the world of a synthetic log, else the
+            run's own.
+        voxels: How far apart the surfaces may be, in voxels.
+        register: Refine how the reference is laid by point-to-plane ICP with the run's cloud.
+
+    Raises:
+        DataError: The log has no truth to lay the reference by, the two share no known surface, or there are
+            no points to register.
+    """
+    world = world or ("truth" if reference.in_truth else "map")
+    octree = read_map(run.path / files.OCTREE_MAP)
+    cloud = read_cloud(run.path / files.CLOUD, scale=1.0).points
+    T_map_reference = _laid_by_truth(run) if world == "truth" else np.eye(4)
+    how = "by the truth's poses" if world == "truth" else "in the run's own world"
+    if register:
+        refined = _registered(reference, cloud, T_map_reference, voxel_m=octree.resolution_m)
+        moved_m = float(np.linalg.norm((inverse(T_map_reference) @ refined)[:3, 3]))
+        T_map_reference, how = refined, f"{how}, then registered"
+    verdict = held_against(octree, reference, T_map_reference, voxels=voxels)
+    metrics = [
+        Metric(f"map held against the {reference.name}, laid {how}", len(verdict.occupied), "voxels"),
+        *([Metric("registration moved it by", moved_m, "m")] if register else []),
+        *verdict_metrics(verdict),
+        *_distances(reference, verdict, cloud, T_map_reference),
+    ]
+    return MapQuality(tuple(metrics), verdict)
+
+
+def _laid_by_truth(run: Run) -> Transform:
+    """Return T_map_truth, by all poses that have a true one.
+
+    Positions alone would leave a log that hardly leaves its place to turn about it.
+    """
+    truth = run.truth()
+    if truth is None:
+        raise DataError(f"{run.path}: its log has no truth to lay a reference by; pass --map-world map")
+    matched = associate(run.trajectory(), truth, names=(str(run.path), "its truth"))
+    R_map, R_truth = matched.T_map_body[:, :3, :3], matched.T_truth_body[:, :3, :3]
+    R = mean_rotation(R_map @ np.swapaxes(R_truth, 1, 2), np.ones(len(matched)))
+    return transform(R, (matched.T_map_body[:, :3, 3] - matched.T_truth_body[:, :3, 3] @ R.T).mean(axis=0))
+
+
+def _registered(
+    reference: Reference, cloud: Points32, T_map_reference: Transform, *, voxel_m: float
+) -> Transform:
+    if reference.points is None:
+        raise DataError("--register: a world that is known exactly has no points to register")
+    found = refined_motion(
+        prepared(cloud, voxel_m=voxel_m),
+        prepared(reference.points, voxel_m=voxel_m),
+        T_map_reference,
+        kind="plane-icp",
+        pair_distances_m=(_PAIR_VOXELS * voxel_m,),
+    )
+    if isinstance(found, str):
+        raise DataError(f"--register: {found}")
+    return found
+
+
+def _distances(
+    reference: Reference, verdict: Verdict, cloud: Points32, T_map_reference: Transform
+) -> list[Metric]:
+    """Return modified Hausdorff and median distances: both ways, but from a world known exactly none."""
+    T_reference_map = inverse(T_map_reference)
+    if reference.signed_distance_m is not None:
+        distances_m = np.abs(reference.signed_distance_m(apply(T_reference_map, cloud.astype(np.float64))))
+        there = CloudDistance(float(distances_m.mean()), float(np.median(distances_m)))
+        return _both(there, "cloud → reference")
+    assert reference.points is not None
+    points = reference.points.astype(np.float32)
+    there = DistanceTo(points).of(cloud, T_reference_map)
+    seen = points[verdict.seen_at(apply(T_map_reference, reference.points))]
+    back = DistanceTo(cloud).of(seen, T_map_reference)
+    return _both(there, "cloud → reference") + _both(back, "reference → cloud where the map looked")
+
+
+def _both(distance: CloudDistance, way: str) -> list[Metric]:
+    return [Metric(f"MHD, {way}", distance.mhd_m, "m"), Metric(f"MPD, {way}", distance.mpd_m, "m")]

@@ -1,0 +1,121 @@
+"""What a map is held against: a cloud, another map, or the world of a synthetic log."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from evaluators.metrics.occupancy import (
+    LogOddsAt,
+    SignedDistance,
+    Verdict,
+    judged_by_distance,
+    judged_by_points,
+)
+from evaluators.metrics.scenes import SCENE, scene_distance
+from mapper.core.errors import DataError
+from mapper.core.geometry import Points, Transform, apply, inverse
+from mapper.core.voxel_grid import thin
+from mapper.octree.map import OctreeMap
+from mapper.octree.octomap_file import read_map
+from mapper.run.files import OCTREE_MAP
+from mapper.sources.cloud_files import ENDINGS, read_cloud
+
+MAP_ENDINGS = (".bt", ".ot", ".octree")
+_WANTED = (
+    f"want a cloud ({' '.join(ENDINGS)}), an octree ({' '.join(MAP_ENDINGS)}), a run, or a synthetic log"
+)
+_MOST_POINTS = 50_000_000  # 1.2 GB
+_THINNED_RATIO = 0.25  # of a voxel: a cloud so thin still fills every voxel that it filled
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reference:
+    """A reference in its own frame.
+
+    Attributes:
+        name: What it is, for a reader.
+        points: (N, 3) metres on its surfaces, no two in a quarter of the map's voxels; None for a world that
+            is known exactly.
+        signed_distance_m: Of a world that is known exactly, else None.
+        log_odds_at: Of a map, else None.
+        in_truth: It lies in the world of the log's truth.
+    """
+
+    name: str
+    points: Points | None = None
+    signed_distance_m: SignedDistance | None = None
+    log_odds_at: LogOddsAt | None = None
+    in_truth: bool = False
+
+
+def read_reference(path: Path, *, voxel_m: float) -> Reference:
+    """Return the reference of a file, of another run's folder, or of a synthetic log's.
+
+    Args:
+        path: A cloud, an octree, a ``scene.json``, or a folder with one of the latter two.
+        voxel_m: Edge of the voxels of the map that it is for.
+
+    Raises:
+        DataError: It is nothing of the kind.
+        MapperError: The file cannot be read or is damaged.
+    """
+    if not path.exists():
+        raise DataError(f"{path}: no such reference for a map; {_WANTED}")
+    if path.is_dir():
+        inside = [path / name for name in (OCTREE_MAP, SCENE) if (path / name).is_file()]
+        if not inside:
+            raise DataError(f"{path}: has neither {OCTREE_MAP} nor {SCENE}; {_WANTED}")
+        path = inside[0]
+    ending = path.suffix.lower()
+    if ending == ".json":
+        return Reference("synthetic world", signed_distance_m=scene_distance(path), in_truth=True)
+    if ending in MAP_ENDINGS:
+        return _octree(read_map(path), voxel_m)
+    if ending in ENDINGS:
+        points = read_cloud(path).points
+        return Reference("cloud", points=points[thin(points, _THINNED_RATIO * voxel_m)].astype(np.float64))
+    raise DataError(f"{path}: not a reference for a map; {_WANTED}")
+
+
+def held_against(
+    octree: OctreeMap, reference: Reference, T_map_reference: Transform, *, voxels: int
+) -> Verdict:
+    """Return which voxels of a map are right.
+
+    Raises:
+        DataError: The two share no known surface.
+    """
+    T_reference_map = inverse(T_map_reference)
+    if (distance_m := reference.signed_distance_m) is not None:
+        return judged_by_distance(
+            octree, lambda points_map: distance_m(apply(T_reference_map, points_map)), voxels=voxels
+        )
+    assert reference.points is not None
+    log_odds_at = reference.log_odds_at
+    return judged_by_points(
+        octree,
+        apply(T_map_reference, reference.points),
+        log_odds_at=None
+        if log_odds_at is None
+        else lambda points_map: log_odds_at(apply(T_reference_map, points_map)),
+        voxels=voxels,
+    )
+
+
+def _octree(octree: OctreeMap, voxel_m: float) -> Reference:
+    leaves = octree.leaves()
+    centres = leaves.centres_world[leaves.log_odds >= octree.occupied_log_odds]
+    if not len(centres):
+        raise DataError("reference: no voxel of the map is occupied, so it has no surface")
+    # A large voxel is as many points as it has of the other map's voxels.
+    pieces = max(1, int(np.ceil(octree.resolution_m / voxel_m)))
+    if len(centres) * pieces**3 > _MOST_POINTS:
+        raise DataError(
+            f"reference: {len(centres)} voxels of {octree.resolution_m:g} m are too coarse for a map of "
+            f"{voxel_m:g} m: {len(centres) * pieces**3} points, over {_MOST_POINTS}; compare a coarser map"
+        )
+    steps = ((np.arange(pieces) + 0.5) / pieces - 0.5) * octree.resolution_m
+    offsets = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    points = (centres[:, None] + offsets).reshape(-1, 3)
+    return Reference("octree", points=points, log_odds_at=octree.query)

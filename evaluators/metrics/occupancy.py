@@ -1,0 +1,244 @@
+"""How right an occupancy map is: about a world known exactly, a cloud, or another map."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluators.metrics.metric import Metric
+from mapper.core.errors import DataError
+from mapper.core.geometry import Array, Points
+from mapper.octree.keys import KEY_COUNT, KEY_ZERO
+from mapper.octree.map import Leaves, OctreeMap
+
+SignedDistance = Callable[[Points], Array]
+"""Maps (N, 3) points in metres to their distances from the nearest surface, negative inside solids."""
+
+LogOddsAt = Callable[[Points], NDArray[np.float32]]
+"""Maps (N, 3) points in metres to log-odds, NaN where nothing is known."""
+
+Keys = NDArray[np.int64]
+Codes = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+_BITS, _MARGIN = 20, 1 << 10  # keys take 16 bits; a step beyond the first or the last must not borrow
+_MOST_SPREAD = 1 << 24
+_SQRT3 = float(np.sqrt(3.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """Every voxel that can be judged, and whether it is right.
+
+    Attributes:
+        occupied: (O, 3) keys of the map's occupied voxels where the reference knows anything.
+        right: (O,) whether the reference has a surface within the tolerance.
+        surface: (S, 3) keys of the voxels that the reference's surfaces pass through.
+        found: (S,) whether the map has an occupied voxel within the tolerance.
+        seen: (S,) found, or at least known to the map: what it never saw it cannot have missed.
+        free_right: (F,) for free voxels of the map that the reference knows, whether it is not solid there.
+        open_free: (G,) for voxels of the reference's open space that the map knows, whether they are free.
+        voxels: The tolerance.
+        resolution_m: Edge of a voxel.
+    """
+
+    occupied: Keys
+    right: Mask
+    surface: Keys
+    found: Mask
+    seen: Mask
+    free_right: Mask
+    open_free: Mask
+    voxels: int
+    resolution_m: float
+
+    def __post_init__(self) -> None:
+        if not len(self.occupied) or not self.seen.any():
+            raise DataError(
+                "occupancy: the map and the reference share no known surface; are both in one frame?"
+            )
+
+    @property
+    def centres_world(self) -> tuple[Points, Points, Points]:
+        """Centres of the occupied voxels that are right, of those that are not, and of surfaces not found."""
+        missing = self.surface[self.seen & ~self.found]
+        return (
+            self._centres(self.occupied[self.right]),
+            self._centres(self.occupied[~self.right]),
+            self._centres(missing),
+        )
+
+    def _centres(self, keys: Keys) -> Points:
+        centres: Points = (keys.astype(np.float64) - (KEY_ZERO - 0.5)) * self.resolution_m
+        return centres
+
+    def seen_at(self, points_world: Points) -> Mask:
+        """Tell for each of (N, 3) points on the reference's surfaces whether the map saw its voxel."""
+        return _among(_codes(_lattice(points_world, self.resolution_m)), _codes(self.surface[self.seen]))
+
+
+def judged_by_distance(octree: OctreeMap, signed_distance_m: SignedDistance, *, voxels: int = 1) -> Verdict:
+    """Return the verdict of a world whose solids are known exactly.
+
+    An occupied voxel is right if its middle is within the tolerance, and half a voxel, of a solid; a free one
+    if it is as near to free space. Surfaces are those that pass through the middle half of a voxel which the
+    map knows; open space is what has no solid within the tolerance.
+
+    Args:
+        octree: The map, in the frame of the truth.
+        signed_distance_m: The truth.
+        voxels: The tolerance.
+
+    Raises:
+        DataError: The map is empty, or knows no surface.
+    """
+    leaves, occupied = _known(octree)
+    edge_m = leaves.resolution_m
+    reach_m = (voxels + 0.5) * edge_m
+    distance_m = signed_distance_m(leaves.centres_world)
+    keys = leaves.keys.astype(np.int64)
+    surface = keys[np.abs(distance_m) <= 0.25 * edge_m]
+    return Verdict(
+        occupied=keys[occupied],
+        right=distance_m[occupied] <= reach_m,
+        surface=surface,
+        found=_near(surface, keys[occupied], voxels=voxels),
+        seen=np.ones(len(surface), np.bool_),
+        free_right=distance_m[~occupied] >= -reach_m,
+        open_free=~occupied[distance_m > reach_m * _SQRT3],
+        voxels=voxels,
+        resolution_m=edge_m,
+    )
+
+
+def judged_by_points(
+    octree: OctreeMap, points_world: Points, *, log_odds_at: LogOddsAt | None = None, voxels: int = 1
+) -> Verdict:
+    """Return the verdict of a reference of which points on its surfaces are known, and perhaps free space.
+
+    Tolerances are whole voxels along each axis. Free voxels are right unless the reference is solid there and
+    the map has no surface within the tolerance; open space is what is free with no surface so near.
+
+    Args:
+        octree: The map.
+        points_world: (N, 3) metres, in the map's world, so dense that no voxel of a surface is left out.
+        log_odds_at: What the reference knows of the map's world; None knows surfaces alone, so that every
+            occupied voxel is judged and no free one.
+        voxels: The tolerance.
+
+    Raises:
+        DataError: The map is empty, or knows none of the surfaces.
+    """
+    leaves, occupied = _known(octree)
+    keys = leaves.keys.astype(np.int64)
+    surface = _keys_of(points_world, leaves.resolution_m)
+    near_surface = _near(keys, surface, voxels=voxels)
+    found = _near(surface, keys[occupied], voxels=voxels)
+    judged, free_right, open_free = occupied, np.empty(0, np.bool_), np.empty(0, np.bool_)
+    if log_odds_at is not None:
+        values = log_odds_at(leaves.centres_world)
+        known, solid = ~np.isnan(values), values >= octree.occupied_log_odds
+        judged = occupied & (known | near_surface)
+        near_ours = _near(keys, keys[occupied], voxels=voxels)
+        free_right = (~solid | near_ours)[known & ~occupied]
+        open_free = ~occupied[known & ~near_surface]
+    return Verdict(
+        occupied=keys[judged],
+        right=near_surface[judged],
+        surface=surface,
+        found=found,
+        seen=found | _among(_codes(surface), _codes(keys)),
+        free_right=free_right,
+        open_free=open_free,
+        voxels=voxels,
+        resolution_m=leaves.resolution_m,
+    )
+
+
+def verdict_metrics(verdict: Verdict) -> list[Metric]:
+    """Return precision, recall and F-score of occupied space, and of free space what is known of it.
+
+    The F-score is their harmonic mean (Knapitsch et al. 2017).
+    """
+    within = f"within {verdict.voxels} voxel{'s' if verdict.voxels != 1 else ''}"
+    precision, recall = float(verdict.right.mean()), float(verdict.found[verdict.seen].mean())
+    metrics = [
+        Metric(f"occupied precision, {within}", precision, "ratio"),
+        Metric(f"occupied recall where the map looked, {within}", recall, "ratio"),
+        Metric(
+            f"occupied F-score, {within}", 2.0 * precision * recall / max(precision + recall, 1e-300), "ratio"
+        ),
+    ]
+    if not verdict.seen.all():
+        whole = float(verdict.found.mean())
+        metrics.append(Metric(f"occupied recall of the whole reference, {within}", whole, "ratio"))
+    if len(verdict.free_right) and len(verdict.open_free):
+        metrics += [
+            Metric(f"free precision, {within}", float(verdict.free_right.mean()), "ratio"),
+            Metric(f"free recall, {within}", float(verdict.open_free.mean()), "ratio"),
+        ]
+    return metrics
+
+
+def occupancy_metrics(
+    octree: OctreeMap, signed_distance_m: SignedDistance, *, voxels: int = 1
+) -> list[Metric]:
+    """Return the metrics of ``judged_by_distance``."""
+    return verdict_metrics(judged_by_distance(octree, signed_distance_m, voxels=voxels))
+
+
+def ghosts(octree: OctreeMap, signed_distance_m: SignedDistance, *, voxels: int = 1) -> int:
+    """Return how many voxels are occupied further than so many voxels, and a half, from every solid."""
+    leaves, occupied = _known(octree)
+    distance_m = signed_distance_m(leaves.centres_world[occupied])
+    return int((distance_m > (voxels + 0.5) * leaves.resolution_m).sum())
+
+
+def _known(octree: OctreeMap) -> tuple[Leaves, Mask]:
+    leaves = octree.leaves()
+    return leaves, leaves.log_odds >= octree.occupied_log_odds
+
+
+def _keys_of(points_world: Points, resolution_m: float) -> Keys:
+    """Return the (K, 3) distinct keys of points; those beyond the range of keys are left out."""
+    keys = _lattice(points_world, resolution_m)
+    keys = keys[((keys >= 0) & (keys < KEY_COUNT)).all(axis=1)]
+    _, first = np.unique(_codes(keys), return_index=True)
+    return keys[first]
+
+
+def _lattice(points_world: Points, resolution_m: float) -> Keys:
+    return np.floor(points_world / resolution_m).astype(np.int64) + KEY_ZERO
+
+
+def _near(keys: Keys, others: Keys, *, voxels: int) -> Mask:
+    """Tell for each of (N, 3) keys whether another is at most so many steps away along each axis."""
+    wanted, codes = _codes(keys), _codes(others)
+    reach = np.arange(-voxels, voxels + 1)
+    steps = (reach[:, None, None] + (reach[:, None] << _BITS) + (reach << (2 * _BITS))).ravel()
+    near = np.zeros(len(wanted), dtype=np.bool_)
+    if len(codes) < len(wanted):  # rather spread the few than look around the many
+        at_once = max(1, _MOST_SPREAD // max(len(codes), 1))
+        for first in range(0, len(steps), at_once):
+            near |= _among(wanted, (codes[:, None] + steps[first : first + at_once]).ravel())
+        return near
+    for step in steps:
+        near |= _among(wanted + step, codes)
+    return near
+
+
+def _among(wanted: Codes, codes: Codes) -> Mask:
+    """Tell for each of (N,) codes whether it is one of the others."""
+    if not len(codes):
+        return np.zeros(len(wanted), dtype=np.bool_)
+    ordered = np.sort(codes)
+    among: Mask = ordered[np.minimum(np.searchsorted(ordered, wanted), len(ordered) - 1)] == wanted
+    return among
+
+
+def _codes(keys: Keys) -> Codes:
+    """Return one number for each (N, 3) key, so that a step along an axis adds the same everywhere."""
+    x, y, z = (keys + _MARGIN).T
+    codes: Codes = x | y << _BITS | z << (2 * _BITS)
+    return codes

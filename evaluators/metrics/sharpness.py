@@ -1,0 +1,132 @@
+"""How sharp a map is, without any reference: whether scans laid over each other agree.
+
+It tells a good trajectory from a bad one as far as the sensor is right: scans that are wrong alike agree.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evaluators.metrics.metric import Metric
+from evaluators.metrics.patches import cell_codes, gaps, spreads
+from mapper.core.deskew import STILL, deskewed, twist_at
+from mapper.core.errors import DataError
+from mapper.core.frames import Sensor
+from mapper.core.geometry import Array, Points, apply
+from mapper.core.trajectory import Trajectory
+from mapper.core.voxel_grid import thin
+from mapper.runtime.progress import SILENT, Progress
+from mapper.sources.base import Log
+
+RADIUS_M: dict[Sensor, float] = {"rgbd": 0.2, "lidar": 0.5}
+"""Of the patches: small enough for walls to be flat, large against what scans are laid wrong by."""
+
+_FRAMES, _POINTS, _PATCHES = 100, 200_000, 5_000
+_MIN_NEIGHBOURS = 15
+_BREADTH_RATIO = 0.2
+"""A patch's second variance against its largest: below, it is a line, for instance one LiDAR ring."""
+_SHEETS_APART, _SHEET_SHARE = 5.0, 0.2
+"""Two sheets are so many of their spreads apart, and hold so many of the points: of one sheet with normal
+noise the parts are 2.7 apart, of an evenly filled one 3.5."""
+_LEAST_VARIANCE_M2 = 1e-12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """Points of several scans in one world, and from where they were seen.
+
+    Attributes:
+        points_world: (N, 3) metres.
+        towards_world: (N, 3) from each point to where the sensor was; of any length.
+        frames: (N,) int64: which scan each point is of.
+    """
+
+    points_world: Points
+    towards_world: Array
+    frames: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        n = len(self.points_world)
+        shapes = (self.points_world.shape, self.towards_world.shape, self.frames.shape)
+        if n == 0 or shapes != ((n, 3), (n, 3), (n,)):
+            raise DataError(f"sharpness: points, directions and frames {shapes}, want (N, 3), (N, 3), (N,)")
+
+
+def views_of(source: Log, trajectory: Trajectory, *, progress: Progress = SILENT) -> Views:
+    """Return evenly chosen points of evenly chosen scans, laid out by a trajectory: enough, whatever the log.
+
+    Args:
+        source: The log.
+        trajectory: T_world_body of its frames.
+        progress: Who watches.
+
+    Raises:
+        DataError: No frame of the log has a pose.
+        FrameError: A frame cannot be read.
+    """
+    index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
+    entries = [entry for entry in source.entries() if entry.stamp_ns in index_of]
+    chosen = entries[:: max(1, -(-len(entries) // _FRAMES))]
+    points, towards, frames = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty(0, np.int64)]
+    with progress.stage("sharp") as report:
+        for number, entry in enumerate(chosen):
+            index = index_of[entry.stamp_ns]
+            twist = STILL if source.sensor == "rgbd" else twist_at(trajectory, index)
+            scan = deskewed(entry.scan(), twist)
+            few = scan.points_body[:: max(1, len(scan.points_body) * len(chosen) // _POINTS)]
+            T_world_body = trajectory.T_world_body[index]
+            points.append(apply(T_world_body, few.astype(np.float64)))
+            towards.append((scan.origin_body - few) @ T_world_body[:3, :3].T)
+            frames.append(np.full(len(few), number, np.int64))
+            report(number + 1, len(chosen))
+    return Views(np.concatenate(points), np.concatenate(towards), np.concatenate(frames))
+
+
+def sharpness_metrics(views: Views, *, radius_m: float) -> list[Metric]:
+    """Return wall thickness, double walls, mean map entropy and mean plane variance.
+
+    Patches are the points within a radius of one in each voxel half as wide, seen from the same side, in two
+    frames or more. A patch is as thick as the standard deviation across its best plane, unless it is a line.
+    Corners and clutter are patches too, so what counts is the median, and maps compare that show the same; to
+    leave them out would leave out the walls blurred most. Double walls are the share of patches whose
+    points lie in two sheets, steps and edges among them. Entropy is ½ ln |2πe Σ| of a patch's covariance
+    (Droeschel, Stückler & Behnke 2014), plane variance its least eigenvalue (Razlaw et al. 2015).
+
+    Args:
+        views: The scans, laid out.
+        radius_m: Of the patches.
+
+    Raises:
+        DataError: No patch was seen in two frames, or all are lines.
+    """
+    order = np.argsort(cell_codes(views.points_world, radius_m), kind="stable")
+    points, towards = views.points_world[order], views.towards_world[order]
+    frames, codes = views.frames[order], cell_codes(points, radius_m)
+    patches = thin(points.astype(np.float32), 0.5 * radius_m)
+    patches = patches[:: max(1, -(-len(patches) // _PATCHES))].astype(np.int64)
+    covariances, counts = spreads(points, towards, frames, codes, patches, radius_m)
+    enough = counts >= _MIN_NEIGHBOURS
+    if not enough.any():
+        raise DataError(
+            f"sharpness: nowhere {_MIN_NEIGHBOURS} points of two frames within {radius_m:g} m: no overlap"
+        )
+    variances, axes = np.linalg.eigh(covariances[enough])
+    variances = np.maximum(variances, _LEAST_VARIANCE_M2)
+    broad = variances[:, 1] >= _BREADTH_RATIO * variances[:, 2]
+    if not broad.any():
+        raise DataError(f"sharpness: all patches of {radius_m:g} m are lines; choose a larger radius")
+    thickness_m = np.sqrt(variances[broad, 0])
+    normals = np.ascontiguousarray(axes[broad, :, 0])
+    apart, shares = gaps(points, towards, codes, patches[enough][broad], normals, radius_m)
+    double = (apart >= _SHEETS_APART) & (shares >= _SHEET_SHARE)
+    entropy = 0.5 * (3.0 * np.log(2.0 * np.pi * np.e) + np.log(variances).sum(axis=1))
+    about = f"radius {radius_m:g} m"
+    return [
+        Metric(f"patches seen in several frames, {about}", int(enough.sum()), "patches"),
+        Metric(f"wall thickness median, {about}", float(np.median(thickness_m)), "m"),
+        Metric(f"wall thickness quartile, {about}", float(np.percentile(thickness_m, 25.0)), "m"),
+        Metric(f"double walls, {about}", 100.0 * float(double.mean()), "%"),
+        Metric(f"mean map entropy, {about}", float(entropy.mean()), "nats"),
+        Metric(f"mean plane variance, {about}", float(variances[:, 0].mean()), "m²"),
+    ]

@@ -1,0 +1,126 @@
+"""Pictures of a depth camera's accuracy: errors over the distance, and where in the image they lie."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from evaluators.depth_camera.accuracy import Accuracy, DepthLevel, ResidualMap
+from evaluators.depth_camera.noise_fit import NoiseFit
+from mapper.export.page import FAINT, INK, LINE, hex_of, save
+from mapper.export.palette import Rgb
+from mapper.export.panels import page, panel
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_RAW: Rgb = (38, 145, 87)
+_FILTERED: Rgb = (214, 69, 37)
+"""Green before DIF and red after, as in the thesis's figure 2.16."""
+
+_MM = 1e3
+_COLUMNS = 4
+_MAP_IN, _BAR_IN, _CAPTION_IN = 3.6, 0.65, 0.4
+_CLIP_PERCENT = 99.0
+
+
+def write_accuracy(path: Path, levels: Sequence[DepthLevel], fit: NoiseFit, *, title: str) -> None:
+    """Draw the largest error and the standard deviation over the distance, before and after DIF.
+
+    Args:
+        path: PNG file to write.
+        levels: From near to far.
+        fit: The noise before DIF as a curve.
+        title: Headline.
+    """
+    figure = page(title, columns=2, rows=1, width_in=5.6, height_in=4.4)
+    distance_m = [level.typical.distance_m for level in levels]
+    axes = panel(figure, 0, columns=2, rows=1)
+    for label, color, accuracies in _kinds(levels):
+        largest = [_MM * one.max_error_m for one in accuracies]
+        most = [_MM * one.max_error_99_m for one in accuracies]
+        axes.plot(distance_m, largest, "o-", color=hex_of(color), markersize=4, label=f"{label}, all pixels")
+        axes.plot(
+            distance_m,
+            most,
+            "o--",
+            color=hex_of(color),
+            markersize=4,
+            label=f"{label}, without the worst 1 %",
+        )
+    _finish(axes, "largest error Δd, mm")
+    axes = panel(figure, 1, columns=2, rows=1)
+    z = np.linspace(fit.low_m, fit.high_m, 200)
+    axes.plot(z, _MM * fit.noise.sigma_m(z), color=INK, linewidth=1.0, label=f"σ = {fit.noise.text} m")
+    for label, color, accuracies in _kinds(levels):
+        spread = [_MM * one.std_m for one in accuracies]
+        axes.plot(distance_m, spread, "o", color=hex_of(color), markersize=5, label=label)
+    for marker, label, known_m in (
+        ("^", "of a pixel over time", [level.temporal_m for level in levels]),
+        ("v", "that stays over time", [level.fixed_m for level in levels]),
+        ("_", "a step of quantisation", [level.typical.step_m for level in levels]),
+    ):
+        _draw_known(axes, distance_m, known_m, marker=marker, label=label)
+    _finish(axes, "standard deviation s, mm")
+    save(figure, path)
+
+
+def _kinds(levels: Sequence[DepthLevel]) -> tuple[tuple[str, Rgb, list[Accuracy]], ...]:
+    return (
+        ("before DIF", _RAW, [level.typical.raw for level in levels]),
+        ("after DIF", _FILTERED, [level.typical.filtered for level in levels]),
+    )
+
+
+def _draw_known(
+    axes: "Axes", distance_m: Sequence[float], values_m: Sequence[float | None], *, marker: str, label: str
+) -> None:
+    """Mark a figure that not every distance tells."""
+    known = [(x, _MM * value) for x, value in zip(distance_m, values_m, strict=True) if value is not None]
+    if known:
+        axes.plot(*np.array(known).T, marker, color=FAINT, markersize=5, label=label, fillstyle="none")
+
+
+def _finish(axes: "Axes", what: str) -> None:
+    axes.set_xlim(left=0.0)
+    axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("distance, m", color=FAINT, fontsize=8)
+    axes.set_ylabel(what, color=FAINT, fontsize=8)
+    axes.grid(color=LINE, linewidth=0.4)
+    axes.legend(loc="upper left", fontsize=8, framealpha=0.92, edgecolor=LINE)
+
+
+def write_residuals(path: Path, maps: Sequence[ResidualMap], *, title: str) -> None:
+    """Draw by how much each pixel's depth is off, over the grey images.
+
+    Every panel has its own scale, up to the 99th percentile of its errors.
+
+    Args:
+        path: PNG file to write.
+        maps: One or more.
+        title: Headline.
+    """
+    columns = min(len(maps), _COLUMNS)
+    rows = -(-len(maps) // columns)
+    width_in = _MAP_IN if columns > 1 else 2.0 * _MAP_IN
+    height, width = maps[0].image.shape
+    image_in = width_in - _BAR_IN
+    cell_in = image_in * height / width + _CAPTION_IN
+    figure = page(title, columns=columns, rows=rows, width_in=width_in, height_in=cell_in)
+    full = np.array([*figure.get_size_inches(), *figure.get_size_inches()])
+    for number, one in enumerate(maps):
+        row, column = divmod(number, columns)
+        left_in, bottom_in = column * width_in + 0.1, (rows - 1 - row) * cell_in + 0.1
+        axes = figure.add_axes(tuple([left_in, bottom_in, image_in, cell_in - _CAPTION_IN] / full))
+        beside = figure.add_axes(
+            tuple([left_in + image_in + 0.06, bottom_in, 0.12, cell_in - _CAPTION_IN] / full)
+        )
+        known = np.abs(one.error_m[~np.isnan(one.error_m)])
+        most_mm = _MM * max(float(np.percentile(known, _CLIP_PERCENT)), 1e-6)
+        axes.imshow(one.image, cmap="gray", vmin=0, vmax=255)
+        shown = axes.imshow(_MM * one.error_m, cmap="RdBu_r", vmin=-most_mm, vmax=most_mm)
+        figure.colorbar(shown, cax=beside).ax.tick_params(labelsize=7, colors=FAINT)
+        axes.set_title(f"{one.caption}; mm", fontsize=9, color=INK)
+        axes.set_axis_off()
+    save(figure, path)

@@ -1,0 +1,1 @@
+"""One registration of two clouds, step by step."""

@@ -1,0 +1,119 @@
+"""A registration as text for a screen, and as files: the aligned cloud, pictures, JSON and a recording."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evaluators.pictures.registration import write_before_and_after
+from evaluators.pictures.registration_mcap import write_registration_log
+from evaluators.register.config import RegisterConfig
+from evaluators.register.registration import Registered, xyz_rpy
+from mapper.core.frames import Scan, Sensor
+from mapper.core.geometry import apply
+from mapper.export.palette import ESTIMATE
+from mapper.export.ply import write_ply
+from mapper.runtime.atomic import MANIFEST_NAME, write_text
+
+ALIGNED, PICTURE, RECORDING = "aligned.ply", "registration.png", "registration.mcap"
+
+
+def registration_text(registered: Registered) -> str:
+    """Return the motion, its trust, the distances and the times, for a terminal."""
+    alignment = registered.alignment
+    lines = [f"method   {registered.method}"]
+    if registered.stages[-1].name == "refined":
+        xyz, rpy = xyz_rpy(alignment.T_target_source)
+        lines += [
+            "xyz      {:.4f} {:.4f} {:.4f} m".format(*xyz),
+            "rpy      {:.3f} {:.3f} {:.3f} °".format(*rpy),
+            *("         " + " ".join(f"{value:10.6f}" for value in row) for row in alignment.T_target_source),
+            f"agree    {alignment.pairs} pairs, {alignment.inlier_ratio:.0%}, "
+            f"RMS {alignment.inlier_rmse_m:.3f} m",
+        ]
+    lines.append("trusted  yes" if alignment.converged else f"trusted  no: {alignment.reason}")
+    lines += ["", f"{'':9}{'MHD':>9} {'MPD':>9}"]
+    for stage in registered.stages:
+        lines.append(f"{stage.name:<9}{stage.distance.mhd_m:7.3f} m {stage.distance.mpd_m:7.3f} m")
+    times = ", ".join(f"{name} {1e3 * spent:.0f}" for name, spent in registered.seconds.items())
+    return "\n".join([*lines, "", f"ms       {times}"])
+
+
+def write_registration(
+    folder: Path,
+    registered: Registered,
+    *,
+    target: Scan,
+    source: Scan,
+    names: tuple[str, str],
+    sensor: Sensor,
+    config: RegisterConfig,
+) -> None:
+    """Write what is known of a registration, trusted or not.
+
+    Args:
+        folder: Existing folder.
+        registered: The registration.
+        target: Scan that stayed.
+        source: Scan that was aligned to it.
+        names: What the user calls target and source.
+        sensor: Tells which way is up.
+        config: How it was done.
+    """
+    last = registered.stages[-1]
+    points_target = apply(last.T_target_source, source.points_body.astype(np.float64)).astype(np.float32)
+    colors = source.colors
+    if colors is None:
+        colors = np.broadcast_to(np.array(ESTIMATE, np.uint8), points_target.shape)
+    write_ply(folder / ALIGNED, points_target, colors)
+    write_before_and_after(
+        folder / PICTURE,
+        target.points_body,
+        source.points_body,
+        [(stage.name, stage.T_target_source) for stage in registered.stages],
+        sensor=sensor,
+        title=f"{Path(names[1]).name} (red) on {Path(names[0]).name} (blue), {registered.method}",
+    )
+    write_registration_log(
+        folder / RECORDING,
+        target.points_body,
+        source.points_body,
+        [
+            (
+                stage.T_target_source,
+                {"stage": stage.name, "mhd_m": stage.distance.mhd_m, "mpd_m": stage.distance.mpd_m},
+            )
+            for stage in registered.stages
+        ],
+    )
+    record = _record(registered) | {
+        "target": names[0],
+        "source": names[1],
+        "config": config.model_dump(mode="json"),
+    }
+    write_text(folder / MANIFEST_NAME, json.dumps(record, indent=2, ensure_ascii=False) + "\n")
+
+
+def _record(registered: Registered) -> dict[str, Any]:
+    alignment = registered.alignment
+    return {
+        "method": registered.method,
+        "trusted": alignment.converged,
+        "reason": alignment.reason,
+        "T_target_source": alignment.T_target_source.tolist(),
+        "inlier_ratio": alignment.inlier_ratio,
+        "inlier_rmse_m": alignment.inlier_rmse_m if np.isfinite(alignment.inlier_rmse_m) else None,
+        "pairs": alignment.pairs,
+        "information": None if alignment.information is None else alignment.information.tolist(),
+        "stages": [
+            {
+                "name": stage.name,
+                "T_target_source": stage.T_target_source.tolist(),
+                "mhd_m": stage.distance.mhd_m,
+                "mpd_m": stage.distance.mpd_m,
+            }
+            for stage in registered.stages
+        ],
+        "seconds": dict(registered.seconds),
+    }

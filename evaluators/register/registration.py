@@ -1,0 +1,145 @@
+"""One registration, told step by step: where it began, what each stage made of it, and how long that took."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from evaluators.metrics.cloud_distance import CloudDistance, DistanceTo
+from mapper.core.errors import ConfigError
+from mapper.core.frames import Frame, RgbdFrame, Scan
+from mapper.core.geometry import Transform
+from mapper.odometry.config import IsvdOdometryConfig
+from mapper.registration.base import Alignment
+from mapper.registration.config import AnyRegistration
+from mapper.registration.factory import build_registration
+from mapper.registration.hough.config import HoughGicpConfig, HoughNdtConfig
+
+_WARM_UP_STRIDE = 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stage:
+    """How the clouds lay after one step.
+
+    Attributes:
+        name: "before", "Hough" or "refined".
+        T_target_source: (4, 4) the motion by then.
+        distance: How far the source lay from the target under it.
+    """
+
+    name: str
+    T_target_source: Transform
+    distance: CloudDistance
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registered:
+    """A registration and its course.
+
+    Attributes:
+        method: What the configuration calls it.
+        alignment: The answer.
+        stages: From the beginning on; without "refined" where there was no answer at all.
+        seconds: Wall time of each step, in order.
+    """
+
+    method: str
+    alignment: Alignment
+    stages: tuple[Stage, ...]
+    seconds: Mapping[str, float]
+
+
+def register(
+    target: Frame,
+    source: Frame,
+    config: AnyRegistration | IsvdOdometryConfig,
+    T_target_source: Transform,
+) -> Registered:
+    """Return the motion between two frames, and how it was found.
+
+    Args:
+        target: Frame that stays.
+        source: Frame that is aligned to it.
+        config: The method.
+        T_target_source: (4, 4) guess, for methods that refine one.
+
+    Raises:
+        ConfigError: A method of images was given scans.
+        DataError: A frame without points.
+    """
+    motions = {"before": T_target_source}
+    if isinstance(config, IsvdOdometryConfig):
+        alignment, seconds = _by_features(target, source, config)
+    else:
+        alignment, hough, seconds = _by_scans(target.scan(), source.scan(), config, T_target_source)
+        if hough is not None:
+            motions["Hough"] = hough
+    if alignment.converged or alignment.information is not None:
+        motions["refined"] = alignment.T_target_source
+    distance = DistanceTo(target.scan().points_body)
+    points_source = source.scan().points_body
+    stages = (Stage(name, T, distance.of(points_source, T)) for name, T in motions.items())
+    return Registered(config.kind, alignment, tuple(stages), seconds)
+
+
+def _by_scans(
+    target: Scan, source: Scan, config: AnyRegistration, T_target_source: Transform
+) -> tuple[Alignment, Transform | None, dict[str, float]]:
+    """Return the answer, Hough's own where the method has that stage, and the time of every step."""
+    thin = thinned(target), thinned(source)  # loads libraries and compiled code, which is no step's time
+    _timed(*thin, config, T_target_source)
+    return _timed(target, source, config, T_target_source)
+
+
+def _timed(
+    target: Scan, source: Scan, config: AnyRegistration, T_target_source: Transform
+) -> tuple[Alignment, Transform | None, dict[str, float]]:
+    began = time.perf_counter()
+    if isinstance(config, HoughGicpConfig | HoughNdtConfig):
+        from mapper.registration.hough.aligner import Hough
+
+        voter = Hough(config).prepare(target)
+        prepared = time.perf_counter()
+        course = voter.stages(source)
+        hough = None if course.hough is None else course.hough.T_target_source
+        return course.alignment, hough, {"prepare": prepared - began, **course.seconds}
+    aligner = build_registration(config).prepare(target)
+    prepared = time.perf_counter()
+    alignment = aligner.align(source, T_target_source)
+    return alignment, None, {"prepare": prepared - began, "align": time.perf_counter() - prepared}
+
+
+def thinned(scan: Scan) -> Scan:
+    """Return what a method is tried on first, so that no clock sees what is loaded and compiled for it."""
+    # A view with gaps would have kernels compiled for itself and none for whole scans.
+    return Scan(scan.stamp_ns, np.ascontiguousarray(scan.points_body[::_WARM_UP_STRIDE]))
+
+
+def _by_features(
+    target: Frame, source: Frame, config: IsvdOdometryConfig
+) -> tuple[Alignment, dict[str, float]]:
+    from mapper.odometry.isvd import IsvdOdometry, matched_pairs, shared_points
+    from mapper.registration.isvd import Isvd
+
+    if not isinstance(target, RgbdFrame) or not isinstance(source, RgbdFrame):
+        raise ConfigError("--method isvd matches images, and these are scans; name frames of an RGB-D log")
+    odometry = IsvdOdometry(config)
+    began = time.perf_counter()
+    seen_target = odometry.observe(target)
+    detected = time.perf_counter()
+    seen_source = odometry.observe(source)
+    for match in (config.match, config.fallback):
+        pairs = matched_pairs(seen_target, seen_source, match)
+        alignment = Isvd(config.registration).fit(*shared_points(seen_target, seen_source, pairs))
+        if alignment.converged:
+            break
+    return alignment, {"prepare": detected - began, "align": time.perf_counter() - detected}
+
+
+def xyz_rpy(T_a_b: Transform) -> tuple[list[float], list[float]]:
+    """Return a pose as metres and as roll, pitch, yaw in degrees, for a screen or a file."""
+    from mapper.core.rotations import euler_from_rotation
+
+    return T_a_b[:3, 3].tolist(), np.degrees(euler_from_rotation(T_a_b[:3, :3])).tolist()

@@ -1,0 +1,1 @@
+"""Builds of many logs by many methods in many configurations."""

@@ -1,0 +1,114 @@
+"""One cell of a sweep: a whole build, and what it is worth in numbers."""
+
+import platform
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal
+
+import mapper
+from evaluators.metrics.run_summary import summary
+from evaluators.tables.table import Record
+from mapper.config.build import BuildConfig
+from mapper.core.errors import ConfigError, MapperError
+from mapper.pipeline.build import build
+from mapper.run.files import CONFIG, MANIFEST, OCTREE_MAP, SUMMARY, TRAJECTORY, TRUTH
+from mapper.run.folder import Run
+from mapper.run.manifest import library_versions
+from mapper.runtime.timing import forget_peak_memory
+from mapper.sources import open_source
+
+Keep = Literal["nothing", "trajectory", "run"]
+
+STAGES = ("track", "solve", "level", "fuse", "write")
+_WITH_TRAJECTORY = {CONFIG, MANIFEST, SUMMARY, TRAJECTORY, TRUTH}
+
+
+def environment() -> dict[str, str]:
+    """Return the versions of all that can change a result."""
+    return {"mapper": mapper.__version__, **library_versions()}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BuildCell:
+    """Builds a run, measures it, and keeps as much of it as is wanted.
+
+    Attributes:
+        log: Absolute path.
+        config: Every knob.
+        scratch: Folder for the run while it is built.
+        kept: What becomes of it: this folder, or None.
+        keep: How much of it.
+        environment: Where the sweep was planned; a worker elsewhere has to have the same versions.
+    """
+
+    log: Path
+    config: BuildConfig
+    scratch: Path
+    kept: Path | None
+    keep: Keep
+    environment: Mapping[str, str]
+
+    def __call__(self) -> list[Record]:
+        """Return the build's numbers, one record.
+
+        Raises:
+            MapperError: As the build says, or this machine has other versions of the libraries.
+        """
+        self._refuse_other_versions()
+        forget_peak_memory()
+        self.scratch.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=self.scratch, ignore_cleanup_errors=True) as folder:
+            try:
+                source = open_source(self.log, self.config.source)
+                run = build(source, self.config, Path(folder) / "run")
+            except MapperError as error:
+                raise MapperError(str(error)) from None  # its notes name a folder that will not be there
+            record = _measured(run, sensor=source.sensor)
+            if self.kept is not None:
+                _keep(run.path, self.kept, self.keep)
+        return [record]
+
+    def _refuse_other_versions(self) -> None:
+        for name, version in environment().items():
+            planned = self.environment.get(name)
+            if version != planned:
+                raise ConfigError(
+                    f"worker on {platform.node()}: {name} {version}, where the sweep was planned with "
+                    f"{planned}; results would not compare, so install the same"
+                )
+
+
+def _measured(run: Run, *, sensor: str) -> Record:
+    manifest = run.manifest
+    counts, timing = manifest.counts, manifest.timing
+    return {
+        "sensor": sensor,
+        **summary(run),
+        "skipped_frames": counts.skipped,
+        "lost_frames": counts.lost,
+        "keyframes": counts.nodes,
+        "leaves": counts.leaves,
+        "cloud_points": counts.cloud_points,
+        "map_bytes": (run.path / OCTREE_MAP).stat().st_size,
+        **{f"{stage}_s": timing.stage_s[stage] for stage in STAGES},
+        "total_s": timing.total_s,
+        "frames_per_s": timing.frames_per_s,
+        "real_time_factor": timing.real_time_factor,
+        "peak_memory_mb": timing.peak_memory_mb,
+        "host": platform.node(),
+        "mapper_version": manifest.mapper_version,
+        "python_version": manifest.python_version,
+    }
+
+
+def _keep(run: Path, kept: Path, keep: Keep) -> None:
+    if keep == "trajectory":
+        for file in run.iterdir():
+            if file.name not in _WITH_TRAJECTORY:
+                file.unlink()
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(kept, ignore_errors=True)  # of a cell that was killed before it could say that it is done
+    run.rename(kept)

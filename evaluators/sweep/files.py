@@ -1,0 +1,28 @@
+"""A sweep as files: the table for programs, and the page for people."""
+
+from collections.abc import Mapping
+
+from evaluators.study.cells import CellResult
+from evaluators.sweep.page import page_of
+from evaluators.sweep.plan import Place, Plan
+from evaluators.sweep.tables import sweep_records
+from evaluators.tables.parquet import write_parquet
+from evaluators.tables.table import Record, csv_text
+from mapper.runtime.atomic import write_text
+
+FILES = CSV, PARQUET, PAGE = "results.csv", "results.parquet", "summary.html"
+
+
+def write_sweep(plan: Plan, results: Mapping[Place, CellResult], *, title: str) -> list[Record]:
+    """Write a sweep's table and its page, and return the table.
+
+    Args:
+        plan: What was asked for, and where its results go.
+        results: What became of each cell.
+        title: Of the page.
+    """
+    records = sweep_records(plan, results)
+    write_text(plan.out / CSV, csv_text(records))
+    write_parquet(plan.out / PARQUET, records)
+    write_text(plan.out / PAGE, page_of(plan, records, title=title))
+    return records

@@ -1,0 +1,222 @@
+"""Logs × methods × configurations: which builds there are to make, and what they came to."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from glob import glob, has_magic
+from pathlib import Path
+from typing import Any
+
+from evaluators.study.cells import Cell, CellResult, run_cells
+from evaluators.study.seeds import seeded
+from evaluators.sweep.build_job import BuildCell, environment
+from evaluators.sweep.config import ConfigurationConfig, MethodConfig, SweepConfig
+from mapper.config.build import BuildConfig
+from mapper.config.loading import load_config, load_source_config, read_config
+from mapper.core.errors import ConfigError
+from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig, ThesisLoopsConfig
+from mapper.odometry.config import IsvdOdometryConfig, KeyframeOdometryConfig
+from mapper.odometry.scan_to_map.config import ScanOdometryConfig
+from mapper.run.fingerprint import fingerprint
+from mapper.runtime.atomic import resumable_folder, write_text
+from mapper.runtime.progress import SILENT, Progress
+from mapper.sources import open_source
+from mapper.sources.base import Log
+from mapper.sources.config import SourceConfig
+
+CELLS, RUNS, SCRATCH, PLAN = "cells", "runs", "scratch", "sweep.json"
+_IMAGE_LOOPS = (PlaceLoopsConfig, ThesisLoopsConfig)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where in the table a build stands.
+
+    Attributes:
+        log: Its name, unique in the sweep.
+        method: Its name.
+        configuration: Its name.
+        seed: None if the build has no use for one, or none was asked for.
+    """
+
+    log: str
+    method: str
+    configuration: str
+    seed: int | None = None
+
+    @property
+    def label(self) -> str:
+        """As in "desk, isvd, fine, seed 1"."""
+        seed = () if self.seed is None else (f"seed {self.seed}",)
+        return ", ".join([self.log, self.method, self.configuration, *seed])
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Every build of a sweep, and what cannot be built.
+
+    Attributes:
+        config: What was asked for.
+        out: Absolute folder of the results.
+        entries: A cell for every place, log by log, or why the method does not apply to the log.
+    """
+
+    config: SweepConfig
+    out: Path
+    entries: dict[Place, Cell | str]
+
+    @property
+    def cells(self) -> dict[Place, Cell]:
+        """What there is to build."""
+        return {place: entry for place, entry in self.entries.items() if isinstance(entry, Cell)}
+
+
+def plan_sweep(path: Path, out: Path) -> Plan:
+    """Return what a sweep's file asks for, every configuration checked and every log opened.
+
+    Raises:
+        ConfigError: The file, or a configuration that it makes, is refused; no log fits a glob.
+        SourceError: A log cannot be opened.
+    """
+    config = read_config(path, SweepConfig)
+    out, versions = out.resolve(), environment()
+    entries: dict[Place, Cell | str] = {}
+    for name, log in _logs(path, config).items():
+        sources: dict[SourceConfig, Log] = {}
+        mark = fingerprint(log)
+        for method in config.method:
+            for configuration in config.configuration:
+                place = Place(name, method.name, configuration.name)
+                build_config, source = _resolved(path, log, method, configuration, sources)
+                if misfit := _misfit(build_config, source):
+                    entries[place] = misfit
+                    continue
+                for seed, seeded_config in _repeats(build_config, config.seeds):
+                    place = Place(name, method.name, configuration.name, seed)
+                    key = _key(mark, seeded_config, config.keep, versions)
+                    kept = None if config.keep == "nothing" else out / RUNS / key
+                    work = BuildCell(log.resolve(), seeded_config, out / SCRATCH, kept, config.keep, versions)
+                    entries[place] = Cell(key, place.label, work)
+    return Plan(config, out, entries)
+
+
+def run_sweep(
+    plan: Plan, *, processes: int = 1, scheduler: str | None = None, progress: Progress = SILENT
+) -> dict[Place, CellResult]:
+    """Return what each cell came to; what an earlier sweep in the same folder has finished is not run again.
+
+    Args:
+        plan: What to do.
+        processes: As for ``run_jobs``; every build keeps to one core.
+        scheduler: As for ``run_jobs``.
+        progress: Who waits.
+
+    Raises:
+        ConfigError: As for ``run_jobs``.
+        RunError: OUT holds something else, or another sweep is at work there.
+    """
+    out, cells = plan.out, plan.cells
+    with resumable_folder(out, mark=PLAN):
+        shutil.rmtree(out / SCRATCH, ignore_errors=True)  # what a killed sweep left
+        write_text(out / PLAN, json.dumps(_described(plan), indent=1, ensure_ascii=False) + "\n")
+        results = run_cells(
+            list(cells.values()),
+            out / CELLS,
+            processes=processes,
+            scheduler=scheduler,
+            progress=progress,
+        )
+        with suppress(OSError):
+            (out / SCRATCH).rmdir()
+    return dict(zip(cells, results, strict=True))
+
+
+def _logs(path: Path, config: SweepConfig) -> dict[str, Path]:
+    """Return the logs by name, in the order of the file; a glob's by the alphabet."""
+    found: list[Path] = []
+    for pattern in config.logs:
+        whole = str(path.parent / Path(pattern).expanduser())
+        # Path.glob refuses absolute patterns.
+        logs = sorted(map(Path, glob(whole))) if has_magic(pattern) else [Path(whole)]  # noqa: PTH207
+        if not logs:
+            raise ConfigError(f"{path}: logs: nothing fits {pattern!r}")
+        found += [log for log in logs if log not in found]
+    names = [log.absolute().name for log in found]
+    return {str(log) if names.count(name) > 1 else name: log for name, log in zip(names, found, strict=True)}
+
+
+def _resolved(
+    path: Path,
+    log: Path,
+    method: MethodConfig,
+    configuration: ConfigurationConfig,
+    sources: dict[SourceConfig, Log],
+) -> tuple[BuildConfig, Log]:
+    """Return a build's configuration, and its log; opening one may mean to read through it."""
+    file = None if method.config is None else path.parent / method.config
+    overrides = (*method.set, *configuration.set)
+    try:
+        source_config = load_source_config(file, overrides)
+        if source_config not in sources:
+            sources[source_config] = open_source(log, source_config)
+        source = sources[source_config]
+        config = load_config(file, overrides, sensor=source.sensor)
+    except ConfigError as error:
+        raise ConfigError(
+            f"{path}: method {method.name!r}, configuration {configuration.name!r}: {error}"
+        ) from None
+    return config.model_copy(update={"workers": 0}), source  # a core for each cell, so that times compare
+
+
+def _misfit(config: BuildConfig, source: Log) -> str:
+    """Return why a log cannot be built so; empty if it can."""
+    odometry, loops = config.odometry, config.loops
+    if source.sensor == "lidar" and isinstance(odometry, IsvdOdometryConfig | KeyframeOdometryConfig):
+        return f"odometry.kind={odometry.kind} needs images"
+    if odometry.kind == "wheels" and source.wheels is None:
+        return "odometry.kind=wheels needs wheels"
+    sees_scans = source.sensor == "lidar" or isinstance(odometry, ScanOdometryConfig)
+    if sees_scans and isinstance(loops, _IMAGE_LOOPS):
+        return f"loops.kind={loops.kind} needs images, odometry.kind={odometry.kind} sees scans"
+    if not sees_scans and isinstance(loops, ScanLoopsConfig):
+        return f"loops.kind=scans needs scans, odometry.kind={odometry.kind} sees images"
+    return ""
+
+
+def _repeats(config: BuildConfig, seeds: tuple[int, ...]) -> Iterator[tuple[int | None, BuildConfig]]:
+    """Yield the configuration with each seed; as it is, and once, where there is no seed in it."""
+    if not seeds or seeded(config, 0) == seeded(config, 1):
+        yield None, config
+        return
+    for seed in dict.fromkeys(seeds):
+        yield seed, seeded(config, seed)
+
+
+def _key(log: str, config: BuildConfig, keep: str, versions: dict[str, str]) -> str:
+    """Return what tells this result from others: what goes into it, and not what it is called."""
+    files = [fingerprint(file) for file in _files(config.model_dump()) if file.exists()]
+    told = [log, config.model_dump(mode="json"), files, keep, versions]
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:20]
+
+
+def _files(tree: Any) -> Iterator[Path]:
+    """Yield the files that a configuration names, whose content counts as well."""
+    if isinstance(tree, Path):
+        yield tree
+    elif isinstance(tree, dict):
+        for value in tree.values():
+            yield from _files(value)
+
+
+def _described(plan: Plan) -> dict[str, Any]:
+    return {
+        "sweep": plan.config.model_dump(mode="json"),
+        "versions": environment(),
+        "entries": {
+            place.label: entry.key if isinstance(entry, Cell) else f"does not apply: {entry}"
+            for place, entry in plan.entries.items()
+        },
+    }

@@ -1,0 +1,163 @@
+"""A sweep as records, and as the table that is shown of it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from statistics import median
+
+from evaluators.study.cells import CellResult
+from evaluators.sweep.plan import RUNS, Place, Plan
+from evaluators.tables.table import MISSING, Column, Record, Value, text_table
+
+_WHOLE = 0.995
+COVERED_ALIKE = 0.95
+"""Errors are compared of those who cover at least this share of what the best covers."""
+
+Variant = tuple[str, str]
+"""Names of a method and of a configuration."""
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A number that methods are compared by.
+
+    Attributes:
+        key: Of the records.
+        title: With the unit.
+        shown: Turns a number into text.
+        best: Which one is marked, if any.
+        needs_coverage: It flatters whoever gives up where it is hard.
+    """
+
+    key: str
+    title: str
+    shown: Callable[[float], str]
+    best: Callable[[Sequence[float]], float] | None = None
+    needs_coverage: bool = False
+
+
+QUANTITIES = (
+    Quantity("ate_m", "ATE RMSE m", "{:.4f}".format, min, needs_coverage=True),
+    Quantity("rpe_1s_m", "RPE 1 s m", "{:.4f}".format, min, needs_coverage=True),
+    Quantity("coverage_ratio", "coverage %", lambda value: f"{100.0 * value:.0f}", max),
+    Quantity("loops", "loops", "{:.0f}".format),
+    Quantity("frames_per_s", "frames/s", "{:.1f}".format, max),
+    Quantity("peak_memory_mb", "peak MB", "{:.0f}".format, min),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """The builds of one log by one method and configuration, which differ by their seed.
+
+    Attributes:
+        records: Of those that finished.
+        failures: How many did not.
+    """
+
+    records: tuple[Record, ...] = ()
+    failures: int = 0
+
+    def values(self, key: str) -> list[float]:
+        """Return what is known of a quantity, in order."""
+        return sorted(float(value) for record in self.records if (value := record.get(key)) is not None)
+
+    def text(self, quantity: Quantity) -> str:
+        """Return the median, with the range if it is one as shown, and what takes from its worth."""
+        values = self.values(quantity.key)
+        if not values:
+            return MISSING
+        text, least, most = map(quantity.shown, (median(values), values[0], values[-1]))
+        if least != most:
+            text += f" ({least}–{most})"
+        if quantity.needs_coverage and self.coverage < _WHOLE:
+            text += f" at {100.0 * self.coverage:.0f} %"
+        if self.failures:
+            text += f", {self.failures} failed"
+        return text
+
+    @property
+    def coverage(self) -> float:
+        """Return the median share of the frames that have a pose."""
+        values = self.values("coverage_ratio")
+        return median(values) if values else 0.0
+
+
+def sweep_records(plan: Plan, results: Mapping[Place, CellResult]) -> list[Record]:
+    """Return a record for every place in the table, whatever became of it; all have the same names."""
+    rows = [_row(plan, place, results.get(place)) for place in plan.entries]
+    names = dict.fromkeys(name for row in rows for name in row)
+    return [{name: row.get(name) for name in names} for row in rows]
+
+
+def _row(plan: Plan, place: Place, result: CellResult | None) -> dict[str, Value]:
+    row: dict[str, Value] = asdict(place)
+    if result is None:
+        return row | {"status": "does not apply", "reason": str(plan.entries[place])}
+    if result.failure:
+        return row | {"status": "failed", "reason": result.failure}
+    kept = None if plan.config.keep == "nothing" else f"{RUNS}/{result.key}"
+    (measured,) = result.records
+    return row | {"status": "finished", "reason": None, **measured, "cell_s": result.seconds, "run": kept}
+
+
+def grouped(records: Sequence[Record]) -> dict[str, dict[Variant, Group]]:
+    """Return the builds that differ by their seed alone together, by log and by what they were built with."""
+    groups: dict[str, dict[Variant, Group]] = {}
+    for record in records:
+        of_log = groups.setdefault(str(record["log"]), {})
+        variant = str(record["method"]), str(record["configuration"])
+        group = of_log.get(variant, Group())
+        if record["status"] == "finished":
+            group = replace(group, records=(*group.records, record))
+        elif record["status"] == "failed":
+            group = replace(group, failures=group.failures + 1)
+        of_log[variant] = group
+    return groups
+
+
+def best_of(groups: Mapping[Variant, Group], quantity: Quantity) -> set[Variant]:
+    """Return who has the best median of one log, as it is shown; nobody where nothing is to choose.
+
+    Errors are compared of those alone who cover about as much of the log as any.
+    """
+    if quantity.best is None:
+        return set()
+    enough = COVERED_ALIKE * max(group.coverage for group in groups.values()) * quantity.needs_coverage
+    medians = {
+        variant: median(values)
+        for variant, group in groups.items()
+        if (values := group.values(quantity.key)) and group.coverage >= enough
+    }
+    if len(medians) < 2:
+        return set()
+    best = quantity.shown(quantity.best(list(medians.values())))
+    return {variant for variant, value in medians.items() if quantity.shown(value) == best}
+
+
+def summary_text(records: Sequence[Record]) -> str:
+    """Return a line for every log, method and configuration, and what did not go well."""
+    groups = grouped(records)
+    columns = [Column("label", "log, method, configuration")]
+    columns += [Column(quantity.key, quantity.title) for quantity in QUANTITIES]
+    lines = [
+        {"label": Place(log, *variant).label}
+        | {quantity.key: group.text(quantity) for quantity in QUANTITIES}
+        for log, of_log in groups.items()
+        for variant, group in of_log.items()
+        if group.records
+    ]
+    return "\n".join([*([text_table(columns, lines)] if lines else []), *troubles(records)])
+
+
+def troubles(records: Sequence[Record]) -> list[str]:
+    """Return what failed and what does not apply, with the reason; a line for all that have the same."""
+    alike: dict[tuple[Value, ...], list[str]] = {}
+    for record in records:
+        if record["status"] != "finished":
+            kind = tuple(record[name] for name in ("status", "log", "method", "reason"))
+            seed = "" if record["seed"] is None else f", seed {record['seed']}"
+            alike.setdefault(kind, []).append(f"{record['configuration']}{seed}")
+    return [
+        f"{status}: {log}, {method} ({'; '.join(which)}): {reason}"
+        for (status, log, method, reason), which in alike.items()
+    ]
