@@ -8,7 +8,7 @@ import typer
 
 from cli.console import progress_for
 from cli.environment import prepare_libraries
-from cli.options import Quiet, workers_here
+from cli.options import Quiet, workers_for
 
 if TYPE_CHECKING:
     from mapper.merging.merge import Merged
@@ -61,7 +61,7 @@ def merge(
     from mapper.merging.merge import merge as merge_runs
     from mapper.run.folder import load_run
 
-    workers = workers_here(processes, scheduler, default=1)
+    workers = workers_for(processes, scheduler, default=1)
     prepare_libraries()
     if poses is not None and place is not Place.BUILT:
         raise ConfigError(f"--place {place} and --poses {poses}: both say where the runs lie; give one")
@@ -69,8 +69,7 @@ def merge(
         _placed([load_run(run) for run in runs], place, poses),
         out,
         tile_m=tile_m,
-        processes=workers,
-        scheduler=scheduler,
+        workers=workers,
         progress=progress_for(quiet=quiet),
         overwrite=overwrite,
     )

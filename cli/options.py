@@ -2,9 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from mapper.runtime.executor import Workers
 
 ConfigFile = Annotated[
     Path | None,
@@ -52,18 +55,19 @@ def merged(sugar: Sequence[str], overrides: Sequence[str] | None) -> list[str]:
     return [*sugar, *(overrides or ())]
 
 
-def workers_here(processes: int | None, scheduler: str | None, *, default: int) -> int:
-    """Return how many workers there are on this machine, if no scheduler has others.
+def workers_for(processes: int | None, scheduler: str | None, *, default: int) -> "Workers":
+    """Return where jobs run: on so many processes of this machine, or on a scheduler's workers.
 
     Raises:
-        ConfigError: There are none, or both are given.
+        ConfigError: There are no processes, or both are given.
     """
     from mapper.core.errors import ConfigError
+    from mapper.runtime.executor import Workers
 
     if processes is None:
-        return default
+        return Workers(default, scheduler)
     if scheduler is not None:
         raise ConfigError(f"--processes {processes}: has no meaning with --scheduler; leave it out")
     if processes < 1:
         raise ConfigError(f"--processes {processes}: want at least 1")
-    return processes
+    return Workers(processes)

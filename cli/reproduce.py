@@ -10,7 +10,7 @@ import typer
 
 from cli.console import progress_for
 from cli.environment import has_compiled_code, prepare_libraries
-from cli.options import First, Last, Quiet, workers_here
+from cli.options import First, Last, Quiet, workers_for
 
 
 class Paper(StrEnum):
@@ -61,13 +61,13 @@ def reproduce(
 
     Example: mapper reproduce thesis --logs logs --tables 5.1,5.2 --out runs/thesis
     """
-    from evaluators.papers.book import Cut
     from evaluators.papers.files import tables_text
+    from evaluators.papers.paper import Cut
     from evaluators.papers.reproduce import Request
     from evaluators.papers.reproduce import reproduce as reproduce_tables
 
     every_core = os.cpu_count() or 1
-    workers = workers_here(processes, scheduler, default=every_core if paper is Paper.THESIS else 1)
+    workers = workers_for(processes, scheduler, default=every_core if paper is Paper.THESIS else 1)
     prepare_libraries()
     request = Request(
         paper=paper.value,
@@ -84,8 +84,7 @@ def reproduce(
     reproduction = reproduce_tables(
         request,
         out,
-        processes=workers,
-        scheduler=scheduler,
+        workers=workers,
         progress=progress,
     )
     if not quiet:

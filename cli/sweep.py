@@ -8,7 +8,7 @@ import typer
 
 from cli.console import progress_for
 from cli.environment import has_compiled_code, prepare_libraries
-from cli.options import Quiet, workers_here
+from cli.options import Quiet, workers_for
 
 
 def sweep(
@@ -38,7 +38,7 @@ def sweep(
     from evaluators.sweep.plan import plan_sweep, run_sweep
     from evaluators.sweep.tables import summary_text
 
-    workers = workers_here(processes, scheduler, default=os.cpu_count() or 1)
+    workers = workers_for(processes, scheduler, default=os.cpu_count() or 1)
     prepare_libraries()
     progress = progress_for(quiet=quiet)
     plan = plan_sweep(file, out)
@@ -46,8 +46,7 @@ def sweep(
         progress.note("first run here: the kernels are compiled once, which takes about a minute")
     results = run_sweep(
         plan,
-        processes=workers,
-        scheduler=scheduler,
+        workers=workers,
         progress=progress,
     )
     records = write_sweep(plan, results, title=file.stem)

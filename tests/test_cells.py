@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 from workers_made import Work, told, until
 
-from evaluators.study.cells import Cell, run_cells
+from evaluators.study.engine import run_study
 from mapper.core.errors import DataError, RunError
 from mapper.runtime.atomic import locked
+from mapper.runtime.executor import Workers
+from mapper.runtime.job_runner import Job
 
 
 class Notes:
@@ -37,18 +39,29 @@ def diary(tmp_path):
 
 
 def cell(diary, name, how="records", *, key=None):
-    return Cell(key or f"cell-{name}", f"the cell {name}", Work(diary, str(name), how))
+    return Job(key or f"cell-{name}", f"the cell {name}", Work(diary, str(name), how))
+
+
+def run_cells(cells, folder, **options):
+    return list(run_study(dict(enumerate(cells)), folder, **options).values())
 
 
 def test_results_come_in_order_and_are_not_worked_out_again(diary, tmp_path):
     cells = [cell(diary, n) for n in (3, 1, 2)]
-    first, second = (run_cells(cells, tmp_path / "cells", processes=p) for p in (2, 1))
+    first, second = (run_cells(cells, tmp_path / "cells", workers=Workers(p)) for p in (2, 1))
 
     assert first == second
     assert [result.key for result in first] == ["cell-3", "cell-1", "cell-2"]
     assert first[1].records == ({"name": "1", "third": 1 / 3, "nothing": None},)
     assert first[1].seconds > 0.0
     assert told(diary) == {"1": 1, "2": 1, "3": 1}
+
+
+def test_finished_cells_need_no_workers(diary, tmp_path):
+    (first,) = run_cells([cell(diary, 1)], tmp_path / "cells")
+    (again,) = run_cells([cell(diary, 1)], tmp_path / "cells", workers=Workers(scheduler="nonsense"))
+    assert again == first
+    assert run_cells([], tmp_path / "cells", workers=Workers(scheduler="nonsense")) == []
 
 
 def test_more_cells_leave_the_finished_ones_alone(diary, tmp_path):
@@ -64,7 +77,7 @@ def test_more_cells_leave_the_finished_ones_alone(diary, tmp_path):
 def test_a_cluster_comes_to_the_same(diary, tmp_path, dask_scheduler):
     cells = [cell(diary, n) for n in range(3)]
     ours = run_cells(cells, tmp_path / "ours")
-    theirs = run_cells(cells, tmp_path / "theirs", scheduler=dask_scheduler)
+    theirs = run_cells(cells, tmp_path / "theirs", workers=Workers(scheduler=dask_scheduler))
     assert [result.records for result in ours] == [result.records for result in theirs]
 
 
@@ -95,12 +108,12 @@ def test_a_file_that_is_no_cell_is_worked_out_again(diary, tmp_path, text):
     (again,) = run_cells([cell(diary, 1)], tmp_path / "cells", progress=observer)
     assert again.records == result.records
     assert told(diary)["1"] == 2
-    assert observer.notes == [f"{file}: is no finished cell, or a damaged one; it is worked out again"]
+    assert observer.notes == [f"{file}: not a finished result, or a damaged one; it is worked out again"]
     assert json.loads(file.read_text())["records"] == json.loads(good)["records"]
 
 
 def test_one_key_is_one_piece_of_work(diary, tmp_path):
-    twins = [cell(diary, 1), Cell("cell-1", "its twin", Work(diary, "1", "records"))]
+    twins = [cell(diary, 1), Job("cell-1", "its twin", Work(diary, "1", "records"))]
     one, other = run_cells(twins, tmp_path / "cells")
     assert (one.label, other.label) == ("the cell 1", "its twin")
     assert one.records == other.records
@@ -117,19 +130,22 @@ def test_two_sweeps_do_not_share_a_folder(diary, tmp_path):
 @pytest.mark.parametrize("key", ["", "../up", ".hidden", "a b", "a" * 201])
 def test_a_key_is_a_file_s_name(key):
     with pytest.raises(DataError, match="its key is a file's name"):
-        Cell(key, "a cell", Path.cwd)
+        Job(key, "a cell", Path.cwd)
 
 
 def test_killed_in_the_middle_it_goes_on_and_runs_nothing_finished_twice(diary, tmp_path):
     script = tmp_path / "sweep.py"
     script.write_text(
         "from pathlib import Path\n"
-        "from evaluators.study.cells import Cell, run_cells\n"
+        "from evaluators.study.engine import run_study\n"
+        "from mapper.runtime.job_runner import Job\n"
+        "from mapper.runtime.executor import Workers\n"
         "from workers_made import Work\n"
         "if __name__ == '__main__':\n"
         f"    diary, folder = Path({str(diary)!r}), Path({str(tmp_path / 'cells')!r})\n"
-        "    cells = [Cell(f'cell-{n}', str(n), Work(diary, str(n), 'nap_records')) for n in range(8)]\n"
-        "    print([len(result.records) for result in run_cells(cells, folder, processes=2)])\n"
+        "    jobs = {n: Job(f'cell-{n}', str(n), Work(diary, str(n), 'nap_records')) for n in range(8)}\n"
+        "    results = run_study(jobs, folder, workers=Workers(2)).values()\n"
+        "    print([len(result.records) for result in results])\n"
     )
     here = Path(__file__).parent
     command = {"args": [sys.executable, str(script)], "env": {"PYTHONPATH": f"{here}:{here.parent}"}}

@@ -13,7 +13,6 @@ from mapper.core.errors import ConfigError, DataError, RunError
 from mapper.core.geometry import exp, inverse
 from mapper.core.trajectory import Trajectory
 from mapper.export.grid import read_grid
-from mapper.merging import jobs as merging_jobs
 from mapper.merging import steps
 from mapper.merging.merge import merge
 from mapper.merging.merged_map import open_map
@@ -27,7 +26,8 @@ from mapper.octree.slice import cut_slice
 from mapper.run.files import SUMMARY
 from mapper.run.folder import load_run, write_run
 from mapper.run.manifest import Input, Manifest
-from mapper.runtime.executor import run_jobs
+from mapper.runtime import job_runner
+from mapper.runtime.executor import Workers, run_jobs
 from mapper.sources.trajectory_files import write_tum
 
 BAND = SliceConfig(min_height_m=-0.5, max_height_m=0.8)
@@ -76,19 +76,19 @@ def bytes_of(folder, *, but=""):
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
-def shuffled_jobs(jobs, **settings):
+def shuffled_jobs(jobs, *workers, **settings):
     order = np.random.default_rng(0).permutation(len(jobs))
-    for index, result in run_jobs([jobs[i] for i in order], **settings):
+    for index, result in run_jobs([jobs[i] for i in order], *workers, **settings):
         yield int(order[index]), result
 
 
 def test_the_bytes_are_the_same_for_one_process_two_processes_and_any_order(
     runs, merged, tmp_path, monkeypatch
 ):
-    MERGE(as_built(runs), tmp_path / "two", processes=2)
+    MERGE(as_built(runs), tmp_path / "two", workers=Workers(2))
     assert bytes_of(tmp_path / "two") == bytes_of(merged.path)
 
-    monkeypatch.setattr(merging_jobs, "run_jobs", shuffled_jobs)
+    monkeypatch.setattr(job_runner, "run_jobs", shuffled_jobs)
     monkeypatch.setattr("mapper.merging.merge.draw", lambda *_: None)
     MERGE(as_built(runs), tmp_path / "shuffled")
     assert bytes_of(tmp_path / "shuffled") == bytes_of(merged.path, but=SUMMARY)
@@ -96,7 +96,7 @@ def test_the_bytes_are_the_same_for_one_process_two_processes_and_any_order(
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_dask_cluster_writes_the_same_bytes(runs, merged, tmp_path, dask_scheduler):
-    MERGE(as_built(runs), tmp_path / "map", scheduler=dask_scheduler)
+    MERGE(as_built(runs), tmp_path / "map", workers=Workers(scheduler=dask_scheduler))
 
     assert bytes_of(tmp_path / "map") == bytes_of(merged.path, but=SUMMARY)
 
@@ -172,11 +172,11 @@ def test_a_merge_that_was_stopped_goes_on_where_it_was(runs, merged, tmp_path, m
             raise OSError("the disk is gone")
         return steps.join_tile(site, tile, *arguments, **settings)
 
-    def jobs(some, **settings):
-        return run_jobs(some, **settings, attempts=1)
+    def jobs(some, executor, **_):
+        return run_jobs(some, executor, attempts=1)
 
     monkeypatch.setattr("mapper.merging.merge.join_tile", join)
-    monkeypatch.setattr(merging_jobs, "run_jobs", jobs)
+    monkeypatch.setattr(job_runner, "run_jobs", jobs)
     with pytest.raises(RunError, match=r"join \d+: OSError: the disk is gone.*\(and 1 more\).*to go on"):
         MERGE(as_built(runs), out)
     assert not out.exists()

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from scan_world import on_street, street, view
 
-from evaluators.papers.hough import METHODS, HoughTrial, hough_cells
+from evaluators.papers.hough import METHODS, HoughTrial, hough_jobs
 from evaluators.papers.hough_pairs import ALL_RINGS, FEW_RINGS, Clouds, LogPair, find_pairs
 from evaluators.papers.hough_tables import hough_reproduction
 from evaluators.papers.scan_pairs import fewer_rings, merged, perturbed
-from evaluators.study.cells import CellResult
 from mapper.core.errors import ConfigError, SourceError
 from mapper.core.frames import Scan
 from mapper.core.geometry import apply, rotation_exp, transform
 from mapper.core.trajectory import trajectory_from
+from mapper.runtime.job_runner import JobResult
 from mapper.sources.trajectory_files import read_kitti, write_kitti
 
 RELLIS = Path(__file__).parents[2] / "shared/data/rellis_cross_sensor"
@@ -67,10 +67,10 @@ def test_a_trial_finds_the_scan_again_and_draws_it(logs, tmp_path):
 
 
 def test_cells_are_told_apart_by_pair_method_and_seed(logs, tmp_path):
-    cells = hough_cells(logs, seeds=2, pictures=tmp_path)
+    cells = list(hough_jobs(logs, seeds=2, pictures=tmp_path).values())
 
     assert len({cell.key for cell in cells}) == len(cells) == 4 * len(METHODS) * 2
-    again = hough_cells(logs, seeds=3, pictures=tmp_path / "elsewhere")
+    again = hough_jobs(logs, seeds=3, pictures=tmp_path / "elsewhere").values()
     assert {cell.key for cell in cells} < {cell.key for cell in again}
     assert [cell.run.picture is not None for cell in cells[:2]] == [True, False]
 
@@ -207,7 +207,7 @@ def trial(**changes):
 
 
 def results_of(*trials):
-    return [CellResult(f"k{i}", f"cell {i}", (each,), 1.0) for i, each in enumerate(trials)]
+    return [JobResult(f"k{i}", f"cell {i}", (each,), 1.0) for i, each in enumerate(trials)]
 
 
 def cell_of(reproduction, table, row, column):
@@ -269,7 +269,7 @@ def test_what_is_missing_is_told(tmp_path):
         ("mhd_hough_m", "mpd_hough_m", "mhd_final_m", "mpd_final_m", "error_m", "error_deg")
     )
     results = results_of(trial(**missing, right=0, trusted=0, reason="no objects"))
-    broken = CellResult("k9", "c, 16 rings, hough-ndt, seed 0", (), 0.0, "c.bin: is empty")
+    broken = JobResult("k9", "c, 16 rings, hough-ndt, seed 0", (), 0.0, "c.bin: is empty")
 
     reproduction = hough_reproduction([*results, broken], pictures=tmp_path)
 

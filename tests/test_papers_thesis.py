@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from evaluators.papers.ablation import follow
-from evaluators.papers.book import Cut
-from evaluators.papers.measured import CONFIGS, cell_for, cells_of
+from evaluators.papers.measurements import CONFIGS, cells_of, job_for
 from evaluators.papers.model import PaperCell
-from evaluators.papers.thesis import BOOK, ThesisJob, table_of
+from evaluators.papers.paper import Cut
+from evaluators.papers.thesis import PAPER, ThesisJob, table_of
 from evaluators.papers.thesis_tables import tables
-from evaluators.study.cells import CellResult
 from evaluators.study.seeds import seeded
 from mapper.config.loading import load_config
 from mapper.core.errors import ConfigError, DataError
@@ -21,6 +20,7 @@ from mapper.core.trajectory import trajectory_from
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import TrackingResult, track_log
+from mapper.runtime.job_runner import JobResult
 from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
 from mapper.sources.trajectory_files import read_tum
@@ -119,7 +119,7 @@ def test_settings_followed_together_are_as_each_alone(desk_log):
         assert together[name].lost == 0
         if name == "loops":
             assert any(loop.verdict == "accepted" for loop in solved.loops)
-    assert len({followed.estimate.T_world_body.tobytes() for followed in together.values()}) == 5
+    assert len({result.estimate.T_world_body.tobytes() for result in together.values()}) == 5
 
 
 def test_a_setting_that_places_too_little_says_so_and_the_others_go_on(desk_log):
@@ -168,8 +168,8 @@ def test_another_log_seed_or_part_is_another_cell_and_another_place_is_not(job, 
     ]
     moved = ThesisJob(("5.5",), job.sequence, tmp_path / "moved", 0, job.cut, tmp_path)
 
-    assert len({cell_for(each).key for each in [job, *others]}) == 6
-    assert cell_for(moved).key == cell_for(job).key
+    assert len({job_for(each).key for each in [job, *others]}) == 6
+    assert job_for(moved).key == job_for(job).key
 
 
 def test_a_log_without_truth_has_no_error(tiny_tum_log, tmp_path):
@@ -182,7 +182,7 @@ def test_a_log_without_truth_has_no_error(tiny_tum_log, tmp_path):
 
 def test_tables_of_the_same_frames_are_measured_together(job):
     def groups(sequence):
-        jobs = BOOK.jobs(list(tables()), sequence, job.log, 0, Cut(), job.paths)
+        jobs = PAPER.measurements(list(tables()), sequence, job.log, 0, Cut(), job.paths)
         return [each.tables for each in jobs]
 
     assert groups("fr1/xyz") == [("4.1", "5.1", "5.2", "5.5"), ("detectors",)]
@@ -214,7 +214,7 @@ def test_the_end_of_a_path_is_off_in_the_axes_of_its_start():
     truth = trajectory_from(zip(stamps, true, strict=True))
     estimate = trajectory_from(zip(stamps, [*true[:-1], end], strict=True))
 
-    off = tables()["4.1"].judge(estimate, truth)
+    off = tables()["4.1"].measure(estimate, truth)
 
     assert off[:3] == pytest.approx([10.0, -20.0, 30.0])
     assert off[3:6] == pytest.approx([0.006, 0.002, -0.004])  # roll about z, pitch about x, yaw about y
@@ -223,9 +223,9 @@ def test_the_end_of_a_path_is_off_in_the_axes_of_its_start():
 
 def test_the_thesiss_own_log_stands_beside_ours_without_a_ratio(job):
     jobs = [ThesisJob(("4.1",), "fr1/xyz", job.log, 0, job.cut, job.paths)]
-    results = [CellResult("k", "l", tuple(figure(place, 1.0) for place in jobs[0].places), 1.0)]
+    results = {jobs[0]: JobResult("k", "l", tuple(figure(place, 1.0) for place in jobs[0].places), 1.0)}
 
-    table = table_of("4.1", jobs, results)
+    table = table_of("4.1", results)
 
     verdicts = {(cell.row.partition(",")[0], cell.published is None): cell.verdict for cell in table.cells}
     assert verdicts == {
@@ -244,14 +244,15 @@ def figure(place, value, failure=None, note=""):
 def test_seeds_are_gathered_and_failures_told(job):
     jobs = [ThesisJob(("5.2",), "fr1/xyz", job.log, seed, job.cut, job.paths) for seed in range(3)]
     mp1, mp2, *_ = jobs[0].places
-    results = [
-        CellResult("a", "a", (figure(mp1, 0.03), figure(mp2, 0.02, note="5 lost.")), 1.0),
-        CellResult("b", "b", (figure(mp1, 0.01), figure(mp2, None, "too few frames")), 1.0),
-        CellResult("c", "c", (), 0.0, "its worker was killed by SIGKILL"),
+    outcomes = [
+        JobResult("a", "a", (figure(mp1, 0.03), figure(mp2, 0.02, note="5 lost.")), 1.0),
+        JobResult("b", "b", (figure(mp1, 0.01), figure(mp2, None, "too few frames")), 1.0),
+        JobResult("c", "c", (), 0.0, "its worker was killed by SIGKILL"),
     ]
+    results = dict(zip(jobs, outcomes, strict=True))
 
-    cells = cells_of("5.2", jobs, results, {"fr1/xyz": {"MP1": 0.02}})
-    table = table_of("5.2", jobs, results)
+    cells = cells_of("5.2", results, {"fr1/xyz": {"MP1": 0.02}})
+    table = table_of("5.2", results)
 
     assert cells[0] == PaperCell(
         "fr1/xyz", "MP1", 0.02, (0.03, 0.01), ("seed 2: its worker was killed by SIGKILL",)

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cli.main import app
-from evaluators.papers.book import Cut
+from evaluators.papers.paper import Cut
 from evaluators.papers.reproduce import Request, reproduce
 from evaluators.papers.thesis import ThesisJob
 from evaluators.papers.zhao import TABLES, ZhaoJob

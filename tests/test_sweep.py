@@ -2,7 +2,6 @@ import csv
 import json
 import re
 from contextlib import contextmanager
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,12 +9,14 @@ from chromium import CHROMIUM, MISSING, Page
 from pyarrow import parquet
 from test_cli import mapper
 
-from evaluators.study.cells import Cell, CellResult
+from evaluators.study.versions import SameVersions, versions
 from evaluators.sweep.chart import Line, dot_chart
 from evaluators.sweep.files import write_sweep
 from evaluators.sweep.plan import plan_sweep, run_sweep
 from evaluators.sweep.tables import QUANTITIES, best_of, grouped, summary_text, sweep_records
 from mapper.core.errors import ConfigError, RunError, SourceError
+from mapper.runtime.executor import Workers
+from mapper.runtime.job_runner import Job, JobResult
 
 FEW = "source.last_frame=11"
 TIMES = {"cell_s", "track_s", "solve_s", "level_s", "fuse_s", "write_s", "total_s", "frames_per_s"}
@@ -52,7 +53,7 @@ def method(name, *overrides):
 
 
 def configs_of(plan):
-    return {place: cell.run.config for place, cell in plan.cells.items()}
+    return {place: cell.run.config for place, cell in plan.jobs.items()}
 
 
 def test_every_method_meets_every_configuration(swept, desk_log, tmp_path):
@@ -92,7 +93,7 @@ def test_logs_are_found_by_globs_and_told_apart(swept, tiny_tum_log, tmp_path):
     for folder in ("b/desk", "a/desk", "a/room"):
         tiny_tum_log(2, folder=folder)
     plan = plan_sweep(swept("logs = ['a/room', '*/*']", method("a")), tmp_path / "out")
-    assert [place.log for place in plan.cells] == ["room", str(tmp_path / "a/desk"), str(tmp_path / "b/desk")]
+    assert [place.log for place in plan.jobs] == ["room", str(tmp_path / "a/desk"), str(tmp_path / "b/desk")]
 
 
 def test_what_does_not_fit_a_sensor_is_left_out(swept, desk_log, scans, tmp_path):
@@ -106,7 +107,7 @@ def test_what_does_not_fit_a_sensor_is_left_out(swept, desk_log, scans, tmp_path
         method("scans", "loops.kind=scans"),
     )
     entries = plan_sweep(file, tmp_path / "out").entries
-    found = {(p.log, p.method): "" if isinstance(e, Cell) else e for p, e in entries.items()}
+    found = {(p.log, p.method): "" if isinstance(e, Job) else e for p, e in entries.items()}
     blind = "loops.kind=places needs images, odometry.kind=gicp sees scans"
     assert found == {
         ("desk", "default"): "",
@@ -137,13 +138,13 @@ def test_seeds_repeat_what_draws_by_chance(swept, desk_log, tmp_path):
     file = swept(
         f"logs = ['{desk_log}']", "seeds = [4, 7]", "[[method]]\nname = 'a'\nconfig = 'seedless.json'"
     )
-    assert [place.seed for place in plan_sweep(file, tmp_path / "out").cells] == [None]
+    assert [place.seed for place in plan_sweep(file, tmp_path / "out").jobs] == [None]
 
 
 def test_a_key_tells_what_is_built_and_not_what_it_is_called(swept, desk_log, tiny_tum_log, tmp_path):
     def keys(*lines, log=desk_log):
         plan = plan_sweep(swept(f"logs = ['{log}']", *lines), tmp_path / "out")
-        return [cell.key for cell in plan.cells.values()]
+        return [cell.key for cell in plan.jobs.values()]
 
     plain = keys(method("a"))
     assert keys(method("b"), "[[configuration]]\nname = 'c'") == plain
@@ -283,7 +284,7 @@ def test_builds_in_other_processes_come_to_the_same(interrupted, resumable_folde
     assert resumable_folder
     file, out, _ = interrupted
     plan = plan_sweep(file, tmp_path / "out")
-    write_sweep(plan, run_sweep(plan, scheduler=dask_scheduler), title="again")
+    write_sweep(plan, run_sweep(plan, workers=Workers(scheduler=dask_scheduler)), title="again")
 
     theirs, ours = (
         parquet.read_table(folder / "results.parquet").drop_columns(sorted(TIMES)).to_pylist()
@@ -305,19 +306,19 @@ def test_another_folder_is_not_filled(swept, desk_log, tmp_path):
 
 def test_a_worker_with_other_libraries_refuses(swept, desk_log, tmp_path):
     plan = plan_sweep(swept(f"logs = ['{desk_log}']", method("a")), tmp_path / "out")
-    (cell,) = plan.cells.values()
-    elsewhere = replace(cell.run, environment={**cell.run.environment, "numpy": "1.0"})
-    with pytest.raises(ConfigError, match=r"numpy .*, where the sweep was planned with 1\.0"):
+    (cell,) = plan.jobs.values()
+    elsewhere = SameVersions(cell.run, {**versions(), "numpy": "1.0"})
+    with pytest.raises(ConfigError, match=r"numpy .*, where the work was planned with 1\.0"):
         elsewhere()
 
 
 def invented(plan, **values):
     """Return results for a plan; a build without values has failed."""
     return {
-        place: CellResult(
+        place: JobResult(
             cell.key, cell.label, ({**known},) if known else (), 1.0, "" if known else "it was dark"
         )
-        for place, cell in plan.cells.items()
+        for place, cell in plan.jobs.items()
         for known in (values.get(f"{place.method}{'' if place.seed is None else place.seed}"),)
     }
 

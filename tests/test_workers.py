@@ -8,14 +8,14 @@ from workers_made import Work, alive, told, until
 
 from mapper.core.errors import ConfigError, DependencyError
 from mapper.runtime import executor as workers
-from mapper.runtime.executor import Failure, run_jobs
+from mapper.runtime.executor import Failure, Workers, make_executor, run_jobs
 
 
 @pytest.fixture(params=["here", "processes", "dask"])
-def crew(request):
+def anywhere(request):
     if request.param == "dask":
-        return {"scheduler": request.getfixturevalue("dask_scheduler")}
-    return {"processes": 1 if request.param == "here" else 2}
+        return Workers(scheduler=request.getfixturevalue("dask_scheduler"))
+    return Workers(1 if request.param == "here" else 2)
 
 
 @pytest.fixture
@@ -23,19 +23,20 @@ def diary(tmp_path):
     return tmp_path / "diary"
 
 
-def test_every_job_is_done_once_wherever(crew, diary):
+def outcomes_of(jobs, given, **options):
+    with make_executor(given) as executor:
+        return dict(run_jobs(jobs, executor, **options))
+
+
+def test_every_job_is_done_once_wherever(anywhere, diary):
     jobs = [Work(diary, str(n)) for n in range(7)]
-    assert dict(run_jobs(jobs, **crew)) == {n: n * n for n in range(7)}
+    assert outcomes_of(jobs, anywhere) == {n: n * n for n in range(7)}
     assert told(diary) == {str(n): 1 for n in range(7)}
 
 
-def test_no_jobs_need_no_workers():
-    assert list(run_jobs([], scheduler="nonsense")) == []
-
-
-def test_what_raises_is_tried_again_and_the_others_go_on(crew, diary):
+def test_what_raises_is_tried_again_and_the_others_go_on(anywhere, diary):
     jobs = [Work(diary, "1", "raise"), Work(diary, "2"), Work(diary, "3", "refuse")]
-    outcomes = dict(run_jobs(jobs, attempts=3, **crew))
+    outcomes = outcomes_of(jobs, anywhere, attempts=3)
     assert outcomes[1] == 4
     assert outcomes[2] == Failure("3.png: is black", 3)
     assert outcomes[0].attempts == 3
@@ -45,7 +46,7 @@ def test_what_raises_is_tried_again_and_the_others_go_on(crew, diary):
 
 def test_what_ends_its_worker_is_the_only_one_lost(diary):
     jobs = [Work(diary, "1", "exit"), Work(diary, "2", "kill"), *(Work(diary, str(n)) for n in (3, 4, 5))]
-    outcomes = dict(run_jobs(jobs, processes=2))
+    outcomes = outcomes_of(jobs, Workers(2))
     assert outcomes == {
         0: Failure("its worker ended with exit status 3", 2),
         1: Failure("its worker was killed by SIGKILL", 2),
@@ -58,19 +59,19 @@ def test_what_ends_its_worker_is_the_only_one_lost(diary):
 
 def test_what_ended_its_worker_once_gets_another(diary):
     jobs = [Work(diary, "flaky", "exit_once"), Work(diary, "2")]
-    assert dict(run_jobs(jobs, processes=2)) == {0: 7, 1: 4}
+    assert outcomes_of(jobs, Workers(2)) == {0: 7, 1: 4}
     assert told(diary) == {"flaky": 2, "2": 1}
 
 
 def test_what_ends_a_cluster_s_worker_is_the_only_one_lost(diary, dask_scheduler):
     jobs = [Work(diary, "1", "exit"), Work(diary, "2"), Work(diary, "3")]
-    outcomes = dict(run_jobs(jobs, scheduler=dask_scheduler, attempts=1))
+    outcomes = outcomes_of(jobs, Workers(scheduler=dask_scheduler), attempts=1)
     assert outcomes == {0: Failure("its worker died, 1 of 1 times; its log may say why", 1), 1: 4, 2: 9}
     assert told(diary) == {"1": 1, "2": 1, "3": 1}
 
 
 def test_a_result_that_cannot_travel_is_a_failure(diary):
-    outcomes = dict(run_jobs([Work(diary, "1", "unpicklable"), Work(diary, "2")], processes=2))
+    outcomes = outcomes_of([Work(diary, "1", "unpicklable"), Work(diary, "2")], Workers(2))
     assert "pickle" in outcomes[0].reason
     assert outcomes[1] == 4
 
@@ -78,18 +79,17 @@ def test_a_result_that_cannot_travel_is_a_failure(diary):
 def test_libraries_get_one_thread_each(diary, monkeypatch):
     for name in ("OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
         monkeypatch.delenv(name, raising=False)
-    outcomes = dict(run_jobs([Work(diary, "1", "limits"), Work(diary, "2")], processes=2))
+    outcomes = outcomes_of([Work(diary, "1", "limits"), Work(diary, "2")], Workers(2))
     assert outcomes[0] == (1, "1")
 
 
 def test_leaving_early_ends_the_workers(diary):
     jobs = [Work(diary, "1"), Work(diary, "asleep", "wait"), Work(diary, "awake", "wait")]
-    results = run_jobs(jobs, processes=2)
-    assert next(results) == (0, 1)
-    until((diary.parent / "asleep.pid").exists)
-    pid = int((diary.parent / "asleep.pid").read_text() or 0)
-    assert alive(pid)
-    results.close()
+    with make_executor(Workers(2)) as executor:
+        assert next(run_jobs(jobs, executor)) == (0, 1)
+        until((diary.parent / "asleep.pid").exists)
+        pid = int((diary.parent / "asleep.pid").read_text() or 0)
+        assert alive(pid)
     assert not alive(pid)
 
 
@@ -97,11 +97,12 @@ def test_workers_do_not_outlive_a_parent_that_is_killed(diary, tmp_path):
     script = tmp_path / "sweep.py"
     script.write_text(
         "from pathlib import Path\n"
-        "from mapper.runtime.executor import run_jobs\n"
+        "from mapper.runtime.executor import Workers, make_executor, run_jobs\n"
         "from workers_made import Work\n"
         "if __name__ == '__main__':\n"
         f"    diary = Path({str(diary)!r})\n"
-        "    list(run_jobs([Work(diary, name, 'wait') for name in 'ab'], processes=2))\n"
+        "    with make_executor(Workers(2)) as executor:\n"
+        "        list(run_jobs([Work(diary, name, 'wait') for name in 'ab'], executor))\n"
     )
     here = Path(__file__).parent
     parent = subprocess.Popen([sys.executable, str(script)], env={"PYTHONPATH": f"{here}:{here.parent}"})
@@ -113,10 +114,10 @@ def test_workers_do_not_outlive_a_parent_that_is_killed(diary, tmp_path):
     until(lambda: not any(map(alive, pids)), seconds=10.0)
 
 
-@pytest.mark.parametrize("wrong", [{"processes": 0}, {"attempts": 0}])
-def test_numbers_of_nothing_are_refused(diary, wrong):
+@pytest.mark.parametrize(("processes", "attempts"), [(0, 1), (1, 0)])
+def test_numbers_of_nothing_are_refused(diary, processes, attempts):
     with pytest.raises(ConfigError, match="want at least 1"):
-        list(run_jobs([Work(diary, "1")], **wrong))
+        outcomes_of([Work(diary, "1")], Workers(processes), attempts=attempts)
 
 
 @pytest.mark.parametrize(
@@ -127,14 +128,14 @@ def test_numbers_of_nothing_are_refused(diary, wrong):
         ("tcp://127.0.0.1:9", "tcp://127.0.0.1:9: no Dask scheduler answers there within 0.3 s"),
     ],
 )
-def test_a_scheduler_that_is_not_there_is_told(diary, monkeypatch, address, message):
+def test_a_scheduler_that_is_not_there_is_told(monkeypatch, address, message):
     monkeypatch.setattr(workers, "_ANSWER_S", 0.3)
     with pytest.raises(ConfigError) as told_:
-        list(run_jobs([Work(diary, "1")], scheduler=address))
+        make_executor(Workers(scheduler=address))
     assert str(told_.value).startswith(message)
 
 
-def test_a_missing_extra_is_told(diary, monkeypatch):
+def test_a_missing_extra_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(DependencyError, match=r"pip install 'mapper\[cluster\]'"):
-        list(run_jobs([Work(diary, "1")], scheduler="tcp://127.0.0.1:8786"))
+        make_executor(Workers(scheduler="tcp://127.0.0.1:8786"))

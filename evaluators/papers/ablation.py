@@ -1,4 +1,4 @@
-"""ISVD with several settings on one log, in lockstep: nothing is done twice that they have in common."""
+"""Variants of ISVD on one log in lockstep: what their settings have in common is computed once."""
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
@@ -25,8 +25,8 @@ from mapper.sources.base import Log
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Followed:
-    """What a setting made of a log.
+class VariantResult:
+    """Result of one variant.
 
     Attributes:
         estimate: Poses of the frames that were placed; None if too few were.
@@ -44,37 +44,37 @@ class Followed:
         return self.frames - (0 if self.estimate is None else len(self.estimate))
 
 
-def follow(source: Log, variants: Mapping[str, BuildConfig]) -> dict[str, Followed]:
-    """Return what every setting makes of a log.
+def follow(source: Log, variants: Mapping[str, BuildConfig]) -> dict[str, VariantResult]:
+    """Return the result of every variant on a log.
 
-    Each frame is read once, each detector looks at it once, and frames are matched and registered once by
-    all that do so alike.
+    Each frame is read once, its features are detected once by each detector, and frames are matched and
+    registered once for all variants that do so alike.
 
     Raises:
         ConfigError: An odometry is not ISVD.
     """
-    eyes: dict[DetectorConfig, _Eyes] = {}
-    followers: dict[BuildConfig, _Follower] = {}
+    detectors: dict[DetectorConfig, _SharedDetector] = {}
+    runs: dict[BuildConfig, _VariantRun] = {}
     for name, config in variants.items():
         if not isinstance(config.odometry, IsvdOdometryConfig):
             raise ConfigError(f"{name}: odometry.kind is {config.odometry.kind}, want isvd")
-        if config not in followers:
+        if config not in runs:
             detector = config.odometry.detector
-            seeing = eyes.setdefault(detector, _Eyes(detector))
-            followers[config] = _Follower(config, config.odometry, seeing)
+            shared = detectors.setdefault(detector, _SharedDetector(detector))
+            runs[config] = _VariantRun(config, config.odometry, shared)
     for entry in source.entries():
         try:
             frame = entry.load(colour=False)
         except FrameError:
             continue  # as a build does
-        for follower in followers.values():
-            follower.add(frame)
-    followed = {config: follower.followed() for config, follower in followers.items()}
-    return {name: followed[config] for name, config in variants.items()}
+        for run in runs.values():
+            run.add(frame)
+    results = {config: run.result() for config, run in runs.items()}
+    return {name: results[config] for name, config in variants.items()}
 
 
-class _Eyes:
-    """A detector, and what was found of its features in the newest frame, however many odometries ask."""
+class _SharedDetector:
+    """Detector of several odometries: keeps the newest frame's features, their matches and their fits."""
 
     def __init__(self, config: DetectorConfig) -> None:
         self._detector = build_detector(config)
@@ -119,12 +119,12 @@ class _Eyes:
         return self._pairs[key]
 
 
-class _Follower:
-    """One setting on its way through the log."""
+class _VariantRun:
+    """One variant, frame by frame."""
 
-    def __init__(self, config: BuildConfig, odometry: IsvdOdometryConfig, eyes: _Eyes) -> None:
+    def __init__(self, config: BuildConfig, odometry: IsvdOdometryConfig, shared: _SharedDetector) -> None:
         self._config = config
-        self._odometry = IsvdOdometry(odometry, detector=eyes, register=eyes.comparing(odometry))
+        self._odometry = IsvdOdometry(odometry, detector=shared, register=shared.comparing(odometry))
         self._closer = build_loop_detector(config.loops, config.graph.solve)
         self._graph = PoseGraph()
         self._tracks: list[FrameResult] = []
@@ -140,7 +140,7 @@ class _Follower:
         self._graph.add_factors(track.factors)
         self._closer.add(track.node, track, partial(self._odometry.view, observation))
 
-    def followed(self) -> Followed:
+    def result(self) -> VariantResult:
         """Return the poses with the loops' correction."""
         loops = tuple(self._closer.closures())
         self._graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")
@@ -149,5 +149,5 @@ class _Follower:
             refuse_a_fragment(tracking, self._config, sensor="rgbd")
             solved = solve(self._graph, loops, self._config.graph)
         except MapperError as error:
-            return Followed(None, len(self._tracks), str(error))
-        return Followed(replace(tracking, graph=solved.graph).trajectory(), len(self._tracks))
+            return VariantResult(None, len(self._tracks), str(error))
+        return VariantResult(replace(tracking, graph=solved.graph).trajectory(), len(self._tracks))

@@ -42,7 +42,7 @@ class Clouds:
 
     Attributes:
         target: The map.
-        source: The scan, told in its own frame.
+        source: The scan, in its own frame.
         T_target_source: Its pose in the map; None if nobody knows.
     """
 

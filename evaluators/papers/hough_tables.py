@@ -4,7 +4,7 @@ Their clouds are not public, so ours are other scenes. Scene by scene there is n
 it succeeds, how near it ends and how long it takes can be.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import mean, median
 
@@ -20,8 +20,8 @@ from evaluators.papers.hough_pairs import (
 )
 from evaluators.papers.model import PaperCell, PaperTable, Reproduction
 from evaluators.papers.published import published
-from evaluators.study.cells import CellResult
 from evaluators.tables.table import Record, Value
+from mapper.runtime.job_runner import JobResult
 
 NEAR_M = 0.03
 """A final MPD below it is the paper's success."""
@@ -46,13 +46,14 @@ _PRINTED_AS = {ALL_RINGS: "HDL", FEW_RINGS: "VLP", "HDL": "HDL", "VLP": "VLP"}
 Trials = Sequence[Record]
 
 
-def hough_reproduction(results: Sequence[CellResult], *, pictures: Path) -> Reproduction:
+def hough_reproduction(results: Iterable[JobResult], *, pictures: Path) -> Reproduction:
     """Return both summed up, the printed table, ours in its layout by each method, and our errors.
 
     Args:
-        results: Of the cells of :func:`~evaluators.papers.hough.hough_cells`.
+        results: Of the jobs of :func:`~evaluators.papers.hough.hough_jobs`.
         pictures: Folder they drew into.
     """
+    results = list(results)
     trials = [record for result in results for record in result.records]
     return Reproduction(
         paper=_PAPER,

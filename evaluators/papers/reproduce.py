@@ -1,28 +1,30 @@
-"""A paper's tables measured again on whatever of its logs are at hand; work that was killed goes on."""
+"""A paper's tables measured again on whatever of its logs are at hand; work that was stopped goes on."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from evaluators.papers import thesis, zhao
-from evaluators.papers.book import Book, Cut
 from evaluators.papers.files import write_reproduction
-from evaluators.papers.hough import hough_cells
+from evaluators.papers.hough import hough_jobs
 from evaluators.papers.hough_tables import hough_reproduction
-from evaluators.papers.measured import cell_for
+from evaluators.papers.measurements import job_for
 from evaluators.papers.model import Reproduction
+from evaluators.papers.paper import Cut, Paper
 from evaluators.papers.sequences import Found, find_sequences
-from evaluators.study.cells import Cell, CellResult, run_cells
+from evaluators.study.engine import CELLS, run_study
 from mapper.core.errors import ConfigError, DataError
 from mapper.runtime.atomic import resumable_folder, write_text
+from mapper.runtime.executor import IN_PROCESS, Workers
+from mapper.runtime.job_runner import Job, JobResult
 from mapper.runtime.progress import SILENT, Progress
 
-Paper = Literal["thesis", "zhao", "hough"]
+PaperName = Literal["thesis", "zhao", "hough"]
 
-CELLS, PATHS, PICTURES, PLAN = "cells", "trajectories", "pictures", "reproduce.json"
-_BOOKS: Mapping[Paper, Book] = {"thesis": thesis.BOOK, "zhao": zhao.BOOK}
+PATHS, PICTURES, PLAN = "trajectories", "pictures", "reproduce.json"
+_PAPERS: Mapping[PaperName, Paper] = {"thesis": thesis.PAPER, "zhao": zhao.PAPER}
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +40,7 @@ class Request:
         cut: Which frames are used.
     """
 
-    paper: Paper
+    paper: PaperName
     logs: Path
     given: Mapping[str, Path] = field(default_factory=dict)
     tables: tuple[str, ...] = ()
@@ -54,90 +56,82 @@ class Request:
                     "hough has one table, of pairs of clouds: it knows no --log, --tables, --first or --last"
                 )
             return
-        known = _BOOKS[self.paper].sequences
+        known = _PAPERS[self.paper].sequences
         if unknown := [name for name in self.tables if name not in known]:
             raise ConfigError(f"--tables {','.join(unknown)}: {self.paper} has {', '.join(known)}")
 
 
 def reproduce(
-    request: Request,
-    out: Path,
-    *,
-    processes: int = 1,
-    scheduler: str | None = None,
-    progress: Progress = SILENT,
+    request: Request, out: Path, *, workers: Workers = IN_PROCESS, progress: Progress = SILENT
 ) -> Reproduction:
     """Measure what is not measured yet, and write all tables, ours beside the printed figures.
 
     Args:
         request: What to measure.
-        out: Folder for tables, pictures, trajectories and finished cells; one that is there is gone on with.
-        processes: As for ``run_cells``.
-        scheduler: As for ``run_cells``; its workers have to see the logs and ``out`` under the same paths.
-        progress: Who waits.
+        out: Folder for tables, pictures, trajectories and finished cells; an unfinished one is completed.
+        workers: Where to measure; a scheduler's workers see the logs and ``out`` under the same paths.
+        progress: Told how far it is.
 
     Raises:
         SourceError: None of the paper's logs is there.
-        ConfigError: As for ``run_jobs``, or a log is named that the paper does not have.
+        ConfigError: As for ``run_study``, or a log is named that the paper does not have.
         DataError: Nothing could be measured.
         RunError: OUT holds something else, or another process is filling it.
     """
-    work = _HoughWork(request) if request.paper == "hough" else _BookWork(request, _BOOKS[request.paper])
-    cells = work.cells(out.resolve())
-    with resumable_folder(out, mark=PLAN) as folder:
-        write_text(folder / PLAN, _described(request, cells))
-        results = run_cells(
-            cells, folder / CELLS, processes=processes, scheduler=scheduler, progress=progress
-        )
-        if all(result.failure for result in results):
-            raise DataError(f"nothing could be measured; {results[0].label}: {results[0].failure}")
-        reproduction = work.reproduction(cells, results, folder)
-        write_reproduction(folder, reproduction)
+    out = out.resolve()
+    jobs: dict[Any, Job]
+    if request.paper == "hough":
+        jobs = hough_jobs(request.logs, seeds=request.seeds, pictures=out / PICTURES)
+    else:
+        sequences = _Sequences(request, _PAPERS[request.paper])
+        jobs = sequences.jobs(out / PATHS)
+    with resumable_folder(out, mark=PLAN):
+        plan = {
+            "paper": request.paper,
+            "logs": str(request.logs.resolve()),
+            "cells": {job.label: job.key for job in jobs.values()},
+        }
+        write_text(out / PLAN, json.dumps(plan, indent=1, ensure_ascii=False) + "\n")
+        results = run_study(jobs, out / CELLS, workers=workers, progress=progress)
+        if all(result.failure for result in results.values()):
+            first = next(iter(results.values()))
+            raise DataError(f"nothing could be measured; {first.label}: {first.failure}")
+        if request.paper == "hough":
+            reproduction = hough_reproduction(results.values(), pictures=out / PICTURES)
+        else:
+            reproduction = sequences.reproduction(results)
+        write_reproduction(out, reproduction)
     return reproduction
 
 
-class _HoughWork:
-    """Pairs of clouds."""
+class _Sequences:
+    """A paper's sequences that are at hand, and what is asked of them."""
 
-    def __init__(self, request: Request) -> None:
-        self._request = request
-
-    def cells(self, folder: Path) -> list[Cell]:
-        return hough_cells(self._request.logs, seeds=self._request.seeds, pictures=folder / PICTURES)
-
-    def reproduction(
-        self, _cells: Sequence[Cell], results: Sequence[CellResult], folder: Path
-    ) -> Reproduction:
-        return hough_reproduction(results, pictures=folder / PICTURES)
-
-
-class _BookWork:
-    """Sequences."""
-
-    def __init__(self, request: Request, book: Book) -> None:
-        self._request, self._book = request, book
-        self._tables = [name for name in book.sequences if not request.tables or name in request.tables]
-        names = dict.fromkeys(name for table in self._tables for name in book.sequences[table])
+    def __init__(self, request: Request, paper: Paper) -> None:
+        self._request, self._paper = request, paper
+        self._tables = [name for name in paper.sequences if not request.tables or name in request.tables]
+        names = dict.fromkeys(name for table in self._tables for name in paper.sequences[table])
         self._found: Found = find_sequences(request.logs, [*names], request.given)
 
-    def cells(self, folder: Path) -> list[Cell]:
-        request, paths = self._request, folder / PATHS
-        return [
-            cell_for(job)
+    def jobs(self, paths: Path) -> dict[Any, Job]:
+        """Return a job for every measurement."""
+        request = self._request
+        return {
+            measurement: job_for(measurement)
             for name, log in self._found.logs.items()
             for seed in range(request.seeds)
-            for job in self._book.jobs(self._tables, name, log.resolve(), seed, request.cut, paths)
-        ]
+            for measurement in self._paper.measurements(
+                self._tables, name, log.resolve(), seed, request.cut, paths
+            )
+        }
 
-    def reproduction(
-        self, cells: Sequence[Cell], results: Sequence[CellResult], _folder: Path
-    ) -> Reproduction:
-        jobs = [cell.run for cell in cells]
+    def reproduction(self, results: Mapping[Any, JobResult]) -> Reproduction:
+        """Return the tables that anything was measured for."""
         cut = self._request.cut
         cut_notes = () if cut.is_whole else (f"Only frames {cut} of each sequence were used: no ratio.",)
-        tables = (self._book.table_of(name, jobs, results) for name in self._tables)
+        tables = (self._paper.table_of(name, results) for name in self._tables)
         return Reproduction(
-            paper=self._book.title,
+            paper=self._paper.title,
             tables=tuple(
                 replace(
                     table,
@@ -147,17 +141,8 @@ class _BookWork:
                 for table in tables
                 if any(cell.ours or cell.failures for cell in table.cells)
             ),
-            paths=tuple(self._book.drawn(jobs)),
+            paths=tuple(self._paper.drawn([*results])),
             missing=self._found.missing,
             seeds=self._request.seeds,
             notes=self._found.notes,
         )
-
-
-def _described(request: Request, cells: Sequence[Cell]) -> str:
-    told = {
-        "paper": request.paper,
-        "logs": str(request.logs.resolve()),
-        "cells": {cell.label: cell.key for cell in cells},
-    }
-    return json.dumps(told, indent=1, ensure_ascii=False) + "\n"

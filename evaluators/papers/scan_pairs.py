@@ -1,4 +1,4 @@
-"""Pairs for registration without a guess: a scan told in a frame of any yaw, and the map it belongs into."""
+"""Pairs for registration without a guess: a scan in a frame of any yaw, and the map it belongs into."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ _RINGS, _KEPT_RINGS = 64, 16
 
 
 def moved(scan: Scan, T_new_body: Transform) -> Scan:
-    """Return a scan told in another frame."""
+    """Return a scan in the coordinates of another frame."""
     return Scan(
         stamp_ns=scan.stamp_ns,
         points_body=apply(T_new_body, scan.points_body.astype(np.float64)).astype(np.float32),
@@ -28,7 +28,7 @@ def perturbed(
     *,
     offset_m: float,
 ) -> tuple[Scan, Transform]:
-    """Return a scan told in a frame of any yaw, at most so far from the target, and that frame's pose."""
+    """Return a scan in a frame of any yaw, at most so far from the target, and that frame's pose."""
     yaw, bearing = rng.uniform(-np.pi, np.pi, 2)
     reach_m = offset_m * np.sqrt(rng.random())
     c, s = np.cos(yaw), np.sin(yaw)
@@ -48,7 +48,7 @@ def fewer_rings(scan: Scan) -> Scan:
 
 
 def merged(scans: Sequence[Scan], T_map_body: Sequence[Transform], *, voxel_m: float) -> Scan:
-    """Return a map of scans, one point per voxel, told to have been seen from its origin."""
+    """Return a map of scans, one point per voxel, as if it had been seen from its origin."""
     points = np.concatenate(
         [
             apply(T, scan.points_body.astype(np.float64)).astype(np.float32)

@@ -1,23 +1,29 @@
-"""The tables of Somlyai's PhD thesis measured again: what each part of ISVD is worth."""
+"""The tables of Somlyai's PhD thesis measured again: the error with and without each part of ISVD."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from evaluators.metrics.trajectory import align, associate, ate
-from evaluators.papers.ablation import Followed, follow
-from evaluators.papers.book import Book, Cut
-from evaluators.papers.measured import Place, cells_of, failed, measured, notes_of
-from evaluators.papers.model import PaperCell, PaperPath, PaperTable
+from evaluators.papers.ablation import VariantResult, follow
+from evaluators.papers.measurements import (
+    Place,
+    Results,
+    cells_of,
+    failed,
+    filled,
+    measured,
+    open_with_truth,
+)
+from evaluators.papers.model import PaperPath, PaperTable
+from evaluators.papers.paper import Cut, Paper
 from evaluators.papers.sequences import slug
 from evaluators.papers.thesis_tables import Setting, tables
-from evaluators.study.cells import CellResult
 from evaluators.study.seeds import seeded
 from evaluators.tables.table import Record
 from mapper.config.build import BuildConfig
 from mapper.core.errors import DataError
 from mapper.core.trajectory import Trajectory
-from mapper.sources import open_source
 from mapper.sources.trajectory_files import read_tum, write_tum
 
 
@@ -28,7 +34,7 @@ class ThesisJob:
     Attributes:
         tables: Of ``thesis_tables.tables()``; they use the same frames of the sequence.
         sequence: As the thesis calls it.
-        log: Where it lies.
+        log: Its folder or file.
         seed: Of RANSAC.
         cut: Which frames are used.
         paths: Folder for the trajectories.
@@ -63,13 +69,11 @@ class ThesisJob:
     def __call__(self) -> list[Record]:
         """Follow the log with every setting."""
         configs = self.configs()
-        source = open_source(self.log, next(iter(configs.values())).source)
-        if source.truth is None:
-            raise DataError(f"{self.log}: has no ground truth, so there is no error to tell")
-        followed = follow(source, configs)
+        source, truth = open_with_truth(self.log, next(iter(configs.values())))
+        results = follow(source, configs)
         records: list[Record] = []
         for table, name in self._variants():
-            records += self._judged(table, name, followed[f"{table} {name}"], source.truth)
+            records += self._records(table, name, results[f"{table} {name}"], truth)
         return records
 
     def _variants(self) -> dict[tuple[str, str], Setting]:
@@ -85,20 +89,20 @@ class ThesisJob:
         rows = ablation.places(ablation.row(self.sequence), setting)
         return [Place(table, row, column) for row, column in rows]
 
-    def _judged(self, table: str, setting: str, followed: Followed, truth: Trajectory) -> list[Record]:
+    def _records(self, table: str, setting: str, result: VariantResult, truth: Trajectory) -> list[Record]:
         places = self._places(table, setting)
-        if followed.estimate is None:
-            return [failed(place, followed.failure) for place in places]
+        if result.estimate is None:
+            return [failed(place, result.failure) for place in places]
         try:
-            values = tables()[table].judge(followed.estimate, truth)
+            values = tables()[table].measure(result.estimate, truth)
         except DataError as error:
             return [failed(place, str(error)) for place in places]
         if self._is_drawn(table):
-            self._keep(setting, followed.estimate, truth)
+            self._keep(setting, result.estimate, truth)
         note = (
             f"{self.sequence}, {setting}, seed {self.seed}: "
-            f"{followed.lost} of {followed.frames} frames were not placed."
-            if followed.lost
+            f"{result.lost} of {result.frames} frames were not placed."
+            if result.lost
             else ""
         )
         return [measured(place, float(value), note) for place, value in zip(places, values, strict=True)]
@@ -135,27 +139,13 @@ class ThesisJob:
         ]
 
 
-def table_of(name: str, jobs: Sequence[ThesisJob], results: Sequence[CellResult]) -> PaperTable:
-    """Return a table with what its jobs came to."""
+def table_of(name: str, results: Results) -> PaperTable:
+    """Return a table with the figures of its measurements."""
     ablation = tables()[name]
-    own = tuple(
-        PaperCell(row, column, figure, ())
-        for row, line in ablation.own.items()
-        for column, figure in line.items()
-    )
-    return PaperTable(
-        name=ablation.name,
-        title=ablation.title,
-        source=ablation.source,
-        metric=ablation.metric,
-        unit=ablation.unit,
-        cells=(*own, *cells_of(name, jobs, results, ablation.printed)),
-        axis=ablation.axis,
-        notes=(*ablation.notes, *notes_of(name, results)),
-    )
+    return filled(name, ablation.table, cells_of(name, results, ablation.printed), results)
 
 
-def _jobs(
+def _measurements(
     names: Sequence[str], sequence: str, log: Path, seed: int, cut: Cut, paths: Path
 ) -> Sequence[ThesisJob]:
     """Return one job for all tables that use the same frames and share most of the work."""
@@ -167,10 +157,10 @@ def _jobs(
     return [ThesisJob(tuple(group), sequence, log, seed, cut, paths) for group in alike.values()]
 
 
-BOOK = Book(
+PAPER = Paper(
     title="Somlyai, PhD thesis, Óbuda University",
     sequences={name: [*ablation.sequences] for name, ablation in tables().items()},
-    jobs=_jobs,
+    measurements=_measurements,
     table_of=table_of,
     drawn=lambda jobs: [path for job in jobs for path in job.drawn()],
 )

@@ -1,14 +1,15 @@
-"""Which settings the tables of Somlyai's PhD thesis (Óbuda University) compare, and on which sequences."""
+"""The tables of Somlyai's PhD thesis (Óbuda University): the settings they compare, and the sequences."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
 from evaluators.metrics.trajectory import associate, rpe
-from evaluators.papers.measured import CONFIGS, ate_rmse_m
+from evaluators.papers.measurements import CONFIGS, ate_rmse_m
+from evaluators.papers.model import PaperCell, PaperTable
 from evaluators.papers.published import Figures, figures, published
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_config
@@ -33,7 +34,7 @@ class Setting(NamedTuple):
 
 Places = Callable[[str, str], Sequence[tuple[str, str]]]
 """Row and column of each figure that a sequence and a setting give."""
-Judge = Callable[[Trajectory, Trajectory], Sequence[float]]
+Figure = Callable[[Trajectory, Trajectory], Sequence[float]]
 """These figures, of an estimate and the truth."""
 
 
@@ -42,36 +43,22 @@ class Ablation:
     """A table: some sequences, each with settings that differ in one thing.
 
     Attributes:
-        name: As printed.
-        title: What it tells.
-        source: Where it is printed.
-        metric: What its figures are.
-        unit: Of its figures; empty where columns differ.
+        table: Without what we measure; the thesis's figures of logs that nobody else has are in it.
         printed: The thesis's figures of logs that may be at hand.
         sequences: And how many of their first frames are used; None is all.
         settings: By what they are called in the table.
         places: Where figures belong.
-        judge: How they are worked out.
-        axis: What the settings count.
+        measure: How they are worked out.
         alone: It shares too little work with the others to be measured with them.
-        own: The thesis's figures of a log that nobody else has.
-        notes: What a reader has to know.
     """
 
-    name: str
-    title: str
-    source: str
-    metric: str
-    unit: str
+    table: PaperTable
     printed: Figures
     sequences: Mapping[str, int | None]
     settings: Mapping[str, Setting]
     places: Places = lambda row, setting: [(row, setting)]
-    judge: Judge = lambda estimate, truth: [ate_rmse_m(estimate, truth)]
-    axis: str = ""
+    measure: Figure = lambda estimate, truth: [ate_rmse_m(estimate, truth)]
     alone: bool = False
-    own: Figures = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
 
     def row(self, sequence: str) -> str:
         """Return what a sequence is called in the table."""
@@ -86,65 +73,62 @@ def tables() -> Mapping[str, Ablation]:
     previous = figures("isvd_previous_frames")
     return {
         "4.1": _icp_or_svd(iterations),
-        "4.2": replace(
-            _errors(
-                "Table 4.2",
-                "Loop closure on a long log",
-                "loop_2100_frames",
-                {"ISVD+DIF": Setting("ISVD+DIF"), "ISVD+DIF+LC": Setting("ISVD+LC+DIF")},
-            ),
+        "4.2": _errors(
+            "Table 4.2",
+            "Loop closure on a long log",
+            "loop_2100_frames",
+            {"ISVD+DIF": Setting("ISVD+DIF"), "ISVD+DIF+LC": Setting("ISVD+LC+DIF")},
             sequences={"fr3/long_office": 2100},
         ),
-        "5.1": replace(
-            _errors(
-                "Table 5.1",
-                "ISVD by the number of its iterations",
-                "isvd_iterations",
-                {count: _iterations(count) for count in next(iter(iterations.values()))},
-            ),
+        "5.1": _errors(
+            "Table 5.1",
+            "ISVD by the number of its iterations",
+            "isvd_iterations",
+            {count: _iterations(count) for count in next(iter(iterations.values()))},
             printed=iterations,
-            sequences=dict.fromkeys(iterations),
             axis="iterations",
         ),
-        "5.2": replace(
-            _errors(
-                "Table 5.2",
-                "ISVD by the number of previous frames (MP) that each frame is registered against",
-                "isvd_previous_frames",
-                {mp: Setting(mp) for mp in next(iter(previous.values()))},
-            ),
+        "5.2": _errors(
+            "Table 5.2",
+            "ISVD by the number of previous frames (MP) that each frame is registered against",
+            "isvd_previous_frames",
+            {mp: Setting(mp) for mp in next(iter(previous.values()))},
             axis="MP",
         ),
-        "5.5": replace(
-            _errors(
-                "Table 5.5",
-                "ISVD alone, with loop closure (LC) and with the depth image filter (DIF)",
-                "isvd_loop_dif",
-                {
-                    "ISVD": Setting("ISVD"),
-                    "ISVD+LC": Setting("ISVD+LC"),
-                    "ISVD+LC+DIF": Setting("ISVD+LC+DIF"),
-                    "ISVD+LC, graph": Setting("ISVD+LC", ("graph.solve=batch",)),
-                    "ISVD+LC+DIF, graph": Setting("ISVD+LC+DIF", ("graph.solve=batch",)),
-                },
-            ),
+        "5.5": _errors(
+            "Table 5.5",
+            "ISVD alone, with loop closure (LC) and with the depth image filter (DIF)",
+            "isvd_loop_dif",
+            {
+                "ISVD": Setting("ISVD"),
+                "ISVD+LC": Setting("ISVD+LC"),
+                "ISVD+LC+DIF": Setting("ISVD+LC+DIF"),
+                "ISVD+LC, graph": Setting("ISVD+LC", ("graph.solve=batch",)),
+                "ISVD+LC+DIF, graph": Setting("ISVD+LC+DIF", ("graph.solve=batch",)),
+            },
             notes=("“graph” is ours: the same loops as constraints of a pose graph.",),
         ),
         "detectors": _detectors(iterations),
     }
 
 
-def _errors(name: str, title: str, key: str, settings: Mapping[str, Setting]) -> Ablation:
-    """Return a table of ATE RMSE whose rows are sequences."""
-    printed = figures(key)
+def _errors(
+    name: str,
+    title: str,
+    key: str,
+    settings: Mapping[str, Setting],
+    *,
+    printed: Figures | None = None,
+    sequences: Mapping[str, int | None] | None = None,
+    axis: str = "",
+    notes: tuple[str, ...] = (),
+) -> Ablation:
+    """Return a table of ATE RMSE whose rows are sequences, usually those of the printed figures."""
+    printed = printed or figures(key)
     return Ablation(
-        name=name,
-        title=title,
-        source=published()[key]["source"],
-        metric="ATE RMSE",
-        unit="m",
+        table=PaperTable(name, title, published()[key]["source"], "ATE RMSE", "m", (), axis, notes),
         printed=printed,
-        sequences=dict.fromkeys(printed),
+        sequences=sequences or dict.fromkeys(printed),
         settings=settings,
     )
 
@@ -161,14 +145,26 @@ def _icp_or_svd(test_logs: Figures) -> Ablation:
     """Return algorithms 5 and 6, which differ in one line, by how far off the path's end is."""
     table = published()["icp_vs_svd"]
     columns = [f"{name} [{unit}]" for name, unit in (column.rsplit("_", 1) for column in table["columns"])]
-    own = {f"{step}, {_OWN_LOG}": dict(zip(columns, row, strict=True)) for step, row in table["rows"].items()}
+    own = [
+        PaperCell(f"{step}, {_OWN_LOG}", column, figure, ())
+        for step, row in table["rows"].items()
+        for column, figure in zip(columns, row, strict=True)
+    ]
     halving = "odometry.registration.threshold=halving"
     return Ablation(
-        name="Table 4.1",
-        title="ICP or SVD in each iteration",
-        source=table["source"],
-        metric="error at the end of the path",
-        unit="",
+        table=PaperTable(
+            name="Table 4.1",
+            title="ICP or SVD in each iteration",
+            source=table["source"],
+            metric="error at the end of the path",
+            unit="",
+            cells=tuple(own),
+            notes=(
+                "The thesis's own log is not at hand: its rows tell of another path, so there is no ratio.",
+                "Axes are the camera's at the start (x right, y down, z forward); roll turns about z, pitch "
+                "about x, yaw about y. “total” is the mean of the three amounts, as the printed totals are.",
+            ),
+        ),
         printed={},
         sequences=dict.fromkeys(test_logs),
         settings={
@@ -176,13 +172,7 @@ def _icp_or_svd(test_logs: Figures) -> Ablation:
             for step in table["rows"]
         },
         places=lambda row, step: [(f"{step}, {row}", column) for column in columns],
-        judge=_end_error,
-        own=own,
-        notes=(
-            "The thesis's own log is not at hand: its rows tell of another path, so there is no ratio.",
-            "Axes are the camera's at the start (x right, y down, z forward); roll turns about z, pitch "
-            "about x, yaw about y. “total” is the mean of the three amounts, as the printed totals are.",
-        ),
+        measure=_end_error,
     )
 
 
@@ -208,15 +198,20 @@ def _detectors(test_logs: Figures) -> Ablation:
         **{f"surf{mp}-avg": (f"odometry.previous_frames={mp}", mean) for mp in (4, 8)},
     }
     return Ablation(
-        name="Figure 5.6",
-        title="Detectors by the error from frame to frame; the number is MP, “avg” the plain mean of MP",
-        source="Somlyai thesis Figure 5.6, a drawing without figures",
-        metric="RPE RMSE, consecutive",
-        unit="m",
+        table=PaperTable(
+            name="Figure 5.6",
+            title="Detectors by the error from frame to frame; the number is MP, “avg” the plain mean of MP",
+            source="Somlyai thesis Figure 5.6, a drawing without figures",
+            metric="RPE RMSE, consecutive",
+            unit="m",
+            cells=(),
+            notes=(
+                "The thesis draws Poznań's trajectory1: ORB is the worst, SURF with MP 4 and 8 the best.",
+            ),
+        ),
         printed={},
         sequences={POZNAN: 300, **dict.fromkeys(test_logs)},
         settings={name: Setting("ISVD", overrides) for name, overrides in detectors.items()},
-        judge=lambda estimate, truth: [rpe(associate(estimate, truth)).translation_m.rmse],
+        measure=lambda estimate, truth: [rpe(associate(estimate, truth)).translation_m.rmse],
         alone=True,
-        notes=("The thesis draws Poznań's trajectory1: ORB is the worst, SURF with MP 4 and 8 the best.",),
     )

@@ -7,20 +7,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from evaluators.papers.book import Book, Cut
-from evaluators.papers.measured import CONFIGS, Place, ate_rmse_m, cells_of, measured, notes_of
+from evaluators.papers.measurements import (
+    CONFIGS,
+    Place,
+    Results,
+    ate_rmse_m,
+    cells_of,
+    filled,
+    measured,
+    open_with_truth,
+)
 from evaluators.papers.model import PaperCell, PaperTable
+from evaluators.papers.paper import Cut, Paper
 from evaluators.papers.published import figures, published
 from evaluators.papers.sequences import slug
-from evaluators.study.cells import CellResult
 from evaluators.study.seeds import seeded
 from evaluators.tables.table import Record
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_config
-from mapper.core.errors import DataError
 from mapper.pipeline.build import build
 from mapper.run.files import CLOUD, OCTREE_BT
-from mapper.sources import open_source
 
 _OURS, _CLOUD, _OCTREE = "Zhao", "dense cloud", "octree 0.05 m"
 _RESOLUTION_M = 0.05
@@ -32,27 +38,33 @@ class Printed:
     """A table of the paper.
 
     Attributes:
-        name: As printed.
-        title: What it tells.
         key: In ``published.json``.
-        metric: What its figures are.
-        unit: Of its figures.
+        table: Without its cells.
         columns: Those that our method fills; the others are other systems.
-        notes: What a reader has to know.
     """
 
-    name: str
-    title: str
     key: str
-    metric: str
-    unit: str
+    table: PaperTable
     columns: tuple[str, ...] = (_OURS,)
-    notes: tuple[str, ...] = ()
+
+
+def _printed(
+    number: str,
+    title: str,
+    key: str,
+    metric: str,
+    unit: str,
+    *,
+    columns: tuple[str, ...] = (_OURS,),
+    notes: tuple[str, ...] = (),
+) -> Printed:
+    source = published()[key]["source"]
+    return Printed(key, PaperTable(f"Table {number}", title, source, metric, unit, (), notes=notes), columns)
 
 
 TABLES: Mapping[str, Printed] = {
-    "3": Printed(
-        "Table 3",
+    "3": _printed(
+        "3",
         "Run time over the whole sequence, dense map included",
         "zhao_runtime",
         "run time",
@@ -62,9 +74,9 @@ TABLES: Mapping[str, Printed] = {
             "mapper build, maps and files included; compare the CPU time if the machine was busy.",
         ),
     ),
-    "4": Printed("Table 4", "Absolute pose error", "zhao_ape", "APE RMSE", "m"),
-    "5": Printed(
-        "Table 5",
+    "4": _printed("4", "Absolute pose error", "zhao_ape", "APE RMSE", "m"),
+    "5": _printed(
+        "5",
         "Size of the map's files",
         "zhao_map_size",
         "file size",
@@ -81,7 +93,7 @@ class ZhaoJob:
 
     Attributes:
         sequence: As the paper calls it.
-        log: Where it lies.
+        log: Its folder or file.
         seed: Of RANSAC.
         cut: Which frames are used.
     """
@@ -111,11 +123,9 @@ class ZhaoJob:
         return {_OURS: seeded(load_config(CONFIGS / "zhao.toml", [octree, *self.cut.overrides()]), self.seed)}
 
     def __call__(self) -> list[Record]:
-        """Build a run and look at what it took, where it went and what it left."""
+        """Build a run, and return its time, its error and the sizes of its files."""
         config = self.configs()[_OURS]
-        source = open_source(self.log, config.source)
-        if source.truth is None:
-            raise DataError(f"{self.log}: has no ground truth, so there is no error to tell")
+        source, truth = open_with_truth(self.log, config)
         with TemporaryDirectory(prefix="mapper-zhao-") as folder:
             began = time.process_time()
             run = build(source, config, Path(folder) / "run")
@@ -123,7 +133,7 @@ class ZhaoJob:
             counts = run.manifest.counts
             values = {
                 ("3", _OURS): run.manifest.timing.total_s,
-                ("4", _OURS): ate_rmse_m(run.trajectory(), source.truth),
+                ("4", _OURS): ate_rmse_m(run.trajectory(), truth),
                 ("5", _CLOUD): (run.path / CLOUD).stat().st_size / _MB,
                 ("5", _OCTREE): (run.path / OCTREE_BT).stat().st_size / _MB,
             }
@@ -138,37 +148,29 @@ class ZhaoJob:
         ]
 
 
-def table_of(name: str, jobs: Sequence[ZhaoJob], results: Sequence[CellResult]) -> PaperTable:
-    """Return a table with what the jobs came to, and the other systems' printed figures beside it."""
-    table = TABLES[name]
-    printed = figures(table.key)
-    ours = cells_of(name, jobs, results, printed)
+def table_of(name: str, results: Results) -> PaperTable:
+    """Return a table with our figures, and the other systems' printed ones beside them."""
+    printed = TABLES[name]
+    rows = figures(printed.key)
+    ours = cells_of(name, results, rows)
     cells = []
     for row in dict.fromkeys(cell.row for cell in ours):
         cells += [cell for cell in ours if cell.row == row]
-        others = (column for column in printed[row] if column not in table.columns)
-        cells += [PaperCell(row, column, printed[row][column], ()) for column in others]
-    return PaperTable(
-        name=table.name,
-        title=table.title,
-        source=published()[table.key]["source"],
-        metric=table.metric,
-        unit=table.unit,
-        cells=tuple(cells),
-        notes=(*table.notes, *notes_of(name, results)),
-    )
+        others = (column for column in rows[row] if column not in printed.columns)
+        cells += [PaperCell(row, column, rows[row][column], ()) for column in others]
+    return filled(name, printed.table, cells, results)
 
 
-def _jobs(
+def _measurements(
     _tables: Sequence[str], sequence: str, log: Path, seed: int, cut: Cut, _paths: Path
 ) -> Sequence[ZhaoJob]:
     return [ZhaoJob(sequence, log, seed, cut)]  # one run fills all tables
 
 
-BOOK = Book(
+PAPER = Paper(
     title="Zhao, Liu and Yang, Journal of Computer Applications, 2020",
-    sequences={name: [*figures(table.key)] for name, table in TABLES.items()},
-    jobs=_jobs,
+    sequences={name: [*figures(printed.key)] for name, printed in TABLES.items()},
+    measurements=_measurements,
     table_of=table_of,
 )
 

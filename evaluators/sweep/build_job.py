@@ -1,22 +1,19 @@
-"""One cell of a sweep: a whole build, and what it is worth in numbers."""
+"""Job of a sweep: one whole build, and its numbers as a record."""
 
 import platform
 import shutil
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
 
-import mapper
 from evaluators.metrics.run_summary import summary
 from evaluators.tables.table import Record
 from mapper.config.build import BuildConfig
-from mapper.core.errors import ConfigError, MapperError
+from mapper.core.errors import MapperError
 from mapper.pipeline.build import build
 from mapper.run.files import CONFIG, MANIFEST, OCTREE_MAP, SUMMARY, TRAJECTORY, TRUTH
 from mapper.run.folder import Run
-from mapper.run.manifest import library_versions
 from mapper.runtime.timing import forget_peak_memory
 from mapper.sources import open_source
 
@@ -26,22 +23,16 @@ STAGES = ("track", "solve", "level", "fuse", "write")
 _WITH_TRAJECTORY = {CONFIG, MANIFEST, SUMMARY, TRAJECTORY, TRUTH}
 
 
-def environment() -> dict[str, str]:
-    """Return the versions of all that can change a result."""
-    return {"mapper": mapper.__version__, **library_versions()}
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class BuildCell:
-    """Builds a run, measures it, and keeps as much of it as is wanted.
+class BuildJob:
+    """Build of a run, which is measured, and kept as far as is wanted.
 
     Attributes:
         log: Absolute path.
-        config: Every knob.
+        config: Every setting.
         scratch: Folder for the run while it is built.
-        kept: What becomes of it: this folder, or None.
+        kept: Folder that the run is kept in, or None.
         keep: How much of it.
-        environment: Where the sweep was planned; a worker elsewhere has to have the same versions.
     """
 
     log: Path
@@ -49,15 +40,13 @@ class BuildCell:
     scratch: Path
     kept: Path | None
     keep: Keep
-    environment: Mapping[str, str]
 
     def __call__(self) -> list[Record]:
         """Return the build's numbers, one record.
 
         Raises:
-            MapperError: As the build says, or this machine has other versions of the libraries.
+            MapperError: As the build says.
         """
-        self._refuse_other_versions()
         forget_peak_memory()
         self.scratch.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=self.scratch, ignore_cleanup_errors=True) as folder:
@@ -70,15 +59,6 @@ class BuildCell:
             if self.kept is not None:
                 _keep(run.path, self.kept, self.keep)
         return [record]
-
-    def _refuse_other_versions(self) -> None:
-        for name, version in environment().items():
-            planned = self.environment.get(name)
-            if version != planned:
-                raise ConfigError(
-                    f"worker on {platform.node()}: {name} {version}, where the sweep was planned with "
-                    f"{planned}; results would not compare, so install the same"
-                )
 
 
 def _measured(run: Run, *, sensor: str) -> Record:
@@ -110,5 +90,5 @@ def _keep(run: Path, kept: Path, keep: Keep) -> None:
             if file.name not in _WITH_TRAJECTORY:
                 file.unlink()
     kept.parent.mkdir(parents=True, exist_ok=True)
-    shutil.rmtree(kept, ignore_errors=True)  # of a cell that was killed before it could say that it is done
+    shutil.rmtree(kept, ignore_errors=True)  # of a build that was killed before its result was written
     run.rename(kept)

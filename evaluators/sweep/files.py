@@ -2,18 +2,18 @@
 
 from collections.abc import Mapping
 
-from evaluators.study.cells import CellResult
 from evaluators.sweep.page import page_of
-from evaluators.sweep.plan import Place, Plan
+from evaluators.sweep.plan import BuildName, Plan
 from evaluators.sweep.tables import sweep_records
 from evaluators.tables.parquet import write_parquet
 from evaluators.tables.table import Record, csv_text
 from mapper.runtime.atomic import write_text
+from mapper.runtime.job_runner import JobResult
 
 FILES = CSV, PARQUET, PAGE = "results.csv", "results.parquet", "summary.html"
 
 
-def write_sweep(plan: Plan, results: Mapping[Place, CellResult], *, title: str) -> list[Record]:
+def write_sweep(plan: Plan, results: Mapping[BuildName, JobResult], *, title: str) -> list[Record]:
     """Write a sweep's table and its page, and return the table.
 
     Args:

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 
-from evaluators.sweep.build_job import environment
+from evaluators.study.versions import versions
 from evaluators.sweep.chart import Line, dot_chart
 from evaluators.sweep.config import ConfigurationConfig
 from evaluators.sweep.plan import Plan
@@ -41,7 +41,7 @@ def page_of(plan: Plan, records: Sequence[Record], *, title: str) -> str:
         section("Failed and left out", _list(bad) if bad else "<p>Nothing.</p>"),
         section("Builds", _builds(records)),
         section("Methods and configurations", _settings(plan)),
-        section("Versions", _table(["", "version"], environment().items())),
+        section("Versions", _table(["", "version"], versions().items())),
     ]
     counts = [f"{sum(r['status'] == status for r in records)} {status}" for status in _statuses(records)]
     header = f"<h1>{escape(title)}</h1><div>{escape(', '.join(counts))}</div>"

@@ -1,18 +1,18 @@
-"""Logs × methods × configurations: which builds there are to make, and what they came to."""
+"""Plan of a sweep: a job for every build of logs × methods × configurations × seeds, and its results."""
 
-import hashlib
 import json
 import shutil
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from glob import glob, has_magic
 from pathlib import Path
 from typing import Any
 
-from evaluators.study.cells import Cell, CellResult, run_cells
+from evaluators.study.engine import CELLS, run_study
 from evaluators.study.seeds import seeded
-from evaluators.sweep.build_job import BuildCell, environment
+from evaluators.study.versions import digest, versions
+from evaluators.sweep.build_job import BuildJob
 from evaluators.sweep.config import ConfigurationConfig, MethodConfig, SweepConfig
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_config, load_source_config, read_config
@@ -22,18 +22,20 @@ from mapper.odometry.config import IsvdOdometryConfig, KeyframeOdometryConfig
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.run.fingerprint import fingerprint
 from mapper.runtime.atomic import resumable_folder, write_text
+from mapper.runtime.executor import IN_PROCESS, Workers
+from mapper.runtime.job_runner import Job, JobResult
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 
-CELLS, RUNS, SCRATCH, PLAN = "cells", "runs", "scratch", "sweep.json"
+RUNS, SCRATCH, PLAN = "runs", "scratch", "sweep.json"
 _IMAGE_LOOPS = (PlaceLoopsConfig, ThesisLoopsConfig)
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Where in the table a build stands.
+class BuildName:
+    """Name of a build: its place in the table.
 
     Attributes:
         log: Its name, unique in the sweep.
@@ -61,17 +63,17 @@ class Plan:
     Attributes:
         config: What was asked for.
         out: Absolute folder of the results.
-        entries: A cell for every place, log by log, or why the method does not apply to the log.
+        entries: A job for every build, log by log, or the reason why its method does not apply to the log.
     """
 
     config: SweepConfig
     out: Path
-    entries: dict[Place, Cell | str]
+    entries: dict[BuildName, Job | str]
 
     @property
-    def cells(self) -> dict[Place, Cell]:
-        """What there is to build."""
-        return {place: entry for place, entry in self.entries.items() if isinstance(entry, Cell)}
+    def jobs(self) -> dict[BuildName, Job]:
+        """The builds that there are."""
+        return {build: entry for build, entry in self.entries.items() if isinstance(entry, Job)}
 
 
 def plan_sweep(path: Path, out: Path) -> Plan:
@@ -82,56 +84,49 @@ def plan_sweep(path: Path, out: Path) -> Plan:
         SourceError: A log cannot be opened.
     """
     config = read_config(path, SweepConfig)
-    out, versions = out.resolve(), environment()
-    entries: dict[Place, Cell | str] = {}
+    out = out.resolve()
+    entries: dict[BuildName, Job | str] = {}
     for name, log in _logs(path, config).items():
         sources: dict[SourceConfig, Log] = {}
         mark = fingerprint(log)
         for method in config.method:
             for configuration in config.configuration:
-                place = Place(name, method.name, configuration.name)
+                build = BuildName(name, method.name, configuration.name)
                 build_config, source = _resolved(path, log, method, configuration, sources)
                 if misfit := _misfit(build_config, source):
-                    entries[place] = misfit
+                    entries[build] = misfit
                     continue
                 for seed, seeded_config in _repeats(build_config, config.seeds):
-                    place = Place(name, method.name, configuration.name, seed)
-                    key = _key(mark, seeded_config, config.keep, versions)
+                    build = replace(build, seed=seed)
+                    key = _key(mark, seeded_config, config.keep)
                     kept = None if config.keep == "nothing" else out / RUNS / key
-                    work = BuildCell(log.resolve(), seeded_config, out / SCRATCH, kept, config.keep, versions)
-                    entries[place] = Cell(key, place.label, work)
+                    work = BuildJob(log.resolve(), seeded_config, out / SCRATCH, kept, config.keep)
+                    entries[build] = Job(key, build.label, work)
     return Plan(config, out, entries)
 
 
 def run_sweep(
-    plan: Plan, *, processes: int = 1, scheduler: str | None = None, progress: Progress = SILENT
-) -> dict[Place, CellResult]:
-    """Return what each cell came to; what an earlier sweep in the same folder has finished is not run again.
+    plan: Plan, *, workers: Workers = IN_PROCESS, progress: Progress = SILENT
+) -> dict[BuildName, JobResult]:
+    """Return the result of every build; what an earlier one in the folder has finished is kept.
 
     Args:
-        plan: What to do.
-        processes: As for ``run_jobs``; every build keeps to one core.
-        scheduler: As for ``run_jobs``.
-        progress: Who waits.
+        plan: The builds.
+        workers: Where the builds run; each keeps to one core.
+        progress: Told how far it is.
 
     Raises:
-        ConfigError: As for ``run_jobs``.
+        ConfigError: As for ``run_study``.
         RunError: OUT holds something else, or another sweep is at work there.
     """
-    out, cells = plan.out, plan.cells
+    out = plan.out
     with resumable_folder(out, mark=PLAN):
         shutil.rmtree(out / SCRATCH, ignore_errors=True)  # what a killed sweep left
         write_text(out / PLAN, json.dumps(_described(plan), indent=1, ensure_ascii=False) + "\n")
-        results = run_cells(
-            list(cells.values()),
-            out / CELLS,
-            processes=processes,
-            scheduler=scheduler,
-            progress=progress,
-        )
+        results = run_study(plan.jobs, out / CELLS, workers=workers, progress=progress)
         with suppress(OSError):
             (out / SCRATCH).rmdir()
-    return dict(zip(cells, results, strict=True))
+    return results
 
 
 def _logs(path: Path, config: SweepConfig) -> dict[str, Path]:
@@ -187,7 +182,7 @@ def _misfit(config: BuildConfig, source: Log) -> str:
 
 
 def _repeats(config: BuildConfig, seeds: tuple[int, ...]) -> Iterator[tuple[int | None, BuildConfig]]:
-    """Yield the configuration with each seed; as it is, and once, where there is no seed in it."""
+    """Yield the configuration with each seed, or once as it is if it has none."""
     if not seeds or seeded(config, 0) == seeded(config, 1):
         yield None, config
         return
@@ -195,11 +190,10 @@ def _repeats(config: BuildConfig, seeds: tuple[int, ...]) -> Iterator[tuple[int 
         yield seed, seeded(config, seed)
 
 
-def _key(log: str, config: BuildConfig, keep: str, versions: dict[str, str]) -> str:
-    """Return what tells this result from others: what goes into it, and not what it is called."""
+def _key(log: str, config: BuildConfig, keep: str) -> str:
+    """Return a build's key: a hash of all that goes into it, not of what it is called."""
     files = [fingerprint(file) for file in _files(config.model_dump()) if file.exists()]
-    told = [log, config.model_dump(mode="json"), files, keep, versions]
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:20]
+    return digest(log, config.model_dump(mode="json"), files, keep, versions(), digits=20)
 
 
 def _files(tree: Any) -> Iterator[Path]:
@@ -214,9 +208,9 @@ def _files(tree: Any) -> Iterator[Path]:
 def _described(plan: Plan) -> dict[str, Any]:
     return {
         "sweep": plan.config.model_dump(mode="json"),
-        "versions": environment(),
+        "versions": versions(),
         "entries": {
-            place.label: entry.key if isinstance(entry, Cell) else f"does not apply: {entry}"
-            for place, entry in plan.entries.items()
+            build.label: entry.key if isinstance(entry, Job) else f"does not apply: {entry}"
+            for build, entry in plan.entries.items()
         },
     }

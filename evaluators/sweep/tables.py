@@ -4,9 +4,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from statistics import median
 
-from evaluators.study.cells import CellResult
-from evaluators.sweep.plan import RUNS, Place, Plan
+from evaluators.sweep.plan import RUNS, BuildName, Plan
 from evaluators.tables.table import MISSING, Column, Record, Value, text_table
+from mapper.runtime.job_runner import JobResult
 
 _WHOLE = 0.995
 COVERED_ALIKE = 0.95
@@ -82,17 +82,17 @@ class Group:
         return median(values) if values else 0.0
 
 
-def sweep_records(plan: Plan, results: Mapping[Place, CellResult]) -> list[Record]:
-    """Return a record for every place in the table, whatever became of it; all have the same names."""
-    rows = [_row(plan, place, results.get(place)) for place in plan.entries]
+def sweep_records(plan: Plan, results: Mapping[BuildName, JobResult]) -> list[Record]:
+    """Return a record for every build, finished or not; all have the same names."""
+    rows = [_row(plan, build, results.get(build)) for build in plan.entries]
     names = dict.fromkeys(name for row in rows for name in row)
     return [{name: row.get(name) for name in names} for row in rows]
 
 
-def _row(plan: Plan, place: Place, result: CellResult | None) -> dict[str, Value]:
-    row: dict[str, Value] = asdict(place)
+def _row(plan: Plan, build: BuildName, result: JobResult | None) -> dict[str, Value]:
+    row: dict[str, Value] = asdict(build)
     if result is None:
-        return row | {"status": "does not apply", "reason": str(plan.entries[place])}
+        return row | {"status": "does not apply", "reason": str(plan.entries[build])}
     if result.failure:
         return row | {"status": "failed", "reason": result.failure}
     kept = None if plan.config.keep == "nothing" else f"{RUNS}/{result.key}"
@@ -140,7 +140,7 @@ def summary_text(records: Sequence[Record]) -> str:
     columns = [Column("label", "log, method, configuration")]
     columns += [Column(quantity.key, quantity.title) for quantity in QUANTITIES]
     lines = [
-        {"label": Place(log, *variant).label}
+        {"label": BuildName(log, *variant).label}
         | {quantity.key: group.text(quantity) for quantity in QUANTITIES}
         for log, of_log in groups.items()
         for variant, group in of_log.items()

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError
 from mapper.core.geometry import apply
 from mapper.export.picture import write_merged
-from mapper.merging.jobs import Foreman
 from mapper.merging.merged_map import MapManifest
 from mapper.merging.placing import Placed
+from mapper.merging.stages import Stages
 from mapper.merging.steps import JoinedTile, SeenColumn, Site, save_ground, see_column
 from mapper.octree.ground_height import NOTHING, ground_from_lowest
 from mapper.octree.slice import OccupancyGrid, grid_of, shrunk
@@ -26,7 +26,7 @@ _MAX_TILT = np.cos(np.deg2rad(5.0))
 
 def look_from_above(
     site: Site,
-    foreman: Foreman,
+    stages: Stages,
     joined: Mapping[int, JoinedTile],
     manifest: MapManifest,
     placed: Sequence[Placed],
@@ -56,7 +56,7 @@ def look_from_above(
         )
         for tiles in columns.values()
     }
-    done = [seen for _, seen in foreman.run("slice", jobs, SeenColumn)]
+    done = [seen for _, seen in stages.run("slice", jobs, SeenColumn)]
     if any(item.T_map_world[2, 2] < _MAX_TILT for item in placed):
         return done, None, ["no slice: a run is tilted by more than 5°, so z is not up in the map"]
     seen = np.zeros(shape, np.uint8)

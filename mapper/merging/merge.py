@@ -1,4 +1,4 @@
-"""From many runs to one map on disk: the whole story."""
+"""Merging: the maps of many runs added up, tile by tile, to one map on disk."""
 
 import shutil
 from collections.abc import Mapping, Sequence
@@ -14,9 +14,9 @@ from mapper.core.geometry import apply
 from mapper.export.grid import write_grid
 from mapper.merging.assembling import write_whole_bt, write_whole_ot
 from mapper.merging.from_above import draw, look_from_above
-from mapper.merging.jobs import Foreman
 from mapper.merging.merged_map import TILES, MapManifest, MergedMap, RunInMap, Tile, open_map
 from mapper.merging.placing import Placed, doubts
+from mapper.merging.stages import Stages
 from mapper.merging.steps import Effort, JoinedTile, SeenColumn, Site, SplitRun, join_tile, split_run
 from mapper.merging.tiling import tiling_for
 from mapper.octree.config import OctreeConfig
@@ -24,7 +24,8 @@ from mapper.run import files
 from mapper.run.fingerprint import fingerprint
 from mapper.run.manifest import is_merged_map
 from mapper.runtime.atomic import MANIFEST_NAME, atomic_folder
-from mapper.runtime.executor import hired
+from mapper.runtime.executor import IN_PROCESS, Workers, make_executor
+from mapper.runtime.job_runner import JobRunner
 from mapper.runtime.progress import SILENT, Progress
 
 DEFAULT_TILE_M = 50.0
@@ -64,8 +65,7 @@ def merge(
     out: Path,
     *,
     tile_m: float = DEFAULT_TILE_M,
-    processes: int = 1,
-    scheduler: str | None = None,
+    workers: Workers = IN_PROCESS,
     progress: Progress = SILENT,
     overwrite: bool = False,
 ) -> Merged:
@@ -79,8 +79,7 @@ def merge(
         placed: The runs, and where their worlds lie.
         out: Folder to create; until it is whole it is called ``OUT.partial``.
         tile_m: About how long the edge of a tile is.
-        processes: Workers on this machine.
-        scheduler: Address of a Dask scheduler instead; its workers must see the same files.
+        workers: Where the jobs run; those of a Dask cluster must see the same files.
         progress: Who watches.
         overwrite: Replace a map that is there, once the new one is whole.
 
@@ -101,7 +100,7 @@ def merge(
         runs=tuple(_described(item) for item in placed),
     )
     with (
-        hired(scheduler, processes) as crew,
+        make_executor(workers) as executor,
         atomic_folder(
             out, overwrite=overwrite, keeps=lambda partial: _begun_alike(partial, manifest)
         ) as folder,
@@ -111,13 +110,13 @@ def merge(
         for note in doubtful:
             progress.note(note)
         site = Site(folder, folder / _SCRATCH, tiling, config)
-        foreman = Foreman(site.scratch / "done", crew, progress)
-        split = _split(site, foreman, placed)
-        joined = _join(site, foreman, split, follows_ground=manifest.slice.above == "ground")
+        stages = Stages(JobRunner(site.scratch / "done", progress), executor, progress)
+        split = _split(site, stages, placed)
+        joined = _join(site, stages, split, follows_ground=manifest.slice.above == "ground")
         has_colors = any(part.has_colors for part in split)
         write_whole_ot(folder / files.OCTREE_OT, site, joined, has_colors=has_colors)
         write_whole_bt(folder / files.OCTREE_BT, site, joined)
-        seen, grid, missing = look_from_above(site, foreman, joined, manifest, placed)
+        seen, grid, missing = look_from_above(site, stages, joined, manifest, placed)
         for note in missing:
             progress.note(note)
         manifest = _completed(manifest, site, split, joined, seen, [*doubtful, *missing])
@@ -183,7 +182,7 @@ def _begun_alike(partial: Path, manifest: MapManifest) -> bool:
         return False
 
 
-def _split(site: Site, foreman: Foreman, placed: Sequence[Placed]) -> list[SplitRun]:
+def _split(site: Site, stages: Stages, placed: Sequence[Placed]) -> list[SplitRun]:
     jobs = {
         f"{index:04d}": partial(
             split_run,
@@ -194,12 +193,12 @@ def _split(site: Site, foreman: Foreman, placed: Sequence[Placed]) -> list[Split
         )
         for index, item in enumerate(placed)
     }
-    done = dict(foreman.run("split", jobs, SplitRun))
+    done = dict(stages.run("split", jobs, SplitRun))
     return [done[name] for name in jobs]
 
 
 def _join(
-    site: Site, foreman: Foreman, split: Sequence[SplitRun], *, follows_ground: bool
+    site: Site, stages: Stages, split: Sequence[SplitRun], *, follows_ground: bool
 ) -> dict[int, JoinedTile]:
     """Return what became of every tile, in Morton order."""
     tiles = sorted({tile for part in split for tile in part.part_bytes})
@@ -218,7 +217,7 @@ def _join(
     }
     tile_of = dict(zip(jobs, tiles, strict=True))
     done = {}
-    for name, joined in foreman.run("join", jobs, JoinedTile):
+    for name, joined in stages.run("join", jobs, JoinedTile):
         done[tile_of[name]] = joined
         shutil.rmtree(site.parts(tile_of[name]), ignore_errors=True)
     return {tile: done[tile] for tile in tiles}

@@ -1,1 +1,1 @@
-"""Executors, ordered parallel maps, progress, timing, and files that are written whole or not at all."""
+"""How work runs: executors, and jobs whose results are kept."""

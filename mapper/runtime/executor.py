@@ -1,6 +1,6 @@
-"""Jobs on processes of this machine, or on a Dask cluster; a worker that dies takes one job with it.
+"""Executors: run jobs on processes of this machine or on a Dask cluster; a crash costs one job only.
 
-Every local worker is a process of its own with one job at a time, so it is known which job killed it. A Dask
+Every local worker is a process of its own with one job at a time, so it is known which job ended it. A Dask
 cluster has to run the same version of this package on the same files: its workers see a shared file system.
 """
 
@@ -13,7 +13,7 @@ import threading
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context, parent_process
@@ -28,19 +28,40 @@ if TYPE_CHECKING:
     from distributed import Future
 
 R = TypeVar("R")
-Job = Callable[[], Any]
+Work = Callable[[], Any]
 
 _ANSWER_S = 10.0
 _ADDRESS = re.compile(r"(tcp|tls|wss?)://.+:\d+")
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
-    """What became of a job that did not finish.
+class Workers:
+    """Where jobs run.
 
     Attributes:
-        reason: One line: a MapperError's message, another exception's type, message and place, or what
-            ended the worker.
+        processes: Workers on this machine, each with one thread per library; 1 works in this process.
+        scheduler: Address of a Dask scheduler, ``tcp://host:8786``; replaces ``processes``.
+    """
+
+    processes: int = 1
+    scheduler: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.processes < 1:
+            raise ConfigError(f"processes: {self.processes}, want at least 1")
+
+
+IN_PROCESS = Workers()
+"""One job at a time, in this process."""
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """Result of a job that did not finish.
+
+    Attributes:
+        reason: One line: a MapperError's message, another exception's type, message and place, or how the
+            worker ended.
         attempts: How often the job was begun.
     """
 
@@ -48,85 +69,81 @@ class Failure:
     attempts: int
 
 
-def run_jobs(
-    jobs: Sequence[Callable[[], R]],
-    *,
-    processes: int = 1,
-    scheduler: str | None = None,
-    attempts: int = 2,
-    crew: "Crew | None" = None,
-) -> Iterator[tuple[int, R | Failure]]:
-    """Yield the index of each job and its result as they finish, in any order.
-
-    A job that raises, or whose worker dies, is tried again after the others; the others go on. Leaving the
-    iterator early, as Ctrl-C does, ends local workers at once; a Dask worker finishes what it has begun.
-
-    Args:
-        jobs: Callables that can be pickled: a ``functools.partial`` of a module's function, or a frozen
-            dataclass with ``__call__``. Their results travel through a pipe, so big ones belong in files.
-        processes: Workers on this machine, each with one thread per library; 1 works in this process.
-        scheduler: Address of a Dask scheduler, ``tcp://host:8786``; replaces ``processes``.
-        attempts: How often a job is begun before it is given up. Dask itself begins a job whose worker died
-            again on others, as its ``allowed-failures`` says.
-        crew: Workers that were hired before and stay for more; replaces ``processes`` and ``scheduler``.
-
-    Raises:
-        ConfigError: A number is not positive, or the scheduler does not answer, has no workers or went away.
-        DependencyError: There is a scheduler, but Dask's ``distributed`` is not installed.
-    """
-    if attempts < 1:
-        raise ConfigError(f"attempts: {attempts}, want at least 1")
-    if not jobs:
-        return
-    with hired(scheduler, min(processes, len(jobs))) if crew is None else nullcontext(crew) as crew:
-        waiting, begun = deque(range(len(jobs))), Counter[int]()
-        in_hand = 0
-        while waiting or in_hand:
-            while waiting and in_hand < crew.size():
-                index = waiting.popleft()
-                crew.begin(index, jobs[index])
-                in_hand += 1
-            index, outcome = crew.next_done()
-            in_hand -= 1
-            if isinstance(outcome, Failure):
-                begun[index] += outcome.attempts
-                if begun[index] < attempts:
-                    waiting.append(index)
-                    continue
-                outcome = Failure(outcome.reason, begun[index])
-            yield index, outcome
-
-
-class Crew(Protocol):
-    """Whoever does the work; takes no more jobs at once than its size. Leaving it ends the work."""
+class Executor(Protocol):
+    """Workers that run jobs, at most as many at once as its size. Leaving it as a context ends the work."""
 
     def __enter__(self) -> Self: ...
     def __exit__(self, *_: object) -> None: ...
 
     def size(self) -> int:
-        """Return how many jobs can be in hand at once."""
+        """Return how many jobs can run at once."""
         ...
 
-    def begin(self, index: int, job: Job) -> None:
+    def submit(self, index: int, job: Work) -> None:
         """Begin a job."""
         ...
 
     def next_done(self) -> tuple[int, Any]:
-        """Wait for a job, and return its index and its result or Failure."""
+        """Wait for a job to end, and return its index and its result or Failure."""
         ...
 
 
-def hired(scheduler: str | None, processes: int) -> Crew:
-    """Return workers for several lists of jobs, one after the other; see ``run_jobs``."""
-    if processes < 1:
-        raise ConfigError(f"processes: {processes}, want at least 1")
-    if scheduler is not None:
-        return _Cluster(scheduler)
-    return _Processes(processes) if processes > 1 else _Here()
+def make_executor(workers: Workers, *, jobs: int | None = None) -> Executor:
+    """Return an executor for one or several lists of jobs, one after the other.
+
+    Args:
+        workers: Where the jobs run.
+        jobs: How many there will be, if that is known: no more processes are started.
+
+    Raises:
+        ConfigError: The scheduler does not answer, or has no workers.
+        DependencyError: There is a scheduler, but Dask's ``distributed`` is not installed.
+    """
+    if workers.scheduler is not None:
+        return _DaskCluster(workers.scheduler)
+    processes = workers.processes if jobs is None else min(workers.processes, jobs)
+    return _ProcessPool(processes) if processes > 1 else _InProcess()
 
 
-def _attempt(job: Job) -> Any:
-    """Return a job's result, or the Failure that it came to."""
+def run_jobs(
+    jobs: Sequence[Callable[[], R]], executor: Executor, *, attempts: int = 2
+) -> Iterator[tuple[int, R | Failure]]:
+    """Yield the index of each job and its result as they finish, in any order.
+
+    A job that raises, or whose worker ends, is tried again after the others; the others go on.
+
+    Args:
+        jobs: Callables that can be pickled: a ``functools.partial`` of a module's function, or a frozen
+            dataclass with ``__call__``. Their results travel through a pipe, so big ones belong in files.
+        executor: Leaving it, as Ctrl-C does, ends local workers at once; a Dask worker finishes its job.
+        attempts: How often a job is begun before it is given up. Dask itself begins a job whose worker ended
+            again on others, as its ``allowed-failures`` says.
+
+    Raises:
+        ConfigError: ``attempts`` is not positive, or the scheduler went away.
+    """
+    if attempts < 1:
+        raise ConfigError(f"attempts: {attempts}, want at least 1")
+    waiting, begun = deque(range(len(jobs))), Counter[int]()
+    running = 0
+    while waiting or running:
+        while waiting and running < executor.size():
+            index = waiting.popleft()
+            executor.submit(index, jobs[index])
+            running += 1
+        index, outcome = executor.next_done()
+        running -= 1
+        if isinstance(outcome, Failure):
+            begun[index] += outcome.attempts
+            if begun[index] < attempts:
+                waiting.append(index)
+                continue
+            outcome = Failure(outcome.reason, begun[index])
+        yield index, outcome
+
+
+def _attempt(job: Work) -> Any:
+    """Return a job's result, or a Failure."""
     try:
         return job()
     except Exception as error:
@@ -142,8 +159,8 @@ def _reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {message}{place}"
 
 
-class _Here(AbstractContextManager["_Here"]):
-    """This very process."""
+class _InProcess(AbstractContextManager["_InProcess"]):
+    """Executor that runs jobs in this process."""
 
     def __exit__(self, *_: object) -> None:
         pass
@@ -151,15 +168,15 @@ class _Here(AbstractContextManager["_Here"]):
     def size(self) -> int:
         return 1
 
-    def begin(self, index: int, job: Job) -> None:
+    def submit(self, index: int, job: Work) -> None:
         self._index, self._job = index, job
 
     def next_done(self) -> tuple[int, Any]:
         return self._index, _attempt(self._job)
 
 
-class _Processes(AbstractContextManager["_Processes"]):
-    """Processes on this machine, begun when there is work for them and replaced when they die."""
+class _ProcessPool(AbstractContextManager["_ProcessPool"]):
+    """Executor of processes on this machine, started when there is work and replaced when they end."""
 
     def __init__(self, count: int) -> None:
         self._count = count
@@ -173,9 +190,9 @@ class _Processes(AbstractContextManager["_Processes"]):
     def size(self) -> int:
         return self._count
 
-    def begin(self, index: int, job: Job) -> None:
+    def submit(self, index: int, job: Work) -> None:
         worker = self._idle.pop() if self._idle else _Worker()
-        with suppress(BrokenPipeError):  # it died while idle; next_done will find the pipe closed
+        with suppress(BrokenPipeError):  # it ended while idle; next_done will find the pipe closed
             worker.connection.send(job)
         self._busy[worker.connection] = worker, index
 
@@ -186,13 +203,13 @@ class _Processes(AbstractContextManager["_Processes"]):
         try:
             outcome = connection.recv()
         except (EOFError, ConnectionError):
-            return index, Failure(worker.autopsy(), 1)
+            return index, Failure(worker.exit_reason(), 1)
         self._idle.append(worker)
         return index, outcome
 
 
 class _Worker:
-    """A spawned process that does the jobs sent to it, one at a time, and dies with whoever began it."""
+    """A spawned process that runs the jobs sent to it, one at a time, and ends with its parent."""
 
     def __init__(self) -> None:
         context = get_context("spawn")  # a forked copy of a process with threads may hang
@@ -202,13 +219,13 @@ class _Worker:
         theirs.close()  # so that the pipe ends with the process
 
     def kill(self) -> None:
-        """End the process, whatever it does."""
+        """End the process at once."""
         self._process.kill()
         self._process.join()
         self.connection.close()
 
-    def autopsy(self) -> str:
-        """Return what the process died of, after its end of the pipe has closed."""
+    def exit_reason(self) -> str:
+        """Return how the process ended, after its end of the pipe has closed."""
         self._process.join()
         self.connection.close()
         code = self._process.exitcode or 0
@@ -220,7 +237,7 @@ class _Worker:
 def _serve(connection: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     one_thread_per_library()
-    threading.Thread(target=_die_with_the_parent, daemon=True).start()
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
     while True:
         try:
             packed = connection.recv_bytes()
@@ -237,16 +254,16 @@ def _unpacked(packed: bytes) -> Any:
     return pickle.loads(packed)()
 
 
-def _die_with_the_parent() -> None:
-    """A parent that was killed cannot end its workers, and a second sweep must not find them at work."""
+def _exit_with_parent() -> None:
+    """Exit once the parent has: a killed one cannot end its workers, and a second run must not meet them."""
     parent = parent_process()
     if parent is not None:
         parent.join()
         os._exit(1)
 
 
-class _Cluster(AbstractContextManager["_Cluster"]):
-    """The workers of a Dask scheduler."""
+class _DaskCluster(AbstractContextManager["_DaskCluster"]):
+    """Executor of a Dask scheduler's workers."""
 
     def __init__(self, scheduler: str) -> None:
         if not _ADDRESS.fullmatch(scheduler):  # Dask itself would try for a while before it said so
@@ -286,7 +303,7 @@ class _Cluster(AbstractContextManager["_Cluster"]):
             raise self._gone() from None
         return max(sum(threads.values()), 1)
 
-    def begin(self, index: int, job: Job) -> None:
+    def submit(self, index: int, job: Work) -> None:
         future = self._client.submit(_attempt_with_limits, job, pure=False)
         self._index_of[future] = index
         self._done.add(future)
@@ -311,6 +328,6 @@ class _Cluster(AbstractContextManager["_Cluster"]):
         return ConfigError(f"{self._scheduler}: the Dask scheduler went away before all jobs were done")
 
 
-def _attempt_with_limits(job: Job) -> Any:
+def _attempt_with_limits(job: Work) -> Any:
     one_thread_per_library()
     return _attempt(job)

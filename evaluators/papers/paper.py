@@ -1,14 +1,14 @@
-"""What the papers have in common whose tables are measured on sequences."""
+"""Papers whose tables are measured on sequences: what thesis and Zhao have in common."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from evaluators.papers.measured import Measurement
+from evaluators.papers.measurements import Measurement
 from evaluators.papers.model import PaperPath, PaperTable
-from evaluators.study.cells import CellResult
 from mapper.core.errors import ConfigError
+from mapper.runtime.job_runner import JobResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Cut:
         return f"{self.first} … {'end' if self.last is None else self.last}"
 
     def overrides(self, most: int | None = None) -> list[str]:
-        """Return what says so to a configuration; a paper may itself use so many frames at most."""
+        """Return the settings that choose these frames; a paper may itself use so many frames at most."""
         ends = [] if self.last is None else [self.last]
         if most is not None:
             ends.append(most - 1)
@@ -44,20 +44,20 @@ class Cut:
 
 
 @dataclass(frozen=True, slots=True)
-class Book:
+class Paper:
     """A paper.
 
     Attributes:
         title: Who wrote it, and where.
         sequences: The sequences of each table, by what tables are called on the command line.
-        jobs: Returns what is to be measured of a sequence for some tables, with a seed: takes the tables, the
-            sequence, its log, the seed, which frames, and a folder for trajectories.
-        table_of: Returns a table with what all jobs came to.
-        drawn: Returns the trajectories that jobs have left.
+        measurements: Returns what is to be measured of a sequence for some tables, with a seed: takes the
+            tables, the sequence, its log, the seed, which frames, and a folder for trajectories.
+        table_of: Returns a table with the results of all measurements.
+        drawn: Returns the trajectories that measurements have left.
     """
 
     title: str
     sequences: dict[str, list[str]]
-    jobs: Callable[[Sequence[str], str, Path, int, Cut, Path], Sequence[Measurement]]
-    table_of: Callable[[str, Sequence[Any], Sequence[CellResult]], PaperTable]
+    measurements: Callable[[Sequence[str], str, Path, int, Cut, Path], Sequence[Measurement]]
+    table_of: Callable[[str, Mapping[Any, JobResult]], PaperTable]
     drawn: Callable[[Sequence[Any]], Sequence[PaperPath]] = lambda _: ()

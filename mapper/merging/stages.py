@@ -1,0 +1,66 @@
+"""Stages of a merge: lists of jobs, one after the other, whose results are kept until the map is whole."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain
+from typing import TypeVar
+
+from mapper.core.config import Config
+from mapper.core.errors import RunError
+from mapper.runtime.executor import Executor
+from mapper.runtime.job_runner import Job, JobRunner, Record
+from mapper.runtime.progress import Progress
+
+Result = TypeVar("Result", bound=Config)
+
+
+@dataclass(frozen=True, slots=True)
+class Stages:
+    """Runs the jobs of each stage.
+
+    Attributes:
+        runner: Keeps their results, so that a merge that was stopped goes on where it was.
+        executor: Where they run.
+        progress: Told how many are done.
+    """
+
+    runner: JobRunner
+    executor: Executor
+    progress: Progress
+
+    def run(
+        self, stage: str, work: Mapping[str, Callable[[], Result]], kind: type[Result]
+    ) -> Iterator[tuple[str, Result]]:
+        """Yield the name and the result of every job, those known from an earlier session first.
+
+        Args:
+            stage: What the jobs are called together.
+            work: By name, which is what a job is known by when the merge is started again.
+            kind: Of the results.
+
+        Raises:
+            RunError: A job failed twice; the others were done.
+        """
+        jobs = {
+            f"{stage}-{name}": Job(f"{stage}-{name}", f"{stage} {name}", partial(_as_record, one))
+            for name, one in work.items()
+        }
+        finished = self.runner.finished(jobs.values())
+        left = [job for key, job in jobs.items() if key not in finished]
+        failures: list[str] = []
+        with self.progress.stage(stage) as report:
+            results = chain(finished.values(), self.runner.run(left, self.executor))
+            for count, result in enumerate(results, start=1):
+                report(count, len(jobs))
+                if result.failure:
+                    failures.append(f"{result.label}: {result.failure}")
+                else:
+                    yield result.key.removeprefix(f"{stage}-"), kind.model_validate(result.records[0])
+        if failures:
+            more = f" (and {len(failures) - 1} more)" if len(failures) > 1 else ""
+            raise RunError(f"{failures[0]}{more}; what is done stays: give the same command to go on")
+
+
+def _as_record(work: Callable[[], Config]) -> list[Record]:
+    return [work().model_dump(mode="json")]

@@ -1,0 +1,141 @@
+"""Resumable jobs: each result is kept in a file, so work that was stopped goes on where it was."""
+
+import json
+import math
+import re
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from mapper.core.errors import DataError
+from mapper.runtime.atomic import write_text
+from mapper.runtime.executor import Executor, Failure, run_jobs
+from mapper.runtime.progress import SILENT, Progress
+
+Record = Mapping[str, Any]
+"""Names with text, finite numbers, None, or lists and mappings of these."""
+
+_FORMAT = "mapper cell 1"
+_KEY = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Work whose result is a few records.
+
+    Attributes:
+        key: Name of the result's file. The same key stands for the same result, in other sessions too, so it
+            is a hash of all that decides the result unless its folder is for one piece of work alone.
+        label: What messages call the job.
+        run: Does the work, and can be pickled; ``mapper.runtime.executor`` says how.
+    """
+
+    key: str
+    label: str
+    run: Callable[[], Sequence[Record]]
+
+    def __post_init__(self) -> None:
+        if not _KEY.fullmatch(self.key):
+            raise DataError(f"job {self.key!r}: its key is a file's name; want {_KEY.pattern}")
+
+
+@dataclass(frozen=True, slots=True)
+class JobResult:
+    """Result of a job.
+
+    Attributes:
+        key: The job's.
+        label: The job's.
+        records: What its work returned; empty if it failed.
+        seconds: Wall time of the work, wherever it ran; 0 if it failed.
+        failure: Why it failed, in one line, or empty.
+    """
+
+    key: str
+    label: str
+    records: tuple[Record, ...]
+    seconds: float
+    failure: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class JobRunner:
+    """Runs jobs and keeps each result in ``FOLDER/KEY.json``, written by the process that worked it out.
+
+    So nothing finished is lost when any process ends. A failure is written too, and its job run again the
+    next time.
+
+    Attributes:
+        folder: Where the results are; a Dask cluster's workers must see it as well.
+        progress: Told of damaged files.
+    """
+
+    folder: Path
+    progress: Progress = SILENT
+
+    def finished(self, jobs: Iterable[Job]) -> dict[str, JobResult]:
+        """Return the results that an earlier session has left, by key."""
+        return {job.key: result for job in jobs if (result := self._read(job.key)) is not None}
+
+    def run(self, jobs: Sequence[Job], executor: Executor, *, attempts: int = 2) -> Iterator[JobResult]:
+        """Yield the result of every job as it finishes, in any order.
+
+        Args:
+            jobs: With different keys.
+            executor: Where they run.
+            attempts: How often a job is begun before it has failed.
+        """
+        folder = self.folder.resolve()
+        outcomes = run_jobs([_KeptJob(job, folder) for job in jobs], executor, attempts=attempts)
+        for index, outcome in outcomes:
+            if isinstance(outcome, Failure):
+                outcome = JobResult(jobs[index].key, jobs[index].label, (), 0.0, outcome.reason)
+                _write(folder, outcome)
+            yield outcome
+
+    def _read(self, key: str) -> JobResult | None:
+        """Return a job's result, or None if it is still to be worked out."""
+        path = self.folder / f"{key}.json"
+        try:
+            tree = json.loads(path.read_text(encoding="utf-8"))
+            if tree.pop("format") != _FORMAT or tree["key"] != key:
+                raise ValueError
+            result = JobResult(**tree | {"records": tuple(map(_checked, tree["records"]))})
+        except FileNotFoundError:
+            return None
+        except (ValueError, TypeError, KeyError, AttributeError, DataError):
+            self.progress.note(f"{path}: not a finished result, or a damaged one; it is worked out again")
+            return None
+        return None if result.failure else result
+
+
+@dataclass(frozen=True, slots=True)
+class _KeptJob:
+    """A job that writes its result where it runs."""
+
+    job: Job
+    folder: Path
+
+    def __call__(self) -> JobResult:
+        began = time.perf_counter()
+        records = tuple(map(_checked, self.job.run()))
+        result = JobResult(self.job.key, self.job.label, records, time.perf_counter() - began)
+        _write(self.folder, result)
+        return result
+
+
+def _checked(record: Record) -> Record:
+    """Return the record, refusing what a file would not give back as it was."""
+    for name, value in record.items():
+        if not isinstance(value, str | int | float | list | dict | None) or (
+            isinstance(value, float) and not math.isfinite(value)
+        ):
+            raise DataError(f"{name} is {value!r}; want text, a finite number or None")
+    return dict(record)
+
+
+def _write(folder: Path, result: JobResult) -> None:
+    text = json.dumps({"format": _FORMAT, **asdict(result)}, indent=1, ensure_ascii=False, allow_nan=False)
+    write_text(folder / f"{result.key}.json", text + "\n")
