@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from cli.console import progress_for
+from cli.console import print_files, progress_for
 from cli.environment import prepare_libraries
 from cli.options import First, Last, Overrides, Quiet, Stride, assignments, merged, selection
 
@@ -34,14 +34,14 @@ def compare(
 ) -> None:
     """Run every method over the same frames, as odometry and on pairs with guesses that are off.
 
+    A comparison that was stopped goes on after its last finished method: give the same command again.
+
     Example: mapper compare rgbd_dataset_freiburg1_xyz --method isvd --method gicp --out runs/compared
     """
-    from evaluators.compare.comparison import compare as compare_methods
     from evaluators.compare.config import CompareConfig
-    from evaluators.compare.files import write_comparison
+    from evaluators.compare.files import compare_into
     from evaluators.compare.tables import tables_text
     from mapper.config.loading import overridden
-    from mapper.runtime.atomic import atomic_folder
     from mapper.sources import open_source
 
     prepare_libraries()
@@ -49,11 +49,7 @@ def compare(
     sugar = [*selection(first, last, stride, None), *assignments({"pairs": pairs, "seed": seed})]
     config = overridden(given, merged(sugar, set_))
     source = open_source(log, config.source)
-    progress = progress_for(quiet=quiet)
-    with atomic_folder(out, overwrite=overwrite) as folder:
-        comparison = compare_methods(source, config, progress=progress)
-        write_comparison(folder, comparison)
-        files = ", ".join(sorted(child.name for child in folder.iterdir()))
+    comparison = compare_into(out, source, config, overwrite=overwrite, progress=progress_for(quiet=quiet))
     if not quiet:
         print(tables_text(comparison))
-        print(f"files  {files}\nin     {out}")
+        print_files(out)

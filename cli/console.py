@@ -2,8 +2,9 @@
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from mapper.runtime.progress import SILENT, Progress, Report
 
@@ -16,6 +17,12 @@ def progress_for(*, quiet: bool, prompts: bool = False) -> Progress:
     if quiet:
         return SILENT
     return Bars() if sys.stderr.isatty() and not prompts else Lines()
+
+
+def print_files(out: Path, names: Iterable[str] = (), *, width: int = 7) -> None:
+    """Print what a verb has left in a folder: the names given, or all that is there."""
+    names = names or sorted(child.name for child in out.iterdir())
+    print(f"{'files':<{width}}{', '.join(names)}\n{'in':<{width}}{out}")
 
 
 class _Notes:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cli.console import print_files
 from cli.environment import prepare_libraries
 from cli.options import Overrides, Quiet
 
@@ -84,9 +85,8 @@ def register(
                 sensor=target_sensor,
                 config=config,
             )
-            files = ", ".join(sorted(child.name for child in folder.iterdir()))
         if not quiet:
-            print(f"files    {files}\nin       {out}")
+            print_files(out, width=9)
     if rerun is not None:
         name = f"{source} on {target}"
         _shown(rerun, registered, target_frame.scan(), source_frame.scan(), name, target_sensor)

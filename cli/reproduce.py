@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from cli.console import progress_for
+from cli.console import print_files, progress_for
 from cli.environment import has_compiled_code, prepare_libraries
 from cli.options import First, Last, Quiet, workers_for
 
@@ -89,7 +89,7 @@ def reproduce(
     )
     if not quiet:
         print(tables_text(reproduction))
-        print(f"files  {', '.join(sorted(child.name for child in out.iterdir()))}\nin     {out}")
+        print_files(out)
 
 
 def _given(assignments: Sequence[str]) -> dict[str, Path]:

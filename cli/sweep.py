@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from cli.console import progress_for
+from cli.console import print_files, progress_for
 from cli.environment import has_compiled_code, prepare_libraries
 from cli.options import Quiet, workers_for
 
@@ -52,4 +52,4 @@ def sweep(
     records = write_sweep(plan, results, title=file.stem)
     if not quiet:
         print(summary_text(records))
-        print(f"files  {', '.join(FILES)}\nin     {out}")
+        print_files(out, FILES)

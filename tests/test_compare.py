@@ -17,9 +17,10 @@ from evaluators.compare import comparison as compare_module
 from evaluators.compare.catalogue import methods_for
 from evaluators.compare.comparison import compare
 from evaluators.compare.config import CompareConfig, LidarCompareConfig
-from evaluators.compare.files import write_comparison
+from evaluators.compare.files import compare_into, write_comparison
 from evaluators.compare.methods import registration_method
-from evaluators.compare.tables import odometry_records, registration_records, tables_text, trial_records
+from evaluators.compare.pairwise import registration_records
+from evaluators.compare.tables import odometry_records, tables_text
 from mapper.core.errors import ConfigError, DataError, FrameError
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import LidarSimulator
@@ -45,8 +46,8 @@ def desk(desk_log):
 
 
 @pytest.fixture(scope="module")
-def on_desk(desk):
-    return compare(desk, RGBD)
+def on_desk(desk, tmp_path_factory):
+    return compare(desk, RGBD, tmp_path_factory.mktemp("desk"))
 
 
 @pytest.fixture(scope="module")
@@ -56,8 +57,8 @@ def street():
 
 
 @pytest.fixture(scope="module")
-def on_street(street):
-    return compare(street, LIDAR)
+def on_street(street, tmp_path_factory):
+    return compare(street, LIDAR, tmp_path_factory.mktemp("street"))
 
 
 def test_every_method_follows_a_short_path(on_desk, on_street):
@@ -81,7 +82,7 @@ def test_paths_are_of_the_body_whatever_a_method_saw(on_desk):
 
 def test_registration_is_right_from_good_guesses(on_desk, on_street):
     for comparison in (on_desk, on_street):
-        for row in registration_records(comparison):
+        for row in registration_records(comparison.trials):
             assert row["trials"] == row["right"] + row["wrong"] + row["no_answer"] == 3
     near = comparison_rows(on_desk, "0.05 m, 3°") | comparison_rows(on_street, "0.5 m, 5°")
     assert {"rgbd", "gicp", "kiss-icp"} <= set(near)
@@ -93,19 +94,25 @@ def test_registration_is_right_from_good_guesses(on_desk, on_street):
     assert {name: row["right"] for name, row in blind.items()} == dict.fromkeys(blind, 3)
 
 
+def trials_of(comparison):
+    return comparison.trials
+
+
 def comparison_rows(comparison, guess):
-    return {row["method"]: row for row in registration_records(comparison) if row["guess_off_by"] == guess}
+    return {
+        row["method"]: row for row in registration_records(comparison.trials) if row["guess_off_by"] == guess
+    }
 
 
-def test_a_second_time_gives_the_same(street, on_street):
-    again = compare(street, LIDAR)
+def test_a_second_time_gives_the_same(street, on_street, tmp_path):
+    again = compare(street, LIDAR, tmp_path)
     assert without_times(odometry_records(again)) == without_times(odometry_records(on_street))
-    assert without_times(trial_records(again)) == without_times(trial_records(on_street))
+    assert without_times(again.trials) == without_times(on_street.trials)
 
 
-def test_the_choice_of_methods_changes_no_numbers(desk, on_desk):
-    alone = compare(desk, RGBD.model_copy(update={"methods": ("gicp",)}))
-    for records in (odometry_records, trial_records):
+def test_the_choice_of_methods_changes_no_numbers(desk, on_desk, tmp_path):
+    alone = compare(desk, RGBD.model_copy(update={"methods": ("gicp",)}), tmp_path)
+    for records in (odometry_records, trials_of):
         expected = [row for row in without_times(records(on_desk)) if row["method"] == "gicp"]
         assert without_times(records(alone)) == expected
 
@@ -134,19 +141,19 @@ class Stumbles:
         raise ZeroDivisionError("over\na stone")
 
 
-def test_a_method_that_breaks_down_does_not_take_the_others_along(desk, on_desk, monkeypatch):
+def test_a_method_that_breaks_down_does_not_take_the_others_along(desk, on_desk, monkeypatch, tmp_path):
     def with_a_bad_one(source, config):
         methods, notes = methods_for(source, config)
         return [registration_method("bad", Stumbles, uses_guess=True), *methods], notes
 
     monkeypatch.setattr(compare_module, "methods_for", with_a_bad_one)
-    comparison = compare(desk, RGBD.model_copy(update={"methods": ("gicp",)}))
+    comparison = compare(desk, RGBD.model_copy(update={"methods": ("gicp",)}), tmp_path)
 
     bad, good = comparison.runs
     assert bad.broke == "broke down at frame 1: ZeroDivisionError: over a stone"
     assert (bad.errors, len(bad.trajectory)) == (None, 0)
     assert good.errors == on_desk.runs[2].errors
-    rows = [row for row in registration_records(comparison) if row["method"] == "bad"]
+    rows = [row for row in registration_records(comparison.trials) if row["method"] == "bad"]
     assert [(row["right"], row["wrong"], row["no_answer"], row["median_m"]) for row in rows] == 3 * [
         (0, 0, 3, None)
     ]
@@ -164,25 +171,27 @@ def damaged(log, bad):
     return replace(log, entry_at=entry_at)
 
 
-def test_frames_that_cannot_be_read_are_skipped_for_all(desk):
-    comparison = compare(damaged(desk, {3, 4}), RGBD.model_copy(update={"methods": ("gicp",), "pairs": 6}))
+def test_frames_that_cannot_be_read_are_skipped_for_all(desk, tmp_path):
+    config = RGBD.model_copy(update={"methods": ("gicp",), "pairs": 6})
+    comparison = compare(damaged(desk, {3, 4}), config, tmp_path / "some")
     assert [skip.reason.endswith("torn") for skip in comparison.skipped] == [True, True]
     assert comparison.runs[0].frames == 6
     assert comparison.runs[0].errors.ate_m < 0.02
     with pytest.raises(DataError, match="none of 8 frames can be read; the first: frame"):
-        compare(damaged(desk, set(range(8))), RGBD)
+        compare(damaged(desk, set(range(8))), RGBD, tmp_path / "all")
 
 
 def test_without_truth_there_is_speed_and_a_path_only(desk, tmp_path):
-    comparison = compare(replace(desk, truth=None), RGBD.model_copy(update={"methods": ("gicp",)}))
+    config = RGBD.model_copy(update={"methods": ("gicp",)})
+    comparison = compare(replace(desk, truth=None), config, tmp_path / "cells")
     row = odometry_records(comparison)[0]
     assert (row["ate_rmse_m"], row["rpe_rmse_m"], row["drift_ratio"]) == (None, None, None)
     assert row["frames_per_s"] > 0.0
     assert not comparison.trials
     assert "the log has no truth" in tables_text(comparison)
-    write_comparison(tmp_path, comparison)
-    assert (tmp_path / "paths.png").is_file()
-    assert not (tmp_path / "registration.csv").exists()
+    write_comparison(tmp_path / "out", comparison)
+    assert (tmp_path / "out/paths.png").is_file()
+    assert not (tmp_path / "out/registration.csv").exists()
 
 
 def test_the_files_agree_with_each_other(on_desk, tmp_path):
@@ -232,15 +241,48 @@ def test_the_verb_prints_both_tables_and_leaves_a_folder(desk_log, tmp_path):
 
     assert "exists already" in mapper(*arguments, status=1).stderr
     assert mapper(*arguments, "--overwrite", "--quiet").stdout == ""
+    assert not (out / "cells").exists()
     refused = mapper("compare", desk_log, "--method", "magic", "--out", tmp_path / "other", status=1)
     assert "mapper: no method 'magic'; want one of local-map, isvd, pnp, rgbd, icp" in refused.stderr
     assert not (tmp_path / "other").exists()
 
 
+def test_a_comparison_that_was_stopped_goes_on_where_it_was(desk, tmp_path, monkeypatch):
+    config = CompareConfig(methods=("gicp", "kiss-icp"), pairs=0)
+    once = compare_into(tmp_path / "once", desk, config)
+    with monkeypatch.context() as patch:
+        patch.setattr("evaluators.compare.methods.OdometryTracker.add", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            compare_into(tmp_path / "out", desk, config)
+    followed = []
+    monkeypatch.setattr(compare_module.MethodRun, "add", recording(followed, compare_module.MethodRun.add))
+
+    comparison = compare_into(tmp_path / "out", desk, config)
+
+    assert followed == ["kiss-icp"] * 8
+    assert without_times(odometry_records(comparison)) == without_times(odometry_records(once))
+    assert (tmp_path / "out/compare.mcap").read_bytes() == (tmp_path / "once/compare.mcap").read_bytes()
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        path.name for path in (tmp_path / "once").iterdir()
+    }
+
+
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
+def recording(followed, add):
+    def recorded(run, frame):
+        followed.append(run._method.name)
+        add(run, frame)
+
+    return recorded
+
+
 @pytest.mark.skipif(not KITTI.is_dir(), reason=f"{KITTI} is not here")
-def test_real_scans_are_followed_to_centimetres():
+def test_real_scans_are_followed_to_centimetres(tmp_path):
     source = open_source(KITTI, SourceConfig(last_frame=3))
-    comparison = compare(source, CompareConfig(methods=("gicp", "hough-gicp"), pairs=0))
+    comparison = compare(source, CompareConfig(methods=("gicp", "hough-gicp"), pairs=0), tmp_path)
     for run in comparison.runs:
         assert run.failures == 0
         assert run.errors.ate_m < 0.03, run.method

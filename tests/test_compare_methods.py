@@ -7,7 +7,7 @@ import pytest
 
 from evaluators.compare.catalogue import methods_for
 from evaluators.compare.config import CompareConfig, RgbdCompareConfig
-from evaluators.compare.frames import Reader
+from evaluators.compare.frames import FrameReader
 from evaluators.compare.methods import FrameToFrame, OdometryPairs
 from evaluators.compare.scales import kiss_icp, registrations_for
 from mapper.core.errors import FrameError
@@ -135,7 +135,7 @@ def test_scans_of_images_stand_upright():
     depth_m[2, 2] = 9.0  # too deep
     frame = RgbdFrame(7, np.zeros((48, 64), np.uint8), depth_m, camera)
 
-    moment = Reader(RgbdCompareConfig()).read(Loaded(frame))
+    moment = FrameReader(RgbdCompareConfig()).read(Loaded(frame))
 
     ((ahead_m, left_m, up_m),) = moment.scan.points_body.tolist()
     assert ahead_m == pytest.approx(2.0)
@@ -223,7 +223,7 @@ def test_every_method_serves_as_odometry_and_on_pairs(desk_log):
     source = open_source(desk_log, SourceConfig(last_frame=1))
     methods, notes = methods_for(source, CompareConfig())
     assert not notes
-    reader = Reader(RgbdCompareConfig())
+    reader = FrameReader(RgbdCompareConfig())
     first, second = (reader.read(entry) for entry in source.entries())
     for method in methods:
         tracker = method.tracker()

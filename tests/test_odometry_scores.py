@@ -7,9 +7,7 @@ from evaluators.metrics.odometry import (
     ONE_FRAME,
     ONE_SECOND,
     OdometryRun,
-    judged_run,
-    position_errors_m,
-    rotation_errors_rad,
+    assess_run,
     step_for,
 )
 from mapper.core.geometry import exp
@@ -33,18 +31,18 @@ def run_of(trajectory, frames=41):
 def test_the_truth_seen_from_elsewhere_has_no_errors():
     truth = path()
     T_map_world = exp(np.array([0.4, -1.0, 2.0]), np.array([5.0, 6.0, 7.0]))
-    run = judged_run(run_of(truth.moved(T_map_world)), truth, ONE_SECOND)
+    run = assess_run(run_of(truth.moved(T_map_world)), truth, ONE_SECOND)
 
     errors = run.errors
     assert max(errors.ate_m, errors.rpe_m, errors.rpe_rad, errors.drift_ratio) < 1e-7
-    assert position_errors_m(run.matched).max() < 1e-9
-    assert rotation_errors_rad(run.matched).max() < 1e-7
+    assert run.matched.position_errors_m.max() < 1e-9
+    assert run.matched.rotation_errors_rad.max() < 1e-7
     np.testing.assert_allclose(run.trajectory.T_world_body, truth.T_world_body, atol=1e-9)
     assert (run.coverage, run.frames_per_s) == (1.0, 20.5)
 
 
 def test_drift_is_the_share_of_the_way_that_is_missing():
-    errors = judged_run(run_of(path(scale=0.95)), path(), ONE_SECOND).errors
+    errors = assess_run(run_of(path(scale=0.95)), path(), ONE_SECOND).errors
     # A stretch along the swinging path is longer than the straight line between its ends.
     assert 0.03 < errors.drift_ratio <= 0.05
     assert errors.rpe_m == pytest.approx(0.05 * 10.0, rel=0.02)
@@ -62,7 +60,7 @@ def test_a_step_is_a_second_where_the_log_has_one():
 def test_frames_without_a_pose_are_uncovered_and_not_judged():
     truth = path()
     half = Trajectory(truth.stamps_ns[:10], truth.T_world_body[:10])
-    run = judged_run(run_of(half), truth, ONE_SECOND)
+    run = assess_run(run_of(half), truth, ONE_SECOND)
     assert run.coverage == pytest.approx(10 / 41)
     assert len(run.matched) == 10
 
@@ -71,14 +69,14 @@ def test_frames_without_a_pose_are_uncovered_and_not_judged():
 def test_too_few_poses_have_no_errors(left):
     truth = path()
     run = run_of(Trajectory(truth.stamps_ns[:left], truth.T_world_body[:left]))
-    assert judged_run(run, truth, ONE_SECOND).errors is None
-    assert judged_run(run_of(truth), None, ONE_SECOND).errors is None
+    assert assess_run(run, truth, ONE_SECOND).errors is None
+    assert assess_run(run_of(truth), None, ONE_SECOND).errors is None
 
 
 def test_pieces_shorter_than_a_step_have_no_relative_error():
     truth = path()
     piece = Trajectory(truth.stamps_ns[:5], truth.T_world_body[:5])
-    errors = judged_run(run_of(piece), truth, ONE_SECOND).errors
+    errors = assess_run(run_of(piece), truth, ONE_SECOND).errors
     assert errors.rpe_m is None
     assert errors.rpe_rad is None
     assert errors.ate_m < 1e-9

@@ -7,11 +7,10 @@ from evaluators.compare.config import GuessConfig, LidarCompareConfig, RgbdCompa
 from evaluators.compare.pairwise import (
     NO_GUESS,
     Pair,
-    Trial,
     guesses_for,
-    judged,
+    outcome_of,
     pairs_of,
-    registration_scores,
+    registration_records,
 )
 from mapper.core.geometry import exp, inverse, rotation_log
 from mapper.core.trajectory import Trajectory
@@ -103,34 +102,45 @@ def test_an_answer_is_right_if_neither_error_is_too_large(offset_m, turn_deg, ou
     off = exp(np.array([0.0, 0.0, np.deg2rad(turn_deg)]), np.zeros(3))
     off[0, 3] = offset_m
     alignment = Alignment(T_true @ off, converged=True, inlier_ratio=1.0, inlier_rmse_m=0.0)
-    found, translation_m, rotation_rad = judged(alignment, T_true, RgbdCompareConfig())
-    assert found == outcome
-    assert (translation_m, np.rad2deg(rotation_rad)) == pytest.approx((offset_m, turn_deg), abs=1e-9)
+    found = outcome_of(alignment, T_true, RgbdCompareConfig())
+    assert found["outcome"] == outcome
+    errors = found["translation_m"], np.rad2deg(found["rotation_rad"])
+    assert errors == pytest.approx((offset_m, turn_deg), abs=1e-9)
 
 
 def test_no_answer_is_neither_right_nor_wrong():
-    assert judged(failed("no idea"), np.eye(4), LidarCompareConfig()) == ("none", np.inf, np.inf)
+    found = outcome_of(failed("no idea"), np.eye(4), LidarCompareConfig())
+    assert found == {"outcome": "none", "translation_m": None, "rotation_rad": None}
 
 
-def trial(method, guess, outcome, error=np.inf):
-    return Trial(method, 0, 1, 1, guess, outcome, error, error / 10, 2.0, 30.0 if error < 1 else 90.0, "")
+def trial(method, guess, outcome, error=None):
+    return {
+        "method": method,
+        "guess": guess,
+        "outcome": outcome,
+        "translation_m": error,
+        "rotation_rad": error and error / 10,
+        "prepare_ms": 2.0,
+        "align_ms": 30.0 if error is not None and error < 1 else 90.0,
+    }
 
 
 def test_medians_are_of_the_right_ones_and_failures_are_counted():
     trials = [
-        trial("b", 0, "right", 0.01),
+        trial("b", "0.1 m", "right", 0.01),
         trial("a", NO_GUESS, "none"),
-        trial("b", 0, "wrong", 5.0),
-        trial("b", 1, "wrong", 7.0),
-        trial("b", 0, "right", 0.03),
-        trial("b", 0, "none"),
+        trial("b", "0.1 m", "wrong", 5.0),
+        trial("b", "1 m", "wrong", 7.0),
+        trial("b", "0.1 m", "right", 0.03),
+        trial("b", "0.1 m", "none"),
     ]
-    near, far, blind = registration_scores(trials)
+    near, far, blind = registration_records(trials)
 
-    assert (near.method, near.guess, near.trials) == ("b", 0, 4)
-    assert (near.right, near.wrong, near.none) == (2, 1, 1)
-    assert near.translation_m == pytest.approx((0.02, 0.029))
-    assert near.rotation_rad == pytest.approx((0.002, 0.0029))
-    assert (near.prepare_ms, near.align_ms) == (2.0, 60.0)
-    assert (far.right, far.wrong, far.translation_m) == (0, 1, None)
-    assert (blind.method, blind.guess, blind.none, blind.rotation_rad) == ("a", NO_GUESS, 1, None)
+    assert (near["method"], near["guess_off_by"], near["trials"]) == ("b", "0.1 m", 4)
+    assert (near["right"], near["wrong"], near["no_answer"]) == (2, 1, 1)
+    assert (near["median_m"], near["p95_m"]) == pytest.approx((0.02, 0.029))
+    assert (near["median_rad"], near["p95_rad"]) == pytest.approx((0.002, 0.0029))
+    assert (near["prepare_ms"], near["align_ms"]) == (2.0, 60.0)
+    assert (far["right"], far["wrong"], far["median_m"]) == (0, 1, None)
+    assert (blind["method"], blind["guess_off_by"], blind["no_answer"]) == ("a", NO_GUESS, 1)
+    assert blind["median_rad"] is None

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.console import progress_for
+from cli.console import print_files, progress_for
 from cli.environment import prepare_libraries
 from cli.options import Quiet, assignments
 
@@ -82,13 +82,13 @@ def line_laser(
         judged = judge(scans, truth, config.stripe) if truth else None
         if judged is not None:
             judged.write(folder)
-        files = ", ".join(sorted(child.name for child in folder.iterdir()))
     for note in notes:
         progress.note(note)
     if not quiet:
         if judged is not None:
             print(f"{judged.text}\n")
-        print(f"{_summary(scans)}\nfiles    {files}\nin       {out}")
+        print(_summary(scans))
+        print_files(out, width=9)
 
 
 def calibrate(

@@ -1,46 +1,51 @@
-"""Every method on one log: the same frames, prepared in the same way, as odometry and pair by pair."""
+"""Comparison of methods on one log: a job for each, as odometry over all frames and on pairs of them."""
 
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from evaluators.compare.catalogue import methods_for
 from evaluators.compare.config import CompareConfig, TrialsConfig
-from evaluators.compare.frames import Moment, Reader
+from evaluators.compare.frames import FrameReader, PreparedFrame
 from evaluators.compare.methods import Method, Tracker, reason_of
-from evaluators.compare.pairwise import Trial, guesses_for, pairs_of, trials_of
-from evaluators.metrics.odometry import OdometryRun, Step, judged_run, step_for
+from evaluators.compare.pairwise import guesses_for, pairs_of, trials_of
+from evaluators.metrics.odometry import OdometryRun, Step, assess_run, step_for
+from evaluators.study.engine import run_study
+from evaluators.study.versions import digest, versions
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Sensor
 from mapper.core.geometry import inverse
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, Stamps
 from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.run.fingerprint import fingerprint
+from mapper.runtime.job_runner import Job, Record
 from mapper.runtime.progress import SILENT, Progress
-from mapper.sources.base import Log, Skipped
+from mapper.sources.base import FrameRef, Log, Skipped
 
 _WARM_UP_FRAMES = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """What the methods come to on one log.
+    """The results of all methods on one log.
 
     Attributes:
-        path: Where it lies.
-        log: What it calls itself.
+        path: Of the log.
+        log: Its name.
         sensor: What took it.
         config: How the methods were compared.
-        truth: Where the body really was while the log was taken, if it tells.
+        truth: True poses of the body while the log was taken, if it has them.
         runs: Each method over the whole log.
         step: Of the runs' relative errors.
-        trials: Every registration of every pair.
-        read_ms: What reading a frame takes of the CPU, for all methods alike and not counted as theirs.
-        scan_ms: What making its scan takes, likewise.
+        trials: A record of every registration of every pair, as ``trials_of`` returns them.
+        read_ms: CPU time of reading a frame, for all methods alike and not counted as theirs.
+        scan_ms: CPU time of making its scan, likewise.
         skipped: Frames that could not be read.
         notes: What had to be left out, a sentence each.
     """
@@ -52,7 +57,7 @@ class Comparison:
     truth: Trajectory | None
     runs: tuple[OdometryRun, ...]
     step: Step
-    trials: tuple[Trial, ...]
+    trials: tuple[Record, ...]
     read_ms: float
     scan_ms: float
     skipped: tuple[Skipped, ...]
@@ -61,55 +66,178 @@ class Comparison:
     @property
     def trials_config(self) -> TrialsConfig:
         """Which registrations were tried, and what counts as right."""
-        return trials_config(self.config, self.sensor)
+        return self.config.trials(self.sensor)
 
 
-def trials_config(config: CompareConfig, sensor: Sensor) -> TrialsConfig:
-    """Return which registrations are tried on logs of a sensor."""
-    return config.rgbd if sensor == "rgbd" else config.lidar
-
-
-def compare(source: Log, config: CompareConfig, *, progress: Progress = SILENT) -> Comparison:
+def compare(source: Log, config: CompareConfig, folder: Path, *, progress: Progress = SILENT) -> Comparison:
     """Run every chosen method over the whole log, and on pairs of its frames.
 
-    Frames are read one at a time and shown to one method after the other, so memory does not grow with the
-    log. Times are of the CPU: they are what one core would take, whatever else the machine does. A method
-    that breaks down is told with its reason, and the others go on.
+    Every method gets the same frames, one at a time, so memory does not grow with the log. Times are of the
+    CPU: they are what one core would take, whatever else the machine does. A method that breaks down is
+    listed with its reason, and the others go on.
+
+    Args:
+        source: The log.
+        config: Which methods, and how they are compared.
+        folder: Where the results of finished methods are kept: what is there is not run again.
+        progress: Told how far each method is, and of frames that cannot be read.
 
     Raises:
         ConfigError: No method of such a name, or none of them can use the log.
         DataError: No frame can be read.
     """
     methods, notes = methods_for(source, config)
-    reader = Reader(config.rgbd)
-    _warm_up(source, methods, config)
-    racers, stamps_ns, skipped = _race(source, methods, reader, progress=progress)
-    step = step_for(stamps_ns)
-    truth = None if source.truth is None else _while(source.truth, stamps_ns)
-    runs = tuple(racer.run(truth, step) for racer in racers)
-    trials: list[Trial] = []
+    settings = config.model_dump(mode="json", exclude={"methods"})
+    decides = digest(versions(), fingerprint(source.path), settings, digits=12)
+    jobs = {
+        method.name: Job(
+            f"{method.name}.{decides}", method.name, MethodJob(source, config, method.name, progress)
+        )
+        for method in methods
+    }
+    found: dict[str, Any] = {}
+    for name, result in run_study(jobs, folder, attempts=1).items():
+        if result.failure:
+            raise DataError(result.failure)
+        (found[name],) = result.records
+    one, *_ = found.values()
+    skipped = tuple(Skipped(**skip) for skip in one["skipped"])
+    for skip in skipped:
+        progress.note(f"skipped: {skip.reason}")
+    frames_ns = np.array(one["frames_ns"], np.int64)
+    truth, step = _truth_during(source, frames_ns), step_for(frames_ns)
     if truth is None:
         notes = [*notes, "the log has no truth for these frames: no errors, and no registration of pairs"]
-    elif config.pairs:
-        trials = _register(source, methods, truth, config, progress=progress)
+    frames = len(found) * len(frames_ns)
     return Comparison(
         path=source.path,
         log=source.name,
         sensor=source.sensor,
         config=config,
         truth=truth,
-        runs=runs,
+        runs=tuple(assess_run(_run_of(name, record), truth, step) for name, record in found.items()),
         step=step,
-        trials=tuple(trials),
-        read_ms=1e3 * reader.read_s / max(reader.frames, 1),
-        scan_ms=1e3 * reader.scan_s / max(reader.frames, 1),
-        skipped=tuple(skipped),
+        trials=_by_pair([trial for record in found.values() for trial in record["trials"]]),
+        read_ms=1e3 * sum(record["read_s"] for record in found.values()) / frames,
+        scan_ms=1e3 * sum(record["scan_s"] for record in found.values()) / frames,
+        skipped=skipped,
         notes=tuple(notes),
     )
 
 
-class _Racer:
-    """One method on its way through the log."""
+def _run_of(method: str, record: Any) -> OdometryRun:
+    """Return what ``MethodRun.record`` has recorded."""
+    stamps_ns = np.array(record["stamps_ns"], np.int64)
+    return OdometryRun(
+        method=method,
+        frames=record["frames"],
+        failures=record["failures"],
+        seconds=record["seconds"],
+        trajectory=Trajectory(stamps_ns, np.array(record["T_world_body"]).reshape(-1, 4, 4)),
+        broke=record["broke"],
+    )
+
+
+def _by_pair(trials: Sequence[Record]) -> tuple[Record, ...]:
+    """Return the trials of all methods pair by pair."""
+    pairs = dict.fromkeys((trial["target_ns"], trial["source_ns"]) for trial in trials)
+    number = {pair: index for index, pair in enumerate(pairs)}
+    return tuple(sorted(trials, key=lambda trial: number[trial["target_ns"], trial["source_ns"]]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MethodJob:
+    """One method on one log.
+
+    Attributes:
+        source: The log.
+        config: How methods are compared.
+        method: Its name.
+        progress: Told how far it is.
+    """
+
+    source: FrameSource
+    config: CompareConfig
+    method: str
+    progress: Progress = SILENT
+
+    def __call__(self) -> list[Record]:
+        """Return one record: the run over the whole log, every trial, and what reading took.
+
+        Raises:
+            DataError: No frame can be read.
+        """
+        method = next(one for one in methods_for(self.source, self.config)[0] if one.name == self.method)
+        self._warm_up(method)
+        run, reader = MethodRun(method), FrameReader(self.config.rgbd)
+        frames_ns, skipped = self._follow(run, reader)
+        truth = _truth_during(self.source, frames_ns)
+        return [
+            {
+                **run.record(),
+                "trials": [] if truth is None else self._register(method, truth),
+                "frames_ns": frames_ns.tolist(),
+                "skipped": [asdict(skip) for skip in skipped],
+                "read_s": reader.read_s,
+                "scan_s": reader.scan_s,
+            }
+        ]
+
+    def _warm_up(self, method: Method) -> None:
+        """Let the method load its libraries and compiled code before anything is timed."""
+        reader = FrameReader(self.config.rgbd)
+        frames = []
+        for entry in islice(self.source.entries(), _WARM_UP_FRAMES):
+            with suppress(FrameError):
+                frames.append(reader.read(entry))
+        with suppress(Exception):  # what breaks down will do so again, and be recorded
+            tracker = method.tracker()
+            for frame in frames:
+                tracker.add(method.view(frame))
+
+    def _follow(self, run: "MethodRun", reader: FrameReader) -> tuple[Stamps, list[Skipped]]:
+        """Show the method every frame; return the stamps of those that can be read, and the others."""
+        frames_ns: list[int] = []
+        skipped: list[Skipped] = []
+        with self.progress.stage(self.method) as report:
+            for done, entry in enumerate(self.source.entries(), start=1):
+                try:
+                    frame = reader.read(entry)
+                except FrameError as error:
+                    skipped.append(Skipped(entry.stamp_ns, str(error)))
+                    continue
+                run.add(frame)
+                frames_ns.append(entry.stamp_ns)
+                report(done, len(self.source))
+        if not frames_ns:
+            raise DataError(
+                f"{self.source.path}: none of {len(self.source)} frames can be read; "
+                f"the first: {skipped[0].reason}"
+            )
+        return np.array(frames_ns, np.int64), skipped
+
+    def _register(self, method: Method, truth: Trajectory) -> list[Record]:
+        """Register pairs of frames from every guess."""
+        if not self.config.pairs:
+            return []
+        entries: list[FrameRef] = list(self.source.entries())
+        stamps_ns = np.array([entry.stamp_ns for entry in entries], np.int64)
+        settings, reader = self.config.trials(self.source.sensor), FrameReader(self.config.rgbd)
+        pairs = pairs_of(stamps_ns, truth, count=self.config.pairs, frames_apart=settings.frames_apart)
+        level = self.source.sensor == "lidar"
+        trials: list[Record] = []
+        with self.progress.stage(f"{self.method} on pairs") as report:
+            for done, pair in enumerate(pairs, start=1):
+                with suppress(FrameError):  # the frame is among the skipped ones
+                    frames = reader.read(entries[pair.target]), reader.read(entries[pair.source])
+                    guesses = guesses_for(pair, settings.guesses, level=level, seed=self.config.seed)
+                    trials += trials_of(method, pair, frames, guesses, settings)
+                report(done, len(pairs))
+        return trials
+
+
+class MethodRun:
+    """One method over a whole log, frame by frame."""
 
     def __init__(self, method: Method) -> None:
         self._method = method
@@ -119,110 +247,48 @@ class _Racer:
         self._seconds = 0.0
         self._broke = ""
 
-    def add(self, moment: Moment) -> None:
+    def add(self, frame: PreparedFrame) -> None:
         """Show the method the next frame, unless it has broken down."""
         if self._broke:
             return
-        self._T_body_seen = np.eye(4) if self._method.sees_images else moment.T_body_scan
+        self._T_body_seen = np.eye(4) if self._method.sees_images else frame.T_body_scan
         began = time.process_time()
         try:
             self._tracker = self._tracker or self._method.tracker()
-            self._failures += not self._tracker.add(self._method.view(moment))
+            self._failures += not self._tracker.add(self._method.view(frame))
         except Exception as error:  # a library's breakdown is a result, and the other methods go on
             self._broke = f"broke down at frame {self._frames}: {reason_of(error)}"
         self._seconds += time.process_time() - began
         self._frames += 1
 
-    def run(self, truth: Trajectory | None, step: Step) -> OdometryRun:
-        """Return what became of the method."""
+    def record(self) -> dict[str, Any]:
+        """Return counts, CPU seconds, the poses of the body, and why the method broke down if it did."""
         began = time.process_time()
         trajectory = trajectory_from(())
         if self._tracker is not None and not self._broke:
             try:
                 trajectory = self._tracker.trajectory()
+                if not np.isfinite(trajectory.T_world_body).all():
+                    raise DataError("a pose is not finite")
             except Exception as error:  # as above
+                trajectory = trajectory_from(())
                 self._broke = f"broke down at the end: {reason_of(error)}"
         self._seconds += time.process_time() - began
-        run = OdometryRun(
-            method=self._method.name,
-            frames=self._frames,
-            failures=self._failures,
-            seconds=self._seconds,
-            trajectory=Trajectory(trajectory.stamps_ns, trajectory.T_world_body @ inverse(self._T_body_seen)),
-            broke=self._broke,
-        )
-        return judged_run(run, truth, step)
+        return {
+            "frames": self._frames,
+            "failures": self._failures,
+            "seconds": self._seconds,
+            "stamps_ns": trajectory.stamps_ns.tolist(),
+            "T_world_body": (trajectory.T_world_body @ inverse(self._T_body_seen)).tolist(),
+            "broke": self._broke,
+        }
 
 
-def _race(
-    source: Log, methods: Sequence[Method], reader: Reader, *, progress: Progress
-) -> tuple[list[_Racer], Stamps, list[Skipped]]:
-    """Show every frame to every method."""
-    racers = [_Racer(method) for method in methods]
-    stamps_ns: list[int] = []
-    skipped: list[Skipped] = []
-    with progress.stage("follow") as report:
-        for done, entry in enumerate(source.entries(), start=1):
-            try:
-                moment = reader.read(entry)
-            except FrameError as error:
-                skipped.append(Skipped(entry.stamp_ns, str(error)))
-                progress.note(f"skipped: {error}")
-                continue
-            for racer in racers:
-                racer.add(moment)
-            stamps_ns.append(entry.stamp_ns)
-            report(done, len(source))
-    if not stamps_ns:
-        raise DataError(
-            f"{source.path}: none of {len(source)} frames can be read; the first: {skipped[0].reason}"
-        )
-    return racers, np.array(stamps_ns, np.int64), skipped
-
-
-def _while(truth: Trajectory, stamps_ns: Stamps) -> Trajectory | None:
+def _truth_during(source: FrameSource, frames_ns: Stamps) -> Trajectory | None:
     """Return the true poses from the first frame to the last; None if there are none."""
-    first_ns, last_ns = stamps_ns[0] - MAX_TRUTH_GAP_NS, stamps_ns[-1] + MAX_TRUTH_GAP_NS
+    truth = source.truth
+    if truth is None:
+        return None
+    first_ns, last_ns = frames_ns[0] - MAX_TRUTH_GAP_NS, frames_ns[-1] + MAX_TRUTH_GAP_NS
     near = (truth.stamps_ns >= first_ns) & (truth.stamps_ns <= last_ns)
     return Trajectory(truth.stamps_ns[near], truth.T_world_body[near]) if near.any() else None
-
-
-def _register(
-    source: Log,
-    methods: Sequence[Method],
-    truth: Trajectory,
-    config: CompareConfig,
-    *,
-    progress: Progress,
-) -> list[Trial]:
-    """Register pairs of frames by every method from every guess."""
-    settings, reader = trials_config(config, source.sensor), Reader(config.rgbd)
-    entries = list(source.entries())
-    pairs = pairs_of(source.stamps_ns, truth, count=config.pairs, frames_apart=settings.frames_apart)
-    trials: list[Trial] = []
-    with progress.stage("register") as report:
-        for done, pair in enumerate(pairs, start=1):
-            try:
-                target, source_moment = reader.read(entries[pair.target]), reader.read(entries[pair.source])
-            except FrameError:
-                continue  # it was told when the log was followed
-            level = source.sensor == "lidar"
-            guesses = guesses_for(pair, settings.guesses, level=level, seed=config.seed)
-            for method in methods:
-                trials += trials_of(method, pair, (target, source_moment), guesses, settings)
-            report(done, len(pairs))
-    return trials
-
-
-def _warm_up(source: Log, methods: Sequence[Method], config: CompareConfig) -> None:
-    """Let every method load its libraries and compiled code before anything is timed."""
-    reader = Reader(config.rgbd)
-    moments = []
-    for entry in islice(source.entries(), _WARM_UP_FRAMES):
-        with suppress(FrameError):
-            moments.append(reader.read(entry))
-    for method in methods:
-        with suppress(Exception):  # what breaks down will do so again, and be told
-            tracker = method.tracker()
-            for moment in moments:
-                tracker.add(method.view(moment))

@@ -1,4 +1,4 @@
-"""What `mapper compare` compares, and how."""
+"""Settings of `mapper compare`."""
 
 import math
 from typing import Annotated
@@ -6,6 +6,7 @@ from typing import Annotated
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from mapper.core.config import Config
+from mapper.core.frames import Sensor
 from mapper.sources.config import SourceConfig
 
 
@@ -63,7 +64,7 @@ class LidarCompareConfig(TrialsConfig):
 
 
 class CompareConfig(Config):
-    """Everything ``mapper compare`` can be told."""
+    """All settings of ``mapper compare``."""
 
     source: SourceConfig = SourceConfig()
     methods: tuple[str, ...] = ()
@@ -74,3 +75,7 @@ class CompareConfig(Config):
     """Of the errors of the guesses."""
     rgbd: RgbdCompareConfig = RgbdCompareConfig()
     lidar: LidarCompareConfig = LidarCompareConfig()
+
+    def trials(self, sensor: Sensor) -> TrialsConfig:
+        """Return which registrations are tried on logs of a sensor."""
+        return self.rgbd if sensor == "rgbd" else self.lidar

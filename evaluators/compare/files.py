@@ -1,34 +1,35 @@
-"""What `mapper compare` leaves: tables, every trial, every path, pictures and one MCAP log."""
+"""Files of `mapper compare`: tables, every trial, every path, pictures and one MCAP log."""
 
 import json
-from collections.abc import Sequence
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
-import numpy as np
+from mapper.runtime.atomic_folder import atomic_folder
 
 import mapper
-from evaluators.compare.comparison import Comparison
-from evaluators.compare.pairwise import NO_GUESS, Trial
+from evaluators.compare.comparison import Comparison, compare
+from evaluators.compare.config import CompareConfig
+from evaluators.compare.pairwise import NO_GUESS, registration_records
 from evaluators.compare.tables import (
     REGISTRATION_COLUMNS,
-    guess_text,
     odometry_columns,
     odometry_notes,
     odometry_records,
     registration_notes,
-    registration_records,
-    trial_records,
 )
-from evaluators.metrics.odometry import OdometryRun, position_errors_m, rotation_errors_rad
-from evaluators.metrics.trajectory import Matched
+from evaluators.metrics.odometry import OdometryRun
 from evaluators.pictures.comparison import write_path_errors, write_paths, write_registration_errors
-from evaluators.pictures.comparison_mcap import PathErrors, write_comparison_log
-from evaluators.tables.table import Record, csv_text, markdown_table
+from evaluators.pictures.comparison_mcap import write_comparison_log
+from evaluators.study.engine import CELLS
+from evaluators.tables.table import Record, column, csv_text, markdown_table
 from mapper.core.geometry import Array
-from mapper.export.ros_messages import Value
 from mapper.run.manifest import library_versions
 from mapper.runtime.atomic import MANIFEST_NAME, write_text
+from mapper.runtime.progress import SILENT, Progress
+from mapper.sources.base import FrameSource
 from mapper.sources.trajectory_files import write_tum
 
 TABLES, REPORT = "tables.md", "comparison.json"
@@ -38,31 +39,70 @@ MCAP = "compare.mcap"
 TRAJECTORIES = "trajectories"
 
 
-def write_comparison(folder: Path, comparison: Comparison) -> None:
-    """Fill a folder; :func:`mapper.runtime.atomic.staged` makes it appear as a whole.
+def compare_into(
+    out: Path,
+    source: FrameSource,
+    config: CompareConfig,
+    *,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
+) -> Comparison:
+    """Compare methods on a log and leave a folder; a comparison that was stopped goes on where it was.
 
-    Apart from times, the same comparison gives the same bytes.
+    Args:
+        out: Folder to create; until it is whole it is called ``OUT.partial``.
+        source: The log.
+        config: Which methods, and how they are compared.
+        overwrite: Replace a folder that is there, once the new one is whole.
+        progress: As for ``compare``.
+
+    Raises:
+        RunError: OUT is there already, or another process is filling it.
+        ConfigError: As for ``compare``.
+        DataError: As for ``compare``.
     """
-    odometry, registration = odometry_records(comparison), registration_records(comparison)
+    plan = json.dumps(_manifest(source.path, config), indent=2, ensure_ascii=False) + "\n"
+    with atomic_folder(out, overwrite=overwrite, keeps=lambda partial: _begun_with(partial, plan)) as folder:
+        write_text(folder / MANIFEST_NAME, plan)
+        comparison = compare(source, config, folder / CELLS, progress=progress)
+        write_comparison(folder, comparison)
+        shutil.rmtree(folder / CELLS)
+    return comparison
+
+
+def _begun_with(partial: Path, plan: str) -> bool:
+    """Tell whether a folder that was left behind is the beginning of this very comparison."""
+    mark = partial / MANIFEST_NAME
+    return mark.is_file() and mark.read_text(encoding="utf-8") == plan
+
+
+def write_comparison(folder: Path, comparison: Comparison) -> None:
+    """Fill a folder. Apart from times, the same comparison gives the same bytes."""
+    odometry, registration = odometry_records(comparison), registration_records(comparison.trials)
     write_text(folder / ODOMETRY, csv_text(odometry))
     write_text(folder / TABLES, _markdown(comparison, odometry, registration))
     if registration:
         write_text(folder / REGISTRATION, csv_text(registration))
-        write_text(folder / TRIALS, csv_text(trial_records(comparison)))
-    write_text(folder / REPORT, _json({"odometry": odometry, "registration": registration}))
-    paths = {run.method: run.trajectory for run in comparison.runs}
-    for name, trajectory in paths.items():
-        if len(trajectory):
-            write_tum(folder / TRAJECTORIES / f"{name}.tum", trajectory)
+        write_text(folder / TRIALS, csv_text(comparison.trials))
+    _write_json(folder / REPORT, {"odometry": odometry, "registration": registration})
+    for run in comparison.runs:
+        if len(run.trajectory):
+            write_tum(folder / TRAJECTORIES / f"{run.method}.tum", run.trajectory)
     _write_pictures(folder, comparison)
     write_comparison_log(
         folder / MCAP,
-        paths,
+        comparison.runs,
         truth=comparison.truth,
-        errors={run.method: _errors(run.matched) for run in comparison.runs if run.matched is not None},
-        trials=[_logged(comparison, trial) for trial in comparison.trials],
+        trials=comparison.trials,
     )
-    write_text(folder / MANIFEST_NAME, _json(_manifest(comparison)))
+    _write_json(
+        folder / MANIFEST_NAME,
+        {
+            **_manifest(comparison.path, comparison.config),
+            "skipped": [asdict(skip) for skip in comparison.skipped],
+            "notes": comparison.notes,
+        },
+    )
 
 
 def _markdown(comparison: Comparison, odometry: Sequence[Record], registration: Sequence[Record]) -> str:
@@ -74,32 +114,33 @@ def _markdown(comparison: Comparison, odometry: Sequence[Record], registration: 
     return "\n\n".join(parts) + "\n"
 
 
-def _manifest(comparison: Comparison) -> dict[str, object]:
+def _manifest(log: Path, config: CompareConfig) -> dict[str, Any]:
     return {
         "kind": "comparison",
-        "log": str(comparison.path.resolve()),
+        "log": str(log.resolve()),
         "mapper_version": mapper.__version__,
         "libraries": library_versions(),
-        "config": comparison.config.model_dump(mode="json"),
-        "skipped": [asdict(skip) for skip in comparison.skipped],
-        "notes": comparison.notes,
+        "config": config.model_dump(mode="json"),
     }
 
 
+def _write_json(path: Path, tree: Mapping[str, Any]) -> None:
+    write_text(path, json.dumps(tree, indent=2, ensure_ascii=False) + "\n")
+
+
 def _write_pictures(folder: Path, comparison: Comparison) -> None:
-    judged = {run.method: run.matched for run in comparison.runs if run.matched is not None}
-    captions = {run.method: _caption(run) for run in comparison.runs}
     write_paths(
         folder / PATHS_VIEW,
         {run.method: run.trajectory for run in comparison.runs},
         truth=comparison.truth,
-        captions=captions,
+        captions={run.method: _caption(run) for run in comparison.runs},
         title=f"Paths on {comparison.log}" + (", over the truth" if comparison.truth is not None else ""),
     )
-    if judged:
+    known = {run.method: run.matched for run in comparison.runs if run.matched is not None}
+    if known:
         write_path_errors(
             folder / PATH_ERRORS_VIEW,
-            {name: position_errors_m(matched) for name, matched in judged.items()},
+            {method: matched.position_errors_m for method, matched in known.items()},
             {run.method: run.steps_m for run in comparison.runs if len(run.steps_m)},
             step=comparison.step.text,
             title=f"Odometry on {comparison.log}",
@@ -120,43 +161,19 @@ def _caption(run: OdometryRun) -> str:
 
 
 def _by_guess(comparison: Comparison) -> dict[str, dict[str, Array]]:
-    """Return the errors of all registrations; methods without use for a guess stand beside every kind."""
-    methods = list(dict.fromkeys(trial.method for trial in comparison.trials))
+    """Return the errors of all registrations; methods that use no guess stand beside every kind."""
+    methods = dict.fromkeys(str(trial["method"]) for trial in comparison.trials)
     return {
         f"guess off by up to {guess.text}": {
-            method: np.array(
+            method: column(
                 [
-                    t.translation_m
-                    for t in comparison.trials
-                    if t.method == method and t.guess in (kind, NO_GUESS)
-                ]
+                    trial
+                    for trial in comparison.trials
+                    if trial["method"] == method and trial["guess"] in (guess.text, NO_GUESS)
+                ],
+                "translation_m",
             )
             for method in methods
         }
-        for kind, guess in enumerate(comparison.trials_config.guesses)
+        for guess in comparison.trials_config.guesses
     }
-
-
-def _errors(matched: Matched) -> PathErrors:
-    return PathErrors(matched.stamps_ns, position_errors_m(matched), rotation_errors_rad(matched))
-
-
-def _logged(comparison: Comparison, trial: Trial) -> tuple[int, str, dict[str, Value]]:
-    """Return a trial without its times: two logs of the same comparison have the same bytes."""
-    return (
-        trial.target_ns,
-        trial.method,
-        {
-            "source_ns": trial.source_ns,
-            "frames_apart": trial.frames_apart,
-            "guess_off_by": guess_text(comparison, trial.guess),
-            "outcome": trial.outcome,
-            "translation_m": trial.translation_m,
-            "rotation_rad": trial.rotation_rad,
-            "reason": trial.reason,
-        },
-    )
-
-
-def _json(tree: object) -> str:
-    return json.dumps(tree, indent=2, ensure_ascii=False) + "\n"

@@ -1,4 +1,4 @@
-"""A log's frames, read and prepared once in the same way for every method."""
+"""A log's frames, prepared in the same way for every method."""
 
 import time
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ _T_OPTICAL_UPRIGHT = np.array(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Moment:
+class PreparedFrame:
     """One frame as the methods get it.
 
     Attributes:
@@ -36,26 +36,24 @@ class Moment:
         return motion
 
 
-class Reader:
-    """Reads frames, and counts what that takes.
+class FrameReader:
+    """Reads frames, and counts the CPU time of reading.
 
     Attributes:
-        frames: How many were read.
         read_s: Seconds of the CPU for reading and decoding.
         scan_s: The same for making scans of depth images.
     """
 
     def __init__(self, config: RgbdCompareConfig) -> None:
-        """Start.
+        """Begin at zero.
 
         Args:
             config: How depth images become scans.
         """
         self._config = config
-        self.frames = 0
         self.read_s = self.scan_s = 0.0
 
-    def read(self, entry: FrameRef) -> Moment:
+    def read(self, entry: FrameRef) -> PreparedFrame:
         """Return a frame of the log.
 
         Raises:
@@ -64,17 +62,18 @@ class Reader:
         began = time.process_time()
         frame = entry.load(colour=False)
         loaded = time.process_time()
-        moment = self._prepared(frame)
-        self.frames += 1
+        prepared = self._prepared(frame)
         self.read_s += loaded - began
         self.scan_s += time.process_time() - loaded
-        return moment
+        return prepared
 
-    def _prepared(self, frame: Frame) -> Moment:
+    def _prepared(self, frame: Frame) -> PreparedFrame:
         if not isinstance(frame, RgbdFrame):
             # Without times no method deskews: registrations of pairs could not, for they know no motion.
-            return Moment(frame, replace(frame, times_s=None), np.eye(4))
+            return PreparedFrame(frame, replace(frame, times_s=None), np.eye(4))
         scan = frame.scan(stride_px=self._config.stride_px, max_depth_m=self._config.max_depth_m)
         R_body_scan = _T_OPTICAL_UPRIGHT[:3, :3]
         points = np.ascontiguousarray(scan.points_body @ R_body_scan.astype(np.float32))
-        return Moment(frame, Scan(scan.stamp_ns, points, scan.origin_body @ R_body_scan), _T_OPTICAL_UPRIGHT)
+        return PreparedFrame(
+            frame, Scan(scan.stamp_ns, points, scan.origin_body @ R_body_scan), _T_OPTICAL_UPRIGHT
+        )

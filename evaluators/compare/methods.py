@@ -1,4 +1,4 @@
-"""What `mapper compare` sets side by side: odometries, and registrations that serve as odometries."""
+"""Methods of `mapper compare`: odometries and registrations, each of which serves as the other."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from evaluators.compare.frames import Moment
+from evaluators.compare.frames import PreparedFrame
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, RgbdFrame, Scan
 from mapper.core.geometry import Transform, apply, interpolate, inverse, nearest_rotation, transform
@@ -65,9 +65,9 @@ class Method:
     tracker: Callable[[], Tracker]
     registration: Callable[[], AnyRegistration]
 
-    def view(self, moment: Moment) -> Frame:
+    def view(self, frame: PreparedFrame) -> Frame:
         """Return what the method gets of a frame."""
-        return moment.frame if self.sees_images else moment.scan
+        return frame.frame if self.sees_images else frame.scan
 
 
 def odometry_method(name: str, build: Callable[[], FrameOdometry[Any]], *, sees_images: bool) -> Method:

@@ -1,24 +1,23 @@
-"""Registration of pairs of frames from guesses that are wrong by known amounts."""
+"""Trials: pairs of frames registered from guesses that are wrong by known amounts."""
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from evaluators.compare.config import GuessConfig, TrialsConfig
-from evaluators.compare.frames import Moment
+from evaluators.compare.frames import PreparedFrame
 from evaluators.compare.methods import Method, reason_of
+from evaluators.tables.table import Record, Value, column
 from mapper.core.geometry import Transform, angle_between, inverse, rotation_exp, transform
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, Stamps, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.registration.base import Alignment, failed
 
-Outcome = Literal["right", "wrong", "none"]
-"""What became of a registration: right, wrong but trusted, or no answer."""
-NO_GUESS = -1
-"""Stands for the guess of a method that has no use for one."""
+NO_GUESS = "not used"
+"""The guess of a method that does not use one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,66 +35,6 @@ class Pair:
     target: int
     source: int
     T_target_source: Transform
-
-
-@dataclass(frozen=True, slots=True)
-class Trial:
-    """One registration of one pair.
-
-    Attributes:
-        method: Its name.
-        target_ns: Stamp of the target.
-        source_ns: Stamp of the source.
-        frames_apart: Between the two.
-        guess: Which of the configured guesses; ``NO_GUESS`` if the method uses none.
-        outcome: What became of it.
-        translation_m: Distance from the true position; infinite without an answer.
-        rotation_rad: Angle from the true rotation; infinite without an answer.
-        prepare_ms: Of the CPU, for the target alone.
-        align_ms: The same, for the source.
-        reason: Why there is no answer.
-    """
-
-    method: str
-    target_ns: int
-    source_ns: int
-    frames_apart: int
-    guess: int
-    outcome: Outcome
-    translation_m: float
-    rotation_rad: float
-    prepare_ms: float
-    align_ms: float
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class RegistrationScore:
-    """What a method's trials from one kind of guess come to.
-
-    Attributes:
-        method: Its name.
-        guess: As in :class:`Trial`.
-        trials: How many there were.
-        right: How many were right.
-        wrong: How many were wrong but trusted.
-        none: How many gave no answer.
-        translation_m: Median and 95th percentile of the right ones' errors; None without any.
-        rotation_rad: The same of the angles.
-        prepare_ms: Median over all trials.
-        align_ms: Median over all trials.
-    """
-
-    method: str
-    guess: int
-    trials: int
-    right: int
-    wrong: int
-    none: int
-    translation_m: tuple[float, float] | None
-    rotation_rad: tuple[float, float] | None
-    prepare_ms: float
-    align_ms: float
 
 
 def pairs_of(stamps_ns: Stamps, truth: Trajectory, *, count: int, frames_apart: Sequence[int]) -> list[Pair]:
@@ -145,35 +84,37 @@ def guesses_for(pair: Pair, guesses: Sequence[GuessConfig], *, level: bool, seed
 def trials_of(
     method: Method,
     pair: Pair,
-    moments: tuple[Moment, Moment],
+    frames: tuple[PreparedFrame, PreparedFrame],
     guesses: Sequence[Transform],
     config: TrialsConfig,
-) -> list[Trial]:
-    """Register a pair by one method: from every guess, or once if it has no use for them.
+) -> list[Record]:
+    """Register a pair by one method: from every guess, or once if it does not use them.
 
     Args:
-        method: Which.
+        method: The method.
         pair: With the truth.
-        moments: Target and source.
-        guesses: (4, 4) T_target_source of the body.
-        config: What counts as right.
+        frames: Target and source.
+        guesses: (4, 4) T_target_source of the body, one of each configured kind.
+        config: The kinds of guesses, and what counts as right.
+
+    Returns:
+        A record for each registration: its errors are None without an answer, its times of the CPU.
     """
-    kinds = range(len(guesses)) if method.uses_guess else (NO_GUESS,)
-    return [
-        _trial(method, pair, moments, kind, np.eye(4) if kind == NO_GUESS else guesses[kind], config)
-        for kind in kinds
-    ]
+    if not method.uses_guess:
+        return [_trial(method, pair, frames, NO_GUESS, np.eye(4), config)]
+    kinds = zip(config.guesses, guesses, strict=True)
+    return [_trial(method, pair, frames, kind.text, T_guess, config) for kind, T_guess in kinds]
 
 
 def _trial(
     method: Method,
     pair: Pair,
-    moments: tuple[Moment, Moment],
-    kind: int,
+    frames: tuple[PreparedFrame, PreparedFrame],
+    guess: str,
     T_guess: Transform,
     config: TrialsConfig,
-) -> Trial:
-    target, source = moments
+) -> Record:
+    target, source = frames
     T_true = pair.T_target_source
     if not method.sees_images:
         T_guess, T_true = target.upright(T_guess), target.upright(T_true)
@@ -185,66 +126,71 @@ def _trial(
     except Exception as error:  # a library's breakdown is a result, and the other methods go on
         alignment = failed(f"broke down: {reason_of(error)}")
     aligned = time.process_time()
-    outcome, translation_m, rotation_rad = judged(alignment, T_true, config)
-    return Trial(
-        method=method.name,
-        target_ns=target.frame.stamp_ns,
-        source_ns=source.frame.stamp_ns,
-        frames_apart=pair.source - pair.target,
-        guess=kind,
-        outcome=outcome,
-        translation_m=translation_m,
-        rotation_rad=rotation_rad,
-        prepare_ms=1e3 * (prepared - began),
-        align_ms=1e3 * (aligned - prepared),
-        reason=alignment.reason,
-    )
+    return {
+        "method": method.name,
+        "target_ns": target.frame.stamp_ns,
+        "source_ns": source.frame.stamp_ns,
+        "frames_apart": pair.source - pair.target,
+        "guess": guess,
+        **outcome_of(alignment, T_true, config),
+        "prepare_ms": 1e3 * (prepared - began),
+        "align_ms": 1e3 * (aligned - prepared),
+        "reason": alignment.reason,
+    }
 
 
-def judged(
-    alignment: Alignment, T_target_source: Transform, config: TrialsConfig
-) -> tuple[Outcome, float, float]:
-    """Return what an alignment is worth, and how far it is off in metres and radians."""
+def outcome_of(alignment: Alignment, T_target_source: Transform, config: TrialsConfig) -> dict[str, Value]:
+    """Return the outcome of an alignment, right, wrong or none, and its errors in metres and radians."""
     if not alignment.converged:
-        return "none", np.inf, np.inf
+        return {"outcome": "none", "translation_m": None, "rotation_rad": None}
     T_found = alignment.T_target_source
     translation_m = float(np.linalg.norm(T_found[:3, 3] - T_target_source[:3, 3]))
     rotation_rad = angle_between(T_found[:3, :3], T_target_source[:3, :3])
     right = translation_m <= config.max_error_m and rotation_rad <= config.max_error_rad
-    return "right" if right else "wrong", translation_m, rotation_rad
+    errors = {"translation_m": translation_m, "rotation_rad": rotation_rad}
+    known = {key: error if math.isfinite(error) else None for key, error in errors.items()}
+    return {"outcome": "right" if right else "wrong", **known}
 
 
-def registration_scores(trials: Sequence[Trial]) -> list[RegistrationScore]:
-    """Return one score for each method and guess, in the order of their first trials by method."""
-    methods = list(dict.fromkeys(trial.method for trial in trials))
-    kinds = sorted({(methods.index(trial.method), trial.guess) for trial in trials})
-    return [
-        _score([trial for trial in trials if (trial.method, trial.guess) == (methods[m], guess)])
-        for m, guess in kinds
-    ]
+def registration_records(trials: Sequence[Record]) -> list[Record]:
+    """Return one record for each method and kind of guess, in the order of the methods' first trials."""
+    methods = dict.fromkeys(trial["method"] for trial in trials)
+    guesses = dict.fromkeys(trial["guess"] for trial in trials)
+    groups = {
+        (method, guess): [trial for trial in trials if (trial["method"], trial["guess"]) == (method, guess)]
+        for method in methods
+        for guess in guesses
+    }
+    return [_summary(group) for group in groups.values() if group]
 
 
-def _score(trials: Sequence[Trial]) -> RegistrationScore:
-    right = [trial for trial in trials if trial.outcome == "right"]
-    outcomes = [trial.outcome for trial in trials]
-    return RegistrationScore(
-        method=trials[0].method,
-        guess=trials[0].guess,
-        trials=len(trials),
-        right=len(right),
-        wrong=outcomes.count("wrong"),
-        none=outcomes.count("none"),
-        translation_m=_middle_and_tail([trial.translation_m for trial in right]),
-        rotation_rad=_middle_and_tail([trial.rotation_rad for trial in right]),
-        prepare_ms=float(np.median([trial.prepare_ms for trial in trials])),
-        align_ms=float(np.median([trial.align_ms for trial in trials])),
-    )
+def _summary(trials: Sequence[Record]) -> Record:
+    """Return how often a method was right from one kind of guess, and the errors of its right answers."""
+    outcomes = [trial["outcome"] for trial in trials]
+    right = [trial for trial in trials if trial["outcome"] == "right"]
+    median_m, tail_m = _middle_and_tail(right, "translation_m")
+    median_rad, tail_rad = _middle_and_tail(right, "rotation_rad")
+    return {
+        "method": trials[0]["method"],
+        "guess_off_by": trials[0]["guess"],
+        "trials": len(trials),
+        "right": len(right),
+        "wrong": outcomes.count("wrong"),
+        "no_answer": outcomes.count("none"),
+        "right_ratio": len(right) / len(trials),
+        "median_m": median_m,
+        "p95_m": tail_m,
+        "median_rad": median_rad,
+        "p95_rad": tail_rad,
+        "prepare_ms": float(np.median(column(trials, "prepare_ms"))),
+        "align_ms": float(np.median(column(trials, "align_ms"))),
+    }
 
 
-def _middle_and_tail(errors: Sequence[float]) -> tuple[float, float] | None:
-    if not errors:
-        return None
-    median, tail = np.percentile(errors, [50.0, 95.0])
+def _middle_and_tail(trials: Sequence[Record], key: str) -> tuple[float, float] | tuple[None, None]:
+    if not trials:
+        return None, None
+    median, tail = np.percentile(column(trials, key), [50.0, 95.0])
     return float(median), float(tail)
 
 

@@ -1,12 +1,11 @@
-"""A comparison as records and as the two tables that are shown of it."""
+"""The two tables of a comparison: odometry over the whole log, and registration of pairs."""
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from textwrap import fill
 
 from evaluators.compare.comparison import Comparison
-from evaluators.compare.pairwise import NO_GUESS, registration_scores
+from evaluators.compare.pairwise import registration_records
 from evaluators.tables.table import Column, Record, text_table
 
 _LINE_WIDTH = 110
@@ -25,7 +24,7 @@ _ONE_DECIMAL = _decimals(1)
 
 
 def odometry_records(comparison: Comparison) -> list[Record]:
-    """Return one record for each method's way over the whole log."""
+    """Return one record for each method's run over the whole log."""
     records: list[Record] = []
     for run in comparison.runs:
         errors = run.errors
@@ -46,51 +45,8 @@ def odometry_records(comparison: Comparison) -> list[Record]:
     return records
 
 
-def registration_records(comparison: Comparison) -> list[Record]:
-    """Return one record for each method and kind of guess."""
-    records: list[Record] = []
-    for score in registration_scores(comparison.trials):
-        median_m, tail_m = score.translation_m or (None, None)
-        median_rad, tail_rad = score.rotation_rad or (None, None)
-        records.append(
-            {
-                "method": score.method,
-                "guess_off_by": guess_text(comparison, score.guess),
-                "trials": score.trials,
-                "right": score.right,
-                "wrong": score.wrong,
-                "no_answer": score.none,
-                "right_ratio": score.right / score.trials,
-                "median_m": median_m,
-                "p95_m": tail_m,
-                "median_rad": median_rad,
-                "p95_rad": tail_rad,
-                "prepare_ms": score.prepare_ms,
-                "align_ms": score.align_ms,
-            }
-        )
-    return records
-
-
-def trial_records(comparison: Comparison) -> list[Record]:
-    """Return one record for each registration; errors without an answer are None."""
-    return [
-        {
-            key: None if isinstance(value, float) and not math.isfinite(value) else value
-            for key, value in asdict(trial).items()
-        }
-        | {"guess": guess_text(comparison, trial.guess)}
-        for trial in comparison.trials
-    ]
-
-
-def guess_text(comparison: Comparison, kind: int) -> str:
-    """Return how far off a guess may be, as in "0.2 m, 10°"."""
-    return "not used" if kind == NO_GUESS else comparison.trials_config.guesses[kind].text
-
-
 def odometry_columns(comparison: Comparison) -> list[Column]:
-    """Return what is shown of each method's way over the whole log."""
+    """Return what is shown of each method's run over the whole log."""
     step = comparison.step.text
     return [
         Column("method", "method"),
@@ -140,7 +96,7 @@ def registration_notes(comparison: Comparison) -> list[str]:
     """Return what must be known to read the second table, a sentence each."""
     config = comparison.trials_config
     apart = ", ".join(map(str, config.frames_apart))
-    pairs = {(trial.target_ns, trial.source_ns) for trial in comparison.trials}
+    pairs = {(trial["target_ns"], trial["source_ns"]) for trial in comparison.trials}
     return [
         f"{len(pairs)} pairs, {apart} frames apart; guesses are off by up to as much, "
         f"seed {comparison.config.seed}",
@@ -155,7 +111,7 @@ def tables_text(comparison: Comparison) -> str:
     parts = [text_table(odometry_columns(comparison), odometry_records(comparison))]
     parts += _indented(odometry_notes(comparison))
     if comparison.trials:
-        parts.append(text_table(REGISTRATION_COLUMNS, registration_records(comparison)))
+        parts.append(text_table(REGISTRATION_COLUMNS, registration_records(comparison.trials)))
         parts += _indented(registration_notes(comparison))
     return "\n".join(parts)
 

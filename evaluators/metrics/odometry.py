@@ -1,4 +1,4 @@
-"""What a method's path over a whole log is worth."""
+"""Errors of a method's path over a whole log."""
 
 from dataclasses import dataclass, field, replace
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from evaluators.metrics.trajectory import DeltaUnit, Matched, align, associate, ate, step_errors
 from mapper.core.errors import DataError
-from mapper.core.geometry import Array, angle_between
+from mapper.core.geometry import Array
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
 from mapper.core.trajectory import Trajectory
 
@@ -56,7 +56,7 @@ class PathErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OdometryRun:
-    """What became of one method on a whole log.
+    """One method on a whole log.
 
     Attributes:
         method: Its name.
@@ -100,7 +100,7 @@ def step_for(stamps_ns: Stamps) -> Step:
     return ONE_SECOND if has_pair else ONE_FRAME
 
 
-def judged_run(run: OdometryRun, truth: Trajectory | None, step: Step) -> OdometryRun:
+def assess_run(run: OdometryRun, truth: Trajectory | None, step: Step) -> OdometryRun:
     """Return a run with its path laid over the truth, and its errors; as it is where too few poses have one.
 
     Args:
@@ -125,18 +125,6 @@ def judged_run(run: OdometryRun, truth: Trajectory | None, step: Step) -> Odomet
     )
     trajectory = run.trajectory.moved(similarity.T_truth_map)
     return replace(run, trajectory=trajectory, matched=matched, errors=errors, steps_m=steps_m)
-
-
-def position_errors_m(matched: Matched) -> Array:
-    """Return (N,) distances from the true positions."""
-    errors: Array = np.linalg.norm(matched.T_map_body[:, :3, 3] - matched.T_truth_body[:, :3, 3], axis=1)
-    return errors
-
-
-def rotation_errors_rad(matched: Matched) -> Array:
-    """Return (N,) angles to the true rotations."""
-    pairs = zip(matched.T_map_body, matched.T_truth_body, strict=True)
-    return np.array([angle_between(estimated[:3, :3], true[:3, :3]) for estimated, true in pairs])
 
 
 def _drift_ratio(matched: Matched) -> float | None:

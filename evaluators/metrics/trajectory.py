@@ -34,6 +34,17 @@ class Matched:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
+    @property
+    def position_errors_m(self) -> Array:
+        """(N,) distances from the true positions."""
+        return _lengths(self.T_map_body[:, :3, 3] - self.T_truth_body[:, :3, 3])
+
+    @property
+    def rotation_errors_rad(self) -> Array:
+        """(N,) angles to the true rotations."""
+        pairs = zip(self.T_map_body, self.T_truth_body, strict=True)
+        return np.array([angle_between(estimated[:3, :3], true[:3, :3]) for estimated, true in pairs])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity:
@@ -153,7 +164,7 @@ def ate(matched: Matched) -> Statistics:
 
     The pairs are compared as they are; lay the estimate over the truth first.
     """
-    return statistics(_lengths(matched.T_map_body[:, :3, 3] - matched.T_truth_body[:, :3, 3]))
+    return statistics(matched.position_errors_m)
 
 
 def rpe(matched: Matched, *, delta: float = 1.0, unit: DeltaUnit = "frames") -> RelativeErrors:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evaluators.metrics.odometry import position_errors_m
 from evaluators.metrics.trajectory import associate
 from evaluators.papers.layout import compares, file_name
 from evaluators.papers.model import PaperCell, PaperPath, PaperTable, Reproduction
@@ -145,7 +144,7 @@ def _short(table: PaperTable) -> str:
 def _write_paths(path: Path, paths: Sequence[PaperPath]) -> None:
     """Draw every path over its truth, coloured by its error; those of one sequence by one scale."""
     matched = [associate(read_tum(each.estimate), read_tum(each.truth)) for each in paths]
-    errors_m = [position_errors_m(pairs) for pairs in matched]
+    errors_m = [pairs.position_errors_m for pairs in matched]
     most_m: dict[str, float] = {}
     for each, errors in zip(paths, errors_m, strict=True):
         most_m[each.row] = max(most_m.get(each.row, 0.0), float(errors.max()))

@@ -6,7 +6,6 @@ import numpy as np
 
 from evaluators.metrics.evaluate import Judged, have_clock
 from evaluators.metrics.occupancy import Verdict
-from evaluators.metrics.odometry import position_errors_m, rotation_errors_rad
 from evaluators.pictures.map_agreement import write_agreement
 from evaluators.pictures.path_errors import write_errors
 from mapper.core.errors import DataError
@@ -38,8 +37,8 @@ def write_trajectory_errors(folder: Path, found: Judged, *, title: str) -> Path:
         truth=matched.T_truth_body[:, :3, 3],
         elapsed=elapsed / NS_PER_S if timed else elapsed,
         elapsed_name="s" if timed else "poses",
-        errors_m=position_errors_m(matched),
-        errors_rad=rotation_errors_rad(matched),
+        errors_m=matched.position_errors_m,
+        errors_rad=matched.rotation_errors_rad,
         relative_percent={
             f"{length.length_m:g} m": 100.0 * length.translation_ratio
             for length in found.lengths

@@ -5,6 +5,10 @@ import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from mapper.core.geometry import Array
+
 Value = str | int | float | None
 Record = Mapping[str, Value]
 """One row: name to value, with its unit in the name and every digit in the value; None is not known."""
@@ -48,6 +52,11 @@ class Column:
     key: str
     title: str
     shown: Callable[..., str] = str
+
+
+def column(records: Sequence[Record], key: str) -> Array:
+    """Return (N,) the numbers of one name in all records, NaN where they are not known."""
+    return np.array([record[key] for record in records], dtype=np.float64)
 
 
 def text_table(columns: Sequence[Column], records: Sequence[Record]) -> str:
