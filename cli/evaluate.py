@@ -10,7 +10,7 @@ from cli.console import progress_for
 from cli.environment import prepare_libraries
 
 if TYPE_CHECKING:
-    from evaluators.metrics.evaluate import Judged
+    from evaluators.metrics.evaluate import Assessment
     from evaluators.metrics.map_quality import MapQuality
     from evaluators.metrics.metric import Metric
     from mapper.core.timebase import Stamps
@@ -105,14 +105,14 @@ def evaluate(
     Example: mapper eval runs/xyz --align yaw --plot plots, or: mapper eval 00.txt --truth poses/00.txt, or:
     mapper eval runs/flat --map logs/flat --sharpness
     """
-    from evaluators.metrics.evaluate import ALIGNED, judged
+    from evaluators.metrics.evaluate import ALIGNED, assess
     from mapper.core.errors import DataError
 
     prepare_libraries()
     run, trajectory, known = _loaded(estimate, truth, times)
     if lengths is not None and known is None:
         raise DataError(f"--lengths {lengths}: relative errors need a truth; tell one with --truth")
-    found = judged(
+    found = assess(
         trajectory,
         known,
         alignment=align.value,
@@ -146,7 +146,7 @@ def evaluate(
         if held is None or found.matched is not None:
             write_trajectory_errors(plot, found, title=f"{name}, {ALIGNED[align.value]}")
         if held is not None and map_ is not None:
-            write_map_errors(plot, held.verdict, title=f"{name} against {map_.resolve().name}")
+            write_map_errors(plot, held.check, title=f"{name} against {map_.resolve().name}")
 
 
 def _loaded(
@@ -237,7 +237,7 @@ def _loops_of(run: "Run", truth: "Trajectory") -> "list[Metric]":
     return loop_metrics(run.loops(), keyframes_ns, truth, looked_every_m=looked_every_m)
 
 
-def _text(metrics: "list[Metric]", found: "Judged", format_: Format) -> str:
+def _text(metrics: "list[Metric]", found: "Assessment", format_: Format) -> str:
     from dataclasses import asdict
 
     from evaluators.metrics import metric

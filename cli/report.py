@@ -48,7 +48,7 @@ def _names(runs: Sequence[Path]) -> list[str]:
 def _figures(run: "Run") -> "list[Figure]":
     import numpy as np
 
-    from evaluators.metrics.evaluate import judged
+    from evaluators.metrics.evaluate import assess
     from evaluators.metrics.loops import loop_metrics
     from evaluators.metrics.metric import shown
     from mapper.export.report.data import Figure
@@ -57,7 +57,7 @@ def _figures(run: "Run") -> "list[Figure]":
 
     counts, truth = run.manifest.counts, run.truth()
     frames_ns = np.array([record.stamp_ns for record in run.records()], dtype=np.int64)
-    metrics = list(judged(run.trajectory(), truth, frames_ns=frames_ns).metrics)
+    metrics = list(assess(run.trajectory(), truth, frames_ns=frames_ns).metrics)
     if truth is not None:
         metrics += loop_metrics(run.loops(), read_tum(run.path / KEYFRAMES).stamps_ns, truth)
     return [

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from cli.console import Bars, Lines
 from cli.evaluate import evaluate as evaluate_verb
 from cli.main import app
-from evaluators.metrics.evaluate import judged
+from evaluators.metrics.evaluate import assess
 from mapper.run.folder import load_run
 from mapper.sources.trajectory_files import read_tum
 
@@ -212,7 +212,7 @@ def test_eval_states_the_alignment_and_agrees_with_the_library(run_folder, desk_
 
     values = {metric["name"]: metric["value"] for metric in of_files}
     frames_ns = np.array([record.stamp_ns for record in load_run(run_folder).records()])
-    found = judged(read_tum(estimate), read_tum(truth), frames_ns=frames_ns)
+    found = assess(read_tum(estimate), read_tum(truth), frames_ns=frames_ns)
     assert {m.name: m.value for m in found.metrics}.items() <= values.items()
     told = {metric["name"]: metric["value"] for metric in of_run}
     assert {name: told[name] for name in values} == pytest.approx(values)
@@ -261,7 +261,7 @@ def test_eval_reads_kitti_text_with_and_without_times(run_folder, tmp_path):
 
 def test_eval_has_the_library_s_default():
     on_the_line = inspect.signature(evaluate_verb).parameters["align"].default
-    assert on_the_line == inspect.signature(judged).parameters["alignment"].default
+    assert on_the_line == inspect.signature(assess).parameters["alignment"].default
 
 
 def test_a_converted_log_gives_the_same_trajectory(run_folder, desk_log, tmp_path):

@@ -20,7 +20,8 @@ from evaluators.compare.config import CompareConfig, LidarCompareConfig
 from evaluators.compare.files import compare_into, write_comparison
 from evaluators.compare.methods import registration_method
 from evaluators.compare.pairwise import registration_records
-from evaluators.compare.tables import odometry_records, tables_text
+from evaluators.compare.tables import tables_of, tables_text
+from evaluators.metrics.odometry import PathErrors
 from mapper.core.errors import ConfigError, DataError, FrameError
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import LidarSimulator
@@ -94,6 +95,10 @@ def test_registration_is_right_from_good_guesses(on_desk, on_street):
     assert {name: row["right"] for name, row in blind.items()} == dict.fromkeys(blind, 3)
 
 
+def odometry_records(comparison):
+    return tables_of(comparison)[0].records
+
+
 def trials_of(comparison):
     return comparison.trials
 
@@ -151,7 +156,7 @@ def test_a_method_that_breaks_down_does_not_take_the_others_along(desk, on_desk,
 
     bad, good = comparison.runs
     assert bad.broke == "broke down at frame 1: ZeroDivisionError: over a stone"
-    assert (bad.errors, len(bad.trajectory)) == (None, 0)
+    assert (bad.errors, len(bad.trajectory)) == (PathErrors(), 0)
     assert good.errors == on_desk.runs[2].errors
     rows = [row for row in registration_records(comparison.trials) if row["method"] == "bad"]
     assert [(row["right"], row["wrong"], row["no_answer"], row["median_m"]) for row in rows] == 3 * [

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from evaluators.metrics.coverage import frame_coverage, time_coverage
-from evaluators.metrics.evaluate import judged
+from evaluators.metrics.evaluate import assess
 from mapper.core.geometry import transform
 from mapper.core.trajectory import Trajectory
 
@@ -53,5 +53,5 @@ def test_a_late_truth_and_a_missing_pose_are_no_gaps():
 def test_poses_without_times_have_no_coverage():
     poses = np.array([transform(np.eye(3), [0.1 * k, 0.0, 0.0]) for k in range(100)])
     numbered, timed = Trajectory(np.arange(100), poses), Trajectory(FRAMES_NS, poses)
-    assert "longest gap" not in values_of(judged(numbered, numbered).metrics)
-    assert values_of(judged(timed, timed).metrics)["coverage, share of the truth's time"] == 100.0
+    assert "longest gap" not in values_of(assess(numbered, numbered).metrics)
+    assert values_of(assess(timed, timed).metrics)["coverage, share of the truth's time"] == 100.0

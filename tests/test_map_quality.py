@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from evaluators.metrics.map_reference import held_against, read_reference
-from evaluators.metrics.occupancy import judged_by_points, verdict_metrics
+from evaluators.metrics.map_reference import check_occupancy, read_reference
+from evaluators.metrics.occupancy import assess_by_points, check_metrics
 from evaluators.metrics.scenes import outdoor_distance_m, scene_distance
 from evaluators.metrics.sharpness import Views, sharpness_metrics
 from evaluators.pictures.evaluation import write_map_errors
@@ -38,7 +38,7 @@ def mapped(*faces, resolution_m=EDGE_M):
 
 
 def scores(octree, points, **options):
-    metrics = verdict_metrics(judged_by_points(octree, points, **options))
+    metrics = check_metrics(assess_by_points(octree, points, **options))
     return {metric.name.split(",")[0]: metric.value for metric in metrics}
 
 
@@ -70,9 +70,9 @@ def test_a_map_meets_itself_at_any_resolution(resolution_m, tmp_path):
     reference = read_reference(tmp_path / "other.bt", voxel_m=EDGE_M)
     octree = mapped(wall(2.02))
 
-    verdict = held_against(octree, reference, np.eye(4), voxels=1)
+    verdict = check_occupancy(octree, reference, np.eye(4), voxels=1)
 
-    values = {metric.name.split(",")[0]: metric.value for metric in verdict_metrics(verdict)}
+    values = {metric.name.split(",")[0]: metric.value for metric in check_metrics(verdict)}
     assert values[PRECISION] == values["free precision"] == 1.0
     assert min(values[RECALL], values["free recall"]) > 0.99
 
@@ -99,8 +99,8 @@ def test_a_reference_is_laid_where_it_is_said_to_lie(tmp_path):
     reference = read_reference(tmp_path / "wall.ply", voxel_m=EDGE_M)
     octree = mapped(wall(2.02))
 
-    laid = verdict_metrics(held_against(octree, reference, T_map_reference, voxels=1))
-    lost = verdict_metrics(held_against(octree, reference, transform(np.eye(3), [0.3, 0.0, 0.0]), voxels=1))
+    laid = check_metrics(check_occupancy(octree, reference, T_map_reference, voxels=1))
+    lost = check_metrics(check_occupancy(octree, reference, transform(np.eye(3), [0.3, 0.0, 0.0]), voxels=1))
 
     assert min(metric.value for metric in laid) > 0.97
     assert lost[0].value < 0.6
@@ -110,7 +110,7 @@ def test_a_doubled_map_scores_lower_and_its_picture_shows_the_copy(tmp_path):
     once, twice = mapped(wall(2.02)), mapped(wall(1.82), wall(2.02))
     assert scores(once, wall(2.02))[F_SCORE] == 1.0
     assert scores(twice, wall(2.02))[F_SCORE] < 0.8
-    verdict = judged_by_points(twice, wall(2.02))
+    verdict = assess_by_points(twice, wall(2.02))
     agreed, extra, missing = verdict.centres_world
     assert np.unique(extra[:, 0].round(3)).tolist() == [1.825]
     assert len(agreed) + len(extra) == len(verdict.occupied)

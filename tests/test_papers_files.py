@@ -79,7 +79,8 @@ def shifted(x_m, y_m=0.0):
 
 
 def test_a_line_tells_printed_ours_spread_ratio_verdict_and_failures():
-    columns, records = compared(ITERATIONS)
+    shown = compared(ITERATIONS)
+    columns, records = shown.columns, shown.records
 
     rows = shown_cells(columns, records)
     assert [column.title for column in columns][1:] == (
@@ -92,7 +93,8 @@ def test_a_line_tells_printed_ours_spread_ratio_verdict_and_failures():
 
 
 def test_the_printed_layout_has_a_line_for_each_kind_of_figure():
-    columns, records = as_printed(ITERATIONS, with_spread=True)
+    shown = as_printed(ITERATIONS, with_spread=True)
+    columns, records = shown.columns, shown.records
 
     assert shown_cells(columns, records) == [
         ["fr1/xyz", "printed", "0.0659", "0.0420", "0.0204"],
@@ -102,12 +104,13 @@ def test_the_printed_layout_has_a_line_for_each_kind_of_figure():
         ["", "ratio", "0.91", "1.20", "–"],
         ["fr1/desk", "printed", "0.17551", "–", "–"],
     ]
-    _, without = as_printed(ITERATIONS, with_spread=False)
+    without = as_printed(ITERATIONS, with_spread=False).records
     assert [record["line"] for record in without] == ["printed", "ours", "ratio", "printed"]
 
 
 def test_columns_of_their_own_units_have_digits_of_their_own():
-    columns, records = as_printed(OURS, with_spread=False)
+    shown = as_printed(OURS, with_spread=False)
+    columns, records = shown.columns, shown.records
 
     assert shown_cells(columns, records) == [["street", "0.0289", "136"]]
 
@@ -190,6 +193,7 @@ def test_small_figures_beside_large_ones_keep_their_digits():
         (PaperCell("fr1/xyz", "cloud", 7.7, (0.4,)), PaperCell("fr1/xyz", "octree", 0.216, (0.0213,))),
     )  # fmt: skip
 
-    columns, records = compared(sizes)
+    shown = compared(sizes)
+    columns, records = shown.columns, shown.records
 
     assert [row[3] for row in shown_cells(columns, records)] == ["0.4", "0.021"]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from evaluators.metrics.evaluate import judged
+from evaluators.metrics.evaluate import assess
 from evaluators.metrics.run_summary import summary
 from evaluators.pictures.evaluation import write_trajectory_errors
 from mapper.config.build import BuildConfig
@@ -44,7 +44,7 @@ def run_in(folder, estimate, truth):
 
 def test_a_row_says_how_wrong_a_path_is_and_of_how_much_of_the_log(tmp_path):
     row = summary(run_in(tmp_path, path_of(scale=1.1), path_of()))
-    found = judged(path_of(scale=1.1), path_of())
+    found = assess(path_of(scale=1.1), path_of())
     values = {metric.name: metric.value for metric in found.metrics}
 
     assert (row["listed_frames"], row["tracked_frames"], row["coverage_ratio"]) == (150, 120, 0.8)
@@ -73,13 +73,13 @@ def test_what_is_not_known_is_none(tmp_path):
 @pytest.mark.parametrize("stamps_ns", [STAMPS_NS, np.arange(120)], ids=["timed", "numbered"])
 def test_the_picture_of_a_path_is_drawn_with_times_or_without(stamps_ns, tmp_path):
     estimate, truth = (Trajectory(stamps_ns, path_of(scale=scale).T_world_body) for scale in (1.1, 1.0))
-    picture = write_trajectory_errors(tmp_path / "plots", judged(estimate, truth), title="1.1 times")
+    picture = write_trajectory_errors(tmp_path / "plots", assess(estimate, truth), title="1.1 times")
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 def test_there_is_nothing_to_draw_without_a_truth_or_into_a_file(tmp_path):
     with pytest.raises(DataError, match="nothing to draw without a truth"):
-        write_trajectory_errors(tmp_path / "plots", judged(path_of(), None), title="")
+        write_trajectory_errors(tmp_path / "plots", assess(path_of(), None), title="")
     (tmp_path / "taken").write_text("")
     with pytest.raises(DataError, match="want a folder for pictures"):
-        write_trajectory_errors(tmp_path / "taken", judged(path_of(), path_of()), title="")
+        write_trajectory_errors(tmp_path / "taken", assess(path_of(), path_of()), title="")

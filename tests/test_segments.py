@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evaluators.metrics.evaluate import judged
+from evaluators.metrics.evaluate import assess
 from evaluators.metrics.segments import (
     KITTI_LENGTHS_M,
     length_records,
@@ -128,7 +128,7 @@ def test_no_alignment_but_scale_changes_relative_errors():
     truth = Trajectory(np.arange(300) * 100_000_000, poses)
     estimate = Trajectory(truth.stamps_ns, drifted(poses, seed=5)).moved(exp(np.ones(3), np.ones(3)))
     means = {
-        kind: judged(estimate, truth, alignment=kind).lengths[0].translation_ratio.mean()
+        kind: assess(estimate, truth, alignment=kind).lengths[0].translation_ratio.mean()
         for kind in ("none", "yaw", "se3")
     }
     assert means["none"] == pytest.approx(means["se3"]) == pytest.approx(means["yaw"])

@@ -65,7 +65,8 @@ def depth(
     sensor depth rgbd_dataset_freiburg1_xyz --fit-plane --out kinect, then: mapper build LOG --out RUN
     --config kinect/sensor.toml
     """
-    from evaluators.depth_camera.study import SENSOR, depth_text, study_depth, write_depth_study
+    from evaluators.depth_camera.study import depth_text, study_depth
+    from evaluators.pictures.depth_camera import SENSOR, write_depth_study
     from mapper.config.loading import load_config
     from mapper.runtime.atomic import atomic_folder
     from mapper.sources import open_source

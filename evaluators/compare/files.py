@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,19 +12,13 @@ from mapper.runtime.atomic_folder import atomic_folder
 import mapper
 from evaluators.compare.comparison import Comparison, compare
 from evaluators.compare.config import CompareConfig
-from evaluators.compare.pairwise import NO_GUESS, registration_records
-from evaluators.compare.tables import (
-    REGISTRATION_COLUMNS,
-    odometry_columns,
-    odometry_notes,
-    odometry_records,
-    registration_notes,
-)
+from evaluators.compare.pairwise import NO_GUESS
+from evaluators.compare.tables import tables_of
 from evaluators.metrics.odometry import OdometryRun
 from evaluators.pictures.comparison import write_path_errors, write_paths, write_registration_errors
 from evaluators.pictures.comparison_mcap import write_comparison_log
 from evaluators.study.engine import CELLS
-from evaluators.tables.table import Record, column, csv_text, markdown_table
+from evaluators.tables.table import column, csv_text
 from mapper.core.geometry import Array
 from mapper.run.manifest import library_versions
 from mapper.runtime.atomic import MANIFEST_NAME, write_text
@@ -78,23 +72,20 @@ def _begun_with(partial: Path, plan: str) -> bool:
 
 def write_comparison(folder: Path, comparison: Comparison) -> None:
     """Fill a folder. Apart from times, the same comparison gives the same bytes."""
-    odometry, registration = odometry_records(comparison), registration_records(comparison.trials)
-    write_text(folder / ODOMETRY, csv_text(odometry))
-    write_text(folder / TABLES, _markdown(comparison, odometry, registration))
-    if registration:
-        write_text(folder / REGISTRATION, csv_text(registration))
+    tables = tables_of(comparison)
+    records = {"odometry": tables[0].records, "registration": tables[1].records if tables[1:] else []}
+    write_text(folder / ODOMETRY, csv_text(records["odometry"]))
+    if comparison.trials:
+        write_text(folder / REGISTRATION, csv_text(records["registration"]))
         write_text(folder / TRIALS, csv_text(comparison.trials))
-    _write_json(folder / REPORT, {"odometry": odometry, "registration": registration})
+    _write_json(folder / REPORT, records)
+    markdown = "\n\n".join([f"# {comparison.log}", *(table.markdown() for table in tables)])
+    write_text(folder / TABLES, markdown + "\n")
     for run in comparison.runs:
         if len(run.trajectory):
             write_tum(folder / TRAJECTORIES / f"{run.method}.tum", run.trajectory)
     _write_pictures(folder, comparison)
-    write_comparison_log(
-        folder / MCAP,
-        comparison.runs,
-        truth=comparison.truth,
-        trials=comparison.trials,
-    )
+    write_comparison_log(folder / MCAP, comparison.runs, truth=comparison.truth, trials=comparison.trials)
     _write_json(
         folder / MANIFEST_NAME,
         {
@@ -103,15 +94,6 @@ def write_comparison(folder: Path, comparison: Comparison) -> None:
             "notes": comparison.notes,
         },
     )
-
-
-def _markdown(comparison: Comparison, odometry: Sequence[Record], registration: Sequence[Record]) -> str:
-    parts = [f"# {comparison.log}", "## Odometry", markdown_table(odometry_columns(comparison), odometry)]
-    parts.append("\n".join(f"- {note}" for note in odometry_notes(comparison)))
-    if registration:
-        parts += ["## Registration", markdown_table(REGISTRATION_COLUMNS, registration)]
-        parts.append("\n".join(f"- {note}" for note in registration_notes(comparison)))
-    return "\n\n".join(parts) + "\n"
 
 
 def _manifest(log: Path, config: CompareConfig) -> dict[str, Any]:
@@ -157,7 +139,7 @@ def _write_pictures(folder: Path, comparison: Comparison) -> None:
 def _caption(run: OdometryRun) -> str:
     if run.broke:
         return "broke down"
-    return "no truth" if run.errors is None else f"ATE {run.errors.ate_m:.3f} m"
+    return "no truth" if run.errors.ate_m is None else f"ATE {run.errors.ate_m:.3f} m"
 
 
 def _by_guess(comparison: Comparison) -> dict[str, dict[str, Array]]:

@@ -1,4 +1,4 @@
-"""The figures by which a depth camera's accuracy is told (thesis 2.6.1, 2.6.2)."""
+"""Accuracy of a depth camera on a plane: the figures of Somlyai (PhD thesis), §2.6.1 and §2.6.2."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -29,11 +29,11 @@ class Patch:
         """Rows and columns, to index an image by."""
         return slice(self.row, self.row + self.height), slice(self.column, self.column + self.width)
 
-    def refuse_outside(self, camera: PinholeCamera) -> None:
-        """Refuse to reach beyond a camera's image.
+    def check_inside(self, camera: PinholeCamera) -> None:
+        """Check that the patch lies in a camera's image.
 
         Raises:
-            DataError: It does, or is too small to hold a plane.
+            DataError: It reaches beyond the image, or is too small to hold a plane.
         """
         right, bottom = self.column + self.width, self.row + self.height
         if min(self.column, self.row) < 0 or right > camera.width_px or bottom > camera.height_px:
@@ -55,7 +55,7 @@ def central_patch(camera: PinholeCamera) -> Patch:
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """How far the depths of a plane are from it.
+    """Errors of measured depths from a plane.
 
     Attributes:
         max_error_m: Δd, the largest error (eq. 2.46).
@@ -71,7 +71,7 @@ class Accuracy:
 
 
 def accuracy_of(depth_m: Array, reference_m: Array | float) -> Accuracy:
-    """Return how far depths are from where they should be.
+    """Return the errors of depths from where they should be.
 
     Δd = max(|d − min δ|, |d − max δ|) is the largest |δ − d|; of n pixels the worst n // 100 are left out.
 
@@ -103,7 +103,7 @@ def quantisation_step_m(depth_m: Array) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class SeenPlane:
-    """What a plane in one frame showed.
+    """One plane in one frame.
 
     Attributes:
         distance_m: How far away it was measured.
@@ -111,7 +111,7 @@ class SeenPlane:
         measured_ratio: Share of its pixels that had a depth.
         raw: Of the depth image as it is.
         filtered: After DIF.
-        step_m: Of quantisation, where the depths that occur tell it.
+        step_m: Of quantisation; None if too few depths occur.
     """
 
     distance_m: float
@@ -122,9 +122,34 @@ class SeenPlane:
     step_m: float | None
 
 
+def seen_plane(
+    depth_m: Array, filtered_m: Array, reference_m: Array | float, *, distance_m: float, tilt_rad: float
+) -> SeenPlane:
+    """Return the figures of one plane.
+
+    Args:
+        depth_m: Measured depths, 0 where there is none.
+        filtered_m: The same after DIF.
+        reference_m: True depth of each, or of all.
+        distance_m: How far away the plane was measured.
+        tilt_rad: Between its normal and the optical axis.
+
+    Raises:
+        DataError: Nothing is measured.
+    """
+    return SeenPlane(
+        distance_m=distance_m,
+        tilt_rad=tilt_rad,
+        measured_ratio=float((depth_m > 0.0).mean()),
+        raw=accuracy_of(depth_m, reference_m),
+        filtered=accuracy_of(filtered_m, reference_m),
+        step_m=quantisation_step_m(depth_m),
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class DepthLevel:
-    """What one distance showed.
+    """All planes at one distance.
 
     Attributes:
         name: Of the log.
@@ -163,7 +188,7 @@ def _typical_accuracy(many: Sequence[Accuracy]) -> Accuracy:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualMap:
-    """Where in an image the depth is off.
+    """Errors of the depth over an image.
 
     Attributes:
         image: (H, W) uint8 grey image.
@@ -176,8 +201,8 @@ class ResidualMap:
     caption: str
 
 
-def refuse_scans(source: Log) -> None:
-    """Refuse a log without depth images.
+def check_rgbd(source: Log) -> None:
+    """Check that a log has depth images.
 
     Raises:
         SourceError: It is a LiDAR's.
@@ -192,7 +217,7 @@ def first_frame(source: Log) -> RgbdFrame:
     Raises:
         SourceError: None can, or they are scans.
     """
-    refuse_scans(source)
+    check_rgbd(source)
     reason = "it has no frames"
     for entry in source.entries():
         try:

@@ -1,4 +1,4 @@
-"""A depth camera's noise as a function of the distance."""
+"""Fit of a depth camera's noise as a function of the distance."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -1,4 +1,4 @@
-"""Planes through patches of depth images, and what is left of the depth beside them."""
+"""Planes fitted to patches of depth images."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array
 
 MAX_NOISE_RATIO = 0.05
-"""What scatters by a larger share of its distance is no plane."""
+"""A patch whose depths scatter by a larger share of their distance is not a plane."""
 
 _ROUNDS = 4
 _OUTLIER_SIGMAS = 4.0

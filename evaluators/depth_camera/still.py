@@ -1,4 +1,4 @@
-"""A depth camera that stands still before a plane at a known distance (thesis 2.6.1, 2.6.2)."""
+"""A depth camera that stands still before a plane at a known distance (Somlyai, PhD thesis, §2.6)."""
 
 from dataclasses import replace
 
@@ -9,11 +9,10 @@ from evaluators.depth_camera.accuracy import (
     Patch,
     ResidualMap,
     SeenPlane,
-    accuracy_of,
     central_patch,
     depth_frame,
     first_frame,
-    quantisation_step_m,
+    seen_plane,
     typical_of,
 )
 from evaluators.depth_camera.planes import MAX_NOISE_RATIO, fit_planes
@@ -32,7 +31,7 @@ _DECODERS = 2
 
 
 class _Pixels:
-    """Each pixel's mean and variance over the frames, from sums: errors are small, so nothing cancels."""
+    """Mean and variance of each pixel over the frames, from sums: errors are small, so nothing cancels."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self._count, self._sum, self._squares = np.zeros(shape), np.zeros(shape), np.zeros(shape)
@@ -95,7 +94,7 @@ def depth_at(
     """
     first = first_frame(source)
     where = central_patch(first.camera) if patch is None else patch
-    where.refuse_outside(first.camera)
+    where.check_inside(first.camera)
 
     def seen(entry: FrameRef) -> tuple[SeenPlane, Array] | str:
         try:
@@ -121,7 +120,7 @@ def depth_at(
     if reasons:
         progress.note(f"{source.path}: {len(reasons)} frames left out; the first: {reasons[0]}")
     typical = typical_of(planes)
-    _refuse_elsewhere(source, typical.distance_m, distance_m)
+    _check_distance(source, typical.distance_m, distance_m)
     error_m = np.full(first.depth_m.shape, np.nan)
     error_m[where.slices] = pixels.mean_m
     caption = f"{distance_m:g} m, mean of {len(planes)} frames"
@@ -132,7 +131,7 @@ def depth_at(
 
 
 def _see(frame: RgbdFrame, distance_m: float, patch: Patch, *, keep_tilt: bool) -> tuple[SeenPlane, Array]:
-    """Return what one frame's patch says, and each pixel's error from its plane, NaN without depth.
+    """Return the plane in one frame's patch, and each pixel's error from it, NaN without depth.
 
     Raises:
         DataError: It shows no plane.
@@ -156,18 +155,17 @@ def _see(frame: RgbdFrame, distance_m: float, patch: Patch, *, keep_tilt: bool) 
         )
     on_plane_m = plane.depth_m.reshape(depth_m.shape)
     reference_m = distance_m if keep_tilt else on_plane_m * (distance_m / plane.distance_m[0])
-    seen = SeenPlane(
+    seen = seen_plane(
+        depth_m,
+        dif(frame.depth_m)[patch.slices].astype(np.float64),
+        reference_m,
         distance_m=float(plane.distance_m[0]),
         tilt_rad=float(plane.tilt_rad[0]),
-        measured_ratio=float(measured.mean()),
-        raw=accuracy_of(depth_m, reference_m),
-        filtered=accuracy_of(dif(frame.depth_m)[patch.slices].astype(np.float64), reference_m),
-        step_m=quantisation_step_m(depth_m),
     )
     return seen, np.where(measured, depth_m - on_plane_m, np.nan)
 
 
-def _refuse_elsewhere(source: Log, shown_m: float, distance_m: float) -> None:
+def _check_distance(source: Log, shown_m: float, distance_m: float) -> None:
     if abs(shown_m - distance_m) > _MAX_DISTANCE_RATIO * distance_m:
         raise DataError(
             f"{source.path}: shows a plane at {shown_m:.3g} m, not at {distance_m:g} m; are the distances "

@@ -1,32 +1,26 @@
-"""A depth camera's accuracy as text for a screen, and as files: numbers, pictures, and what a build reads."""
+"""Study of a depth camera: its accuracy at every distance that its logs show, and a model of its noise."""
 
-import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
-from evaluators.depth_camera.accuracy import DepthLevel, Patch, ResidualMap, refuse_scans
+from evaluators.depth_camera.accuracy import DepthLevel, Patch, ResidualMap, check_rgbd
 from evaluators.depth_camera.noise_fit import NoiseFit, fit_noise
 from evaluators.depth_camera.still import depth_at
 from evaluators.depth_camera.tiles import depth_of_planes
-from evaluators.pictures.depth_camera import write_accuracy, write_residuals
-from evaluators.tables.table import Column, Record, csv_text, text_table
+from evaluators.tables.table import Column, Record, text_table
 from mapper.core.geometry import Array
-from mapper.runtime.atomic import MANIFEST_NAME, write_text
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
-
-SENSOR, NUMBERS, ACCURACY, RESIDUALS = "sensor.toml", "depth.csv", "accuracy.png", "residuals.png"
 
 _MM = 1e3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthStudy:
-    """What logs tell of a depth camera.
+    """Accuracy and noise of a depth camera by its logs.
 
     Attributes:
         logs: What was measured.
@@ -56,7 +50,7 @@ def study_depth(
 
     Args:
         sources: RGB-D logs of one camera.
-        distances_m: Of the plane before which the camera stands in each; None finds planes by itself.
+        distances_m: Of the plane before which the camera stands in each; None looks for planes.
         patch: Where in the image to look, or the usual place.
         keep_tilt: As :func:`evaluators.depth_camera.still.depth_at`.
         most_frames: As :func:`evaluators.depth_camera.tiles.depth_of_planes`.
@@ -67,7 +61,7 @@ def study_depth(
         SourceError: A log has no depth images that can be read.
     """
     for source in sources:
-        refuse_scans(source)
+        check_rgbd(source)
     levels: list[DepthLevel] = []
     maps: list[tuple[float, ResidualMap]] = []
     if distances_m is None:
@@ -157,36 +151,3 @@ def _uncertainty_text(uncertainty: Array) -> str:
     if any(math.isnan(error) for error in uncertainty):
         return "unknown: as many coefficients as distances"
     return ", ".join(f"{error:.2g}" for error in uncertainty if error) or "0"
-
-
-def sensor_toml(study: DepthStudy) -> str:
-    """Return the noise as a configuration that ``mapper build`` reads."""
-    fit = study.fit
-    a, b, c = fit.noise.constant_m, fit.noise.linear, fit.noise.quadratic_per_m
-    return (
-        f"# mapper sensor depth: σ_z = {fit.noise.text} m,\n"
-        f"# measured at {fit.low_m:.2f} … {fit.high_m:.2f} m in {', '.join(study.logs)}\n"
-        f"\n[odometry.depth_noise]\nconstant_m = {a!r}\nlinear = {b!r}\nquadratic_per_m = {c!r}\n"
-    )
-
-
-def write_depth_study(folder: Path, study: DepthStudy) -> None:
-    """Fill an existing folder with numbers, pictures and the configuration."""
-    title = f"{study.logs[0]}{' and more' if len(study.logs) > 1 else ''}: depth"
-    write_text(folder / SENSOR, sensor_toml(study))
-    write_text(folder / NUMBERS, csv_text(records_of(study)))
-    write_accuracy(folder / ACCURACY, study.levels, study.fit, title=f"{title} accuracy")
-    write_residuals(folder / RESIDUALS, study.maps, title=f"{title} less that of the plane")
-    fit = study.fit
-    record = {
-        "kind": "depth accuracy",
-        "logs": list(study.logs),
-        "distances": "given" if study.is_known else "fitted",
-        "noise": fit.noise.model_dump(),
-        "form": fit.form,
-        "uncertainty": [None if math.isnan(error) else float(error) for error in fit.uncertainty],
-        "misfit_ratio": fit.misfit_ratio,
-        "between_m": [fit.low_m, fit.high_m],
-        "levels": [asdict(level) for level in study.levels],
-    }
-    write_text(folder / MANIFEST_NAME, json.dumps(record, indent=2, ensure_ascii=False) + "\n")

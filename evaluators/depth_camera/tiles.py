@@ -1,4 +1,4 @@
-"""A depth camera's noise from an ordinary log: whatever planes it happens to show, at whatever distance."""
+"""Accuracy of a depth camera from an ordinary log: by the planes that it happens to show."""
 
 from itertools import islice
 
@@ -10,10 +10,10 @@ from evaluators.depth_camera.accuracy import (
     Patch,
     ResidualMap,
     SeenPlane,
-    accuracy_of,
     depth_frame,
     first_frame,
     quantisation_step_m,
+    seen_plane,
     typical_of,
 )
 from evaluators.depth_camera.planes import MAX_NOISE_RATIO, Planes, fit_planes
@@ -70,7 +70,7 @@ def depth_of_planes(
     first = first_frame(source)
     side = max(first.camera.width_px // (_TILES_ACROSS * _BLOCKS), 1) * _BLOCKS
     where = patch or Patch(0, 0, first.camera.width_px, first.camera.height_px)
-    where.refuse_outside(first.camera)
+    where.check_inside(first.camera)
     if min(where.width, where.height) < side:
         raise DataError(f"patch {where}: want at least one tile of {side}×{side} px")
 
@@ -108,7 +108,7 @@ def depth_of_planes(
 
 
 def _planes(frame: RgbdFrame, where: Patch, side: int, *, number: int) -> tuple[list[SeenPlane], ResidualMap]:
-    """Return what the tiles of a frame show that show a plane, and a picture of them."""
+    """Return the planes that tiles of a frame show, and a picture of them."""
     depth_m = _cut(frame.depth_m[where.slices], side)
     rays = _cut(ray_table(frame.camera)[where.slices], side)
     filtered_m = _cut(dif(frame.depth_m)[where.slices], side)
@@ -121,13 +121,12 @@ def _planes(frame: RgbdFrame, where: Patch, side: int, *, number: int) -> tuple[
         tile_m, on_plane_m = depth_m[whole[k]], planes.depth_m[k]
         tiles_m[whole[k]] = np.where(tile_m > 0.0, tile_m - on_plane_m, np.nan)
         seen.append(
-            SeenPlane(
+            seen_plane(
+                tile_m,
+                filtered_m[whole[k]],
+                on_plane_m,
                 distance_m=float(np.median(on_plane_m)),
                 tilt_rad=float(planes.tilt_rad[k]),
-                measured_ratio=float((tile_m > 0.0).mean()),
-                raw=accuracy_of(tile_m, on_plane_m),
-                filtered=accuracy_of(filtered_m[whole[k]], on_plane_m),
-                step_m=steps_m[k],
             )
         )
     error_m = np.full(frame.depth_m.shape, np.nan)
@@ -150,7 +149,7 @@ def _joined(tiles: Array, side: int, *, across: int) -> Array:
 
 
 def _are_planes(planes: Planes, depth_m: Array, steps_m: list[float | None]) -> NDArray[np.bool_]:
-    """Tell which tiles a plane explains up to noise."""
+    """Return (T,) which tiles a plane explains up to noise."""
     measured = depth_m > 0.0
     share = planes.used.sum(axis=1) / np.maximum(measured.sum(axis=1), 1)
     shape_m = _shape_m(np.where(planes.used, depth_m - planes.depth_m, np.nan))

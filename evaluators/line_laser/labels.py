@@ -8,11 +8,11 @@ import numpy as np
 
 from evaluators.line_laser.scores import (
     DETECTION_COLUMNS,
+    PERCENT,
     TABLE_2_1,
     Counts,
     count_all,
     detection_records,
-    percent,
     summed,
 )
 from evaluators.tables.table import Column, Record, csv_text, text_table
@@ -30,9 +30,9 @@ _NEAR_M = 0.1
 _RANGE_COLUMNS = (
     Column("range_m", "range m"),
     Column("columns", "columns"),
-    Column("median_error_ratio", "median error %", percent),
-    Column("p90_error_ratio", "90th percentile %", percent),
-    Column("thesis_error_ratio", "thesis %", percent),
+    Column("median_error_ratio", "median error %", PERCENT),
+    Column("p90_error_ratio", "90th percentile %", PERCENT),
+    Column("thesis_error_ratio", "thesis %", PERCENT),
 )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluators.tables.table import Column, Record
+from evaluators.tables.table import Column, Record, decimals
 from mapper.core.frames import Image
 from mapper.core.geometry import Array
 from mapper.line_laser.config import StripeConfig
@@ -19,19 +19,17 @@ TOLERANCE_PX = 3.0
 """A pixel within this distance of the stripe's true middle shows the stripe."""
 
 
-def percent(share: float) -> str:
-    """Return a share as a table shows it."""
-    return f"{100.0 * share:.1f}"
-
+PERCENT = decimals(1, times=100.0)
+"""Shows a share."""
 
 DETECTION_COLUMNS = (
     Column("method", "method"),
-    Column("precision", "precision %", percent),
-    Column("recall", "recall %", percent),
-    Column("f_score", "F %", percent),
-    Column("pixel_precision", "pixels' precision %", percent),
-    Column("pixel_recall", "pixels' recall %", percent),
-    Column("pixel_f_score", "pixels' F %", percent),
+    Column("precision", "precision %", PERCENT),
+    Column("recall", "recall %", PERCENT),
+    Column("f_score", "F %", PERCENT),
+    Column("pixel_precision", "pixels' precision %", PERCENT),
+    Column("pixel_recall", "pixels' recall %", PERCENT),
+    Column("pixel_f_score", "pixels' F %", PERCENT),
 )
 
 

@@ -6,7 +6,7 @@ from statistics import median
 
 import numpy as np
 
-from evaluators.line_laser.scores import TABLE_2_1, Counts, count_all, percent, summed
+from evaluators.line_laser.scores import PERCENT, TABLE_2_1, Counts, count_all, summed
 from evaluators.tables.table import Column, Record, Value
 from mapper.core.frames import Image
 from mapper.core.geometry import Array, Transform
@@ -58,21 +58,21 @@ class Study:
 STUDY_COLUMNS = (
     Column("scene", "scene"),
     Column("method", "method"),
-    Column("precision", "precision %", percent),
-    Column("recall", "recall %", percent),
-    Column("f_score", "F %", percent),
-    Column("f_score_low", "lowest F %", percent),
-    Column("f_score_high", "highest F %", percent),
-    Column("pixel_f_score", "pixels' F %", percent),
+    Column("precision", "precision %", PERCENT),
+    Column("recall", "recall %", PERCENT),
+    Column("f_score", "F %", PERCENT),
+    Column("f_score_low", "lowest F %", PERCENT),
+    Column("f_score_high", "highest F %", PERCENT),
+    Column("pixel_f_score", "pixels' F %", PERCENT),
     Column("best_in_seeds", "best in seeds"),
 )
 TABLE_COLUMNS = (
     Column("range_m", "true m", "{:.2f}".format),
     Column("measured_m", "measured m", "{:.3f}".format),
-    Column("error_ratio", "error %", percent),
-    Column("worst_error_ratio", "worst seed's %", percent),
+    Column("error_ratio", "error %", PERCENT),
+    Column("worst_error_ratio", "worst seed's %", PERCENT),
     Column("thesis_measured_m", "thesis m", "{:.2f}".format),
-    Column("thesis_error_ratio", "thesis %", percent),
+    Column("thesis_error_ratio", "thesis %", PERCENT),
 )
 
 

@@ -1,4 +1,4 @@
-"""How far one cloud lies from another (Nagy, Gálai & Benedek 2016, §IV)."""
+"""Distance of one cloud from another (Nagy, Gálai & Benedek 2016, §IV)."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ class CloudDistance:
 
     Attributes:
         mhd_m: Modified Hausdorff distance, their mean.
-        mpd_m: Their median, which what moved between the two scans does not disturb.
+        mpd_m: Their median, which objects that moved between the two scans do not disturb.
     """
 
     mhd_m: float
@@ -24,7 +24,7 @@ class CloudDistance:
 
 
 class DistanceTo:
-    """Measures clouds against one cloud, whose search tree is built once."""
+    """Distances from one cloud, whose search tree is built once."""
 
     def __init__(self, points_target: Points32) -> None:
         """Index the cloud Q, (N, 3) metres.

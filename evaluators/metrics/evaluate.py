@@ -1,4 +1,4 @@
-"""Everything worth telling about one trajectory, with truth or without."""
+"""Evaluation of one trajectory: all its metrics, with truth or without."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,8 +31,8 @@ _CLOCK_NS = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judged:
-    """What a trajectory is worth.
+class Assessment:
+    """Evaluation of a trajectory.
 
     Attributes:
         metrics: Every number, the errors first.
@@ -48,11 +48,11 @@ class Judged:
 def evaluate(
     estimate: Trajectory, truth: Trajectory | None, *, alignment: AlignmentKind = "se3"
 ) -> list[Metric]:
-    """Return the numbers of ``judged``."""
-    return list(judged(estimate, truth, alignment=alignment).metrics)
+    """Return the numbers of ``assess``."""
+    return list(assess(estimate, truth, alignment=alignment).metrics)
 
 
-def judged(
+def assess(
     estimate: Trajectory,
     truth: Trajectory | None,
     *,
@@ -61,14 +61,14 @@ def judged(
     lengths_m: Sequence[float] | None = None,
     max_gap_s: float = 0.02,
     names: tuple[str, str] = ("the estimate", "the truth"),
-) -> Judged:
+) -> Assessment:
     """Return path length, start-to-end offset and coverage, and with truth ATE, RPE and relative errors.
 
     The names state the alignment. RPE compares consecutive matched poses.
 
     Args:
-        estimate: What is judged.
-        truth: Where the body really was, or None if nobody knows.
+        estimate: The trajectory.
+        truth: True poses of the body, or None if they are not known.
         alignment: How the estimate is laid over the truth first.
         frames_ns: Stamps of all frames of the log, of which the estimate should have poses; None takes the
             time that the truth covers instead.
@@ -87,7 +87,7 @@ def judged(
         Metric("start-to-end rotation", offset.rotation_rad, "rad"),
     ]
     if truth is None:
-        return Judged(tuple(own))
+        return Assessment(tuple(own))
     matched = associate(estimate, truth, max_gap_s=max_gap_s, names=names)
     similarity = align(matched, alignment)
     aligned = similarity.moved(matched)
@@ -98,7 +98,7 @@ def judged(
         *segment_metrics(lengths),
         *own,
     ]
-    return Judged(tuple(metrics), aligned, lengths)
+    return Assessment(tuple(metrics), aligned, lengths)
 
 
 def _against_truth(aligned: Matched, alignment: AlignmentKind) -> list[Metric]:
@@ -127,7 +127,7 @@ def _alignment_metrics(matched: Matched, similarity: Similarity, alignment: Alig
 
 
 def have_clock(stamps_ns: Stamps) -> bool:
-    """Tell whether stamps are times: numbers of poses, as KITTI text gets them, span less than any log."""
+    """Return whether stamps are times: numbers of poses, as KITTI text gets them, span less than any log."""
     return bool(stamps_ns[-1] - stamps_ns[0] >= _CLOCK_NS)
 
 

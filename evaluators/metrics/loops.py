@@ -1,4 +1,4 @@
-"""Whether loop closures are right, and how many true revisits they found."""
+"""Loop metrics: how many closures are right, and how many true revisits they found."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ from mapper.loops.closure import LoopClosure, discrepancy
 MAX_ERROR_M, MAX_ERROR_RAD = 0.2, 0.1
 """A loop that is farther from the truth is wrong."""
 REVISIT_M, REVISIT_RAD, REVISIT_S = 0.5, np.deg2rad(20.0), 5.0
-"""A keyframe revisits what an earlier one saw from so near, in so nearly the same direction, so long ago."""
+"""A keyframe revisits a place if an earlier one was so near, turned so nearly alike, so long ago."""
 
 
 def loop_metrics(
@@ -25,25 +25,25 @@ def loop_metrics(
     Args:
         loops: Every candidate with its verdict.
         keyframes_ns: (N,) int64 stamps of all nodes, in time order.
-        truth: Where the body really was; what it does not cover is not judged.
-        looked_every_m: How far a run went between two looks for loops: one found from so near counts for a
-            keyframe too.
+        truth: True poses of the body; loops that it does not cover are left out.
+        looked_every_m: Distance that a run went between two searches for loops: a loop found from so near
+            counts for a keyframe too.
     """
-    held = [loop for loop in loops if loop.verdict == "accepted"]
+    accepted = [loop for loop in loops if loop.verdict == "accepted"]
     revisits = revisits_of(keyframes_ns, truth)
     along_m = _along(keyframes_ns, truth)
-    found_m = along_m[np.isin(keyframes_ns, [loop.stamp_j_ns for loop in held])]
+    found_m = along_m[np.isin(keyframes_ns, [loop.stamp_j_ns for loop in accepted])]
     found = (np.abs(along_m[:, np.newaxis] - found_m) <= looked_every_m).any(axis=1)
     return [
-        Metric("loops", len(held), "loops"),
-        Metric("loops wrongly accepted", sum(_wrong(held, truth)), "loops"),
+        Metric("loops", len(accepted), "loops"),
+        Metric("loops wrongly accepted", sum(_wrong(accepted, truth)), "loops"),
         Metric("true revisits", int(revisits.sum()), "keyframes"),
         Metric("true revisits with a loop", int((found & revisits).sum()), "keyframes"),
     ]
 
 
 def revisits_of(keyframes_ns: Stamps, truth: Trajectory) -> NDArray[np.bool_]:
-    """Return (N,) which keyframes see again, by the truth, what an earlier one saw."""
+    """Return (N,) which keyframes revisit, by the truth, the place of an earlier one."""
     index, gap_ns = nearest(truth.stamps_ns, keyframes_ns)
     known = gap_ns <= MAX_TRUTH_GAP_NS
     T_truth_body: Array = truth.T_world_body[index]
@@ -65,14 +65,14 @@ def _along(keyframes_ns: Stamps, truth: Trajectory) -> Array:
     return along_m
 
 
-def _wrong(held: Sequence[LoopClosure], truth: Trajectory) -> list[bool]:
+def _wrong(accepted: Sequence[LoopClosure], truth: Trajectory) -> list[bool]:
     """Return for each loop that the truth covers whether it is wrong."""
-    stamps_ns = np.array([(loop.stamp_i_ns, loop.stamp_j_ns) for loop in held], np.int64).reshape(-1, 2)
+    stamps_ns = np.array([(loop.stamp_i_ns, loop.stamp_j_ns) for loop in accepted], np.int64).reshape(-1, 2)
     index, gap_ns = nearest(truth.stamps_ns, stamps_ns.ravel())
     ends = index.reshape(-1, 2)
     known = (gap_ns <= MAX_TRUTH_GAP_NS).reshape(-1, 2)
     wrong = []
-    for loop, (i, j), covered in zip(held, ends, known, strict=True):
+    for loop, (i, j), covered in zip(accepted, ends, known, strict=True):
         if covered.all() and loop.T_i_j is not None:
             miss = discrepancy(loop.T_i_j, truth.T_world_body[i], truth.T_world_body[j])
             wrong.append(miss.translation_m > MAX_ERROR_M or miss.rotation_rad > MAX_ERROR_RAD)

@@ -1,4 +1,4 @@
-"""What a run's map is worth, held against a reference."""
+"""Quality of a run's map: its octree and its cloud compared with a reference."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -6,9 +6,9 @@ from typing import Literal
 import numpy as np
 
 from evaluators.metrics.cloud_distance import CloudDistance, DistanceTo
-from evaluators.metrics.map_reference import Reference, held_against
+from evaluators.metrics.map_reference import Reference, check_occupancy
 from evaluators.metrics.metric import Metric
-from evaluators.metrics.occupancy import Verdict, verdict_metrics
+from evaluators.metrics.occupancy import OccupancyCheck, check_metrics
 from evaluators.metrics.trajectory import associate
 from mapper.core.errors import DataError
 from mapper.core.frames import Points32
@@ -24,20 +24,20 @@ _PAIR_VOXELS = 3.0
 """How far apart the points of a pair may be while a reference is registered."""
 
 World = Literal["truth", "map"]
-"""In which world a reference lies: that of the log's truth, or the run's own, which is levelled."""
+"""World that a reference lies in: that of the log's truth, or the run's own, which is levelled."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapQuality:
-    """A map held against a reference.
+    """Comparison of a map with a reference.
 
     Attributes:
         metrics: Every number; the first says how the reference was laid.
-        verdict: The voxels that they come from.
+        check: The voxels that they come from.
     """
 
     metrics: tuple[Metric, ...]
-    verdict: Verdict
+    check: OccupancyCheck
 
 
 def map_quality(
@@ -47,7 +47,7 @@ def map_quality(
 
     Args:
         run: A finished run.
-        reference: What to hold it against.
+        reference: What to compare it with.
         world: In which the reference lies; None is the truth's for the world of a synthetic log, else the
             run's own.
         voxels: How far apart the surfaces may be, in voxels.
@@ -66,14 +66,14 @@ def map_quality(
         refined = _registered(reference, cloud, T_map_reference, voxel_m=octree.resolution_m)
         moved_m = float(np.linalg.norm((inverse(T_map_reference) @ refined)[:3, 3]))
         T_map_reference, how = refined, f"{how}, then registered"
-    verdict = held_against(octree, reference, T_map_reference, voxels=voxels)
+    check = check_occupancy(octree, reference, T_map_reference, voxels=voxels)
     metrics = [
-        Metric(f"map held against the {reference.name}, laid {how}", len(verdict.occupied), "voxels"),
+        Metric(f"map held against the {reference.name}, laid {how}", len(check.occupied), "voxels"),
         *([Metric("registration moved it by", moved_m, "m")] if register else []),
-        *verdict_metrics(verdict),
-        *_distances(reference, verdict, cloud, T_map_reference),
+        *check_metrics(check),
+        *_distances(reference, check, cloud, T_map_reference),
     ]
-    return MapQuality(tuple(metrics), verdict)
+    return MapQuality(tuple(metrics), check)
 
 
 def _laid_by_truth(run: Run) -> Transform:
@@ -108,7 +108,7 @@ def _registered(
 
 
 def _distances(
-    reference: Reference, verdict: Verdict, cloud: Points32, T_map_reference: Transform
+    reference: Reference, check: OccupancyCheck, cloud: Points32, T_map_reference: Transform
 ) -> list[Metric]:
     """Return modified Hausdorff and median distances: both ways, but from a world known exactly none."""
     T_reference_map = inverse(T_map_reference)
@@ -119,7 +119,7 @@ def _distances(
     assert reference.points is not None
     points = reference.points.astype(np.float32)
     there = DistanceTo(points).of(cloud, T_reference_map)
-    seen = points[verdict.seen_at(apply(T_map_reference, reference.points))]
+    seen = points[check.seen_at(apply(T_map_reference, reference.points))]
     back = DistanceTo(cloud).of(seen, T_map_reference)
     return _both(there, "cloud → reference") + _both(back, "reference → cloud where the map looked")
 

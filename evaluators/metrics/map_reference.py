@@ -1,4 +1,4 @@
-"""What a map is held against: a cloud, another map, or the world of a synthetic log."""
+"""Reference of a map: a cloud, another map, or the world of a synthetic log."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,10 +7,10 @@ import numpy as np
 
 from evaluators.metrics.occupancy import (
     LogOddsAt,
+    OccupancyCheck,
     SignedDistance,
-    Verdict,
-    judged_by_distance,
-    judged_by_points,
+    assess_by_distance,
+    assess_by_points,
 )
 from evaluators.metrics.scenes import SCENE, scene_distance
 from mapper.core.errors import DataError
@@ -78,9 +78,9 @@ def read_reference(path: Path, *, voxel_m: float) -> Reference:
     raise DataError(f"{path}: not a reference for a map; {_WANTED}")
 
 
-def held_against(
+def check_occupancy(
     octree: OctreeMap, reference: Reference, T_map_reference: Transform, *, voxels: int
-) -> Verdict:
+) -> OccupancyCheck:
     """Return which voxels of a map are right.
 
     Raises:
@@ -88,12 +88,12 @@ def held_against(
     """
     T_reference_map = inverse(T_map_reference)
     if (distance_m := reference.signed_distance_m) is not None:
-        return judged_by_distance(
+        return assess_by_distance(
             octree, lambda points_map: distance_m(apply(T_reference_map, points_map)), voxels=voxels
         )
     assert reference.points is not None
     log_odds_at = reference.log_odds_at
-    return judged_by_points(
+    return assess_by_points(
         octree,
         apply(T_map_reference, reference.points),
         log_odds_at=None

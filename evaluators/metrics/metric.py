@@ -1,4 +1,4 @@
-"""One measured number with its name and unit, and tables of them."""
+"""Metric: one measured number with its name and unit, and tables of them."""
 
 import json
 import math
@@ -12,7 +12,7 @@ _DEGREES = {"rad": "°", "rad/m": "°/m"}
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """What was measured, the value, and in which unit.
+    """One measured number.
 
     Attributes:
         name: What a reader would call it, with whatever it depends on: "ATE RMSE, SE(3)-aligned".
@@ -54,7 +54,7 @@ def json_text(metrics: Sequence[Metric]) -> str:
 
 
 def shown(metric: Metric) -> tuple[str, str, str]:
-    """Degrees exist only here, on the screen."""
+    """Return a metric's name, value and unit as they are shown; angles in degrees, here alone."""
     if metric.unit in _DEGREES:
         return metric.name, f"{math.degrees(metric.value):.6g}", _DEGREES[metric.unit]
     if isinstance(metric.value, int):

@@ -1,4 +1,4 @@
-"""How right an occupancy map is: about a world known exactly, a cloud, or another map."""
+"""Occupancy check: how right a map's voxels are by a world known exactly, a cloud, or another map."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,8 +28,8 @@ _SQRT3 = float(np.sqrt(3.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Verdict:
-    """Every voxel that can be judged, and whether it is right.
+class OccupancyCheck:
+    """Every voxel that can be assessed, and whether it is right.
 
     Attributes:
         occupied: (O, 3) keys of the map's occupied voxels where the reference knows anything.
@@ -74,12 +74,14 @@ class Verdict:
         return centres
 
     def seen_at(self, points_world: Points) -> Mask:
-        """Tell for each of (N, 3) points on the reference's surfaces whether the map saw its voxel."""
+        """Return (N,) whether the map saw the voxel of each of (N, 3) points on the reference's surfaces."""
         return _among(_codes(_lattice(points_world, self.resolution_m)), _codes(self.surface[self.seen]))
 
 
-def judged_by_distance(octree: OctreeMap, signed_distance_m: SignedDistance, *, voxels: int = 1) -> Verdict:
-    """Return the verdict of a world whose solids are known exactly.
+def assess_by_distance(
+    octree: OctreeMap, signed_distance_m: SignedDistance, *, voxels: int = 1
+) -> OccupancyCheck:
+    """Check a map by a world whose solids are known exactly.
 
     An occupied voxel is right if its middle is within the tolerance, and half a voxel, of a solid; a free one
     if it is as near to free space. Surfaces are those that pass through the middle half of a voxel which the
@@ -99,7 +101,7 @@ def judged_by_distance(octree: OctreeMap, signed_distance_m: SignedDistance, *, 
     distance_m = signed_distance_m(leaves.centres_world)
     keys = leaves.keys.astype(np.int64)
     surface = keys[np.abs(distance_m) <= 0.25 * edge_m]
-    return Verdict(
+    return OccupancyCheck(
         occupied=keys[occupied],
         right=distance_m[occupied] <= reach_m,
         surface=surface,
@@ -112,10 +114,10 @@ def judged_by_distance(octree: OctreeMap, signed_distance_m: SignedDistance, *, 
     )
 
 
-def judged_by_points(
+def assess_by_points(
     octree: OctreeMap, points_world: Points, *, log_odds_at: LogOddsAt | None = None, voxels: int = 1
-) -> Verdict:
-    """Return the verdict of a reference of which points on its surfaces are known, and perhaps free space.
+) -> OccupancyCheck:
+    """Check a map by points on a reference's surfaces, and by its free space where that is known.
 
     Tolerances are whole voxels along each axis. Free voxels are right unless the reference is solid there and
     the map has no surface within the tolerance; open space is what is free with no surface so near.
@@ -124,7 +126,7 @@ def judged_by_points(
         octree: The map.
         points_world: (N, 3) metres, in the map's world, so dense that no voxel of a surface is left out.
         log_odds_at: What the reference knows of the map's world; None knows surfaces alone, so that every
-            occupied voxel is judged and no free one.
+            occupied voxel is assessed and no free one.
         voxels: The tolerance.
 
     Raises:
@@ -135,17 +137,17 @@ def judged_by_points(
     surface = _keys_of(points_world, leaves.resolution_m)
     near_surface = _near(keys, surface, voxels=voxels)
     found = _near(surface, keys[occupied], voxels=voxels)
-    judged, free_right, open_free = occupied, np.empty(0, np.bool_), np.empty(0, np.bool_)
+    assessed, free_right, open_free = occupied, np.empty(0, np.bool_), np.empty(0, np.bool_)
     if log_odds_at is not None:
         values = log_odds_at(leaves.centres_world)
         known, solid = ~np.isnan(values), values >= octree.occupied_log_odds
-        judged = occupied & (known | near_surface)
+        assessed = occupied & (known | near_surface)
         near_ours = _near(keys, keys[occupied], voxels=voxels)
         free_right = (~solid | near_ours)[known & ~occupied]
         open_free = ~occupied[known & ~near_surface]
-    return Verdict(
-        occupied=keys[judged],
-        right=near_surface[judged],
+    return OccupancyCheck(
+        occupied=keys[assessed],
+        right=near_surface[assessed],
         surface=surface,
         found=found,
         seen=found | _among(_codes(surface), _codes(keys)),
@@ -156,13 +158,13 @@ def judged_by_points(
     )
 
 
-def verdict_metrics(verdict: Verdict) -> list[Metric]:
+def check_metrics(check: OccupancyCheck) -> list[Metric]:
     """Return precision, recall and F-score of occupied space, and of free space what is known of it.
 
     The F-score is their harmonic mean (Knapitsch et al. 2017).
     """
-    within = f"within {verdict.voxels} voxel{'s' if verdict.voxels != 1 else ''}"
-    precision, recall = float(verdict.right.mean()), float(verdict.found[verdict.seen].mean())
+    within = f"within {check.voxels} voxel{'s' if check.voxels != 1 else ''}"
+    precision, recall = float(check.right.mean()), float(check.found[check.seen].mean())
     metrics = [
         Metric(f"occupied precision, {within}", precision, "ratio"),
         Metric(f"occupied recall where the map looked, {within}", recall, "ratio"),
@@ -170,13 +172,13 @@ def verdict_metrics(verdict: Verdict) -> list[Metric]:
             f"occupied F-score, {within}", 2.0 * precision * recall / max(precision + recall, 1e-300), "ratio"
         ),
     ]
-    if not verdict.seen.all():
-        whole = float(verdict.found.mean())
+    if not check.seen.all():
+        whole = float(check.found.mean())
         metrics.append(Metric(f"occupied recall of the whole reference, {within}", whole, "ratio"))
-    if len(verdict.free_right) and len(verdict.open_free):
+    if len(check.free_right) and len(check.open_free):
         metrics += [
-            Metric(f"free precision, {within}", float(verdict.free_right.mean()), "ratio"),
-            Metric(f"free recall, {within}", float(verdict.open_free.mean()), "ratio"),
+            Metric(f"free precision, {within}", float(check.free_right.mean()), "ratio"),
+            Metric(f"free recall, {within}", float(check.open_free.mean()), "ratio"),
         ]
     return metrics
 
@@ -184,8 +186,8 @@ def verdict_metrics(verdict: Verdict) -> list[Metric]:
 def occupancy_metrics(
     octree: OctreeMap, signed_distance_m: SignedDistance, *, voxels: int = 1
 ) -> list[Metric]:
-    """Return the metrics of ``judged_by_distance``."""
-    return verdict_metrics(judged_by_distance(octree, signed_distance_m, voxels=voxels))
+    """Return the metrics of ``assess_by_distance``."""
+    return check_metrics(assess_by_distance(octree, signed_distance_m, voxels=voxels))
 
 
 def ghosts(octree: OctreeMap, signed_distance_m: SignedDistance, *, voxels: int = 1) -> int:
@@ -213,12 +215,12 @@ def _lattice(points_world: Points, resolution_m: float) -> Keys:
 
 
 def _near(keys: Keys, others: Keys, *, voxels: int) -> Mask:
-    """Tell for each of (N, 3) keys whether another is at most so many steps away along each axis."""
+    """Return for each of (N, 3) keys whether another is at most so many steps away along each axis."""
     wanted, codes = _codes(keys), _codes(others)
     reach = np.arange(-voxels, voxels + 1)
     steps = (reach[:, None, None] + (reach[:, None] << _BITS) + (reach << (2 * _BITS))).ravel()
     near = np.zeros(len(wanted), dtype=np.bool_)
-    if len(codes) < len(wanted):  # rather spread the few than look around the many
+    if len(codes) < len(wanted):  # spreading the few is faster than searching around the many
         at_once = max(1, _MOST_SPREAD // max(len(codes), 1))
         for first in range(0, len(steps), at_once):
             near |= _among(wanted, (codes[:, None] + steps[first : first + at_once]).ravel())
@@ -229,7 +231,7 @@ def _near(keys: Keys, others: Keys, *, voxels: int) -> Mask:
 
 
 def _among(wanted: Codes, codes: Codes) -> Mask:
-    """Tell for each of (N,) codes whether it is one of the others."""
+    """Return (N,) whether each code is one of the others."""
     if not len(codes):
         return np.zeros(len(wanted), dtype=np.bool_)
     ordered = np.sort(codes)

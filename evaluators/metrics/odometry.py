@@ -37,10 +37,10 @@ ONE_SECOND, ONE_FRAME = Step(1.0, "s"), Step(1.0, "frames")
 
 @dataclass(frozen=True, slots=True)
 class PathErrors:
-    """How far a path is from the truth.
+    """Errors of a path against the truth; None is not known.
 
     Attributes:
-        ate_m: Root mean square distance of the positions, SE(3)-aligned.
+        ate_m: Root mean square distance of the positions from the true ones.
         rpe_m: Root mean square error of the translation over a step; None where no two poses are one apart.
         rpe_rad: The same of the rotation.
         drift_ratio: Mean error of the translation over a stretch of the path, as a share of its length. The
@@ -48,10 +48,10 @@ class PathErrors:
             no two poses are so far apart.
     """
 
-    ate_m: float
-    rpe_m: float | None
-    rpe_rad: float | None
-    drift_ratio: float | None
+    ate_m: float | None = None
+    rpe_m: float | None = None
+    rpe_rad: float | None = None
+    drift_ratio: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +65,7 @@ class OdometryRun:
         seconds: Of the CPU, without what is common to all methods.
         trajectory: T_world_body, laid over the truth where there is one.
         matched: The poses that have a true one, laid over it; None without truth or with too few.
-        errors: How far they are from it.
+        errors: Of these; nothing is known without truth or with too few.
         steps_m: (S,) errors of the translation over one step; empty where no two poses are one apart.
         broke: Why the method did not come to the end of the log; empty when it did.
     """
@@ -76,7 +76,7 @@ class OdometryRun:
     seconds: float
     trajectory: Trajectory
     matched: Matched | None = None
-    errors: PathErrors | None = None
+    errors: PathErrors = PathErrors()
     steps_m: Array = field(default_factory=lambda: np.empty(0))
     broke: str = ""
 
@@ -116,15 +116,24 @@ def assess_run(run: OdometryRun, truth: Trajectory | None, step: Step) -> Odomet
     matched = associate(run.trajectory, truth, max_gap_s=MAX_TRUTH_GAP_NS / NS_PER_S)
     similarity = align(matched, "se3")
     matched = similarity.moved(matched)
+    return replace(
+        run,
+        trajectory=run.trajectory.moved(similarity.T_truth_map),
+        matched=matched,
+        errors=path_errors(matched, step),
+        steps_m=_step_errors(matched, step.delta, step.unit)[0],
+    )
+
+
+def path_errors(matched: Matched, step: Step) -> PathErrors:
+    """Return the errors of a path that lies over the truth, the relative ones over a step."""
     steps_m, steps_rad = _step_errors(matched, step.delta, step.unit)
-    errors = PathErrors(
+    return PathErrors(
         ate_m=ate(matched).rmse,
         rpe_m=_rms(steps_m),
         rpe_rad=_rms(steps_rad),
         drift_ratio=_drift_ratio(matched),
     )
-    trajectory = run.trajectory.moved(similarity.T_truth_map)
-    return replace(run, trajectory=trajectory, matched=matched, errors=errors, steps_m=steps_m)
 
 
 def _drift_ratio(matched: Matched) -> float | None:

@@ -1,4 +1,4 @@
-"""The neighbours of points within a radius: how they are spread, and whether they lie in two sheets."""
+"""Patches: the neighbours of points within a radius, their spread, and whether they lie in two sheets."""
 
 import numpy as np
 from numba import njit

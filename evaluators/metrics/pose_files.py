@@ -1,4 +1,4 @@
-"""Trajectories as people keep them: TUM text, or KITTI's with or without a list of times."""
+"""Reading of trajectories: TUM text, or KITTI's with or without a list of times."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ _KITTI_COLUMNS = 12
 
 
 def is_kitti(path: Path) -> bool:
-    """Tell whether a file begins with a row-major 3×4 pose, which has no stamp.
+    """Return whether a file begins with a row-major 3×4 pose, which has no stamp.
 
     Raises:
         SourceError: The file cannot be read.

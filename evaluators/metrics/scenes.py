@@ -1,4 +1,4 @@
-"""How far points are from the solids of a synthetic world, whose every surface is known."""
+"""Distances of points from the solids of a synthetic world, whose every surface is known."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Relative errors over stretches of the path, as the KITTI odometry benchmark defines them."""
+"""Relative errors over segments of the path, as the KITTI odometry benchmark defines them."""
 
 import math
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ import numpy as np
 
 from evaluators.metrics.metric import Metric
 from evaluators.metrics.trajectory import Matched, motion_errors, progress_of, statistics
-from evaluators.tables.table import Column, Record
+from evaluators.tables.table import Column, Record, decimals
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array
 
@@ -82,7 +82,7 @@ def segment_errors(matched: Matched, lengths_m: Sequence[float]) -> tuple[Length
 
 
 def segment_metrics(errors: Sequence[LengthErrors]) -> list[Metric]:
-    """Return what the segments of all given lengths together come to; nothing where there are none.
+    """Return the metrics of the segments of all given lengths together; none where there are no segments.
 
     The means over KITTI's eight lengths are the two numbers of the benchmark's table.
     """
@@ -101,20 +101,13 @@ def segment_metrics(errors: Sequence[LengthErrors]) -> list[Metric]:
     ]
 
 
-def _percent_text(ratio: float) -> str:
-    return f"{100.0 * ratio:.3f}"
-
-
-def _degrees_text(angle_rad: float) -> str:
-    return f"{math.degrees(angle_rad):.5f}"
-
-
+_PERCENT, _DEGREES = decimals(3, times=100.0), decimals(5, times=math.degrees(1.0))
 _FIGURES = ("mean", "median", "max")
 LENGTH_COLUMNS = (
     Column("length_m", "segment, m", "{:g}".format),
     Column("segments", "number"),
-    *(Column(f"translation_{name}_ratio", f"{name} %", _percent_text) for name in _FIGURES),
-    *(Column(f"rotation_{name}_radpm", f"{name} °/m", _degrees_text) for name in _FIGURES),
+    *(Column(f"translation_{name}_ratio", f"{name} %", _PERCENT) for name in _FIGURES),
+    *(Column(f"rotation_{name}_radpm", f"{name} °/m", _DEGREES) for name in _FIGURES),
 )
 
 

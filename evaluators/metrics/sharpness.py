@@ -1,6 +1,7 @@
-"""How sharp a map is, without any reference: whether scans laid over each other agree.
+"""Sharpness of a map, without any reference: how well scans that are laid over each other agree.
 
-It tells a good trajectory from a bad one as far as the sensor is right: scans that are wrong alike agree.
+It separates a good trajectory from a bad one only as far as the sensor is right: scans that are wrong alike
+agree.
 """
 
 from dataclasses import dataclass
@@ -34,7 +35,7 @@ _LEAST_VARIANCE_M2 = 1e-12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """Points of several scans in one world, and from where they were seen.
+    """Points of several scans in one world, and the directions they were seen from.
 
     Attributes:
         points_world: (N, 3) metres.
@@ -59,7 +60,7 @@ def views_of(source: Log, trajectory: Trajectory, *, progress: Progress = SILENT
     Args:
         source: The log.
         trajectory: T_world_body of its frames.
-        progress: Who watches.
+        progress: Told how far it is.
 
     Raises:
         DataError: No frame of the log has a pose.

@@ -1,4 +1,4 @@
-"""How far an estimated trajectory is from the truth: ATE and RPE as the TUM benchmark defines them."""
+"""Errors of an estimated trajectory: ATE and RPE as the TUM benchmark defines them."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -74,7 +74,7 @@ class Statistics:
 
 @dataclass(frozen=True, slots=True)
 class RelativeErrors:
-    """What RPE finds.
+    """Relative pose errors.
 
     Attributes:
         translation_m: Errors of the relative translation.
@@ -89,7 +89,7 @@ class RelativeErrors:
 
 @dataclass(frozen=True, slots=True)
 class Offset:
-    """How far apart two poses are."""
+    """Offset of one pose from another."""
 
     translation_m: float
     rotation_rad: float
@@ -109,7 +109,7 @@ def associate(
     serve twice. This is how evo reads the rule of the TUM benchmark (Sturm et al. 2012).
 
     Raises:
-        DataError: No pair lies within ``max_gap_s``; the message tells the smallest gap.
+        DataError: No pair lies within ``max_gap_s``; the message has the smallest gap.
     """
     if not len(estimate) or not len(truth):
         empty = names[0] if not len(estimate) else names[1]
@@ -131,7 +131,7 @@ def associate(
 
 
 def align(matched: Matched, kind: AlignmentKind) -> Similarity:
-    """Return what lays the estimate over the truth with the least squared distance of positions.
+    """Return the motion that lays the estimate over the truth with the least squared distance of positions.
 
     "none" moves nothing; "yaw" shifts, and turns about z (Zhang & Scaramuzza 2018), which is all that is open
     where z is up in both worlds; "se3" fits a rigid motion (Arun et al. 1987), "sim3" a scale as well
@@ -185,7 +185,7 @@ def step_errors(matched: Matched, *, delta: float, unit: DeltaUnit) -> tuple[Arr
     """Return the relative pose errors over all steps of a fixed length, metres and radians, (N,) each.
 
     Every pose is compared with the one that lies nearest to ``delta`` ahead of it: in matched frames, in
-    seconds, or in metres along the true path, so that every estimate is judged over the same pairs.
+    seconds, or in metres along the true path, so that every estimate is compared over the same pairs.
     Steps in metres or seconds that miss ``delta`` by more than a tenth are left out.
 
     Raises:
@@ -227,7 +227,7 @@ def start_end_offset(trajectory: Trajectory) -> Offset:
 def progress_of(matched: Matched, unit: DeltaUnit) -> Array:
     """Return (N,) how far along the log every pose is, in the unit; it never decreases.
 
-    Metres are those of the true path, so that every estimate is judged over the same stretches.
+    Metres are those of the true path, so that every estimate is compared over the same stretches.
     """
     if unit == "frames":
         return np.arange(len(matched), dtype=np.float64)
@@ -277,7 +277,7 @@ def _lengths(vectors: Array) -> Array:
 
 
 def statistics(errors: Array) -> Statistics:
-    """Return what (N ≥ 1,) errors come to."""
+    """Return the statistics of (N ≥ 1,) errors."""
     return Statistics(
         rmse=float(np.sqrt(np.mean(errors**2))),
         mean=float(errors.mean()),

@@ -1,30 +1,28 @@
-"""What `mapper reproduce` leaves: the tables for people, programs and papers, plots, and a page of it all."""
+"""Files of `mapper reproduce`: the tables as Markdown, CSV and LaTeX, plots, and a page of them."""
 
 import base64
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from html import escape
 from pathlib import Path
-from textwrap import fill
 
 from evaluators.papers.layout import as_printed, compared, compares, counted, everything, failures, headline
 from evaluators.papers.model import RULE, PaperTable, Reproduction
 from evaluators.papers.plots import write_plots
 from evaluators.tables.table import (
-    Column,
-    Record,
+    Table,
     csv_text,
+    indented,
     latex_table,
     latex_text,
-    markdown_table,
+    markdown_list,
     shown_cells,
-    text_table,
 )
 from mapper.export.html import bullets, document, section, table
 from mapper.runtime.atomic import write_text
 
 MARKDOWN, CSV, LATEX, PAGE = "tables.md", "tables.csv", "tables.tex", "index.html"
-_LINE_WIDTH = 110
 _FAILURES_SHOWN = 8
 
 
@@ -47,25 +45,30 @@ def tables_text(reproduction: Reproduction) -> str:
     """Return every table for a terminal, with what must be known to read it indented below."""
     parts = []
     for each in _filled(reproduction):
-        parts += [headline(each), text_table(*_laid_out(each, with_spread=False))]
         missing = failures(each)
-        more = [f"{len(missing) - _FAILURES_SHOWN} more failed; see {MARKDOWN}"]
-        parts += _indented([*_remarks(each), *missing[:_FAILURES_SHOWN]])
-        parts += [*_indented(more if len(missing) > _FAILURES_SHOWN else []), ""]
-    return "\n".join([*parts, *_indented(_closing(reproduction))])
+        notes = [*_remarks(each), *missing[:_FAILURES_SHOWN]]
+        if len(missing) > _FAILURES_SHOWN:
+            notes.append(f"{len(missing) - _FAILURES_SHOWN} more failed; see {MARKDOWN}")
+        parts += [headline(each), _shown(each, notes, with_spread=False).text(), ""]
+    return "\n".join([*parts, *indented(_closing(reproduction))])
 
 
 def _filled(reproduction: Reproduction) -> list[PaperTable]:
     return [each for each in reproduction.tables if each.cells]
 
 
-def _laid_out(each: PaperTable, *, with_spread: bool) -> tuple[list[Column], list[Record]]:
-    return compared(each) if compares(each) else as_printed(each, with_spread=with_spread)
+def _shown(each: PaperTable, notes: Sequence[str], *, with_spread: bool = True) -> Table:
+    table = compared(each) if compares(each) else as_printed(each, with_spread=with_spread)
+    return replace(table, title=headline(each), notes=notes)
 
 
 def _remarks(each: PaperTable) -> list[str]:
     """Return what must be known to read a table, its verdicts counted first."""
     return [*([counted(each)] if compares(each) else []), *each.notes]
+
+
+def _everything_known(each: PaperTable) -> list[str]:
+    return [each.source, *_remarks(each), *failures(each)]
 
 
 def _closing(reproduction: Reproduction) -> list[str]:
@@ -79,20 +82,10 @@ def _closing(reproduction: Reproduction) -> list[str]:
     ]
 
 
-def _indented(notes: Sequence[str]) -> list[str]:
-    return [fill(note, _LINE_WIDTH, initial_indent="  ", subsequent_indent="    ") for note in notes]
-
-
 def _markdown(reproduction: Reproduction) -> str:
-    parts = [f"# {reproduction.paper}"]
-    for each in _filled(reproduction):
-        parts += [f"## {headline(each)}", markdown_table(*_laid_out(each, with_spread=True))]
-        parts += _listed([each.source, *_remarks(each), *failures(each)])
-    return "\n\n".join([*parts, "## Notes", *_listed(_closing(reproduction))]) + "\n"
-
-
-def _listed(lines: Sequence[str]) -> list[str]:
-    return ["\n".join(f"- {line}" for line in lines)] if lines else []
+    tables = [_shown(each, _everything_known(each)).markdown() for each in _filled(reproduction)]
+    notes = ["## Notes", markdown_list(_closing(reproduction))]
+    return "\n\n".join([f"# {reproduction.paper}", *tables, *notes]) + "\n"
 
 
 def _latex(reproduction: Reproduction) -> str:
@@ -100,9 +93,10 @@ def _latex(reproduction: Reproduction) -> str:
     parts = ["% \\usepackage{booktabs}, then \\input this file, or copy the table you want."]
     for each in _filled(reproduction):
         caption = latex_text(f"{headline(each)}. Printed: {each.source}.")
+        printed = as_printed(each, with_spread=True)
         parts.append(
             "\\begin{table}\n\\centering\\scriptsize\\setlength{\\tabcolsep}{3pt}\n"
-            f"\\caption{{{caption}}}\n{latex_table(*as_printed(each, with_spread=True))}\n\\end{{table}}"
+            f"\\caption{{{caption}}}\n{latex_table(printed.columns, printed.records)}\n\\end{{table}}"
         )
     return "\n\n".join(parts) + "\n"
 
@@ -123,10 +117,10 @@ def _page(folder: Path, reproduction: Reproduction, plots: Mapping[str, Path]) -
 
 
 def _section(each: PaperTable, plot: Path | None) -> str:
-    columns, records = _laid_out(each, with_spread=True)
-    shown = table([column.title for column in columns], shown_cells(columns, records))
-    told = bullets([each.source, *_remarks(each), *failures(each)])
-    return section(headline(each), shown + told + (_image(plot) if plot else ""))
+    shown = _shown(each, _everything_known(each))
+    head = [column.title for column in shown.columns]
+    body = table(head, shown_cells(shown.columns, shown.records)) + bullets(shown.notes)
+    return section(shown.title, body + (_image(plot) if plot else ""))
 
 
 def _image(path: Path) -> str:

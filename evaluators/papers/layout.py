@@ -1,4 +1,4 @@
-"""How a paper's table is laid out: a line for each comparison, or as printed with our lines below theirs."""
+"""Layouts of a paper's table: a line for each comparison, or as printed with our lines below theirs."""
 
 import math
 import re
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from statistics import median
 
 from evaluators.papers.model import PaperCell, PaperTable, Reproduction
-from evaluators.tables.table import Column, Record
+from evaluators.tables.table import Column, Record, Table
 
 _DIGITS = 3
 """Of figures that have no printed one beside them to show how many make sense."""
@@ -24,7 +24,7 @@ def headline(table: PaperTable) -> str:
     return "; ".join(filter(None, (f"{table.name}: {table.title}", quantity)))
 
 
-def compared(table: PaperTable) -> tuple[list[Column], list[Record]]:
+def compared(table: PaperTable) -> Table:
     """Return a line for each figure: printed, ours, its spread over the seeds, ratio and verdict."""
     decimals = _decimals(table)
     records: list[Record] = [
@@ -40,10 +40,10 @@ def compared(table: PaperTable) -> tuple[list[Column], list[Record]]:
     always = {"row": "", "column": table.axis, "printed": "printed", "ours": "ours"}
     often = {"spread": "spread", "ratio": "ratio", "verdict": "verdict", "failures": "failed"}
     shown = {key: title for key, title in often.items() if any(record[key] is not None for record in records)}
-    return [Column(key, title) for key, title in {**always, **shown}.items()], records
+    return Table([Column(key, title) for key, title in {**always, **shown}.items()], records)
 
 
-def as_printed(table: PaperTable, *, with_spread: bool) -> tuple[list[Column], list[Record]]:
+def as_printed(table: PaperTable, *, with_spread: bool) -> Table:
     """Return the printed layout, where a row's figures, ours, their range and the ratios are lines.
 
     Args:
@@ -65,7 +65,7 @@ def as_printed(table: PaperTable, *, with_spread: bool) -> tuple[list[Column], l
     head = [Column("row", "")]
     if len({record["line"] for record in records}) > 1:
         head.append(Column("line", ""))
-    return [*head, *(Column(column, column) for column in decimals)], records
+    return Table([*head, *(Column(column, column) for column in decimals)], records)
 
 
 def everything(reproduction: Reproduction) -> list[Record]:

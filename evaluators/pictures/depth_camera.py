@@ -1,19 +1,28 @@
-"""Pictures of a depth camera's accuracy: errors over the distance, and where in the image they lie."""
+"""Files of a depth camera's study: numbers, pictures of its errors, and a configuration for builds."""
 
+import json
+import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mapper.runtime.atomic_folder import MANIFEST_NAME
 
 from evaluators.depth_camera.accuracy import Accuracy, DepthLevel, ResidualMap
 from evaluators.depth_camera.noise_fit import NoiseFit
+from evaluators.depth_camera.study import DepthStudy, records_of
+from evaluators.tables.table import csv_text
 from mapper.export.page import FAINT, INK, LINE, hex_of, save
 from mapper.export.palette import Rgb
 from mapper.export.panels import page, panel
+from mapper.runtime.atomic import write_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+SENSOR, NUMBERS, ACCURACY, RESIDUALS = "sensor.toml", "depth.csv", "accuracy.png", "residuals.png"
 
 _RAW: Rgb = (38, 145, 87)
 _FILTERED: Rgb = (214, 69, 37)
@@ -23,6 +32,39 @@ _MM = 1e3
 _COLUMNS = 4
 _MAP_IN, _BAR_IN, _CAPTION_IN = 3.6, 0.65, 0.4
 _CLIP_PERCENT = 99.0
+
+
+def write_depth_study(folder: Path, study: DepthStudy) -> None:
+    """Fill an existing folder with numbers, pictures and the configuration."""
+    title = f"{study.logs[0]}{' and more' if len(study.logs) > 1 else ''}: depth"
+    write_text(folder / SENSOR, _sensor_toml(study))
+    write_text(folder / NUMBERS, csv_text(records_of(study)))
+    write_accuracy(folder / ACCURACY, study.levels, study.fit, title=f"{title} accuracy")
+    write_residuals(folder / RESIDUALS, study.maps, title=f"{title} less that of the plane")
+    fit = study.fit
+    record = {
+        "kind": "depth accuracy",
+        "logs": list(study.logs),
+        "distances": "given" if study.is_known else "fitted",
+        "noise": fit.noise.model_dump(),
+        "form": fit.form,
+        "uncertainty": [None if math.isnan(error) else float(error) for error in fit.uncertainty],
+        "misfit_ratio": fit.misfit_ratio,
+        "between_m": [fit.low_m, fit.high_m],
+        "levels": [asdict(level) for level in study.levels],
+    }
+    write_text(folder / MANIFEST_NAME, json.dumps(record, indent=2, ensure_ascii=False) + "\n")
+
+
+def _sensor_toml(study: DepthStudy) -> str:
+    """Return the noise as a configuration that ``mapper build`` reads."""
+    fit = study.fit
+    a, b, c = fit.noise.constant_m, fit.noise.linear, fit.noise.quadratic_per_m
+    return (
+        f"# mapper sensor depth: σ_z = {fit.noise.text} m,\n"
+        f"# measured at {fit.low_m:.2f} … {fit.high_m:.2f} m in {', '.join(study.logs)}\n"
+        f"\n[odometry.depth_noise]\nconstant_m = {a!r}\nlinear = {b!r}\nquadratic_per_m = {c!r}\n"
+    )
 
 
 def write_accuracy(path: Path, levels: Sequence[DepthLevel], fit: NoiseFit, *, title: str) -> None:
@@ -76,7 +118,7 @@ def _kinds(levels: Sequence[DepthLevel]) -> tuple[tuple[str, Rgb, list[Accuracy]
 def _draw_known(
     axes: "Axes", distance_m: Sequence[float], values_m: Sequence[float | None], *, marker: str, label: str
 ) -> None:
-    """Mark a figure that not every distance tells."""
+    """Mark a figure that is not known at every distance."""
     known = [(x, _MM * value) for x, value in zip(distance_m, values_m, strict=True) if value is not None]
     if known:
         axes.plot(*np.array(known).T, marker, color=FAINT, markersize=5, label=label, fillstyle="none")

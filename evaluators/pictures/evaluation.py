@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluators.metrics.evaluate import Judged, have_clock
-from evaluators.metrics.occupancy import Verdict
+from evaluators.metrics.evaluate import Assessment, have_clock
+from evaluators.metrics.occupancy import OccupancyCheck
 from evaluators.pictures.map_agreement import write_agreement
 from evaluators.pictures.path_errors import write_errors
 from mapper.core.errors import DataError
@@ -14,12 +14,12 @@ from mapper.core.timebase import NS_PER_S
 TRAJECTORY, MAP = "trajectory.png", "map.png"
 
 
-def write_trajectory_errors(folder: Path, found: Judged, *, title: str) -> Path:
+def write_trajectory_errors(folder: Path, found: Assessment, *, title: str) -> Path:
     """Draw where, when and over which lengths a trajectory is wrong; return the picture.
 
     Args:
         folder: Gets ``trajectory.png``; made if it is not there.
-        found: Judged against a truth.
+        found: Assessment against a truth.
         title: Headline.
 
     Raises:
@@ -49,21 +49,21 @@ def write_trajectory_errors(folder: Path, found: Judged, *, title: str) -> Path:
     return picture
 
 
-def write_map_errors(folder: Path, verdict: Verdict, *, title: str) -> Path:
+def write_map_errors(folder: Path, check: OccupancyCheck, *, title: str) -> Path:
     """Draw where a map and its reference agree, and where not; return the picture.
 
     Args:
         folder: Gets ``map.png``; made if it is not there.
-        verdict: Of the map.
+        check: Of the map.
         title: Headline.
 
     Raises:
         DataError: The folder cannot be made.
     """
     picture = _made(folder) / MAP
-    agreed, extra, missing = verdict.centres_world
+    agreed, extra, missing = check.centres_world
     write_agreement(
-        picture, agreed=agreed, extra=extra, missing=missing, edge_m=verdict.resolution_m, title=title
+        picture, agreed=agreed, extra=extra, missing=missing, edge_m=check.resolution_m, title=title
     )
     return picture
 

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, replace
 from statistics import median
 
 from evaluators.sweep.plan import RUNS, BuildName, Plan
-from evaluators.tables.table import MISSING, Column, Record, Value, text_table
+from evaluators.tables.table import MISSING, Column, Record, Value, decimals, text_table
 from mapper.runtime.job_runner import JobResult
 
 _WHOLE = 0.995
@@ -36,12 +36,12 @@ class Quantity:
 
 
 QUANTITIES = (
-    Quantity("ate_m", "ATE RMSE m", "{:.4f}".format, min, needs_coverage=True),
-    Quantity("rpe_1s_m", "RPE 1 s m", "{:.4f}".format, min, needs_coverage=True),
-    Quantity("coverage_ratio", "coverage %", lambda value: f"{100.0 * value:.0f}", max),
-    Quantity("loops", "loops", "{:.0f}".format),
-    Quantity("frames_per_s", "frames/s", "{:.1f}".format, max),
-    Quantity("peak_memory_mb", "peak MB", "{:.0f}".format, min),
+    Quantity("ate_m", "ATE RMSE m", decimals(4), min, needs_coverage=True),
+    Quantity("rpe_1s_m", "RPE 1 s m", decimals(4), min, needs_coverage=True),
+    Quantity("coverage_ratio", "coverage %", decimals(0, times=100.0), max),
+    Quantity("loops", "loops", decimals(0)),
+    Quantity("frames_per_s", "frames/s", decimals(1), max),
+    Quantity("peak_memory_mb", "peak MB", decimals(0), min),
 )
 
 

@@ -1,9 +1,10 @@
-"""Tables of results: aligned text for a terminal, Markdown and LaTeX for a report, CSV for other programs."""
+"""Tables of results: text for a terminal, Markdown and LaTeX for a report, CSV for other programs."""
 
 import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import fill
 
 import numpy as np
 
@@ -14,6 +15,8 @@ Record = Mapping[str, Value]
 """One row: name to value, with its unit in the name and every digit in the value; None is not known."""
 
 MISSING = "–"
+
+_LINE_WIDTH = 110
 
 _LATEX = {
     **{character: f"\\{character}" for character in "&%$#_{}"},
@@ -52,6 +55,47 @@ class Column:
     key: str
     title: str
     shown: Callable[..., str] = str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Table:
+    """Records as they are shown, with what must be known to read them.
+
+    Attributes:
+        columns: What is shown of each record.
+        records: A row each.
+        title: Headline in a document.
+        notes: A sentence each.
+    """
+
+    columns: Sequence[Column]
+    records: Sequence[Record]
+    title: str = ""
+    notes: Sequence[str] = ()
+
+    def text(self) -> str:
+        """Return aligned lines for a terminal, with the notes indented below."""
+        return "\n".join([text_table(self.columns, self.records), *indented(self.notes)])
+
+    def markdown(self) -> str:
+        """Return the table under its headline, with the notes as a list."""
+        parts = [f"## {self.title}", markdown_table(self.columns, self.records)]
+        return "\n\n".join([*parts, *([markdown_list(self.notes)] if self.notes else [])])
+
+
+def decimals(count: int, *, times: float = 1.0) -> Callable[[float], str]:
+    """Return what shows a number, in another unit if it is multiplied, with so many decimals."""
+    return lambda value: f"{times * value:.{count}f}"
+
+
+def indented(notes: Sequence[str]) -> list[str]:
+    """Return sentences as they stand below a table on a terminal."""
+    return [fill(note, _LINE_WIDTH, initial_indent="  ", subsequent_indent="    ") for note in notes]
+
+
+def markdown_list(lines: Sequence[str]) -> str:
+    """Return a Markdown list."""
+    return "\n".join(f"- {line}" for line in lines)
 
 
 def column(records: Sequence[Record], key: str) -> Array:
