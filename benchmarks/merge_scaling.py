@@ -144,11 +144,11 @@ def print_costs(runs: list[Run], folder: Path) -> None:
         f"MB: {RUNS} runs' maps {input_bytes / 1e6:.2f}, shuffle {found.shuffle_bytes / 1e6:.2f}, "
         f"{100 * found.shuffle_bytes / input_bytes:.0f} %"
     )
-    for name, efforts in (("split a run", found.split), ("join a tile", found.join), ("slice", found.see)):
-        seconds = [effort.seconds for effort in efforts]
+    for name, stage in (("split a run", "split"), ("join a tile", "join"), ("slice", "slice")):
+        seconds = [cost.seconds for cost in found.costs[stage]]
         print(f"{name}: {len(seconds)} jobs, median {np.median(seconds):.3f} s, max {max(seconds):.3f} s")
     voxels = sum(run.voxels for run in manifest.runs)
-    split_s, join_s = (sum(effort.seconds for effort in jobs) for jobs in (found.split, found.join))
+    split_s, join_s = (sum(cost.seconds for cost in found.costs[stage]) for stage in ("split", "join"))
     print(f"voxels per second: split {voxels / split_s / 1e6:.1f} M, join {voxels / join_s / 1e6:.1f} M")
     costs = {count: merged_apart(runs, folder / f"p{count}", processes=count) for count in (1, 2)}
     print(

@@ -141,7 +141,8 @@ def evaluate(
         metrics += _sharpness_of(sharp_log, trajectory)
     print(_text(metrics, found, Format.JSON if json else format_))
     if plot is not None:
-        from evaluators.pictures.evaluation import write_map_errors, write_trajectory_errors
+        from evaluators.pictures.map_agreement import write_map_errors
+        from evaluators.pictures.path_errors import write_trajectory_errors
 
         if held is None or found.matched is not None:
             write_trajectory_errors(plot, found, title=f"{name}, {ALIGNED[align.value]}")

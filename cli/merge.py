@@ -97,9 +97,9 @@ def _summary(merged: "Merged") -> str:
         Column("shared_voxels", "known before"),
         Column("agreement", "walls alike", lambda share: MISSING if share is None else f"{share:.0%}"),
     ]
-    jobs = {"split": merged.split, "join": merged.join, "slice": merged.see}
-    seconds = ", ".join(f"{name} {sum(job.seconds for job in done):.1f}" for name, done in jobs.items())
-    peak_mb = max(job.peak_memory_mb for done in jobs.values() for job in done)
+    costs = merged.costs
+    seconds = ", ".join(f"{name} {sum(cost.seconds for cost in of):.1f}" for name, of in costs.items())
+    peak_mb = max(cost.peak_memory_mb for of in costs.values() for cost in of)
     lines = [
         text_table(columns, records),
         "",

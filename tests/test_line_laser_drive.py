@@ -110,7 +110,7 @@ def study():
 
 
 def test_the_combination_finds_the_stripe_better_than_any_method_alone(study):
-    records = line_laser_study.detections(study)
+    records = line_laser_study.detections(study).records
     f_scores = {record["method"]: record["f_score"] for record in records}
     pixels = {record["method"]: record["pixel_f_score"] for record in records}
     assert max(f_scores, key=f_scores.get) == max(pixels, key=pixels.get) == "combined"
@@ -119,7 +119,7 @@ def test_the_combination_finds_the_stripe_better_than_any_method_alone(study):
 
 
 def test_ranges_are_at_least_as_right_as_the_thesis_measured(study):
-    for record in line_laser_study.table_2_1(study):
+    for record in line_laser_study.table_2_1(study).records:
         assert record["error_ratio"] <= record["thesis_error_ratio"] + 1e-9
         assert abs(record["measured_m"] - record["range_m"]) < 0.01 * record["range_m"]
         assert record["thesis_measured_m"] == TABLE_2_1[record["range_m"]]

@@ -9,7 +9,7 @@ from evaluators.metrics.map_reference import check_occupancy, read_reference
 from evaluators.metrics.occupancy import assess_by_points, check_metrics
 from evaluators.metrics.scenes import outdoor_distance_m, scene_distance
 from evaluators.metrics.sharpness import Views, sharpness_metrics
-from evaluators.pictures.evaluation import write_map_errors
+from evaluators.pictures.map_agreement import write_map_errors
 from mapper.core.errors import DataError, MapperError
 from mapper.core.geometry import exp, inverse, transform
 from mapper.export.ply import write_ply

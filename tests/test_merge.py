@@ -13,7 +13,7 @@ from mapper.core.errors import ConfigError, DataError, RunError
 from mapper.core.geometry import exp, inverse
 from mapper.core.trajectory import Trajectory
 from mapper.export.grid import read_grid
-from mapper.merging import steps
+from mapper.merging import jobs as merging_jobs
 from mapper.merging.merge import merge
 from mapper.merging.merged_map import open_map
 from mapper.merging.placing import Placed, as_built, by_poses, by_truth
@@ -166,11 +166,11 @@ def test_leaves_larger_than_a_tile_are_pruned_across_tiles(tmp_path, config):
 def test_a_merge_that_was_stopped_goes_on_where_it_was(runs, merged, tmp_path, monkeypatch):
     out, joined = tmp_path / "map", []
 
-    def join(site, tile, *arguments, **settings):
+    def join(workspace, tile, *arguments, **settings):
         joined.append(tile)
         if len(joined) in (4, 5):
             raise OSError("the disk is gone")
-        return steps.join_tile(site, tile, *arguments, **settings)
+        return merging_jobs.join_tile(workspace, tile, *arguments, **settings)
 
     def jobs(some, executor, **_):
         return run_jobs(some, executor, attempts=1)

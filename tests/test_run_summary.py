@@ -5,7 +5,7 @@ import pytest
 
 from evaluators.metrics.evaluate import assess
 from evaluators.metrics.run_summary import summary
-from evaluators.pictures.evaluation import write_trajectory_errors
+from evaluators.pictures.path_errors import write_trajectory_errors
 from mapper.config.build import BuildConfig
 from mapper.core.errors import DataError
 from mapper.core.geometry import exp, transform

@@ -50,8 +50,8 @@ def line_laser(
 
     Example: mapper sensor line-laser drive/images --calibration C.toml --wheels drive/encoders.txt --out seen
     """
-    from evaluators.line_laser.labels import judge
     from evaluators.line_laser.labels import read_labels
+    from evaluators.line_laser.labels import score
     from mapper.config.loading import overridden
     from mapper.config.loading import read_config
     from mapper.line_laser.config import THESIS, LineLaserCalibration, LineLaserConfig
@@ -79,14 +79,14 @@ def line_laser(
             write_drive(folder, driven, title=out.resolve().name)
         write_scans(folder, scans, calibration=known, config=config, notes=notes)
         _draw(folder, list(scans), config.stripe, truth)
-        judged = judge(scans, truth, config.stripe) if truth else None
-        if judged is not None:
-            judged.write(folder)
+        scores = score(scans, truth, config.stripe) if truth else None
+        if scores is not None:
+            scores.write(folder)
     for note in notes:
         progress.note(note)
     if not quiet:
-        if judged is not None:
-            print(f"{judged.text}\n")
+        if scores is not None:
+            print(f"{scores.text}\n")
         print(_summary(scans))
         print_files(out, width=9)
 
@@ -149,7 +149,7 @@ def accuracy(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Print who finds the stripe in rendered rooms.
+    """Print how well each method finds the stripe in rendered rooms.
 
     The rooms have lamps, red things and noise. The thesis's Table 2.1 is measured again, too.
 
@@ -174,11 +174,11 @@ def accuracy(
         found = study(config, range(seeds), progress=progress_for(quiet=quiet))
         scenes, ranges = detections(found), table_2_1(found)
         if folder is not None:
-            write_text(folder / "detections.csv", csv_text(scenes))
-            write_text(folder / "table_2.1.csv", csv_text(ranges))
+            write_text(folder / "detections.csv", csv_text(scenes.records))
+            write_text(folder / "table_2.1.csv", csv_text(ranges.records))
             write_text(folder / MANIFEST_NAME, config.model_dump_json(indent=1) + "\n")
     if not quiet:
-        print(f"{text_table(STUDY_COLUMNS, scenes)}\n\n{text_table(TABLE_COLUMNS, ranges)}")
+        print(f"{scenes.text()}\n\n{ranges.text()}")
 
 
 def _draw(

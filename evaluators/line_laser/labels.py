@@ -1,4 +1,4 @@
-"""A line-laser sensor's images against labels: every method's stripe, and the ranges."""
+"""Labelled images of a line-laser sensor: every method's stripe, and the ranges, against the labels."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,15 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from evaluators.line_laser.scores import (
-    DETECTION_COLUMNS,
     PERCENT,
     TABLE_2_1,
     Counts,
     count_all,
-    detection_records,
+    detection_table,
     summed,
 )
-from evaluators.tables.table import Column, Record, csv_text, text_table
+from evaluators.tables.table import Column, Record, Table, csv_text
 from mapper.core.errors import SourceError
 from mapper.core.geometry import Array
 from mapper.line_laser.config import StripeConfig
@@ -37,12 +36,12 @@ _RANGE_COLUMNS = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judgement:
-    """How right a sensor was about labelled images.
+class LabelScores:
+    """Detections and ranges of a sensor in labelled images.
 
     Attributes:
         images: How many.
-        counts: What every method found.
+        counts: Of every method's detections.
         true_m: (N,) ranges in all columns in which a stripe was and was found.
         found_m: (N,) what was measured there.
     """
@@ -55,19 +54,26 @@ class Judgement:
     @property
     def text(self) -> str:
         """Both tables, for a terminal."""
-        detections = text_table(DETECTION_COLUMNS, detection_records(self.counts))
-        return f"{detections}\n\n{text_table(_RANGE_COLUMNS, range_records(self.true_m, self.found_m))}"
+        return f"{self._detections.text()}\n\n{self._ranges.text()}"
 
     def write(self, folder: Path) -> None:
         """Write both tables as ``detections.csv`` and ``range_errors.csv``."""
-        write_text(folder / "detections.csv", csv_text(detection_records(self.counts)))
-        write_text(folder / "range_errors.csv", csv_text(range_records(self.true_m, self.found_m)))
+        write_text(folder / "detections.csv", csv_text(self._detections.records))
+        write_text(folder / "range_errors.csv", csv_text(self._ranges.records))
+
+    @property
+    def _detections(self) -> Table:
+        return detection_table(self.counts)
+
+    @property
+    def _ranges(self) -> Table:
+        return Table(_RANGE_COLUMNS, range_records(self.true_m, self.found_m))
 
 
-def judge(
+def score(
     scans: Mapping[Path, LineScan], labels: Mapping[str, tuple[Array, Array]], config: StripeConfig
-) -> Judgement:
-    """Return how right scans are whose images have labels; the others do not count.
+) -> LabelScores:
+    """Return the scores of scans whose images have labels; the others do not count.
 
     Args:
         scans: By their images.
@@ -82,7 +88,7 @@ def judge(
     true_m = np.concatenate([labels[path.name][1][scan.columns] for path, scan in labelled.items()])
     found_m = np.concatenate([scan.points_sensor[:, 0] for scan in labelled.values()])
     both = np.isfinite(true_m)
-    return Judgement(len(labelled), counts, true_m[both], found_m[both])
+    return LabelScores(len(labelled), counts, true_m[both], found_m[both])
 
 
 def range_records(true_m: Array, found_m: Array) -> list[Record]:
@@ -117,7 +123,7 @@ def read_labels(path: Path, *, images: Sequence[Path], width_px: int) -> dict[st
         width_px: W.
 
     Raises:
-        SourceError: The file is missing or malformed, or tells of other images.
+        SourceError: The file is missing or malformed, or is of other images.
     """
     labels: dict[str, tuple[Array, Array]] = {}
     for number, words in rows(path, separator=","):

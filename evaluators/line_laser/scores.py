@@ -1,19 +1,20 @@
-"""How well each method finds a laser's stripe, and what the thesis's sensor measured."""
+"""Scores of the methods that find a laser's stripe in images with known stripes."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluators.tables.table import Column, Record, decimals
+from evaluators.tables.table import Column, Table, decimals
 from mapper.core.frames import Image
 from mapper.core.geometry import Array
 from mapper.line_laser.config import StripeConfig
 from mapper.line_laser.detection import METHODS, Method, Response, responses, stripe_rows
 
 TABLE_2_1: Mapping[float, float] = {0.5: 0.50, 1.0: 0.99, 1.5: 1.45, 1.7: 1.65}
-"""Metres: what was true, and what the thesis's sensor measured."""
+"""True ranges in metres, and what the sensor of Somlyai (PhD thesis, Table 2.1) measured there."""
 
 TOLERANCE_PX = 3.0
 """A pixel within this distance of the stripe's true middle shows the stripe."""
@@ -22,7 +23,7 @@ TOLERANCE_PX = 3.0
 PERCENT = decimals(1, times=100.0)
 """Shows a share."""
 
-DETECTION_COLUMNS = (
+_COLUMNS = (
     Column("method", "method"),
     Column("precision", "precision %", PERCENT),
     Column("recall", "recall %", PERCENT),
@@ -35,7 +36,7 @@ DETECTION_COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """What a method found in some images; counts of several images add up.
+    """Counts of a method's detections in some images; those of several images add up.
 
     Attributes:
         stripe_columns: Columns with a stripe.
@@ -54,14 +55,7 @@ class Counts:
     right_rows: int = 0
 
     def __add__(self, other: "Counts") -> "Counts":
-        return Counts(
-            self.stripe_columns + other.stripe_columns,
-            self.marked + other.marked,
-            self.right + other.right,
-            self.reached + other.reached,
-            self.rows + other.rows,
-            self.right_rows + other.right_rows,
-        )
+        return Counts(*map(add, astuple(self), astuple(other)))
 
     @property
     def pixels(self) -> tuple[float, float, float]:
@@ -75,7 +69,7 @@ class Counts:
 
 
 def count(response: Response, true_rows: Array, *, join_px: int) -> Counts:
-    """Return what a method's (H, W) response says of (W,) true rows, NaN where there is no stripe."""
+    """Return the counts of a method's (H, W) response by (W,) true rows, NaN where there is no stripe."""
     found = stripe_rows(response, join_px=join_px)
     right = (response > 0) & is_right(np.arange(float(len(response)))[:, None], true_rows)
     return Counts(
@@ -89,7 +83,7 @@ def count(response: Response, true_rows: Array, *, join_px: int) -> Counts:
 
 
 def count_all(image: Image, true_rows: Array, config: StripeConfig) -> dict[Method, Counts]:
-    """Return what every method finds in an (H, W, 3) RGB image with its (W,) true rows."""
+    """Return the counts of every method in an (H, W, 3) RGB image with its (W,) true rows."""
     return {
         method: count(response, true_rows, join_px=config.join_px)
         for method, response in responses(image, config).items()
@@ -105,19 +99,20 @@ def summed(counts: Iterable[Mapping[Method, Counts]]) -> dict[Method, Counts]:
 
 
 def is_right(found: Array, true_rows: Array) -> NDArray[np.bool_]:
-    """Tell in which of (W,) columns the row that was found is the stripe's."""
+    """Return in which of (W,) columns the row that was found is the stripe's."""
     right: NDArray[np.bool_] = np.abs(found - true_rows) <= TOLERANCE_PX  # False where NaN
     return right
 
 
-def detection_records(counts: Mapping[Method, Counts]) -> list[Record]:
+def detection_table(counts: Mapping[Method, Counts]) -> Table:
     """Return one record for each method."""
-    return [
+    records = [
         {"method": method}
         | dict(zip(("precision", "recall", "f_score"), found.columns, strict=True))
         | dict(zip(("pixel_precision", "pixel_recall", "pixel_f_score"), found.pixels, strict=True))
         for method, found in counts.items()
     ]
+    return Table(_COLUMNS, records)
 
 
 def _scores(right: int, found: int, reached: int, wanted: int) -> tuple[float, float, float]:

@@ -1,4 +1,4 @@
-"""The line-laser sensor on rendered images, seed after seed: who finds the stripe where, and Table 2.1."""
+"""Study of the line-laser sensor on rendered images: detections of every method and Table 2.1, by seed."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from statistics import median
 import numpy as np
 
 from evaluators.line_laser.scores import PERCENT, TABLE_2_1, Counts, count_all, summed
-from evaluators.tables.table import Column, Record, Value
+from evaluators.tables.table import Column, Record, Table, Value
 from mapper.core.frames import Image
 from mapper.core.geometry import Array, Transform
 from mapper.line_laser.calibration import CalibrationShot, calibrate, find_board
@@ -36,7 +36,7 @@ SCENES: Mapping[str, Mapping[str, float]] = {
     "dark": {"ambient": 0.2},
     "noisy": {"noise_levels": 8.0},
 }
-"""What each scene changes of the usual one."""
+"""The settings that each scene changes."""
 
 IMAGES_PER_SCENE = 6
 _WALL_M = 6.0  # wider than the image
@@ -44,18 +44,18 @@ _WALL_M = 6.0  # wider than the image
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """What came of it, a figure for each seed.
+    """Results of the study, one for each seed.
 
     Attributes:
-        found: What each method found, by scene.
-        measured_m: What was measured, by true range; a median over the columns of an image.
+        found: Counts of each method's detections, by scene.
+        measured_m: Measured range, the median over the columns of an image, by true range.
     """
 
     found: Mapping[str, Sequence[Mapping[Method, Counts]]]
     measured_m: Mapping[float, Sequence[float]]
 
 
-STUDY_COLUMNS = (
+_STUDY_COLUMNS = (
     Column("scene", "scene"),
     Column("method", "method"),
     Column("precision", "precision %", PERCENT),
@@ -66,7 +66,7 @@ STUDY_COLUMNS = (
     Column("pixel_f_score", "pixels' F %", PERCENT),
     Column("best_in_seeds", "best in seeds"),
 )
-TABLE_COLUMNS = (
+_TABLE_COLUMNS = (
     Column("range_m", "true m", "{:.2f}".format),
     Column("measured_m", "measured m", "{:.3f}".format),
     Column("error_ratio", "error %", PERCENT),
@@ -99,7 +99,7 @@ def study(config: LineLaserConfig, seeds: Sequence[int], *, progress: Progress =
     return Study(found, measured_m)
 
 
-def detections(study: Study) -> list[Record]:
+def detections(study: Study) -> Table:
     """Return one record for each scene and method: medians and spread over the seeds."""
     records: list[Record] = []
     for name, seeds in study.found.items():
@@ -107,10 +107,10 @@ def detections(study: Study) -> list[Record]:
         for method in METHODS:
             spread = _spread([seed[method] for seed in seeds])
             records.append({"scene": name, "method": method, **spread, "best_in_seeds": best.count(method)})
-    return records
+    return Table(_STUDY_COLUMNS, records)
 
 
-def table_2_1(study: Study) -> list[Record]:
+def table_2_1(study: Study) -> Table:
     """Return Table 2.1: what was measured, in whole centimetres as printed there, and its relative error."""
     records: list[Record] = []
     for range_m, measured_m in study.measured_m.items():
@@ -127,7 +127,7 @@ def table_2_1(study: Study) -> list[Record]:
                 "thesis_error_ratio": abs(TABLE_2_1[range_m] - range_m) / range_m,
             }
         )
-    return records
+    return Table(_TABLE_COLUMNS, records)
 
 
 def _spread(counts: Sequence[Counts]) -> dict[str, Value]:
@@ -167,7 +167,7 @@ def _measured(
 
 
 def _found(synth: LineLaserSynthConfig, config: LineLaserConfig) -> dict[Method, Counts]:
-    """Return what every method finds in images taken all the way round the room."""
+    """Return the counts of every method in images taken all the way round the room."""
     room, poses = make_room(synth), sensor_poses(synth).T_world_body
     places = np.linspace(0, len(poses), IMAGES_PER_SCENE, endpoint=False).astype(np.int64)
     photos = (_photo(synth, room, poses[place], Stream.SENSOR, int(place)) for place in places)

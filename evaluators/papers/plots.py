@@ -152,14 +152,7 @@ def _write_paths(path: Path, paths: Sequence[PaperPath]) -> None:
     figure, across, down = _page(title, len(paths), height_in=_PATH_IN)
     for number, (each, pairs, errors) in enumerate(zip(paths, matched, errors_m, strict=True)):
         axes = panel(figure, number, columns=across, rows=down)
-        colored = draw_path(
-            axes,
-            pairs.T_map_body[:, :3, 3],
-            truth=pairs.T_truth_body[:, :3, 3],
-            errors_m=errors,
-            most_m=most_m[each.row],
-        )
-        add_color_bar(axes, colored)
+        add_color_bar(axes, draw_path(axes, pairs, errors, most_m=most_m[each.row]))
         axes.set_title(f"{each.row}, {each.method}: ATE {each.ate_m:.4f} m", fontsize=9, color=INK)
     save(figure, path)
 

@@ -1,4 +1,4 @@
-"""A picture of two maps laid over each other: where they agree, what one has too much, what it misses."""
+"""Picture of a map over its reference: where they agree, and what the map has too much or misses."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -6,13 +6,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, Points
+from evaluators.metrics.occupancy import OccupancyCheck
+from evaluators.pictures.path_errors import made_folder
+from mapper.core.geometry import Array
 from mapper.export.page import FAINT, INK, hex_of, save
 from mapper.export.palette import ESTIMATE, OCCUPIED_CELL, TRUTH, UNKNOWN_CELL, Rgb
 from mapper.export.panels import page, panel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+MAP = "map.png"
 
 AGREED: Rgb = OCCUPIED_CELL
 EXTRA: Rgb = ESTIMATE
@@ -24,19 +28,23 @@ _ERROR_WEIGHT = 3.0  # against voxels that agree, or a wrong one in a wall would
 _FAINTEST = 0.35  # of the colour of a column with a single voxel, so that it is seen
 
 
-def write_agreement(
-    path: Path, *, agreed: Points, extra: Points, missing: Points, edge_m: float, title: str
-) -> None:
+def write_map_errors(folder: Path, check: OccupancyCheck, *, title: str) -> Path:
     """Draw voxels from above and from the side; a column that is not all of one kind mixes the colours.
 
     Args:
-        path: PNG file to write.
-        agreed: (N, 3) metres, centres of the voxels that both have.
-        extra: (M, 3) of those that only the map has.
-        missing: (K, 3) of those that only the reference has; N + M + K ≥ 1.
-        edge_m: Edge of a voxel.
+        folder: Gets ``map.png``; made if it is not there.
+        check: The map and its reference.
         title: Headline.
+
+    Returns:
+        The picture.
+
+    Raises:
+        DataError: The folder cannot be made.
     """
+    picture = made_folder(folder) / MAP
+    agreed, extra, missing = check.centres_world
+    edge_m = check.resolution_m
     kinds = {
         f"agreed, {len(agreed)} voxels": (agreed, AGREED),
         f"only in the map, {len(extra)}": (extra, EXTRA),
@@ -55,7 +63,8 @@ def write_agreement(
     for label, (_, color) in kinds.items():
         axes.plot([], [], "s", color=hex_of(color), label=label)
     axes.legend(loc="upper right", fontsize=8, framealpha=0.92)
-    save(figure, path)
+    save(figure, picture)
+    return picture
 
 
 def _draw(

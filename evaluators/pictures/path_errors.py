@@ -1,12 +1,15 @@
 """Pictures of one path's errors: where along the path, when, and over which lengths."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from evaluators.metrics.evaluate import Assessment, have_clock
+from evaluators.metrics.trajectory import Matched
+from mapper.core.errors import DataError
 from mapper.core.geometry import Array
+from mapper.core.timebase import NS_PER_S
 from mapper.export.page import FAINT, INK, LINE, hex_of, save
 from mapper.export.palette import END, ESTIMATE, START, TRUTH
 from mapper.export.panels import draw_boxes, extent, page, panel, widest_axes
@@ -15,66 +18,78 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.collections import LineCollection
 
+TRAJECTORY = "trajectory.png"
+
 _COLOR_MAP = "turbo"
 _WIDTH_IN, _HEIGHT_IN = 5.6, 4.4
 
 
-def write_errors(
-    path: Path,
-    *,
-    positions: Array,
-    truth: Array,
-    elapsed: Array,
-    elapsed_name: str,
-    errors_m: Array,
-    errors_rad: Array,
-    relative_percent: Mapping[str, Array],
-    title: str,
-) -> None:
+def write_trajectory_errors(folder: Path, found: Assessment, *, title: str) -> Path:
     """Draw a path coloured by its error, its errors over time, and boxes of those over segments.
 
     Args:
-        path: PNG file to write.
-        positions: (N, 3) metres, laid over the truth.
-        truth: (N, 3) where the body really was at the same moments.
-        elapsed: (N,) how far along the log the poses are.
-        elapsed_name: In what: "s", "poses".
-        errors_m: (N,) distances from the true positions.
-        errors_rad: (N,) angles to the true rotations.
-        relative_percent: Length in words to the (S,) errors of the translation over it, in percent of it;
-            empty where the path is too short for any.
+        folder: Gets ``trajectory.png``; made if it is not there.
+        found: The trajectory, assessed against a truth.
         title: Headline.
+
+    Returns:
+        The picture.
+
+    Raises:
+        DataError: There was no truth, or the folder cannot be made.
     """
+    matched = found.matched
+    if matched is None:
+        raise DataError(f"{folder}: nothing to draw without a truth; tell one with --truth")
+    picture = made_folder(folder) / TRAJECTORY
+    timed = have_clock(matched.stamps_ns)
+    elapsed = (matched.stamps_ns - matched.stamps_ns[0]).astype(np.float64)
+    errors_m = matched.position_errors_m
+    relative_percent = {
+        f"{length.length_m:g} m": 100.0 * length.translation_ratio for length in found.lengths if len(length)
+    }
     figure = page(title, columns=2, rows=2, width_in=_WIDTH_IN, height_in=_HEIGHT_IN)
     path_axes, position_axes, length_axes, rotation_axes = (
         panel(figure, number, columns=2, rows=2) for number in range(4)
     )
     path_axes.set_title("over the truth, seen from where it is widest", fontsize=9, color=INK)
-    colored = draw_path(path_axes, positions, truth=truth, errors_m=errors_m)
-    add_color_bar(path_axes, colored)
+    add_color_bar(path_axes, draw_path(path_axes, matched, errors_m))
     for axes, values, name in (
         (position_axes, errors_m, "distance from the truth, m"),
-        (rotation_axes, np.degrees(errors_rad), "angle to the truth, °"),
+        (rotation_axes, np.degrees(matched.rotation_errors_rad), "angle to the truth, °"),
     ):
-        _draw_over_time(axes, elapsed, values, name=name)
-        axes.set_xlabel(elapsed_name, color=FAINT, fontsize=8)
+        _draw_over_time(axes, elapsed / NS_PER_S if timed else elapsed, values, name=name)
+        axes.set_xlabel("s" if timed else "poses", color=FAINT, fontsize=8)
     if relative_percent:
         draw_boxes(length_axes, relative_percent)
         length_axes.set_xlabel("error of the translation over a segment, %", color=FAINT, fontsize=8)
     else:
         length_axes.text(0.5, 0.5, "too short a path", color=FAINT, transform=length_axes.transAxes)
-    save(figure, path)
+    save(figure, picture)
+    return picture
+
+
+def made_folder(folder: Path) -> Path:
+    """Return a folder for pictures, made if it is not there.
+
+    Raises:
+        DataError: It cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be made: {error.strerror}; want a folder for pictures") from None
+    return folder
 
 
 def draw_path(
-    axes: "Axes", positions: Array, *, truth: Array, errors_m: Array, most_m: float | None = None
+    axes: "Axes", matched: Matched, errors_m: Array, *, most_m: float | None = None
 ) -> "LineCollection":
     """Draw a path over the truth, from the side on which that is widest, coloured by its error.
 
     Args:
         axes: Where.
-        positions: (N, 3) metres, laid over the truth.
-        truth: (M, 3) metres.
+        matched: The path, laid over the truth.
         errors_m: (N,) distances from the truth.
         most_m: Error of the strongest colour; None is the largest.
 
@@ -83,6 +98,7 @@ def draw_path(
     """
     from matplotlib.collections import LineCollection
 
+    positions, truth = matched.T_map_body[:, :3, 3], matched.T_truth_body[:, :3, 3]
     axes_world = widest_axes(truth)
     seen, true = positions @ axes_world.T, truth @ axes_world.T
     axes.plot(*true.T, color=hex_of(TRUTH), linewidth=3.0, alpha=0.3)
@@ -102,7 +118,7 @@ def draw_path(
 
 
 def add_color_bar(axes: "Axes", colored: "LineCollection") -> None:
-    """Tell in a corner what the colours of ``draw_path`` mean."""
+    """Add the scale of the colours of ``draw_path`` in a corner."""
     place = axes.inset_axes((0.6, 0.95, 0.36, 0.025))
     bar = axes.figure.colorbar(colored, cax=place, orientation="horizontal")
     bar.ax.tick_params(labelsize=7, colors=FAINT)

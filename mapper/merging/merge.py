@@ -12,12 +12,12 @@ from pydantic import ValidationError
 from mapper.core.errors import ConfigError, RunError
 from mapper.core.geometry import apply
 from mapper.export.grid import write_grid
-from mapper.merging.assembling import write_whole_bt, write_whole_ot
-from mapper.merging.from_above import draw, look_from_above
+from mapper.merging.jobs import JoinedTile, SlicedColumn, SplitRun, Workspace, join_tile, split_run
 from mapper.merging.merged_map import TILES, MapManifest, MergedMap, RunInMap, Tile, open_map
-from mapper.merging.placing import Placed, doubts
-from mapper.merging.stages import Stages
-from mapper.merging.steps import Effort, JoinedTile, SeenColumn, Site, SplitRun, join_tile, split_run
+from mapper.merging.octomap_files import write_whole_bt, write_whole_ot
+from mapper.merging.placing import Placed, warnings_about
+from mapper.merging.slicing import draw, slice_map
+from mapper.merging.stages import Cost, Stages
 from mapper.merging.tiling import tiling_for
 from mapper.octree.config import OctreeConfig
 from mapper.run import files
@@ -43,20 +43,17 @@ _MUST_AGREE = (
 
 @dataclass(frozen=True, slots=True)
 class Merged:
-    """A merge that is done.
+    """A finished merge.
 
     Attributes:
-        map: What came out.
-        split: What each run took, in no order.
-        join: What each tile took.
-        see: What each column of tiles took.
-        shuffle_bytes: What was written by the first jobs for the second ones to read.
+        map: The merged map.
+        costs: Of the jobs of its stages: "split", one for each run, "join", one for each tile, and "slice",
+            one for each column of tiles; in no order.
+        shuffle_bytes: Size of the files between the first two stages.
     """
 
     map: MergedMap
-    split: tuple[Effort, ...]
-    join: tuple[Effort, ...]
-    see: tuple[Effort, ...]
+    costs: Mapping[str, Sequence[Cost]]
     shuffle_bytes: int
 
 
@@ -72,15 +69,15 @@ def merge(
     """Add up the maps of runs, tile by tile, as independent evidence (Bayes, prior 0.5).
 
     No process ever holds more than one run's map, or one tile and one run's part of it. The bytes do not
-    depend on who did the jobs or in which order; the order of the runs shows in the last bit of a log-odds. A
-    merge that was stopped goes on where it was when it is started again with the same runs.
+    depend on where or in which order the jobs ran; the order of the runs shows in the last bit of a log-odds.
+    A merge that was stopped goes on where it was when it is started again with the same runs.
 
     Args:
-        placed: The runs, and where their worlds lie.
+        placed: The runs, and the poses of their worlds.
         out: Folder to create; until it is whole it is called ``OUT.partial``.
         tile_m: About how long the edge of a tile is.
         workers: Where the jobs run; those of a Dask cluster must see the same files.
-        progress: Who watches.
+        progress: Told how far it is.
         overwrite: Replace a map that is there, once the new one is whole.
 
     Raises:
@@ -106,36 +103,34 @@ def merge(
         ) as folder,
     ):
         manifest.save(folder)
-        doubtful = doubts(placed)
-        for note in doubtful:
+        warnings = warnings_about(placed)
+        for note in warnings:
             progress.note(note)
-        site = Site(folder, folder / _SCRATCH, tiling, config)
-        stages = Stages(JobRunner(site.scratch / "done", progress), executor, progress)
-        split = _split(site, stages, placed)
-        joined = _join(site, stages, split, follows_ground=manifest.slice.above == "ground")
+        workspace = Workspace(folder, folder / _SCRATCH, tiling, config)
+        stages = Stages(JobRunner(workspace.scratch / "done", progress), executor, progress)
+        split = _split(workspace, stages, placed)
+        joined = _join(workspace, stages, split, follows_ground=manifest.slice.above == "ground")
         has_colors = any(part.has_colors for part in split)
-        write_whole_ot(folder / files.OCTREE_OT, site, joined, has_colors=has_colors)
-        write_whole_bt(folder / files.OCTREE_BT, site, joined)
-        seen, grid, missing = look_from_above(site, stages, joined, manifest, placed)
+        write_whole_ot(folder / files.OCTREE_OT, workspace, joined, has_colors=has_colors)
+        write_whole_bt(folder / files.OCTREE_BT, workspace, joined)
+        columns, grid, missing = slice_map(workspace, stages, joined, manifest, placed)
         for note in missing:
             progress.note(note)
-        manifest = _completed(manifest, site, split, joined, seen, [*doubtful, *missing])
+        manifest = _completed(manifest, workspace, split, joined, columns, [*warnings, *missing])
         if grid is not None:
             write_grid(folder, files.SLICE, grid)
             draw(folder / files.SUMMARY, grid, placed, manifest)
-        _clean(site, joined)
+        _clean(workspace, joined)
         manifest.save(folder)
     return Merged(
         map=open_map(out),
-        split=tuple(part.effort for part in split),
-        join=tuple(tile.effort for tile in joined.values()),
-        see=tuple(column.effort for column in seen),
+        costs=stages.costs,
         shuffle_bytes=sum(sum(part.part_bytes.values()) for part in split),
     )
 
 
 def _common_config(placed: Sequence[Placed]) -> OctreeConfig:
-    """Return the configuration of the map, after the runs have been found fit to be merged."""
+    """Return the configuration of the map, after checking that the runs can be merged."""
     if not placed:
         raise ConfigError("nothing to merge; name the run folders")
     first = placed[0].run
@@ -175,18 +170,18 @@ def _floor_z_m(first: Placed) -> float:
 
 
 def _begun_alike(partial: Path, manifest: MapManifest) -> bool:
-    """Tell whether what was left behind is the beginning of this very merge."""
+    """Return whether a folder that was left behind is the beginning of this very merge."""
     try:
         return MapManifest.model_validate_json((partial / MANIFEST_NAME).read_bytes()) == manifest
     except (OSError, ValidationError):
         return False
 
 
-def _split(site: Site, stages: Stages, placed: Sequence[Placed]) -> list[SplitRun]:
+def _split(workspace: Workspace, stages: Stages, placed: Sequence[Placed]) -> list[SplitRun]:
     jobs = {
         f"{index:04d}": partial(
             split_run,
-            site,
+            workspace,
             index,
             item.run.path.resolve() / files.OCTREE_MAP,
             None if item.stays else item.T_map_world,
@@ -198,16 +193,16 @@ def _split(site: Site, stages: Stages, placed: Sequence[Placed]) -> list[SplitRu
 
 
 def _join(
-    site: Site, stages: Stages, split: Sequence[SplitRun], *, follows_ground: bool
+    workspace: Workspace, stages: Stages, split: Sequence[SplitRun], *, follows_ground: bool
 ) -> dict[int, JoinedTile]:
-    """Return what became of every tile, in Morton order."""
+    """Return the result of every tile, in Morton order."""
     tiles = sorted({tile for part in split for tile in part.part_bytes})
     if not tiles:
         raise RunError("nothing is known in any of the runs' maps; there is nothing to merge")
     jobs = {
-        site.tiling.name_of(tile): partial(
+        workspace.tiling.name_of(tile): partial(
             join_tile,
-            site,
+            workspace,
             tile,
             [run for run, part in enumerate(split) if tile in part.part_bytes],
             has_colors=any(part.has_colors for part in split),
@@ -219,16 +214,16 @@ def _join(
     done = {}
     for name, joined in stages.run("join", jobs, JoinedTile):
         done[tile_of[name]] = joined
-        shutil.rmtree(site.parts(tile_of[name]), ignore_errors=True)
+        shutil.rmtree(workspace.parts(tile_of[name]), ignore_errors=True)
     return {tile: done[tile] for tile in tiles}
 
 
 def _completed(
     manifest: MapManifest,
-    site: Site,
+    workspace: Workspace,
     split: Sequence[SplitRun],
     joined: Mapping[int, JoinedTile],
-    seen: Sequence[SeenColumn],
+    columns: Sequence[SlicedColumn],
     notes: Sequence[str],
 ) -> MapManifest:
     """Return the manifest of the map when it is whole."""
@@ -246,18 +241,18 @@ def _completed(
         )
         for run, part, (shared, both, either) in zip(manifest.runs, split, counts, strict=True)
     )
-    lower_m = {tile: site.tiling.lower_m(tile) for tile in joined}
+    lower_m = {tile: workspace.tiling.lower_m(tile) for tile in joined}
     tiles = tuple(
         Tile(
-            name=site.tiling.name_of(tile),
+            name=workspace.tiling.name_of(tile),
             lower_m=tuple(lower_m[tile].tolist()),
-            upper_m=tuple((lower_m[tile] + site.tiling.edge_m).tolist()),
+            upper_m=tuple((lower_m[tile] + workspace.tiling.edge_m).tolist()),
             voxels=result.voxels,
             runs=tuple(runs_of[tile]),
         )
         for tile, result in joined.items()
     )
-    area_m2 = sum(column.known_columns for column in seen) * site.tiling.resolution_m**2
+    area_m2 = sum(column.known_columns for column in columns) * workspace.tiling.resolution_m**2
     return manifest.model_copy(
         update={
             "status": "complete",
@@ -270,10 +265,10 @@ def _completed(
     )
 
 
-def _clean(site: Site, joined: Mapping[int, JoinedTile]) -> None:
-    """Remove what only the merge needed, and what a worker that was killed may have left among the tiles."""
-    shutil.rmtree(site.scratch)
-    wanted = {site.tile(tile) for tile in joined}
-    for file in (site.folder / TILES).iterdir():
+def _clean(workspace: Workspace, joined: Mapping[int, JoinedTile]) -> None:
+    """Remove the scratch folder, and files that a killed worker may have left among the tiles."""
+    shutil.rmtree(workspace.scratch)
+    wanted = {workspace.tile(tile) for tile in joined}
+    for file in (workspace.folder / TILES).iterdir():
         if file not in wanted:
             file.unlink()

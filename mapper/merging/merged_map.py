@@ -1,4 +1,4 @@
-"""What a merged map says about itself, and how a part of it is opened."""
+"""Merged map on disk: its manifest, and the opening of a part of it."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,7 +51,7 @@ class Tile(Config):
     voxels: int
     """Known ones."""
     runs: tuple[int, ...]
-    """Places of the runs in the list that know something here."""
+    """Places in the list of the runs that know any voxel here."""
 
 
 class MapManifest(Config):
@@ -73,7 +73,7 @@ class MapManifest(Config):
 
     @property
     def summary(self) -> str:
-        """How large it is, in a line."""
+        """Its size, in a line."""
         return (
             f"{self.voxels} voxels of {self.octree.resolution_m:g} m in {len(self.tiles)} tiles of "
             f"{self.tile_m:g} m, {1e6 * self.area_km2:.0f} m² seen from above"
@@ -90,7 +90,7 @@ class MergedMap:
 
     Attributes:
         path: Its folder.
-        manifest: What it says about itself.
+        manifest: Its ``manifest.json``.
     """
 
     path: Path

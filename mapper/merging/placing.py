@@ -1,4 +1,4 @@
-"""Where the runs' worlds lie in the map: as they are, by their truths, or as a file tells."""
+"""Poses of the runs' worlds in the map: as they are, by their truths, or from a file."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from mapper.core.timebase import MAX_TRUTH_GAP_NS, nearest
 from mapper.run.folder import Run
 
 _LEVER_M = 1.0
-"""A straight path alone would not tell how a run is turned about it; the body's axes, so long, do."""
+"""Length of the body's axes in the fit: a straight path alone leaves a turn about itself open."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,9 +22,9 @@ class Placed:
     """A run in the map.
 
     Attributes:
-        run: It.
+        run: The run.
         T_map_world: (4, 4) pose of its world in the map.
-        how: How that is known, in a few words.
+        how: Where the pose comes from, in a few words.
     """
 
     run: Run
@@ -38,12 +38,12 @@ class Placed:
 
 
 def as_built(runs: Sequence[Run]) -> list[Placed]:
-    """Take every run's world for the map's: sessions of one chain, or logs that were mapped in one frame."""
+    """Place every run by the identity: sessions of one chain, or logs that were mapped in one frame."""
     return [Placed(run, np.eye(4), "as built") for run in runs]
 
 
 def by_truth(runs: Sequence[Run]) -> list[Placed]:
-    """Bring runs together by their truths, which share a frame, in the world of the first.
+    """Place runs by their truths, which share a frame, in the world of the first.
 
     The first run is not moved, so the map is as level as it is, and as sharp.
 
@@ -60,7 +60,7 @@ def by_truth(runs: Sequence[Run]) -> list[Placed]:
 
 
 def by_poses(runs: Sequence[Run], path: Path) -> list[Placed]:
-    """Place runs as a file says: a line ``RUN tx ty tz qx qy qz qw``, the pose of its world, for each folder.
+    """Place runs by a file: a line ``RUN tx ty tz qx qy qz qw``, the pose of its world, for each folder.
 
     Raises:
         DataError: The file cannot be read, a line is not like that, or a run has none or two.
@@ -76,8 +76,8 @@ def by_poses(runs: Sequence[Run], path: Path) -> list[Placed]:
     return [Placed(run, poses[_name(run)], f"by {path.name}") for run in runs]
 
 
-def doubts(placed: Sequence[Placed]) -> list[str]:
-    """Return what a user should know about the runs that are going to be added up, a line each."""
+def warnings_about(placed: Sequence[Placed]) -> list[str]:
+    """Return warnings about the runs that are going to be added up, a line each."""
     found = []
     if len(placed) > 1 and all(item.stays for item in placed):
         found.append(

@@ -1,4 +1,4 @@
-"""Cubes that a map is cut into: the nodes of its octree at one depth, so their order is the octree's own."""
+"""Tiling: the cubes that a map is cut into, nodes of its octree at one depth and in its order."""
 
 from dataclasses import dataclass
 from math import log2
@@ -13,7 +13,7 @@ from mapper.octree.keys import BLOCK_BITS, KEY_BITS, KEY_ZERO, gather
 
 @dataclass(frozen=True, slots=True)
 class Tiling:
-    """How large the tiles are.
+    """Size of the tiles.
 
     Attributes:
         resolution_m: Edge of a voxel.

@@ -1,6 +1,6 @@
-"""The files of the whole, written from the tiles' pieces one after the other.
+"""OctoMap files of a merged map, written from the tiles' pieces one after the other.
 
-Tiles stand in Morton order, as OctoMap's files list nodes in preorder: what comes between the pieces are the
+Tiles stand in Morton order, and OctoMap's files list nodes in preorder: between the pieces there are only the
 few nodes above the tiles. The bytes are those of the whole map written in one piece.
 """
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.merging.steps import JoinedTile, Site
+from mapper.merging.jobs import JoinedTile, Workspace
 from mapper.octree.attributes import UNSET
 from mapper.octree.color_tree import COLOR_NODE, parent_color
 from mapper.octree.octomap_file import LEAF_ROOT, write_tree
@@ -19,24 +19,24 @@ from mapper.octree.tree import NODE, UpperNodes, children_in, preorder, upper_no
 Tiles = Mapping[int, JoinedTile]
 
 
-def write_whole_ot(path: Path, site: Site, tiles: Tiles, *, has_colors: bool) -> None:
+def write_whole_ot(path: Path, workspace: Workspace, tiles: Tiles, *, has_colors: bool) -> None:
     """Write the log-odds of all tiles as one ``.ot`` file; atomic.
 
     Args:
         path: File to write.
-        site: Where the tiles' pieces are.
+        workspace: With the tiles' pieces.
         tiles: Increasing.
         has_colors: Whether the map has any.
     """
     ordered = list(tiles)
-    upper = _upper(site, tiles, [joined.top for joined in tiles.values()])
+    upper = _upper(workspace, tiles, [joined.top for joined in tiles.values()])
     visited = preorder(upper).tolist()
     colors = _colors(upper, tiles) if has_colors else None
 
     def payload() -> Iterator[NDArray[np.generic]]:
         for node in visited:
             if node < len(tiles):
-                yield np.fromfile(site.piece(ordered[node], "ot"), np.uint8)
+                yield np.fromfile(workspace.piece(ordered[node], "ot"), np.uint8)
             elif colors is None:
                 yield upper.nodes[node : node + 1]
             else:
@@ -50,15 +50,15 @@ def write_whole_ot(path: Path, site: Site, tiles: Tiles, *, has_colors: bool) ->
         payload(),
         binary=False,
         node_count=sum(tiles[ordered[node]].nodes if node < len(tiles) else 1 for node in visited),
-        resolution_m=site.tiling.resolution_m,
+        resolution_m=workspace.tiling.resolution_m,
         tree_name="ColorOcTree" if has_colors else "OcTree",
     )
 
 
-def write_whole_bt(path: Path, site: Site, tiles: Tiles) -> None:
+def write_whole_bt(path: Path, workspace: Workspace, tiles: Tiles) -> None:
     """Write all tiles, each voxel free or occupied, as one ``.bt`` file; atomic."""
     ordered = list(tiles)
-    upper = _upper(site, tiles, [joined.state for joined in tiles.values()])
+    upper = _upper(workspace, tiles, [joined.state for joined in tiles.values()])
     visited = preorder(upper).tolist()
     words = {
         node: word_of(upper, node) for node in visited if node >= len(tiles) and upper.nodes[node]["mask"]
@@ -69,18 +69,20 @@ def write_whole_bt(path: Path, site: Site, tiles: Tiles) -> None:
     def payload() -> Iterator[NDArray[np.generic]]:
         for node in visited:
             if node < len(tiles):
-                yield np.fromfile(site.piece(ordered[node], "bt"), np.uint8)
+                yield np.fromfile(workspace.piece(ordered[node], "bt"), np.uint8)
             elif node in words:
                 yield words[node].astype("<u2", copy=False)
         if not children:
             yield LEAF_ROOT
 
-    write_tree(path, payload(), binary=True, node_count=1 + children, resolution_m=site.tiling.resolution_m)
+    write_tree(
+        path, payload(), binary=True, node_count=1 + children, resolution_m=workspace.tiling.resolution_m
+    )
 
 
-def _upper(site: Site, tiles: Tiles, tops: list[tuple[float, int]]) -> UpperNodes:
+def _upper(workspace: Workspace, tiles: Tiles, tops: list[tuple[float, int]]) -> UpperNodes:
     codes = np.fromiter(tiles, np.int64, len(tiles))
-    return upper_nodes(codes, np.array(tops, NODE), np.arange(len(tiles) + 1), levels=site.tiling.depth)
+    return upper_nodes(codes, np.array(tops, NODE), np.arange(len(tiles) + 1), levels=workspace.tiling.depth)
 
 
 def _colors(upper: UpperNodes, tiles: Tiles) -> NDArray[np.uint8]:
