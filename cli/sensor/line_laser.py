@@ -50,10 +50,8 @@ def line_laser(
 
     Example: mapper sensor line-laser drive/images --calibration C.toml --wheels drive/encoders.txt --out seen
     """
-    from evaluators.line_laser.labels import read_labels
-    from evaluators.line_laser.labels import score
-    from mapper.config.loading import overridden
-    from mapper.config.loading import read_config
+    from evaluators.line_laser.labels import read_labels, score
+    from mapper.config.loading import overridden, read_config
     from mapper.line_laser.config import THESIS, LineLaserCalibration, LineLaserConfig
     from mapper.line_laser.files import find_images
     from mapper.line_laser.products import write_drive, write_scans
@@ -112,8 +110,8 @@ def calibrate(
 
     Example: mapper sensor line-laser-calibrate drive/shots --wheelbase 0.26 --sensor-x 0.2 --out C.toml
     """
+    from evaluators.pictures.line_laser import write_calibration_picture
     from mapper.config.loading import overridden
-from evaluators.pictures.line_laser import write_calibration_picture
     from mapper.core.errors import RunError
     from mapper.line_laser.calibration import calibrate as fit_laws
     from mapper.line_laser.calibration import calibration_text
@@ -157,13 +155,8 @@ def accuracy(
     """
     from contextlib import nullcontext
 
-    from evaluators.line_laser.study import STUDY_COLUMNS
-    from evaluators.line_laser.study import TABLE_COLUMNS
-    from evaluators.line_laser.study import detections
-    from evaluators.line_laser.study import study
-    from evaluators.line_laser.study import table_2_1
+    from evaluators.line_laser.study import detections, study, table_2_1
     from evaluators.tables.table import csv_text
-    from evaluators.tables.table import text_table
     from mapper.config.loading import overridden
     from mapper.line_laser.config import LineLaserConfig
     from mapper.runtime.atomic import MANIFEST_NAME, atomic_folder, write_text

@@ -156,7 +156,7 @@ class MethodJob:
         progress: Told how far it is.
     """
 
-    source: FrameSource
+    source: Log
     config: CompareConfig
     method: str
     progress: Progress = SILENT
@@ -284,7 +284,7 @@ class MethodRun:
         }
 
 
-def _truth_during(source: FrameSource, frames_ns: Stamps) -> Trajectory | None:
+def _truth_during(source: Log, frames_ns: Stamps) -> Trajectory | None:
     """Return the true poses from the first frame to the last; None if there are none."""
     truth = source.truth
     if truth is None:

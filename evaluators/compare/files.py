@@ -7,8 +7,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mapper.runtime.atomic_folder import atomic_folder
-
 import mapper
 from evaluators.compare.comparison import Comparison, compare
 from evaluators.compare.config import CompareConfig
@@ -21,9 +19,9 @@ from evaluators.study.engine import CELLS
 from evaluators.tables.table import column, csv_text
 from mapper.core.geometry import Array
 from mapper.run.manifest import library_versions
-from mapper.runtime.atomic import MANIFEST_NAME, write_text
+from mapper.runtime.atomic import MANIFEST_NAME, atomic_folder, write_text
 from mapper.runtime.progress import SILENT, Progress
-from mapper.sources.base import FrameSource
+from mapper.sources.base import Log
 from mapper.sources.trajectory_files import write_tum
 
 TABLES, REPORT = "tables.md", "comparison.json"
@@ -35,7 +33,7 @@ TRAJECTORIES = "trajectories"
 
 def compare_into(
     out: Path,
-    source: FrameSource,
+    source: Log,
     config: CompareConfig,
     *,
     overwrite: bool = False,

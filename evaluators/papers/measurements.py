@@ -18,7 +18,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.run.fingerprint import fingerprint
 from mapper.runtime.job_runner import Job, JobResult
 from mapper.sources import open_source
-from mapper.sources.base import FrameSource
+from mapper.sources.base import Log
 
 CONFIGS = Path(__file__).with_name("configs")
 """The settings of the papers' methods: ``thesis/*.toml`` and ``zhao.toml``."""
@@ -86,7 +86,7 @@ def job_for(measurement: Measurement) -> Job:
     return Job(f"{name}.seed{seed}.{decides}", f"{name}, seed {seed}", measurement)
 
 
-def open_with_truth(log: Path, config: BuildConfig) -> tuple[FrameSource, Trajectory]:
+def open_with_truth(log: Path, config: BuildConfig) -> tuple[Log, Trajectory]:
     """Return a log and its ground truth.
 
     Raises:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from mapper.runtime.atomic_folder import MANIFEST_NAME
 
 from evaluators.depth_camera.accuracy import Accuracy, DepthLevel, ResidualMap
 from evaluators.depth_camera.noise_fit import NoiseFit
@@ -17,7 +16,7 @@ from evaluators.tables.table import csv_text
 from mapper.export.page import FAINT, INK, LINE, hex_of, save
 from mapper.export.palette import Rgb
 from mapper.export.panels import page, panel
-from mapper.runtime.atomic import write_text
+from mapper.runtime.atomic import MANIFEST_NAME, write_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -5,9 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from mapper.runtime.atomic_folder import locked
-
 from evaluators.study.versions import SameVersions, versions
+from mapper.runtime.atomic import locked
 from mapper.runtime.executor import IN_PROCESS, Workers, make_executor
 from mapper.runtime.job_runner import Job, JobResult, JobRunner
 from mapper.runtime.progress import SILENT, Progress
