@@ -1,7 +1,7 @@
 """How the back end bears long graphs, and false loops.
 
-    python benchmarks/graph_growth.py growth [--most 10000]
-    python benchmarks/graph_growth.py false-loops [--seeds 20]
+    python -m benchmarks.graph_growth growth [--most 10000]
+    python -m benchmarks.graph_growth false-loops [--seeds 20]
 
 "growth": one update of the incremental solver per keyframe with a loop, and one batch solve, against the
 number of keyframes; CPU time. A walk of 1000 keyframes a lap around a building, loops to earlier laps.
@@ -15,11 +15,12 @@ from time import process_time
 
 import numpy as np
 
-from mapper.core.geometry import Transform, apply, exp, fit_rigid, inverse, rotation_exp, transform
+from mapper.core.geometry import Transform, apply, exp, fit_rigid, rotation_exp, transform
 from mapper.graph.config import GraphConfig
 from mapper.graph.incremental import IncrementalSolver
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.graph.optimize import optimize
+from tests.support.noisy_graphs import noisy_measure, odometry_chain, wrong_alignment
 
 STEP_M = 0.15
 ODOMETRY = PoseSigmas(rotation_rad=0.002, translation_m=0.005)
@@ -71,19 +72,8 @@ def walk(
     rng = np.random.default_rng(seed)
     truth = true_poses(nodes, lap)
 
-    def measured(i: int, j: int, sigmas: PoseSigmas) -> Transform:
-        error = exp(
-            rng.normal(0.0, too_confident * sigmas.rotation_rad, 3),
-            rng.normal(0.0, too_confident * sigmas.translation_m, 3),
-        )
-        return inverse(truth[i]) @ truth[j] @ error
-
-    graph = PoseGraph()
-    graph.add_node(0, 0, truth[0])
-    for k in range(1, nodes):
-        T_before_here = measured(k - 1, k, ODOMETRY)
-        graph.add_node(k, k, graph.T_world_node[k - 1] @ T_before_here)
-        graph.add_factors([BetweenFactor(k - 1, k, T_before_here, ODOMETRY.information)])
+    measured = noisy_measure(truth, rng, too_confident=too_confident)
+    graph = odometry_chain(truth, measured, ODOMETRY)
     true_loops = 0
     for j in range(lap, nodes, loop_every):
         near = np.flatnonzero(np.linalg.norm(truth[: j - LEAST_GAP, :3, 3] - truth[j, :3, 3], axis=1) < 0.5)
@@ -98,9 +88,8 @@ def walk(
         if j - i < LEAST_GAP:
             continue
         T_i_j = exp(rng.normal(0.0, 0.3, 3), rng.normal(0.0, 1.0, 3))
-        for k in range(size):  # one wrong alignment of two stretches of the way
-            T_ik_jk = inverse(truth[i + k]) @ truth[i] @ T_i_j @ inverse(truth[j]) @ truth[j + k]
-            graph.add_factors([BetweenFactor(i + k, j + k, T_ik_jk, LOOP.information, "loop")])
+        for ik, jk, T_ik_jk in wrong_alignment(truth, i, j, T_i_j, size):
+            graph.add_factors([BetweenFactor(ik, jk, T_ik_jk, LOOP.information, "loop")])
         wanted -= size
     return Walk(truth, graph, true_loops)
 

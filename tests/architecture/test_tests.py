@@ -1,0 +1,33 @@
+"""The tests' own architecture: what they share is in tests/support, and no two files have one name."""
+
+import ast
+from collections import Counter
+
+from tests.support.paths import ROOT
+
+FILES = sorted((ROOT / "tests").rglob("*.py"))
+TESTS = [path for path in FILES if path.name.startswith("test_")]
+
+
+def test_no_test_imports_another_test():
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            match node:
+                case ast.ImportFrom(module=str(module), level=level):
+                    assert level == 0, f"{path}:{node.lineno}: import by full name"
+                    names = [module, *(f"{module}.{alias.name}" for alias in node.names)]
+                case ast.Import():
+                    names = [alias.name for alias in node.names]
+                case _:
+                    continue
+            for name in names:
+                parts = name.split(".")
+                is_test = any(part == "conftest" or part.startswith("test_") for part in parts)
+                assert not is_test, f"{path}:{node.lineno} imports {name}; share it in tests/support"
+                assert parts[0] != "tests" or parts[:2] in (["tests"], ["tests", "support"]), name
+
+
+def test_every_test_is_in_a_folder_and_has_a_name_of_its_own():
+    counts = Counter(path.name for path in TESTS)
+    assert [name for name, count in counts.items() if count > 1] == []
+    assert [path.name for path in TESTS if path.parent == ROOT / "tests"] == []

@@ -1,0 +1,314 @@
+import csv
+import inspect
+import io
+import json
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from cli.console import Bars, Lines
+from cli.evaluate import evaluate as evaluate_verb
+from cli.main import app
+from evaluators.metrics.evaluate import assess
+from mapper.run.folder import load_run
+from mapper.sources.trajectory_files import read_tum
+from tests.support.command_line import mapper
+
+VERBS = [
+    "build",
+    "fuse",
+    "loops",
+    "eval",
+    "export",
+    "merge",
+    "plan",
+    "solve",
+    "compare",
+    "sweep",
+    "reproduce",
+    "register",
+    "convert",
+    "synth",
+    "demo",
+    "config",
+    "view",
+    "report",
+    "doctor",
+    "inspect",
+]
+HEAVY = {
+    "cv2",
+    "numba",
+    "gtsam",
+    "matplotlib",
+    "mahotas",
+    "foxglove",
+    "mcap",
+    "pydantic",
+    "numpy",
+    "rich",
+    "open3d",
+    "kiss_icp",
+    "kiss_matcher",
+    "rerun",
+    "distributed",
+    "rosbags",
+    "laspy",
+}
+
+
+@pytest.fixture
+def run_folder(desk_run):
+    return desk_run.path
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_has_help_with_an_example(verb):
+    assert f"Example: mapper {verb} " in mapper(verb, "--help").stdout
+
+
+def test_no_verb_escapes_these_tests():
+    assert sorted(command.name for command in app.registered_commands) == sorted(VERBS)
+
+
+def test_help_loads_nothing_heavy():
+    code = "import sys; from cli.main import app; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert not HEAVY & {name.split(".")[0] for name in loaded.split()}
+
+
+def test_a_build_on_images_loads_nothing_that_only_scans_recordings_and_viewers_need(desk_log, tmp_path):
+    code = "import sys; from cli.main import app; app(standalone_mode=False); print(*sys.modules)"
+    arguments = ["build", desk_log, "--out", tmp_path / "run", "--last", "11", "--quiet"]
+    ran = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True)
+    assert not ran.stderr
+    loaded = {name.split(".")[0] for name in ran.stdout.split()}
+    assert not loaded & {"open3d", "kiss_icp", "kiss_matcher", "rerun", "laspy"}
+
+
+def test_build_prints_a_table(desk_log, tmp_path):
+    result = mapper("build", desk_log, "--out", tmp_path / "run", "--first", 3, "--last", 24, "--stride", 2)
+
+    assert "11 tracked, 0 lost, 0 skipped" in result.stdout
+    for row in ("keyframes", "ATE RMSE, SE(3)-aligned", "path length", "peak memory", "trajectory.tum"):
+        assert row in result.stdout
+    source = load_run(tmp_path / "run").config.source
+    assert (source.first_frame, source.last_frame, source.stride, source.require_truth) == (3, 24, 2, False)
+
+
+def test_build_is_quiet_when_told(desk_log, tmp_path):
+    result = mapper("build", desk_log, "--out", tmp_path / "run", "--last", 11, "--quiet")
+    assert result.output == ""
+
+
+def test_spelled_out_overrides_win(desk_log, tmp_path):
+    mapper(
+        "build", desk_log, "--out", tmp_path / "run", "--last", 5, "--set", "source.last_frame=12", "--quiet"
+    )
+    assert load_run(tmp_path / "run").config.source.last_frame == 12
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["build", "nowhere", "--out", "run"], "mapper: nowhere: no such file or folder"),
+        (["build", "LOG", "--out", "RUN"], "pass --overwrite to replace it"),
+        (["build", "LOG", "--out", "run", "--set", "a.b=1"], "mapper: overrides: a: Extra inputs"),
+        (["build", "LOG", "--out", "run", "--last", "4", "--quiet"], "mapper: only 5 of 5 frames read"),
+        (["build", "LOG", "--out", "run", "--config", "no.toml"], "mapper: no.toml: cannot be read"),
+        (["fuse", "nowhere"], "mapper: nowhere: no such run folder"),
+        (["fuse", "RUN", "--set", "graph.solve=none"], "mapper: graph: fuse keeps what was tracked"),
+        (["fuse", "RUN", "--log", "gone"], "gone: the log of RUN is no longer there; tell its new place"),
+        (["export", "nowhere", "--as", "ply"], "mapper: nowhere: no such run folder"),
+        (
+            ["export", "RUN", "--as", "jpeg"],
+            "mapper: no exporter 'jpeg'; want one of octomap, native, ply, voxels",
+        ),
+        (["export", "RUN", "--as", "ply", "--out", "a.obj"], "mapper: a.obj: ply files end with .ply"),
+        (["export", "RUN", "--as", "tum", "--set", "a.b=1"], "mapper: overrides: a: Extra inputs"),
+        (["eval", "nowhere"], "mapper: nowhere: no such run folder"),
+        (["eval", "RUN", "--map", "nowhere"], "mapper: nowhere: no such reference for a map"),
+        (["eval", "RUN", "--tolerance", "2"], "mapper: --map-world, --register and --tolerance tell how"),
+        (["eval", "RUN", "--lengths", "1;2"], "mapper: --lengths 1;2: want metres with commas"),
+        (["eval", "RUN", "--lengths", "99"], "mapper: --lengths 99: the true path, where there are poses"),
+        (["eval", "RUN", "--log", "nowhere"], "mapper: nowhere: --log is for bare trajectories"),
+        (["eval", "RUN", "--times", "nowhere"], "mapper: nowhere: --times is for poses in KITTI text"),
+        (["eval", "RUN", "--truth", "nowhere"], "mapper: nowhere: cannot be read"),
+        (["convert", "nowhere", "--out", "log", "--as", "tum"], "mapper: nowhere: no such file or folder"),
+        (["synth", "log", "--rooms", "5"], "mapper: overrides: rooms: Input should be a multiple of 2"),
+        (["demo", "--out", "LOG", "--set", "workers=x"], "mapper: overrides: workers: Input should be"),
+        (["config", "--set", "odometry.kind=zip"], "mapper: overrides: odometry: Input tag 'zip' found"),
+    ],
+)
+def test_a_mistake_is_one_line(run_folder, desk_log, tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    places = {"LOG": str(desk_log), "RUN": str(run_folder)}
+    result = mapper(*(places.get(word, word) for word in arguments), status=1)
+
+    assert len(result.stderr.splitlines()) == 1
+    assert message.replace("RUN", str(run_folder)) in result.stderr
+
+
+def test_a_failed_build_says_where_its_rest_is(desk_log, tmp_path):
+    result = mapper("build", desk_log, "--out", tmp_path / "run", "--last", 4, "--quiet", status=1)
+    assert f"what there is so far stays in {tmp_path / 'run.partial'}" in result.stderr
+
+
+def test_ctrl_c_ends_with_130_and_one_line(desk_log, tmp_path, monkeypatch):
+    def interrupt(*_arguments, **_options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mapper.pipeline.build.build", interrupt)
+    result = mapper("build", desk_log, "--out", tmp_path / "run", status=130)
+    assert result.stderr == "mapper: interrupted\n"
+
+
+def test_a_bug_keeps_its_traceback(desk_log, tmp_path, monkeypatch):
+    def stumble(*_arguments, **_options):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("mapper.pipeline.build.build", stumble)
+    with pytest.raises(ZeroDivisionError):
+        mapper("build", desk_log, "--out", tmp_path / "run")
+
+
+def test_fuse_changes_the_map_of_a_run(run_folder, tmp_path):
+    run = shutil.copytree(run_folder, tmp_path / "run")
+
+    assert "leaves of 0.2 m" in mapper("fuse", run, "--set", "octree.resolution_m=0.2").stdout
+
+    assert load_run(run).manifest.counts.leaves < load_run(run_folder).manifest.counts.leaves
+    assert (run / "trajectory.tum").read_bytes() == (run_folder / "trajectory.tum").read_bytes()
+
+
+def test_export_prints_where_its_file_is(run_folder, tmp_path):
+    assert mapper("export", run_folder, "--as", "tum").stdout == f"{run_folder / 'trajectory.tum'}\n"
+
+    out = tmp_path / "poses.txt"
+    assert mapper("export", run_folder, "--as", "kitti", "--out", out).stdout == f"{out}\n"
+    again = mapper("export", run_folder, "--as", "kitti", "--out", out, status=1)
+    assert again.stderr == (
+        f"mapper: {out}: exists already; choose another --out, or pass --overwrite to replace it\n"
+    )
+    assert mapper("export", run_folder, "--as", "kitti", "--out", out, "--overwrite", "--quiet").output == ""
+
+
+def test_eval_states_the_alignment_and_agrees_with_the_library(run_folder, desk_log):
+    estimate, truth = run_folder / "trajectory.tum", desk_log / "groundtruth.txt"
+
+    of_run = json.loads(mapper("eval", run_folder, "--json").stdout)
+    of_files = json.loads(mapper("eval", estimate, "--truth", truth, "--log", desk_log, "--json").stdout)
+
+    values = {metric["name"]: metric["value"] for metric in of_files}
+    frames_ns = np.array([record.stamp_ns for record in load_run(run_folder).records()])
+    found = assess(read_tum(estimate), read_tum(truth), frames_ns=frames_ns)
+    assert {m.name: m.value for m in found.metrics}.items() <= values.items()
+    told = {metric["name"]: metric["value"] for metric in of_run}
+    assert {name: told[name] for name in values} == pytest.approx(values)
+    assert told.keys() - values.keys() == {
+        "loops",
+        "loops wrongly accepted",
+        "true revisits",
+        "true revisits with a loop",
+    }
+    assert told["loops wrongly accepted"] == 0
+    assert "ATE RMSE, SE(3)-aligned" in mapper("eval", run_folder).stdout
+    assert "ATE RMSE, Sim(3)-aligned" in mapper("eval", run_folder, "--align", "sim3").stdout
+    assert "ATE RMSE, not aligned" in mapper("eval", run_folder, "--align", "none").stdout
+    assert "ATE" not in mapper("eval", estimate).stdout
+
+
+def test_eval_holds_the_map_against_the_world_of_a_synthetic_log(run_folder, desk_log, tmp_path):
+    plots = tmp_path / "plots"
+    printed = mapper("eval", run_folder, "--map", desk_log, "--sharpness", "--plot", plots, "--format", "csv")
+    values = {row["name"]: float(row["value"]) for row in csv.DictReader(io.StringIO(printed.stdout))}
+    assert values["occupied F-score, within 1 voxel"] > 0.9
+    assert 0.0 < values["wall thickness median, radius 0.2 m"] < 0.1
+    assert sorted(path.name for path in plots.iterdir()) == ["map.png", "trajectory.png"]
+
+    of_itself = mapper(
+        "eval", run_folder, "--map", run_folder, "--tolerance", 0, "--format", "markdown"
+    ).stdout
+    assert "| occupied F-score, within 0 voxels | 1 | ratio |" in of_itself
+    lost = json.loads(mapper("eval", run_folder, "--map", desk_log, "--map-world", "map", "--json").stdout)
+    scores = {row["name"]: row["value"] for row in lost}
+    assert scores["occupied F-score, within 1 voxel"] < 0.7
+
+
+def test_eval_reads_kitti_text_with_and_without_times(run_folder, tmp_path):
+    poses, times = tmp_path / "poses.txt", tmp_path / "times.txt"
+    mapper("export", run_folder, "--as", "kitti", "--out", poses)
+    times.write_text("\n".join((run_folder / "trajectory.tum").read_text().split("\n")[1:]))
+    by_line = json.loads(mapper("eval", poses, "--truth", poses, "--json").stdout)
+    by_time = json.loads(
+        mapper("eval", poses, "--truth", run_folder / "truth.tum", "--times", times, "--json").stdout
+    )
+    of_run = json.loads(mapper("eval", run_folder, "--json").stdout)
+    assert by_line[1]["value"] < 1e-9
+    assert by_time[1] == pytest.approx(of_run[1])
+
+
+def test_eval_has_the_library_s_default():
+    on_the_line = inspect.signature(evaluate_verb).parameters["align"].default
+    assert on_the_line == inspect.signature(assess).parameters["alignment"].default
+
+
+def test_a_converted_log_gives_the_same_trajectory(run_folder, desk_log, tmp_path):
+    mapper("convert", desk_log, "--as", "mbag", "--out", tmp_path / "log")
+    mapper("build", tmp_path / "log", "--out", tmp_path / "run", "--quiet")
+
+    ours, theirs = load_run(tmp_path / "run").trajectory(), load_run(run_folder).trajectory()
+    assert ours.stamps_ns.tolist() == theirs.stamps_ns.tolist()
+    assert abs(ours.T_world_body - theirs.T_world_body).max() < 1e-12
+
+
+def test_a_synthetic_log_has_the_length_asked_for(tmp_path):
+    scene = ["width_px=64", "height_px=48", "texture_px_per_m=16", "frame_rate_hz=10"]
+    settings = [word for knob in scene for word in ("--set", knob)]
+    mapper("synth", tmp_path / "log", "--seconds", 1, "--path", "spin", "--seed", 3, *settings)
+
+    assert len(list((tmp_path / "log" / "rgb").iterdir())) == 11
+    assert json.loads((tmp_path / "log" / "scene.json").read_text())["config"]["seed"] == 3
+
+
+def test_config_prints_what_build_would_use(tmp_path):
+    path = tmp_path / "isvd.json"
+    path.write_text(mapper("config", "--set", "odometry.kind=isvd", "--set", "workers=1").stdout)
+
+    again = mapper("config", "--config", path).stdout
+    assert json.loads(again) == json.loads(path.read_text())
+    assert json.loads(again)["odometry"]["previous_frames"] == 4
+
+
+def test_a_package_that_cannot_be_written_gets_another_place_for_compiled_code(tmp_path, monkeypatch):
+    from cli import environment
+
+    monkeypatch.setattr(environment.os, "access", lambda _path, _mode: False)
+    monkeypatch.setattr(environment.os, "environ", {"XDG_CACHE_HOME": str(tmp_path)})
+    environment.prepare_environment()
+
+    assert environment.os.environ["NUMBA_CACHE_DIR"] == str(tmp_path / "mapper" / "numba")
+    assert environment.os.environ["OMP_NUM_THREADS"] == "1"
+
+
+def test_many_notes_become_few_lines(capsys):
+    lines = Lines()
+    for i in range(100):
+        lines.note(f"skipped: {i}")
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "mapper: skipped: 0"
+    assert len(said) == 6
+
+
+def test_bars_end_full(monkeypatch, capsys):
+    monkeypatch.setenv("TERM", "xterm")
+    with Bars().stage("fuse") as report:
+        report(3, 3)
+    assert "3/3" in capsys.readouterr().err
+
+
+def test_the_version_is_printed():
+    assert mapper("--version").stdout.startswith("mapper ")

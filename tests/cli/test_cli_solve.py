@@ -1,0 +1,145 @@
+"""``mapper solve`` from the command line."""
+
+import json
+
+import numpy as np
+import pytest
+
+from mapper.core.geometry import exp, inverse, transform
+from mapper.graph.g2o import read_g2o, write_g2o
+from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
+from mapper.sources.trajectory_files import read_tum
+from tests.support.command_line import invoke
+
+INFORMATION = PoseSigmas(rotation_rad=0.01, translation_m=0.02).information
+
+
+def solved(*arguments):
+    result = invoke("solve", *arguments)
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def ring(n=20, *, seed=0):
+    """Truth, and a graph of it whose estimates drift and whose last node sees the first four again."""
+    rng = np.random.default_rng(seed)
+    angles = np.linspace(0.0, 2.0 * np.pi, n)
+    truth = [
+        exp(np.array([0.0, 0.0, a]), np.zeros(3)) @ transform(np.eye(3), [2.0, 0.0, 0.0]) for a in angles
+    ]
+    graph = PoseGraph()
+    graph.add_node(0, 10**9, truth[0])
+    for k in range(1, n):
+        error = exp(rng.normal(0, 0.01, 3), rng.normal(0, 0.02, 3))
+        T_before_here = inverse(truth[k - 1]) @ truth[k] @ error
+        graph.add_node(k, (k + 1) * 10**9, graph.T_world_node[k - 1] @ T_before_here)
+        graph.add_factors([BetweenFactor(k - 1, k, T_before_here, INFORMATION)])
+    graph.add_factors(
+        BetweenFactor(k, n - 1, inverse(truth[k]) @ truth[n - 1], INFORMATION, "loop") for k in range(4)
+    )
+    return graph, truth
+
+
+def with_a_false_loop(graph):
+    wrong = transform(np.eye(3), [0.0, 0.0, 3.0])
+    graph.add_factors([BetweenFactor(5, 12, wrong, INFORMATION, "loop")])
+    return graph
+
+
+def test_a_folder_holds_graph_path_picture_and_report(tmp_path):
+    graph, truth = ring()
+    write_g2o(tmp_path / "ring.g2o", with_a_false_loop(graph))
+
+    shown = solved(tmp_path / "ring.g2o", "--out", tmp_path / "out").stdout
+
+    report = json.loads((tmp_path / "out/solve.json").read_text())
+    assert report["nodes"] == 20
+    assert report["edges"] == 24
+    assert report["loops"] == 5
+    assert report["rejected"] == [[5, 12]]
+    assert report["component_sizes"] == [20]
+    assert 0.0 < report["error_after"] < report["error_before"]
+    assert "4 of 5 accepted" in shown
+    again = read_g2o(tmp_path / "out/graph.g2o")
+    assert [factor.origin for factor in again.factors].count("loop") == 5
+    assert np.linalg.norm(again.T_world_node[19][:3, 3] - truth[19][:3, 3]) < 0.05
+    path = read_tum(tmp_path / "out/keyframes.tum")
+    assert path.stamps_ns.tolist() == list(graph.stamps_ns.values())
+    np.testing.assert_allclose(path.T_world_body[7], again.T_world_node[7], atol=1e-12)
+    assert (tmp_path / "out/graph.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_file_is_the_same_graph_with_solved_nodes(tmp_path):
+    graph, _ = ring()
+    write_g2o(tmp_path / "ring.g2o", graph)
+    result = solved(tmp_path / "ring.g2o", "--out", tmp_path / "out.g2o", "--quiet")
+    assert result.stdout == ""
+    again = read_g2o(tmp_path / "out.g2o")
+    assert again.stamps_ns == graph.stamps_ns
+    assert len(again.factors) == len(graph.factors)
+    assert (again.T_world_node[19] != graph.T_world_node[19]).any()
+
+
+def stripped(path):
+    """The same graph as somebody else would have written it."""
+    text = "\n".join(line.partition("#")[0] for line in path.read_text().splitlines())
+    path.write_text(text + "\n")
+    return path
+
+
+def test_a_foreign_file_is_plain_least_squares_unless_doubt_is_asked_for(tmp_path):
+    write_g2o(tmp_path / "ring.g2o", with_a_false_loop(ring()[0]))
+    foreign = stripped(tmp_path / "ring.g2o")
+    plain = solved(foreign, "--out", tmp_path / "plain").stdout
+    solved(foreign, "--out", tmp_path / "robust", "--robust", "dcs")
+    plain_report = json.loads((tmp_path / "plain/solve.json").read_text())
+    robust_report = json.loads((tmp_path / "robust/solve.json").read_text())
+    assert plain_report["loops"] == 0
+    assert "accepted" not in plain
+    assert robust_report["loops"] == 5
+    assert robust_report["rejected"] == [[5, 12]]
+    assert robust_report["error_after"] < 0.1 * plain_report["error_after"]
+
+
+def test_components_are_reported(tmp_path):
+    graph, _ = ring()
+    graph.add_node(100, 100 * 10**9, np.eye(4))
+    graph.add_node(101, 101 * 10**9, np.eye(4))
+    graph.add_factors([BetweenFactor(100, 101, transform(np.eye(3), [1.0, 0.0, 0.0]), INFORMATION)])
+    write_g2o(tmp_path / "two.g2o", graph)
+    shown = solved(tmp_path / "two.g2o", "--out", tmp_path / "out.g2o").stdout
+    assert "2, each solved on its own: 20, 2 nodes" in shown
+    assert read_g2o(tmp_path / "out.g2o").T_world_node[101][0, 3] == pytest.approx(1.0)
+
+
+def test_every_knob_of_the_graph_turns(tmp_path):
+    write_g2o(tmp_path / "ring.g2o", ring()[0])
+    knobs = ("--robust", "none", "--initial", "given", "--set", "graph.max_iterations=1")
+    solved(tmp_path / "ring.g2o", "--out", tmp_path / "out", *knobs)
+    report = json.loads((tmp_path / "out/solve.json").read_text())
+    assert report["iterations"] == 1
+    assert report["config"]["initial"] == "given"
+    assert report["config"]["robust"] == "none"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--set", "octree.resolution_m=1"], "octree: Extra inputs are not permitted"),
+        (["--set", "max_iterations=0"], "max_iterations: Input should be greater than 0"),
+    ],
+)
+def test_a_knob_that_is_none_is_refused(tmp_path, arguments, message):
+    write_g2o(tmp_path / "ring.g2o", ring()[0])
+    result = invoke("solve", tmp_path / "ring.g2o", "--out", tmp_path / "out.g2o", *arguments)
+    assert result.exit_code == 1
+    assert message in result.stderr
+
+
+def test_a_folder_that_is_there_is_not_written_into(tmp_path):
+    write_g2o(tmp_path / "ring.g2o", ring()[0])
+    (tmp_path / "out").mkdir()
+    result = invoke("solve", tmp_path / "ring.g2o", "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert "exists already" in result.stderr
+    assert not any((tmp_path / "out").iterdir())

@@ -1,0 +1,150 @@
+import json
+
+import pytest
+
+from mapper.config.build import BuildConfig
+from mapper.config.loading import load_config, load_run_config, overridden
+from mapper.core.errors import ConfigError, MapperWarning
+from mapper.features.config import SurfConfig
+from mapper.octree.config import OctreeConfig
+from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig
+from mapper.simulation.config import SynthConfig
+from tests.support.paths import CONFIGS
+
+
+@pytest.fixture
+def toml(tmp_path):
+    def write(text):
+        path = tmp_path / "lab.toml"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_no_file_and_no_override_are_the_defaults():
+    assert load_config() == BuildConfig()
+
+
+def test_an_override_wins_over_the_file_and_leaves_the_rest(toml):
+    config = load_config(toml("[octree]\nresolution_m = 0.2\nmax_range_m = 3\n"), ["octree.resolution_m=0.1"])
+
+    assert config.octree.resolution_m == 0.1
+    assert config.octree.max_range_m == 3.0
+    assert config.slice == BuildConfig().slice
+
+
+def test_one_knob_keeps_the_default_kind():
+    config = load_config(overrides=["odometry.detector.max_features=500"])
+
+    assert type(config.odometry) is LocalMapConfig
+    assert config.odometry.detector == LocalMapConfig().detector.model_copy(update={"max_features": 500})
+
+
+def test_one_knob_keeps_the_kind_of_the_file_and_its_default_detector(toml):
+    config = load_config(
+        toml('[odometry]\nkind = "isvd"\n'),
+        ["odometry.previous_frames=2", "odometry.detector.max_features=500"],
+    )
+
+    assert config.odometry == IsvdOdometryConfig(previous_frames=2, detector=SurfConfig(max_features=500))
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("octree.resolution=0.1", "overrides: octree.resolution: Extra inputs are not permitted"),
+        ("octree.resolution_m=-1", "overrides: octree.resolution_m: Input should be greater than 0"),
+        ("odometry.previous_frames=2", "odometry.local-map.previous_frames: Extra inputs are not permitted"),
+        ("odometry.kind=zip", "overrides: odometry: Input tag 'zip' found using 'kind' does not match any"),
+        ("workers=many", "overrides: workers: Input should be a valid integer"),
+        ("workers", "override 'workers': want key.path=value"),
+        ("workers.x.y=1", "overrides: workers: Input should be a valid integer"),
+    ],
+)
+def test_a_mistake_is_named_in_one_line(override, message):
+    with pytest.raises(ConfigError) as caught:
+        load_config(overrides=[override])
+
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_mistake_in_a_file_names_the_file(toml):
+    path = toml("[slice]\nmax_height = 2\n")
+
+    with pytest.raises(ConfigError, match=r"lab\.toml: slice\.max_height: Extra inputs are not permitted"):
+        load_config(path, ["workers=1"])
+
+
+def test_files_that_cannot_be_parsed_or_read(toml, tmp_path):
+    with pytest.raises(ConfigError, match="not valid TOML"):
+        load_config(toml("[slice\n"))
+    with pytest.raises(ConfigError, match="No such file"):
+        load_config(tmp_path / "none.toml")
+
+
+def test_a_run_s_own_json_gives_the_same_configuration(tmp_path):
+    config = load_config(overrides=["odometry.kind=isvd", "source.first_frame=3"])
+    path = tmp_path / "config.json"
+    path.write_text(config.model_dump_json(indent=2))
+
+    assert load_config(path) == config
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("octree.resolution_m=inf", "octree.resolution_m: Input should be a finite number"),
+        ("slice.min_height_m=nan", "slice.min_height_m: Input should be a finite number"),
+        ("slice.min_height_m=1.2", "slice: .*max_height_m 1.2 must be above min_height_m 1.2"),
+    ],
+)
+def test_values_that_would_fail_late_are_refused_early(override, message):
+    with pytest.raises(ConfigError, match=message):
+        load_config(None, [override])
+
+
+def test_a_run_of_an_older_version_loses_the_settings_that_are_no_more(tmp_path):
+    tree = BuildConfig().model_dump(mode="json")
+    tree["odometry"]["former"], tree["odometry"]["detector"]["gone"] = 1, 2
+    tree["octree"]["resolution_m"], tree["old_part"] = 0.1, {"a": 1}
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps(tree))
+    (tmp_path / "manifest.json").write_text("{}")
+    names = r"odometry\.detector\.gone, odometry\.former, old_part$"
+
+    with pytest.warns(MapperWarning, match=names):
+        loaded = load_run_config(path)
+    with pytest.warns(MapperWarning, match=names):
+        again = load_config(path)
+
+    assert loaded == again == BuildConfig(octree=OctreeConfig(resolution_m=0.1))
+
+
+def test_a_file_of_a_user_keeps_no_unknown_setting(tmp_path):
+    path = tmp_path / "config.json"
+    path.write_text('{"octree": {"resolution": 0.1}}')
+    with pytest.raises(ConfigError, match=r"octree\.resolution"):
+        load_config(path)
+
+
+def test_any_configuration_can_be_overridden():
+    config = overridden(SynthConfig(), ["sensor.axial_noise_ratio=0", "seed=5"])
+
+    assert config.sensor.axial_noise_ratio == 0.0
+    assert config.seed == 5
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.rglob("*.toml")), ids=lambda p: p.stem)
+def test_every_shipped_configuration_is_valid(path):
+    assert load_config(path) != BuildConfig()
+
+
+def test_turning_one_knob_leaves_the_others_of_its_part():
+    """Parts may default to something else than their class does, as the loops' matching does."""
+    default = load_config().loops.verification.match
+    turned = load_config(None, ["loops.verification.match.max_ratio=0.7"]).loops.verification.match
+    assert turned == default.model_copy(update={"max_ratio": 0.7})
+    fallback = load_config(None, ["odometry.kind=isvd", "odometry.fallback.homography_iterations=7"]).odometry
+    assert (fallback.fallback.filter, fallback.fallback.max_ratio) == ("none", 0.95)

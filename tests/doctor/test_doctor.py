@@ -1,0 +1,131 @@
+import json
+import sys
+import tomllib
+
+import numpy as np
+import pytest
+
+from mapper.core.errors import DataError
+from mapper.doctor import libraries, machine
+from mapper.doctor.finding import Finding
+from mapper.doctor.libraries import look_at_library, tried
+from mapper.doctor.self_tests import SELF_TESTS, WrongAnswerError, _expect_near
+from mapper.doctor.system_libraries import apt_line, look_at_system_libraries
+from tests.support.command_line import invoke
+from tests.support.paths import ROOT
+
+PYPROJECT = ROOT / "pyproject.toml"
+AGAIN = "install it again"
+
+
+def ended(code, **options):
+    return tried("lib", "1.2", [sys.executable, "-c", code], again=AGAIN, **options)
+
+
+def test_every_library_that_we_need_has_a_self_test():
+    needed = tomllib.loads(PYPROJECT.read_text())["project"]["dependencies"]
+    names = {libraries._REQUIREMENT.match(line)["name"] for line in needed}
+    assert names == set(SELF_TESTS)
+
+
+def test_a_library_that_works_is_well():
+    finding = look_at_library("gtsam", "4.3")
+    assert (finding.verdict, finding.remedy) == ("well", "")
+    assert finding.detail.startswith("4.")
+
+
+@pytest.mark.parametrize(
+    ("code", "detail", "remedy"),
+    [
+        ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "self-test died of SIGSEGV", AGAIN),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGILL)", "died of SIGILL", "build the library"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "died of SIGKILL", "was there memory"),
+        ("raise ValueError('got [0, 0, 0]')", "1.2, ValueError: got [0, 0, 0]", AGAIN),
+        (
+            "raise ImportError('libGL.so.1: cannot open shared object file: No such file or directory')",
+            "ImportError: libGL.so.1: cannot open",
+            "sudo apt-get install libgl1",
+        ),
+        ("raise SystemExit(3)", "1.2, exit status 3", AGAIN),
+    ],
+)
+def test_a_failure_is_reported_and_not_suffered(code, detail, remedy):
+    finding = ended(code)
+    assert finding.verdict == "failed"
+    assert detail in finding.detail
+    assert remedy in finding.remedy
+
+
+def test_a_library_that_hangs_is_given_up():
+    assert "still busy after 1 s" in ended("import time; time.sleep(60)", patience_s=1.0).detail
+
+
+def test_a_library_that_is_missing_or_old_is_told_with_the_line_that_mends_it():
+    missing = look_at_library("no-such-library", "1.5")
+    assert (missing.detail, missing.remedy) == ("not installed", "pip install 'no-such-library>=1.5'")
+
+    old = look_at_library("numpy", "99.1")
+    assert old.detail.endswith(", want at least 99.1")
+    assert old.remedy == "pip install 'numpy>=99.1'"
+
+
+def test_missing_system_libraries_come_with_the_apt_line():
+    finding = look_at_system_libraries(["libstdc++.so.6", "libnothing.so.7"])
+    assert finding.detail == "missing libnothing.so.7"
+    assert finding.remedy == "find the package with: apt-file search libnothing.so.7"
+    assert apt_line(["libGL.so.1", "libEGL.so.1"]) == "sudo apt-get install libgl1 libegl1"
+
+
+def test_a_cache_that_cannot_be_written_fails(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    assert "0 compiled" in machine.look_at_kernels().detail
+    assert machine.look_at_kernels().verdict == "well"
+
+    monkeypatch.setattr(machine.os, "access", lambda _path, _mode: False)
+    finding = machine.look_at_kernels()
+    assert (finding.verdict, "NUMBA_CACHE_DIR" in finding.remedy) == ("failed", True)
+
+
+def test_threads_of_the_libraries_own_are_a_warning(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    assert machine.look_at_threads().verdict == "well"
+    monkeypatch.setenv("OMP_NUM_THREADS", "8")
+    assert machine.look_at_threads().verdict == "warning"
+
+
+def test_what_is_scarce_is_a_warning(monkeypatch):
+    for limit, look in (
+        ("_LEAST_MEMORY_GB", machine.look_at_memory),
+        ("_LEAST_DISK_GB", machine.look_at_disk),
+    ):
+        monkeypatch.setattr(machine, limit, 1e9)
+        assert look().verdict == "warning"
+
+
+def test_a_finding_that_is_not_well_says_what_to_do():
+    with pytest.raises(DataError, match="verdict 'failed' with remedy ''"):
+        Finding("x", "failed", "broken")
+
+
+@pytest.mark.parametrize("as_json", [True, False])
+def test_the_verb_fails_when_a_library_does(monkeypatch, as_json):
+    monkeypatch.setattr("mapper.doctor.examination.SELF_TESTS", {"zstandard": None, "no-such-library": None})
+    result = invoke("doctor", *(["--json"] if as_json else []))
+
+    assert result.exit_code == 1
+    assert result.stderr.splitlines()[-1] == "mapper: doctor: 1 of 9 failed: no-such-library"
+    if as_json:
+        verdicts = {told["name"]: told["verdict"] for told in json.loads(result.stdout)}
+        assert (verdicts["zstandard"], verdicts["no-such-library"]) == ("well", "failed")
+    else:
+        assert "do: pip install 'no-such-library>=0'" in result.stdout
+
+
+@pytest.mark.parametrize("name", SELF_TESTS)
+def test_every_self_test_passes_here(name, tmp_path):
+    SELF_TESTS[name](tmp_path)
+
+
+def test_a_wrong_answer_is_an_error():
+    with pytest.raises(WrongAnswerError, match=r"got \[0\.1\]"):
+        _expect_near(np.array([0.1]), np.array([0.5]))

@@ -1,0 +1,250 @@
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from evaluators.metrics.evaluate import evaluate
+from mapper.config.build import BuildConfig
+from mapper.core.errors import ConfigError
+from mapper.export.report.data import Figure, chapter_of, drawn
+from mapper.export.report.page import page_of, write_report
+from mapper.pipeline.build import build
+from mapper.run.folder import load_run
+from mapper.sources import open_source
+from tests.support.chromium import CHROMIUM, MISSING, Page
+from tests.support.command_line import invoke
+
+HOSTILE = "</script><img src=x onerror=alert(1)>&\"'"
+needs_browser = pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
+
+
+class Structure(HTMLParser):
+    """Which elements are open, and where a page would fetch something from."""
+
+    EMPTY = frozenset({"meta", "img", "input", "br"})
+
+    def __init__(self, page):
+        super().__init__()
+        self.open, self.addresses, self.scripts = [], [], []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attributes):
+        if tag not in self.EMPTY:
+            self.open.append(tag)
+        self.scripts += [dict(attributes)] if tag == "script" else []
+        self.addresses += [value for name, value in attributes if name in ("src", "href")]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def runs(desk_run, desk_log, tmp_path_factory):
+    config = BuildConfig.model_validate({"odometry": {"kind": "isvd"}})
+    return [desk_run, build(open_source(desk_log), config, tmp_path_factory.mktemp("report") / "isvd")]
+
+
+@pytest.fixture(scope="module")
+def page(runs, tmp_path_factory):
+    path = tmp_path_factory.mktemp("page") / "report.html"
+    result = invoke("report", *(run.path for run in runs), "--out", path)
+    assert result.stdout == f"{path}\n"
+    return path
+
+
+def test_the_numbers_are_the_run_s(runs):
+    run = runs[0]
+    data = drawn(chapter_of(run, "desk", []))
+
+    trajectory = run.trajectory()
+    np.testing.assert_allclose(data["path"]["x"], trajectory.positions_world[:, 0], atol=6e-4)
+    assert data["path"]["t"][0] == 0.0
+    assert data["frames"]["inliers"] == [record.diagnostics.inliers for record in run.records()]
+    assert [(loop["i"], loop["j"], loop["verdict"]) for loop in data["loops"]] == [
+        (loop.i, loop.j, loop.verdict) for loop in run.loops()
+    ]
+
+
+def test_the_errors_are_the_terms_of_the_ate(runs):
+    run = runs[0]
+    errors_m = np.array(drawn(chapter_of(run, "desk", []))["error"]["m"])
+    ate = next(m.value for m in evaluate(run.trajectory(), run.truth()) if m.name.startswith("ATE RMSE"))
+    assert np.sqrt((errors_m**2).mean()) == pytest.approx(ate, rel=1e-3)
+
+
+def test_the_page_is_well_formed_and_fetches_nothing(page):
+    structure = Structure(page.read_text())
+    assert structure.open == []
+    assert len(structure.addresses) >= 2
+    assert all(address.startswith("data:image/") for address in structure.addresses)
+    assert "default-src 'none'" in page.read_text()
+
+
+def test_the_tables_hold_every_run_side_by_side(page, runs):
+    text = page.read_text()
+    assert re.search(
+        r"<th>ATE RMSE, SE\(3\)-aligned</th><td[^>]*>[\d.e-]+ m</td><td[^>]*>[\d.e-]+ m</td>", text
+    )
+    assert '<tr class="differs"><th>odometry.kind</th>' in text
+    assert "<tr><th>octree.resolution_m</th>" in text
+    for library, version in runs[0].manifest.libraries.items():
+        assert f'<th>{library}</th><td data-of="0">{version}</td>' in text
+
+
+def test_what_a_log_calls_itself_cannot_become_markup(runs):
+    manifest = runs[0].manifest
+    hostile = replace(
+        runs[0],
+        manifest=manifest.model_copy(
+            update={"input": manifest.input.model_copy(update={"path": f"/logs/{HOSTILE.replace('/', '')}"})}
+        ),
+    )
+    text = page_of([chapter_of(hostile, HOSTILE, [Figure(HOSTILE, HOSTILE)])])
+
+    structure = Structure(text)
+    assert structure.open == []
+    assert len(structure.scripts) == 2
+    assert "x" not in structure.addresses
+    data = re.search(r'id="data">(.*?)</script>', text, re.DOTALL)[1]
+    assert json.loads(data)[0]["name"] == HOSTILE
+
+
+def test_a_run_without_truth_loops_and_views_has_a_page(desk_log, tmp_path):
+    source = replace(open_source(desk_log), truth=None)
+    run = build(source, BuildConfig.model_validate({"loops": {"kind": "none"}}), tmp_path / "bare")
+    (run.path / "cloud.png").unlink()
+    data = drawn(chapter_of(run, "bare", []))
+    assert (data["truth"], data["error"], data["loops"]) == (None, None, [])
+    assert "no picture" in page_of([chapter_of(run, "bare", [])])
+
+
+def test_runs_of_one_name_are_told_apart(runs, tmp_path):
+    with pytest.raises(ConfigError, match="each of its own name"):
+        write_report(tmp_path / "report.html", [chapter_of(runs[0], "desk", [])] * 2)
+    assert list(tmp_path.iterdir()) == []
+
+    twin = tmp_path / "desk"
+    twin.symlink_to(runs[0].path)
+    invoke("report", runs[0].path, twin, "--out", tmp_path / "r.html")
+    assert load_run(twin).manifest == runs[0].manifest
+    names = re.findall(r"checked> (\S+) <small>", (tmp_path / "r.html").read_text())
+    assert names == [str(runs[0].path), str(twin)]
+
+
+def test_a_page_that_is_there_is_not_replaced_unasked(page, runs):
+    again = invoke("report", runs[0].path, "--out", page)
+    assert (again.exit_code, "pass --overwrite to replace it" in again.stderr) == (1, True)
+
+
+@needs_browser
+@pytest.mark.parametrize("width_px", [1400, 420])
+def test_it_renders_without_a_complaint_and_within_the_window(page, width_px, tmp_path):
+    with Page(page, width_px=width_px) as browser:
+        assert browser.run("document.querySelectorAll('figure.curve path.line').length") >= 8
+        assert browser.run("document.querySelectorAll('figure.plan image').length") == 2
+        assert browser.run("document.documentElement.scrollWidth") <= width_px
+        browser.screenshot(tmp_path / "page.png")
+        assert browser.complaints == []
+        assert [url for url in browser.asked_for if not url.startswith(("data:image/", "file://"))] == []
+
+
+@needs_browser
+def test_what_is_told_by_pointing_clicking_and_dragging(page):
+    curves = "document.querySelectorAll('[data-curve=inliers] path.line').length"
+    read_out = "document.querySelector('[data-curve=inliers] .read-out').textContent"
+    with Page(page) as browser:
+        x, y = browser.centre("[data-curve=inliers] svg")
+        browser.mouse("mouseMoved", x, y)
+        assert re.match(r"desk at [\d.]+ s: \d+   isvd at [\d.]+ s: \d+$", browser.run(read_out))
+        assert "from the truth" in browser.run("document.querySelector('.plan .read-out').textContent")
+        assert browser.run("document.querySelector('.plan .here').getAttribute('visibility')") == "visible"
+
+        browser.click("[data-curve=inliers] .legend button")
+        assert browser.run(curves) == 1
+        browser.click("[data-curve=inliers] .legend button")
+        browser.click("[data-run='1']")
+        assert browser.run(curves) == 1
+        assert browser.run("[...document.querySelectorAll('[data-of=\"1\"]')].every(e => e.hidden)")
+        browser.click("[data-run='1']")
+
+        labels = "[...document.querySelectorAll('[data-curve=inliers] text')].map(e => e.textContent)"
+        before = browser.run(labels)
+        x, y = browser.centre("[data-curve=inliers] svg")
+        browser.mouse("mousePressed", x, y, clicks=1)
+        browser.mouse("mouseMoved", x + 200, y)
+        browser.mouse("mouseReleased", x + 200, y, clicks=1)
+        assert browser.run(labels) != before
+        browser.run(
+            "document.querySelector('[data-curve=inliers] svg').dispatchEvent(new MouseEvent('dblclick'))"
+        )
+        assert browser.run(labels) == before
+
+        bar = "document.querySelector('.plan svg text').textContent"
+        everything = browser.run(bar)
+        x, y = browser.centre(".plan svg")
+        browser.mouse("mousePressed", x, y, clicks=1)
+        browser.mouse("mouseMoved", x + 40, y + 40)
+        browser.mouse("mouseReleased", x + 40, y + 40, clicks=1)
+        assert float(browser.run(bar).split()[0]) < float(everything.split()[0])
+        browser.run("document.querySelector('.plan svg').dispatchEvent(new MouseEvent('dblclick'))")
+        assert browser.run(bar) == everything
+
+        shown = "[...document.querySelectorAll('.settings tbody tr')].filter(e => !e.hidden).length"
+        differing, everything = browser.run(shown), "document.querySelectorAll('.settings tbody tr').length"
+        assert 0 < differing < browser.run(everything)
+        browser.click("#differing")
+        assert browser.run(shown) == browser.run(everything)
+        browser.run(
+            "(() => { const e = document.getElementById('setting'); e.value = 'octree.';"
+            " e.dispatchEvent(new Event('input')); })()"
+        )
+        assert 0 < browser.run(shown) < browser.run(everything)
+        assert browser.complaints == []
+
+
+@needs_browser
+def test_the_loops_table_sorts_and_sifts(runs, tmp_path):
+    chapter = chapter_of(runs[0], "desk", [])
+    rejected = [
+        replace(loop, verdict="rejected", reason="isvd: too few", i=k)
+        for k, loop in enumerate(chapter.results.loops[:3] or _some_loops(chapter))
+    ]
+    path = tmp_path / "report.html"
+    write_report(
+        path, [replace(chapter, results=replace(chapter.results, loops=(*rejected, *_some_loops(chapter))))]
+    )
+    first = "[...document.querySelectorAll('.loops tbody tr')].map(e => Number(e.firstChild.textContent))"
+    with Page(path) as browser:
+        nodes = browser.run(first)
+        browser.click(".loops th")
+        assert browser.run(first) == sorted(nodes)
+        browser.click(".loops th")
+        assert browser.run(first) == sorted(nodes, reverse=True)
+        browser.run(
+            "(() => { const e = document.querySelector('.loops select'); e.value = 'accepted';"
+            " e.dispatchEvent(new Event('change')); })()"
+        )
+        assert len(browser.run(first)) == 2
+
+
+def _some_loops(chapter):
+    from mapper.loops.closure import LoopClosure
+
+    graph = chapter.results.graph
+    nodes = list(graph.T_world_node)
+    return [
+        LoopClosure(
+            i,
+            nodes[-1],
+            graph.stamps_ns[i],
+            graph.stamps_ns[nodes[-1]],
+            "hand",
+            "accepted",
+            T_i_j=np.eye(4),
+            information=np.eye(6),
+        )
+        for i in nodes[:2]
+    ]

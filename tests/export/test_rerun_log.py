@@ -1,0 +1,386 @@
+import shutil
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+
+from cli.build import _onlooker, built
+from mapper.config.build import BuildConfig
+from mapper.config.export import RerunConfig
+from mapper.core.errors import ConfigError, DataError, ViewerError
+from mapper.core.frames import Scan
+from mapper.export.rerun.finished import show_run
+from mapper.export.rerun.live import LiveRerun
+from mapper.export.rerun.recording import recorded
+from mapper.export.rerun.target import check_target
+from mapper.export.run_maps import maps_of, snapshots_of
+from mapper.odometry.base import Diagnostics, FrameResult
+from mapper.pipeline.build import build
+from mapper.run.folder import load_run
+from mapper.run.observers import Step
+from mapper.sources import open_source
+from tests.support.command_line import invoke
+
+RERUN = Path(sys.executable).with_name("rerun")
+
+
+class Told:
+    """A recording read back: its chunks by entity."""
+
+    def __init__(self, path):
+        self.reader = rr.chunk.RrdReader(path)
+        self.chunks = {}
+        for chunk in self.reader.stream():
+            self.chunks.setdefault(chunk.entity_path, []).append(chunk)
+
+    def values(self, entity, component):
+        """All values of a component, in order of their stamps."""
+        rows = []
+        for chunk in self.chunks[entity]:
+            batch = chunk.to_record_batch()
+            if component in batch.schema.names:
+                values = batch.column(component).to_pylist()
+                stamps = (
+                    batch.column("stamp").cast("int64").to_pylist()
+                    if "stamp" in chunk.timeline_names
+                    else [0]
+                )
+                rows += [
+                    (stamp, value) for stamp, value in zip(stamps, values, strict=True) if value is not None
+                ]
+        return sorted(rows, key=lambda row: row[0])
+
+    def one(self, entity, component):
+        [(_, value)] = self.values(entity, component)
+        return np.array(value)
+
+
+@pytest.fixture(scope="module")
+def run(desk_run, tmp_path_factory):
+    """A copy, for recordings to lie in."""
+    return load_run(shutil.copytree(desk_run.path, tmp_path_factory.mktemp("rerun") / "desk"))
+
+
+@pytest.fixture(scope="module")
+def told(run):
+    path = run.path / "told.rrd"
+    show_run(run, str(path))
+    return Told(path)
+
+
+def test_two_recordings_of_a_run_say_the_same(run, tmp_path):
+    paths = [tmp_path / "one.rrd", tmp_path / "other.rrd"]
+    for path in paths:
+        show_run(run, str(path))
+    compared = subprocess.run(
+        [RERUN, "rrd", "compare", "--unordered", *paths], capture_output=True, text=True
+    )
+    assert compared.returncode == 0, compared.stderr
+
+
+def test_the_paths_are_the_run_s(run, told):
+    estimate = told.one("/world/path/estimate", "LineStrips3D:strips")[0]
+    np.testing.assert_allclose(estimate, run.trajectory().positions_world, atol=1e-6)
+    truth = told.one("/world/path/truth", "LineStrips3D:strips")[0]
+    assert np.linalg.norm(truth[0] - estimate[0]) < 0.05  # laid over the estimate, in its own world
+
+
+def test_the_body_has_a_pose_at_every_exact_stamp(run, told):
+    trajectory = run.trajectory()
+    rows = told.values("/world/body", "Transform3D:translation")
+    assert [stamp for stamp, _ in rows] == trajectory.stamps_ns.tolist()
+    np.testing.assert_allclose([value[0] for _, value in rows], trajectory.positions_world, atol=1e-6)
+
+
+def test_the_graph_is_nodes_and_lines_between_them(run, told):
+    graph = run.graph()
+    nodes = told.one("/world/graph/nodes", "Points3D:positions")
+    np.testing.assert_allclose(nodes, [T[:3, 3] for T in graph.T_world_node.values()], atol=1e-6)
+    lines = told.one("/world/graph/odometry", "LineStrips3D:strips")
+    assert len(lines) == sum(factor.origin == "odometry" for factor in graph.factors)
+
+
+def test_every_loop_is_a_line_by_verdict_and_a_line_of_text(run, told):
+    loops = run.loops()
+    for verdict in ("accepted", "rejected"):
+        count = sum(loop.verdict == verdict for loop in loops)
+        entity = f"/world/loops/{verdict}"
+        assert (len(told.one(entity, "LineStrips3D:strips")) if entity in told.chunks else 0) == count
+    said = told.values("/log/loops", "TextLog:text") if "/log/loops" in told.chunks else []
+    assert [stamp for stamp, _ in said] == sorted(loop.stamp_j_ns for loop in loops)
+
+
+def test_the_voxels_are_the_occupied_ones(run, told):
+    octree = maps_of(run).octree
+    leaves = octree.leaves()
+    occupied = leaves.centres_world[leaves.log_odds >= octree.occupied_log_odds]
+    indices = told.one("/world/map/voxels", "VoxelGridMap:voxel_indices")
+    edge_m = told.one("/world/map/voxels", "VoxelGridMap:voxel_size")[0]
+    np.testing.assert_allclose((indices + 0.5) * edge_m, occupied, atol=1e-5)
+    assert len(told.one("/world/map/voxels", "VoxelGridMap:colors")) == len(occupied)
+
+
+def test_the_slice_lies_as_rerun_s_own_importer_lays_the_one_in_the_mcap(run, told):
+    ours = told.one("/world/map/slice", "GridMap:data")[0]
+    imported = [
+        chunk.to_record_batch()
+        for chunk in rr.chunk.McapReader(run.path / "run.mcap").stream()
+        if chunk.entity_path == "/map/slice" and chunk.timeline_names
+    ]
+    assert ours.tolist() == imported[0].column("GridMap:data")[0].as_py()[0]
+    placed = imported[0].column("GridMap:translation")[0].as_py()[0]
+    np.testing.assert_allclose(told.one("/world/map/slice", "GridMap:translation")[0], placed, atol=1e-6)
+
+
+def test_images_come_from_the_run_s_own_log(run, told):
+    snapshots = list(snapshots_of(run))
+    rows = told.values("/world/body/camera", "EncodedImage:blob")
+    assert len(rows) == len(snapshots) == -(-len(run.trajectory()) // run.config.mcap.image_stride)
+    assert [stamp for stamp, _ in rows] == [snapshot.stamp_ns for snapshot in snapshots]
+    assert bytes(rows[0][1][0]) == snapshots[0].jpeg
+    matrix = told.one("/world/body/camera", "Pinhole:image_from_camera")[0]
+    np.testing.assert_allclose(matrix.reshape(3, 3).T, snapshots[0].camera.matrix, rtol=1e-6)
+
+
+def test_diagnostics_are_curves(run, told):
+    for name in ("features", "matches", "inliers", "residual"):
+        rows = told.values(f"/diagnostics/{name}", "Scalars:scalars")
+        wanted = [(record.stamp_ns, getattr(record.diagnostics, name)) for record in run.records()]
+        assert [(stamp, value[0]) for stamp, value in rows] == wanted
+    assert len(told.values("/diagnostics/ms", "Scalars:scalars")) == len(run.records())
+
+
+def test_a_run_without_images_loops_and_truth_can_be_told(desk_log, tmp_path):
+    config = BuildConfig.model_validate({"mcap": {"image_stride": 0}, "loops": {"kind": "none"}})
+    source = open_source(desk_log)
+    source.truth = None
+    run = build(source, config, tmp_path / "bare")
+    show_run(run, str(tmp_path / "bare.rrd"))
+    entities = Told(tmp_path / "bare.rrd").chunks
+    assert not {"/world/path/truth", "/world/body/camera", "/log/loops"} & entities.keys()
+
+
+def test_the_recording_verifies_and_brings_its_blueprint(run):
+    path = run.path / "told.rrd"
+    subprocess.run([str(RERUN), "rrd", "verify", str(path)], check=True, capture_output=True)
+    assert len(rr.chunk.RrdReader(path).blueprints()) == 1
+
+
+def test_a_recording_that_fails_leaves_no_file(tmp_path):
+    with pytest.raises(DataError), recorded(str(tmp_path / "x.rrd"), name="x", has_images=True):
+        raise DataError("stop")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("target", ["run.mcap", "spam", "connect:nonsense", ""])
+def test_a_target_is_refused_at_once(target):
+    with pytest.raises(ConfigError, match=r"want FILE\.rrd, spawn, connect or connect:rerun\+http"):
+        check_target(target)
+
+
+def test_a_viewer_that_does_not_answer_is_one_line(run):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with pytest.raises(ViewerError, match=f"no viewer answers at rerun.http://127.0.0.1:{port}/proxy"):
+        show_run(run, f"connect:rerun+http://127.0.0.1:{port}/proxy")
+
+
+def test_no_screen_is_one_line(run, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    with pytest.raises(ViewerError, match="there is no screen"):
+        show_run(run, "spawn")
+
+
+def test_the_verb_keeps_the_recording_in_the_run(run, tmp_path):
+    result = invoke("view", run.path)
+    assert result.stdout == f"{run.path / 'run.rrd'}\n"
+    assert "/world/path/estimate" in Told(run.path / "run.rrd").chunks
+
+    other = tmp_path / "other.rrd"
+    assert invoke("view", run.path, "--rrd", other, "--quiet").output == ""
+    again = invoke("view", run.path, "--rrd", other)
+    assert (again.exit_code, "pass --overwrite" in again.stderr) == (1, True)
+    both = invoke("view", run.path, "--rrd", other, "--spawn")
+    assert both.stderr == "mapper: --rrd, --spawn and --connect: choose one\n"
+
+
+class Log:
+    """Standard input with some lines to come."""
+
+    def __init__(self, lines):
+        self.lines = list(lines)
+
+    def isatty(self):
+        return True
+
+    def readline(self):
+        return self.lines.pop(0)
+
+
+def build_verb(log, out, *arguments):
+    return invoke("build", log, "--out", out, "--quiet", *arguments)
+
+
+@pytest.fixture(scope="module")
+def live(desk_log, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("live")
+    result = build_verb(
+        desk_log, folder / "run", "--rerun", folder / "live.rrd", "--set", "rerun.image_stride=5"
+    )
+    assert (result.exit_code, result.output) == (0, "")
+    return load_run(folder / "run"), Told(folder / "live.rrd")
+
+
+def test_looking_on_changes_nothing(run, live):
+    assert (live[0].path / "trajectory.tum").read_bytes() == (run.path / "trajectory.tum").read_bytes()
+
+
+def test_a_build_is_told_frame_by_frame(live):
+    run, told = live
+    assert {name for chunks in told.chunks.values() for c in chunks for name in c.timeline_names} == {"stamp"}
+    records, trajectory = run.records(), run.trajectory()
+    inliers = told.values("/diagnostics/inliers", "Scalars:scalars")
+    assert [(stamp, value[0]) for stamp, value in inliers] == [
+        (record.stamp_ns, record.diagnostics.inliers) for record in records
+    ]
+    body = told.values("/world/live/body", "Transform3D:translation")
+    assert [stamp for stamp, _ in body] == trajectory.stamps_ns.tolist()
+    assert len(told.values("/diagnostics/ms", "Scalars:scalars")) == len(records)
+
+
+def test_images_come_with_the_features_that_were_found_and_those_that_agreed(live):
+    run, told = live
+    records = run.records()[::5]
+    images = told.values("/world/live/body/camera", "EncodedImage:blob")
+    assert [stamp for stamp, _ in images] == [record.stamp_ns for record in records]
+    assert bytes(images[0][1][0])[:2] == b"\xff\xd8"
+    dots = told.values("/world/live/body/camera/features", "Points2D:positions")
+    colors = told.values("/world/live/body/camera/features", "Points2D:colors")
+    for record, (_, positions), (_, values) in zip(records, dots, colors, strict=True):
+        assert len(positions) == record.diagnostics.features
+        _, counts = np.unique(values, return_counts=True)
+        assert record.diagnostics.inliers in counts
+        assert np.min(positions) >= 0
+        assert np.max(positions) <= 320
+    ways = told.values("/world/live/body/camera/matches", "LineStrips2D:strips")
+    assert [stamp for stamp, _ in ways] == [record.stamp_ns for record in records]
+    for record, (_, positions), (_, lines) in zip(records, dots, ways, strict=True):
+        assert (record is records[0]) == (len(lines) == 0)
+        assert len(lines) <= record.diagnostics.inliers
+        assert {tuple(end) for _, end in lines} <= {tuple(position) for position in positions}
+    assert len(told.values("/world/live/body/cloud", "Points3D:positions")) == len(records)
+
+
+def test_estimates_end_up_in_the_levelled_world(live):
+    run, told = live
+    T = np.eye(4)
+    T[:3, :3] = told.one("/world/live", "Transform3D:mat3x3").reshape(3, 3).T
+    T[:3, 3] = told.one("/world/live", "Transform3D:translation")[0]
+    positions = np.array(
+        [value[0] for _, value in told.values("/world/live/body", "Transform3D:translation")]
+    )
+    on_levelled = positions @ T[:3, :3].T + T[:3, 3]
+    assert np.abs(on_levelled - run.trajectory().positions_world).max() < 0.03  # what loops have moved
+
+    paths = [value for _, value in told.values("/world/live/estimates", "LineStrips3D:strips") if value]
+    assert len(paths[-1][0]) > 0.9 * run.manifest.counts.nodes
+    graph = [value for _, value in told.values("/world/live/factors", "LineStrips3D:strips") if value]
+    assert len(graph[-1]) >= len(paths[-1][0]) - 1
+
+
+def test_the_results_follow(live):
+    run, told = live
+    estimate = told.one("/world/path/estimate", "LineStrips3D:strips")[0]
+    np.testing.assert_allclose(estimate, run.trajectory().positions_world, atol=1e-6)
+    assert {
+        "/world/map/voxels",
+        "/world/map/slice",
+        "/slice",
+        "/about",
+        "/world/graph/nodes",
+    } <= told.chunks.keys()
+
+
+def test_a_scan_is_a_cloud_without_an_image(tmp_path):
+    class FrameRef:
+        def load(self):
+            return Scan(7, np.zeros((50_000, 3), np.float32))
+
+    class LoopDetector:
+        def closures(self):
+            return ()
+
+        def current_estimate(self, _node):
+            return np.eye(4)
+
+    path = tmp_path / "scan.rrd"
+    diagnostics = Diagnostics(50_000, 100, 90, 0.1, "m", "icp")
+    with recorded(str(path), name="scan", has_images=False, body="world/live/body") as log:
+        observer = LiveRerun(log, "lidar", RerunConfig(cloud_points=10_000))
+        track = FrameResult(7, 0, np.eye(4), np.eye(4), True, diagnostics)
+        observer.on_frame(Step(FrameRef(), track, lambda: None, lambda: None, LoopDetector()))
+    told = Told(path)
+    assert len(told.values("/world/live/body/cloud", "Points3D:positions")[0][1]) == 10_000
+    assert "/world/live/body/camera" not in told.chunks
+
+
+def test_a_build_that_fails_leaves_what_was_seen(desk_log, tmp_path):
+    seen = tmp_path / "seen.rrd"
+    result = build_verb(desk_log, tmp_path / "run", "--rerun", seen, "--last", 4)
+    assert result.exit_code == 1
+    assert f"what it recorded so far is in {seen}" in result.stderr
+    assert len(Told(seen).values("/diagnostics/features", "Scalars:scalars")) == 5
+
+
+def test_a_build_that_is_refused_leaves_no_recording(desk_log, run, tmp_path):
+    result = build_verb(desk_log, run.path, "--rerun", tmp_path / "seen.rrd")
+    assert "pass --overwrite to replace it" in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_stepping_waits_after_each_frame_until_told_to_run_on(desk_log, tmp_path, monkeypatch):
+    keys = Log(["\n", "\n", "c\n"])
+    monkeypatch.setattr("cli.stepping.sys.stdin", keys)
+    path = tmp_path / "stepped.rrd"
+    built(
+        desk_log,
+        None,
+        ["source.last_frame=11"],
+        tmp_path / "run",
+        overwrite=False,
+        quiet=True,
+        onlooker=_onlooker(str(path), step=True, overwrite=False),
+    )
+    assert keys.lines == []
+    assert len(Told(path).values("/diagnostics/features", "Scalars:scalars")) == 12
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--step"], "--step: there is nothing to see without --rerun"),
+        (["--step", "--onto", "RUN"], "--step: there is nothing to see without --rerun"),
+        (
+            ["--rerun", "LIVE", "--step"],
+            "--step: waits for Enter after each frame, but standard input is no terminal",
+        ),
+        (["--rerun", "spam"], "rerun target 'spam': want FILE.rrd, spawn, connect or connect:rerun+http"),
+        (["--rerun", "THERE"], "exists already; choose another, or pass --overwrite to replace it"),
+        (["--rerun", "LIVE", "--onto", "RUN"], "not with --onto; look at the new run with mapper view"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused_in_one_line(desk_log, run, tmp_path, arguments, message):
+    there = tmp_path / "there.rrd"
+    there.touch()
+    names = {"LIVE": str(tmp_path / "live.rrd"), "THERE": str(there), "RUN": str(run.path)}
+    result = build_verb(desk_log, tmp_path / "run", *(names.get(word, word) for word in arguments))
+    assert (result.exit_code, len(result.stderr.splitlines())) == (1, 1)
+    assert message in result.stderr
+    assert not (tmp_path / "live.rrd").exists()

@@ -1,0 +1,169 @@
+"""Loops found on a walk round a made-up room: by words, by pose, and as the thesis does."""
+
+from collections.abc import Sequence
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from mapper.config.loading import load_config
+from mapper.core.errors import DataError
+from mapper.core.geometry import Transform, exp, inverse
+from mapper.core.timebase import NS_PER_S
+from mapper.features.frame_view import ImageView
+from mapper.graph.model import BetweenFactor
+from mapper.loops.closure import LoopClosure, discrepancy
+from mapper.loops.config import GateConfig, NoLoopsConfig, PlaceLoopsConfig, ThesisLoopsConfig
+from mapper.loops.detector import LoopDetector
+from mapper.loops.factory import build_loop_detector
+from tests.support.feature_room import LAP, LINK, NODES, PLACES, Room, track, walked
+
+
+def drifting(truth: Sequence[Transform]) -> list[Transform]:
+    """The same walk by an odometry that turns 1 % too far and climbs a little."""
+    poses = [truth[0]]
+    for before, after in pairwise(truth):
+        step = inverse(before) @ after @ exp(np.array([0.0, 0.0, 0.0015]), np.array([0.0, 0.0, 0.004]))
+        poses.append(poses[-1] @ step)
+    return poses
+
+
+def walk(
+    detector: LoopDetector, room: Room, *, poses: Sequence[Transform] | None = None, features=None
+) -> list[ImageView]:
+    """Feed a loop detector with the walk; ``poses`` are the odometry's."""
+    truth = walked()
+    poses = drifting(truth) if poses is None else poses
+    views = [room.view(T, k * NS_PER_S // 2) for k, T in enumerate(truth)]
+    for k, T_world_body in enumerate(poses):
+        links = [BetweenFactor(k - 1, k, inverse(poses[k - 1]) @ T_world_body, LINK)] if k else []
+        count = 500 if features is None else features[k]
+        detector.add(
+            k, track(k, views[k].stamp_ns, T_world_body, links, features=count), partial(views.__getitem__, k)
+        )
+    return views
+
+
+def accepted(detector: LoopDetector) -> list[LoopClosure]:
+    return [loop for loop in detector.closures() if loop.verdict == "accepted"]
+
+
+def worst_m(loops: Sequence[LoopClosure]) -> float:
+    truth = walked()
+    return max(discrepancy(loop.T_i_j, truth[loop.i], truth[loop.j]).translation_m for loop in loops)
+
+
+@pytest.mark.parametrize("propose", ["places", "nearby"])
+def test_the_second_lap_closes_on_the_first(propose):
+    detector = build_loop_detector(PlaceLoopsConfig(propose=propose, places=PLACES), "batch")
+    walk(detector, Room(1))
+    found = accepted(detector)
+    assert len({loop.j for loop in found}) >= 0.8 * (NODES - LAP)
+    assert worst_m(found) < 0.05
+    assert {loop.proposed_by for loop in found} == {propose}
+
+
+def test_loops_correct_the_current_estimate():
+    detector = build_loop_detector(PlaceLoopsConfig(places=PLACES), "batch")
+    walk(detector, Room(1))
+    truth = walked()
+    drifted = drifting(truth)
+    end = detector.current_estimate(NODES - 1)
+    assert np.linalg.norm(drifted[-1][:3, 3] - truth[-1][:3, 3]) > 0.1
+    assert np.linalg.norm(end[:3, 3] - truth[-1][:3, 3]) < 0.05
+
+
+def test_every_candidate_gets_a_verdict():
+    detector = build_loop_detector(PlaceLoopsConfig(places=PLACES), "batch")
+    walk(detector, Room(1))
+    for loop in detector.closures():
+        assert (loop.verdict == "rejected") == bool(loop.reason)
+        assert loop.stamp_j_ns - loop.stamp_i_ns >= 5 * NS_PER_S
+
+
+def test_two_runs_find_the_same():
+    runs = []
+    for _ in range(2):
+        detector = build_loop_detector(PlaceLoopsConfig(places=PLACES), "batch")
+        walk(detector, Room(1))
+        runs.append([(loop.i, loop.j, loop.reason, loop.similarity) for loop in detector.closures()])
+    assert runs[0] == runs[1]
+
+
+def test_the_gate_refuses_what_odometry_rules_out():
+    gate = GateConfig(
+        slack_m=0.01, slack_rad=0.01, drift_ratio=0.0, drift_rad_per_m=0.0, drift_rad_per_rad=0.0
+    )
+    detector = build_loop_detector(PlaceLoopsConfig(places=PLACES, gate=gate), "batch")
+    walk(detector, Room(1))
+    assert not accepted(detector)
+    assert any(loop.reason.startswith("gate: ") for loop in detector.closures())
+
+
+def test_a_loop_that_no_other_confirms_is_rejected():
+    detector = build_loop_detector(PlaceLoopsConfig(places=PLACES, min_agreeing=NODES), "batch")
+    walk(detector, Room(1))
+    assert not accepted(detector)
+    assert any(loop.reason.startswith("alone: ") for loop in detector.closures())
+
+
+def test_a_look_needs_motion():
+    detector = build_loop_detector(
+        PlaceLoopsConfig(places=PLACES, min_motion_m=10.0, min_motion_rad=10.0), "batch"
+    )
+    walk(detector, Room(1))
+    assert not detector.closures()
+
+
+def test_words_need_orb_descriptors():
+    detector = build_loop_detector(PlaceLoopsConfig(propose="places"), "batch")
+    view = Room(1).view(np.eye(4), 0)
+    numbers = ImageView(
+        0,
+        view.pixels,
+        view.sigma_px,
+        np.zeros((len(view), 64), np.float32),
+        view.points_camera,
+        view.intrinsics,
+        view.T_body_camera,
+    )
+    with pytest.raises(DataError, match="want 256 bits; choose detector 'orb' or 'uniform-orb'"):
+        detector.add(0, track(0, 0, np.eye(4)), lambda: numbers)
+
+
+def test_the_thesis_looks_only_from_sharp_frames():
+    sharp = [800 if k % 10 == 5 else 500 for k in range(NODES)]
+    detector = build_loop_detector(ThesisLoopsConfig(keyframe_interval=5), "proportional")
+    walk(detector, Room(1), features=sharp)
+    assert detector.closures()
+    assert {loop.j % 10 for loop in detector.closures()} == {5}
+    assert worst_m(accepted(detector)) < 0.05
+
+
+def test_the_thesis_finds_nothing_when_no_frame_is_sharp():
+    detector = build_loop_detector(ThesisLoopsConfig(), "proportional")
+    walk(detector, Room(1))
+    assert not detector.closures()
+
+
+def test_proportional_correction_puts_the_newest_node_where_its_loop_wants_it():
+    sharp = [800 if k == 50 else 500 for k in range(NODES)]
+    detector = build_loop_detector(ThesisLoopsConfig(keyframe_interval=5), "proportional")
+    walk(detector, Room(1), features=sharp)
+    (closed,) = accepted(detector)
+    assert closed.j == 50
+    miss = discrepancy(closed.T_i_j, detector.current_estimate(closed.i), detector.current_estimate(closed.j))
+    assert miss.translation_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_no_loops_finds_nothing():
+    detector = build_loop_detector(NoLoopsConfig(), "batch")
+    walk(detector, Room(1))
+    assert detector.closures() == ()
+
+
+def test_the_configuration_names_the_kind():
+    assert isinstance(load_config(None, ["loops.kind=thesis"]).loops, ThesisLoopsConfig)
+    assert isinstance(load_config().loops, PlaceLoopsConfig)
+    assert isinstance(load_config(None, ["loops.kind=none"]).loops, NoLoopsConfig)

@@ -1,0 +1,302 @@
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+
+from mapper.core.errors import DataError
+from mapper.core.frames import PinholeCamera, RgbdFrame, Scan, ray_table
+from mapper.core.geometry import apply, exp, inverse, rotation_exp, transform
+from mapper.core.timebase import nearest, ns_from_seconds_text
+from mapper.core.trajectory import Trajectory
+from mapper.mapping.config import LevelConfig
+from mapper.mapping.levelling import AXES, find_level
+from mapper.sources.base import Accelerations
+from mapper.sources.trajectory_files import read_tum
+from tests.support.paths import FR1_XYZ
+
+CAMERA = PinholeCamera(width_px=160, height_px=120, fx_px=130.0, fy_px=130.0, cx_px=79.5, cy_px=59.5)
+MS = 1_000_000
+
+
+@dataclass
+class Rectangle:
+    """A patch of the plane where coordinate ``axis`` equals ``at``; bounds of the other two, metres."""
+
+    axis: int
+    at: float
+    low: tuple[float, float] = (-3.0, -3.0)
+    high: tuple[float, float] = (3.0, 3.0)
+
+
+FLOOR = Rectangle(2, 0.0)
+CEILING = Rectangle(2, 2.6)
+WALLS = [Rectangle(0, 3.0, (-3.0, 0.0), (3.0, 2.6)), Rectangle(1, 3.0, (-3.0, 0.0), (3.0, 2.6))]
+OTHER_WALLS = [Rectangle(0, -3.0, (-3.0, 0.0), (3.0, 2.6)), Rectangle(1, -3.0, (-3.0, 0.0), (3.0, 2.6))]
+ROOM = [FLOOR, CEILING, *WALLS, *OTHER_WALLS]
+DESK = Rectangle(2, 0.75, (0.3, -1.5), (2.9, 1.5))
+
+
+def pose(x, y, z, *, yaw_deg, down_deg, roll_deg=0.0):
+    """T_room_camera of a camera that looks along yaw (0 is +x) and down."""
+    yaw, down, roll = np.radians([yaw_deg, down_deg, roll_deg])
+    R_room_level_camera = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    R = rotation_exp(np.array([0.0, 0.0, yaw])) @ R_room_level_camera
+    return transform(
+        R @ rotation_exp(np.array([-down, 0.0, 0.0])) @ rotation_exp(np.array([0.0, 0.0, roll])), [x, y, z]
+    )
+
+
+def seen(scene, T_room_camera, *, rng, stamp_ns=0):
+    """What a depth camera with Kinect-like noise sees of the rectangles."""
+    rays_camera = np.dstack([ray_table(CAMERA), np.ones((120, 160))])[::2, ::2].reshape(-1, 3)
+    rays = rays_camera @ T_room_camera[:3, :3].T
+    eye = T_room_camera[:3, 3]
+    depth_m = np.full(len(rays), np.inf)
+    for rectangle in scene:
+        others = [k for k in range(3) if k != rectangle.axis]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (rectangle.at - eye[rectangle.axis]) / rays[:, rectangle.axis]
+            hits = eye + t[:, None] * rays
+        within = (hits[:, others] >= rectangle.low) & (hits[:, others] <= rectangle.high)
+        depth_m = np.where((t > 0.3) & within.all(axis=1) & (t < depth_m), t, depth_m)
+    got = depth_m < 5.0
+    noisy = depth_m[got] + rng.normal(0.0, 1.0, got.sum()) * 0.0012 * depth_m[got] ** 2
+    return Scan(stamp_ns, (rays_camera[got] * noisy[:, None]).astype(np.float32))
+
+
+def log_of(scene, T_room_cameras, *, seed=0):
+    """Scans and trajectory in a world that is tilted against the room, as the first camera's frame is."""
+    rng = np.random.default_rng(seed)
+    T_world_room = exp(rng.normal(0, 1, 3), rng.normal(0, 2, 3))
+    T_world_cameras = np.array([T_world_room @ T for T in T_room_cameras])
+    stamps_ns = np.arange(len(T_world_cameras), dtype=np.int64) * 33 * MS
+    scans = [
+        (seen(scene, T_room, rng=rng, stamp_ns=int(stamp)), T_world)
+        for stamp, T_room, T_world in zip(stamps_ns, T_room_cameras, T_world_cameras, strict=True)
+    ]
+    return scans, Trajectory(stamps_ns, T_world_cameras), T_world_room
+
+
+def around(*, x=0.0, down_deg=25.0, n=12, height_m=1.4, span_deg=90.0):
+    rolls = np.linspace(-4, 4, n)
+    return [
+        pose(x, 0.0, height_m, yaw_deg=yaw, down_deg=down_deg, roll_deg=roll)
+        for yaw, roll in zip(np.linspace(0, span_deg, n), rolls, strict=True)
+    ]
+
+
+def level_of(scans, trajectory, accelerations=None, **body):
+    return find_level(scans, trajectory=trajectory, accelerations=accelerations, config=LevelConfig(), **body)
+
+
+def tilt_deg(level, T_world_room):
+    up_level = level.T_level_world[:3, :3] @ T_world_room[:3, 2]
+    return np.degrees(np.arccos(np.clip(up_level[2], -1.0, 1.0)))
+
+
+def floor_height_m(level, T_world_room):
+    """Where the room's own floor, below the first pose, lies in the level frame."""
+    return float(apply(level.T_level_world @ T_world_room, np.zeros((1, 3)))[0, 2])
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("down_deg", [0.0, 25.0, 50.0])
+def test_a_room_is_levelled_from_any_world(seed, down_deg):
+    scans, trajectory, T_world_room = log_of(ROOM, around(down_deg=down_deg), seed=seed)
+    level = level_of(scans, trajectory)
+    assert level.method == "planes"
+    assert "floor seen" in level.detail
+    assert tilt_deg(level, T_world_room) < 0.3
+    assert abs(floor_height_m(level, T_world_room)) < 0.02
+
+
+def test_the_first_pose_stands_at_the_origin_and_looks_along_x():
+    scans, trajectory, _ = log_of(ROOM, around())
+    T_level_first = level_of(scans, trajectory).T_level_world @ trajectory.T_world_body[0]
+    np.testing.assert_allclose(T_level_first[:3, 3], [0.0, 0.0, 1.4], atol=0.02)
+    heading = T_level_first[:3, :3] @ AXES["rgbd"].forward
+    assert heading[0] > 0.8
+    assert abs(heading[1]) < 1e-12
+    assert (T_level_first[:3, :3] @ AXES["rgbd"].up)[2] > 0.8
+
+
+def test_a_camera_that_looks_straight_down_takes_its_heading_from_its_own_up():
+    poses = [
+        pose(x, 0.0, 1.4, yaw_deg=0.0, down_deg=d) for x, d in zip((0, 0.5, 1.0), (90, 30, 30), strict=True)
+    ]
+    scans, trajectory, _ = log_of(ROOM, poses)
+    T_level_first = level_of(scans, trajectory).T_level_world @ trajectory.T_world_body[0]
+    np.testing.assert_allclose(T_level_first[:3, :3] @ AXES["rgbd"].up, [1.0, 0.0, 0.0], atol=0.02)
+
+
+def test_a_big_desk_is_not_taken_for_the_floor():
+    poses = [pose(-0.4, y, 1.5, yaw_deg=0.0, down_deg=40.0) for y in np.linspace(-1, 1, 10)]
+    poses += [pose(-0.4, 0.0, 1.5, yaw_deg=60.0, down_deg=40.0)] * 2
+    scans, trajectory, T_world_room = log_of([DESK, FLOOR, WALLS[0]], poses)
+    level = level_of(scans, trajectory)
+    assert tilt_deg(level, T_world_room) < 0.5
+    assert "floor seen" in level.detail
+    assert abs(floor_height_m(level, T_world_room)) < 0.02
+
+
+def test_a_desk_with_things_below_it_is_no_floor():
+    poses = [pose(0.2, y, 1.5, yaw_deg=0.0, down_deg=50.0) for y in np.linspace(-0.5, 0.5, 10)]
+    scans, trajectory, T_world_room = log_of([DESK], poses)
+    rng = np.random.default_rng(0)
+    clutter_room = rng.uniform([-0.5, -1.0, 0.0], [0.2, 1.0, 0.5], (200, 3))
+    cluttered = [
+        (
+            Scan(
+                s.stamp_ns,
+                np.vstack([s.points_body, apply(inverse(T) @ T_world_room, clutter_room)]).astype("f4"),
+            ),
+            T,
+        )
+        for s, T in scans
+    ]
+    level = level_of(cluttered, trajectory)
+    assert "no floor seen" in level.detail
+    assert tilt_deg(level, T_world_room) < 0.5
+    assert -0.1 < floor_height_m(level, T_world_room) < 0.05
+
+
+def test_a_dominant_wall_in_front_of_a_camera_that_looks_down_is_not_up():
+    floor_strip = Rectangle(2, 0.0, (1.6, -3.0), (2.0, 3.0))
+    poses = [pose(1.0, y, 1.4, yaw_deg=5 * y, down_deg=35.0) for y in np.linspace(-1.5, 1.5, 10)]
+    scans, trajectory, T_world_room = log_of([WALLS[0], floor_strip], poses)
+    assert tilt_deg(level_of(scans, trajectory), T_world_room) < 0.5
+
+
+def test_two_walls_are_enough():
+    scans, trajectory, T_world_room = log_of(WALLS, around(down_deg=15.0))
+    level = level_of(scans, trajectory)
+    assert level.method == "planes"
+    assert "no floor seen" in level.detail
+    assert tilt_deg(level, T_world_room) < 0.5
+
+
+def test_one_wall_tells_one_tilt_and_says_so():
+    poses = [pose(0.0, y, 1.4, yaw_deg=0.0, down_deg=15.0, roll_deg=6.0) for y in np.linspace(-1, 1, 10)]
+    scans, trajectory, T_world_room = log_of(WALLS[:1], poses)
+    level = level_of(scans, trajectory)
+    wall_normal_level = level.T_level_world[:3, :3] @ T_world_room[:3, 0]
+    assert abs(np.degrees(np.arcsin(wall_normal_level[2]))) < 0.5
+    assert tilt_deg(level, T_world_room) == pytest.approx(6.0, abs=1.0)
+    assert "the tilt along them is the camera's" in level.detail
+
+
+def test_without_any_plane_the_camera_says_what_is_up():
+    rng = np.random.default_rng(0)
+    trajectory = Trajectory(np.arange(4) * MS, np.array([pose(0, 0, 1, yaw_deg=0, down_deg=20)] * 4))
+    cloud = Scan(0, rng.uniform(-2, 2, (4000, 3)).astype(np.float32))
+    for scans in ([(cloud, T) for T in trajectory.T_world_body], []):
+        level = level_of(scans, trajectory)
+        assert level.method == "camera"
+        np.testing.assert_allclose(
+            level.T_level_world[2, :3], trajectory.T_world_body[0, :3, :3] @ AXES["rgbd"].up, atol=1e-12
+        )
+    assert "no points seen" in level.detail
+
+
+def readings_of(trajectory, T_world_room, R_body_sensor, *, noise_mps2, seed=0, per_pose=32):
+    """Readings around each pose, pointing up in the accelerometer's own axes."""
+    rng = np.random.default_rng(seed)
+    R_world_body = np.repeat(trajectory.T_world_body[:, :3, :3], per_pose, axis=0)
+    up_sensor = np.einsum("ji,nkj,k->ni", R_body_sensor, R_world_body, T_world_room[:3, 2])
+    stamps_ns = np.repeat(trajectory.stamps_ns, per_pose) + np.tile(np.arange(per_pose), len(trajectory)) * MS
+    return Accelerations(stamps_ns, 9.81 * up_sensor + rng.normal(0, noise_mps2, up_sensor.shape))
+
+
+SENSOR_AXES = [
+    np.eye(3),
+    np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]),
+    np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]),
+]
+
+
+@pytest.mark.parametrize("R_body_sensor", SENSOR_AXES)
+def test_an_accelerometer_of_any_axes_tells_up(R_body_sensor):
+    poses = [
+        pose(0, 0, 1.4, yaw_deg=y, down_deg=20 + 15 * np.sin(y / 15), roll_deg=10 * np.cos(y / 15))
+        for y in range(0, 90, 3)
+    ]
+    scans, trajectory, T_world_room = log_of([], poses)
+    accelerations = readings_of(trajectory, T_world_room, R_body_sensor, noise_mps2=0.6)
+    level = level_of(scans, trajectory, accelerations)
+    assert level.method == "accelerometer"
+    assert tilt_deg(level, T_world_room) < 0.5
+
+
+def test_an_accelerometer_that_cannot_tell_its_axes_gives_way_to_planes():
+    still = [pose(0.02 * k, 0, 1.4, yaw_deg=0, down_deg=30) for k in range(8)]
+    scans, trajectory, T_world_room = log_of(ROOM, still)
+    accelerations = readings_of(trajectory, T_world_room, SENSOR_AXES[1], noise_mps2=0.5)
+    level = level_of(scans, trajectory, accelerations)
+    assert level.method == "planes"
+    assert "ambiguous" in level.detail
+    assert tilt_deg(level, T_world_room) < 0.5
+
+
+@pytest.mark.parametrize(("shift_ns", "noise_mps2"), [(10**12, 0.1), (0, 30.0)])
+def test_useless_readings_give_way_to_planes_and_say_why(shift_ns, noise_mps2):
+    scans, trajectory, T_world_room = log_of(ROOM, around())
+    readings = readings_of(trajectory, T_world_room, np.eye(3), noise_mps2=noise_mps2)
+    late = Accelerations(readings.stamps_ns + shift_ns, readings.acceleration_mps2)
+    level = level_of(scans, trajectory, late)
+    assert level.method == "planes"
+    assert "accelerometer" in level.detail
+
+
+def test_a_body_with_other_axes_can_say_so():
+    R_camera_lidar = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # x forward, z up
+    T_camera_lidar = transform(R_camera_lidar, np.zeros(3))
+    scans, trajectory, T_world_room = log_of(ROOM, around())
+    as_lidar = [
+        (
+            Scan(s.stamp_ns, apply(inverse(T_camera_lidar), s.points_body).astype(np.float32)),
+            T @ T_camera_lidar,
+        )
+        for s, T in scans
+    ]
+    moved = Trajectory(trajectory.stamps_ns, trajectory.T_world_body @ T_camera_lidar)
+    level = level_of(as_lidar, moved, axes=AXES["lidar"])
+    assert tilt_deg(level, T_world_room) < 0.3
+    assert (level.T_level_world @ moved.T_world_body[0])[0, 0] > 0.8
+
+
+def test_the_same_log_gives_the_same_frame_to_the_bit():
+    scans, trajectory, _ = log_of(ROOM, around())
+    assert (level_of(scans, trajectory).T_level_world == level_of(scans, trajectory).T_level_world).all()
+
+
+def test_a_log_without_poses_is_refused():
+    with pytest.raises(DataError, match="no poses"):
+        level_of([], Trajectory(np.empty(0, np.int64), np.empty((0, 4, 4))))
+
+
+@pytest.mark.skipif(not FR1_XYZ.is_dir(), reason=f"{FR1_XYZ} is not here")
+def test_a_real_desk_is_levelled_as_its_motion_capture_says():
+    truth = read_tum(FR1_XYZ / "groundtruth.txt")
+    camera = PinholeCamera(640, 480, 517.3, 516.5, 318.6, 255.3)
+    rows = [line.split() for line in (FR1_XYZ / "depth.txt").read_text().splitlines() if line[0] != "#"]
+    scans = []
+    for stamp_text, name in rows[10:790:26]:
+        stamp_ns = ns_from_seconds_text(stamp_text)
+        index, _ = nearest(truth.stamps_ns, np.array([stamp_ns]))
+        depth_m = cv2.imread(str(FR1_XYZ / name), cv2.IMREAD_UNCHANGED).astype(np.float32) / 5000.0
+        frame = RgbdFrame(stamp_ns, np.zeros((480, 640), np.uint8), depth_m, camera)
+        scans.append((frame.scan(stride_px=8, max_depth_m=4.0), truth.T_world_body[index[0]]))
+
+    level = level_of(
+        scans, Trajectory(np.array([s.stamp_ns for s, _ in scans]), np.array([T for _, T in scans]))
+    )
+
+    # The camera looks down by 44°. Seen through the truth, the floor itself leans by 2.4° against the
+    # truth's z axis (a plane fitted to 25 000 floor points), so no closer agreement can be asked for.
+    up_truth = level.T_level_world[2, :3]
+    assert level.method == "planes"
+    assert np.degrees(np.arccos(up_truth[2])) < 3.0
+    floor_truth = np.array([0.03046, -0.02864, 0.99913])
+    assert np.degrees(np.linalg.norm(np.cross(up_truth, floor_truth))) < 0.7
+    assert -level.T_level_world[2, 3] / up_truth[2] == pytest.approx(0.0, abs=0.1)

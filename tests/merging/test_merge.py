@@ -1,0 +1,367 @@
+"""Many runs become one map: the same bytes whoever does the work, and those of a merge in memory."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli.main import app
+from mapper.config.build import BuildConfig
+from mapper.core.errors import ConfigError, DataError, RunError
+from mapper.core.geometry import exp, inverse
+from mapper.core.trajectory import Trajectory
+from mapper.export.grid import read_grid
+from mapper.merging import jobs as merging_jobs
+from mapper.merging.merge import merge
+from mapper.merging.merged_map import open_map
+from mapper.merging.placing import Placed, as_built, by_poses, by_truth
+from mapper.octree.config import SliceConfig
+from mapper.octree.map import OctreeMap
+from mapper.octree.map_file import write_map
+from mapper.octree.octomap_file import write_bt, write_ot
+from mapper.octree.resampling import blocks_reached, resampled
+from mapper.octree.slice import cut_slice
+from mapper.run.files import SUMMARY
+from mapper.run.folder import load_run, write_run
+from mapper.run.manifest import Input, Manifest
+from mapper.runtime import job_runner
+from mapper.runtime.executor import Workers, run_jobs
+from mapper.sources.trajectory_files import write_tum
+from tests.support.octree_maps import COLORED, CONFIG, as_dict, mapped, total
+
+BAND = SliceConfig(min_height_m=-0.5, max_height_m=0.8)
+MERGE = partial(merge, tile_m=3.2)
+
+
+def make_run(path, octree, *, band=BAND, log="sha256:0", T_truth_world=None):
+    """A run folder with what a merge reads."""
+    config = BuildConfig(octree=octree.config, slice=band)
+    manifest = Manifest(status="building", input=Input(path="/log", kind="tum", fingerprint=log))
+    rng = np.random.default_rng(len(path.name))
+    poses = np.array([exp(rng.normal(0, 0.3, 3), rng.normal(0, 1.0, 3)) for _ in range(9)])
+    trajectory = Trajectory(np.arange(9) * 100_000_000 + 1, poses)
+    with write_run(path, manifest, config, overwrite=True) as writer:
+        write_map(writer.folder / "map.octree", octree)
+        write_tum(writer.folder / "trajectory.tum", trajectory)
+        if T_truth_world is not None:
+            write_tum(writer.folder / "truth.tum", trajectory.moved(T_truth_world))
+    return load_run(path)
+
+
+@pytest.fixture(scope="module")
+def maps():
+    return [mapped(seed, config=COLORED) for seed in range(8)]
+
+
+@pytest.fixture(scope="module")
+def runs(maps, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    return [make_run(folder / f"run{i}", octree, log=f"sha256:{i}") for i, octree in enumerate(maps)]
+
+
+@pytest.fixture(scope="module")
+def merged(runs, tmp_path_factory):
+    return MERGE(as_built(runs), tmp_path_factory.mktemp("merged") / "map").map
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Spare the picture, which takes half a second."""
+    monkeypatch.setattr("mapper.merging.merge.draw", lambda *_: None)
+
+
+def bytes_of(folder, *, but=""):
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != but)
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def shuffled_jobs(jobs, *workers, **settings):
+    order = np.random.default_rng(0).permutation(len(jobs))
+    for index, result in run_jobs([jobs[i] for i in order], *workers, **settings):
+        yield int(order[index]), result
+
+
+def test_the_bytes_are_the_same_for_one_process_two_processes_and_any_order(
+    runs, merged, tmp_path, monkeypatch
+):
+    MERGE(as_built(runs), tmp_path / "two", workers=Workers(2))
+    assert bytes_of(tmp_path / "two") == bytes_of(merged.path)
+
+    monkeypatch.setattr(job_runner, "run_jobs", shuffled_jobs)
+    monkeypatch.setattr("mapper.merging.merge.draw", lambda *_: None)
+    MERGE(as_built(runs), tmp_path / "shuffled")
+    assert bytes_of(tmp_path / "shuffled") == bytes_of(merged.path, but=SUMMARY)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_dask_cluster_writes_the_same_bytes(runs, merged, tmp_path, dask_scheduler):
+    MERGE(as_built(runs), tmp_path / "map", workers=Workers(scheduler=dask_scheduler))
+
+    assert bytes_of(tmp_path / "map") == bytes_of(merged.path, but=SUMMARY)
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("config", [CONFIG, COLORED], ids=["plain", "colours"])
+def test_the_files_are_those_of_the_maps_added_up_in_memory(maps, tmp_path, config):
+    maps = maps[:4]
+    octree, overlaps = total(maps, config=config)
+    write_bt(tmp_path / "whole.bt", octree)
+    write_ot(tmp_path / "whole.ot", octree)
+    plain = [total([each], config=config)[0] for each in maps]
+    runs = [make_run(tmp_path / f"run{i}", each) for i, each in enumerate(plain)]
+
+    found = merge(as_built(runs), tmp_path / "map", tile_m=1.6).map
+
+    assert (found.path / "map.bt").read_bytes() == (tmp_path / "whole.bt").read_bytes()
+    assert (found.path / "map.ot").read_bytes() == (tmp_path / "whole.ot").read_bytes()
+    assert found.manifest.voxels == len(octree)
+    assert [run.shared_voxels for run in found.manifest.runs] == [each.shared for each in overlaps]
+    assert len(found.manifest.tiles) > 8
+    whole = found.load(np.full(3, -100.0), np.full(3, 100.0))
+    assert as_dict(whole) == as_dict(octree)
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("above", ["floor", "ground"])
+def test_the_slice_is_that_of_the_whole(maps, tmp_path, above):
+    band = BAND.model_copy(update={"above": above, "min_cluster_cells": 2})
+    runs = [make_run(tmp_path / f"run{i}", each, band=band) for i, each in enumerate(maps[:3])]
+
+    found = MERGE(as_built(runs), tmp_path / "map").map
+
+    octree, _ = total(maps[:3], config=COLORED)
+    grid, expected = read_grid(found.path / "slice.yaml"), cut_slice(octree, band)
+    np.testing.assert_array_equal(grid.cells, expected.cells)
+    np.testing.assert_allclose(grid.origin_world_m, expected.origin_world_m)
+    columns = {(x, y) for x, y, _ in as_dict(octree)}
+    assert found.manifest.area_km2 == pytest.approx(len(columns) * 0.1**2 / 1e6, rel=1e-6)
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("config", [CONFIG, COLORED], ids=["plain", "colours"])
+def test_leaves_larger_than_a_tile_are_pruned_across_tiles(tmp_path, config):
+    octree = OctreeMap(config)
+    codes = np.concatenate([np.arange(64) + (1 << 30), np.arange(8) + (1 << 31), [3]])
+    values = np.full((len(codes), 512), octree._sensor().lowest)
+    values[-2, 7] = octree._sensor().highest
+    octree.restore_blocks(codes, np.ones(values.shape, bool), values[np.ones(values.shape, bool)])
+    if octree.attributes is not None:
+        arrays = octree.attributes.arrays._replace()
+        rows = octree.attributes.claim(np.arange(0, len(codes), 2))
+        arrays = octree.attributes.arrays
+        arrays.color_weights[rows] = 1
+        arrays.color_sums[rows] = np.random.default_rng(0).integers(0, 256, (len(rows), 512, 3))
+    run = make_run(tmp_path / "run", octree)
+    write_bt(tmp_path / "whole.bt", octree)
+    write_ot(tmp_path / "whole.ot", octree)
+
+    merge(as_built([run]), tmp_path / "map", tile_m=0.8)
+
+    assert (tmp_path / "map/map.bt").read_bytes() == (tmp_path / "whole.bt").read_bytes()
+    assert (tmp_path / "map/map.ot").read_bytes() == (tmp_path / "whole.ot").read_bytes()
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_merge_that_was_stopped_goes_on_where_it_was(runs, merged, tmp_path, monkeypatch):
+    out, joined = tmp_path / "map", []
+
+    def join(workspace, tile, *arguments, **settings):
+        joined.append(tile)
+        if len(joined) in (4, 5):
+            raise OSError("the disk is gone")
+        return merging_jobs.join_tile(workspace, tile, *arguments, **settings)
+
+    def jobs(some, executor, **_):
+        return run_jobs(some, executor, attempts=1)
+
+    monkeypatch.setattr("mapper.merging.merge.join_tile", join)
+    monkeypatch.setattr(job_runner, "run_jobs", jobs)
+    with pytest.raises(RunError, match=r"join \d+: OSError: the disk is gone.*\(and 1 more\).*to go on"):
+        MERGE(as_built(runs), out)
+    assert not out.exists()
+    with pytest.raises(RunError, match="not finished"):
+        open_map(out)
+    with pytest.raises(RunError, match="not finished; the mapper merge that began it goes on"):
+        load_run(out)
+    lost = joined[3:5]
+    joined.clear()
+    joined.extend([0] * 5)
+    monkeypatch.setattr("mapper.merging.merge.split_run", print)  # nothing is split again
+
+    MERGE(as_built(runs), out)
+
+    assert joined[5:] == lost
+    assert bytes_of(out) == bytes_of(merged.path, but=SUMMARY)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_what_was_left_of_another_merge_is_not_gone_on_with(runs, merged, tmp_path, monkeypatch):
+    out = tmp_path / "map"
+    with monkeypatch.context() as patch:
+        patch.setattr("mapper.merging.merge.write_whole_bt", None)
+        with pytest.raises(TypeError):
+            MERGE(as_built(runs[:2]), out)
+
+    MERGE(as_built(runs), out)
+
+    assert bytes_of(out) == bytes_of(merged.path, but=SUMMARY)
+
+
+def test_a_part_of_the_map_is_opened_alone(maps, merged):
+    octree, _ = total(maps, config=COLORED)
+    lower_m, upper_m = np.array([0.1, 0.1, 0.1]), np.array([3.1, 3.1, 3.1])
+
+    part = open_map(merged.path).load(lower_m, upper_m)
+
+    leaves = part.leaves()
+    assert 0 < len(leaves.keys) < len(octree)
+    assert (leaves.centres_world > 0.0).all()
+    assert (leaves.centres_world < 3.2).all()
+    inside = (octree.leaves().centres_world > 0.0).all(axis=1) & (octree.leaves().centres_world < 3.2).all(
+        axis=1
+    )
+    np.testing.assert_array_equal(
+        part.query(octree.leaves().centres_world[inside]), octree.leaves().log_odds[inside]
+    )
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_runs_are_brought_together_by_their_truths(maps, tmp_path):
+    T_truth_first, T_truth_second = (
+        exp(np.array([0.0, 0.0, 2.0]), np.ones(3)),
+        exp(np.array([0, 0, 1.0]), -np.ones(3)),
+    )
+    first = make_run(tmp_path / "a", maps[0], T_truth_world=T_truth_first)
+    second = make_run(tmp_path / "b", maps[1], T_truth_world=T_truth_second)
+
+    placed = by_truth([first, second])
+
+    T_map_second = inverse(T_truth_first) @ T_truth_second
+    assert placed[0].stays
+    np.testing.assert_allclose(placed[1].T_map_world, T_map_second, atol=1e-9)
+    found = MERGE(placed, tmp_path / "map").map
+    moved = resampled(
+        maps[1], inverse(placed[1].T_map_world), blocks_reached(maps[1], placed[1].T_map_world), COLORED
+    )
+    octree, _ = total([maps[0], moved], config=COLORED)
+    write_ot(tmp_path / "whole.ot", octree)
+    assert (found.path / "map.ot").read_bytes() == (tmp_path / "whole.ot").read_bytes()
+
+
+def test_a_straight_path_tells_how_a_run_is_turned_about_it(maps, tmp_path):
+    run = make_run(tmp_path / "a", maps[0])
+    poses = np.array([np.eye(4) for _ in range(9)])
+    poses[:, 0, 3] = np.arange(9)
+    straight = Trajectory(np.arange(9) + 1, poses)
+    T_truth_world = exp(np.array([1.0, 0.4, -2.0]), np.array([3.0, 2.0, 1.0]))
+    write_tum(run.path / "trajectory.tum", straight)
+    write_tum(run.path / "truth.tum", straight.moved(T_truth_world))
+    still = make_run(tmp_path / "still", maps[0], T_truth_world=np.eye(4))
+
+    placed = by_truth([still, run])
+
+    np.testing.assert_allclose(placed[1].T_map_world, T_truth_world, atol=1e-9)
+
+
+def test_poses_come_from_a_file(runs, tmp_path, monkeypatch):
+    path = tmp_path / "poses.txt"
+    path.write_text(
+        "# name tx ty tz qx qy qz qw\nrun1,1,2,3,0,0,0,1\nrun0 0 0 0 0 0 0 1\nother 0 0 0 0 0 0 1\n"
+    )
+
+    placed = by_poses(runs[:2], path)
+
+    assert placed[0].stays
+    np.testing.assert_array_equal(placed[1].T_map_world[:3, 3], [1.0, 2.0, 3.0])
+    monkeypatch.chdir(runs[1].path)
+    np.testing.assert_array_equal(by_poses([load_run(Path())], path)[0].T_map_world, placed[1].T_map_world)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("run0 0 0 0 0 0 0 1\n", "no line for run1"),
+        ("run0 0 0 0 0 0 1\n", "poses.txt:1: want RUN tx ty tz"),
+        ("run0 0 0 0 0 0 0 nan\n", "poses.txt:1: want RUN tx ty tz"),
+        ("run0 0 0 0 0 0 0 0\n", "poses.txt:1: want RUN tx ty tz"),
+        ("run0 0 0 0 0 0 0 1\nrun0 0 0 0 0 0 0 1\n", "poses.txt:2: a second pose of run0"),
+    ],
+)
+def test_a_bad_line_of_poses_is_named(runs, tmp_path, text, complaint):
+    path = tmp_path / "poses.txt"
+    path.write_text(text)
+
+    with pytest.raises(DataError, match=complaint):
+        by_poses(runs[:2], path)
+
+
+def test_runs_that_do_not_fit_together_are_refused(runs, maps, tmp_path):
+    coarse = OctreeMap(COLORED.model_copy(update={"resolution_m": 0.2}))
+    unsure = OctreeMap(COLORED.model_copy(update={"hit_probability": 0.6}))
+
+    with pytest.raises(ConfigError, match=r"octree\.resolution_m is 0\.2, but 0\.1 in .*run0.*mapper fuse"):
+        MERGE(as_built([runs[0], make_run(tmp_path / "coarse", coarse)]), tmp_path / "map")
+    with pytest.raises(ConfigError, match=r"octree\.hit_probability is 0\.6, but 0\.7"):
+        MERGE(as_built([runs[0], make_run(tmp_path / "unsure", unsure)]), tmp_path / "map")
+    with pytest.raises(RunError, match="given twice"):
+        MERGE(as_built([runs[0], runs[0]]), tmp_path / "map")
+    with pytest.raises(RunError, match="nothing is known"):
+        MERGE(as_built([make_run(tmp_path / "empty", OctreeMap(COLORED))]), tmp_path / "map")
+    with pytest.raises(RunError, match="has no truth to be placed by"):
+        by_truth(runs[:2])
+    bare = make_run(tmp_path / "bare", maps[0])
+    (bare.path / "map.octree").unlink()
+    with pytest.raises(RunError, match=r"has no map\.octree; make it with mapper fuse"):
+        MERGE(as_built([bare]), tmp_path / "map")
+    with pytest.raises(RunError, match="run0: is no merged map, so --overwrite will not replace it"):
+        MERGE(as_built(runs), runs[0].path, overwrite=True)
+    with pytest.raises(ConfigError, match=r"tile edge 0\.1 m"):
+        merge(as_built(runs), tmp_path / "map", tile_m=0.1)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_path_is_planned_on_a_merged_map(tmp_path, capsys):
+    octree = OctreeMap(CONFIG)
+    sides = np.linspace(-1.95, 1.95, 40).astype(np.float32)
+    ring = [(x, y, 0.05) for x in sides for y in sides if max(abs(x), abs(y)) > 1.9]
+    octree.insert_points(np.array(ring, np.float32), np.array([0.05, 0.05, 0.05]))
+    MERGE(as_built([make_run(tmp_path / "run", octree)]), tmp_path / "map")
+
+    app(
+        ["plan", str(tmp_path / "map"), "--from", "-1", "0", "--to", "1", "0.5", "--radius", "0.1"],
+        standalone_mode=False,
+    )
+
+    assert capsys.readouterr().out.startswith("2.06 m in the slice")
+    assert (tmp_path / "map/plan.png").stat().st_size > 10_000
+    assert '"map": "slice"' in (tmp_path / "map/plan.json").read_text()
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_user_is_told_what_to_doubt(runs, maps, merged, tmp_path):
+    assert merged.manifest.notes[0].startswith("every run's world was taken for the map's")
+    again = make_run(tmp_path / "again", maps[0], log="sha256:1")
+    upside_down = Placed(again, exp(np.array([np.pi, 0.0, 0.0]), np.zeros(3)), "by hand")
+
+    found = MERGE([as_built(runs[1:2])[0], upside_down], tmp_path / "map").map
+
+    assert found.manifest.notes == (
+        "run1 and again were made from 9 frames that are the same; these count twice",
+        "no slice: a run is tilted by more than 5°, so z is not up in the map",
+    )
+    assert not (found.path / "slice.yaml").exists()
+
+
+def test_the_verb_says_what_it_made(runs, tmp_path, capsys):
+    arguments = ["merge", str(runs[0].path), str(runs[1].path), "--out", str(tmp_path / "map")]
+
+    app([*arguments, "--tile-m", "1.6"], standalone_mode=False)
+
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ["run", "placed", "voxels", "known", "before", "walls", "alike"]
+    assert lines[2].split()[:3] == ["run1", "as", "built"]
+    assert lines[-1] == str(tmp_path / "map")
+    assert open_map(tmp_path / "map").manifest.status == "complete"
+    with pytest.raises(RunError, match=r"is a merged map, not a run"):
+        load_run(tmp_path / "map")

@@ -1,0 +1,283 @@
+import struct
+
+import numpy as np
+import pyoctomap
+import pytest
+
+from mapper.core.errors import MapFileError, MapSizeError
+from mapper.octree import blocks
+from mapper.octree.config import OctreeConfig
+from mapper.octree.map import OctreeMap, log_odds
+from mapper.octree.octomap_file import read_map, write_bt, write_ot
+from tests.support.octomap_oracle import fr1_xyz_scans, fuse, voxels
+from tests.support.paths import DATA, FR1_XYZ
+
+BOTH_KINDS = pytest.mark.parametrize("write", [write_bt, write_ot], ids=["bt", "ot"])
+FREE, OCCUPIED = log_odds(0.1192), log_odds(0.971)
+
+
+def saturated_scans(seed, *, repeats=8):
+    """Scans of the same ends until much of the free space is clamped, so that OctoMap prunes."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.6, 0.6, (600, 3)).astype(np.float32)
+    return [(points, rng.uniform(0.0, 0.04, 3)) for _ in range(repeats)]
+
+
+@pytest.fixture(scope="module")
+def octree():
+    octree = OctreeMap(OctreeConfig())
+    for points, origin in saturated_scans(0):
+        octree.insert_points(points, origin)
+    return octree
+
+
+@pytest.fixture(scope="module")
+def their_tree():
+    return fuse(saturated_scans(0), resolution_m=0.05, max_range_m=4.0, discretize=True)
+
+
+def assert_equal_leaves(octree, other):
+    np.testing.assert_array_equal(octree.leaves().keys, other.leaves().keys)
+    np.testing.assert_array_equal(octree.leaves().log_odds, other.leaves().log_odds)
+    assert len(octree) == len(other)
+
+
+def test_files_equal_the_cpp_library_s_byte_for_byte(octree, their_tree, tmp_path):
+    assert their_tree.getNumLeafNodes() < 0.9 * len(octree)  # pruning has something to do
+
+    write_ot(tmp_path / "map.ot", octree)
+    write_bt(tmp_path / "map.bt", octree)
+
+    assert (tmp_path / "map.ot").read_bytes() == their_tree.write()
+    their_tree.read(str(tmp_path / "map.ot"))  # writeBinary destroys log-odds: work on a copy
+    assert (tmp_path / "map.bt").read_bytes() == their_tree.writeBinary()
+
+
+@pytest.mark.skipif(not FR1_XYZ.exists(), reason="needs ../shared/data/tum_fr1_xyz")
+def test_files_of_real_frames_equal_the_cpp_library_s(tmp_path):
+    scans = fr1_xyz_scans(8)
+    octree = OctreeMap(OctreeConfig())
+    for points, origin in scans:
+        octree.insert_points(points, origin)
+    tree = fuse(scans, resolution_m=0.05, max_range_m=4.0, discretize=True)
+
+    write_ot(tmp_path / "map.ot", octree)
+    write_bt(tmp_path / "map.bt", octree)
+
+    assert (tmp_path / "map.ot").read_bytes() == tree.write()
+    assert (tmp_path / "map.bt").read_bytes() == tree.writeBinary()
+
+
+def test_the_cpp_library_reads_our_files(octree, tmp_path):
+    write_ot(tmp_path / "map.ot", octree)
+
+    tree = pyoctomap.OcTree(0.05).read(str(tmp_path / "map.ot"))
+
+    leaves = octree.leaves()
+    ours = {tuple(key): value for key, value in zip(leaves.keys.tolist(), leaves.log_odds, strict=True)}
+    assert voxels(tree, resolution_m=0.05) == ours
+
+
+def test_ot_keeps_every_log_odds(octree, tmp_path):
+    write_ot(tmp_path / "map.ot", octree)
+
+    assert_equal_leaves(read_map(tmp_path / "map.ot"), octree)
+
+
+def test_bt_keeps_free_occupied_and_unknown(octree, tmp_path):
+    write_bt(tmp_path / "map.bt", octree)
+
+    read, leaves = read_map(tmp_path / "map.bt").leaves(), octree.leaves()
+
+    np.testing.assert_array_equal(read.keys, leaves.keys)
+    np.testing.assert_array_equal(read.log_odds, np.where(leaves.log_odds >= 0, OCCUPIED, FREE))
+
+
+@BOTH_KINDS
+def test_an_empty_map_is_a_file_without_payload(write, tmp_path):
+    write(tmp_path / "map", OctreeMap(OctreeConfig(resolution_m=0.125)))
+
+    assert (tmp_path / "map").read_bytes().endswith(b"id OcTree\nsize 0\nres 0.125\ndata\n")
+    assert len(read_map(tmp_path / "map")) == 0
+    assert read_map(tmp_path / "map").resolution_m == 0.125
+
+
+@pytest.mark.skipif(not DATA.exists(), reason="needs ../shared/data/octomap")
+@pytest.mark.parametrize("name", ["geb079.bt", "freiburg1_360.bt", "velma.ot"])
+def test_published_maps_survive_a_round_trip(name, tmp_path):
+    path = DATA / "octomap" / name
+    octree = read_map(path)
+    write = write_bt if path.suffix == ".bt" else write_ot
+
+    write(tmp_path / "again", octree)
+
+    if path.suffix == ".bt":  # velma.ot was written unpruned
+        payload = (tmp_path / "again").read_bytes().partition(b"data\n")[2]
+        assert payload == path.read_bytes().partition(b"data\n")[2]
+    else:
+        assert_equal_leaves(read_map(tmp_path / "again"), octree)
+
+
+@pytest.mark.skipif(not DATA.exists(), reason="needs ../shared/data/octomap")
+def test_a_published_map_reads_as_the_cpp_library_reads_it():
+    path = DATA / "octomap" / "velma.ot"
+    octree, tree = read_map(path), pyoctomap.OcTree(0.1).read(str(path))
+
+    theirs = [
+        (leaf.getCoordinate(), leaf.current_node.getLogOdds(), leaf.getDepth()) for leaf in tree.begin_leafs()
+    ]
+
+    assert len(octree) == sum(8 ** (16 - depth) for _, _, depth in theirs)
+    inside = np.array([centre for centre, _, _ in theirs]) + 0.01  # off the corner at a pruned leaf's centre
+    assert octree.query(inside).tolist() == [value for _, value, _ in theirs]
+
+
+def test_a_color_octree_gives_its_log_odds(tmp_path):
+    tree = pyoctomap.ColorOcTree(0.1)
+    for i in range(20):
+        tree.updateNode(np.array([0.1 * i, -0.3 * i, 0.05]), i % 2 == 0)
+    tree.write(str(tmp_path / "color.ot"))
+
+    octree = read_map(tmp_path / "color.ot")
+
+    centres = np.array([[0.1 * i, -0.3 * i, 0.05] for i in range(20)])
+    assert len(octree) == 20
+    assert octree.query(centres + 1e-6).tolist() == [log_odds(0.7), log_odds(0.4)] * 10
+
+
+def test_what_is_inserted_after_reading_goes_on_from_there(octree, tmp_path):
+    write_ot(tmp_path / "map.ot", octree)
+    again, leaves = read_map(tmp_path / "map.ot"), octree.leaves()
+    first = leaves.centres_world[:1]
+
+    again.insert_points(first.astype(np.float32), first[0])
+
+    assert again.query(first)[0] == min(leaves.log_odds[0] + log_odds(0.7), OCCUPIED)
+    assert len(again) == len(octree)
+
+
+HEADER = b"# Octomap OcTree file\n# comment\nid OcTree\nsize 1\nres 0.1\ndata\n"
+DEEP = b"".join(struct.pack("<fB", 1.0, 1) for _ in range(16)) + struct.pack("<fB", 1.0, 0)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"# Octomap OcTree file\nres 0.1\nsize 17\nid OcTree\ndata\n",
+        b"# Octomap OcTree file version 2\n\n#x\nid 1\n# y z\nsize 17\nres 1e-1\nauthor me\ndata\n",
+        b"# Octomap OcTree file\r\nid OcTree\r\nsize 17\r\nres 0.1\r\ndata\n",
+    ],
+    ids=["order", "comments", "crlf"],
+)
+def test_headers_may_differ(header, tmp_path):
+    (tmp_path / "map.ot").write_bytes(header + DEEP)
+
+    leaves = read_map(tmp_path / "map.ot").leaves()
+
+    assert leaves.keys.tolist() == [[0, 0, 0]]
+    assert leaves.resolution_m == 0.1
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "not an OctoMap file: it is empty"),
+        (b"ply\nformat ascii 1.0\n", "not an OctoMap file: it starts with b'ply'"),
+        (b"\x89PNG\r\n\x1a\n" * 9, "not an OctoMap file"),
+        (HEADER[:40], "no line 'data'; the file is truncated"),
+        (HEADER.replace(b"size 1\n", b""), "no line 'size'"),
+        (HEADER.replace(b"res 0.1\n", b""), "no line 'res'"),
+        (HEADER.replace(b"id OcTree\n", b""), "no line 'id'"),
+        (HEADER.replace(b"id OcTree", b"id CountingOcTree"), "'CountingOcTree'; only OcTree and ColorOcTree"),
+        (HEADER.replace(b"size 1", b"size -1"), "size '-1' must be a count"),
+        (HEADER.replace(b"size 1", b"size many"), "size 'many' must be a count"),
+        (HEADER.replace(b"res 0.1", b"res 0"), "res '0' a length > 0 m"),
+        (HEADER.replace(b"res 0.1", b"res nan"), "res 'nan' a length > 0 m"),
+        (HEADER.replace(b"size 1", b"size 0") + b"x", "size 0, but 1 bytes follow"),
+        (HEADER.replace(b"size 1", b"size 16") + DEEP, "promises 16 nodes of 5 bytes, but 85 bytes follow"),
+        (HEADER.replace(b"size 1", b"size 999999999999") + DEEP, "promises 999999999999 nodes"),
+        (HEADER.replace(b"size 1", b"size 18") + DEEP[:5] + DEEP, "deeper than 16 levels"),
+        (HEADER.replace(b"size 1", b"size 16") + DEEP[:80], "ends before its tree does"),
+        (HEADER.replace(b"size 1", b"size 18") + DEEP + DEEP[-5:], "goes on after its tree has ended"),
+        (HEADER.replace(b"size 1", b"size 17") + DEEP[:80] + struct.pack("<fB", np.nan, 0), "not finite"),
+    ],
+)
+def test_files_that_are_no_maps_are_refused(data, message, tmp_path):
+    (tmp_path / "map.ot").write_bytes(data)
+
+    with pytest.raises(MapFileError, match=message) as caught:
+        read_map(tmp_path / "map.ot")
+    assert "\n" not in str(caught.value)
+    assert str(tmp_path / "map.ot") in str(caught.value)
+
+
+@pytest.mark.parametrize("change", ["smaller", "larger", "huge"])
+def test_a_bt_of_another_size_is_refused(octree, change, tmp_path):
+    write_bt(tmp_path / "map.bt", octree)
+    data = (tmp_path / "map.bt").read_bytes()
+    size = int(data.split(b"size ")[1].split(b"\n")[0])
+    wrong = {"smaller": size - 1, "larger": size + 1, "huge": 10**12}[change]
+    (tmp_path / "map.bt").write_bytes(data.replace(b"size %d" % size, b"size %d" % wrong))
+
+    with pytest.raises(MapFileError, match=f"{wrong} nodes"):
+        read_map(tmp_path / "map.bt")
+
+
+@BOTH_KINDS
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_truncated_files_are_refused(write, octree, share, tmp_path):
+    write(tmp_path / "map", octree)
+    data = (tmp_path / "map").read_bytes()
+    (tmp_path / "map").write_bytes(data[: int(share * len(data)) // 2 * 2])
+
+    with pytest.raises(MapFileError, match=r"truncated|promises|cannot hold"):
+        read_map(tmp_path / "map")
+
+
+@BOTH_KINDS
+def test_no_damage_goes_unnoticed_as_anything_but_a_map_or_an_error(write, octree, tmp_path, monkeypatch):
+    # A flipped bit can turn a small leaf into a huge one: the machine pretends to have 64 MiB.
+    monkeypatch.setattr(
+        blocks.os, "sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**14}[name]
+    )
+    write(tmp_path / "map", octree)
+    data = (tmp_path / "map").read_bytes()
+    rng = np.random.default_rng(0)
+    outcomes = {"read": 0, "refused": 0}
+    for _ in range(150):
+        damaged = bytearray(data)
+        for at in rng.integers(0, len(data), 3):
+            damaged[at] ^= 1 << int(rng.integers(8))
+        (tmp_path / "damaged").write_bytes(damaged)
+        try:
+            assert len(read_map(tmp_path / "damaged").leaves().keys) >= 0
+            outcomes["read"] += 1
+        except (MapFileError, MapSizeError):
+            outcomes["refused"] += 1
+    assert outcomes["refused"] > 20  # log-odds of an .ot may change unnoticed, its structure may not
+
+
+def test_a_leaf_too_large_for_memory_is_refused(tmp_path):
+    data = HEADER.replace(b"size 1", b"size 2") + struct.pack("<fB", 1.0, 1) + struct.pack("<fB", 1.0, 0)
+    (tmp_path / "map.ot").write_bytes(data)
+
+    with pytest.raises(MapSizeError, match="pruned leaves expanded needs 131072"):
+        read_map(tmp_path / "map.ot")
+
+
+def test_a_missing_file_is_one_clear_line(tmp_path):
+    with pytest.raises(MapFileError, match=r"nothing\.bt: cannot be read: No such file"):
+        read_map(tmp_path / "nothing.bt")
+
+
+@BOTH_KINDS
+def test_a_failed_write_leaves_the_old_file(write, octree, tmp_path, monkeypatch):
+    path = tmp_path / "map"
+    write(path, octree)
+    before = path.read_bytes()
+    monkeypatch.setattr("mapper.octree.octomap_file._header_bytes", lambda *_: "text where bytes belong")
+    with pytest.raises(TypeError):
+        write(path, octree)
+
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,0 +1,83 @@
+"""A map seen from another frame: what lies at each voxel's centre, and nothing forgotten."""
+
+import numpy as np
+import pytest
+
+from mapper.core.errors import MapSizeError
+from mapper.core.geometry import apply, exp, inverse
+from mapper.octree.map import OctreeMap
+from mapper.octree.resampling import blocks_reached, resampled
+from tests.support.octree_maps import COLORED, CONFIG, as_dict, mapped
+
+
+def moved(octree, T_map_world, *, config=CONFIG):
+    codes = blocks_reached(octree, T_map_world)
+    return resampled(octree, inverse(T_map_world), codes, config)
+
+
+def some_motion(seed):
+    rng = np.random.default_rng(seed)
+    return exp(rng.normal(0.0, 1.0, 3), rng.normal(0.0, 5.0, 3))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_voxel_holds_what_lies_at_its_centre(seed):
+    octree, T_map_world = mapped(seed), some_motion(seed)
+
+    found = moved(octree, T_map_world)
+
+    leaves = found.leaves()
+    np.testing.assert_array_equal(
+        octree.query(apply(inverse(T_map_world), leaves.centres_world)), leaves.log_odds
+    )
+    # and nothing is missing: voxels all around the moved map that are not in it are unknown there
+    edge = found.resolution_m
+    low, high = (np.floor(f(leaves.centres_world, axis=0) / edge).astype(int) for f in (np.min, np.max))
+    rng = np.random.default_rng(seed)
+    probes = (rng.integers(low - 20, high + 20, (20_000, 3)) + 0.5) * edge
+    np.testing.assert_array_equal(found.query(probes), octree.query(apply(inverse(T_map_world), probes)))
+
+
+def test_a_shift_by_whole_voxels_loses_nothing():
+    octree, T_map_world = mapped(5), np.eye(4)
+    T_map_world[:3, 3] = np.array([3, -20, 7]) * CONFIG.resolution_m
+
+    found = as_dict(moved(octree, T_map_world))
+
+    shifted = {(x + 3, y - 20, z + 7): value for (x, y, z), value in as_dict(octree).items()}
+    assert found == shifted
+
+
+def test_a_wall_of_one_voxel_stays_closed_however_it_is_turned():
+    octree = OctreeMap(CONFIG)
+    y, z = np.meshgrid(np.arange(-3.95, 4.0, 0.1), np.arange(-3.95, 4.0, 0.1))
+    wall = np.column_stack([np.full(y.size, 2.05), y.ravel(), z.ravel()]).astype(np.float32)
+    octree.insert_points(wall, np.zeros(3))
+    T_map_world = exp(np.array([0.3, -0.5, 0.7]), np.zeros(3))
+
+    turned = moved(octree, T_map_world)
+
+    directions = apply(T_map_world, wall[np.abs(wall[:, 1:]).max(axis=1) < 1.4].astype(float))
+    ends = turned.cast_rays(np.zeros_like(directions), directions, max_range_m=np.inf, through_unknown=True)
+    assert len(directions) > 500
+    assert ends.hits.all()
+
+
+def test_attributes_come_along():
+    octree, T_map_world = mapped(6, config=COLORED), some_motion(6)
+
+    found = moved(octree, T_map_world, config=COLORED)
+
+    centres = found.leaves().centres_world
+    here, there = found.attributes.at(centres), octree.attributes.at(apply(inverse(T_map_world), centres))
+    for name in ("colors", "colored", "hits", "last_seen_ns"):
+        np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
+    assert here.colored.any()
+
+
+def test_a_map_is_not_placed_where_keys_end():
+    T_map_world = np.eye(4)
+    T_map_world[0, 3] = 3276.0
+
+    with pytest.raises(MapSizeError, match=r"reaches 327\d m from the map's origin.* ends at 3276\.8 m"):
+        blocks_reached(mapped(7), T_map_world)

@@ -1,0 +1,132 @@
+"""Relocalisation after a loss: a known place is recognised, an unknown one begins a sub-map."""
+
+import numpy as np
+import pytest
+
+from mapper.core.geometry import angle_between, inverse
+from mapper.graph.components import components
+from mapper.graph.model import PoseGraph
+from mapper.odometry.config import LocalMapConfig, PnpConfig
+from mapper.odometry.factory import build_frame_odometry
+from mapper.simulation.config import SynthConfig
+from mapper.simulation.source import CameraSimulator
+from tests.support.desk_frames import blank
+
+RATE_HZ = 15.0
+BOTH = pytest.mark.parametrize("config", [LocalMapConfig(), PnpConfig()], ids=lambda config: config.kind)
+
+
+@pytest.fixture(scope="module")
+def source():
+    """One and a half turns on the spot."""
+    return CameraSimulator(
+        SynthConfig(
+            path="spin",
+            duration_s=7.0,
+            frame_rate_hz=RATE_HZ,
+            max_yaw_rate_rad_s=1.9,
+            width_px=320,
+            height_px=240,
+            texture_px_per_m=96,
+        )
+    ).log()
+
+
+@pytest.fixture(scope="module")
+def frames(source):
+    return [entry.load(colour=False) for entry in source.entries()]
+
+
+def seconds(start_s, end_s):
+    return slice(round(start_s * RATE_HZ), round(end_s * RATE_HZ))
+
+
+def tracked(frames, odometry):
+    return [odometry.track(odometry.observe(frame)) for frame in frames]
+
+
+def graph_of(tracks, odometry):
+    graph = PoseGraph()
+    for track in tracks:
+        if track.is_keyframe:
+            graph.add_node(track.node, track.stamp_ns, track.T_world_body)
+    graph.add_factors(odometry.finish())
+    return graph
+
+
+@BOTH
+def test_a_known_place_is_recognised_in_its_first_frame(source, frames, config):
+    dark = seconds(4.5, 5.5)
+    log = [*frames[: dark.start], *map(blank, frames[dark]), *frames[dark.stop :]]
+
+    tracks = tracked(log, build_frame_odometry(config))
+
+    assert [i for i, t in enumerate(tracks) if t.node is None] == list(range(dark.start, dark.stop))
+    back = tracks[dark.stop]
+    assert back.diagnostics.method == "relocalised"
+    found_by = back.links[0].i if back.is_keyframe else back.node
+    assert found_by < tracks[dark.start - 1].node // 2  # a keyframe of the turn before
+    T_truth = inverse(source.truth.T_world_body[0]) @ source.truth.T_world_body[dark.stop]
+    miss = inverse(T_truth) @ back.T_world_body
+    assert np.linalg.norm(miss[:3, 3]) < 0.08
+    assert angle_between(miss[:3, :3], np.eye(3)) < 0.04
+
+
+@BOTH
+def test_an_unknown_place_begins_a_sub_map(frames, config):
+    before, elsewhere = frames[seconds(0.0, 1.0)], frames[seconds(2.3, 3.3)]
+    odometry = build_frame_odometry(config.model_copy(update={"max_lost_frames": 4}))
+
+    tracks = tracked([*before, *elsewhere], odometry)
+
+    last, after = tracks[len(before) - 1], tracks[len(before) :]
+    assert [t.node is None for t in after] == [True] * 4 + [False] * (len(after) - 4)
+    first = after[4]
+    assert first.is_keyframe
+    assert first.diagnostics.method == "start"
+    assert not first.links
+    assert not first.factors
+    assert np.allclose(first.T_world_body, last.T_world_body)
+    assert all(t.node >= first.node for t in after[4:])
+    parts = components(graph_of(tracks, odometry))
+    assert [part[0] for part in parts] == [0, first.node]
+
+
+def test_without_sub_maps_frames_stay_lost(frames):
+    odometry = build_frame_odometry(LocalMapConfig(max_lost_frames=0))
+    before, elsewhere = frames[seconds(0.0, 1.0)], frames[seconds(2.3, 3.3)]
+    assert all(t.node is None for t in tracked([*before, *elsewhere], odometry)[len(before) :])
+
+
+def test_darkness_is_no_place(frames):
+    """Frames without features never begin a map, however many they are."""
+    odometry = build_frame_odometry(LocalMapConfig(max_lost_frames=2))
+    tracks = tracked([*frames[:5], *map(blank, frames[5:9]), *frames[9:12]], odometry)
+    assert all(t.node is None for t in tracks[5:9])
+    assert tracks[9].diagnostics.method == "relocalised"
+
+
+def test_a_second_turn_is_tracked_with_the_first_ones_landmarks(frames):
+    """After relocalisation keyframes share landmarks with those from before the loss: one component."""
+    dark = seconds(4.5, 5.5)
+    odometry = build_frame_odometry(LocalMapConfig())
+    tracks = tracked([*frames[: dark.start], *map(blank, frames[dark]), *frames[dark.stop :]], odometry)
+    graph = graph_of(tracks, odometry)
+    assert len(components(graph)) == 1
+    assert any(factor.j - factor.i > 10 for factor in graph.factors)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_of_two_weak_poses_that_of_more_inliers_counts(frames, order):
+    """No pose has enough inliers here, so each keyframe is tried, in any order."""
+    config = LocalMapConfig(weak_inliers=10_000)
+    odometry = build_frame_odometry(config)
+    tracked(frames[:12], odometry)
+    relocalizer, observation = odometry._relocalizer, odometry.observe(frames[12])
+    keyframes = range(len(odometry._map.keyframes))[::order]
+    alone = [relocalizer.best_among([k], observation, method="alone") for k in keyframes]
+
+    best = relocalizer.best_among(keyframes, observation, method="all")
+
+    assert sum(tracked_pose is not None for tracked_pose in alone) > 1
+    assert best.inliers == max(tracked_pose.inliers for tracked_pose in alone if tracked_pose is not None)

@@ -1,0 +1,196 @@
+"""A second session appended to a run: tied by loops, solved and mapped with the first."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from cli.summary import summary_text
+from evaluators.metrics.trajectory import align, associate, ate
+from mapper.config.loading import load_config, overridden
+from mapper.core.errors import ConfigError, RunError
+from mapper.loops.config import NoLoopsConfig
+from mapper.pipeline.append import append
+from mapper.pipeline.build import build
+from mapper.pipeline.fuse import fuse
+from mapper.run.folder import load_run, moved_log, open_log
+from mapper.simulation import write_tum_log
+from mapper.simulation.config import SynthConfig
+from mapper.sources import open_source
+from mapper.sources.chained import sessions_of
+from mapper.sources.config import SourceConfig
+from tests.support.command_line import mapper
+from tests.support.files import files_of
+
+# A keyframe every few frames, so that a second of walking leaves enough of them to tie.
+SETTINGS = ("odometry.max_keyframe_gap=3", "loops.min_motion_m=0.0")
+
+
+@pytest.fixture(scope="module")
+def first(desk_log, tmp_path_factory):
+    """The first half of the walk."""
+    config = load_config(None, [*SETTINGS, "source.last_frame=15"])
+    return build(open_source(desk_log, config.source), config, tmp_path_factory.mktemp("first") / "run")
+
+
+@pytest.fixture(scope="module")
+def joined(first, desk_log):
+    """The second half, appended by the command line."""
+    out = first.path.with_name("joined")
+    mapper("build", desk_log, "--first", 16, "--onto", first.path, "--out", out)
+    return load_run(out)
+
+
+@pytest.fixture(scope="module")
+def elsewhere(tmp_path_factory):
+    """A log of another flat."""
+    log = tmp_path_factory.mktemp("synthetic") / "elsewhere"
+    size = {"width_px": 320, "height_px": 240, "texture_px_per_m": 64}
+    write_tum_log(log, SynthConfig(seed=5, path="desk", duration_s=0.8, frame_rate_hz=15.0, **size))
+    return log
+
+
+def test_both_sessions_are_one_run_in_the_first_one_s_world(first, joined):
+    counts = joined.manifest.counts
+    assert counts.listed == counts.tracked == len(joined.trajectory()) == 31
+    assert [record.stamp_ns for record in joined.records()] == joined.trajectory().stamps_ns.tolist()
+    assert joined.manifest.levelling == first.manifest.levelling
+
+    T_first, T_joined = (run.graph().T_world_node for run in (first, joined))
+    assert list(T_joined)[: len(T_first)] == list(T_first)
+    np.testing.assert_allclose(T_joined[0], T_first[0], atol=1e-9)
+
+    matched = associate(joined.trajectory(), joined.truth())
+    assert ate(align(matched, "se3").moved(matched)).rmse < 0.02
+
+
+def test_loops_between_the_sessions_hold(first, joined):
+    known = first.graph().T_world_node.keys()
+    loops = joined.loops()
+    assert [(loop.i, loop.j) for loop in loops[: len(first.loops())]] == [
+        (loop.i, loop.j) for loop in first.loops()
+    ]
+    assert any(loop.verdict == "accepted" and loop.i in known and loop.j not in known for loop in loops)
+    held = [(loop.i, loop.j) for loop in loops if loop.verdict == "accepted"]
+    factors = joined.graph().factors
+    assert [(f.i, f.j) for f in factors[len(factors) - len(held) :]] == held
+    assert {f.origin for f in factors[: len(factors) - len(held)]} == {"odometry"}
+
+
+def test_every_frame_hangs_on_its_node(joined):
+    graph = joined.graph()
+    T_by_stamp = dict(
+        zip(joined.trajectory().stamps_ns.tolist(), joined.trajectory().T_world_body, strict=True)
+    )
+    for record in joined.records():
+        if record.is_keyframe:
+            np.testing.assert_allclose(
+                T_by_stamp[record.stamp_ns], graph.T_world_node[record.node], atol=1e-9
+            )
+    assert {record.node for record in joined.records()} == set(graph.T_world_node)
+
+
+def test_the_manifest_remembers_both_logs(joined, desk_log):
+    manifest = json.loads((joined.path / "manifest.json").read_text())
+    (second,) = manifest["input"]["appended"]
+    assert second["path"] == manifest["input"]["path"] == str(desk_log)
+    assert (second["source"]["first_frame"], second["shift_ns"]) == (16, 0)
+    assert joined.config.source.last_frame == 15
+    source = open_log(joined)
+    assert [entry.stamp_ns for entry in source.entries()] == [
+        entry.stamp_ns for entry in open_source(desk_log).entries()
+    ]
+
+
+def test_the_table_names_both_logs(first, joined):
+    assert summary_text(joined, []).splitlines()[0].split() == ["logs", "desk", "+", "desk"]
+    assert summary_text(first, []).startswith("frames")
+
+
+def test_the_maps_are_those_of_fusing_from_scratch(joined, tmp_path):
+    again = shutil.copytree(joined.path, tmp_path / "again")
+    (again / "scan_updates.bin").unlink()
+    mapper("fuse", again, "--quiet")
+    for name in ("map.ot", "cloud.ply", "slice.pgm"):
+        assert (again / name).read_bytes() == (joined.path / name).read_bytes()
+
+
+def test_moved_logs_are_told_in_their_order(joined, desk_log, tmp_path):
+    run = load_run(shutil.copytree(joined.path, tmp_path / "run"))
+    moved = shutil.copytree(desk_log, tmp_path / "moved")
+    mapper("fuse", run.path, "--log", moved, "--log", desk_log, "--set", "cloud.voxel_m=0.1", "--quiet")
+    known = load_run(run.path).manifest.input
+    assert [known.path, known.appended[0].path] == [str(moved), str(desk_log)]
+    result = mapper("fuse", run.path, "--log", moved, status=1)
+    assert "made from 2 logs" in result.stderr
+    with pytest.raises(RunError, match="1 given, want all of them in this order"):
+        moved_log(run, moved)
+
+
+def test_loops_can_be_edited_afterwards(first, joined, tmp_path):
+    run = shutil.copytree(joined.path, tmp_path / "run")
+    known = first.graph().T_world_node.keys()
+    between = [
+        (loop.i, loop.j)
+        for loop in joined.loops()
+        if loop.verdict == "accepted" and loop.i in known and loop.j not in known
+    ]
+    mapper("loops", run, "--remove", *between[0], "--quiet")
+    before = files_of(run)
+    pairs = [word for pair in between[1:] for word in ("--remove", *pair)]
+    result = mapper("loops", run, *pairs, status=1)
+    assert "the graph falls apart" in result.stderr
+    assert files_of(run) == before
+
+
+def test_a_third_session_is_appended_to_two(joined, desk_log, tmp_path):
+    """The same walk once more: its stamps are taken already, so they are shifted."""
+    source = open_source(desk_log, SourceConfig(last_frame=12))
+    three = append(source, joined, overridden(joined.config, ["source.last_frame=12"]), tmp_path / "three")
+    assert three.manifest.counts.tracked == 31 + 13
+    assert [len(session.log) for session in sessions_of(open_log(three))] == [16, 15, 13]
+    assert three.manifest.input.appended[1].shift_ns > 0
+    matched = associate(three.trajectory(), three.truth())
+    assert len(matched) == 44
+    assert ate(align(matched, "se3").moved(matched)).rmse < 0.02
+    assert three.manifest.timing.log_s == pytest.approx(31 / 15 + 11 / 15, abs=0.2)
+    fuse(open_log(three), three, three.config)
+
+
+def test_another_place_is_refused_and_the_run_is_untouched(first, elsewhere, tmp_path):
+    before = files_of(first.path)
+    result = mapper("build", elsewhere, "--onto", first.path, "--out", tmp_path / "out", "--quiet", status=1)
+    assert f"mapper: {elsewhere}: no loop connects it to {first.path}" in result.stderr
+    assert "is it the same place?" in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert files_of(first.path) == before
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("odometry.max_keyframe_gap=9", "odometry: fixed by"),
+        ("level.frames=3", "level: fixed by"),
+        ("graph.solve=proportional", "graph.solve=proportional: cannot join"),
+        ("loops.propose=nearby", "recognised by visual words alone"),
+    ],
+)
+def test_settings_that_cannot_join_are_refused(first, desk_log, tmp_path, override, message):
+    config = overridden(first.config, [override, "source.first_frame=16", "source.last_frame=30"])
+    with pytest.raises(ConfigError, match=message):
+        append(open_source(desk_log, config.source), first, config, tmp_path / "out")
+
+
+def test_a_run_without_loops_takes_no_session(first, desk_log, tmp_path):
+    config = first.config.model_copy(update={"loops": NoLoopsConfig()})
+    with pytest.raises(ConfigError, match=r"loops\.kind=none: cannot connect two sessions; want places"):
+        append(open_source(desk_log), first, config, tmp_path / "out")
+
+
+def test_a_configuration_file_and_a_run_to_append_to_exclude_each_other(first, desk_log, tmp_path):
+    out = tmp_path / "out"
+    config = first.path / "config.json"
+    result = mapper("build", desk_log, "--onto", first.path, "--config", config, "--out", out, status=1)
+    assert "with --onto the settings of" in result.stderr

@@ -1,0 +1,252 @@
+import json
+import shutil
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from evaluators.metrics.trajectory import align, associate, ate
+from mapper.config.loading import load_config, overridden
+from mapper.core.errors import ConfigError, RunError, TrackingError
+from mapper.export.grid import read_grid
+from mapper.octree.octomap_file import read_map
+from mapper.pipeline.build import build
+from mapper.pipeline.fuse import fuse
+from mapper.run.folder import load_run
+from mapper.run.manifest import read_manifest
+from mapper.sources import open_source
+from tests.support.desk import REPEATABLE
+from tests.support.files import files_of
+
+
+def build_run(log, out, *overrides, **options):
+    config = load_config(None, overrides)
+    return build(open_source(log, config.source), config, out, **options)
+
+
+@pytest.fixture
+def run(desk_run):
+    return desk_run
+
+
+@pytest.fixture
+def damaged_log(desk_log, tmp_path):
+    return shutil.copytree(desk_log, tmp_path / "damaged")
+
+
+class Observer:
+    """Interrupts a stage, or remembers what it was told."""
+
+    def __init__(self, interrupt=None):
+        self.interrupt, self.notes, self.reached = interrupt, [], {}
+
+    @contextmanager
+    def stage(self, name):
+        def report(done, total):
+            self.reached[name] = (done, total)
+            if name == self.interrupt and done == 12:
+                raise KeyboardInterrupt
+
+        yield report
+
+    def note(self, message):
+        self.notes.append(message)
+
+
+def test_every_frame_is_tracked_close_to_the_truth(run):
+    counts = run.manifest.counts
+    assert counts.listed == counts.tracked == len(run.trajectory()) == 31
+    assert counts.nodes == len(run.graph().T_world_node) >= 2
+
+    matched = associate(run.trajectory(), run.truth())
+    assert ate(align(matched, "se3").moved(matched)).rmse < 0.02
+
+
+def test_the_world_is_levelled_with_the_floor_at_zero(run):
+    T_world_body = run.trajectory().T_world_body
+    assert run.manifest.levelling.method == "planes"
+    assert (T_world_body[:, 2, 3] > 0.5).all()
+    assert (T_world_body[:, 2, 3] < 2.0).all()
+
+    truth = (
+        run.truth()
+    )  # the synthetic world's z is up and its floor at 0, so heights agree without alignment
+    np.testing.assert_allclose(T_world_body[:, 2, 3], truth.T_world_body[:, 2, 3], atol=0.05)
+
+
+def test_the_graph_is_the_trajectory_s(run):
+    T_by_stamp = dict(zip(run.trajectory().stamps_ns.tolist(), run.trajectory().T_world_body, strict=True))
+    graph = run.graph()
+    for node, stamp_ns in graph.stamps_ns.items():
+        np.testing.assert_allclose(graph.T_world_node[node], T_by_stamp[stamp_ns], atol=1e-9)
+
+
+def test_the_maps_agree_with_each_other(run):
+    octree = read_map(run.path / "map.ot")
+    grid = read_grid(run.path / "slice.yaml")
+    assert len(octree) == run.manifest.counts.leaves > 1000
+    assert grid.resolution_m == octree.resolution_m == run.config.octree.resolution_m
+    assert {0, 100} <= set(np.unique(grid.cells))
+
+    row, column = np.argwhere(grid.cells == 100)[0]
+    x, y = grid.origin_world_m + (np.array([column, row]) + 0.5) * grid.resolution_m
+    heights_m = np.arange(0.1, 1.2, 0.05) + 0.025
+    column_log_odds = octree.query(np.array([[x, y, z] for z in heights_m]))
+    assert (column_log_odds >= octree.occupied_log_odds).any()
+
+
+def test_the_log_holds_the_whole_story(run):
+    with (run.path / "run.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    topics = {
+        summary.channels[channel].topic: count
+        for channel, count in summary.statistics.channel_message_counts.items()
+    }
+    assert topics["/tf"] == 31 + 4
+    assert topics["/diagnostics"] == 31
+    assert topics["/camera/image"] == 4
+    assert {"/trajectory/estimate", "/trajectory/truth", "/graph/factors"} <= set(topics)
+    assert {"/map/octree", "/map/cloud", "/map/slice"} <= set(topics)
+    stamps = run.trajectory().stamps_ns
+    assert summary.statistics.message_start_time == stamps[0]
+    assert summary.statistics.message_end_time == stamps[-1]
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_the_same_log_gives_the_same_bytes(run, desk_log, tmp_path, workers):
+    again = build_run(desk_log, tmp_path / "again", REPEATABLE, f"workers={workers}")
+
+    ours, theirs = files_of(again.path), files_of(run.path)
+    assert ours.keys() == theirs.keys()
+    assert overridden(again.config, ["workers=2"]) == run.config
+    assert again.manifest.model_copy(update={"timing": run.manifest.timing}) == run.manifest
+    for name in ours.keys() - {"config.json", "manifest.json", "frame_ms.csv"}:
+        assert ours[name] == theirs[name], name
+
+
+def test_fusing_again_changes_the_maps_alone(run, desk_log, tmp_path):
+    fine = load_run(shutil.copytree(run.path, tmp_path / "fine"))
+    config = overridden(fine.config, ["octree.resolution_m=0.1", "slice.max_height_m=0.8"])
+
+    fused = fuse(open_source(desk_log), fine, config)
+
+    direct = build_run(
+        desk_log, tmp_path / "direct", REPEATABLE, "octree.resolution_m=0.1", "slice.max_height_m=0.8"
+    )
+    ours, theirs = files_of(fused.path), files_of(direct.path)
+    for name in ours.keys() - {"manifest.json", "frame_ms.csv"}:
+        assert ours[name] == theirs[name], name
+    assert fused.manifest.counts == direct.manifest.counts
+    before, after = run.manifest.timing, fused.manifest.timing
+    assert after.stage_s.keys() == before.stage_s.keys()
+    assert after.stage_s["track"] == before.stage_s["track"]
+    assert after.total_s == pytest.approx(sum(after.stage_s.values()))
+
+
+def test_fusing_spares_a_user_s_files_and_learns_where_the_log_is(run, desk_log, tmp_path):
+    own = load_run(shutil.copytree(run.path, tmp_path / "own"))
+    (own.path / "notes").mkdir()
+    (own.path / "notes" / "monday.txt").write_text("the door was open")
+    (own.path / "mesh.ply").write_bytes(b"of the same trajectory")
+    (own.path / "voxels.ply").write_bytes(b"of the old map")
+    moved = shutil.copytree(desk_log, tmp_path / "moved")
+
+    fused = fuse(open_source(moved), own, overridden(own.config, ["octree.resolution_m=0.2"]))
+
+    assert (own.path / "notes" / "monday.txt").read_text() == "the door was open"
+    assert (own.path / "mesh.ply").exists()
+    assert not (own.path / "voxels.ply").exists()
+    assert fused.manifest.input == run.manifest.input.model_copy(update={"path": str(moved)})
+
+
+def test_a_run_whose_scan_updates_have_their_former_name_is_fused_without_reading_every_frame(
+    run, desk_log, tmp_path
+):
+    old = load_run(shutil.copytree(run.path, tmp_path / "old"))
+    (old.path / "scan_updates.bin").rename(old.path / "sights.bin")
+    observer = Observer()
+
+    fused = fuse(open_source(desk_log), old, old.config, progress=observer)
+
+    tracked = run.manifest.counts.tracked
+    assert f"fused again: 0 of {tracked} frames, which had moved or were not known" in observer.notes
+    ours, before = files_of(fused.path), files_of(run.path)
+    assert ours.keys() == before.keys()
+    for name in ("map.ot", "scan_updates.bin"):
+        assert ours[name] == before[name], name
+
+
+def test_fusing_refuses_what_it_cannot_change(run, desk_log):
+    before = files_of(run.path)
+    with pytest.raises(ConfigError, match="odometry: fuse keeps what was tracked"):
+        fuse(open_source(desk_log), run, overridden(run.config, ["odometry.max_depth_m=3"]))
+    assert files_of(run.path) == before
+
+
+def test_fusing_refuses_another_log(run, damaged_log):
+    (damaged_log / "rgb.txt").write_text((damaged_log / "rgb.txt").read_text() + "\n")
+    with pytest.raises(RunError, match="changed since"):
+        fuse(open_source(damaged_log), run, run.config)
+
+
+def test_bad_frames_are_skipped_counted_and_reported(damaged_log, tmp_path):
+    images = sorted((damaged_log / "rgb").iterdir())
+    images[5].write_bytes(images[5].read_bytes()[:500])
+    depths = sorted((damaged_log / "depth").iterdir())
+    depths[9].write_bytes(b"")
+    observer = Observer()
+
+    run = build_run(damaged_log, tmp_path / "run", progress=observer)
+
+    assert run.manifest.counts.skipped == len(run.manifest.skipped) == 2
+    assert run.manifest.counts.tracked == 29
+    assert images[5].name in run.manifest.skipped[0].reason
+    assert [record.outcome for record in run.records()].count("skipped") == 2
+    assert sum(note.startswith("skipped: ") for note in observer.notes) == 2
+    assert observer.reached == {"track": (31, 31), "fuse": (29, 29)}
+
+
+def test_a_log_without_texture_ends_in_an_error_and_leaves_what_there_is(damaged_log, tmp_path):
+    for image in (damaged_log / "rgb").iterdir():
+        image.write_bytes(_black_png())
+
+    with pytest.raises(TrackingError, match="only 0 of 31 frames read could be tracked, want at least 10"):
+        build_run(damaged_log, tmp_path / "run")
+
+    partial = tmp_path / "run.partial"
+    assert read_manifest(partial / "manifest.json").status == "failed"
+    assert (partial / "frames.csv").read_text().count("lost") >= 31
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_log_of_which_nothing_can_be_read_names_the_first_reason(damaged_log, tmp_path):
+    for depth in (damaged_log / "depth").iterdir():
+        depth.write_bytes(b"")
+
+    with pytest.raises(TrackingError, match=r"none of 31 frames could be read; the first: .*depth"):
+        build_run(damaged_log, tmp_path / "run")
+
+
+@pytest.mark.parametrize("stage", ["track", "fuse"])
+def test_an_interrupted_build_says_so_and_spares_the_old_run(run, desk_log, tmp_path, stage):
+    old = shutil.copytree(run.path, tmp_path / "run")
+    before = files_of(old)
+
+    with pytest.raises(KeyboardInterrupt):
+        build_run(desk_log, old, progress=Observer(interrupt=stage), overwrite=True)
+
+    assert files_of(old) == before
+    assert json.loads((tmp_path / "run.partial" / "manifest.json").read_text())["status"] == "interrupted"
+    assert not list((tmp_path / "run.partial").glob(".*"))
+
+
+def test_a_scan_alone_is_the_frame_s(desk_log):
+    entry = next(iter(open_source(desk_log).entries()))
+    np.testing.assert_array_equal(entry.scan().points_body, entry.load().scan().points_body)
+
+
+def _black_png():
+    import cv2
+
+    return cv2.imencode(".png", np.zeros((240, 320, 3), np.uint8))[1].tobytes()

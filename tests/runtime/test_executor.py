@@ -1,0 +1,140 @@
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from mapper.core.errors import ConfigError, DependencyError
+from mapper.runtime import executor as workers
+from mapper.runtime.executor import Failure, Workers, make_executor, run_jobs
+from tests.support.counted_jobs import Work, alive, told, until
+from tests.support.paths import ROOT
+
+
+@pytest.fixture(params=["here", "processes", "dask"])
+def anywhere(request):
+    if request.param == "dask":
+        return Workers(scheduler=request.getfixturevalue("dask_scheduler"))
+    return Workers(1 if request.param == "here" else 2)
+
+
+@pytest.fixture
+def diary(tmp_path):
+    return tmp_path / "diary"
+
+
+def outcomes_of(jobs, given, **options):
+    with make_executor(given) as executor:
+        return dict(run_jobs(jobs, executor, **options))
+
+
+def test_every_job_is_done_once_wherever(anywhere, diary):
+    jobs = [Work(diary, str(n)) for n in range(7)]
+    assert outcomes_of(jobs, anywhere) == {n: n * n for n in range(7)}
+    assert told(diary) == {str(n): 1 for n in range(7)}
+
+
+def test_what_raises_is_tried_again_and_the_others_go_on(anywhere, diary):
+    jobs = [Work(diary, "1", "raise"), Work(diary, "2"), Work(diary, "3", "refuse")]
+    outcomes = outcomes_of(jobs, anywhere, attempts=3)
+    assert outcomes[1] == 4
+    assert outcomes[2] == Failure("3.png: is black", 3)
+    assert outcomes[0].attempts == 3
+    assert outcomes[0].reason.startswith("ValueError: no such thing as 1 (counted_jobs.py:")
+    assert told(diary) == {"1": 3, "2": 1, "3": 3}
+
+
+def test_what_ends_its_worker_is_the_only_one_lost(diary):
+    jobs = [Work(diary, "1", "exit"), Work(diary, "2", "kill"), *(Work(diary, str(n)) for n in (3, 4, 5))]
+    outcomes = outcomes_of(jobs, Workers(2))
+    assert outcomes == {
+        0: Failure("its worker ended with exit status 3", 2),
+        1: Failure("its worker was killed by SIGKILL", 2),
+        2: 9,
+        3: 16,
+        4: 25,
+    }
+    assert told(diary) == {"1": 2, "2": 2, "3": 1, "4": 1, "5": 1}
+
+
+def test_what_ended_its_worker_once_gets_another(diary):
+    jobs = [Work(diary, "flaky", "exit_once"), Work(diary, "2")]
+    assert outcomes_of(jobs, Workers(2)) == {0: 7, 1: 4}
+    assert told(diary) == {"flaky": 2, "2": 1}
+
+
+def test_what_ends_a_cluster_s_worker_is_the_only_one_lost(diary, dask_scheduler):
+    jobs = [Work(diary, "1", "exit"), Work(diary, "2"), Work(diary, "3")]
+    outcomes = outcomes_of(jobs, Workers(scheduler=dask_scheduler), attempts=1)
+    assert outcomes == {0: Failure("its worker died, 1 of 1 times; its log may say why", 1), 1: 4, 2: 9}
+    assert told(diary) == {"1": 1, "2": 1, "3": 1}
+
+
+def test_a_result_that_cannot_travel_is_a_failure(diary):
+    outcomes = outcomes_of([Work(diary, "1", "unpicklable"), Work(diary, "2")], Workers(2))
+    assert "pickle" in outcomes[0].reason
+    assert outcomes[1] == 4
+
+
+def test_libraries_get_one_thread_each(diary, monkeypatch):
+    for name in ("OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+        monkeypatch.delenv(name, raising=False)
+    outcomes = outcomes_of([Work(diary, "1", "limits"), Work(diary, "2")], Workers(2))
+    assert outcomes[0] == (1, "1")
+
+
+def test_leaving_early_ends_the_workers(diary):
+    jobs = [Work(diary, "1"), Work(diary, "asleep", "wait"), Work(diary, "awake", "wait")]
+    with make_executor(Workers(2)) as executor:
+        assert next(run_jobs(jobs, executor)) == (0, 1)
+        until((diary.parent / "asleep.pid").exists)
+        pid = int((diary.parent / "asleep.pid").read_text() or 0)
+        assert alive(pid)
+    assert not alive(pid)
+
+
+def test_workers_do_not_outlive_a_parent_that_is_killed(diary, tmp_path):
+    script = tmp_path / "sweep.py"
+    script.write_text(
+        "from pathlib import Path\n"
+        "from mapper.runtime.executor import Workers, make_executor, run_jobs\n"
+        "from tests.support.counted_jobs import Work\n"
+        "if __name__ == '__main__':\n"
+        f"    diary = Path({str(diary)!r})\n"
+        "    with make_executor(Workers(2)) as executor:\n"
+        "        list(run_jobs([Work(diary, name, 'wait') for name in 'ab'], executor))\n"
+    )
+    parent = subprocess.Popen([sys.executable, str(script)], env={"PYTHONPATH": str(ROOT)})
+    files = [tmp_path / "a.pid", tmp_path / "b.pid"]
+    until(lambda: all(file.exists() and file.read_text() for file in files))
+    pids = [int(file.read_text()) for file in files]
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    until(lambda: not any(map(alive, pids)), seconds=10.0)
+
+
+@pytest.mark.parametrize(("processes", "attempts"), [(0, 1), (1, 0)])
+def test_numbers_of_nothing_are_refused(diary, processes, attempts):
+    with pytest.raises(ConfigError, match="want at least 1"):
+        outcomes_of([Work(diary, "1")], Workers(processes), attempts=attempts)
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("somewhere", "scheduler 'somewhere': not an address; want tcp://HOST:PORT"),
+        ("", "scheduler '': not an address"),
+        ("tcp://127.0.0.1:9", "tcp://127.0.0.1:9: no Dask scheduler answers there within 0.3 s"),
+    ],
+)
+def test_a_scheduler_that_is_not_there_is_told(monkeypatch, address, message):
+    monkeypatch.setattr(workers, "_ANSWER_S", 0.3)
+    with pytest.raises(ConfigError) as told_:
+        make_executor(Workers(scheduler=address))
+    assert str(told_.value).startswith(message)
+
+
+def test_a_missing_extra_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(DependencyError, match=r"pip install 'mapper\[cluster\]'"):
+        make_executor(Workers(scheduler="tcp://127.0.0.1:8786"))

@@ -1,0 +1,169 @@
+import struct
+
+import cv2
+import numpy as np
+import pytest
+
+from mapper.core.errors import FrameError
+from mapper.sources.ros.image_messages import depth_m_of, image_of, is_depth, size_of
+from mapper.sources.ros.messages import FileMessage, PixelsMessage
+from tests.support.tum_logs import picture
+
+RGB, UNITS = picture(3)
+GREY = cv2.cvtColor(RGB, cv2.COLOR_RGB2GRAY)
+
+
+def pixels(array, encoding, *, padding=0, is_big_endian=False):
+    """An image message whose rows end in padding."""
+    height, width = array.shape[:2]
+    rows = np.ascontiguousarray(array).view(np.uint8).reshape(height, -1)
+    rows = np.pad(rows, ((0, 0), (0, padding)), constant_values=77)
+    return PixelsMessage(
+        0, "optical", encoding, width, height, rows.shape[1], is_big_endian, memoryview(rows.tobytes())
+    )
+
+
+def file(data, format_):
+    return FileMessage(0, "optical", format_, memoryview(bytes(data)))
+
+
+def encoded(array, ending):
+    return cv2.imencode(ending, array)[1].tobytes()
+
+
+ALPHA = np.full((*RGB.shape[:2], 1), 255, np.uint8)
+BGR = RGB[:, :, ::-1]
+
+
+@pytest.mark.parametrize("padding", [0, 13])
+@pytest.mark.parametrize(
+    ("encoding", "array"),
+    [
+        ("rgb8", RGB),
+        ("bgr8", BGR),
+        ("8UC3", BGR),
+        ("rgba8", np.concatenate([RGB, ALPHA], axis=2)),
+        ("bgra8", np.concatenate([BGR, ALPHA], axis=2)),
+        ("8UC4", np.concatenate([BGR, ALPHA], axis=2)),
+    ],
+)
+def test_colour_comes_as_rgb_and_as_the_grey_of_files(encoding, array, padding):
+    message = pixels(array, encoding, padding=padding)
+    np.testing.assert_array_equal(image_of(message, colour=True, where="m"), RGB)
+    np.testing.assert_array_equal(image_of(message, colour=False, where="m"), GREY)
+    assert not is_depth(message)
+    assert size_of(message, where="m") == (64, 48)
+
+
+@pytest.mark.parametrize("encoding", ["mono8", "8UC1"])
+def test_grey_stays_grey(encoding):
+    for colour in (True, False):
+        np.testing.assert_array_equal(image_of(pixels(GREY, encoding), colour=colour, where="m"), GREY)
+
+
+@pytest.mark.parametrize("encoding", ["rggb", "bggr", "gbrg", "grbg"])
+def test_bayer_patterns_are_named_by_their_first_pixels(encoding):
+    """A plain red image is red, whichever pattern it was taken through."""
+    mosaic = np.zeros((48, 64), np.uint8)
+    at = encoding.index("r")
+    mosaic[at // 2 :: 2, at % 2 :: 2] = 200
+    image = image_of(pixels(mosaic, f"bayer_{encoding}8"), colour=True, where="m")
+    np.testing.assert_array_equal(image[8:-8, 8:-8].reshape(-1, 3).max(axis=0), [200, 0, 0])
+
+
+def test_yuv_is_read_in_both_orders_of_bytes():
+    yuyv = np.zeros((48, 64, 2), np.uint8)
+    yuyv[:, :, 0], yuyv[:, :, 1] = 126, 128
+    for message in (pixels(yuyv, "yuv422_yuy2"), pixels(yuyv[:, :, ::-1], "yuv422")):
+        image = image_of(message, colour=True, where="m")
+        assert np.abs(image.astype(int) - 128).max() <= 1
+        assert image_of(message, colour=False, where="m").shape == (48, 64)
+
+
+@pytest.mark.parametrize(("ending", "format_"), [(".png", "png"), (".jpg", "rgb8; jpeg compressed bgr8")])
+def test_image_files_are_decoded_as_on_disk(ending, format_):
+    data = encoded(BGR, ending)
+    message = file(data, format_)
+    expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
+    np.testing.assert_array_equal(image_of(message, colour=True, where="m"), expected)
+    assert size_of(message, where="m") == (64, 48)
+    assert not is_depth(message)
+
+
+@pytest.mark.parametrize("is_big_endian", [False, True])
+@pytest.mark.parametrize("encoding", ["16UC1", "mono16"])
+def test_depth_of_16_bits_is_millimetres(encoding, is_big_endian):
+    units = UNITS.copy()
+    units[5, 6] = 65535  # saturated
+    stored = units.astype(">u2" if is_big_endian else "<u2")
+    message = pixels(stored, encoding, padding=2, is_big_endian=is_big_endian)
+    depth_m = depth_m_of(message, units_per_m=1000.0, where="m")
+    expected = UNITS.astype(np.float32) / np.float32(1000)
+    expected[5, 6] = 0.0
+    np.testing.assert_array_equal(depth_m, expected)
+    assert depth_m.dtype == np.float32
+    assert is_depth(message)
+
+
+@pytest.mark.parametrize("kind", ["<f4", ">f4"])
+def test_depth_of_32_bits_is_metres_and_what_is_no_depth_is_zero(kind):
+    depth = np.linspace(0.5, 4.0, 48 * 64, dtype=np.float32).reshape(48, 64)
+    wild = depth.copy()
+    wild[0, :5] = [np.nan, np.inf, -np.inf, -1.0, 65504.0]
+    message = pixels(wild.astype(kind), "32FC1", is_big_endian=kind == ">f4")
+    depth[0, :5] = 0.0
+    got = depth_m_of(message, units_per_m=1000.0, where="m")
+    assert got.dtype == np.float32
+    np.testing.assert_array_equal(got, depth)
+
+
+def test_compressed_depth_of_16_bits_is_exact():
+    header = struct.pack("<iff", 0, 0.0, 0.0)
+    message = file(header + encoded(UNITS, ".png"), "16UC1; compressedDepth png")
+    expected = UNITS.astype(np.float32) / np.float32(1000)
+    np.testing.assert_array_equal(depth_m_of(message, units_per_m=1000.0, where="m"), expected)
+    bare = file(encoded(UNITS, ".png"), "16UC1; png compressed ")
+    np.testing.assert_array_equal(depth_m_of(bare, units_per_m=1000.0, where="m"), expected)
+    assert is_depth(message)
+    assert is_depth(bare)
+
+
+def test_compressed_depth_of_32_bits_is_inverse_depth():
+    """As compressed_depth_image_transport writes it: A = q · (q + 1) and B = 1 − A / max depth, q = 100."""
+    a = 100.0 * 101.0
+    b = 1.0 - a / 10.0
+    depth = np.linspace(0.5, 9.0, 48 * 64, dtype=np.float64).reshape(48, 64)
+    stored = np.rint(a / depth + b).astype(np.uint16)
+    stored[0, 0] = 0
+    message = file(struct.pack("<iff", 0, a, b) + encoded(stored, ".png"), "32FC1; compressedDepth png")
+    got = depth_m_of(message, units_per_m=1000.0, where="m")
+    assert got[0, 0] == 0.0
+    np.testing.assert_allclose(got.ravel()[1:], depth.ravel()[1:], rtol=5e-4 * 9.0)
+
+
+@pytest.mark.parametrize(
+    ("message", "why"),
+    [
+        (pixels(RGB, "rgb16"), "colour encoded as rgb16; known are rgb8"),
+        (file(encoded(BGR, ".jpg")[:-50], "jpeg"), "truncated JPEG"),
+        (file(b"", "jpeg"), "empty file"),
+        (PixelsMessage(0, "", "rgb8", 64, 48, 192, False, memoryview(bytes(100))), "but 100 bytes are there"),
+    ],
+)
+def test_what_is_no_image_is_refused(message, why):
+    with pytest.raises(FrameError, match=f"m: .*{why}"):
+        image_of(message, colour=True, where="m")
+
+
+@pytest.mark.parametrize(
+    ("message", "why"),
+    [
+        (pixels(RGB, "rgb8"), "depth encoded as rgb8; known are 16UC1"),
+        (file(bytes(4), "16UC1; compressedDepth png"), "compressedDepth of 4 bytes"),
+        (file(bytes(40), "16UC1; compressedDepth rvl"), "RVL is not read; record it as PNG or raw"),
+        (file(encoded(GREY, ".png"), "16UC1; png"), "want one channel of 16 bits"),
+    ],
+)
+def test_what_is_no_depth_is_refused(message, why):
+    with pytest.raises(FrameError, match=f"m: .*{why}"):
+        depth_m_of(message, units_per_m=1000.0, where="m")

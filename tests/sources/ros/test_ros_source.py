@@ -1,0 +1,251 @@
+"""Which topics are mapped, with which camera and where from; and what is done with the others."""
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from mapper.core.errors import FrameError, SourceError
+from mapper.core.frames import PinholeCamera, Scan
+from mapper.core.geometry import exp
+from mapper.core.rotations import quaternion_from_rotation
+from mapper.sources import open_source
+from mapper.sources.config import CameraConfig, SourceConfig, TopicsConfig
+from mapper.sources.ros.encode_ros import SerializedMessage, cloud_message, imu_message, odometry_message
+from mapper.sources.writers import write_log
+from tests.support.recordings import CAMERA, COLOR, DEPTH, camera_info, image, shots, write
+from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
+
+ROS2 = get_typestore(Stores.ROS2_HUMBLE)
+T_BASE_LIDAR = exp(np.array([0.0, 0.0, 1.5]), np.array([0.2, 0.0, 1.1]))
+
+
+def made(type_, **fields):
+    return ROS2.types[type_](**fields)
+
+
+def cloud(stamp_ns, topic="/velodyne_points", n=20):
+    points = np.random.default_rng(stamp_ns % 1000).uniform(-9.0, 9.0, (n, 3)).astype(np.float32)
+    return cloud_message(topic, Scan(stamp_ns, points), frame="lidar")
+
+
+def transforms(*told, topic="/tf_static"):
+    """A message of (parent, child, T_parent_child)."""
+    stamped = []
+    for parent, child, T in told:
+        x, y, z = T[:3, 3].tolist()
+        qx, qy, qz, qw = quaternion_from_rotation(T[:3, :3]).tolist()
+        header = made(
+            "std_msgs/msg/Header",
+            stamp=made("builtin_interfaces/msg/Time", sec=0, nanosec=0),
+            frame_id=parent,
+        )
+        transform = made(
+            "geometry_msgs/msg/Transform",
+            translation=made("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+            rotation=made("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+        )
+        stamped.append(
+            made(
+                "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=transform
+            )
+        )
+    type_ = "tf2_msgs/msg/TFMessage"
+    return SerializedMessage(
+        FIRST_NS, topic, type_, bytes(ROS2.serialize_cdr(made(type_, transforms=stamped), type_))
+    )
+
+
+def odometry(stamp_ns, T, *, child="base_link", topic="/odom"):
+    return odometry_message(stamp_ns, topic, T, frame="odom", child=child)
+
+
+def imu(stamp_ns, acceleration, *, frame="imu", topic="/imu/data"):
+    return imu_message(stamp_ns, topic, np.array(acceleration), frame=frame)
+
+
+def opened(path, messages, **config):
+    return open_source(write(path, messages), SourceConfig(**config))
+
+
+def stamps(n):
+    return [FIRST_NS + i * PERIOD_NS for i in range(n)]
+
+
+def test_images_go_before_clouds_unless_clouds_are_asked_for(tmp_path):
+    messages = [*shots(3), *(cloud(t) for t in stamps(4))]
+    source = opened(tmp_path / "a.mcap", messages)
+    assert (source.sensor, len(source)) == ("rgbd", 3)
+    assert "there are point clouds too: to map those, source.topics.points=/velodyne_points" in source.notes
+    source = open_source(tmp_path / "a.mcap", SourceConfig(topics=TopicsConfig(points="/velodyne_points")))
+    assert (source.sensor, len(source)) == ("lidar", 4)
+    assert source.notes == ["point clouds /velodyne_points"]
+
+
+def test_the_likeliest_of_several_topics_is_taken_and_another_can_be_chosen(tmp_path):
+    messages = []
+    for i, t in enumerate(stamps(3)):
+        rgb, units = picture(i)
+        messages += [
+            image(t, "/cam/infra1/image_rect_raw", rgb[:, :, 0], "mono8"),
+            image(t, "/cam/depth/image_rect_raw", units + 1, "16UC1"),
+            image(t, "/cam/aligned_depth_to_color/image_raw", units, "16UC1"),
+            image(t, "/cam/color/image_raw", rgb, "rgb8"),
+            camera_info(t),
+        ]
+    source = opened(tmp_path / "a.mcap", messages)
+    assert source.notes[0].startswith(
+        "colour /cam/color/image_raw, depth /cam/aligned_depth_to_color/image_raw;"
+    )
+    topics = TopicsConfig(color="/cam/infra1/image_rect_raw", depth="/cam/depth/image_rect_raw")
+    config = SourceConfig(topics=topics, camera=CameraConfig(fx_px=50, fy_px=50, cx_px=32, cy_px=24))
+    chosen = open_source(tmp_path / "a.mcap", config)
+    frame = next(chosen.entries()).load()
+    assert frame.image.ndim == 2
+    assert frame.camera == PinholeCamera(64, 48, 50, 50, 32, 24)
+    assert chosen.notes[0] == "colour /cam/infra1/image_rect_raw, depth /cam/depth/image_rect_raw"
+
+
+@pytest.mark.parametrize(
+    ("topics", "why"),
+    [
+        ({"color": "/nowhere"}, r"a.mcap: source.topics.color=/nowhere is not there; topics for that: /cam"),
+        (
+            {"imu": COLOR},
+            r"source.topics.imu=/cam/color/image_raw is of type sensor_msgs/msg/Image; .*: none",
+        ),
+    ],
+)
+def test_a_choice_that_cannot_be_is_refused(tmp_path, topics, why):
+    with pytest.raises(SourceError, match=why):
+        opened(tmp_path / "a.mcap", shots(2), topics=TopicsConfig(**topics))
+
+
+@pytest.mark.parametrize(
+    ("kept", "why"),
+    [
+        (
+            COLOR,
+            "nothing to map: colour images /cam/color/image_raw, but neither depth images nor point clouds",
+        ),
+        (DEPTH, "nothing to map: depth images /cam/aligned_depth/image_raw, but neither colour images"),
+        ("/cam/color/camera_info", r"no images with depth and no point clouds, only /cam/color/camera_info"),
+        ("", "no message of it can be read"),
+    ],
+)
+def test_what_is_missing_is_named(tmp_path, kept, why):
+    with pytest.raises(SourceError, match=why):
+        opened(tmp_path / "a.mcap", [message for message in shots(3) if message.topic == kept])
+
+
+def test_depth_that_is_not_registered_is_refused(tmp_path):
+    other = PinholeCamera(64, 48, 45.0, 45.0, 31.5, 23.5)
+    messages = [*shots(2), camera_info(FIRST_NS, "/cam/aligned_depth/camera_info", other)]
+    why = r"aligned_depth/image_raw \(64×48 px, focal length 45.0 px\) is not registered to /cam/color"
+    with pytest.raises(SourceError, match=why):
+        opened(tmp_path / "a.mcap", messages)
+    small = [image(FIRST_NS, DEPTH, np.ones((24, 32), np.uint16), "16UC1"), *shots(1)[1:]]
+    with pytest.raises(SourceError, match=r"\(32×24 px\) is not registered"):
+        opened(tmp_path / "b.mcap", small)
+
+
+def test_a_camera_that_nothing_tells_is_an_error_with_a_remedy(tmp_path):
+    messages = [message for message in shots(2) if "info" not in message.topic]
+    with pytest.raises(SourceError, match=r"no camera info for /cam/color/image_raw; .*source.camera.fx_px"):
+        opened(tmp_path / "a.mcap", messages)
+
+
+def test_depth_units_can_be_set(tmp_path):
+    camera = CameraConfig(fx_px=60, fy_px=60, cx_px=32, cy_px=24, depth_factor=5000)
+    frame = next(opened(tmp_path / "a.mcap", shots(1), camera=camera).entries()).load()
+    np.testing.assert_array_equal(frame.depth_m, picture(0)[1].astype(np.float32) / np.float32(5000))
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "a.bag", "a"])
+def test_truth_is_led_to_the_sensor_by_tf(tmp_path, name):
+    poses = [exp(np.array([0.0, 0.0, 0.1 * i]), np.array([float(i), 0.0, 0.0])) for i in range(4)]
+    messages = [
+        transforms(("odom", "base_link", np.eye(4)), topic="/tf"),
+        transforms(("base_link", "lidar", T_BASE_LIDAR)),
+        *(cloud(t) for t in stamps(4)),
+        *(odometry(t, T) for t, T in zip(stamps(4), poses, strict=True)),
+    ]
+    assert opened(tmp_path / name, messages).truth is None
+    topics = TopicsConfig(truth="/odom")
+    source = open_source(tmp_path / name, SourceConfig(topics=topics))
+    np.testing.assert_allclose(source.truth.T_world_body, [T @ T_BASE_LIDAR for T in poses], atol=1e-12)
+    based = open_source(tmp_path / name, SourceConfig(topics=topics, body_frame="base_link"))
+    np.testing.assert_allclose(based.truth.T_world_body, poses, atol=1e-12)
+    own, moved = (next(log.entries()).load() for log in (source, based))
+    expected = own.points_body @ T_BASE_LIDAR[:3, :3].T + T_BASE_LIDAR[:3, 3]
+    np.testing.assert_allclose(moved.points_body, expected, atol=1e-5)
+    with pytest.raises(
+        SourceError, match=r"body_frame=wheel: tf does not connect .* tells of base_link, lidar, odom"
+    ):
+        open_source(tmp_path / name, SourceConfig(body_frame="wheel"))
+
+
+def test_wheels_must_be_asked_for_and_are_led_to_the_sensor(tmp_path):
+    poses = [exp(np.array([0.0, 0.0, 0.1 * i]), np.array([float(i), 0.0, 0.0])) for i in range(4)]
+    wheels = [odometry(t, T) for t, T in zip(stamps(4), poses, strict=True)]
+    tied = [transforms(("base_link", "lidar", T_BASE_LIDAR)), *(cloud(t) for t in stamps(4)), *wheels]
+    assert opened(tmp_path / "a.mcap", tied).wheels is None
+    asked = SourceConfig(topics=TopicsConfig(wheels="/odom"))
+    source = open_source(tmp_path / "a.mcap", asked)
+    np.testing.assert_allclose(source.wheels.T_world_body, [T @ T_BASE_LIDAR for T in poses], atol=1e-12)
+    assert source.truth is None
+    opened(tmp_path / "b.mcap", [*shots(4), *wheels])
+    source = open_source(tmp_path / "b.mcap", asked)
+    np.testing.assert_allclose(source.wheels.T_world_body[0, :3, 2], [1.0, 0.0, 0.0], atol=1e-12)
+    assert any("/odom: tf does not tie base_link to optical" in note for note in source.notes)
+
+
+def test_accelerations_are_told_in_the_body_where_tf_ties_the_two(tmp_path):
+    R = T_BASE_LIDAR[:3, :3]
+    messages = [
+        transforms(("base_link", "lidar", T_BASE_LIDAR), ("base_link", "imu", np.eye(4))),
+        *(cloud(t) for t in stamps(3)),
+        *(imu(t, [0.1, 0.2, 9.8]) for t in stamps(3)),
+        *(imu(t, [0.0, 0.0, 0.0], topic="/gyro") for t in stamps(9)),  # a gyroscope alone
+    ]
+    told = opened(tmp_path / "a.mcap", messages).accelerations
+    assert told.stamps_ns.tolist() == stamps(3)
+    np.testing.assert_allclose(told.acceleration_mps2, np.tile([0.1, 0.2, 9.8] @ R, (3, 1)), atol=1e-12)
+    without = [message for message in messages if "tf" not in message.topic]
+    told = opened(tmp_path / "b.mcap", without).accelerations
+    np.testing.assert_array_equal(told.acceleration_mps2, np.tile([0.1, 0.2, 9.8], (3, 1)))
+
+
+def test_a_camera_of_rectified_images_has_no_distortion(tmp_path):
+    t = stamps(1)[0]
+    rgb, units = picture(0)
+    messages = [
+        image(t, "/cam/image_rect_color", rgb, "rgb8"),
+        image(t, "/cam/depth", units, "16UC1"),
+        camera_info(t, "/cam/camera_info"),
+    ]
+    camera = next(opened(tmp_path / "a.mcap", messages).entries()).load().camera
+    assert camera == PinholeCamera(64, 48, CAMERA.fx_px, CAMERA.fy_px, CAMERA.cx_px, CAMERA.cy_px)
+
+
+def test_points_of_a_camera_are_told_to_look_forward(tmp_path):
+    points = np.random.default_rng(0).uniform(1.0, 5.0, (20, 3)).astype(np.float32)
+    messages = [cloud_message("/points", Scan(t, points), frame="depth_optical") for t in stamps(2)]
+    notes = opened(tmp_path / "a.mcap", messages).notes
+    assert notes[-1].startswith("points are in depth_optical, whose z looks forward")
+
+
+def test_a_topic_whose_images_are_all_damaged_is_named(tmp_path):
+    messages = [m._replace(cdr=m.cdr[:40]) if m.topic == COLOR else m for m in shots(3)]
+    with pytest.raises(SourceError, match="/cam/color/image_raw: none of its first images can be read"):
+        opened(tmp_path / "a.mcap", messages)
+
+
+def test_a_damaged_first_image_file_does_not_hide_the_log(tiny_tum_log, tmp_path):
+    source = open_source(tiny_tum_log(4, ending=".jpg"))
+    file = next(source.entries()).files.colour
+    file.write_bytes(file.read_bytes()[:100])
+    write_log(open_source(source.path), tmp_path / "log.mcap", kind="mcap")
+    again = list(open_source(tmp_path / "log.mcap").entries())
+    with pytest.raises(FrameError, match="truncated JPEG"):
+        again[0].load()
+    assert again[1].load().image.shape == (48, 64, 3)

@@ -1,0 +1,97 @@
+import json
+
+import numpy as np
+import pytest
+
+from mapper.core.errors import SourceError
+from mapper.export.mcap_log import McapLog
+from mapper.sources.config import SourceConfig
+from mapper.sources.inspection import inspect_log, timing_of
+from tests.support.command_line import mapper
+from tests.support.recordings import CAMERA, COLOR, DEPTH, shots, write
+from tests.support.tum_logs import FIRST_NS, PERIOD_NS
+
+MS = 1_000_000
+
+
+def printed(*arguments):
+    return mapper("inspect", *arguments).stdout
+
+
+def test_timing_tells_rates_and_gaps():
+    timing = timing_of(np.array([300, 0, 100, 200, 900, 1000], np.int64) * MS)
+    assert (timing.count, timing.first_ns, timing.duration_s) == (6, 0, 1.0)
+    assert (timing.rate_hz, timing.gaps, timing.longest_gap_s) == (10.0, 1, 0.6)
+    alone = timing_of(np.array([5], np.int64))
+    assert (alone.rate_hz, alone.gaps, alone.longest_gap_s) == (0.0, 0, 0.0)
+
+
+@pytest.mark.parametrize("name", ["log.mcap", "log.bag", "log"])
+def test_a_recording_tells_its_topics_and_its_frames(tmp_path, name):
+    found = inspect_log(write(tmp_path / name, shots(6)), SourceConfig())
+    assert [(topic.name, topic.timing.count) for topic in found.topics] == [
+        (DEPTH, 6), ("/cam/color/camera_info", 6), (COLOR, 6)
+    ]  # fmt: skip
+    assert {topic.encoding for topic in found.topics} == {"ros1" if name == "log.bag" else "cdr"}
+    assert found.topics[2].timing.first_ns == FIRST_NS
+    assert found.topics[2].timing.duration_s == pytest.approx(5 * PERIOD_NS / 1e9)
+    assert (found.log.sensor, found.log.frames.count, found.log.truth) == ("rgbd", 6, None)
+    assert found.log.content.startswith("colour and depth of 64×48 px, the first 94% measured")
+    assert f"{CAMERA.fx_px:g}" in found.log.calibration
+    assert found.problem is None
+
+
+def test_a_folder_tells_its_frames_and_truth(tiny_tum_log):
+    found = inspect_log(tiny_tum_log(5), SourceConfig())
+    assert (found.log.kind, found.log.frames.count, list(found.topics)) == ("tum", 5, [])
+    assert found.log.truth == "5 poses over 0.0 m, within 20 ms of 5 of 5 frames"
+
+
+def test_what_cannot_be_mapped_is_told_with_its_topics(tmp_path):
+    only_colour = [message for message in shots(3) if message.topic == COLOR]
+    found = inspect_log(write(tmp_path / "log.mcap", only_colour), SourceConfig())
+    assert found.log is None
+    assert "but neither depth images nor point clouds" in found.problem
+    assert [topic.name for topic in found.topics] == [COLOR]
+
+
+def test_a_run_of_our_own_is_recognised(tmp_path):
+    with McapLog(tmp_path / "run.mcap") as log:
+        for i in range(3):
+            log.transform(FIRST_NS + i, np.eye(4), parent="world", child="body")
+            log.diagnostics(FIRST_NS + i, {"inliers": i})
+            log.cloud(FIRST_NS + i, np.zeros((2, 3)), colors=np.zeros((2, 3), np.uint8), name="cloud")
+    found = inspect_log(tmp_path / "run.mcap", SourceConfig())
+    assert "a run that mapper wrote" in found.problem
+    assert {topic.name: topic.timing.count for topic in found.topics} == {
+        "/diagnostics": 3,
+        "/map/cloud": 3,
+        "/tf": 3,
+    }
+
+
+def test_the_verb_prints_a_table_and_json(tmp_path):
+    log = write(tmp_path / "log.mcap", shots(6))
+    text = printed(log)
+    for words in (
+        "mcap, called log",
+        "6: 0.2 s at 30.0 Hz, no gaps",
+        "rgbd frames, odometry local-map",
+        "sensor_msgs/msg/Image",
+    ):
+        assert words in text
+    facts = json.loads(printed(log, "--json"))
+    assert facts["log"]["frames"]["count"] == 6
+    assert facts["topics"][2]["name"] == COLOR
+    assert facts["build"].startswith("rgbd frames, odometry local-map")
+    assert "choose others" not in printed(
+        log, "--set", f"source.topics.color={COLOR}", "--set", f"source.topics.depth={DEPTH}"
+    )
+
+
+def test_what_is_no_log_is_refused(tmp_path):
+    with pytest.raises(SourceError, match="no such file or folder"):
+        inspect_log(tmp_path / "nowhere.mcap", SourceConfig())
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SourceError, match=r"not a log of a known format; .*\.mcap, \.bag"):
+        inspect_log(tmp_path / "empty", SourceConfig())

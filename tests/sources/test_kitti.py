@@ -1,0 +1,148 @@
+import numpy as np
+import pytest
+
+from mapper.core.errors import DataError, SourceError
+from mapper.core.geometry import apply, exp, inverse
+from mapper.core.timebase import NS_PER_S
+from mapper.core.trajectory import Trajectory
+from mapper.sources import open_source
+from mapper.sources.config import SourceConfig
+from mapper.sources.trajectory_files import write_kitti
+from tests.support.paths import DATA
+
+N = 5
+T_WORLD_LIDAR = np.array(
+    [exp(np.array([0.0, 0.02 * i, 0.1 * i]), np.array([1.0 * i, 0.1, 0.0])) for i in range(N)]
+)
+T_CAMERA_LIDAR = np.array(
+    [[0.0, -1.0, 0.0, -0.01], [0.0, 0.0, -1.0, -0.05], [1.0, 0.0, 0.0, -0.29], [0.0, 0.0, 0.0, 1.0]]
+)
+CALIBRATION = "\n".join(
+    [f"P{i}: 7 0 6 0 0 7 1 0 0 0 1 0" for i in range(4)]
+    + ["Tr: " + " ".join(f"{v:.12e}" for v in T_CAMERA_LIDAR[:3].ravel())]
+)
+
+
+def scans(folder, numbers=range(N)):
+    (folder / "velodyne").mkdir(parents=True)
+    for i in numbers:
+        records = np.random.default_rng(i).normal(0.0, 10.0, (100, 4)).astype(np.float32)
+        records.tofile(folder / f"velodyne/{i:06d}.bin")
+    return folder
+
+
+def poses(path, T=T_WORLD_LIDAR):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_kitti(path, Trajectory(np.arange(len(T)), T))
+
+
+def stamps_of(source):
+    return [entry.stamp_ns for entry in source.entries()]
+
+
+def test_poses_without_a_calibration_are_the_lidars(tmp_path):
+    poses(scans(tmp_path / "drive") / "poses.txt")
+    source = open_source(tmp_path / "drive")
+    assert (source.kind, source.sensor, source.name, len(source)) == ("kitti", "lidar", "drive", N)
+    assert stamps_of(source) == [i * NS_PER_S // 10 for i in range(N)]
+    assert source.notes == [
+        "neither names nor a times.txt tell stamps; 10 scans a second assumed (source.rate_hz)"
+    ]
+    np.testing.assert_allclose(source.truth.T_world_body, T_WORLD_LIDAR, atol=1e-12)
+    assert source.truth.stamps_ns.tolist() == stamps_of(source)
+    records = np.random.default_rng(0).normal(0.0, 10.0, (100, 4)).astype(np.float32)
+    np.testing.assert_array_equal(next(source.entries()).load().points_body, records[:, :3])
+
+
+def test_poses_with_a_calibration_are_the_cameras(tmp_path):
+    folder = scans(tmp_path)
+    (folder / "calib.txt").write_text(CALIBRATION)
+    (folder / "image_2").mkdir()
+    (folder / "image_2/000000.png").touch()
+    poses(folder / "poses.txt", T_CAMERA_LIDAR @ T_WORLD_LIDAR @ inverse(T_CAMERA_LIDAR))
+    np.testing.assert_allclose(open_source(folder).truth.T_world_body, T_WORLD_LIDAR, atol=1e-9)
+
+
+@pytest.mark.parametrize("opened", ["", "sequences", "sequences/07"])
+def test_the_layout_of_the_benchmark(tmp_path, opened):
+    sequence = scans(tmp_path / "sequences/07")
+    (sequence / "times.txt").write_text("".join(f"{0.1037 * i:.6e}\n" for i in range(N)))
+    poses(tmp_path / "poses/07.txt")
+    source = open_source(tmp_path / opened)
+    assert source.name == "07"
+    assert stamps_of(source) == [103_700_000 * i for i in range(N)]
+    assert source.notes == []
+    np.testing.assert_allclose(source.truth.T_world_body, T_WORLD_LIDAR, atol=1e-12)
+
+
+def test_several_sequences_are_named(tmp_path):
+    scans(tmp_path / "sequences/00")
+    scans(tmp_path / "sequences/11")
+    with pytest.raises(SourceError, match="holds 2 sequences; open one of sequences/00, sequences/11"):
+        open_source(tmp_path)
+
+
+def test_more_poses_than_scans_pair_by_the_scans_numbers(tmp_path):
+    folder = scans(tmp_path, numbers=[1, 3])
+    poses(folder / "poses.txt")
+    source = open_source(folder)
+    np.testing.assert_allclose(source.truth.T_world_body, T_WORLD_LIDAR[[1, 3]], atol=1e-12)
+    assert source.truth.stamps_ns.tolist() == stamps_of(source) == [100_000_000, 300_000_000]
+
+
+def test_fewer_poses_than_scans_are_the_truth_of_the_first(tmp_path):
+    folder = scans(tmp_path)
+    poses(folder / "poses.txt", T_WORLD_LIDAR[:3])
+    source = open_source(folder)
+    assert source.truth.stamps_ns.tolist() == stamps_of(source)[:3]
+    assert "poses.txt: 3 poses tell of 3 of 5 scans" in source.notes
+
+
+def test_another_truth_can_be_named(tmp_path):
+    folder = scans(tmp_path)
+    poses(folder / "poses.txt")
+    poses(folder / "gps/poses.txt", T_WORLD_LIDAR[::-1])
+    truth = open_source(folder, SourceConfig(truth_file="gps/poses.txt")).truth
+    np.testing.assert_allclose(truth.T_world_body, T_WORLD_LIDAR[::-1], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("Tr: 1 0 0 0", r"calib.txt:1: 4 numbers, want 12: the LiDAR's 3×4 pose in the camera"),
+        ("Tr: 1 0 0 0 0 1 0 0 0 0 2 0", "calib.txt:1: not a rigid motion"),
+        ("Tr: 1 0 0 0 0 1 0 0 0 0 nan 0", "calib.txt:1: not a rigid motion"),
+        ("Tr: 1 0 0 0 0 1 0 0 0 0 one 0", "calib.txt:1: could not convert string to float: 'one'"),
+    ],
+)
+def test_a_malformed_calibration_is_refused(tmp_path, line, says):
+    (scans(tmp_path) / "calib.txt").write_text(line)
+    with pytest.raises(SourceError, match=says):
+        open_source(tmp_path)
+
+
+def test_malformed_poses_are_refused(tmp_path):
+    (scans(tmp_path) / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1\n")
+    with pytest.raises(DataError, match=r"poses.txt:1: want 12 finite numbers"):
+        open_source(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["kitti_00", "mulran_kaist03"])
+def test_truth_of_real_logs_lays_scans_onto_each_other(name):
+    """Wrong axes or a wrong calibration would bring fewer points onto the first scan than none at all."""
+    if not (DATA / name).is_dir():
+        pytest.skip(f"{DATA / name} is missing")
+    source = open_source(DATA / name)
+    entries = list(source.entries())
+    assert source.truth.stamps_ns.tolist() == [entry.stamp_ns for entry in entries]
+    steps = inverse(source.truth.T_world_body[0]) @ source.truth.T_world_body
+    ahead_or_back = np.abs(steps[-1, 0, 3]) / np.linalg.norm(steps[-1, :3, 3])
+    assert ahead_or_back > 0.95  # x points along the road
+    first, later = (entries[i].scan().points_body.astype(float) for i in (0, 2))
+    assert overlap(first, apply(steps[2], later)) > 4.0 * overlap(first, later)
+
+
+def overlap(points, others):
+    """Return the part of points' 0.3 m cells, walls and not ground, that the others have too."""
+    cells = [{tuple(c) for c in np.floor(p[p[:, 2] > 0.0] / 0.3).astype(int)} for p in (points, others)]
+    return len(cells[0] & cells[1]) / len(cells[0])

@@ -1,0 +1,128 @@
+import numpy as np
+import pytest
+
+from mapper.core.errors import SourceError
+from mapper.core.geometry import exp
+from mapper.sources import open_source
+from mapper.sources.config import SourceConfig
+from tests.support.tum_logs import CALIBRATION, write_picture
+
+POSES = [exp(np.array([0.1 * i, -0.2, 0.3 * i]), np.array([i, 2.0, -0.5 * i])) for i in range(4)]
+
+
+def matrix_text(T):
+    return "\n".join(" ".join(f"{v:.7e}" for v in row) for row in T) + "\n"
+
+
+def seven_scenes(folder, n=4):
+    for i in range(n):
+        stem = folder / f"frame-{i:06d}"
+        write_picture(stem.with_suffix(".color.png"), stem.with_suffix(".depth.png"), i)
+        stem.with_suffix(".pose.txt").write_text(matrix_text(POSES[i]))
+    (folder / "calibration.toml").write_text(CALIBRATION)
+    return folder
+
+
+def redwood(folder, names, *, colour="rgb", ending=".jpg"):
+    for i, name in enumerate(names):
+        write_picture(folder / colour / f"{name}{ending}", folder / "depth" / f"{name}.png", i)
+    (folder / "calibration.toml").write_text(CALIBRATION)
+    return folder
+
+
+def stamps_of(source):
+    return [entry.stamp_ns for entry in source.entries()]
+
+
+def test_seven_scenes(tmp_path):
+    source = open_source(seven_scenes(tmp_path / "chess"))
+    assert (source.kind, source.name, len(source)) == ("7-scenes", "chess", 4)
+    assert stamps_of(source) == [0, 33333333, 66666667, 100000000]
+    np.testing.assert_allclose(source.truth.T_world_body, POSES, atol=1e-6)
+    assert next(iter(source.entries())).files.depth_units_per_m == 1000
+    assert any("30 frames a second assumed" in note for note in source.notes)
+
+
+def test_a_lost_seven_scenes_pose_is_no_truth(tmp_path):
+    folder = seven_scenes(tmp_path)
+    (folder / "frame-000001.pose.txt").write_text(matrix_text(np.full((4, 4), -np.inf)))
+    (folder / "frame-000002.pose.txt").write_text(matrix_text(np.zeros((4, 4))))
+    source = open_source(folder)
+    assert source.truth.stamps_ns.tolist() == [0, 100000000]
+    assert "pose files: 2 of 4 poses are not finite rigid motions; dropped" in source.notes
+
+
+def test_a_folder_with_one_sequence_opens_it_and_with_two_names_them(tmp_path):
+    seven_scenes(tmp_path / "seq-01")
+    assert len(open_source(tmp_path)) == 4
+    seven_scenes(tmp_path / "seq-02")
+    with pytest.raises(SourceError, match="holds 2 sequences; open one of seq-01, seq-02"):
+        open_source(tmp_path)
+
+
+def test_the_rate_is_an_option_and_gaps_in_the_numbers_keep_their_time(tmp_path):
+    folder = redwood(tmp_path, ["00001", "00002", "00005"])
+    source = open_source(folder, SourceConfig(rate_hz=10.0))
+    assert stamps_of(source) == [100_000_000, 200_000_000, 500_000_000]
+    assert source.kind == "redwood"
+
+
+def test_names_with_microseconds_carry_the_stamp(tmp_path):
+    names = ["0000001-000000033369", "0000002-000000066739", "0000003-000000100108"]
+    source = open_source(redwood(tmp_path, names))
+    assert stamps_of(source) == [33369000, 66739000, 100108000]
+    assert source.notes == []
+
+
+def test_images_without_a_partner_are_counted(tmp_path):
+    folder = redwood(tmp_path, ["00001", "00002", "00003"], colour="image")
+    (folder / "depth/00002.png").unlink()
+    (folder / "image/00003.jpg").unlink()
+    source = open_source(folder)
+    assert len(source) == 1
+    assert "1 colour images have no partner of the same number; left out" in source.notes
+    assert "1 depth images have no partner of the same number; left out" in source.notes
+
+
+def test_redwood_trajectory_counts_images_from_zero(tmp_path):
+    folder = redwood(tmp_path, ["00001", "00002", "00003"])
+    blocks = [f"{i} {i} {i + 1}\n{matrix_text(POSES[i])}" for i in (0, 2)]
+    (folder / "livingroom1-traj.log").write_text("".join(blocks))
+    source = open_source(folder, SourceConfig(rate_hz=10.0))
+    assert source.truth.stamps_ns.tolist() == [100_000_000, 300_000_000]
+    np.testing.assert_allclose(source.truth.T_world_body, [POSES[0], POSES[2]], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0 0 1\n1 0 0 0\n", r"trajectory\.log: 2 lines, want blocks of 5"),
+        ("9 9 10\n" + "1 0 0 0\n" * 4, r"trajectory\.log:1: pose of image 9, but there are only 3 images"),
+        ("0 0 1\n" + "1 0 0\n" * 4, r"trajectory\.log:2: 3 columns, want 4"),
+        ("a b c\n" + "1 0 0 0\n" * 4, r"trajectory\.log:1: 'a b c', want the block's number"),
+    ],
+)
+def test_a_malformed_trajectory_is_named_with_its_line(tmp_path, text, message):
+    folder = redwood(tmp_path, ["00001", "00002", "00003"])
+    (folder / "trajectory.log").write_text(text)
+    with pytest.raises(SourceError, match=message):
+        open_source(folder)
+
+
+def test_the_nominal_camera_is_assumed_only_for_its_own_size(tmp_path):
+    small = redwood(tmp_path / "small", ["0"])
+    (small / "calibration.toml").unlink()
+    with pytest.raises(SourceError, match=r"PrimeSense's nominal camera: holds for 640×480 px, but .* 64×48"):
+        open_source(small)
+    full = tmp_path / "full"
+    write_picture(full / "color/0.png", full / "depth/0.png", 0, width_px=640, height_px=480)
+    source = open_source(full)
+    assert next(iter(source.entries())).camera.fx_px == 525.0
+    assert any("PrimeSense's nominal camera" in note for note in source.notes)
+
+
+def test_a_tum_folder_that_lost_its_lists_is_not_taken_for_numbered_images(tiny_tum_log):
+    log = tiny_tum_log(2)
+    (log / "rgb.txt").unlink()
+    with pytest.raises(SourceError, match=r"known format; looked for rgb\.txt"):
+        open_source(log)

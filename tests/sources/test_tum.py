@@ -1,0 +1,211 @@
+import numpy as np
+import pytest
+
+from mapper.core.errors import FrameError, SourceError
+from mapper.core.timebase import nearest
+from mapper.sources import open_source
+from mapper.sources.calibration import FREIBURG
+from mapper.sources.config import CameraConfig, SourceConfig
+from tests.support.paths import FR1_XYZ
+from tests.support.tum_logs import DEPTH_LEAD_NS, FIRST_NS, PERIOD_NS, picture, write_picture
+
+
+def stamps_of(source):
+    return [entry.stamp_ns for entry in source.entries()]
+
+
+def edit(path, change):
+    path.write_text(change(path.read_text()))
+
+
+def test_reads_every_frame_with_exact_stamps_pixels_and_truth(tiny_tum_log):
+    source = open_source(tiny_tum_log(4))
+    assert (source.kind, source.name, len(source), source.notes) == ("tum", "log", 4, [])
+    assert stamps_of(source) == [FIRST_NS + i * PERIOD_NS for i in range(4)]
+    for i, entry in enumerate(source.entries()):
+        rgb, units = picture(i)
+        frame = entry.load()
+        np.testing.assert_array_equal(frame.rgb, rgb)
+        np.testing.assert_array_equal(frame.depth_m, units.astype(np.float32) / np.float32(5000))
+        assert entry.files.depth_stamp_ns == entry.stamp_ns - DEPTH_LEAD_NS
+        assert entry.load(colour=False).image.shape == (48, 64)
+    assert (frame.camera.fx_px, frame.camera.cy_px, frame.camera.width_px) == (60.0, 23.5, 64)
+    np.testing.assert_allclose(source.truth.positions_world[:, 0], [0, 0.01, 0.02, 0.03])
+    assert source.accelerations is None
+
+
+def test_reads_the_same_twice(tiny_tum_log):
+    source = open_source(tiny_tum_log(3))
+    assert stamps_of(source) == stamps_of(source)
+    once, again = (next(iter(source.entries())).load() for _ in range(2))
+    np.testing.assert_array_equal(once.depth_m, again.depth_m)
+
+
+def test_colour_without_near_depth_is_left_out_and_counted(tiny_tum_log):
+    log = tiny_tum_log(5)
+    edit(log / "depth.txt", lambda text: "\n".join(text.splitlines()[:-2]))
+    source = open_source(log)
+    assert len(source) == 3
+    assert source.notes == ["2 of 5 colour images have no depth image within 20 ms; left out"]
+
+
+def test_the_pair_gap_is_inclusive_to_the_nanosecond(tiny_tum_log):
+    log = tiny_tum_log(3)
+    assert len(open_source(log, SourceConfig(max_pair_gap_s=0.009999))) == 3
+    with pytest.raises(SourceError, match=r"within 9\.998 ms; the closest pair is 0\.009999 s apart"):
+        open_source(log, SourceConfig(max_pair_gap_s=0.009998))
+
+
+def test_listed_files_that_do_not_exist_are_dropped_and_counted(tiny_tum_log):
+    log = tiny_tum_log(4)
+    next(iter(sorted((log / "rgb").iterdir()))).unlink()
+    source = open_source(log)
+    assert len(source) == 3
+    assert source.notes == ["rgb.txt: 1 of 4 listed images do not exist; dropped"]
+
+
+def test_lists_out_of_order_are_sorted_and_repeats_dropped(tiny_tum_log):
+    log = tiny_tum_log(4)
+    want = stamps_of(open_source(log))
+    edit(log / "rgb.txt", lambda text: "\n".join([*reversed(text.splitlines()), text.splitlines()[-1]]))
+    source = open_source(log)
+    assert stamps_of(source) == want
+    assert any("out of time order in 3 places; sorted" in note for note in source.notes)
+    assert any("1 stamps appear twice" in note for note in source.notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("rgb.txt", "", r"rgb\.txt: empty list"),
+        ("depth.txt", "# only a comment\n", r"depth\.txt: empty list"),
+        ("rgb.txt", "1.0 rgb/a.png extra\n", r"rgb\.txt:1: 3 columns, want 2"),
+        ("rgb.txt", "# x\nsoon rgb/a.png\n", r"rgb\.txt:2: stamp 'soon' is not a decimal number"),
+        ("rgb.txt", "1.0 rgb/none.png\n", r"rgb\.txt: none of its 1 images exists"),
+        ("rgb.txt", b"\xff\xfe\x00", r"rgb\.txt: not a text file"),
+        ("groundtruth.txt", "1.0 0 0 0\n", r"groundtruth\.txt:1: 4 columns, want 8"),
+        ("groundtruth.txt", "1.0 0 0 x 0 0 0 1\n", r"groundtruth\.txt:1: could not convert string"),
+        ("accelerometer.txt", "1.0 0 0\n", r"accelerometer\.txt:1: 3 columns, want 4"),
+        ("calibration.toml", "fx_px = 500.0\n", r"calibration\.toml: no number fy_px"),
+        ("calibration.toml", "fx_px = \n", r"calibration\.toml: not valid TOML"),
+    ],
+)
+def test_malformed_files_are_named_with_their_line(tiny_tum_log, name, text, message):
+    log = tiny_tum_log(2)
+    (log / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(SourceError, match=message) as caught:
+        open_source(log)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_depth_list_is_named(tiny_tum_log):
+    log = tiny_tum_log(2)
+    (log / "depth.txt").unlink()
+    with pytest.raises(SourceError, match=r"depth\.txt: cannot be read: No such file"):
+        open_source(log)
+
+
+def test_depth_far_in_time_says_how_far(tiny_tum_log):
+    log = tiny_tum_log(2)
+    edit(log / "depth.txt", lambda text: text.replace("\n13050311", "\n13050411"))
+    with pytest.raises(SourceError, match=r"within 20 ms; the closest pair is 9999\.96 s apart"):
+        open_source(log)
+
+
+def test_unusable_truth_lines_are_dropped_and_noted(tiny_tum_log):
+    log = tiny_tum_log(4)
+    bad = "1305031102.5 nan nan nan nan nan nan nan\n1305031102.6 0 0 0 0 0 0 0\nnan 0 0 0 0 0 0 1\n"
+    edit(log / "groundtruth.txt", lambda text: text + bad)
+    source = open_source(log)
+    assert len(source.truth) == 4
+    assert source.notes == ["groundtruth.txt: 3 of 7 poses are not finite rigid motions; dropped"]
+
+
+@pytest.mark.parametrize("text", ["", "# header\n", "1.0 nan 0 0 0 0 0 1\n"])
+def test_truth_without_a_single_pose_is_no_truth(tiny_tum_log, text):
+    log = tiny_tum_log(2)
+    (log / "groundtruth.txt").write_text(text)
+    source = open_source(log)
+    assert source.truth is None
+    assert source.notes[-1] == "groundtruth.txt: no usable ground truth"
+
+
+def test_no_truth_file_is_no_truth(tiny_tum_log):
+    log = tiny_tum_log(2)
+    (log / "groundtruth.txt").unlink()
+    assert open_source(log).truth is None
+
+
+def test_accelerations_are_read_in_time_order(tiny_tum_log):
+    log = tiny_tum_log(2)
+    (log / "accelerometer.txt").write_text("# t ax ay az\n2.0 0 0 9.81\n1.0 0.5 0 -9.7\n3.0 inf 0 0\n")
+    source = open_source(log)
+    assert source.accelerations.stamps_ns.tolist() == [1_000_000_000, 2_000_000_000]
+    np.testing.assert_array_equal(source.accelerations.acceleration_mps2, [[0.5, 0, -9.7], [0, 0, 9.81]])
+    assert "accelerometer.txt: 1 readings are not finite; dropped" in source.notes
+
+
+def test_a_single_bad_frame_is_its_own_error(tiny_tum_log):
+    log = tiny_tum_log(3)
+    victim = sorted((log / "depth").iterdir())[1]
+    victim.write_bytes(victim.read_bytes()[:-20])
+    first, second, third = open_source(log).entries()
+    first.load()
+    third.load()
+    with pytest.raises(FrameError, match=rf"{victim.name}: truncated PNG"):
+        second.load()
+
+
+def test_images_of_another_size_are_their_own_error(tiny_tum_log):
+    log = tiny_tum_log(3)
+    colour, depth = (sorted((log / name).iterdir())[2] for name in ("rgb", "depth"))
+    write_picture(colour.with_name("big.png"), depth, 0, width_px=80, height_px=40)
+    *_, last = open_source(log).entries()
+    with pytest.raises(FrameError, match=rf"{depth.name}: 80×40 px, but the log has 64×48"):
+        last.load()
+
+
+def test_the_camera_is_as_large_as_the_first_readable_image(tiny_tum_log):
+    log = tiny_tum_log(3)
+    sorted((log / "rgb").iterdir())[0].write_bytes(b"")
+    assert next(iter(open_source(log).entries())).camera.width_px == 64
+    for path in (log / "rgb").iterdir():
+        path.write_bytes(b"")
+    with pytest.raises(SourceError, match=r"none of 3 colour images can be read; the first: .*: empty file"):
+        open_source(log)
+
+
+def test_intrinsics_unknown_says_the_remedy(tiny_tum_log):
+    log = tiny_tum_log(2)
+    (log / "calibration.toml").unlink()
+    with pytest.raises(SourceError, match=r"calibration\.toml .*--set source\.camera\.fx_px="):
+        open_source(log)
+
+
+def test_the_users_camera_wins_over_the_file(tiny_tum_log):
+    camera = CameraConfig(fx_px=50, fy_px=51, cx_px=32, cy_px=24, depth_factor=1000)
+    entry = next(iter(open_source(tiny_tum_log(2), SourceConfig(camera=camera)).entries()))
+    assert entry.camera.fx_px == 50
+    assert entry.files.depth_units_per_m == 1000
+
+
+def test_a_known_camera_of_another_size_is_refused(tiny_tum_log):
+    log = tiny_tum_log(2, folder="rgbd_dataset_freiburg2_desk")
+    (log / "calibration.toml").unlink()
+    with pytest.raises(SourceError, match=r"camera of TUM freiburg2: holds for 640×480 px, but .* 64×48"):
+        open_source(log)
+
+
+@pytest.mark.skipif(not FR1_XYZ.is_dir(), reason=f"{FR1_XYZ} is missing")
+def test_the_real_freiburg1_xyz():
+    source = open_source(FR1_XYZ)
+    assert (len(source), len(source.truth), source.notes) == (798, 3000, [])
+    stamps = np.array(stamps_of(source))
+    assert stamps[[0, -1]].tolist() == [1305031102175304000, 1305031128747363000]
+    _, gap_ns = nearest(source.truth.stamps_ns, stamps)
+    assert (gap_ns <= 20_000_000).sum() == 796
+    assert len(open_source(FR1_XYZ, SourceConfig(require_truth=True))) == 796
+    frame = next(iter(source.entries())).load()
+    assert frame.camera == FREIBURG["1"].camera(width_px=640, height_px=480)
+    assert frame.image.shape == (480, 640, 3)
+    assert 0.5 < np.median(frame.depth_m[frame.depth_m > 0]) < 2.0

@@ -1,0 +1,135 @@
+import numpy as np
+import pytest
+from logs_made import MemoryEntry, log_in_memory
+
+from mapper.core.errors import FrameError, SourceError
+from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
+from mapper.sources import open_source
+from mapper.sources.writers import write_log
+from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
+
+CAMERA = PinholeCamera(64, 48, 60.0, 61.0, 31.5, 23.5, (0.1, -0.2, 0.001, 0.002, 0.05))
+
+
+def frame_at(stamp_ns, seed):
+    rgb, units = picture(seed)
+    return RgbdFrame(stamp_ns, rgb, units.astype(np.float32) / np.float32(5000), CAMERA)
+
+
+def files_under(folder):
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.mark.parametrize("ending", [".png", ".jpg"])
+def test_tum_to_mbag_to_tum_keeps_every_byte_there_is_room_for(tiny_tum_log, tmp_path, ending):
+    log = tiny_tum_log(4, ending=ending)
+    (log / "accelerometer.txt").write_text("# t ax ay az\n1305031102.1 0.1 0.2 9.81\n")
+    tum, mbag, again = (tmp_path / name for name in ("tum", "mbag", "again"))
+    progress = []
+    assert write_log(open_source(log), tum, kind="tum", on_progress=progress.append) == []
+    assert progress == [1, 2, 3, 4]
+    write_log(open_source(tum), mbag, kind="mbag")
+    write_log(open_source(mbag), again, kind="tum")
+    before, first, last = files_under(log), files_under(tum), files_under(again)
+    images = [name for name in before if name.startswith(("rgb/", "depth/"))]
+    assert len(images) == 8
+    for name in images:
+        assert before[name] == first[name] == last[name]
+    for name in ("rgb.txt", "depth.txt", "accelerometer.txt", "calibration.toml"):
+        assert first[name] == last[name]
+    # Truth moves to the frames' stamps, which is all that mbag can say; positions keep every digit.
+    truth, truth_again = open_source(tum).truth, open_source(again).truth
+    assert truth_again.stamps_ns.tolist() == [FIRST_NS + i * PERIOD_NS for i in range(4)]
+    np.testing.assert_array_equal(truth_again.positions_world, truth.positions_world)
+    np.testing.assert_allclose(truth_again.T_world_body, truth.T_world_body, atol=1e-15)
+
+
+def test_mbag_to_mbag_is_exact(tiny_tum_log, tmp_path):
+    write_log(open_source(tiny_tum_log(3)), tmp_path / "a/x", kind="mbag")
+    write_log(open_source(tmp_path / "a/x"), tmp_path / "b/x", kind="mbag")
+    first, second = files_under(tmp_path / "a"), files_under(tmp_path / "b")
+    assert first.keys() == second.keys()
+    for name in first.keys() - {"x/x.mbag"}:
+        assert first[name] == second[name]
+    for line, other in zip(
+        first["x/x.mbag"].decode().splitlines(), second["x/x.mbag"].decode().splitlines(), strict=True
+    ):
+        assert line.split("; ")[:6] == other.split("; ")[:6]
+
+
+def test_truth_is_written_only_where_it_is_near(tiny_tum_log, tmp_path):
+    log = tiny_tum_log(3)
+    truth = log / "groundtruth.txt"
+    truth.write_text("\n".join(truth.read_text().splitlines()[:-1]))
+    write_log(open_source(log), tmp_path / "out", kind="mbag")
+    lines = (tmp_path / "out/out.mbag").read_text().splitlines()
+    assert lines[-1].endswith("nan; nan; nan; nan; nan; nan; nan")
+    assert len(open_source(tmp_path / "out").truth) == 2
+
+
+def test_frames_without_files_are_encoded_losslessly(tmp_path):
+    stamps = [FIRST_NS, FIRST_NS + PERIOD_NS + 1]
+    source = log_in_memory([MemoryEntry(s, frame_at(s, i)) for i, s in enumerate(stamps)])
+    write_log(source, tmp_path / "out", kind="tum")
+    again = open_source(tmp_path / "out")
+    assert again.name == "memory"
+    for entry, made in zip(again.entries(), source.entries(), strict=True):
+        frame = entry.load()
+        assert frame.stamp_ns == made.stamp_ns
+        assert frame.camera == CAMERA
+        np.testing.assert_array_equal(frame.rgb, made.frame.rgb)
+        np.testing.assert_array_equal(frame.depth_m, made.frame.depth_m)
+
+
+def test_depth_beyond_16_bits_becomes_no_measurement(tmp_path):
+    depth_m = np.full((48, 64), 13.2, np.float32)
+    depth_m[0] = 1.0
+    frame = RgbdFrame(FIRST_NS, picture(0)[0], depth_m, CAMERA)
+    write_log(log_in_memory([MemoryEntry(FIRST_NS, frame)]), tmp_path / "out", kind="tum")
+    again = next(iter(open_source(tmp_path / "out").entries())).load()
+    assert (again.depth_m[0] == 1.0).all()
+    assert (again.depth_m[1:] == 0.0).all()
+
+
+def test_a_frame_that_cannot_be_read_is_skipped_and_returned(tmp_path):
+    bad = MemoryEntry(FIRST_NS, FrameError("broken"))
+    good = MemoryEntry(FIRST_NS + 1000, frame_at(FIRST_NS + 1000, 1))
+    skipped = write_log(log_in_memory([bad, good]), tmp_path / "out", kind="mbag")
+    assert [(s.stamp_ns, s.reason) for s in skipped] == [(FIRST_NS, "broken")]
+    assert len(open_source(tmp_path / "out")) == 1
+
+
+def test_scans_and_empty_logs_are_refused_before_anything_is_written(tmp_path):
+    scan = MemoryEntry(5, Scan(5, np.zeros((1, 3), np.float32)))
+    with pytest.raises(SourceError, match="a scan without images; TUM and mbag hold RGB-D frames"):
+        write_log(log_in_memory([scan]), tmp_path / "out", kind="tum")
+    with pytest.raises(SourceError, match="no frame can be written: it has no frames"):
+        write_log(log_in_memory([]), tmp_path / "out", kind="tum")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_existing_log_is_not_overwritten(tiny_tum_log, tmp_path):
+    source = open_source(tiny_tum_log(2))
+    write_log(source, tmp_path / "out", kind="tum")
+    with pytest.raises(SourceError, match="out: exists already"):
+        write_log(source, tmp_path / "out", kind="tum")
+
+
+@pytest.mark.parametrize("kind", ["tum", "mbag"])
+def test_a_log_that_was_interrupted_leaves_nothing(tiny_tum_log, tmp_path, kind):
+    def interrupt(done):
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_log(open_source(tiny_tum_log(3)), tmp_path / "new/out", kind=kind, on_progress=interrupt)
+    assert list((tmp_path / "new").iterdir()) == []
+    (tmp_path / "new/out").mkdir()
+    write_log(open_source(tiny_tum_log(3)), tmp_path / "new/out", kind=kind)
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["out"]
+
+
+def test_a_lidars_log_is_refused_before_its_scans_are_read(tmp_path):
+    source = log_in_memory([MemoryEntry(5, FrameError("was read"))], sensor="lidar")
+    with pytest.raises(SourceError, match=r"memory: scans without images; .* --as kitti"):
+        write_log(source, tmp_path / "out", kind="tum")

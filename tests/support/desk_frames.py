@@ -1,0 +1,38 @@
+"""A walk before a desk as frames in memory, and how far a path lies from its truth."""
+
+from functools import cache
+
+import numpy as np
+from evaluators.trajectory import align, associate, ate
+
+from mapper.core.frames import RgbdFrame
+from mapper.core.trajectory import Trajectory
+from mapper.simulation.config import SynthConfig
+from mapper.simulation.source import SyntheticSource
+
+DESK_WALK = SynthConfig(
+    path="desk", duration_s=3.0, frame_rate_hz=15.0, width_px=320, height_px=240, texture_px_per_m=96
+)
+
+
+@cache
+def desk_walk() -> SyntheticSource:
+    """Return the log of the walk, 3 s long."""
+    return SyntheticSource(DESK_WALK)
+
+
+@cache
+def desk_frames() -> tuple[RgbdFrame, ...]:
+    """Return all 46 frames of the walk, without colours."""
+    return tuple(entry.load(colour=False) for entry in desk_walk().entries())
+
+
+def blank(frame: RgbdFrame) -> RgbdFrame:
+    """Return the same moment with the lens covered."""
+    return RgbdFrame(frame.stamp_ns, np.zeros_like(frame.image), np.zeros_like(frame.depth_m), frame.camera)
+
+
+def ate_rmse_m(trajectory: Trajectory, truth: Trajectory) -> float:
+    """Return the ATE after the best rigid alignment."""
+    matched = associate(trajectory, truth)
+    return ate(align(matched, "se3").moved(matched)).rmse

@@ -1,0 +1,34 @@
+"""Small octree maps of random scans."""
+
+import numpy as np
+
+from mapper.core.frames import Scan
+from mapper.octree.config import OctreeConfig
+from mapper.octree.map import OctreeMap
+
+CONFIG = OctreeConfig(resolution_m=0.1, max_range_m=3.0)
+COLORED = CONFIG.model_copy(update={"attributes": True})
+
+
+def mapped(seed, *, config=CONFIG, scans=5):
+    rng = np.random.default_rng(seed)
+    octree = OctreeMap(config)
+    for i in range(scans):
+        points = rng.normal(0.0, 1.2, (60, 3)).astype(np.float32)
+        pose = np.eye(4)
+        pose[:3, 3] = rng.normal(0.0, 0.4, 3)
+        colors = rng.integers(0, 256, (60, 3), dtype=np.uint8) if config.attributes else None
+        octree.insert(Scan(1000 * seed + i, points, colors=colors), pose)
+    return octree
+
+
+def total(maps, *, config=CONFIG):
+    octree = OctreeMap(config)
+    overlaps = [octree.add(other) for other in maps]
+    octree.clamp()
+    return octree, overlaps
+
+
+def as_dict(octree):
+    leaves = octree.leaves()
+    return {tuple(key): value for key, value in zip(leaves.keys.tolist(), leaves.log_odds, strict=True)}

@@ -1,0 +1,11 @@
+"""Where the repository and the shared recorded data are."""
+
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+CONFIGS = ROOT / "configs"
+SHARED = ROOT.parent / "shared"
+DATA = SHARED / "data"
+FR1_XYZ = DATA / "tum_fr1_xyz"
+KITTI = DATA / "kitti_00"
+POSE_GRAPHS = DATA / "posegraph"

@@ -1,0 +1,67 @@
+"""Recordings made message by message, for the tests of reading them."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from mapper.core.frames import PinholeCamera
+from mapper.sources.ros.encode_ros import SerializedMessage, camera_info_message, image_message
+from mapper.sources.ros.message_writers import message_writer
+from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
+
+CAMERA = PinholeCamera(64, 48, 60.0, 61.0, 31.5, 23.5, (0.1, -0.2, 0.001, 0.002, 0.05))
+COLOR, DEPTH = "/cam/color/image_raw", "/cam/aligned_depth/image_raw"
+
+
+def image(
+    stamp_ns: int, topic: str, pixels: np.ndarray, encoding: str, *, frame: str = "optical"
+) -> SerializedMessage:
+    return image_message(stamp_ns, topic, pixels, encoding=encoding, frame=frame)
+
+
+def camera_info(
+    stamp_ns: int, topic: str = "/cam/color/camera_info", camera: PinholeCamera = CAMERA
+) -> SerializedMessage:
+    return camera_info_message(stamp_ns, topic, camera, frame="optical")
+
+
+def shots(n: int = 6, *, first_ns: int = FIRST_NS) -> list[SerializedMessage]:
+    """RGB-D messages whose depth, in millimetres, comes 5 ms before the colour."""
+    messages = []
+    for i in range(n):
+        stamp_ns = first_ns + i * PERIOD_NS
+        rgb, units = picture(i)
+        messages += [
+            image(stamp_ns - 5_000_000, DEPTH, units, "16UC1"),
+            image(stamp_ns, COLOR, rgb, "rgb8"),
+            camera_info(stamp_ns),
+        ]
+    return messages
+
+
+def write(path: Path, messages: Iterable[SerializedMessage]) -> Path:
+    """Write messages in the order given, into whatever the path is named as."""
+    if path.suffix in (".mcap", ".bag"):
+        with message_writer(path, kind=path.suffix[1:]) as writer:
+            for message in messages:
+                writer.write(message)
+    else:
+        write_folder(Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3), messages)
+    return path
+
+
+def write_folder(folder: Writer, messages: Iterable[SerializedMessage]) -> None:
+    """Write messages as ROS 2 records them, a nanosecond apart."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    connections = {}
+    with folder as writer:
+        for log_ns, message in enumerate(messages, start=FIRST_NS):
+            if message.topic not in connections:
+                connections[message.topic] = writer.add_connection(
+                    message.topic, message.type, typestore=store
+                )
+            writer.write(connections[message.topic], log_ns, message.cdr)
