@@ -20,6 +20,12 @@ if TYPE_CHECKING:
     from mapper.run.folder import Run  # heavy to import: tests of small things do without
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put files with slow tests first: begun last, they would leave the other worker processes idle."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+
+
 @pytest.fixture
 def tiny_tum_log(tmp_path: Path) -> Callable[..., Path]:
     """Make a TUM folder of ``n`` 64×48 frames with truth along x at 0.3 m/s."""

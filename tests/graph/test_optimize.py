@@ -278,7 +278,7 @@ def test_the_iterations_are_reported():
         ("parking-garage", 0.6341924),
         ("sphere2500", 675.70096),
         ("torus3D", 12117.637),
-        ("cubicle", 1372.7779),
+        pytest.param("cubicle", 1372.7779, marks=pytest.mark.slow),
     ],
 )
 def test_reaches_the_published_cost_from_file_initialisation(name, best):

@@ -176,6 +176,7 @@ def mapped(source, config):
     return replace(tracking, graph=solved.graph).trajectory()
 
 
+@pytest.mark.slow
 def test_wheels_connect_what_is_before_and_after_a_covered_lens(interrupted):
     config: BuildConfig = load_config(None, ["loops.kind=none"])
     alone = mapped(

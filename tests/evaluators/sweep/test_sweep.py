@@ -253,6 +253,7 @@ def resumable_folder(interrupted):
     return result, (cell.read_bytes(), cell.stat().st_mtime_ns) == before
 
 
+@pytest.mark.slow
 def test_a_sweep_goes_on_where_it_was_ended(interrupted, resumable_folder):
     _, out, _ = interrupted
     result, is_as_it_was = resumable_folder
@@ -280,6 +281,7 @@ def test_a_sweep_goes_on_where_it_was_ended(interrupted, resumable_folder):
     assert {child.name for child in (out / table[0]["run"]).iterdir()} == kept
 
 
+@pytest.mark.slow
 def test_builds_in_other_processes_come_to_the_same(interrupted, resumable_folder, tmp_path, dask_scheduler):
     assert resumable_folder
     file, out, _ = interrupted
