@@ -10,6 +10,7 @@ from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap, log_odds
 from mapper.octree.octomap_file import read_map, write_bt, write_ot
 from tests.support.octomap_oracle import fr1_xyz_scans, fuse, voxels
+from tests.support.octree_maps import octree_of
 from tests.support.paths import DATA, FR1_XYZ
 
 BOTH_KINDS = pytest.mark.parametrize("write", [write_bt, write_ot], ids=["bt", "ot"])
@@ -25,10 +26,7 @@ def saturated_scans(seed, *, repeats=8):
 
 @pytest.fixture(scope="module")
 def octree():
-    octree = OctreeMap(OctreeConfig())
-    for points, origin in saturated_scans(0):
-        octree.insert_points(points, origin)
-    return octree
+    return octree_of(saturated_scans(0))
 
 
 @pytest.fixture(scope="module")
@@ -56,9 +54,7 @@ def test_files_equal_the_cpp_library_s_byte_for_byte(octree, their_tree, tmp_pat
 @pytest.mark.skipif(not FR1_XYZ.exists(), reason="needs ../shared/data/tum_fr1_xyz")
 def test_files_of_real_frames_equal_the_cpp_library_s(tmp_path):
     scans = fr1_xyz_scans(8)
-    octree = OctreeMap(OctreeConfig())
-    for points, origin in scans:
-        octree.insert_points(points, origin)
+    octree = octree_of(scans)
     tree = fuse(scans, resolution_m=0.05, max_range_m=4.0, discretize=True)
 
     write_ot(tmp_path / "map.ot", octree)

@@ -12,19 +12,10 @@ from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap, log_odds
 from mapper.octree.octomap_file import write_ot
 from tests.support.octomap_oracle import fr1_xyz_scans, fuse, kitti_scans, voxels
-from tests.support.octree_maps import as_dict
+from tests.support.octree_maps import as_dict, octree_of
 from tests.support.paths import FR1_XYZ, KITTI
 
 BOTH_MODES = pytest.mark.parametrize("discretize", [True, False], ids=["discretize", "every-point"])
-
-
-def mapped(scans, *, resolution_m=0.05, max_range_m=4.0, discretize=True):
-    octree = OctreeMap(
-        OctreeConfig(resolution_m=resolution_m, max_range_m=max_range_m, discretize=discretize)
-    )
-    for points, origin in scans:
-        octree.insert_points(points, origin)
-    return octree
 
 
 def random_scans(seed, *, scans=4, points=50, spread_m=2.0):
@@ -47,7 +38,7 @@ def test_equals_octomap_on_random_clouds(seed, resolution_m, discretize):
     settings = {"resolution_m": resolution_m, "max_range_m": 2.5, "discretize": discretize}
     scans = random_scans(seed)
 
-    octree = mapped(scans, **settings)
+    octree = octree_of(scans, **settings)
 
     theirs = voxels(fuse(scans, **settings), resolution_m=resolution_m)
     assert as_dict(octree) == theirs  # keys, and log-odds as float32 bits: == on floats
@@ -72,7 +63,7 @@ def test_equals_octomap_on_awkward_rays(points, origin, discretize):
     origin = np.array(origin)
     scans = [((np.array(points) + shift).astype(np.float32), origin) for shift in (0.0, origin, 0.5 * origin)]
 
-    assert as_dict(mapped(scans, **settings)) == voxels(fuse(scans, **settings), resolution_m=0.05)
+    assert as_dict(octree_of(scans, **settings)) == voxels(fuse(scans, **settings), resolution_m=0.05)
 
 
 @BOTH_MODES
@@ -86,7 +77,7 @@ def test_equals_octomap_far_from_the_map_and_without_a_range(discretize):
     ]
     scans = [(points, origin.astype(np.float64)) for points, origin in scans]
 
-    ours = mapped(scans, resolution_m=0.5, max_range_m=np.inf, discretize=discretize)
+    ours = octree_of(scans, resolution_m=0.5, max_range_m=np.inf, discretize=discretize)
 
     theirs = fuse(scans, resolution_m=0.5, max_range_m=-1.0, discretize=discretize)
     assert as_dict(ours) == voxels(theirs, resolution_m=0.5)
@@ -98,7 +89,7 @@ def test_equals_octomap_on_depth_frames(discretize, tmp_path):
     settings = {"resolution_m": 0.05, "max_range_m": 4.0, "discretize": discretize}
     scans = fr1_xyz_scans(4)
 
-    write_ot(tmp_path / "map.ot", mapped(scans, **settings))
+    write_ot(tmp_path / "map.ot", octree_of(scans, **settings))
 
     assert (tmp_path / "map.ot").read_bytes() == fuse(scans, **settings).write()
 
@@ -109,7 +100,7 @@ def test_equals_octomap_on_lidar_scans(discretize, tmp_path):
     settings = {"resolution_m": 0.4, "max_range_m": 60.0, "discretize": discretize}
     scans = kitti_scans(3)
 
-    write_ot(tmp_path / "map.ot", mapped(scans, **settings))
+    write_ot(tmp_path / "map.ot", octree_of(scans, **settings))
 
     assert (tmp_path / "map.ot").read_bytes() == fuse(scans, **settings).write()
 
@@ -128,12 +119,12 @@ def test_a_scan_is_its_points_at_the_pose(discretize):
         points_world, scan.points_body @ T_world_body[:3, :3].T + T_world_body[:3, 3], atol=1e-5
     )
     origin_world = T_world_body[:3, :3] @ scan.origin_body + T_world_body[:3, 3]
-    assert as_dict(octree) == as_dict(mapped([(points_world, origin_world)], discretize=discretize))
+    assert as_dict(octree) == as_dict(octree_of([(points_world, origin_world)], discretize=discretize))
 
 
 def test_a_voxel_changes_once_per_scan_and_a_hit_wins():
     near, far = [0.525, 0.025, 0.025], [1.025, 0.025, 0.025]  # the far ray crosses the near end
-    octree = mapped([(np.array([far, near, near, far], np.float32), np.full(3, 0.025))])
+    octree = octree_of([(np.array([far, near, near, far], np.float32), np.full(3, 0.025))])
 
     assert octree.query(np.array([near, far])).tolist() == [log_odds(0.7)] * 2
     assert octree.query(np.array([[0.325, 0.025, 0.025]])).tolist() == [log_odds(0.4)]
@@ -152,14 +143,14 @@ def test_log_odds_of_exactly_zero_are_known():
 
 def test_the_order_of_scans_does_not_show_in_the_leaves_of_an_unclamped_map():
     scans = random_scans(1, scans=3)
-    forward, backward = mapped(scans).leaves(), mapped(scans[::-1]).leaves()
+    forward, backward = octree_of(scans).leaves(), octree_of(scans[::-1]).leaves()
 
     np.testing.assert_array_equal(forward.keys, backward.keys)
     np.testing.assert_allclose(forward.log_odds, backward.log_odds, atol=1e-6)
 
 
 def test_leaves_agree_with_queries():
-    octree = mapped(random_scans(2))
+    octree = octree_of(random_scans(2))
     leaves = octree.leaves()
 
     np.testing.assert_array_equal(octree.query(leaves.centres_world), leaves.log_odds)
@@ -167,7 +158,7 @@ def test_leaves_agree_with_queries():
 
 
 def test_what_was_never_seen_is_unknown():
-    octree = mapped(random_scans(2))
+    octree = octree_of(random_scans(2))
     strange = np.array([[1e4, 0, 0], [-1e4, 0, 0], [np.nan, 0, 0], [0, np.inf, 0], [500.0, 500.0, 500.0]])
 
     assert np.isnan(octree.query(strange)).all()
@@ -180,7 +171,7 @@ def test_rays_end_where_octomap_ends_them(through_unknown):
     rough_sphere = rng.normal(0.0, 1.0, (20000, 3))
     rough_sphere *= rng.uniform(1.2, 1.3, (20000, 1)) / np.linalg.norm(rough_sphere, axis=1, keepdims=True)
     scans = [(rough_sphere.astype(np.float32), np.zeros(3))]
-    octree, tree = mapped(scans), fuse(scans, resolution_m=0.05, max_range_m=4.0, discretize=True)
+    octree, tree = octree_of(scans), fuse(scans, resolution_m=0.05, max_range_m=4.0, discretize=True)
     origins = rng.normal(0.0, 0.3, (200, 3)).astype(np.float32).astype(np.float64)
     directions = rng.normal(0.0, 1.0, (200, 3)).astype(np.float32).astype(np.float64)
     directions[:6] = np.vstack([np.eye(3), -np.eye(3)])
@@ -200,7 +191,7 @@ def test_rays_end_where_octomap_ends_them(through_unknown):
 
 
 def test_rays_that_cannot_be_cast_are_refused():
-    octree = mapped(random_scans(2))
+    octree = octree_of(random_scans(2))
     for origins, directions in (
         (np.zeros((2, 3)), np.zeros((2, 3))),
         (np.zeros((2, 3)), np.full((2, 3), np.nan)),
@@ -214,7 +205,7 @@ def test_rays_that_cannot_be_cast_are_refused():
 @BOTH_MODES
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1700.0, -1700.0])
 def test_points_without_a_key_are_refused(bad, discretize):
-    octree = mapped(random_scans(6), discretize=discretize)
+    octree = octree_of(random_scans(6), discretize=discretize)
     before = as_dict(octree)
     points = np.zeros((400, 3), np.float32)
     points[300, 1] = bad
@@ -227,7 +218,7 @@ def test_points_without_a_key_are_refused(bad, discretize):
 @BOTH_MODES
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1700.0])
 def test_an_origin_without_a_key_is_refused(bad, discretize):
-    octree = mapped([], discretize=discretize)
+    octree = octree_of([], discretize=discretize)
 
     with pytest.raises(DataError, match=r"sensor origin .* ±1638\.4 m"):
         octree.insert_points(np.zeros((4, 3), np.float32), np.array([0.0, bad, 0.0]))
@@ -235,11 +226,11 @@ def test_an_origin_without_a_key_is_refused(bad, discretize):
 
 def test_shapes_other_than_n_by_3_are_refused():
     with pytest.raises(DataError, match=r"\(3, 4\), want \(N, 3\)"):
-        mapped([(np.zeros((3, 4), np.float32), np.zeros(3))])
+        octree_of([(np.zeros((3, 4), np.float32), np.zeros(3))])
 
 
 def test_an_empty_scan_changes_nothing():
-    octree = mapped([(np.zeros((0, 3), np.float32), np.zeros(3))])
+    octree = octree_of([(np.zeros((0, 3), np.float32), np.zeros(3))])
 
     assert len(octree) == 0
     assert len(octree.leaves().keys) == 0
@@ -249,14 +240,14 @@ def test_a_scan_too_large_for_its_resolution_is_refused_before_it_is_allocated()
     corners = np.array([[30, 30, 30], [-30, -30, -30]], np.float32)
 
     with pytest.raises(MapSizeError, match=r"scan of 600\d×600\d×600\d voxels needs 512 GiB .* resolution_m"):
-        mapped([(corners, np.zeros(3))], resolution_m=0.01, max_range_m=200.0)
+        octree_of([(corners, np.zeros(3))], resolution_m=0.01, max_range_m=200.0)
 
 
 def test_working_space_is_only_as_large_as_what_rays_cross():
     def resident_bytes():
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
-    octree = mapped([(np.zeros((1, 3), np.float32), np.ones(3))], resolution_m=0.1, max_range_m=80.0)
+    octree = octree_of([(np.zeros((1, 3), np.float32), np.ones(3))], resolution_m=0.1, max_range_m=80.0)
     corners = np.array([[40, 40, 20], [-40, -40, -20], [40, -40, 20]], np.float32)
     before = resident_bytes()
 
@@ -267,7 +258,7 @@ def test_working_space_is_only_as_large_as_what_rays_cross():
 
 
 def test_a_map_too_large_for_memory_is_refused_and_stays_as_it_was(monkeypatch):
-    octree = mapped(random_scans(7)[:1])
+    octree = octree_of(random_scans(7)[:1])
     before = as_dict(octree)
     monkeypatch.setattr(blocks.os, "sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 1}[name])
     with pytest.raises(MapSizeError, match=r"blocks of 8³ voxels needs .* GiB"):
@@ -281,6 +272,6 @@ def test_a_map_too_large_for_memory_is_refused_and_stays_as_it_was(monkeypatch):
 
 def test_clamps_hold():
     ahead, origin = np.array([[0.525, 0.025, 0.025]], np.float32), np.full(3, 0.025)
-    leaves = mapped([(ahead, origin)] * 30).leaves()
+    leaves = octree_of([(ahead, origin)] * 30).leaves()
 
     assert set(leaves.log_odds.tolist()) == {log_odds(0.1192), log_odds(0.971)}

@@ -6,6 +6,7 @@ from mapper.core.errors import DataError
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from tests.support.octomap_oracle import fuse
+from tests.support.octree_maps import octree_of
 
 ALL_DEPTHS = pytest.mark.parametrize("depth", range(17))
 
@@ -21,10 +22,7 @@ def scans(seed, *, spread_m=1.0, count=6):
 
 @pytest.fixture(scope="module")
 def octree():
-    octree = OctreeMap(OctreeConfig())
-    for points, origin in scans(0):
-        octree.insert_points(points, origin)
-    return octree
+    return octree_of(scans(0))
 
 
 @pytest.fixture(scope="module")

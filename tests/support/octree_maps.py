@@ -10,7 +10,18 @@ CONFIG = OctreeConfig(resolution_m=0.1, max_range_m=3.0)
 COLORED = CONFIG.model_copy(update={"attributes": True})
 
 
+def octree_of(scans, *, resolution_m=0.05, max_range_m=4.0, discretize=True):
+    """Return our map of (points_world f32, origin_world) pairs; see octomap_oracle.fuse for OctoMap's."""
+    octree = OctreeMap(
+        OctreeConfig(resolution_m=resolution_m, max_range_m=max_range_m, discretize=discretize)
+    )
+    for points, origin in scans:
+        octree.insert_points(points, origin)
+    return octree
+
+
 def mapped(seed, *, config=CONFIG, scans=5):
+    """Return a map of a few random scans, coloured if the settings keep colours."""
     rng = np.random.default_rng(seed)
     octree = OctreeMap(config)
     for i in range(scans):
@@ -23,6 +34,7 @@ def mapped(seed, *, config=CONFIG, scans=5):
 
 
 def total(maps, *, config=CONFIG):
+    """Return the sum of maps, and what each overlapped with those before it."""
     octree = OctreeMap(config)
     overlaps = [octree.add(other) for other in maps]
     octree.clamp()
@@ -30,5 +42,6 @@ def total(maps, *, config=CONFIG):
 
 
 def as_dict(octree):
+    """Return {key: log-odds} of a map's leaves."""
     leaves = octree.leaves()
     return {tuple(key): value for key, value in zip(leaves.keys.tolist(), leaves.log_odds, strict=True)}
