@@ -12,7 +12,6 @@ from mapper.simulation.config import SynthConfig
 from mapper.simulation.source import CameraSimulator
 from tests.support.desk_frames import blank
 
-pytestmark = pytest.mark.slow  # to render the log takes that long
 RATE_HZ = 15.0
 BOTH = pytest.mark.parametrize("config", [LocalMapConfig(), PnpConfig()], ids=lambda config: config.kind)
 

@@ -113,7 +113,7 @@ def test_an_odometry_that_needs_images_says_so(log, tmp_path):
     [
         ("kitti_00", 0.02),
         # All methods, ours and others', agree within 1 cm here and differ from this truth by 2.3 cm and more.
-        ("mulran_kaist03", 0.03),
+        pytest.param("mulran_kaist03", 0.03, marks=pytest.mark.slow),
     ],
 )
 def test_real_streets(name, limit_m, tmp_path):
