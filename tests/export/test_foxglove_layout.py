@@ -7,7 +7,7 @@ from mcap.reader import make_reader
 from mapper.config.loading import overridden
 from mapper.export.exporters import export
 from mapper.export.mcap_log import PLAN_TOPICS
-from mapper.pipeline.build import fuse
+from mapper.pipeline.fuse import fuse
 from mapper.run.folder import load_run
 from mapper.sources import open_source
 

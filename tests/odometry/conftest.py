@@ -3,12 +3,12 @@
 import pytest
 
 from mapper.core.frames import RgbdFrame
-from mapper.simulation.source import SyntheticSource
+from mapper.sources.base import Log
 from tests.support.desk_frames import desk_frames, desk_walk
 
 
 @pytest.fixture
-def source() -> SyntheticSource:
+def source() -> Log:
     """A synthetic log of three seconds before a desk."""
     return desk_walk()
 

@@ -5,7 +5,6 @@ import zlib
 
 import numpy as np
 import pytest
-from logs_made import MemoryEntry, log_in_memory
 
 from mapper.core.errors import DataError, VocabularyError
 from mapper.core.frames import Scan
@@ -15,6 +14,7 @@ from mapper.places.training_images import descriptors_of
 from mapper.places.vocabulary import ONE, Vocabulary, WordVector, load_vocabulary, similarity
 from mapper.places.word_tree import WordTree
 from tests.support.descriptors import noisy, random_bits
+from tests.support.logs import MemoryEntry, log_in_memory
 
 SMALL = VocabularyConfig(branching=4, levels=3)
 

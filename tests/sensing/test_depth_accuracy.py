@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from logs_made import MemoryEntry, log_in_memory
 
 from evaluators.depth_camera.accuracy import Patch, accuracy_of, quantisation_step_m
 from evaluators.depth_camera.noise_fit import fit_noise
@@ -16,6 +15,7 @@ from mapper.simulation.config import SensorConfig, SynthConfig
 from mapper.simulation.source import CameraSimulator
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
+from tests.support.logs import MemoryEntry, log_in_memory
 from tests.support.paths import FR1_XYZ
 
 CAMERA = PinholeCamera(320, 240, 262.5, 262.5, 159.5, 119.5)

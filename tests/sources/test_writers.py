@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
-from logs_made import MemoryEntry, log_in_memory
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.sources import open_source
 from mapper.sources.writers import write_log
+from tests.support.logs import MemoryEntry, log_in_memory
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
 
 CAMERA = PinholeCamera(64, 48, 60.0, 61.0, 31.5, 23.5, (0.1, -0.2, 0.001, 0.002, 0.05))

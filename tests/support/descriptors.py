@@ -1,7 +1,8 @@
 """Random binary descriptors and noisy copies of them."""
 
 import numpy as np
-from mapper.features.windowed import pack
+
+from mapper.features.hamming import pack
 
 
 def random_bits(rng, n):

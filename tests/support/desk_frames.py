@@ -3,12 +3,13 @@
 from functools import cache
 
 import numpy as np
-from evaluators.trajectory import align, associate, ate
 
+from evaluators.metrics.trajectory import align, associate, ate
 from mapper.core.frames import RgbdFrame
 from mapper.core.trajectory import Trajectory
 from mapper.simulation.config import SynthConfig
-from mapper.simulation.source import SyntheticSource
+from mapper.simulation.source import CameraSimulator
+from mapper.sources.base import Log
 
 DESK_WALK = SynthConfig(
     path="desk", duration_s=3.0, frame_rate_hz=15.0, width_px=320, height_px=240, texture_px_per_m=96
@@ -16,9 +17,9 @@ DESK_WALK = SynthConfig(
 
 
 @cache
-def desk_walk() -> SyntheticSource:
+def desk_walk() -> Log:
     """Return the log of the walk, 3 s long."""
-    return SyntheticSource(DESK_WALK)
+    return CameraSimulator(DESK_WALK).log()
 
 
 @cache

@@ -8,7 +8,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from logs_made import MemoryEntry
 from mcap.reader import make_reader
 
 from evaluators.compare import comparison as compare_module
@@ -27,6 +26,7 @@ from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.trajectory_files import read_tum
 from tests.support.command_line import mapper
+from tests.support.logs import MemoryEntry
 from tests.support.paths import KITTI
 
 RGBD = CompareConfig(methods=("pnp", "rgbd", "gicp", "kiss-icp"), pairs=3)
