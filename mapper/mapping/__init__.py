@@ -1,1 +1,1 @@
-"""From solved poses to maps: fusing, levelling, planes, the cloud."""
+"""Mapping from solved poses: levelling (up and the floor), fusing of frames, the coloured cloud."""

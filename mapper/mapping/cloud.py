@@ -1,4 +1,4 @@
-"""A coloured cloud thinned to one averaged point per voxel, in memory that grows with the scene alone."""
+"""Coloured cloud: one averaged point per voxel, in memory that grows with the scene, not with the log."""
 
 import cv2
 import numpy as np
@@ -13,14 +13,14 @@ Colors = NDArray[np.uint8]
 """(N, 3) uint8 RGB."""
 
 _HALF_SPAN = 1 << (AXIS_BITS - 1)  # voxels on either side of the world's origin
-_BATCH = 1 << 16  # points folded in at once: bounds how far ahead of need memory is reserved
+_BATCH = 1 << 16  # points added at once: bounds the memory reserved ahead of need
 _SUMS = 7  # x, y, z, red, green, blue, count
 
 
 class CloudBuilder:
-    """Folds points into voxels; each voxel keeps the mean position and mean colour of what fell into it.
+    """Builder of a cloud whose points are the mean position and mean colour of the points in each voxel.
 
-    Memory is about 72 bytes a voxel and does not depend on how many points are added.
+    Memory is about 72 bytes a voxel and does not depend on the number of points added.
     """
 
     def __init__(self, voxel_m: float) -> None:
@@ -40,11 +40,11 @@ class CloudBuilder:
         self._index = voxel_index(_BATCH)
 
     def __len__(self) -> int:
-        """Return how many voxels hold a point."""
+        """Return the number of voxels with a point."""
         return self._size
 
     def add(self, points_world: Points32, colors: Colors) -> None:
-        """Fold in a cloud.
+        """Add a cloud.
 
         Args:
             points_world: (N, 3) float32 metres, world frame.
@@ -79,7 +79,7 @@ class CloudBuilder:
             )
 
     def points_and_colors(self) -> tuple[Points32, Colors]:
-        """Return (M, 3) float32 mean positions and (M, 3) uint8 mean colours, voxels in the order met."""
+        """Return (M, 3) float32 mean positions and (M, 3) uint8 mean colours, in order of first points."""
         sums = self._sums[: self._size]
         means = sums[:, :6] / sums[:, 6:]
         return means[:, :3].astype(np.float32), np.rint(means[:, 3:]).astype(np.uint8)
@@ -94,11 +94,11 @@ class CloudBuilder:
 
 @njit(cache=True, nogil=True)
 def _fold(points, colors, voxels_per_m, index, sums, size):  # type: ignore[no-untyped-def]
-    """Add each point to its voxel's sums and return how many voxels there are now."""
+    """Add each point to its voxel's sums; return the number of voxels."""
     last_key, voxel = np.int64(-1), np.int64(-1)
     for i in range(len(points)):
         key = cell_key(points[i, 0] * voxels_per_m, points[i, 1] * voxels_per_m, points[i, 2] * voxels_per_m)
-        if key != last_key:  # neighbouring pixels mostly share a voxel, and a look-up is what costs
+        if key != last_key:  # neighbouring pixels mostly share a voxel, and queries of the index cost most
             voxel = claim_row(index, key, size)
             if voxel == size:
                 sums[size] = 0.0
@@ -117,7 +117,7 @@ def height_colors(
     """Return (N, 3) uint8 RGB for (N,) heights, from blue to red; the palette is Turbo (Mikhailov 2019).
 
     Args:
-        heights_m: In any frame.
+        heights_m: (N,) heights in any frame.
         between_m: Heights of pure blue and red; None is the 2nd and the 98th percentile.
     """
     if len(heights_m) == 0:

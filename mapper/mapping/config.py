@@ -10,23 +10,23 @@ from mapper.octree.config import OctreeConfig, SliceConfig
 
 
 class LevelConfig(Config):
-    """How "up" and the floor are found."""
+    """Settings of levelling: the search for "up" and the floor."""
 
     frames: PositiveInt = 40
-    """How many frames, spread over the log, are looked at."""
-    points_per_frame: PositiveInt = 4000
+    """Number of frames, spread over the log, in which planes are searched."""
     plane_tolerance_m: PositiveFloat = 0.03
+    """Largest standard deviation of a plane's points from it: the noise of the sensor."""
 
 
 class McapConfig(Config):
-    """What goes into ``run.mcap``."""
+    """Content of ``run.mcap``."""
 
     image_stride: NonNegativeInt = 10
     """Every n-th frame's colour image, or scan, is logged; 0 logs none."""
     image_width_px: PositiveInt = 320
     """Wider images are shrunk."""
     image_quality: Annotated[int, Field(ge=1, le=100)] = 80
-    """As libjpeg counts."""
+    """Quality of the JPEG images, on the scale of libjpeg."""
     scan_voxel_m: PositiveFloat = 0.3
     """Scans are thinned to one point per voxel."""
     frame_times: bool = True
@@ -34,16 +34,16 @@ class McapConfig(Config):
 
 
 class CloudConfig(Config):
-    """The coloured cloud."""
+    """Settings of the coloured cloud."""
 
     voxel_m: PositiveFloat = 0.02
-    """The cloud keeps one point, the mean, per cube of this edge."""
+    """The cloud has one point, the mean, per cube of this edge."""
     frame_stride: PositiveInt = 10
-    """Every n-th tracked frame gives its points."""
+    """Every n-th tracked frame adds its points."""
 
 
 class FuseSettings(Protocol):
-    """What fusing reads of a build's configuration."""
+    """The part of a build's configuration that fusing reads."""
 
     @property
     def octree(self) -> OctreeConfig:
@@ -67,7 +67,7 @@ class FuseSettings(Protocol):
 
     @property
     def mcap(self) -> McapConfig:
-        """Which frames are shown in the MCAP log, and how."""
+        """Frames in the MCAP log, and their form."""
         ...
 
     @property

@@ -1,4 +1,4 @@
-"""The second pass over a log: every tracked frame fused at its final pose."""
+"""Fusing: the second pass over a log, in which every tracked frame is added to the maps at its final pose."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -61,7 +61,7 @@ class ScanSnapshot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Maps:
-    """What fusing yields.
+    """The maps of a run.
 
     Attributes:
         octree: Occupied, free and unknown space.
@@ -80,19 +80,28 @@ class Maps:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Job:
-    """A frame to fuse: where it was, what it saw from there before, and who wants to see it in colour."""
+    """A frame to fuse.
+
+    Attributes:
+        entry: The frame.
+        T_world_body: (4, 4) its final pose.
+        twist: Its velocity there, for deskewing.
+        cached: Its update from the last time, if that still holds.
+        feeds_cloud: Whether its points are added to the cloud.
+        feeds_log: Whether its image or scan is logged.
+    """
 
     entry: FrameRef
     T_world_body: Transform
     twist: Twist
-    known: CachedUpdate | None
+    cached: CachedUpdate | None
     feeds_cloud: bool
     feeds_log: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fused:
-    """What a frame saw, or the reason why nobody knows; its points only where somebody wants them."""
+    """A frame's update, or the reason why there is none; its scan if it was read."""
 
     job: _Job
     update: ScanUpdate | None = None
@@ -114,16 +123,16 @@ def fuse_log(
 ) -> Maps:
     """Fuse every frame of the trajectory, in time order; decoding and casting run ahead in threads.
 
-    What a frame saw from where it still is, is merged without reading the frame again, to the same bits.
+    The cached update of a frame that has not moved is merged without reading the frame, to the same bits.
 
     Args:
         source: The log that was tracked.
         trajectory: Final body poses in the levelled world; frames without a pose are left out.
-        config: The octree, cloud, slice and mcap parts matter.
-        progress: Who watches.
-        on_snapshot: Gets every ``mcap.image_stride``-th frame's image, or its points if it has no image.
-        before: What the frames saw when they were fused the last time.
-        after: Gets what they see now.
+        config: Settings of the maps and of the MCAP log.
+        progress: Receives progress and notes.
+        on_snapshot: Receives every ``mcap.image_stride``-th frame's image, or its points if it has no image.
+        before: The frames' updates from the last time they were fused.
+        after: Receives the frames' updates.
     """
     octree, cloud = OctreeMap(config.octree), CloudBuilder(config.cloud.voxel_m)
     casters, moved = _Casters(config.octree), 0
@@ -132,7 +141,7 @@ def fuse_log(
         return _prepared(job, config, casters.caster)
 
     if before is not None and (config.octree.attributes or not before.holds_for(config.octree)):
-        before = None  # colours are in no sight
+        before = None  # updates have no colours
     prepared = ordered_map(prepare, _jobs(source, trajectory, config, before), workers=config.workers)
     with progress.stage("fuse") as report:
         for done, fused in enumerate(prepared, start=1):
@@ -145,7 +154,7 @@ def fuse_log(
             else:
                 octree.merge(fused.update)
             after.add(fused.cached)
-            moved += fused.job.known is None
+            moved += fused.job.cached is None
             if fused.scan is not None and fused.job.feeds_cloud:
                 _add_to_cloud(cloud, fused.scan, fused.job.T_world_body)
             if fused.snapshot is not None:
@@ -157,7 +166,7 @@ def fuse_log(
 
 
 class _Casters(threading.local):
-    """A caster for every thread that asks."""
+    """A caster for every thread."""
 
     def __init__(self, config: OctreeConfig) -> None:
         self.caster = Caster(config)
@@ -171,23 +180,25 @@ def _jobs(
     for entry in source.entries():
         index = index_of.get(entry.stamp_ns)
         if index is not None:
-            T_world_body, known = trajectory.T_world_body[index], None
+            T_world_body, cached = trajectory.T_world_body[index], None
             if before is not None and (
-                source.sensor == "rgbd" or _beside_hold(before, trajectory, index, config.octree)
+                source.sensor == "rgbd" or _neighbours_hold(before, trajectory, index, config.octree)
             ):
-                known = before.lookup(entry.stamp_ns, T_world_body, config=config.octree)
+                cached = before.lookup(entry.stamp_ns, T_world_body, config=config.octree)
             yield _Job(
                 entry,
                 T_world_body,
                 STILL if source.sensor == "rgbd" else twist_at(trajectory, index),
-                known,
+                cached,
                 feeds_cloud=index % config.cloud.frame_stride == 0,
                 feeds_log=image_stride > 0 and index % image_stride == 0,
             )
 
 
-def _beside_hold(before: ScanUpdateFile, trajectory: Trajectory, index: int, config: OctreeConfig) -> bool:
-    """Tell whether the poses before and after one are what they were: a scan is deskewed between them."""
+def _neighbours_hold(
+    before: ScanUpdateFile, trajectory: Trajectory, index: int, config: OctreeConfig
+) -> bool:
+    """Return whether the poses before and after one still hold: a scan is deskewed between them."""
     return all(
         before.holds(int(trajectory.stamps_ns[beside]), trajectory.T_world_body[beside], config=config)
         for beside in (index - 1, index + 1)
@@ -196,19 +207,19 @@ def _beside_hold(before: ScanUpdateFile, trajectory: Trajectory, index: int, con
 
 
 def _prepared(job: _Job, config: FuseSettings, caster: Caster) -> _Fused:
-    """Read and cast one frame as far as needed: its image costs most, and what is known nothing at all."""
+    """Read and cast one frame as far as needed: images cost most, and cached updates nothing."""
     scan, snapshot = None, None
     try:
         if job.feeds_cloud or job.feeds_log or config.octree.attributes:
             frame = job.entry.load()
             scan = deskewed(frame.scan(), job.twist)
             snapshot = _snapshot(frame, scan, config.mcap) if job.feeds_log else None
-        elif job.known is None:
+        elif job.cached is None:
             scan = deskewed(job.entry.scan(), job.twist)
-    except FrameError as error:  # it was readable in the first pass, so the log changed under us
+    except FrameError as error:  # readable in the first pass: the log has changed since
         return _Fused(job, reason=str(error))
-    if job.known is not None:
-        return _Fused(job, job.known.update(), job.known, scan, snapshot)
+    if job.cached is not None:
+        return _Fused(job, job.cached.update(), job.cached, scan, snapshot)
     assert scan is not None
     update = pack(caster.cast(scan, job.T_world_body))
     return _Fused(job, update, cache_update(job.entry.stamp_ns, job.T_world_body, update), scan, snapshot)
@@ -229,6 +240,6 @@ def _add_to_cloud(cloud: CloudBuilder, scan: Scan, T_world_body: Transform) -> N
     R, t = T_world_body[:3, :3].astype(np.float32), T_world_body[:3, 3].astype(np.float32)
     points_world = scan.points_body @ R.T + t
     colors = scan.colors
-    if colors is None:  # the sensor sees no colour, but people see heights in it
+    if colors is None:  # the sensor has no colour: heights are shown by it
         colors = height_colors(points_world[:, 2], between_m=_COLOURED_HEIGHTS_M)
     cloud.add(points_world, colors)

@@ -1,4 +1,4 @@
-"""Which way is up, and where the floor is: the frame that maps are sliced in."""
+"""Levelling: up and the floor, which give the world frame of the maps."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from mapper.mapping.planes import (
     least_support,
     levels_of,
     patches_of,
-    thinned,
+    subsampled,
     vertical_of,
 )
 from mapper.sources.base import Accelerations
@@ -26,13 +26,13 @@ from mapper.sources.base import Accelerations
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyAxes:
-    """How a body is roughly held.
+    """Rough attitude of a sensor's body.
 
     Attributes:
         up: (3,) unit vector that roughly points up, body frame.
-        forward: (3,) unit vector that the body looks along, body frame.
-        stands_on_floor: The floor is what lies below the sensor, not the lowest of what is around: a street
-            may fall away within sight, and reflections lie below it.
+        forward: (3,) unit vector along the body's heading, body frame.
+        stands_on_floor: The floor is the surface below the sensor, not the lowest surface around: a street
+            may fall away in range, and reflections lie below it.
     """
 
     up: Array
@@ -67,13 +67,13 @@ _MIN_FLOOR_POINTS = 100
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
-    """Where the levelled world lies.
+    """The level frame.
 
     Attributes:
-        T_level_world: (4, 4). In the level frame z points up and the floor is at z = 0; the first pose stands
-            at x = y = 0 and looks along +x.
-        method: What told the vertical: "accelerometer", "planes" or "camera".
-        detail: How sure that is, and how the floor was found; a sentence for the manifest.
+        T_level_world: (4, 4). In the level frame z points up and the floor is at z = 0; the first pose is at
+            x = y = 0 and heads along +x.
+        method: Source of the vertical: "accelerometer", "planes" or "camera".
+        detail: Quality of the vertical and source of the floor; a sentence for the manifest.
     """
 
     T_level_world: Transform
@@ -91,34 +91,34 @@ def find_level(
 ) -> Level:
     """Return the level frame of a log.
 
-    Up is told by the accelerometer if the log has one that is unambiguous, else by the planes that the scans
-    show, else by the mean of the body's own up direction. The first two lie within 60° of the last: a
-    camera is held roughly upright.
+    Up comes from the accelerometer if the log has one that is unambiguous, else from the planes in the scans,
+    else from the mean of the body's own up direction. The first two lie within 60° of the last: a camera is
+    held roughly upright.
 
     Args:
         scans: Scans, spread over the log, with their T_world_body.
-        trajectory: Where the body was; at least one pose.
+        trajectory: Poses of the body; at least one.
         accelerations: Readings in the accelerometer's own axes, which may be a permutation of the body's.
-        config: How much is looked at.
-        axes: How the sensor's body is held.
+        config: Gives the tolerance of planes.
+        axes: Rough attitude of the sensor's body.
 
     Raises:
         DataError: The trajectory has no poses.
     """
     if not len(trajectory):
         raise DataError("levelling: the trajectory has no poses")
-    up_guess = _mean_up(trajectory, axes.up)
-    patches = patches_of(scans, points_per_scan=config.points_per_frame, tolerance_m=config.plane_tolerance_m)
-    up_world, method, told = _up(
-        patches, trajectory, accelerations, up_guess=up_guess, tolerance_m=config.plane_tolerance_m
+    tolerance_m, up_guess = config.plane_tolerance_m, _mean_up(trajectory, axes.up)
+    patches = patches_of(scans, tolerance_m=tolerance_m)
+    up_world, method, up_detail = _up(
+        patches, trajectory, accelerations, up_guess=up_guess, tolerance_m=tolerance_m
     )
     if axes.stands_on_floor:
-        floor_m, found = _floor_below(scans, up_world, tolerance_m=config.plane_tolerance_m)
+        floor_m, floor_detail = _floor_below(scans, up_world, tolerance_m=tolerance_m)
     else:
-        heights_m = _heights(scans, up_world, config)
-        floor_m, found = _floor(patches, heights_m, up_world=up_world, tolerance_m=config.plane_tolerance_m)
+        heights_m = _heights(scans, up_world)
+        floor_m, floor_detail = _floor(patches, heights_m, up_world=up_world, tolerance_m=tolerance_m)
     T_level_world = _frame(trajectory.T_world_body[0], up_world, floor_m, axes)
-    return Level(T_level_world, method, f"{told}; {found}")
+    return Level(T_level_world, method, f"{up_detail}; {floor_detail}")
 
 
 def _up(
@@ -129,31 +129,31 @@ def _up(
     up_guess: Array,
     tolerance_m: float,
 ) -> tuple[Array, str, str]:
-    """Return up in the world, the method that told it, and how sure it is."""
-    doubts = []
+    """Return up in the world, its method, and the detail for the manifest, refused methods included."""
+    details = []
     if accelerations is not None:
-        up_world, told = _up_by_accelerometer(accelerations, trajectory, up_guess)
+        up_world, detail = _up_by_accelerometer(accelerations, trajectory, up_guess)
         if up_world is not None:
-            return up_world, "accelerometer", told
-        doubts.append(told)
+            return up_world, "accelerometer", detail
+        details.append(detail)
     if len(patches) >= _MIN_PATCHES:
         vertical = vertical_of(patches, up_guess_world=up_guess, tolerance_m=tolerance_m)
-        told = _planes_text(vertical, len(patches))
+        detail = _planes_text(vertical, len(patches))
         if vertical.horizontal_ratio + vertical.upright_ratio >= _MIN_AGREEING_RATIO:
-            return vertical.up_world, "planes", "; ".join([*doubts, told])
-        doubts.append(f"planes do not agree: {told}")
+            return vertical.up_world, "planes", "; ".join([*details, detail])
+        details.append(f"planes do not agree: {detail}")
     else:
-        doubts.append(f"only {len(patches)} flat patches seen, want {_MIN_PATCHES}")
-    return up_guess, "camera", "; ".join([*doubts, "up is the sensor's mean up direction"])
+        details.append(f"only {len(patches)} flat patches seen, want {_MIN_PATCHES}")
+    return up_guess, "camera", "; ".join([*details, "up is the sensor's mean up direction"])
 
 
 def _up_by_accelerometer(
     accelerations: Accelerations, trajectory: Trajectory, up_guess: Array
 ) -> tuple[Array | None, str]:
-    """Return the mean direction of the readings in the world, or None, and why.
+    """Return the mean direction of the readings in the world, or None, and the detail or the reason.
 
-    The accelerometer's axes are one of the 24 right-angled frames; the right one makes gravity stand still
-    in the world while the body turns.
+    The accelerometer's axes are one of the 24 right-angled frames; with the right one gravity keeps its
+    direction in the world while the body turns.
     """
     readings, R_world_body = _matched_readings(accelerations, trajectory)
     if len(readings) < _MIN_READINGS:
@@ -184,7 +184,7 @@ def _up_by_accelerometer(
 def _matched_readings(accelerations: Accelerations, trajectory: Trajectory) -> tuple[Array, Array]:
     """Return (N, 3) unit readings and the (N, 3, 3) rotation R_world_body at their time.
 
-    Readings far from the usual length are the hand's doing, not gravity's.
+    Readings far from the median length are left out: the body accelerates.
     """
     stride = max(1, -(-len(accelerations.stamps_ns) // _MAX_READINGS))
     stamps_ns = accelerations.stamps_ns[::stride]
@@ -193,9 +193,9 @@ def _matched_readings(accelerations: Accelerations, trajectory: Trajectory) -> t
     usable = np.isfinite(lengths) & (lengths > 0.0)
     if not usable.any():
         return np.empty((0, 3)), np.empty((0, 3, 3))
-    usual = np.median(lengths[usable])
+    median = np.median(lengths[usable])
     pose, gap_ns = nearest(trajectory.stamps_ns, stamps_ns)
-    usable &= (np.abs(lengths - usual) <= 0.2 * usual) & (gap_ns <= _MAX_READING_GAP_NS)
+    usable &= (np.abs(lengths - median) <= 0.2 * median) & (gap_ns <= _MAX_READING_GAP_NS)
     return readings[usable] / lengths[usable, None], trajectory.T_world_body[pose[usable], :3, :3]
 
 
@@ -220,21 +220,19 @@ def _mean_up(trajectory: Trajectory, up_body: Array) -> Array:
     return mean / length if length > 0.3 else first
 
 
-def _heights(scans: Sequence[tuple[Scan, Transform]], up_world: Array, config: LevelConfig) -> Array:
+def _heights(scans: Sequence[tuple[Scan, Transform]], up_world: Array) -> Array:
     """Return (N,) heights along up of the points, metres."""
-    heights = [
-        apply(T_world_body, thinned(scan, config.points_per_frame)) @ up_world for scan, T_world_body in scans
-    ]
+    heights = [apply(T_world_body, subsampled(scan)) @ up_world for scan, T_world_body in scans]
     return np.concatenate([np.empty(0), *heights])
 
 
 def _floor(
     patches: Patches, heights_m: Array, *, up_world: Array, tolerance_m: float
 ) -> tuple[float | None, str]:
-    """Return the floor's height along up, or None if nothing was seen at all, and how it was found.
+    """Return the floor's height along up, or None if there are no points, and the detail of its source.
 
-    The floor is the lowest surface that faces up and that enough patches share. If much lies deeper, it is a
-    table, and the lowest points stand in for the floor.
+    The floor is the lowest surface that faces up with enough patches. If many points lie deeper, that surface
+    is a table, and the lowest points give the floor.
     """
     if not len(heights_m):
         return None, "no points seen: the floor is put at the first pose"
@@ -243,7 +241,7 @@ def _floor(
     surfaces = levels_of(heights_up_m, tolerance_m=tolerance_m, least=least_support(len(heights_up_m)))
     if surfaces:
         medians_m = np.array([np.median(heights_up_m[members]) for members in surfaces])
-        # A surface leaves fringes just beside it; the best supported of the lowest ones is listed first.
+        # A surface has fringes just beside it; the best supported of the lowest ones comes first.
         chosen = int(np.flatnonzero(medians_m <= medians_m.min() + _NEAR_FLOOR_M)[0])
         floor_m = float(medians_m[chosen])
         if (heights_m < floor_m - _NEAR_FLOOR_M).mean() <= _MAX_BELOW_FLOOR_RATIO:
@@ -255,9 +253,9 @@ def _floor(
 def _floor_below(
     scans: Sequence[tuple[Scan, Transform]], up_world: Array, *, tolerance_m: float
 ) -> tuple[float | None, str]:
-    """Return the floor's height along up below the first scan that shows one, and how it was found.
+    """Return the floor's height along up below the first scan with a floor, and the detail of its source.
 
-    That is the best supported height below the sensor among the points around it.
+    It is the best supported height below the sensor among the points around it.
     """
     for scan, T_world_body in scans:
         sensor_world = apply(T_world_body, scan.origin_body[np.newaxis])[0]
@@ -274,9 +272,9 @@ def _floor_below(
 
 
 def _frame(T_world_first: Transform, up_world: Array, floor_m: float | None, axes: BodyAxes) -> Transform:
-    """Return T_level_world: z up, floor at 0, the first pose at x = y = 0, looking along +x.
+    """Return T_level_world: z up, floor at 0, the first pose at x = y = 0 with its heading along +x.
 
-    A body that looks straight down or up has no heading; its own up direction then gives +x.
+    A body that faces straight down or up has no heading; its own up direction then gives +x.
     """
     R_world_first, first_world = T_world_first[:3, :3], T_world_first[:3, 3]
     heading = _flattened(R_world_first @ axes.forward, up_world)

@@ -1,4 +1,4 @@
-"""Which way surfaces face: local plane patches of scans, and the vertical that most of them agree on."""
+"""Plane patches of scans, and the vertical direction that fits most of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Points, Transform, apply
 
+_POINTS_PER_SCAN = 4000
+"""Evenly chosen points of a scan: more hardly change the planes and take longer."""
 _CELL_RANGE_RATIO = 0.1
 _CELL_LIMITS_M = (0.15, 1.0)
 _MIN_PATCH_POINTS = 8
@@ -24,14 +26,14 @@ _TOLERANCE_RAD = np.radians(8.0)
 _REFINED_TOLERANCE_RAD = np.radians(5.0)
 _NORMAL_NOISE_RAD = np.radians(3.0)
 _WIDENINGS = (4.0, 3.0, 2.0, 1.5, 1.0, 1.0, 1.0)
-"""How far beyond the tolerance a level's heights may spread while its tilt is still being found."""
+"""Factors of the tolerance of a level surface's heights, by iteration, while its tilt is refined."""
 _MIN_CONSTRAINT_RATIO = 0.02
 _MIN_LEVEL_PATCHES = 5
 _MIN_LEVEL_RATIO = 0.03
 
-# How much a patch says: a normal falls by chance within 8° of an axis in 0.5 % of all cases, and within 8° of
-# the plane across it in 14 %; the logarithms stand about 2.5 to 1. Surfaces that face down are as telling
-# but seen less surely: nobody films ceilings, and the backs of steep things look like them.
+# Weights of patches: a random normal lies within 8° of an axis in 0.5 % of all cases, and within 8° of the
+# plane across it in 14 %; the ratio of the logarithms is about 2.5. Surfaces that face down are measured less
+# reliably: ceilings are rarely in view, and the backs of steep objects resemble them.
 _FACING_UP, _FACING_DOWN, _UPRIGHT = 2.5, 1.25, 1.0
 
 
@@ -41,7 +43,7 @@ class Patches:
 
     Attributes:
         centres_world: (N, 3) metres, world frame.
-        normals_world: (N, 3) unit vectors, world frame, on the side that the sensor saw.
+        normals_world: (N, 3) unit vectors, world frame, on the sensor's side.
     """
 
     centres_world: Points
@@ -53,14 +55,14 @@ class Patches:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vertical:
-    """The direction that horizontal surfaces face and upright ones do not.
+    """The vertical: the normal of horizontal surfaces, across the normals of upright ones.
 
     Attributes:
         up_world: (3,) unit vector, world frame.
-        horizontal_ratio: Share of the patches that face along it, up or down.
-        upright_ratio: Share of the patches that face across it.
-        determined: False if all patches that agree face one way across it, as with a single wall: then the
-            tilt along that wall is the guess's.
+        horizontal_ratio: Share of the patches with normals along it, up or down.
+        upright_ratio: Share of the patches with normals across it.
+        determined: False if the normals of all fitting patches are parallel and across it, as with a single
+            wall: then the tilt along that wall is the guess's.
     """
 
     up_world: Array
@@ -69,22 +71,19 @@ class Vertical:
     determined: bool
 
 
-def patches_of(
-    scans: Sequence[tuple[Scan, Transform]], *, points_per_scan: int, tolerance_m: float
-) -> Patches:
-    """Return the flat pieces of every scan, by principal components in voxel cells.
+def patches_of(scans: Sequence[tuple[Scan, Transform]], *, tolerance_m: float) -> Patches:
+    """Return the flat patches of every scan, by principal components in voxel cells.
 
-    Cells grow with the scan's median range, so that they hold enough points of a LiDAR as of a camera.
-    Patches of different scans are kept apart: drift between them does not bend a patch.
+    Cells grow with the scan's median range, so that they have enough points of a LiDAR and of a camera.
+    Patches of different scans stay apart: drift between the scans does not bend a patch.
 
     Args:
         scans: Scans with their T_world_body.
-        points_per_scan: Evenly chosen points that are looked at.
         tolerance_m: Largest standard deviation of a patch's points from its plane.
     """
     centres, normals = [np.empty((0, 3))], [np.empty((0, 3))]
     for scan, T_world_body in scans:
-        points_body = thinned(scan, points_per_scan) - scan.origin_body
+        points_body = subsampled(scan) - scan.origin_body
         if len(points_body) < _MIN_PATCH_POINTS:
             continue
         centres_sensor, normals_sensor = _flat_cells(points_body, tolerance_m)
@@ -93,18 +92,18 @@ def patches_of(
     return Patches(np.concatenate(centres), np.concatenate(normals))
 
 
-def thinned(scan: Scan, most: int) -> Points:
-    """Return (M, 3) float64, at most about ``most`` of the scan's points, evenly chosen, body frame."""
-    stride = max(1, -(-len(scan.points_body) // most))
+def subsampled(scan: Scan) -> Points:
+    """Return (M, 3) float64 points of a scan, evenly chosen, body frame; M ≤ 4000."""
+    stride = max(1, -(-len(scan.points_body) // _POINTS_PER_SCAN))
     return scan.points_body[::stride].astype(np.float64)
 
 
 def vertical_of(patches: Patches, *, up_guess_world: Array, tolerance_m: float) -> Vertical:
-    """Return the axis, at most 60° from the guess, that has most patches along it and across it.
+    """Return the axis, at most 60° from the guess, with most patches along it and across it.
 
-    Every direction of a 2.5° grid is scored, weighed by its closeness to the guess. The best is refined by
-    least squares on the normals that agree, under Tukey's biweight (Beaton & Tukey 1974), and on the heights
-    of the level patches: those of one floor or table lie at one height, which over metres of floor tells the
+    Every direction of a 2.5° grid is scored, weighted by its closeness to the guess. The best is refined by
+    least squares on the normals that fit, under Tukey's biweight (Beaton & Tukey 1974), and on the heights of
+    level patches: those of one floor or table lie at one height, which over metres of floor determines the
     tilt far better than normals do.
 
     Args:
@@ -138,8 +137,8 @@ def levels_of(heights_m: Array, *, tolerance_m: float, least: int) -> list[NDArr
 
     Args:
         heights_m: (N,) heights, metres.
-        tolerance_m: Half of the window that one surface fills.
-        least: Windows with fewer heights are no surface.
+        tolerance_m: Half the window of one surface's heights.
+        least: Fewest heights of a surface.
     """
     levels = []
     left = np.argsort(heights_m, kind="stable")
@@ -184,7 +183,7 @@ def _heights_cost(patches: Patches, up: Array, tolerance_m: float) -> Array:
 
 
 def least_support(patches: int) -> int:
-    """Return how many of so many level patches make a surface, rather than a chance."""
+    """Return the fewest level patches, of so many, that make a surface rather than a coincidence."""
     return max(_MIN_LEVEL_PATCHES, int(_MIN_LEVEL_RATIO * patches))
 
 
@@ -192,7 +191,7 @@ def _flat_cells(points: Points, tolerance_m: float) -> tuple[Points, Array]:
     """Return centres and normals, facing the origin, of the cells whose points lie in a plane."""
     cell_m = float(np.clip(_CELL_RANGE_RATIO * np.median(np.linalg.norm(points, axis=1)), *_CELL_LIMITS_M))
     cells = np.floor(points / cell_m).astype(np.int64)
-    # Scans reach less than 2²⁰ cells from the sensor, so three coordinates fit one integer.
+    # Scans reach less than 2²⁰ cells from the sensor, so that three coordinates fit into one integer.
     keys = ((cells[:, 0] << 42) + (cells[:, 1] << 21)) + cells[:, 2]
     _, cell_of, counts = np.unique(keys, return_inverse=True, return_counts=True)
 
@@ -238,7 +237,7 @@ def _cone(axis: Array) -> Array:
 
 
 def _consistency(cosines: Array) -> Array:
-    """Return how much each patch speaks for each candidate, from the cosine between normal and candidate."""
+    """Return each patch's score for each candidate axis, from the cosine between normal and candidate."""
     along = np.clip(1.0 - (1.0 - np.abs(cosines)) / (1.0 - np.cos(_TOLERANCE_RAD)), 0.0, None)
     across = np.clip(1.0 - (cosines / np.sin(_TOLERANCE_RAD)) ** 2, 0.0, None)
     agreement: Array = along * np.where(cosines > 0.0, _FACING_UP, _FACING_DOWN) + across * _UPRIGHT

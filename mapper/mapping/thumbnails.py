@@ -1,4 +1,4 @@
-"""Small JPEG copies of a log's images, and the camera that fits them."""
+"""Thumbnails of a log's images: small JPEG copies and their camera."""
 
 from dataclasses import replace
 
@@ -13,8 +13,8 @@ def encode_jpeg(image: Image, *, width_px: int, quality: int) -> bytes:
 
     Args:
         image: (H, W, 3) uint8 RGB or (H, W) uint8 grey.
-        width_px: Widest result; the height keeps the proportions.
-        quality: 1 … 100 as libjpeg counts.
+        width_px: Largest width of the result; the aspect ratio is kept.
+        quality: 1 … 100 on the scale of libjpeg.
     """
     height, width = image.shape[:2]
     if width > width_px:
@@ -30,7 +30,7 @@ def encode_jpeg(image: Image, *, width_px: int, quality: int) -> bytes:
 
 
 def shrunk_camera(camera: PinholeCamera, *, width_px: int) -> PinholeCamera:
-    """Return the camera of the image that :func:`encode_jpeg` makes at the same ``width_px``."""
+    """Return the camera of the image of :func:`encode_jpeg` at the same ``width_px``."""
     if camera.width_px <= width_px:
         return camera
     height_px = _height_px(camera.width_px, camera.height_px, width_px)
