@@ -1,1 +1,1 @@
-"""What a robot needs to move in a finished map: distances, costs, the floor it can stand on, and paths."""
+"""Navigation in a finished map: distance fields, costmaps, the traversable floor, and paths."""

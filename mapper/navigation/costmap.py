@@ -1,4 +1,4 @@
-"""The inflated costmap that nav2's planners and controllers steer by."""
+"""Inflated costmap for the planners and controllers of nav2."""
 
 from dataclasses import dataclass
 
@@ -16,10 +16,10 @@ NO_INFORMATION, LETHAL, INSCRIBED, FREE_SPACE = 255, 254, 253, 0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Costmap:
-    """What it costs a robot to have its centre in a cell.
+    """Costs of the robot's centre being in a cell.
 
     Attributes:
-        costs: (H, W) uint8, nav2's; row 0 has the lowest y, column 0 the lowest x.
+        costs: (H, W) uint8 costs of nav2; row 0 has the lowest y, column 0 the lowest x.
         origin_world_m: (2,) x and y of the lower left corner of cell (0, 0), metres.
         resolution_m: Edge of a cell.
     """
@@ -32,7 +32,7 @@ class Costmap:
 def inflate(
     grid: OccupancyGrid, *, robot_radius_m: float, inflation_radius_m: float, cost_scaling: float
 ) -> Costmap:
-    """Return the costs that nav2's static and inflation layers make of a grid.
+    """Return the costs of nav2's static and inflation layers for a grid.
 
     With d from a cell's centre to that of the nearest obstacle: 254 on obstacles, 253 up to the robot's
     radius r, then 252·exp(−s·(d − r)) up to the inflation radius, rounded up to whole cells as nav2 does;
@@ -41,8 +41,8 @@ def inflate(
     Args:
         grid: The slice or the floor.
         robot_radius_m: r, the inscribed radius; 0 is a point.
-        inflation_radius_m: How far costs reach; at least r.
-        cost_scaling: s per metre: how fast they fall.
+        inflation_radius_m: Distance up to which there are costs; at least r.
+        cost_scaling: s, per metre.
 
     Raises:
         DataError: A radius or the scaling is negative or not finite, or the inflation ends inside the robot.

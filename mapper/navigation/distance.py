@@ -1,4 +1,4 @@
-"""How far it is to the nearest obstacle: signed Euclidean distance fields in 2D and 3D."""
+"""Signed Euclidean distance fields in 2D and 3D: distances to the nearest obstacle."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ class DistanceField:
     """Signed distances at the centres of a box's voxels.
 
     Attributes:
-        distances_m: (Z, Y, X) float32, as :func:`signed_distances` gives them.
+        distances_m: (Z, Y, X) float32 result of :func:`signed_distances`.
         corner_world_m: (3,) lower x, y, z of voxel [0, 0, 0].
         resolution_m: Edge of a voxel.
     """
@@ -42,7 +42,7 @@ class DistanceField:
         return found
 
     def gradient(self, points_world: Points) -> Distances:
-        """Return the (N, 3) gradient of that interpolation: it points away from the nearest obstacle.
+        """Return the (N, 3) gradient of that interpolation, which points away from the nearest obstacle.
 
         Raises:
             DataError: The points are not (N, 3).
@@ -59,14 +59,14 @@ class DistanceField:
 
 
 def distance_2d(grid: OccupancyGrid, *, unknown_blocks: bool) -> Distances:
-    """Return the signed distance of every cell of a grid; what lies around the grid is unknown.
+    """Return the signed distance of every cell of a grid; the space around the grid is unknown.
 
     Args:
         grid: The slice or the floor.
         unknown_blocks: Whether unknown cells count as obstacles.
 
     Returns:
-        (H, W) float32 metres, as :func:`signed_distances` gives them; row 0 has the lowest y.
+        (H, W) float32 metres as of :func:`signed_distances`; row 0 has the lowest y.
     """
     voxels = layer(grid)
     distances_m = signed_distances(voxels.blocked(unknown_blocks=unknown_blocks), grid.resolution_m)
@@ -80,25 +80,25 @@ def distance_3d(
 
     Args:
         octree: The map.
-        box: Which part; make it larger than wanted by the distance that matters.
+        box: Part of the map; larger than the wanted part by the distance of interest.
         unknown_blocks: Whether unknown voxels count as obstacles.
-        limit_bytes: Working space that it may take.
+        limit_bytes: Limit of the working space.
 
     Raises:
-        MapSizeError: It would take more; nothing has been allocated then.
+        MapSizeError: More space is needed; nothing has been allocated then.
     """
     voxels = cut_box(octree, box, bytes_per_voxel=_BYTES_PER_VOXEL, limit_bytes=limit_bytes)
     return distance_field(voxels, unknown_blocks=unknown_blocks)
 
 
 def distance_field(voxels: VoxelGrid, *, unknown_blocks: bool) -> DistanceField:
-    """Return the distance field of a box that has been cut."""
+    """Return the distance field of a voxel grid."""
     distances_m = signed_distances(voxels.blocked(unknown_blocks=unknown_blocks), voxels.resolution_m)
     return DistanceField(distances_m, voxels.corner_world_m, voxels.resolution_m)
 
 
 def signed_distances(blocked: NDArray[np.bool_], resolution_m: float) -> Distances:
-    """Return how far each cell's centre is from the surface between free and blocked cells, exactly.
+    """Return the exact distance of each cell's centre to the surface between free and blocked cells.
 
     Args:
         blocked: (Z, Y, X).
@@ -122,7 +122,7 @@ def _half_cells(squares: NDArray[np.int32]) -> Distances:
 
 @njit(cache=True, nogil=True)
 def _interpolate(distances: Distances, corner: Array, resolution_m: float, points: Points) -> Distances:
-    """Return (N, 4): the trilinear value and its gradient along x, y, z; NaN outside the box."""
+    """Return the (N, 4) trilinear value and its gradient along x, y, z; NaN outside the box."""
     found = np.full((len(points), 4), np.nan, np.float32)
     depth, height, width = distances.shape
     for i in range(len(points)):
@@ -142,16 +142,16 @@ def _interpolate(distances: Distances, corner: Array, resolution_m: float, point
 
 @njit(cache=True, nogil=True)
 def interpolated(distances: Distances, z: float, y: float, x: float) -> tuple[float, float, float, float]:
-    """Return the trilinear value at a place in cells, and its change per cell along z, y, x.
+    """Return the trilinear value at a position in cells, and its change per cell along z, y, x.
 
-    Cell [0, 0, 0] spans 0 … 1. Beyond the outermost centres the value stays what it is there.
+    Cell [0, 0, 0] spans 0 … 1. Beyond the outermost centres the value is constant.
     """
     depth, height, width = distances.shape
     z0, z1, up_z, slope_z = _between(z, depth)
     y0, y1, up_y, slope_y = _between(y, height)
     x0, x1, up_x, slope_x = _between(x, width)
     if np.isinf(distances[z0, y0, x0]):
-        return distances[z0, y0, x0], np.nan, np.nan, np.nan  # then all are, and have no slope
+        return distances[z0, y0, x0], np.nan, np.nan, np.nan  # then all are infinite, without a slope
     a, b = _mix(distances, z0, y0, x0, x1, up_x), _mix(distances, z0, y1, x0, x1, up_x)
     c, d = _mix(distances, z1, y0, x0, x1, up_x), _mix(distances, z1, y1, x0, x1, up_x)
     low, high = a + up_y * (b - a), c + up_y * (d - c)
@@ -167,11 +167,11 @@ def interpolated(distances: Distances, z: float, y: float, x: float) -> tuple[fl
 
 
 @njit(cache=True, nogil=True)
-def _between(place: float, count: int) -> tuple[int, int, float, float]:
-    """Return the cells whose centres a place lies between, its share of the way, and 1 or 0 beyond them."""
-    clamped = min(max(place - 0.5, 0.0), count - 1.0)
+def _between(position: float, count: int) -> tuple[int, int, float, float]:
+    """Return the cells with centres around a position, its fraction between them, and 1, or 0 beyond them."""
+    clamped = min(max(position - 0.5, 0.0), count - 1.0)
     low = int(clamped)
-    return low, min(low + 1, count - 1), clamped - low, 1.0 if clamped == place - 0.5 else 0.0
+    return low, min(low + 1, count - 1), clamped - low, 1.0 if clamped == position - 0.5 else 0.0
 
 
 @njit(cache=True, nogil=True)

@@ -1,4 +1,4 @@
-"""Straight lines that keep a distance to obstacles, and paths pulled tight between them."""
+"""Line-of-sight tests in a distance field, and path shortening by them (string pulling)."""
 
 from itertools import pairwise
 
@@ -12,22 +12,20 @@ from mapper.navigation.distance import DistanceField, Distances, interpolated
 _GAIN = 1e-4  # of the length: a round that shortens by less is the last
 _MOST_ROUNDS = 30
 _MOST_POINTS = 4000
-_STEEPEST = (
-    3.0**0.5
-)  # slope of a trilinear mix of distances, no two neighbours of which differ by more than 1
-_LEAST_STEP = 0.2  # cells, where a line grazes the distance it has to keep
+_STEEPEST = 3.0**0.5  # slope of a trilinear mix of distances that differ by at most 1 between neighbours
+_LEAST_STEP = 0.2  # cells, where a line's clearance is just the radius
 
 
 def shortened(field: DistanceField, path: Array, *, radius_m: float) -> Array:
-    """Return a path pulled tight: the same ends, the distance kept, never longer.
+    """Return a shortened path: the same ends, with the clearance kept, never longer.
 
-    Each round puts points every cell along the path and then goes on from point to farthest point in sight,
-    from either end in turn, until a round gains next to nothing.
+    Each round puts points every cell along the path and connects each to the farthest point in sight, from
+    either end in turn, until a round shortens the path by less than 10⁻⁴.
 
     Args:
         field: Distances to obstacles.
-        path: (N, 3) z, y, x in cells; cell [0, 0, 0] spans 0 … 1. Each leg keeps the distance.
-        radius_m: The distance.
+        path: (N, 3) z, y, x in cells; cell [0, 0, 0] spans 0 … 1. Each segment has the clearance.
+        radius_m: The clearance.
 
     Returns:
         (M, 3) corners.
@@ -35,8 +33,8 @@ def shortened(field: DistanceField, path: Array, *, radius_m: float) -> Array:
     best = _corners(field, path, radius_m)
     for _ in range(_MOST_ROUNDS):
         length = path_length(best)
-        forth = _corners(field, _dotted(best), radius_m)
-        back = _corners(field, _dotted(forth)[::-1], radius_m)[::-1]
+        forth = _corners(field, _sampled(best), radius_m)
+        back = _corners(field, _sampled(forth)[::-1], radius_m)[::-1]
         best = min(best, forth, back, key=path_length)
         if path_length(best) > (1.0 - _GAIN) * length:
             break
@@ -49,12 +47,12 @@ def path_length(path: Array) -> float:
 
 
 def in_sight(field: DistanceField, begin: Array, end: Array, *, radius_m: float) -> bool:
-    """Tell whether the line between two (3,) places, z, y, x in cells, keeps a distance."""
+    """Return whether the line between two (3,) positions, z, y, x in cells, has a clearance."""
     return bool(_visible(field.distances_m, field.resolution_m, radius_m, begin, end))
 
 
-def _dotted(path: Array) -> Array:
-    """Return points along a path, its corners among them, about a cell apart."""
+def _sampled(path: Array) -> Array:
+    """Return points about a cell apart along a path, its corners included."""
     spacing = max(1.0, path_length(path) / _MOST_POINTS)
     parts = []
     for begin, end in pairwise(path):
@@ -71,12 +69,12 @@ def _corners(field: DistanceField, path: Array, radius_m: float) -> Array:
 
 @njit(cache=True, nogil=True)
 def _anchors(distances: Distances, resolution_m: float, radius_m: float, path: Array) -> NDArray[np.int64]:
-    """Return the indices of a path's points between which straight lines keep the distance."""
+    """Return the indices of a path's points that are joined by straight lines with the clearance."""
     kept = np.empty(len(path), np.int64)
     kept[0], count, anchor = 0, 1, 0
     while anchor < len(path) - 1:
         ahead, stride, grows = anchor + 1, 1, True
-        while stride > 0:  # doubled while points are in sight, then halved: looking at each is quadratic
+        while stride > 0:  # doubled while points are in sight, then halved: testing each is quadratic
             further = min(ahead + stride, len(path) - 1)
             if further > ahead and _visible(distances, resolution_m, radius_m, path[anchor], path[further]):
                 ahead = further
@@ -90,7 +88,7 @@ def _anchors(distances: Distances, resolution_m: float, radius_m: float, path: A
 
 @njit(cache=True, nogil=True)
 def _visible(distances: Distances, resolution_m: float, radius_m: float, begin: Array, end: Array) -> bool:
-    """Tell whether a line keeps the distance, by steps as long as the distance allows (Hart 1996)."""
+    """Return whether a line has the clearance, by steps as long as the distance allows (Hart 1996)."""
     dz, dy, dx = end[0] - begin[0], end[1] - begin[1], end[2] - begin[2]
     length = np.sqrt(dz * dz + dy * dy + dx * dx)
     done = 0.0

@@ -1,4 +1,4 @@
-"""Shortest collision-free paths for a disc on a grid, or for a ball in the octree."""
+"""Path planner: shortest collision-free paths for a disc on a grid, or for a ball in the octree."""
 
 from dataclasses import dataclass
 from itertools import pairwise, product
@@ -26,10 +26,10 @@ class Plan:
     """A path.
 
     Attributes:
-        waypoints_world: (N, D) metres, D = 2 on a grid and 3 in the octree; the ends are those asked for.
-        length_m: Of the straight lines between them.
-        min_clearance_m: The path's least distance to what counts as blocked; +inf if nothing does.
-        config: What was asked for.
+        waypoints_world: (N, D) metres, D = 2 on a grid and 3 in the octree, from start to goal.
+        length_m: Length of the straight lines between them.
+        min_clearance_m: Least distance of the path to blocked space; +inf if there is none.
+        config: Settings of the plan.
     """
 
     waypoints_world: Array
@@ -44,7 +44,7 @@ class Plan:
 
     @property
     def summary(self) -> str:
-        """What it amounts to, in a line."""
+        """The path in one line of text."""
         config = self.config
         where = "the octree" if self.dimensions == 3 else f"the {config.layer}"
         return (
@@ -55,17 +55,17 @@ class Plan:
 
 
 def plan_2d(grid: OccupancyGrid, start_world: Array, goal_world: Array, *, config: PlanConfig) -> Plan:
-    """Return a shortest path for a disc on a grid; what lies around the grid is unknown.
+    """Return a shortest path for a disc on a grid; the space around the grid is unknown.
 
-    The distance field, linear between the centres of cells, stays at or above the radius all along the path.
-    The path is never longer than the shortest one over the centres of neighbouring cells (8 in a plane, 26
-    in space) that keep the radius: that one is searched for, then pulled tight between the obstacles.
+    The distance field, linear between the centres of cells, is at least the radius all along the path. The
+    path is never longer than the shortest one over the centres of neighbouring cells (8 in a plane, 26 in
+    space) with that clearance: that one is searched by A*, then shortened between the obstacles.
 
     Args:
         grid: The slice, or the traversable floor.
         start_world: (2,) metres.
         goal_world: (2,) metres.
-        config: Radius and what unknown cells count as.
+        config: Radius, and whether unknown cells are blocked.
 
     Raises:
         PlanError: An end is outside, unknown or too close to an obstacle, or no path joins the two.
@@ -88,8 +88,8 @@ def plan_3d(
         octree: The map; its floor and ceiling are obstacles like any other.
         start_world: (3,) metres.
         goal_world: (3,) metres.
-        config: Radius and what unknown voxels count as.
-        limit_bytes: Working space that it may take.
+        config: Radius, and whether unknown voxels are blocked.
+        limit_bytes: Limit of the working space.
 
     Raises:
         PlanError: As :func:`plan_2d`.
@@ -111,7 +111,7 @@ def _planned(voxels: VoxelGrid, start_world: Array, goal_world: Array, config: P
             f"{space.text(reached_world)}, {np.linalg.norm(goal_world - reached_world):.2f} m from it: go "
             f"there, or plan with a smaller radius{_or_unknown(config)}"
         )
-    path = np.vstack([space.place(start_world), found.cells + 0.5, space.place(goal_world)])
+    path = np.vstack([space.in_cells(start_world), found.cells + 0.5, space.in_cells(goal_world)])
     waypoints_world = space.world(shortened(space.field, path, radius_m=space.least_m))
     waypoints_world[[0, -1]] = start_world, goal_world  # to the last digit
     return Plan(
@@ -124,13 +124,13 @@ def _planned(voxels: VoxelGrid, start_world: Array, goal_world: Array, config: P
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Space:
-    """Where the middle of a robot may be.
+    """Space for the centre of a robot.
 
     Attributes:
         voxels: The map.
-        field: Distances to what is blocked.
-        free: (Z, Y, X) where the centre of a voxel keeps the radius.
-        config: What was asked for.
+        field: Distances to blocked space.
+        free: (Z, Y, X) mask of voxels whose centres have the radius as clearance.
+        config: Settings of the plan.
     """
 
     voxels: VoxelGrid
@@ -144,17 +144,17 @@ class _Space:
 
     @property
     def least_m(self) -> float:
-        """The radius less what rounding may take."""
+        """The radius less an allowance for rounding."""
         return self.config.radius_m - _ROUNDING_M
 
-    def place(self, point_world: Array) -> Array:
+    def in_cells(self, point_world: Array) -> Array:
         """Return a point's z, y, x in cells."""
-        place: Array = ((point_world - self.voxels.corner_world_m) / self.voxels.resolution_m)[::-1]
-        return place
+        zyx: Array = ((point_world - self.voxels.corner_world_m) / self.voxels.resolution_m)[::-1]
+        return zyx
 
-    def world(self, places: Array) -> Array:
+    def world(self, zyx: Array) -> Array:
         """Return points from their (N, 3) z, y, x in cells."""
-        points_world: Array = self.voxels.corner_world_m + places[:, ::-1] * self.voxels.resolution_m
+        points_world: Array = self.voxels.corner_world_m + zyx[:, ::-1] * self.voxels.resolution_m
         return points_world
 
     def centre(self, cell: NDArray[np.int64]) -> Array:
@@ -163,19 +163,19 @@ class _Space:
         return centre_world
 
     def text(self, point_world: Array) -> str:
-        """Return a point as the user writes it."""
+        """Return a point as messages write it, with two or three coordinates."""
         return point_text(point_world[: self.dimensions])
 
     def cell(self, point_world: Array, name: str) -> Cell:
-        """Return a free cell whose centre one end of the path can go to.
+        """Return a free cell whose centre is in the line of sight of one end of the path.
 
         Raises:
             PlanError: There is none.
         """
         if point_world.shape != (3,) or not np.isfinite(point_world).all():
             raise PlanError(f"the {name} {point_world.tolist()} is no point; want finite coordinates, metres")
-        place = self.place(point_world)
-        z, y, x = (int(n) for n in np.floor(place).clip(-1, 2**31))
+        zyx = self.in_cells(point_world)
+        z, y, x = (int(n) for n in np.floor(zyx).clip(-1, 2**31))
         if not all(0 <= n < count for n, count in zip((z, y, x), self.free.shape, strict=True)):
             known = np.argwhere(self.voxels.states != UNKNOWN)
             low, high = self.world(np.array([known.min(axis=0), known.max(axis=0) + 1]).astype(np.float64))
@@ -185,10 +185,9 @@ class _Space:
             )
         clearance_m = float(self.field.distance(point_world[np.newaxis])[0])
         if clearance_m >= self.least_m:
-            for cell in self._around(place):
-                if self.free[cell] and in_sight(
-                    self.field, place, np.array(cell) + 0.5, radius_m=self.least_m
-                ):
+            for cell in self._around(zyx):
+                centre = np.array(cell) + 0.5
+                if self.free[cell] and in_sight(self.field, zyx, centre, radius_m=self.least_m):
                     return cell
         remedy = self._nearest(point_world)
         if self.voxels.states[z, y, x] == UNKNOWN and self.config.unknown == "blocked":
@@ -203,11 +202,11 @@ class _Space:
             f"a radius of {self.config.radius_m:g} m; {remedy}{_or_unknown(self.config)}"
         )
 
-    def _around(self, place: Array) -> list[Cell]:
-        """Return the cells whose centres surround a place, the nearest first."""
-        low = np.floor(place - 0.5).astype(np.int64)
+    def _around(self, zyx: Array) -> list[Cell]:
+        """Return the cells whose centres surround a position, the nearest first."""
+        low = np.floor(zyx - 0.5).astype(np.int64)
         cells = np.array(list(product(*((n, n + 1) for n in low)))).clip(0, np.array(self.free.shape) - 1)
-        order = np.argsort(np.linalg.norm(cells + 0.5 - place, axis=1), kind="stable")
+        order = np.argsort(np.linalg.norm(cells + 0.5 - zyx, axis=1), kind="stable")
         return [(int(z), int(y), int(x)) for z, y, x in cells[order]]
 
     def _nearest(self, point_world: Array) -> str:
@@ -217,14 +216,14 @@ class _Space:
                 f"nowhere in the map is there room for a radius of {self.config.radius_m:g} m; plan with a "
                 f"smaller one{_or_unknown(self.config)}"
             )
-        squares = np.square(cells + 0.5 - self.place(point_world)).sum(axis=1)
+        squares = np.square(cells + 0.5 - self.in_cells(point_world)).sum(axis=1)
         nearest_world = self.centre(cells[int(np.argmin(squares))])
         away_m = float(np.sqrt(squares.min())) * self.voxels.resolution_m
         return f"the nearest free point is {self.text(nearest_world)}, {away_m:.2f} m away"
 
 
 def point_text(point_world: Array) -> str:
-    """Return a point as messages and headlines name it."""
+    """Return a point as text, metres to three decimals."""
     return f"({', '.join(f'{value:.3f}' for value in point_world)})"
 
 
@@ -238,7 +237,7 @@ def _or_unknown(config: PlanConfig) -> str:
 
 
 def _clearance(field: DistanceField, path_world: Array) -> float:
-    """Return the least distance of points along a path, four in every cell."""
+    """Return the least distance to blocked space along a path, at four points per cell."""
     spacing_m = field.resolution_m / _SAMPLES_PER_CELL
     lowest_m = np.inf
     for begin, end in pairwise(path_world):

@@ -12,17 +12,17 @@ from mapper.core.geometry import Array
 Cell = tuple[int, int, int]
 Cells = NDArray[np.int64]
 
-_START = 255  # in the table of steps: where the search began
+_START = 255  # in the table of steps: the start of the search
 _UNREACHED = 254
 _ROOT_2, _ROOT_3 = 2.0**0.5, 3.0**0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
-    """How a search ended.
+class SearchResult:
+    """Result of a search.
 
     Attributes:
-        cells: (N, 3) z, y, x from the start to the goal, or to the nearest cell that can be reached.
+        cells: (N, 3) z, y, x from the start to the goal, or to the reachable cell nearest to it.
         reached: Whether the last cell is the goal.
     """
 
@@ -30,10 +30,10 @@ class Found:
     reached: bool
 
 
-def shortest_path(free: NDArray[np.bool_], start: Cell, goal: Cell) -> Found:
-    """Return a shortest path over the centres of free cells; a step costs its Euclidean length.
+def shortest_path(free: NDArray[np.bool_], start: Cell, goal: Cell) -> SearchResult:
+    """Return a shortest path over the centres of free cells; the cost of a step is its Euclidean length.
 
-    A diagonal step needs all cells that it touches to be free, so the line between two centres never leaves
+    A diagonal step needs all cells that it touches to be free, so that the line between two centres lies in
     free cells.
 
     Args:
@@ -48,9 +48,9 @@ def shortest_path(free: NDArray[np.bool_], start: Cell, goal: Cell) -> Found:
     moves, lengths, touched = _moves(walled.shape)
     shape = np.array(walled.shape)
     steps, last = _search(walled.ravel(), shape, begin, end, moves, lengths, touched)
-    flat = _walk_back(steps, moves, last)
+    flat = _backtrack(steps, moves, last)
     cells = np.column_stack(np.unravel_index(flat, walled.shape)).astype(np.int64) - shift
-    return Found(cells, reached=bool(last == end))
+    return SearchResult(cells, reached=bool(last == end))
 
 
 def _flat(cell: NDArray[np.int64], shape: tuple[int, ...]) -> int:
@@ -58,9 +58,9 @@ def _flat(cell: NDArray[np.int64], shape: tuple[int, ...]) -> int:
 
 
 def _moves(shape: tuple[int, ...]) -> tuple[Cells, Array, Cells]:
-    """Return every step as (K,) change of a flat index, (K,) length and (K, 6) changes to what it touches.
+    """Return every step as (K,) change of a flat index, (K,) length and (K, 6) changes to touched cells.
 
-    What a step touches besides its two ends is padded with the end itself.
+    The cells that a step touches between its two ends are padded with the end itself.
     """
     reaches = [range(1) if n == 1 else range(-1, 2) for n in shape]
     moves, lengths, touched = [], [], []
@@ -80,7 +80,7 @@ def _moves(shape: tuple[int, ...]) -> tuple[Cells, Array, Cells]:
 def _search(
     free: NDArray[np.bool_], shape: Cells, start: int, goal: int, moves: Cells, lengths: Array, touched: Cells
 ) -> tuple[NDArray[np.uint8], int]:
-    """Return which move led to each cell, and the goal or the reachable cell nearest to it."""
+    """Return the number of the move into each cell, and the goal or the reachable cell nearest to it."""
     cost = np.full(len(free), np.inf)
     steps = np.full(len(free), _UNREACHED, np.uint8)
     keys, heap, count = np.empty(1024), np.empty(1024, np.int64), 0
@@ -108,10 +108,10 @@ def _search(
             through = cost[cell] + lengths[k]
             if through >= cost[other]:
                 continue
-            open_way = True
+            clear = True
             for j in range(6):
-                open_way &= free[cell + touched[k, j]]
-            if not open_way:
+                clear &= free[cell + touched[k, j]]
+            if not clear:
                 continue
             cost[other], steps[other] = through, k
             z, y, x = _unflat(other, shape)
@@ -122,7 +122,7 @@ def _search(
 
 @njit(cache=True, nogil=True)
 def _octile(a: int, b: int, c: int) -> float:
-    """Return the length of the shortest way over that many cells if nothing stands in it."""
+    """Return the length of a shortest path over so many cells along each axis without obstacles."""
     longest, shortest = max(a, b, c), min(a, b, c)
     middle = a + b + c - longest - shortest
     return float(_ROOT_3 * shortest + _ROOT_2 * (middle - shortest) + (longest - middle))
@@ -136,7 +136,7 @@ def _unflat(index: int, shape: Cells) -> tuple[int, int, int]:
 
 @njit(cache=True, nogil=True)
 def _push(keys: Array, heap: Cells, count: int, key: float, item: int) -> tuple[Array, Cells, int]:
-    """Add an item to a binary heap; return the heap, which grows when it is full."""
+    """Add an item to a binary heap; return the heap, enlarged if it was full."""
     if count == len(keys):
         keys = np.concatenate((keys, np.empty_like(keys)))
         heap = np.concatenate((heap, np.empty_like(heap)))
@@ -153,7 +153,7 @@ def _push(keys: Array, heap: Cells, count: int, key: float, item: int) -> tuple[
 
 @njit(cache=True, nogil=True)
 def _pop(keys: Array, heap: Cells, count: int) -> int:
-    """Remove the smallest item; return how many are left."""
+    """Remove the smallest item; return the number of those left."""
     count -= 1
     key, item = keys[count], heap[count]
     hole = 0
@@ -172,7 +172,7 @@ def _pop(keys: Array, heap: Cells, count: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _walk_back(steps: NDArray[np.uint8], moves: Cells, last: int) -> Cells:
+def _backtrack(steps: NDArray[np.uint8], moves: Cells, last: int) -> Cells:
     """Return the flat indices from the start to a reached cell."""
     count, cell = 1, last
     while steps[cell] != _START:

@@ -1,4 +1,4 @@
-"""The floor that a robot can drive on: steps, slopes, drops and head room, read from the octree's columns."""
+"""Traversable floor of a robot, from steps, slopes, drops and head room in the octree's columns."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -27,10 +27,10 @@ Heights = NDArray[np.int32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Columns:
-    """The occupied voxels of every column, from below.
+    """Occupied voxels of every column, in order of height.
 
     Attributes:
-        starts: (H·W + 1,) where each column's voxels begin.
+        starts: (H·W + 1,) start of each column's voxels.
         tops: (N,) upper face of each voxel, in voxels above z = 0.
         shape: H, W.
         first: (2,) keys of the column of lowest x and y.
@@ -43,16 +43,16 @@ class _Columns:
 
 
 def traversable(octree: OctreeMap, config: TraversableConfig, *, floor_z_m: float = 0.0) -> OccupancyGrid:
-    """Return where a robot that starts on the floor can drive.
+    """Return the grid of the floor that a robot can reach from the floor's height.
 
-    A surface is the top of an occupied voxel with head room above it; unseen voxels there do not count
-    against it. Surfaces at the height of the floor, and all that steps join to them, are free. A column is
-    occupied where something stands in the robot's way, where the floor is too steep, or where it drops by
-    more than a step; "way" and "drop" are relative to the nearest free floor. The rest is unknown.
+    A surface is the top of an occupied voxel with head room above it, where unknown voxels count as free.
+    Surfaces at the height of the floor, and all that steps connect to them, are free. A column is occupied
+    where an obstacle lies between step and head height, where the floor is too steep, or where it drops by
+    more than a step; heights are relative to the nearest free floor. The rest is unknown.
 
     Args:
         octree: The map in a world with z up.
-        config: What the robot can do.
+        config: Limits of the robot.
         floor_z_m: Height of the floor in the world.
 
     Raises:
@@ -62,13 +62,13 @@ def traversable(octree: OctreeMap, config: TraversableConfig, *, floor_z_m: floa
         raise DataError("traversable floor: the map is empty; fuse scans into it first")
     columns, limits = _columns(octree), _limits(config, octree.resolution_m, floor_z_m)
     anywhere = np.ones(columns.shape, np.bool_)
-    climbed = _flooded(columns, limits, anywhere)
-    steep = _slopes(climbed, limits.window) > np.tan(config.max_slope_rad)
+    by_steps = _flooded(columns, limits, anywhere)
+    steep = _slopes(by_steps, limits.window) > np.tan(config.max_slope_rad)
     floor = _flooded(columns, limits, ~steep)  # again: steep sides must not lead up to flat tops
     reached = floor > _NOWHERE
     cells = np.full(columns.shape, UNKNOWN, np.int8)
     if reached.any():
-        blocked = (climbed > _NOWHERE) & ~reached
+        blocked = (by_steps > _NOWHERE) & ~reached
         _add_obstacles(columns.starts, columns.tops, _nearest_height(floor), reached, limits, blocked)
         cells[_closed(reached, limits.gap)] = FREE
         cells[blocked] = OCCUPIED
@@ -77,15 +77,15 @@ def traversable(octree: OctreeMap, config: TraversableConfig, *, floor_z_m: floa
 
 
 class _Limits(NamedTuple):
-    """What the robot can do, in voxels.
+    """Limits of the robot, in voxels.
 
     Attributes:
         floor_z: Height of the floor.
         tolerance: Surfaces this near to it are floor.
-        step: Most that the heights of neighbours may differ.
-        room: How many voxels above a surface must not be occupied.
-        gap: How many columns a neighbour may lie beyond the next one.
-        window: How many columns the slope's window reaches to each side.
+        step: Largest difference of heights between neighbours.
+        room: Number of voxels above a surface that must not be occupied.
+        gap: Number of columns between neighbours, at most.
+        window: Number of columns of the slope's window on each side.
     """
 
     floor_z: float
@@ -108,14 +108,14 @@ def _limits(config: TraversableConfig, cell_m: float, floor_z_m: float) -> _Limi
 
 
 def _flooded(columns: _Columns, limits: _Limits, allowed: Mask) -> Heights:
-    """Return the height of the floor in every column that can be reached over allowed ones."""
+    """Return the height of the floor in every column that is connected to it over allowed columns."""
     floor = np.full(columns.shape, _NOWHERE, np.int32)
     _flood(columns.starts, columns.tops, limits, allowed, floor)
     return floor
 
 
 def _cropped(cells: NDArray[np.int8], first: NDArray[np.int64], cell_m: float) -> OccupancyGrid:
-    """Return the grid without empty margins; one that is empty altogether keeps its size."""
+    """Return the grid without unknown margins; a grid without known cells keeps its size."""
     rows, columns = (np.flatnonzero((cells != UNKNOWN).any(axis=axis)) for axis in (1, 0))
     if len(rows):
         cells = cells[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].copy()
@@ -172,7 +172,7 @@ def _surface(
 
 @njit(cache=True, nogil=True)
 def _flood(starts: NDArray[np.int64], tops: Heights, limits: _Limits, allowed: Mask, floor: Heights) -> None:
-    """Write the height of every surface that steps join to the floor into ``floor`` (H, W)."""
+    """Write the height of every surface that steps connect to the floor into ``floor`` (H, W)."""
     height, width = floor.shape
     queue = np.empty(height * width, np.int64)
     count = done = 0
@@ -202,7 +202,7 @@ def _flood(starts: NDArray[np.int64], tops: Heights, limits: _Limits, allowed: M
 
 
 def _nearest_height(floor: Heights) -> Heights:
-    """Return the floor's height in every column, that of the nearest reached one where it is none."""
+    """Return the height of the nearest floor in every column."""
     reached = floor > _NOWHERE
     _, labels = cv2.distanceTransformWithLabels(
         (~reached).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
@@ -217,7 +217,7 @@ def _nearest_height(floor: Heights) -> Heights:
 def _add_obstacles(
     starts: NDArray[np.int64], tops: Heights, level: Heights, reached: Mask, limits: _Limits, blocked: Mask
 ) -> None:
-    """Mark columns off the floor with anything between a step and the head, or deeper than a step."""
+    """Mark columns off the floor with a voxel between step and head height, or deeper than a step."""
     height, width = level.shape
     for row in range(height):
         for column in range(width):
@@ -239,9 +239,9 @@ def _closed(reached: Mask, gap: int) -> Mask:
 
 
 def _slopes(floor: Heights, reach: int) -> Array:
-    """Return (H, W) the rise over run of the least-squares plane through the floor in a square window.
+    """Return the (H, W) rise over run of the least-squares plane through the floor in a square window.
 
-    Where the window's floor is a single line or point, it has no slope: 0.
+    Where the window's floor is a single line or point, the slope is 0.
     """
     offsets = np.arange(-reach, reach + 1, dtype=np.float64)
     ones = np.ones_like(offsets)
@@ -259,7 +259,7 @@ def _slopes(floor: Heights, reach: int) -> Array:
     xx, yy = total(known, offsets**2, ones), total(known, ones, offsets**2)
     xy = total(known, offsets, offsets)
     sum_z, xz, yz = total(z, ones, ones), total(z, offsets, ones), total(z, ones, offsets)
-    # Moments about the mean, times n², which keeps every one of these sums a whole number.
+    # Moments about the mean, times n², so that all of these sums are whole numbers.
     cxx, cyy, cxy = n * xx - x * x, n * yy - y * y, n * xy - x * y
     cxz, cyz = n * xz - x * sum_z, n * yz - y * sum_z
     determinant = cxx * cyy - cxy * cxy

@@ -1,6 +1,7 @@
-"""A box of the map as a dense array, which is what distances and searches work on."""
+"""Dense voxel grid of a box of the map, for distance fields and path search."""
 
 from dataclasses import dataclass
+from math import prod
 
 import numpy as np
 from numba import njit
@@ -13,14 +14,14 @@ from mapper.octree.map import OctreeMap
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 LIMIT_BYTES = 2 << 30
-"""Working space that a distance field or a plan may take unless the caller allows more."""
+"""Default limit of the working space of a distance field or a plan."""
 
 _BLOCK_EDGE = 1 << BLOCK_BITS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Box:
-    """An upright box of the world.
+    """An axis-aligned box of the world.
 
     Attributes:
         low_world_m: (3,) lower corner.
@@ -60,16 +61,16 @@ class VoxelGrid:
     resolution_m: float
 
     def blocked(self, *, unknown_blocks: bool) -> NDArray[np.bool_]:
-        """Return (Z, Y, X) where nothing may be; voxels that nobody has seen count if asked to."""
+        """Return the (Z, Y, X) mask of occupied voxels and, if they block, of unknown ones."""
         blocked: NDArray[np.bool_] = (self.states == OCCUPIED) | ((self.states == UNKNOWN) & unknown_blocks)
         return blocked
 
 
 def known_box(octree: OctreeMap) -> Box:
-    """Return a box of whole 8³ blocks around everything known, and a layer of unknown voxels around them.
+    """Return the box of all 8³ blocks, with a layer of unknown voxels around it.
 
     Raises:
-        DataError: Nothing is known.
+        DataError: The map is empty.
     """
     codes = octree.blocks.codes
     if not len(codes):
@@ -86,15 +87,15 @@ def cut_box(
 
     Args:
         octree: The map.
-        box: Which part of it; it may reach past what is known, but not past the key range.
-        bytes_per_voxel: What the caller is going to need for each, these states included.
-        limit_bytes: How much that may be in all.
+        box: Part of the map; it may reach beyond known voxels, but not beyond the key range.
+        bytes_per_voxel: Working space of the caller per voxel, these states included.
+        limit_bytes: Limit of the working space.
 
     Raises:
-        MapSizeError: It would be more; nothing has been allocated then.
+        MapSizeError: More space is needed; nothing has been allocated then.
         DataError: The box leaves the range of the map's keys.
     """
-    # The allowance keeps a face that lies on a voxel's border from taking in the next layer by a rounding.
+    # The allowance keeps a rounding from adding a layer where a face lies on a voxel's border.
     first = np.floor(box.low_world_m / octree.resolution_m + 1e-6).astype(np.int64) + KEY_ZERO
     last = np.ceil(box.high_world_m / octree.resolution_m - 1e-6).astype(np.int64) + KEY_ZERO - 1
     if (first < 0).any() or (last >= KEY_COUNT).any():
@@ -103,7 +104,12 @@ def cut_box(
             f"±{KEY_ZERO * octree.resolution_m:g} m, the reach of {octree.resolution_m:g} m voxels; shrink it"
         )
     counts = [int(n) for n in last - first + 1]
-    refuse_too_large(counts, bytes_per_voxel=bytes_per_voxel, limit_bytes=limit_bytes)
+    needed_bytes = bytes_per_voxel * prod(counts)
+    if needed_bytes > limit_bytes:
+        raise MapSizeError(
+            f"a box of {'×'.join(str(n) for n in counts)} voxels needs {needed_bytes / 2**30:.1f} GiB of "
+            f"working space, the limit is {limit_bytes / 2**30:.1f}; choose a smaller box or a coarser map"
+        )
     states = np.full(counts[::-1], UNKNOWN, dtype=np.int8)
     codes = octree.blocks.codes
     keys = block_keys(codes)
@@ -114,26 +120,10 @@ def cut_box(
 
 
 def layer(grid: OccupancyGrid) -> VoxelGrid:
-    """Return a 2D grid as one layer of voxels, with the ring of unknown cells that surrounds every map."""
+    """Return a 2D grid as one layer of voxels, surrounded by a ring of unknown cells."""
     states = np.pad(grid.cells, 1, constant_values=UNKNOWN)[np.newaxis]
     x, y = grid.origin_world_m - grid.resolution_m
     return VoxelGrid(states, np.array([x, y, -grid.resolution_m / 2.0]), grid.resolution_m)
-
-
-def refuse_too_large(counts: list[int], *, bytes_per_voxel: int, limit_bytes: int = LIMIT_BYTES) -> None:
-    """Refuse a box before anything is allocated for it.
-
-    Raises:
-        MapSizeError: The voxels would need more than the limit; the message gives the estimate.
-    """
-    needed_bytes = bytes_per_voxel
-    for count in counts:
-        needed_bytes *= count
-    if needed_bytes > limit_bytes:
-        raise MapSizeError(
-            f"a box of {'×'.join(str(n) for n in counts)} voxels needs {needed_bytes / 2**30:.1f} GiB of "
-            f"working space, the limit is {limit_bytes / 2**30:.1f}; choose a smaller box or a coarser map"
-        )
 
 
 @njit(cache=True, nogil=True)
@@ -145,7 +135,7 @@ def _fill_states(
     first: NDArray[np.int64],
     states: NDArray[np.int8],
 ) -> None:
-    """Write what the blocks' voxels are into ``states`` (Z, Y, X); voxel [0, 0, 0] has the key ``first``."""
+    """Write the states of the blocks' voxels to ``states`` (Z, Y, X); voxel [0, 0, 0] has key ``first``."""
     for b in range(len(codes)):
         for voxel in range(BLOCK_VOXELS):
             value = values[slots[b], voxel]
