@@ -17,6 +17,7 @@ from mapper.export.page import FAINT, INK, LINE, hex_of, save
 from mapper.export.palette import Rgb
 from mapper.export.panels import page, panel
 from mapper.runtime.atomic import MANIFEST_NAME, write_text
+from mapper.sensing.depth_noise import depth_sigma_m
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -93,7 +94,7 @@ def write_accuracy(path: Path, levels: Sequence[DepthLevel], fit: NoiseFit, *, t
     _finish(axes, "largest error Δd, mm")
     axes = panel(figure, 1, columns=2, rows=1)
     z = np.linspace(fit.low_m, fit.high_m, 200)
-    axes.plot(z, _MM * fit.noise.sigma_m(z), color=INK, linewidth=1.0, label=f"σ = {fit.noise.text} m")
+    axes.plot(z, _MM * depth_sigma_m(fit.noise, z), color=INK, linewidth=1.0, label=f"σ = {fit.noise.text} m")
     for label, color, accuracies in _kinds(levels):
         spread = [_MM * one.std_m for one in accuracies]
         axes.plot(distance_m, spread, "o", color=hex_of(color), markersize=5, label=label)

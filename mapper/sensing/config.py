@@ -1,14 +1,11 @@
 """Settings of a depth sensor's noise."""
 
 import math
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 from pydantic import NonNegativeFloat, model_validator
 
 from mapper.core.config import Config
-
-if TYPE_CHECKING:
-    from mapper.core.geometry import Array
 
 
 class DepthNoiseConfig(Config):
@@ -38,8 +35,3 @@ class DepthNoiseConfig(Config):
         terms = {"": self.constant_m, "·z": self.linear, "·z²": self.quadratic_per_m}
         signed = [f"{'−' if value < 0.0 else '+'} {abs(value):.3g}{z}" for z, value in terms.items() if value]
         return " ".join(signed).removeprefix("+ ") or "0"
-
-    def sigma_m(self, depth_m: "Array") -> "Array":
-        """Return the standard deviation of depths in metres."""
-        sigma: Array = self.constant_m + depth_m * (self.linear + depth_m * self.quadratic_per_m)
-        return sigma

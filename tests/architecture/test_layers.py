@@ -1,8 +1,10 @@
-"""The architecture is a test: packages depend one way, and heavy libraries have one home each."""
+"""The architecture is a test: folders depend one way, and heavy libraries have one home each."""
 
 import ast
+import sys
 from collections.abc import Iterator
 from functools import cache
+from pathlib import Path
 
 import pytest
 
@@ -10,6 +12,48 @@ from tests.support.paths import ROOT
 
 OURS = {"mapper", "evaluators", "cli"}
 MAY_IMPORT = {"mapper": {"mapper"}, "evaluators": {"evaluators", "mapper"}, "cli": OURS}
+LAYERS = (
+    "core",
+    "runtime",
+    "doctor",
+    "sensing",
+    "features",
+    "graph",
+    "registration",
+    "octree",
+    "navigation",
+    "sources",
+    "simulation",
+    "places",
+    "odometry",
+    "loops",
+    "mapping",
+    "config",
+    "run",
+    "export",
+    "line_laser",
+    "merging",
+    "pipeline",
+)
+"""The folders of mapper/. Each may import those before it, so there is no circle."""
+
+NO_RUN = {"config", "run", "export", "pipeline"}
+FORBIDDEN = {
+    "sensing": NO_RUN,
+    "features": NO_RUN,
+    "places": NO_RUN,
+    "registration": NO_RUN,
+    "odometry": NO_RUN,
+    "loops": NO_RUN,
+    "octree": NO_RUN,
+    "navigation": NO_RUN,
+    "mapping": NO_RUN,
+    "graph": NO_RUN | {"odometry", "loops"},
+    "run": {"export", "merging", "pipeline"},
+}
+"""Imports that are wrong in any order of the layers: methods know no run, fusing needs no writer, solving
+needs no tracking, a run needs no merging."""
+
 TRIES_THEM_ALL = "mapper/doctor/self_tests.py"
 HOMES = {
     "gtsam": ("mapper/graph/",),
@@ -44,23 +88,71 @@ def _imports_of(package: str) -> Iterator[tuple[str, int, str]]:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom):
                 assert node.level == 0, f"{path}:{node.lineno}: import by full name"
-                yield str(path.relative_to(ROOT)), node.lineno, (node.module or "").split(".")[0]
+                yield str(path.relative_to(ROOT)), node.lineno, node.module or ""
             elif isinstance(node, ast.Import):
                 for name in node.names:
-                    yield str(path.relative_to(ROOT)), node.lineno, name.name.split(".")[0]
+                    yield str(path.relative_to(ROOT)), node.lineno, name.name
 
 
 @pytest.mark.parametrize("package", MAY_IMPORT)
 def test_layers_point_one_way(package):
-    for path, line, root in imports_of(package):
+    for path, line, module in imports_of(package):
+        root = module.split(".")[0]
         assert root not in OURS or root in MAY_IMPORT[package], f"{path}:{line} imports {root}"
+
+
+def folder_imports() -> Iterator[tuple[str, str, str, str]]:
+    """Yield (where, folder, imported folder, imported module) of every import between folders of mapper/."""
+    for path, line, module in imports_of("mapper"):
+        inner, parts = Path(path).parts[1:-1], module.split(".")
+        if parts[0] == "mapper" and len(parts) > 1 and inner and inner[0] != parts[1]:
+            yield f"{path}:{line}", inner[0], parts[1], module
+
+
+def test_every_folder_has_its_layer_and_no_module_is_loose():
+    assert {path.parent.name for path in (ROOT / "mapper").glob("*/__init__.py")} == set(LAYERS)
+    assert [path.name for path in (ROOT / "mapper").glob("*.py")] == ["__init__.py"]
+    assert [path.name for path in (ROOT / "evaluators").glob("*.py")] == ["__init__.py"]
+
+
+def test_folders_depend_one_way():
+    for where, folder, imported, module in folder_imports():
+        assert LAYERS.index(imported) < LAYERS.index(folder), f"{where}: {folder} imports {module}"
+        assert imported not in FORBIDDEN.get(folder, ()), f"{where}: {folder} imports {module}"
+
+
+def test_the_lowest_layers_import_only_the_errors():
+    for where, folder, _, module in folder_imports():
+        assert folder not in {"core", "runtime"} or module == "mapper.core.errors", (
+            f"{where} imports {module}"
+        )
+
+
+def settings_modules() -> list[Path]:
+    return [path for path in sorted((ROOT / "mapper").rglob("*config.py")) if path.parent.name != "config"]
+
+
+@pytest.mark.parametrize("path", settings_modules(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_settings_import_only_settings(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom):
+            module = node.module or ""
+            known = module.split(".")[0] in {*sys.stdlib_module_names, "pydantic"}
+            assert known or module.endswith("config"), f"{path}:{node.lineno} imports {module}"
+
+
+def test_settings_build_nothing():
+    for path in settings_modules():
+        for node in ast.walk(ast.parse(path.read_text())):
+            assert not (isinstance(node, ast.FunctionDef) and node.name == "build"), f"{path}:{node.lineno}"
 
 
 @pytest.mark.parametrize("library", HOMES)
 def test_each_big_library_has_one_home(library):
     homes = (*HOMES[library], TRIES_THEM_ALL)
     for package in OURS:
-        for path, line, root in imports_of(package):
+        for path, line, module in imports_of(package):
+            root = module.split(".")[0]
             assert root != library or path.startswith(homes), f"{path}:{line} imports {library}"
 
 

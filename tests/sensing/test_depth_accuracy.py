@@ -11,6 +11,7 @@ from evaluators.depth_camera.study import study_depth
 from evaluators.depth_camera.tiles import depth_of_planes
 from mapper.core.errors import DataError, SourceError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan, ray_table
+from mapper.sensing.depth_noise import depth_sigma_m
 from mapper.simulation.config import SensorConfig, SynthConfig
 from mapper.simulation.source import CameraSimulator
 from mapper.sources import open_source
@@ -193,7 +194,7 @@ def test_a_known_noise_is_recovered_from_walls():
     ):
         assert abs(value - true) < 2e-4
         assert abs(value - true) < 4.0 * error
-    np.testing.assert_allclose(noise.sigma_m(z), A + B * z + C * z**2, rtol=0.01)
+    np.testing.assert_allclose(depth_sigma_m(noise, z), A + B * z + C * z**2, rtol=0.01)
 
 
 def test_a_noise_of_the_disparity_is_told_by_one_number():
@@ -215,7 +216,7 @@ def test_few_distances_tell_one_number_and_one_tells_no_uncertainty():
 def test_a_curve_that_falls_to_zero_is_not_believed():
     z = np.linspace(1.0, 3.0, 9)
     found = fit_noise(z, np.maximum(0.004 * (z - 1.02) ** 2, 1e-5))
-    assert (found.noise.sigma_m(np.linspace(0.1, 5.0, 50)) > 0.0).all()
+    assert (depth_sigma_m(found.noise, np.linspace(0.1, 5.0, 50)) > 0.0).all()
 
 
 def test_a_perfect_sensor_has_no_noise_to_fit():
@@ -248,7 +249,7 @@ def test_noise_is_recovered_from_whatever_planes_there_are():
         [level.typical.filtered.std_m / level.typical.raw.std_m for level in levels], 1.0 / 3.0, rtol=0.1
     )
     fit = fit_noise(z, np.array([level.typical.raw.std_m for level in levels]))
-    np.testing.assert_allclose(fit.noise.sigma_m(z), A + B * z + C * z**2, rtol=0.05)
+    np.testing.assert_allclose(depth_sigma_m(fit.noise, z), A + B * z + C * z**2, rtol=0.05)
 
 
 def test_no_more_frames_than_asked_for_are_looked_at_and_no_balls():

@@ -9,7 +9,7 @@ from mapper.core.frames import RgbdFrame
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
 from mapper.sensing.config import DepthNoiseConfig
-from mapper.sensing.depth_noise import feature_depth_sigma_m
+from mapper.sensing.depth_noise import depth_sigma_m, feature_depth_sigma_m
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.source import CameraSimulator
 
@@ -18,7 +18,7 @@ TINY = DepthNoiseConfig(constant_m=1e-9)
 
 
 def test_the_model_is_a_parabola_and_can_be_read():
-    np.testing.assert_allclose(NOISE.sigma_m(np.array([0.5, 2.0])), [0.00225, 0.012])
+    np.testing.assert_allclose(depth_sigma_m(NOISE, np.array([0.5, 2.0])), [0.00225, 0.012])
     assert NOISE.text == "0.002 − 0.001·z + 0.003·z²"
     assert DepthNoiseConfig(quadratic_per_m=0.0019).text == "0.0019·z²"
 
@@ -55,7 +55,7 @@ def test_a_slope_counts_by_how_uncertain_the_pixel_is():
     found = sigmas_m(slope_m, [(20, 15)] * 3, [1.0, 1.44, 3.0], TINY)
     np.testing.assert_allclose(found, 0.005 * np.array([1.0, 1.44, 3.0]), rtol=1e-4)
     with_noise = sigmas_m(np.full((30, 40), 2.0) + 0.005 * columns, [(20, 15)], [1.0], NOISE)
-    np.testing.assert_allclose(with_noise, np.hypot(NOISE.sigma_m(np.array([2.1])), 0.005), rtol=1e-4)
+    np.testing.assert_allclose(with_noise, np.hypot(depth_sigma_m(NOISE, np.array([2.1])), 0.005), rtol=1e-4)
 
 
 def test_beside_an_edge_the_depth_is_uncertain():
