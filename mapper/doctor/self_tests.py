@@ -205,6 +205,15 @@ def numpy(_folder: Path) -> None:
     _expect_near(np.linalg.solve(2.0 * np.eye(3), np.ones(3)), np.full(3, 0.5))
 
 
+def scipy(_folder: Path) -> None:
+    """Count the connected components of three nodes and one edge."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    edge = coo_array((np.ones(1), (np.array([0]), np.array([1]))), shape=(3, 3))
+    _expect(connected_components(edge, directed=False)[0] == 2, "the components are wrong")
+
+
 def pyarrow(folder: Path) -> None:
     """Write a table and read it back."""
     import pyarrow as pa
@@ -251,6 +260,7 @@ SELF_TESTS: dict[str, Callable[[Path], None]] = {
     "open3d": open3d,
     "opencv-contrib-python-headless": opencv,
     "protobuf": protobuf,
+    "scipy": scipy,
     "pyarrow": pyarrow,
     "pydantic": pydantic,
     "pypcd4": pypcd4,

@@ -121,7 +121,7 @@ def test_spelled_out_overrides_win(desk_log, tmp_path):
         (["build", "LOG", "--out", "run", "--config", "no.toml"], "mapper: no.toml: cannot be read"),
         (["fuse", "nowhere"], "mapper: nowhere: no such run folder"),
         (["fuse", "RUN", "--set", "graph.solve=none"], "mapper: graph: fuse keeps what was tracked"),
-        (["fuse", "RUN", "--log", "gone"], "gone: the log of RUN is no longer there; tell its new place"),
+        (["fuse", "RUN", "--log", "gone"], "gone: the log of RUN is no longer there; give its new place"),
         (["export", "nowhere", "--as", "ply"], "mapper: nowhere: no such run folder"),
         (
             ["export", "RUN", "--as", "jpeg"],

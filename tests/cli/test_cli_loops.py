@@ -108,7 +108,7 @@ def test_the_maps_are_those_of_fusing_from_scratch(run):
     ("arguments", "message"),
     [
         (["--add", "0", "900"], "loop 0 → 900: no node 900; the graph's nodes are 0 … "),
-        (["--add", "1", "1"], "loop 1 → 1: a node cannot be tied to itself"),
+        (["--add", "1", "1"], "loop 1 → 1: a node cannot be connected to itself"),
         (["--add", "1"], "--add 1: want two nodes' numbers"),
         (["--add", "1", "x"], "--add 1 x: want two nodes' numbers"),
         (["--remove", "0", "1"], "loop 0 → 1: no loop of "),

@@ -298,7 +298,7 @@ def test_a_mesh_refuses_what_it_cannot_make(untouched, desk_log, tmp_path):
     pytest.importorskip("open3d", reason="the mesh extra is not installed", exc_type=ImportError)
     gone = moved_log(untouched, tmp_path / "gone")
     with pytest.raises(
-        RunError, match=r"gone: the log of .* is no longer there; tell its new place with --log"
+        RunError, match=r"gone: the log of .* is no longer there; give its new place with --log"
     ):
         export(gone, "mesh", tmp_path / "mesh.ply")
 

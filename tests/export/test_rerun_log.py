@@ -2,6 +2,7 @@ import shutil
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -156,8 +157,7 @@ def test_diagnostics_are_curves(run, told):
 
 def test_a_run_without_images_loops_and_truth_can_be_told(desk_log, tmp_path):
     config = BuildConfig.model_validate({"mcap": {"image_stride": 0}, "loops": {"kind": "none"}})
-    source = open_source(desk_log)
-    source.truth = None
+    source = replace(open_source(desk_log), truth=None)
     run = build(source, config, tmp_path / "bare")
     show_run(run, str(tmp_path / "bare.rrd"))
     entities = Told(tmp_path / "bare.rrd").chunks
