@@ -1,4 +1,4 @@
-"""Progress on stderr: bars on a terminal, a line now and then elsewhere."""
+"""Progress and results on the console: bars on a terminal, lines elsewhere, both on stderr."""
 
 import sys
 import time
@@ -13,7 +13,7 @@ _MOST_NOTES = 5
 
 
 def progress_for(*, quiet: bool, prompts: bool = False) -> Progress:
-    """Return who watches a job: nobody, a terminal, or a file; bars would be drawn over prompts."""
+    """Return the progress of a job: silent, bars on a terminal, or lines; bars would overdraw prompts."""
     if quiet:
         return SILENT
     return Bars() if sys.stderr.isatty() and not prompts else Lines()

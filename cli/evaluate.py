@@ -1,4 +1,4 @@
-"""``mapper eval``: how far a trajectory is from the truth, and what a map is worth."""
+"""``mapper eval``: errors of a trajectory, and the quality of a map."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -31,14 +31,14 @@ class Align(StrEnum):
 
 
 class World(StrEnum):
-    """In which world a map's reference lies."""
+    """World of a map's reference."""
 
     TRUTH = "truth"
     MAP = "map"
 
 
 class Format(StrEnum):
-    """How the numbers are printed."""
+    """Format of the printed metrics."""
 
     TEXT = "text"
     MARKDOWN = "markdown"
@@ -127,12 +127,12 @@ def evaluate(
         metrics += _loops_of(run, known)
     name = estimate.resolve().name
     sharp_log = _log_of(_needed(run, estimate, "--sharpness"), log) if sharpness else None
-    held = None
+    quality = None
     if map_ is not None:
-        held = _held_against(
+        quality = _quality(
             _needed(run, estimate, "--map"), map_, world=map_world, register=register, tolerance=tolerance
         )
-        metrics += held.metrics
+        metrics += quality.metrics
     elif map_world or register or tolerance != _TOLERANCE:
         raise DataError(
             "--map-world, --register and --tolerance tell how to compare with --map, which is missing"
@@ -144,10 +144,10 @@ def evaluate(
         from evaluators.pictures.map_agreement import write_map_errors
         from evaluators.pictures.path_errors import write_trajectory_errors
 
-        if held is None or found.matched is not None:
+        if quality is None or found.matched is not None:
             write_trajectory_errors(plot, found, title=f"{name}, {ALIGNED[align.value]}")
-        if held is not None and map_ is not None:
-            write_map_errors(plot, held.check, title=f"{name} against {map_.resolve().name}")
+        if quality is not None and map_ is not None:
+            write_map_errors(plot, quality.check, title=f"{name} against {map_.resolve().name}")
 
 
 def _loaded(
@@ -177,9 +177,7 @@ def _needed(run: "Run | None", path: Path, option: str) -> "Run":
     return run
 
 
-def _held_against(
-    run: "Run", path: Path, *, world: World | None, register: bool, tolerance: int
-) -> "MapQuality":
+def _quality(run: "Run", path: Path, *, world: World | None, register: bool, tolerance: int) -> "MapQuality":
     from evaluators.metrics.map_quality import map_quality
     from evaluators.metrics.map_reference import read_reference
 

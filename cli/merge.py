@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Place(StrEnum):
-    """Where the runs lie in the map."""
+    """Source of the runs' poses in the map."""
 
     BUILT = "built"
     TRUTH = "truth"

@@ -1,4 +1,4 @@
-"""``mapper register``: how one cloud lies to another."""
+"""``mapper register``: the motion between two clouds."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -62,7 +62,7 @@ def register(
 
     prepare_libraries()
     if rerun is not None:
-        _refuse_to_lose(rerun, overwrite=overwrite)
+        _check_not_there(rerun, overwrite=overwrite)
     check_method(method, guess=guess)
     T_target_source = parse_guess(guess)
     overrides = set_ or []
@@ -94,7 +94,7 @@ def register(
         raise RegistrationError(f"{source} on {target}: not trusted: {registered.alignment.reason}")
 
 
-def _refuse_to_lose(rerun: str, *, overwrite: bool) -> None:
+def _check_not_there(rerun: str, *, overwrite: bool) -> None:
     from mapper.core.errors import RunError
     from mapper.export.rerun.target import check_target
 
@@ -115,7 +115,7 @@ def _shown(
 
 
 def _load(name: str, config: "SourceConfig") -> "tuple[Frame, Sensor]":
-    """Return the frame that a name stands for, and what took it: a file counts as a LiDAR's, with z up."""
+    """Return the frame of a name, and its sensor: a file counts as a LiDAR's, with z up."""
     from mapper.core.errors import SourceError
     from mapper.sources import open_source
     from mapper.sources.clouds import read_scan

@@ -1,4 +1,4 @@
-"""``mapper reproduce``: the papers' tables, ours beside theirs."""
+"""``mapper reproduce``: the papers' tables measured again, ours beside theirs."""
 
 import os
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from cli.options import First, Last, Quiet, workers_for
 
 
 class Paper(StrEnum):
-    """Whose tables can be measured again."""
+    """Papers whose tables can be measured again."""
 
     THESIS = "thesis"
     ZHAO = "zhao"
@@ -93,7 +93,7 @@ def reproduce(
 
 
 def _given(assignments: Sequence[str]) -> dict[str, Path]:
-    """Return where logs of other names lie.
+    """Return the logs of other names.
 
     Raises:
         ConfigError: One is no ``NAME=PATH``, or two have the same name.

@@ -1,4 +1,4 @@
-"""The methods that `mapper compare` knows, set up for a log's sensor."""
+"""Catalogue of the methods of `mapper compare`, set up for a log's sensor."""
 
 from functools import partial
 

@@ -11,7 +11,7 @@ from mapper.sources.config import SourceConfig
 
 
 class GuessConfig(Config):
-    """How far from the truth a registration begins, at most."""
+    """Kind of guess: how far from the truth a registration begins, at most."""
 
     offset_m: NonNegativeFloat
     turn_rad: Annotated[float, Field(ge=0.0, le=math.pi)]
@@ -23,7 +23,7 @@ class GuessConfig(Config):
 
 
 class TrialsConfig(Config):
-    """Which pairs of frames are registered, from which guesses, and what counts as right."""
+    """Settings of trials: pairs of frames, kinds of guesses, and what counts as right."""
 
     frames_apart: Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
     """Each distance gets as many pairs as the others."""
@@ -34,10 +34,10 @@ class TrialsConfig(Config):
 
 
 class RgbdCompareConfig(TrialsConfig):
-    """How RGB-D logs are compared on, whose scenes are a few metres wide."""
+    """Settings for RGB-D logs, whose scenes are a few metres wide."""
 
     max_depth_m: PositiveFloat = 4.0
-    """Deeper measurements are no part of a scan."""
+    """Deeper measurements are left out of a scan."""
     stride_px: PositiveInt = 2
     """Every n-th row and column of the depth image becomes a point of the scan."""
     frames_apart: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (1, 5, 15)
@@ -51,7 +51,7 @@ class RgbdCompareConfig(TrialsConfig):
 
 
 class LidarCompareConfig(TrialsConfig):
-    """How LiDAR logs are compared on, whose scenes are a street wide; guesses are off in the plane only."""
+    """Settings for LiDAR logs, whose scenes are a street wide; guesses are off in the plane only."""
 
     frames_apart: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (1, 5, 10)
     guesses: Annotated[tuple[GuessConfig, ...], Field(min_length=1)] = (
@@ -68,7 +68,7 @@ class CompareConfig(Config):
 
     source: SourceConfig = SourceConfig()
     methods: tuple[str, ...] = ()
-    """Which to compare; none names all that can use the log."""
+    """Names of those to compare; empty is all that can use the log."""
     pairs: NonNegativeInt = 30
     """Pairs of frames to register, spread evenly over the log."""
     seed: NonNegativeInt = 0

@@ -63,7 +63,7 @@ def compare_into(
 
 
 def _begun_with(partial: Path, plan: str) -> bool:
-    """Tell whether a folder that was left behind is the beginning of this very comparison."""
+    """Return whether a folder that was left behind is the beginning of this very comparison."""
     mark = partial / MANIFEST_NAME
     return mark.is_file() and mark.read_text(encoding="utf-8") == plan
 

@@ -36,10 +36,10 @@ class AnyRegistration(Protocol):
 
 
 class Tracker(Protocol):
-    """A method at work on a whole log."""
+    """A method that follows a whole log."""
 
     def add(self, frame: Any, /) -> bool:
-        """Place the next frame, in time order, and tell whether the method found where it is."""
+        """Add the next frame, in time order, and return whether the method found its pose."""
         ...
 
     def trajectory(self) -> Trajectory:
@@ -49,12 +49,12 @@ class Tracker(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Method:
-    """One row of the comparison.
+    """A method of the comparison.
 
     Attributes:
-        name: What it is called, on the command line too.
+        name: Its name, on the command line too.
         sees_images: It gets the log's frames; otherwise the scans that are the same for all.
-        uses_guess: Its registration begins at the guess; otherwise it has no use for one.
+        uses_guess: Its registration begins at a guess.
         tracker: Makes one for a log.
         registration: Makes one for pairs.
     """
@@ -71,7 +71,7 @@ class Method:
 
 
 def odometry_method(name: str, build: Callable[[], FrameOdometry[Any]], *, sees_images: bool) -> Method:
-    """Return a row for an odometry of the project."""
+    """Return an odometry of the project as a method."""
     return Method(
         name,
         sees_images=sees_images,
@@ -84,7 +84,7 @@ def odometry_method(name: str, build: Callable[[], FrameOdometry[Any]], *, sees_
 def registration_method(
     name: str, build: Callable[[], AnyRegistration], *, uses_guess: bool, sees_images: bool = False
 ) -> Method:
-    """Return a row for a registration; as an odometry it registers each frame to the one before it."""
+    """Return a registration as a method; as an odometry it registers each frame to the one before it."""
     return Method(
         name,
         sees_images=sees_images,
@@ -95,12 +95,12 @@ def registration_method(
 
 
 def reason_of(error: Exception) -> str:
-    """Return what broke, in one line."""
+    """Return an exception in one line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 class OdometryTracker:
-    """An odometry of the project with its own estimates: no loops, and nothing solved afterwards."""
+    """Tracker by an odometry of the project: no loops, and nothing solved afterwards."""
 
     def __init__(self, odometry: FrameOdometry[Any]) -> None:
         self._odometry = odometry
@@ -117,7 +117,7 @@ class OdometryTracker:
         return track.node is not None
 
     def trajectory(self) -> Trajectory:
-        """Return the largest part of the path that hangs together."""
+        """Return the largest connected part of the path."""
         graph = PoseGraph()
         for track in self._tracks:
             if track.is_keyframe and track.node is not None:
@@ -129,10 +129,10 @@ class OdometryTracker:
 
 
 class OdometryPairs:
-    """An odometry as a registration: it sees the target, then the source, and nothing else.
+    """Registration by an odometry, which is given the target, then the source, and nothing else.
 
-    It takes no guess. A scan is moved by the guess before it is shown, which comes to the same; what a scan's
-    image would look like from elsewhere, nobody knows.
+    An odometry takes no guess. A scan is moved by the guess before the odometry gets it, which is equivalent;
+    an image cannot be moved, so there the guess is not used.
     """
 
     def __init__(self, build: Callable[[], FrameOdometry[Any]]) -> None:
@@ -144,14 +144,14 @@ class OdometryPairs:
 
 
 class OdometryPair:
-    """An odometry that has seen one frame; good for one alignment, for it remembers that too."""
+    """An odometry that has been given the target; good for one alignment, since it keeps every frame."""
 
     def __init__(self, odometry: FrameOdometry[Any], target: Frame) -> None:
         self._odometry = odometry
         self._target = odometry.track(odometry.observe(target))
 
     def align(self, source: Frame, T_target_source: Transform) -> Alignment:
-        """Return where the odometry finds the second frame."""
+        """Return the motion by the pose that the odometry gives the source."""
         if self._target.node is None:
             return failed("the target alone was lost")
         guess = T_target_source if isinstance(source, Scan) else np.eye(4)
@@ -168,7 +168,7 @@ class OdometryPair:
 
 
 def _seen_from(T_target_source: Transform, source: Frame) -> Frame:
-    """Return a scan's points in the target's frame; an image stays what it is."""
+    """Return a scan's points in the target's frame; an image as it is."""
     if isinstance(source, RgbdFrame):
         return source
     points = apply(T_target_source, source.points_body.astype(np.float64)).astype(np.float32)
@@ -177,9 +177,9 @@ def _seen_from(T_target_source: Transform, source: Frame) -> Frame:
 
 
 class FrameToFrame:
-    """Registers every frame to the one before it, from the motion before it.
+    """Tracker by a registration of every frame to the one before it, from the motion before it.
 
-    Where that does not converge, the motion before carries on: every frame has a pose.
+    Where that does not converge, the motion before is repeated: every frame has a pose.
     """
 
     def __init__(self, registration: AnyRegistration) -> None:
@@ -210,7 +210,7 @@ class FrameToFrame:
         return trajectory_from(self._poses)
 
     def _guess(self, gap_ns: int) -> Transform:
-        """Return the motion of so long a time at the velocity before it."""
+        """Return the motion over a time at the velocity of the last motion."""
         if self._before_ns == 0:
             return np.eye(4)
         return interpolate(np.eye(4), self._T_before_last, gap_ns / self._before_ns)

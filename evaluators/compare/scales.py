@@ -1,4 +1,4 @@
-"""The methods for scans, with their lengths fitted to a log's sensor."""
+"""Settings of the methods for scans, with their lengths scaled to a log's sensor."""
 
 from typing import Any, TypeVar, get_args
 
@@ -23,7 +23,7 @@ def registrations_for(sensor: Sensor) -> list[Any]:
 
 
 def kiss_icp(sensor: Sensor) -> KissOdometryConfig:
-    """Return KISS-ICP as published: its answers are neither doubted nor rescued."""
+    """Return KISS-ICP as published: without our checks of its answers."""
     published = KissOdometryConfig(rescue=None, usual_ratio=0.0, lost_ratio=0.0)
     return published if sensor == "lidar" else shrunk(published, _INDOORS)
 

@@ -1,1 +1,1 @@
-"""Numbers that say how good a trajectory, a map, loops or a registration is."""
+"""Metrics of trajectories, maps, loops and registrations."""

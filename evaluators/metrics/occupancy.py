@@ -183,20 +183,6 @@ def check_metrics(check: OccupancyCheck) -> list[Metric]:
     return metrics
 
 
-def occupancy_metrics(
-    octree: OctreeMap, signed_distance_m: SignedDistance, *, voxels: int = 1
-) -> list[Metric]:
-    """Return the metrics of ``assess_by_distance``."""
-    return check_metrics(assess_by_distance(octree, signed_distance_m, voxels=voxels))
-
-
-def ghosts(octree: OctreeMap, signed_distance_m: SignedDistance, *, voxels: int = 1) -> int:
-    """Return how many voxels are occupied further than so many voxels, and a half, from every solid."""
-    leaves, occupied = _known(octree)
-    distance_m = signed_distance_m(leaves.centres_world[occupied])
-    return int((distance_m > (voxels + 0.5) * leaves.resolution_m).sum())
-
-
 def _known(octree: OctreeMap) -> tuple[Leaves, Mask]:
     leaves = octree.leaves()
     return leaves, leaves.log_odds >= octree.occupied_log_odds

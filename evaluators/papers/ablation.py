@@ -96,7 +96,7 @@ class _SharedDetector:
         return self._features
 
     def comparing(self, config: IsvdOdometryConfig) -> RegisterPair:
-        """Return what compares an earlier frame and the newest as an odometry does."""
+        """Return the comparison of an earlier frame with the newest by an odometry's settings."""
         isvd = Isvd(config.registration)
         how = (config.registration, config.depth_filter, config.undistort, config.max_depth_m)
 

@@ -1,4 +1,4 @@
-"""Which scan belongs into which map: pairs that are given, or made of what is at hand."""
+"""Pairs of a scan and the map it belongs into: given by a file, or made of the logs of a folder."""
 
 import re
 from dataclasses import dataclass
@@ -29,9 +29,9 @@ EXTRINSIC_M, EXTRINSIC_DEG = 0.5, 2.5
 """RELLIS-3D's extrinsic calibration is itself good to about 0.1 m and 1° only."""
 SCANS_PER_LOG = 4
 MAP_SCANS = 20
-"""So many scans before the one that is left out, and as many after it, make the map."""
+"""The map is made of so many scans before the one that is left out, and as many after it."""
 MAP_VOXEL_M = 0.02
-"""And one point of each voxel: MPD cannot fall much below half of it."""
+"""The map has one point in each voxel: MPD cannot fall much below half of its edge."""
 
 _VLP_POINTS = 30_000  # what a VLP-16 gives in a turn; a scan with no more is not thinned further
 
@@ -43,7 +43,7 @@ class Clouds:
     Attributes:
         target: The map.
         source: The scan, in its own frame.
-        T_target_source: Its pose in the map; None if nobody knows.
+        T_target_source: Its pose in the map; None if it is not known.
     """
 
     target: Scan
@@ -56,21 +56,21 @@ class Pair(Protocol):
 
     @property
     def name(self) -> str:
-        """What people call it."""
+        """The pair's name."""
         ...
 
     @property
     def sensor(self) -> str:
-        """What took the scan."""
+        """The sensor of the scan."""
         ...
 
     @property
     def within(self) -> tuple[float, float]:
-        """How near to its pose an answer is right: metres and degrees."""
+        """Tolerance of a right answer: metres and degrees."""
         ...
 
     def identity(self) -> str:
-        """Return what tells it from any other, also after its files have changed."""
+        """Return text that differs for any other pair, and after the files have changed."""
         ...
 
     def clouds(self) -> Clouds:
@@ -96,7 +96,7 @@ class PairConfig(Config):
     """Of the scan in the map: x y z in metres, roll pitch yaw in degrees."""
     within_m: PositiveFloat = RIGHT_M
     within_deg: PositiveFloat = RIGHT_DEG
-    """How near to the pose an answer is right."""
+    """Tolerance of a right answer."""
 
 
 class PairsConfig(Config):
@@ -158,7 +158,7 @@ class LogPair:
 
 
 def find_pairs(logs: Path) -> list[Pair]:
-    """Return the pairs of a folder: those of its ``pairs.toml``, or else what can be made of its logs.
+    """Return the pairs of a folder: those of its ``pairs.toml``, or else those made of its logs.
 
     A log is the folder or one in it. Of LiDAR logs with truth, scans evenly chosen are left out one by one;
     two sensors' clouds of one moment are a pair where an extrinsic calibration ties them, as RELLIS-3D's do.

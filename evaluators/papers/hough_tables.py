@@ -1,7 +1,7 @@
 """Table 1 of Nagy, Gálai & Benedek (2016) as printed, and ours in its layout.
 
-Their clouds are not public, so ours are other scenes. Scene by scene there is nothing to compare; how often
-it succeeds, how near it ends and how long it takes can be.
+Their clouds are not public, so ours are other scenes. Single scenes do not compare; how often the method
+succeeds, how near it ends and how long it takes do.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -26,7 +26,7 @@ from mapper.runtime.job_runner import JobResult
 NEAR_M = 0.03
 """A final MPD below it is the paper's success."""
 FAILED_SCENE = "Bajcsy"
-"""The one scene that its authors saw to be wrong, with either sensor."""
+"""The one scene that its authors found to be wrong, with either sensor."""
 
 _PAPER = "Nagy, Gálai, Benedek: Multimodális pontfelhőregisztráció Hough tér alapú előillesztéssel (2016)"
 _KEYS = ("offset_m", "yaw_deg", *DISTANCES, "seconds")
@@ -51,7 +51,7 @@ def hough_reproduction(results: Iterable[JobResult], *, pictures: Path) -> Repro
 
     Args:
         results: Of the jobs of :func:`~evaluators.papers.hough.hough_jobs`.
-        pictures: Folder they drew into.
+        pictures: Folder of their pictures.
     """
     results = list(results)
     trials = [record for result in results for record in result.records]
@@ -110,7 +110,7 @@ def _near_of(pairs: Collection[Trials], key: str) -> str:
 
 
 def _share_without(key: str) -> Callable[[Trials], float | None]:
-    """Return how many percent of the trials, of those for which it is known, are not what the key says."""
+    """Return the percentage of trials in which a flag is not set, of those for which it is known."""
     return lambda trials: 100.0 * (1.0 - mean(known)) if (known := _known(trials, key)) else None
 
 
@@ -166,15 +166,15 @@ def _in_layout(trials: Trials, method: str) -> PaperTable:
 
 
 def _against_truth(trials: Trials) -> PaperTable:
-    """Return how far the answers are from the truth, where that is known; doubted answers are listed."""
+    """Return the answers' errors, where the truth is known; answers that are not trusted are listed."""
     cells = []
     for group, of_pair in _grouped(trials, "pair", "sensor", "method").items():
         if not _known(of_pair, "right"):
             continue
         row = ", ".join(map(str, group))
         cells += [_cell(row, column, of_pair, key) for key, column in _ERRORS.items()]
-        doubts = tuple(f"seed {t['seed']}: not trusted: {t['reason']}" for t in of_pair if t["reason"])
-        for column, reasons in (("wrong, %", ()), ("not trusted, %", doubts)):
+        untrusted = tuple(f"seed {t['seed']}: not trusted: {t['reason']}" for t in of_pair if t["reason"])
+        for column, reasons in (("wrong, %", ()), ("not trusted, %", untrusted)):
             share = _SUMS[column](of_pair)
             cells.append(PaperCell(row, column, None, () if share is None else (share,), reasons))
     return _table("Table 1, errors", "our answers against the truth", cells)

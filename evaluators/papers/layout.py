@@ -10,11 +10,11 @@ from evaluators.papers.model import PaperCell, PaperTable, Reproduction
 from evaluators.tables.table import Column, Record, Table
 
 _DIGITS = 3
-"""Of figures that have no printed one beside them to show how many make sense."""
+"""Significant digits of figures without a printed one beside them."""
 
 
 def compares(table: PaperTable) -> bool:
-    """Tell whether any figure of ours stands beside a printed one."""
+    """Return whether any figure of ours stands beside a printed one."""
     return any(cell.published is not None and (cell.ours or cell.failures) for cell in table.cells)
 
 
@@ -48,7 +48,7 @@ def as_printed(table: PaperTable, *, with_spread: bool) -> Table:
 
     Args:
         table: The table.
-        with_spread: Tell the lowest and the highest of the seeds, where there are several.
+        with_spread: With the lowest and the highest of the seeds, where there are several.
     """
     decimals = _decimals(table)
     records: list[Record] = []
@@ -111,7 +111,7 @@ def failures(table: PaperTable) -> list[str]:
 
 
 def file_name(name: str) -> str:
-    """Return what a file about something is called, without its ending."""
+    """Return a name as a file's, without its ending."""
     return re.sub(r"[^\w.-]+", "_", name)
 
 

@@ -1,4 +1,4 @@
-"""A paper's table with our measurements beside the printed figures."""
+"""Model of a paper's table: our measurements beside the printed figures."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ RULE = (
     f"up to {SAME_RATIO:.2f} as published, above that worse; failed: no seed gave a figure; in part: "
     "ours is of a part of the log, so there is no ratio."
 )
-"""How verdicts are given, in words for a page."""
+"""The rule of verdicts, for readers."""
 
 
 @dataclass(frozen=True, slots=True)

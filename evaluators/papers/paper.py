@@ -1,4 +1,4 @@
-"""Papers whose tables are measured on sequences: what thesis and Zhao have in common."""
+"""Paper whose tables are measured on sequences of a log."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -34,7 +34,7 @@ _LEGEND: dict[str, Any] = {"fontsize": 7, "framealpha": 0.9, "edgecolor": LINE}
 
 
 def write_plots(folder: Path, reproduction: Reproduction) -> dict[str, Path]:
-    """Draw what can be drawn of a paper's tables and paths, a PNG file each.
+    """Draw a paper's tables that have curves or boxes, and its paths, a PNG file each.
 
     Args:
         folder: Existing folder.
@@ -119,7 +119,7 @@ def _write_boxes(path: Path, table: PaperTable) -> None:
 
 
 def _write_scenes(path: Path, tables: Sequence[PaperTable], *, title: str) -> None:
-    """Draw what the rows of each table come to, a panel for each column and a box for each table."""
+    """Draw the figures of each table's rows, a panel for each column and a box for each table."""
     columns = _columns(tables[0])
     figure, across, down = _page(title, len(columns), height_in=0.9 + _BOX_IN * len(tables))
     left_in = _label_in([_short(table) for table in tables])
@@ -165,12 +165,12 @@ def _page(title: str, panels: int, *, height_in: float = _HEIGHT_IN) -> tuple["F
 
 
 def _title(table: PaperTable) -> str:
-    """Return what fits above a single panel."""
+    """Return a title short enough for a single panel."""
     return f"{table.name}: {table.metric}, {table.unit}"
 
 
 def _label_in(labels: Sequence[str]) -> float:
-    """Return how much room the longest label needs at a panel's left."""
+    """Return the width in inches that the longest label needs at a panel's left."""
     return 0.3 + _LETTER_IN * max(map(len, labels))
 
 

@@ -29,12 +29,12 @@ _PAPERS: Mapping[PaperName, Paper] = {"thesis": thesis.PAPER, "zhao": zhao.PAPER
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What is to be measured again.
+    """Request to measure a paper's tables again.
 
     Attributes:
-        paper: Whose tables.
+        paper: The paper.
         logs: Folder in which to look for its logs.
-        given: Where logs of other names lie, by what the paper calls them.
+        given: Logs of other names, by the paper's names.
         tables: Which, e.g. "5.1"; empty is all.
         seeds: How many draws of whatever is random.
         cut: Which frames are used.
@@ -105,7 +105,7 @@ def reproduce(
 
 
 class _Sequences:
-    """A paper's sequences that are at hand, and what is asked of them."""
+    """Sequences of a paper that are at hand, and the tables that are requested of them."""
 
     def __init__(self, request: Request, paper: Paper) -> None:
         self._request, self._paper = request, paper

@@ -1,4 +1,4 @@
-"""Which of a paper's sequences lie in a folder, by whatever name people give them."""
+"""Search for a paper's sequences in a folder, by any of their usual names."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -18,10 +18,10 @@ LOOKED_FOR = (
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What of a paper's sequences is at hand.
+    """Sequences of a paper that are at hand.
 
     Attributes:
-        logs: Where each one lies, in the paper's order.
+        logs: The log of each, in the paper's order.
         missing: The others, in the paper's order.
         notes: What was ambiguous, a sentence each.
     """
@@ -78,7 +78,7 @@ def slug(name: str) -> str:
 
 
 def _logs(folder: Path, keys: Iterable[str]) -> Iterator[Path]:
-    """Yield what is called like a sequence: the folder itself, what lies in it, and in the folders there."""
+    """Yield the logs named like a sequence: the folder itself, or its children and theirs."""
     if _key(_stem(folder.resolve())) in keys:
         yield folder
     elif folder.is_dir():
@@ -98,7 +98,7 @@ def _stem(path: Path) -> str:
 
 
 def _key(name: str) -> str:
-    """Return what all names of a sequence have in common: "fr1_xyz"."""
+    """Return the part that all names of a sequence have in common: "fr1_xyz"."""
     key = _WRAPPING.sub("", slug(name.replace("ń", "n")))
     key = re.sub(r"^(?:freiburg|fr)_?(\d)_?", r"fr\1_", key)
     return _ALSO.get(key, key)

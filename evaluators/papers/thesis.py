@@ -29,7 +29,7 @@ from mapper.sources.trajectory_files import read_tum, write_tum
 
 @dataclass(frozen=True, slots=True)
 class ThesisJob:
-    """All settings of some tables on one sequence with one seed.
+    """Measurement of all settings of some tables on one sequence with one seed.
 
     Attributes:
         tables: Of ``thesis_tables.tables()``; they use the same frames of the sequence.
@@ -67,7 +67,7 @@ class ThesisJob:
         }
 
     def __call__(self) -> list[Record]:
-        """Follow the log with every setting."""
+        """Track the log with every setting, and return the figures."""
         configs = self.configs()
         source, truth = open_with_truth(self.log, next(iter(configs.values())))
         results = follow(source, configs)

@@ -89,7 +89,7 @@ TABLES: Mapping[str, Printed] = {
 
 @dataclass(frozen=True, slots=True)
 class ZhaoJob:
-    """The method as published on one sequence with one seed.
+    """Measurement of the method as published on one sequence with one seed.
 
     Attributes:
         sequence: As the paper calls it.

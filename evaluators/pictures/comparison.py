@@ -34,7 +34,7 @@ def write_paths(
     Args:
         path: PNG file to write.
         paths: Name to path, laid over the truth; an empty path leaves its panel to the truth.
-        truth: Where the body really was, or None: then each panel is as wide as its path.
+        truth: True poses of the body, or None: then each panel is as wide as its path.
         captions: A few words for each name.
         title: Headline.
     """

@@ -1,4 +1,4 @@
-"""A picture of two clouds from above and from the side, before and after they were registered."""
+"""Picture of two clouds from above and from the side, before and after they were registered."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -40,7 +40,7 @@ def write_before_and_after(
     sensor: Sensor,
     title: str,
 ) -> None:
-    """Draw the target blue, the source red, and dark what of it lies on the target.
+    """Draw the target blue, the source red, and its points that lie on the target dark.
 
     There is a column for each stage, all at one scale.
 
@@ -49,7 +49,7 @@ def write_before_and_after(
         points_target: (N, 3) metres.
         points_source: (M, 3) metres, source frame.
         stages: Name and T_target_source of each.
-        sensor: Tells which way is up.
+        sensor: What took them, which decides the direction up.
         title: Headline.
     """
     target, source = _thinned(points_target), _thinned(points_source)
@@ -84,7 +84,7 @@ def write_before_and_after(
 
 
 def _thinned(points: Points32) -> Array:
-    """Return evenly chosen points, as many as are told apart."""
+    """Return evenly chosen points, as many as a picture can show."""
     step = max(len(points) // _DRAWN, 1)
     return points[::step].astype(np.float64)
 

@@ -1,4 +1,4 @@
-"""A registration as an MCAP recording: the target, and the source after every stage."""
+"""Recording of a registration as an MCAP file: the target, and the source after every stage."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,7 +25,7 @@ def write_registration_log(
         path: MCAP file to write.
         points_target: (N, 3) metres; the recording's world is the target's frame.
         points_source: (M, 3) metres, source frame.
-        stages: T_target_source after each, and what there is to say; the same fields every time.
+        stages: T_target_source after each, and a record with the same fields every time.
     """
     with McapLog(path) as log:
         log.cloud(0, points_target, colors=_one_color(points_target, TRUTH), name="target")

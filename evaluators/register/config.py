@@ -1,4 +1,4 @@
-"""What `mapper register` can be told."""
+"""Settings of `mapper register`."""
 
 from typing import Any, get_args
 
@@ -18,17 +18,17 @@ _METHODS: dict[str, type[Config]] = {
 
 
 class RegisterConfig(Config):
-    """How logs are opened, and the method."""
+    """All settings of ``mapper register``: how logs are opened, and the method."""
 
     source: SourceConfig = SourceConfig()
     registration: AnyRegistration | IsvdOdometryConfig = Field(HoughGicpConfig(), discriminator="kind")
 
 
 def check_method(method: str, *, guess: str | None) -> None:
-    """Refuse a name that no method has, and a guess that the method would not look at.
+    """Check that there is a method of this name, and that it uses a guess if one is given.
 
     Raises:
-        ConfigError: Either.
+        ConfigError: There is none, or it does not.
     """
     if method not in _METHODS:
         raise ConfigError(f"--method {method}: want one of {', '.join(_METHODS)}")
@@ -40,7 +40,7 @@ def check_method(method: str, *, guess: str | None) -> None:
 
 
 def register_config(method: str, sensor: Sensor) -> RegisterConfig:
-    """Return a known method's configuration, scaled to what a sensor sees.
+    """Return a known method's configuration, scaled to a sensor's range.
 
     Raises:
         ConfigError: The method looks for the ground, and a camera's frame has its z ahead.

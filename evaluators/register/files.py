@@ -1,4 +1,4 @@
-"""A registration as text for a screen, and as files: the aligned cloud, pictures, JSON and a recording."""
+"""A registration as text for a terminal, and as files: aligned cloud, picture, JSON and a recording."""
 
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ ALIGNED, PICTURE, RECORDING = "aligned.ply", "registration.png", "registration.m
 
 
 def registration_text(registered: Registered) -> str:
-    """Return the motion, its trust, the distances and the times, for a terminal."""
+    """Return the motion, whether it is trusted, the distances and the times, for a terminal."""
     alignment = registered.alignment
     lines = [f"method   {registered.method}"]
     if registered.stages[-1].name == "refined":
@@ -50,16 +50,16 @@ def write_registration(
     sensor: Sensor,
     config: RegisterConfig,
 ) -> None:
-    """Write what is known of a registration, trusted or not.
+    """Write a registration's files, whether it is trusted or not.
 
     Args:
         folder: Existing folder.
         registered: The registration.
         target: Scan that stayed.
         source: Scan that was aligned to it.
-        names: What the user calls target and source.
-        sensor: Tells which way is up.
-        config: How it was done.
+        names: The user's names of target and source.
+        sensor: What took them, which decides the direction up.
+        config: Its settings.
     """
     last = registered.stages[-1]
     points_target = apply(last.T_target_source, source.points_body.astype(np.float64)).astype(np.float32)

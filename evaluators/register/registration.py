@@ -1,8 +1,9 @@
-"""One registration, told step by step: where it began, what each stage made of it, and how long that took."""
+"""One registration, step by step: its motion and distances after each stage, and the time that it took."""
 
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -21,12 +22,12 @@ _WARM_UP_STRIDE = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stage:
-    """How the clouds lay after one step.
+    """The clouds after one step.
 
     Attributes:
         name: "before", "Hough" or "refined".
         T_target_source: (4, 4) the motion by then.
-        distance: How far the source lay from the target under it.
+        distance: Of the source from the target under it.
     """
 
     name: str
@@ -36,19 +37,21 @@ class Stage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registered:
-    """A registration and its course.
+    """A registration, step by step.
 
     Attributes:
-        method: What the configuration calls it.
+        method: Its name in the configuration.
         alignment: The answer.
         stages: From the beginning on; without "refined" where there was no answer at all.
         seconds: Wall time of each step, in order.
+        cpu_s: CPU time of all steps: a wall clock sees other programs, too.
     """
 
     method: str
     alignment: Alignment
     stages: tuple[Stage, ...]
     seconds: Mapping[str, float]
+    cpu_s: float
 
 
 def register(
@@ -57,7 +60,7 @@ def register(
     config: AnyRegistration | IsvdOdometryConfig,
     T_target_source: Transform,
 ) -> Registered:
-    """Return the motion between two frames, and how it was found.
+    """Register two frames, and return the course of it.
 
     Args:
         target: Frame that stays.
@@ -69,33 +72,37 @@ def register(
         ConfigError: A method of images was given scans.
         DataError: A frame without points.
     """
-    motions = {"before": T_target_source}
+    scans = target.scan(), source.scan()
+    hough = None
     if isinstance(config, IsvdOdometryConfig):
+        began = time.process_time()
         alignment, seconds = _by_features(target, source, config)
     else:
-        alignment, hough, seconds = _by_scans(target.scan(), source.scan(), config, T_target_source)
-        if hough is not None:
-            motions["Hough"] = hough
+        # Loads libraries and compiled code, which is no step's time.
+        _by_scans(_thinned(scans[0]), _thinned(scans[1]), config, T_target_source)
+        began = time.process_time()
+        alignment, hough, seconds = _by_scans(*scans, config, T_target_source)
+    cpu_s = time.process_time() - began
+    motions = {"before": T_target_source}
+    if hough is not None:
+        motions["Hough"] = hough
     if alignment.converged or alignment.information is not None:
         motions["refined"] = alignment.T_target_source
-    distance = DistanceTo(target.scan().points_body)
-    points_source = source.scan().points_body
-    stages = (Stage(name, T, distance.of(points_source, T)) for name, T in motions.items())
-    return Registered(config.kind, alignment, tuple(stages), seconds)
+    distance = distance_to(scans[0])
+    stages = (Stage(name, T, distance.of(scans[1].points_body, T)) for name, T in motions.items())
+    return Registered(config.kind, alignment, tuple(stages), seconds, cpu_s)
+
+
+@lru_cache(maxsize=1)
+def distance_to(target: Scan) -> DistanceTo:
+    """Return what measures distances from a scan's points; that of the last scan is kept."""
+    return DistanceTo(target.points_body)
 
 
 def _by_scans(
     target: Scan, source: Scan, config: AnyRegistration, T_target_source: Transform
 ) -> tuple[Alignment, Transform | None, dict[str, float]]:
     """Return the answer, Hough's own where the method has that stage, and the time of every step."""
-    thin = thinned(target), thinned(source)  # loads libraries and compiled code, which is no step's time
-    _timed(*thin, config, T_target_source)
-    return _timed(target, source, config, T_target_source)
-
-
-def _timed(
-    target: Scan, source: Scan, config: AnyRegistration, T_target_source: Transform
-) -> tuple[Alignment, Transform | None, dict[str, float]]:
     began = time.perf_counter()
     if isinstance(config, HoughGicpConfig | HoughNdtConfig):
         from mapper.registration.hough.aligner import Hough
@@ -111,8 +118,8 @@ def _timed(
     return alignment, None, {"prepare": prepared - began, "align": time.perf_counter() - prepared}
 
 
-def thinned(scan: Scan) -> Scan:
-    """Return what a method is tried on first, so that no clock sees what is loaded and compiled for it."""
+def _thinned(scan: Scan) -> Scan:
+    """Return every tenth point of a scan, for a first run that loads and compiles what the method needs."""
     # A view with gaps would have kernels compiled for itself and none for whole scans.
     return Scan(scan.stamp_ns, np.ascontiguousarray(scan.points_body[::_WARM_UP_STRIDE]))
 

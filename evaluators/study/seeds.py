@@ -1,4 +1,4 @@
-"""Another draw of everything random."""
+"""Seeds of a configuration: another draw of everything random."""
 
 from typing import Any, TypeVar
 

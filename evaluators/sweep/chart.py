@@ -1,4 +1,4 @@
-"""A drawing of one quantity of a log's builds, as SVG that takes its colours from the page."""
+"""Chart of one quantity of a log's builds, as SVG that takes its colours from the page."""
 
 import math
 from collections.abc import Sequence
@@ -13,10 +13,10 @@ _FEWEST_TICKS, _MOST_TICKS = 3, 8
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One way to build.
+    """One line of the chart: the builds by one method and configuration.
 
     Attributes:
-        label: What stands at its left.
+        label: Text at its left.
         colour: Number of its colour.
         values: Sorted; none if there is nothing to draw.
         text: The same in words.
@@ -29,7 +29,7 @@ class Line:
 
 
 def dot_chart(lines: Sequence[Line]) -> str:
-    """Return a dot at each line's median and a bar from its least value to its largest, by logarithm.
+    """Return a chart with a dot at each line's median and a bar over its range, on a logarithmic scale.
 
     Values that are not positive are drawn at the left edge.
     """

@@ -1,4 +1,4 @@
-"""What `mapper sweep` goes through."""
+"""Settings of `mapper sweep`: logs, methods and configurations."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -10,7 +10,7 @@ from mapper.core.config import Config
 
 
 def _assignments(given: Any) -> Any:
-    """Return a table of knobs as ``key.path=value``; a list stays what it is."""
+    """Return a table of settings as ``key.path=value``; a list as it is."""
     return tuple(_flat(given, "")) if isinstance(given, Mapping) else given
 
 
@@ -30,14 +30,14 @@ Assignments = Annotated[tuple[str, ...], BeforeValidator(_assignments)]
 
 
 class ConfigurationConfig(Config):
-    """Knobs that are turned for every method alike."""
+    """Settings that are changed for every method alike."""
 
     name: Name
     set: Assignments = ()
 
 
 class MethodConfig(ConfigurationConfig):
-    """A way to map a log: a configuration file, and knobs turned on top of it."""
+    """Method to map a log: a configuration file, and settings changed on top of it."""
 
     config: Path | None = None
     """TOML file, beside the sweep's own; None begins with the defaults for the log's sensor."""
@@ -52,7 +52,7 @@ class SweepConfig(Config):
     configuration: Annotated[tuple[ConfigurationConfig, ...], Field(min_length=1)] = (
         ConfigurationConfig(name="default"),
     )
-    """They win over what the method says."""
+    """They win over the method's settings."""
     seeds: tuple[NonNegativeInt, ...] = ()
     """Each build is repeated with these in place of every seed of its configuration, if it has any."""
     keep: Literal["nothing", "trajectory", "run"] = "trajectory"

@@ -1,4 +1,4 @@
-"""A sweep as files: the table for programs, and the page for people."""
+"""Files of a sweep: the table for programs, and the page for people."""
 
 from collections.abc import Mapping
 
@@ -17,8 +17,8 @@ def write_sweep(plan: Plan, results: Mapping[BuildName, JobResult], *, title: st
     """Write a sweep's table and its page, and return the table.
 
     Args:
-        plan: What was asked for, and where its results go.
-        results: What became of each cell.
+        plan: The builds, and the folder of their results.
+        results: Of the builds.
         title: Of the page.
     """
     records = sweep_records(plan, results)

@@ -1,4 +1,4 @@
-"""A sweep as one HTML page: what is compared first, everything that was measured below."""
+"""Page of a sweep: the compared quantities first, everything that was measured below."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
@@ -14,11 +14,11 @@ from evaluators.sweep.tables import (
     Quantity,
     Variant,
     best_of,
+    failures_of,
     grouped,
-    troubles,
 )
 from evaluators.tables.table import MISSING, Record, Value
-from mapper.export.html import document, section
+from mapper.export.html import bullets, document, section
 from mapper.run.files import SUMMARY
 
 _DRAWN = ("ate_m", "frames_per_s")
@@ -33,12 +33,12 @@ Groups = Mapping[str, Mapping[Variant, Group]]
 
 
 def page_of(plan: Plan, records: Sequence[Record], *, title: str) -> str:
-    """Return the page's HTML, which loads nothing; it links to what was kept of the builds beside it."""
+    """Return the page's HTML, which loads nothing; it links to the pictures of the builds beside it."""
     groups = grouped(records)
-    bad = troubles(records)
+    bad = failures_of(records)
     sections = [
         *(section(quantity.title, _compared(groups, quantity)) for quantity in QUANTITIES),
-        section("Failed and left out", _list(bad) if bad else "<p>Nothing.</p>"),
+        section("Failed and left out", bullets(bad) if bad else "<p>Nothing.</p>"),
         section("Builds", _builds(records)),
         section("Methods and configurations", _settings(plan)),
         section("Versions", _table(["", "version"], versions().items())),
@@ -105,10 +105,6 @@ def _chart(log: str, of_log: Mapping[Variant, Group], quantity: Quantity) -> str
     return f"<figure><figcaption>{caption}</figcaption>{dot_chart(lines)}</figure>"
 
 
-def _list(lines: Iterable[str]) -> str:
-    return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
-
-
 def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """Return a table; its cells are plain text."""
     top = "".join(f"<th>{escape(text)}</th>" for text in head)
@@ -117,7 +113,7 @@ def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def _builds(records: Sequence[Record]) -> str:
-    """Return everything that was measured, a row for each build, with a link to what was kept of it."""
+    """Return everything that was measured, a row for each build, with a link to its picture."""
     names = [name for name in records[0] if name not in _ELSEWHERE]
     has_links = any(record.get("run") for record in records)
     head = "".join(f"<th>{escape(name)}</th>" for name in names) + "<th>kept</th>" * has_links
@@ -140,12 +136,14 @@ def _shown(value: Value) -> str:
 
 def _settings(plan: Plan) -> str:
     config = plan.config
-    rows = [("method", method.name, _said(method, str(method.config or ""))) for method in config.method]
-    rows += [("configuration", one.name, _said(one)) for one in config.configuration]
+    rows = [
+        ("method", method.name, _settings_text(method, str(method.config or ""))) for method in config.method
+    ]
+    rows += [("configuration", one.name, _settings_text(one)) for one in config.configuration]
     if config.seeds:
         rows.append(("seeds", "", ", ".join(map(str, config.seeds))))
     return _table(["", "name", "settings"], rows)
 
 
-def _said(variant: ConfigurationConfig, file: str = "") -> str:
+def _settings_text(variant: ConfigurationConfig, file: str = "") -> str:
     return ", ".join([*([file] if file else []), *variant.set]) or "defaults"

@@ -77,10 +77,10 @@ class Plan:
 
 
 def plan_sweep(path: Path, out: Path) -> Plan:
-    """Return what a sweep's file asks for, every configuration checked and every log opened.
+    """Return the builds of a sweep's file, every configuration checked and every log opened.
 
     Raises:
-        ConfigError: The file, or a configuration that it makes, is refused; no log fits a glob.
+        ConfigError: The file, or a configuration that results from it, is wrong; no log fits a glob.
         SourceError: A log cannot be opened.
     """
     config = read_config(path, SweepConfig)
@@ -130,7 +130,7 @@ def run_sweep(
 
 
 def _logs(path: Path, config: SweepConfig) -> dict[str, Path]:
-    """Return the logs by name, in the order of the file; a glob's by the alphabet."""
+    """Return the logs by name, in the order of the file; those of a glob in alphabetical order."""
     found: list[Path] = []
     for pattern in config.logs:
         whole = str(path.parent / Path(pattern).expanduser())
@@ -150,7 +150,7 @@ def _resolved(
     configuration: ConfigurationConfig,
     sources: dict[SourceConfig, Log],
 ) -> tuple[BuildConfig, Log]:
-    """Return a build's configuration, and its log; opening one may mean to read through it."""
+    """Return a build's configuration, and its log, which is opened once: that may read all of it."""
     file = None if method.config is None else path.parent / method.config
     overrides = (*method.set, *configuration.set)
     try:
@@ -197,7 +197,7 @@ def _key(log: str, config: BuildConfig, keep: str) -> str:
 
 
 def _files(tree: Any) -> Iterator[Path]:
-    """Yield the files that a configuration names, whose content counts as well."""
+    """Yield the files that a configuration names: their content decides the result as well."""
     if isinstance(tree, Path):
         yield tree
     elif isinstance(tree, dict):

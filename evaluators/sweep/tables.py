@@ -1,4 +1,4 @@
-"""A sweep as records, and as the table that is shown of it."""
+"""Tables of a sweep: a record for every build, and medians over the seeds."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -10,7 +10,7 @@ from mapper.runtime.job_runner import JobResult
 
 _WHOLE = 0.995
 COVERED_ALIKE = 0.95
-"""Errors are compared of those who cover at least this share of what the best covers."""
+"""Errors are compared of the variants that cover at least this share of what the best covers."""
 
 Variant = tuple[str, str]
 """Names of a method and of a configuration."""
@@ -18,14 +18,15 @@ Variant = tuple[str, str]
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """A number that methods are compared by.
+    """Quantity that methods are compared by.
 
     Attributes:
         key: Of the records.
         title: With the unit.
         shown: Turns a number into text.
         best: Which one is marked, if any.
-        needs_coverage: It flatters whoever gives up where it is hard.
+        needs_coverage: It compares only among variants that cover alike: one that leaves out hard frames
+            has smaller errors.
     """
 
     key: str
@@ -51,18 +52,18 @@ class Group:
 
     Attributes:
         records: Of those that finished.
-        failures: How many did not.
+        failures: Number of those that did not.
     """
 
     records: tuple[Record, ...] = ()
     failures: int = 0
 
     def values(self, key: str) -> list[float]:
-        """Return what is known of a quantity, in order."""
+        """Return the known values of a quantity, in order."""
         return sorted(float(value) for record in self.records if (value := record.get(key)) is not None)
 
     def text(self, quantity: Quantity) -> str:
-        """Return the median, with the range if it is one as shown, and what takes from its worth."""
+        """Return the median, with the range if it shows, the coverage if it is not whole, and failures."""
         values = self.values(quantity.key)
         if not values:
             return MISSING
@@ -116,9 +117,9 @@ def grouped(records: Sequence[Record]) -> dict[str, dict[Variant, Group]]:
 
 
 def best_of(groups: Mapping[Variant, Group], quantity: Quantity) -> set[Variant]:
-    """Return who has the best median of one log, as it is shown; nobody where nothing is to choose.
+    """Return the variants with the best median of one log, as it is shown; none if there is no choice.
 
-    Errors are compared of those alone who cover about as much of the log as any.
+    Errors are compared only of those that cover about as much of the log as any.
     """
     if quantity.best is None:
         return set()
@@ -135,7 +136,7 @@ def best_of(groups: Mapping[Variant, Group], quantity: Quantity) -> set[Variant]
 
 
 def summary_text(records: Sequence[Record]) -> str:
-    """Return a line for every log, method and configuration, and what did not go well."""
+    """Return a line for every log, method and configuration, and one for every kind of failure."""
     groups = grouped(records)
     columns = [Column("label", "log, method, configuration")]
     columns += [Column(quantity.key, quantity.title) for quantity in QUANTITIES]
@@ -146,11 +147,11 @@ def summary_text(records: Sequence[Record]) -> str:
         for variant, group in of_log.items()
         if group.records
     ]
-    return "\n".join([*([text_table(columns, lines)] if lines else []), *troubles(records)])
+    return "\n".join([*([text_table(columns, lines)] if lines else []), *failures_of(records)])
 
 
-def troubles(records: Sequence[Record]) -> list[str]:
-    """Return what failed and what does not apply, with the reason; a line for all that have the same."""
+def failures_of(records: Sequence[Record]) -> list[str]:
+    """Return the builds that failed or do not apply, with the reason; a line for all that have the same."""
     alike: dict[tuple[Value, ...], list[str]] = {}
     for record in records:
         if record["status"] != "finished":

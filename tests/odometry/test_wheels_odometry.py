@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evaluators.metrics.occupancy import occupancy_metrics
+from evaluators.metrics.occupancy import assess_by_distance, check_metrics
 from mapper.config.loading import load_config
 from mapper.core.deskew import twist_at
 from mapper.core.errors import ConfigError, FrameError, TrackingError
@@ -92,7 +92,7 @@ def test_walls_stand_where_they_are(flat, scene):
     scans = ordered_map(lambda entry: entry.scan(), flat.entries(), workers=2)
     for scan, T_world_body in zip(scans, path.T_world_body, strict=True):
         octree.insert(scan, flat.truth.T_world_body[0] @ T_world_body)
-    for metric in occupancy_metrics(octree, scene.boxes.signed_distance_m):
+    for metric in check_metrics(assess_by_distance(octree, scene.boxes.signed_distance_m)):
         assert metric.value > (0.995 if "precision" in metric.name else 0.95), metric.name
 
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from evaluators.metrics.occupancy import ghosts, occupancy_metrics
+from evaluators.metrics.occupancy import assess_by_distance, check_metrics
 from mapper.core.errors import DataError
 from mapper.octree.casting import Caster
 from mapper.octree.config import OctreeConfig
@@ -28,8 +28,15 @@ WALL = Boxes(("wall",), np.array([[2.125, 0.0, 0.0]]), np.array([[0.1, 2.0, 2.0]
 
 
 def values_of(octree, signed_distance_m, **options):
-    metrics = occupancy_metrics(octree, signed_distance_m, **options)
+    metrics = check_metrics(assess_by_distance(octree, signed_distance_m, **options))
     return {metric.name.split(",")[0]: metric.value for metric in metrics}
+
+
+def ghosts(octree, signed_distance_m):
+    """How many voxels are occupied further than a voxel and a half from every solid."""
+    leaves = octree.leaves()
+    occupied = leaves.centres_world[leaves.log_odds >= octree.occupied_log_odds]
+    return int((signed_distance_m(occupied) > 1.5 * leaves.resolution_m).sum())
 
 
 def wall_seen(at_x_m):
@@ -81,7 +88,7 @@ def test_voxels_freed_inside_a_wall_count_against_free_precision():
 
 def test_an_empty_map_cannot_be_judged():
     with pytest.raises(DataError, match="no known surface"):
-        occupancy_metrics(OctreeMap(OctreeConfig()), WALL.signed_distance_m)
+        assess_by_distance(OctreeMap(OctreeConfig()), WALL.signed_distance_m)
 
 
 def test_a_noisy_log_with_true_poses_maps_the_world_to_a_voxel():
