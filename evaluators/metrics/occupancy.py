@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from evaluators.metrics.metric import Metric
 from mapper.core.errors import DataError
@@ -19,11 +20,8 @@ LogOddsAt = Callable[[Points], NDArray[np.float32]]
 """Maps (N, 3) points in metres to log-odds, NaN where nothing is known."""
 
 Keys = NDArray[np.int64]
-Codes = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-_BITS, _MARGIN = 20, 1 << 10  # keys take 16 bits; a step beyond the first or the last must not borrow
-_MOST_SPREAD = 1 << 24
 _SQRT3 = float(np.sqrt(3.0))
 
 
@@ -75,7 +73,7 @@ class OccupancyCheck:
 
     def seen_at(self, points_world: Points) -> Mask:
         """Return (N,) whether the map saw the voxel of each of (N, 3) points on the reference's surfaces."""
-        return _among(_codes(_lattice(points_world, self.resolution_m)), _codes(self.surface[self.seen]))
+        return _near(_lattice(points_world, self.resolution_m), self.surface[self.seen], voxels=0)
 
 
 def assess_by_distance(
@@ -150,7 +148,7 @@ def assess_by_points(
         right=near_surface[assessed],
         surface=surface,
         found=found,
-        seen=found | _among(_codes(surface), _codes(keys)),
+        seen=found | _near(surface, keys, voxels=0),
         free_right=free_right,
         open_free=open_free,
         voxels=voxels,
@@ -192,7 +190,7 @@ def _keys_of(points_world: Points, resolution_m: float) -> Keys:
     """Return the (K, 3) distinct keys of points; those beyond the range of keys are left out."""
     keys = _lattice(points_world, resolution_m)
     keys = keys[((keys >= 0) & (keys < KEY_COUNT)).all(axis=1)]
-    _, first = np.unique(_codes(keys), return_index=True)
+    _, first = np.unique(keys @ [1, KEY_COUNT, KEY_COUNT**2], return_index=True)
     return keys[first]
 
 
@@ -202,31 +200,8 @@ def _lattice(points_world: Points, resolution_m: float) -> Keys:
 
 def _near(keys: Keys, others: Keys, *, voxels: int) -> Mask:
     """Return for each of (N, 3) keys whether another is at most so many steps away along each axis."""
-    wanted, codes = _codes(keys), _codes(others)
-    reach = np.arange(-voxels, voxels + 1)
-    steps = (reach[:, None, None] + (reach[:, None] << _BITS) + (reach << (2 * _BITS))).ravel()
-    near = np.zeros(len(wanted), dtype=np.bool_)
-    if len(codes) < len(wanted):  # spreading the few is faster than searching around the many
-        at_once = max(1, _MOST_SPREAD // max(len(codes), 1))
-        for first in range(0, len(steps), at_once):
-            near |= _among(wanted, (codes[:, None] + steps[first : first + at_once]).ravel())
-        return near
-    for step in steps:
-        near |= _among(wanted + step, codes)
+    if not len(others):
+        return np.zeros(len(keys), np.bool_)
+    steps, _ = cKDTree(others).query(keys, p=np.inf, distance_upper_bound=voxels + 0.5)
+    near: Mask = np.isfinite(steps)
     return near
-
-
-def _among(wanted: Codes, codes: Codes) -> Mask:
-    """Return (N,) whether each code is one of the others."""
-    if not len(codes):
-        return np.zeros(len(wanted), dtype=np.bool_)
-    ordered = np.sort(codes)
-    among: Mask = ordered[np.minimum(np.searchsorted(ordered, wanted), len(ordered) - 1)] == wanted
-    return among
-
-
-def _codes(keys: Keys) -> Codes:
-    """Return one number for each (N, 3) key, so that a step along an axis adds the same everywhere."""
-    x, y, z = (keys + _MARGIN).T
-    codes: Codes = x | y << _BITS | z << (2 * _BITS)
-    return codes

@@ -4,13 +4,14 @@ It separates a good trajectory from a bad one only as far as the sensor is right
 agree.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from evaluators.metrics.metric import Metric
-from evaluators.metrics.patches import cell_codes, gaps, spreads
 from mapper.core.deskew import STILL, deskewed, twist_at
 from mapper.core.errors import DataError
 from mapper.core.frames import Sensor
@@ -101,33 +102,75 @@ def sharpness_metrics(views: Views, *, radius_m: float) -> list[Metric]:
     Raises:
         DataError: No patch was seen in two frames, or all are lines.
     """
-    order = np.argsort(cell_codes(views.points_world, radius_m), kind="stable")
-    points, towards = views.points_world[order], views.towards_world[order]
-    frames, codes = views.frames[order], cell_codes(points, radius_m)
-    patches = thin(points.astype(np.float32), 0.5 * radius_m)
-    patches = patches[:: max(1, -(-len(patches) // _PATCHES))].astype(np.int64)
-    covariances, counts = spreads(points, towards, frames, codes, patches, radius_m)
-    enough = counts >= _MIN_NEIGHBOURS
-    if not enough.any():
+    order = np.lexsort(np.floor(views.points_world / radius_m).T)  # cell by cell
+    views = Views(views.points_world[order], views.towards_world[order], views.frames[order])
+    patches = list(_patches(views, radius_m))
+    if not patches:
         raise DataError(
             f"sharpness: nowhere {_MIN_NEIGHBOURS} points of two frames within {radius_m:g} m: no overlap"
         )
-    variances, axes = np.linalg.eigh(covariances[enough])
+    variances, axes = np.linalg.eigh([_covariance(patch) for patch in patches])
     variances = np.maximum(variances, _LEAST_VARIANCE_M2)
     broad = variances[:, 1] >= _BREADTH_RATIO * variances[:, 2]
     if not broad.any():
         raise DataError(f"sharpness: all patches of {radius_m:g} m are lines; choose a larger radius")
     thickness_m = np.sqrt(variances[broad, 0])
-    normals = np.ascontiguousarray(axes[broad, :, 0])
-    apart, shares = gaps(points, towards, codes, patches[enough][broad], normals, radius_m)
-    double = (apart >= _SHEETS_APART) & (shares >= _SHEET_SHARE)
+    double = [_is_double(patches[k], normal=axes[k, :, 0], radius_m=radius_m) for k in np.flatnonzero(broad)]
     entropy = 0.5 * (3.0 * np.log(2.0 * np.pi * np.e) + np.log(variances).sum(axis=1))
     about = f"radius {radius_m:g} m"
     return [
-        Metric(f"patches seen in several frames, {about}", int(enough.sum()), "patches"),
+        Metric(f"patches seen in several frames, {about}", len(patches), "patches"),
         Metric(f"wall thickness median, {about}", float(np.median(thickness_m)), "m"),
         Metric(f"wall thickness quartile, {about}", float(np.percentile(thickness_m, 25.0)), "m"),
-        Metric(f"double walls, {about}", 100.0 * float(double.mean()), "%"),
+        Metric(f"double walls, {about}", 100.0 * float(np.mean(double)), "%"),
         Metric(f"mean map entropy, {about}", float(entropy.mean()), "nats"),
         Metric(f"mean plane variance, {about}", float(variances[:, 0].mean()), "m²"),
     ]
+
+
+def _patches(views: Views, radius_m: float) -> Iterator[Array]:
+    """Yield the points about evenly chosen ones, (N, 3) metres from the chosen one.
+
+    They are within the radius and were seen from the same side, so that the two faces of a thin wall are two
+    patches. Patches with too few points, or with points of one frame alone, are left out.
+    """
+    points, towards = views.points_world, views.towards_world
+    chosen = thin(points.astype(np.float32), 0.5 * radius_m)
+    chosen = chosen[:: max(1, -(-len(chosen) // _PATCHES))].astype(np.int64)
+    around = cKDTree(points).query_ball_point(points[chosen], 1.001 * radius_m, return_sorted=True)
+    for i, near in zip(chosen, around, strict=True):
+        offsets = points[near] - points[i]
+        inside = (offsets**2).sum(axis=1) <= radius_m * radius_m
+        inside &= (towards[near] * towards[i]).sum(axis=1) > 0.0
+        if inside.sum() >= _MIN_NEIGHBOURS and (views.frames[near][inside] != views.frames[i]).any():
+            yield offsets[inside]
+
+
+def _covariance(offsets: Array) -> Array:
+    """Return the (3, 3) sample covariance of (N, 3) points, m²."""
+    centred = offsets - (offsets / len(offsets)).sum(axis=0)
+    covariance: Array = (centred[:, :, None] * centred[:, None, :] / (len(offsets) - 1)).sum(axis=0)
+    return covariance
+
+
+def _is_double(offsets: Array, *, normal: Array, radius_m: float) -> bool:
+    """Return whether a patch consists of two sheets.
+
+    The points half as near to the normal through its middle as the radius are parted in two along it so that
+    the parts differ most (Otsu 1979). The sheets' distance is that of the parts' means over their spread.
+    """
+    along = (offsets * normal).sum(axis=1)
+    beside = (offsets**2).sum(axis=1) - along * along <= 0.25 * radius_m * radius_m
+    ordered = np.sort(along[beside])
+    if len(ordered) < 3:
+        return False
+    sums, below = np.cumsum(ordered), np.arange(1, len(ordered))
+    above, low, high = len(ordered) - below, sums[:-1], sums[-1] - sums[:-1]
+    between = below * above * (low / below - high / above) ** 2
+    k = int(between.argmax())
+    squares = np.cumsum(ordered * ordered)[-1]
+    within = squares - low[k] * low[k] / below[k] - high[k] ** 2 / above[k]
+    spread = np.sqrt(max(within, 0.0) / len(ordered))
+    apart = (high[k] / above[k] - low[k] / below[k]) / max(spread, 1e-9)
+    share = min(below[k], above[k]) / len(ordered)
+    return bool(apart >= _SHEETS_APART and share >= _SHEET_SHARE)
