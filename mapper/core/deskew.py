@@ -1,4 +1,4 @@
-"""Undoes the motion of a sensor during its sweep, so that a scan is what it would have been at its stamp."""
+"""Deskewing: the points of a sweep are moved to where they would have been measured at the scan's stamp."""
 
 from dataclasses import dataclass, replace
 
@@ -24,7 +24,7 @@ class Twist:
     translation_mps: Array
 
     def over(self, duration_s: float) -> Transform:
-        """Return the (4, 4) pose of the body after a duration in the body before it."""
+        """Return T_before_after (4, 4), the motion of the body in a duration."""
         return exp(self.rotation_radps * duration_s, self.translation_mps * duration_s)
 
 
@@ -32,13 +32,13 @@ STILL = Twist(np.zeros(3), np.zeros(3))
 
 
 def twist_between(T_world_before: Transform, T_world_after: Transform, *, duration_s: float) -> Twist:
-    """Return the constant velocity that leads from one pose to another."""
+    """Return the constant velocity from one pose to another."""
     rotation_rad, translation_m = log(inverse(T_world_before) @ T_world_after)
     return Twist(rotation_rad / duration_s, translation_m / duration_s)
 
 
 def twist_at(trajectory: Trajectory, index: int) -> Twist:
-    """Return the velocity of a trajectory's pose, from the pose before it to the one after it."""
+    """Return the velocity at a pose of a trajectory, from the pose before it to the pose after it."""
     first, last = max(index - 1, 0), min(index + 1, len(trajectory) - 1)
     if first == last:
         return STILL
@@ -48,9 +48,9 @@ def twist_at(trajectory: Trajectory, index: int) -> Twist:
 
 
 def deskewed(scan: Scan, twist: Twist) -> Scan:
-    """Return the scan as taken all at once at its stamp; without times per point it is returned as it is.
+    """Return the scan with all points moved to its stamp; without times per point, the scan itself.
 
-    A point seen τ after the stamp moves by exp(τ·twist): constant velocity, as in KISS-ICP (Vizzo et al.
+    A point measured τ after the stamp moves by exp(τ·twist): constant velocity, as in KISS-ICP (Vizzo et al.
     2023, eq. 2).
     """
     if scan.times_s is None:

@@ -5,7 +5,7 @@ Library code raises or warns; only ``cli`` turns them into one line and, for an 
 
 
 class MapperError(Exception):
-    """An error whose message names the thing, the value, the limit and the remedy."""
+    """Base of all errors: the message names the thing, the value, the limit and the remedy."""
 
 
 class ConfigError(MapperError):
@@ -13,7 +13,7 @@ class ConfigError(MapperError):
 
 
 class DataError(MapperError):
-    """Data that break a promise: wrong shape, not finite, out of order."""
+    """Invalid data: of a wrong shape, not finite, or out of order."""
 
 
 class SourceError(MapperError):
@@ -21,11 +21,11 @@ class SourceError(MapperError):
 
 
 class FrameError(SourceError):
-    """One frame that cannot be read; the rest of the log may still be good."""
+    """One frame that cannot be read; the rest of the log may still be readable."""
 
 
 class TrackingError(MapperError):
-    """Too little of a log could be tracked to make a map from it."""
+    """A log of which too little could be tracked for a map."""
 
 
 class GraphError(MapperError):
@@ -33,7 +33,7 @@ class GraphError(MapperError):
 
 
 class LoopError(MapperError):
-    """A loop that cannot be added or removed, or two sessions that no loop ties."""
+    """A loop that cannot be added or removed, or two sessions that no loop connects."""
 
 
 class MapSizeError(MapperError):
@@ -45,19 +45,19 @@ class MapFileError(MapperError):
 
 
 class VocabularyError(MapperError):
-    """A vocabulary that is missing or damaged, or descriptors that it has no words for."""
+    """A vocabulary that is missing or damaged, or of other descriptors."""
 
 
 class RegistrationError(MapperError):
-    """Two clouds were registered, and the answer is not to be trusted."""
+    """A registration whose result is not accepted."""
 
 
 class PlanError(MapperError):
-    """A path that does not exist, or an end of it where the robot has no room."""
+    """A path that does not exist, or whose start or goal has too little clearance."""
 
 
 class DependencyError(MapperError):
-    """A library that an optional part needs, and that is not installed or cannot be loaded."""
+    """A library of an optional part that is not installed or cannot be loaded."""
 
 
 class ViewerError(MapperError):
@@ -65,7 +65,7 @@ class ViewerError(MapperError):
 
 
 class RunError(MapperError):
-    """A run folder that is missing, unfinished or already there."""
+    """A run folder that is missing, unfinished or already exists."""
 
 
 class MapperWarning(UserWarning):

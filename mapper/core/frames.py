@@ -1,4 +1,4 @@
-"""What a sensor saw at one moment: RGB-D frames, scans, and the camera model between pixels and rays."""
+"""RGB-D frames, scans, and the pinhole camera model."""
 
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -15,7 +15,7 @@ from mapper.core.geometry import Array, Points, Transform, is_rigid
 Image = NDArray[np.uint8]
 DepthImage = NDArray[np.float32]
 Points32 = NDArray[np.float32]
-"""(N, 3) float32 metres: within a kilometre of the sensor the rounding stays below 0.1 mm."""
+"""(N, 3) float32 metres: within a kilometre of the sensor the rounding is below 0.1 mm."""
 
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -58,7 +58,7 @@ class PinholeCamera:
         return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
 
     def undistort(self, pixels: NDArray[np.floating]) -> Array:
-        """Return where (N, 2) measured pixels (column, row) would lie without distortion, in pixels."""
+        """Return the (N, 2) undistorted positions of (N, 2) measured pixels (column, row), in pixels."""
         ideal: Array = np.asarray(pixels, dtype=np.float64)
         if self.distortion == NO_DISTORTION or len(ideal) == 0:
             return ideal
@@ -72,7 +72,7 @@ class PinholeCamera:
         return ideal
 
     def distort(self, pixels: Array) -> Array:
-        """Return where (N, 2) undistorted pixels lie in the image as taken: the inverse of ``undistort``."""
+        """Return the (N, 2) positions of undistorted pixels in the raw image: inverse of ``undistort``."""
         if self.distortion == NO_DISTORTION or len(pixels) == 0:
             return pixels
         rays = (pixels - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
@@ -92,7 +92,7 @@ class PinholeCamera:
 
 @lru_cache(maxsize=8)
 def ray_table(camera: PinholeCamera) -> NDArray[np.float32]:
-    """Return (H, W, 2) float32: the undistorted x/z and y/z of every pixel's ray, camera frame."""
+    """Return the (H, W, 2) float32 undistorted x/z and y/z of every pixel's ray, camera frame."""
     columns, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
     ideal = camera.undistort(np.column_stack([columns.ravel(), rows.ravel()]))
     table = (ideal - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
@@ -106,7 +106,7 @@ class Scan:
     Attributes:
         stamp_ns: Time of capture, nanoseconds since the Unix epoch.
         points_body: (N, 3) float32, metres, body frame. Missing returns are absent, not zero.
-        origin_body: (3,) float64, metres, body frame: where the rays start.
+        origin_body: (3,) float64, metres, body frame: origin of the rays.
         colors: (N, 3) uint8 RGB of each point, where the sensor has colour.
         times_s: (N,) float32 seconds after ``stamp_ns`` of each point, where the file has them.
     """
@@ -136,7 +136,7 @@ class Scan:
             raise DataError(f"scan {self.stamp_ns}: times {self.times_s.shape}, want {shape[:1]}")
 
     def scan(self) -> "Scan":
-        """Return itself: a scan already is what every frame can become."""
+        """Return the scan itself: frames of every kind can be converted to a scan."""
         return self
 
 
@@ -184,7 +184,7 @@ class RgbdFrame:
         return rgb
 
     def scan(self, *, stride_px: int = 1, max_depth_m: float = np.inf) -> Scan:
-        """Return the measured pixels as a scan in the body frame; a colour image colours it.
+        """Return the measured pixels as a scan in the body frame, with the colours of a colour image.
 
         Args:
             stride_px: Keep every n-th row and column.
@@ -213,4 +213,4 @@ Frame = RgbdFrame | Scan
 
 
 Sensor = Literal["rgbd", "lidar"]
-"""What took a log's frames: RGB-D frames whose body is an optical frame, or scans with z roughly up."""
+"""Kind of a log's sensor: RGB-D frames whose body is an optical frame, or scans with z roughly up."""

@@ -88,7 +88,7 @@ def log(T_a_b: Transform) -> tuple[Array, Array]:
 
 
 def adjoint(T_a_b: Transform) -> Array:
-    """Return (6, 6): takes b's twists (rotation, translation) to a's (Murray, Li & Sastry 1994, §2.4)."""
+    """Return the (6, 6) map of twists (rotation, translation) of b to a (Murray, Li & Sastry 1994, §2.4)."""
     R, t = T_a_b[:3, :3], T_a_b[:3, 3]
     zero = np.zeros((3, 3))
     return np.block([[R, zero], [skew(t) @ R, R]])
@@ -105,7 +105,7 @@ def _left_jacobian(rotation_rad: Array) -> Array:
 
 
 def interpolate(T_a_b: Transform, T_a_c: Transform, fraction: float) -> Transform:
-    """Return the pose a fraction of the way from b to c: rotation on SO(3), position on the straight line."""
+    """Return the pose at a fraction between b and c: rotation on SO(3), position on the straight line."""
     R_b_c = T_a_b[:3, :3].T @ T_a_c[:3, :3]
     R = T_a_b[:3, :3] @ rotation_exp(fraction * rotation_log(R_b_c))
     return transform(R, (1.0 - fraction) * T_a_b[:3, 3] + fraction * T_a_c[:3, 3])
@@ -135,8 +135,8 @@ def mean_rotation(rotations: Iterable[Array], weights: Iterable[float]) -> Array
 def fit_rigid(target: Points, source: Points, *, with_scale: bool = False) -> tuple[Transform, float]:
     """Return the least-squares motion and scale that take source points to their target partners.
 
-    Arun, Huang & Blostein 1987 with the determinant correction of Umeyama 1991 (eq. 40 to 43), which
-    stays right when noise would make the plain solution a reflection.
+    Arun, Huang & Blostein 1987 with the determinant correction of Umeyama 1991 (eq. 40 to 43), which is
+    right also when noise makes the plain solution a reflection.
 
     Args:
         target: (N, 3) points in the target frame, metres.
@@ -167,7 +167,7 @@ def fit_rigid(target: Points, source: Points, *, with_scale: bool = False) -> tu
 
 
 def is_rigid(T: NDArray[np.float64], *, tolerance: float = 1e-5) -> bool:
-    """Tell whether a (4, 4) or (N, 4, 4) array holds rigid motions only."""
+    """Return whether a (4, 4) or (N, 4, 4) array consists of rigid motions."""
     T = np.asarray(T)
     if T.shape == (4, 4):
         return _is_rigid_rows(T.tolist(), tolerance)
@@ -181,7 +181,7 @@ def is_rigid(T: NDArray[np.float64], *, tolerance: float = 1e-5) -> bool:
 
 
 def _is_rigid_rows(rows: list[list[float]], tolerance: float) -> bool:
-    """Tell it of one motion: arrays would take ten times as long, and every pose and factor passes here."""
+    """Return the same for one motion: arrays take ten times as long, and every pose and factor is checked."""
     (a, b, c, x), (d, e, f, y), (g, h, i, z), (p, q, r, s) = rows
     products = (
         a * a + b * b + c * c - 1.0,

@@ -1,4 +1,4 @@
-"""Small dense linear algebra, compiled without BLAS: numba's own imports SciPy and is no faster here."""
+"""Small dense linear algebra, compiled without BLAS: numba's own needs SciPy and is no faster here."""
 
 import numpy as np
 from numba import njit
@@ -27,7 +27,7 @@ def turned(A, v):
 def solve_positive(A, b):
     """Return x with A x = b by Cholesky's factorisation; zeros where A (N, N) is not positive definite.
 
-    A step of zero is what an optimiser does with a system that says nothing.
+    An optimiser then takes a step of zero.
     """
     n = len(b)
     L = np.empty((n, n))
@@ -74,7 +74,7 @@ def twist_exp(delta, T):
     moved = np.eye(4)
     moved[:3, :3] = product(R, T)
     moved[:3, 3] = turned(R, T[:3, 3]) + turned(V, delta[3:])
-    # Products of many small rotations drift off SO(3): one Gram–Schmidt step keeps them on it.
+    # Products of many small rotations drift off SO(3): a Gram–Schmidt step restores them.
     for i in range(3):
         for j in range(i):
             dot = 0.0

@@ -1,4 +1,4 @@
-"""Quaternions (always xyzw) and Euler angles, which live only in files and on screens."""
+"""Conversions of rotations from and to quaternions (always xyzw) and Euler angles, as files have them."""
 
 import numpy as np
 
@@ -32,7 +32,7 @@ def rotation_from_quaternion(xyzw: Array) -> Array:
 def quaternion_from_rotation(R: Array) -> Array:
     """Return the unit xyzw quaternion, w ≥ 0, of a (3, 3) rotation, or (N, 4) of (N, 3, 3).
 
-    Every row of 4 · q · qᵀ is the quaternion times a factor; that with the largest factor loses no digits
+    Every row of 4 · q · qᵀ is the quaternion times a factor; the row with the largest factor loses no digits
     (Shepperd 1978).
     """
     (xx, yx, zx), (xy, yy, zy), (xz, yz, zz) = R.T
@@ -50,7 +50,7 @@ def quaternion_from_rotation(R: Array) -> Array:
 
 
 def rotation_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
-    """Return Rz(yaw) · Ry(pitch) · Rx(roll) (thesis eq. 2.19–2.22)."""
+    """Return Rz(yaw) · Ry(pitch) · Rx(roll) (Somlyai (PhD thesis), eq. 2.19–2.22)."""
     cr, sr = np.cos(roll_rad), np.sin(roll_rad)
     cp, sp = np.cos(pitch_rad), np.sin(pitch_rad)
     cy, sy = np.cos(yaw_rad), np.sin(yaw_rad)
@@ -66,7 +66,8 @@ def rotation_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Ar
 def euler_from_rotation(R: Array) -> tuple[float, float, float]:
     """Return (roll, pitch, yaw) in radians with ``rotation_from_euler(...) == R``.
 
-    At gimbal lock (pitch = ±π/2) only roll ∓ yaw is defined: roll is set to 0 (thesis eq. 2.29–2.33).
+    At gimbal lock (pitch = ±π/2) only roll ∓ yaw is defined: roll is set to 0 (Somlyai (PhD thesis),
+    eq. 2.29–2.33).
     """
     sine = float(np.clip(-R[2, 0], -1.0, 1.0))
     pitch = float(np.arcsin(sine))

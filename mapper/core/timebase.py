@@ -11,7 +11,7 @@ NS_PER_S = 1_000_000_000
 _LARGEST_S = (2**63 - 1) // NS_PER_S
 
 MAX_TRUTH_GAP_NS = 20_000_000
-"""A true pose farther from a frame in time says nothing about it: TUM's own limit for pairing stamps."""
+"""Limit between the stamps of a frame and of its true pose: that of TUM's tools."""
 
 Stamps = NDArray[np.int64]
 """(N,) int64 nanoseconds since the Unix epoch (or the log's own zero)."""

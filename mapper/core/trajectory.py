@@ -1,4 +1,4 @@
-"""A body's poses over time, and its TUM and KITTI text forms."""
+"""Trajectory: a body's poses over time."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -54,7 +54,7 @@ class Trajectory:
         return float(np.linalg.norm(np.diff(self.positions_world, axis=0), axis=1).sum())
 
     def moved(self, T_new_world: Transform) -> "Trajectory":
-        """Return the same motion seen from another world frame."""
+        """Return the same motion in another world frame."""
         return Trajectory(self.stamps_ns, T_new_world @ self.T_world_body)
 
 
@@ -66,6 +66,6 @@ def trajectory_from(poses: Iterable[tuple[int, Transform]]) -> Trajectory:
 
 
 def start_to_end(trajectory: Trajectory) -> Transform:
-    """Return T_start_end, the last pose seen from the first."""
+    """Return T_start_end, the last pose in the frame of the first."""
     T_start_end: Transform = inverse(trajectory.T_world_body[0]) @ trajectory.T_world_body[-1]
     return T_start_end

@@ -1,4 +1,4 @@
-"""Points by voxels: the first that fell into each, or the mean of all."""
+"""Voxel grid downsampling: the first point in every voxel, or the mean of its points."""
 
 import numpy as np
 from numba import njit
@@ -12,7 +12,7 @@ from mapper.core.voxel_index import cell_key, claim_row, voxel_index
 def thin(points: Points32, voxel_m: float) -> NDArray[np.intp]:
     """Return the indices of the first point in every voxel, ascending.
 
-    Unlike a mean, a point that is kept has a time and a range of its own.
+    Unlike a mean, a point that is kept has its own time and range.
 
     Args:
         points: (N, 3) finite, metres.

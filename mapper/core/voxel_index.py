@@ -1,8 +1,8 @@
 """Voxel index: a compiled hash table from the int64 keys of voxels to row numbers.
 
-Open addressing with linear probing. Rows number the keys in the order in which they were added, so what is
-stored by row does not depend on the hash; neighbouring voxels mostly have neighbouring rows, which is why the
-keys are kept by row and the table holds rows alone.
+Open addressing with linear probing. Rows number the keys in the order in which they were added, so that data
+stored by row do not depend on the hash. Neighbouring voxels mostly have neighbouring rows: that is why keys
+are stored by row, and the table has rows alone.
 """
 
 from typing import NamedTuple
@@ -21,7 +21,7 @@ _VACANT = -1
 
 
 class VoxelIndex(NamedTuple):
-    """The arrays that compiled code needs to find rows by key.
+    """The arrays of an index, for compiled code.
 
     Attributes:
         rows: (C,) int32 rows by the hash of their keys, −1 where vacant. C is a power of two, at least twice
@@ -55,7 +55,7 @@ def cell_key(x, y, z):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _slot_of(index, key):  # type: ignore[no-untyped-def]
-    """Return where in the table a key's row is, or the vacant place where it belongs."""
+    """Return the number of the table's entry with a key's row, or of the vacant one where it belongs."""
     mask = len(index.rows) - 1
     # Folded, since the product's middle bits do not depend on the key's highest ones.
     slot = (((key ^ (key >> 32)) * FIBONACCI) >> 32) & mask

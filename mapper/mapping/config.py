@@ -1,4 +1,4 @@
-"""Settings of fusing: levelling, the cloud, and what the MCAP log shows of each frame."""
+"""Settings of mapping: levelling, the coloured cloud, and the frames in the MCAP log."""
 
 from typing import Annotated, Protocol
 

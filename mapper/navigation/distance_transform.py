@@ -2,7 +2,7 @@
 
 As in Felzenszwalb & Huttenlocher (2012) the lower envelope of parabolas is taken axis after axis, in linear
 time; borders between parabolas are kept as the first whole cell, so nothing is rounded.
-``scipy.ndimage.distance_transform_edt`` takes 4 to 5 times as long, and knows distances to centres only.
+``scipy.ndimage.distance_transform_edt`` takes 4 to 5 times as long, and has distances to centres only.
 """
 
 import numpy as np

@@ -16,7 +16,7 @@ from mapper.navigation.voxels import LIMIT_BYTES, VoxelGrid, cut_box, known_box,
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import UNKNOWN, OccupancyGrid
 
-_BYTES_PER_VOXEL = 30  # a distance field's 14, what is free, and the search's costs and steps
+_BYTES_PER_VOXEL = 30  # a distance field's 14, the mask of free voxels, and the search's costs and steps
 _ROUNDING_M = 1e-6
 _SAMPLES_PER_CELL = 4
 

@@ -19,7 +19,7 @@ from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 _NOWHERE = -(1 << 30)
 """Height of the floor, in voxels, where none has been reached."""
 
-_ALLOWANCE = 1e-6  # of a voxel: 0.1 m is two voxels of 5 cm, whatever the division says
+_ALLOWANCE = 1e-6  # of a voxel: 0.1 m is two voxels of 5 cm, whatever the rounding of the division
 
 Mask = NDArray[np.bool_]
 Heights = NDArray[np.int32]

@@ -1,1 +1,1 @@
-"""The occupancy octree and what is cut from it."""
+"""The occupancy octree: updates, queries, its files, and the 2D slice."""

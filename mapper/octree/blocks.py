@@ -128,7 +128,7 @@ def slot_of(table, code):
 
 @njit(cache=True, nogil=True)
 def find_slots(table, codes, slots):
-    """Write each code's slot, or −1; return how many are missing."""
+    """Write each code's slot, or −1; return the number of missing ones."""
     missing = 0
     for i in range(len(codes)):
         slots[i] = slot_of(table, codes[i])

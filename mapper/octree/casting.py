@@ -40,7 +40,7 @@ class Caster:
         """Bytes of address space held."""
         return self._buffer.memory_bytes
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Drop the working memory, together with a cast in it that is not going to be read."""
         self._buffer = WindowBuffer()
 
@@ -84,7 +84,7 @@ class Caster:
             ends_world, origin, resolution_m, self.config.max_range_m
         )
         self._refuse(outside, len(ends_world))
-        window = self._buffer.place(lowest, highest, origin=base)
+        window = self._buffer.window(lowest, highest, origin=base)
         kernels.cast_rays(stops, hits, origin, resolution_m, window)
         positions = take_touched(window)
         return Cast(window, positions, block_codes(window, positions, lowest))

@@ -249,12 +249,12 @@ def merge(cells, positions, slots, values, sensor):
         Number of voxels that became known.
     """
     hit, miss, lowest, highest = sensor.hit, sensor.miss, sensor.lowest, sensor.highest
-    born = 0
+    added = 0
     for i in range(len(positions)):
         start = positions[i] * BLOCK_VOXELS
         seen_block = cells[start : start + BLOCK_VOXELS]
         block = values[slots[i]]
-        block_born = int32(0)
+        block_added = int32(0)
         for j in range(BLOCK_VOXELS):  # this loop vectorises: selections only, no branch
             seen = int32(seen_block[j])
             old = block[j]
@@ -267,7 +267,7 @@ def merge(cells, positions, slots, values, sensor):
             clamped = value >= highest if seen == OCCUPIED else value <= lowest
             new = value if clamped else new
             block[j] = old if seen == UNTOUCHED else new
-            block_born += int32(unknown & (seen != UNTOUCHED))
-        born += block_born
+            block_added += int32(unknown & (seen != UNTOUCHED))
+        added += block_added
         seen_block[:] = UNTOUCHED
-    return born
+    return added

@@ -159,7 +159,7 @@ class OctreeMap:
             if self.attributes is not None:
                 self.attributes.claim(slots[ended_blocks(cast.window.cells, cast.positions)])
         except MapSizeError:
-            self._caster.forget()
+            self._caster.reset()
             raise
         self._add(cast.window.cells, cast.positions, slots)
 
@@ -304,10 +304,10 @@ class OctreeMap:
         own = self.blocks.claim(other.blocks.codes[slots])
         if self.attributes is not None and other.attributes is not None:
             self.attributes.add_layer(other.attributes, slots, own)
-        born, overlap = add_blocks(
+        added, overlap = add_blocks(
             self.blocks.table.values, own, other.blocks.table.values, slots, self.occupied_log_odds
         )
-        self._known += born
+        self._known += added
         return Overlap(*overlap)
 
     def clamp(self) -> None:

@@ -1,8 +1,8 @@
 """Map files (``.octree``): all of a map, compressed and checked; the same map gives the same bytes.
 
 Layout: that of ``runtime.checked_file`` with a header in JSON and a body compressed by Zstandard. The body
-holds, little-endian, one after the other: Morton codes of the blocks as differences (int64), which of their
-voxels are known (64 bytes per block) and those voxels' log-odds (float32); then, if the map has attributes,
+holds, little-endian, one after the other: Morton codes of the blocks as differences (int64), masks of
+their known voxels (64 bytes per block) and those voxels' log-odds (float32); then, if the map has attributes,
 the same two for voxels that have any, and these voxels' red, green and blue sums, colour weights, hits
 (uint32) and last stamps (int64).
 """

@@ -46,29 +46,29 @@ class SeenThrough:
         missing = len(values) - len(self._runs)
         if missing > 0:
             self._runs = np.concatenate([self._runs, np.zeros((missing, BLOCK_VOXELS), np.uint8)])
-        born: int = _merge(
+        added: int = _merge(
             cells, positions, slots, values, sensor, self._runs, self._scans, self._occupied_log_odds
         )
-        return born
+        return added
 
 
 @njit(cache=True, nogil=True)
 def _merge(cells, positions, slots, values, sensor, runs, scans, occupied_log_odds):
     hit, miss, lowest, highest = sensor.hit, sensor.miss, sensor.lowest, sensor.highest
     released = max(lowest, float32(scans) * miss)
-    born = 0
+    added = 0
     for i in range(len(positions)):
         start = positions[i] * BLOCK_VOXELS
         seen_block = cells[start : start + BLOCK_VOXELS]
         block, runs_block = values[slots[i]], runs[slots[i]]
-        block_born = int32(0)
+        block_added = int32(0)
         for j in range(BLOCK_VOXELS):
             seen = int32(seen_block[j])
             if seen == UNTOUCHED:
                 continue
             old = block[j]
             unknown = old != old
-            block_born += int32(unknown)
+            block_added += int32(unknown)
             value = float32(0.0) if unknown else old
             if seen == OCCUPIED:
                 runs_block[j] = 0
@@ -79,6 +79,6 @@ def _merge(cells, positions, slots, values, sensor, runs, scans, occupied_log_od
             if runs_block[j] >= scans and new >= occupied_log_odds:
                 new = released
             block[j] = new
-        born += block_born
+        added += block_added
         seen_block[:] = UNTOUCHED
-    return born
+    return added

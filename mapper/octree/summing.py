@@ -36,7 +36,7 @@ def add_blocks(stored, slots, others, other_slots, threshold):
     Returns:
         Number of voxels that became known, and the three counts of an Overlap.
     """
-    born, shared, both, either = 0, 0, 0, 0
+    added, shared, both, either = 0, 0, 0, 0
     for b in range(len(slots)):
         own, other = stored[slots[b]], others[other_slots[b]]
         for i in range(BLOCK_VOXELS):
@@ -47,6 +47,6 @@ def add_blocks(stored, slots, others, other_slots, threshold):
                 either += (here >= threshold) | (there >= threshold)
                 own[i] = float32(here + there)
             elif there == there:
-                born += 1
+                added += 1
                 own[i] = there
-    return born, (shared, both, either)
+    return added, (shared, both, either)

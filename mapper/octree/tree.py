@@ -48,7 +48,7 @@ def nodes_in_preorder(store: BlockStore, *, root_depth: int = 0) -> NDArray[np.v
 
     Args:
         store: The blocks.
-        root_depth: Depth of a node above all blocks that takes the root's place; it is listed first.
+        root_depth: Depth of a node above all blocks that serves as root; it is listed first.
     """
     slots = store.sorted_slots()
     parts, starts = np.empty(len(slots) * _PYRAMID, NODE), np.zeros(len(slots) + 1, np.int64)
@@ -66,7 +66,7 @@ def words_in_preorder(
     Args:
         store: At least one block.
         threshold: Log-odds from which a voxel is occupied.
-        root_depth: Depth of a node above all blocks that takes the root's place.
+        root_depth: Depth of a node above all blocks that serves as root.
     """
     slots = store.sorted_slots()
     parts, starts = np.empty(len(slots) * _WORDS, np.uint16), np.zeros(len(slots) + 1, np.int64)

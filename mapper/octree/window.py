@@ -60,7 +60,7 @@ class WindowBuffer:
         """Bytes of address space held."""
         return self._cells.nbytes + self._touched.nbytes
 
-    def place(
+    def window(
         self, lowest: NDArray[np.int64], highest: NDArray[np.int64], *, origin: NDArray[np.int64]
     ) -> Window:
         """Return a window in which no two voxels between two corners share a cell.
@@ -154,7 +154,7 @@ def block_codes(window, positions, lowest):
     Args:
         window: The window with the blocks.
         positions: (B,) int64 positions of the blocks in it.
-        lowest: (3,) int64 smallest keys for which the window was placed: they resolve the wrap-around.
+        lowest: (3,) int64 smallest keys of the window, which resolve the wrap-around.
     """
     codes = np.empty(len(positions), np.int64)
     for i in range(len(positions)):
