@@ -273,11 +273,9 @@ def _add(
         x = float32(r00 * bx + r01 * by + r02 * bz + t0)
         y = float32(r10 * bx + r11 * by + r12 * bz + t1)
         z = float32(r20 * bx + r21 * by + r22 * bz + t2)
-        key_x, key_y, key_z = (
-            key_of(x, inverse_resolution),
-            key_of(y, inverse_resolution),
-            key_of(z, inverse_resolution),
-        )
+        key_x = key_of(x, inverse_resolution)
+        key_y = key_of(y, inverse_resolution)
+        key_z = key_of(z, inverse_resolution)
         packed = key_x | (key_y << KEY_BITS) | (key_z << (2 * KEY_BITS))
         moved = packed != here
         if moved:

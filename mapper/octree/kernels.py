@@ -12,7 +12,7 @@ from numba import njit
 from numpy import float32, float64, int32, int64
 
 from mapper.core.voxel_index import FIBONACCI
-from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_COUNT, KEY_ZERO, centre_of, key_of
+from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_COUNT, KEY_ZERO, centre_of, have_keys, key_of
 from mapper.octree.window import FREE, OCCUPIED, UNTOUCHED, cell_of
 
 _CHUNK = 256  # points worked on at a time: their scratch arrays stay in the first-level cache
@@ -73,22 +73,13 @@ def end_voxels(points_body, T_world_body, resolution_m):
             x[j], y[j], z[j] = points_body[start + j, 0], points_body[start + j, 1], points_body[start + j, 2]
         for j in range(size):  # this loop vectorises: one array per axis, no branch
             bx, by, bz = float64(x[j]), float64(y[j]), float64(z[j])
-            kx = (
-                np.floor(inverse_resolution * float64(float32(r00 * bx + r01 * by + r02 * bz + t0)))
-                + KEY_ZERO
-            )
-            ky = (
-                np.floor(inverse_resolution * float64(float32(r10 * bx + r11 * by + r12 * bz + t1)))
-                + KEY_ZERO
-            )
-            kz = (
-                np.floor(inverse_resolution * float64(float32(r20 * bx + r21 * by + r22 * bz + t2)))
-                + KEY_ZERO
-            )
-            inside = (
-                (kx >= 0) & (kx < KEY_COUNT) & (ky >= 0) & (ky < KEY_COUNT) & (kz >= 0) & (kz < KEY_COUNT)
-            )
-            outside += int64(not inside)
+            wx = float64(float32(r00 * bx + r01 * by + r02 * bz + t0))
+            wy = float64(float32(r10 * bx + r11 * by + r12 * bz + t1))
+            wz = float64(float32(r20 * bx + r21 * by + r22 * bz + t2))
+            kx = np.floor(inverse_resolution * wx) + KEY_ZERO
+            ky = np.floor(inverse_resolution * wy) + KEY_ZERO
+            kz = np.floor(inverse_resolution * wz) + KEY_ZERO
+            outside += int64(not have_keys(kx, ky, kz))
             packed[j + 1] = int64(kx) | (int64(ky) << 16) | (int64(kz) << 32)
         distinct = 0
         for j in range(size):  # neighbouring pixels mostly share a voxel
@@ -167,11 +158,9 @@ def cast_rays(stops, hits, origin, resolution_m, window):
     inverse_resolution = 1.0 / resolution_m
     cells, touched = window.cells, window.touched
     x_bits, y_bits, z_bits = window.bits[0], window.bits[1], window.bits[2]
-    key_x, key_y, key_z = (
-        key_of(origin[0], inverse_resolution),
-        key_of(origin[1], inverse_resolution),
-        key_of(origin[2], inverse_resolution),
-    )
+    key_x = key_of(origin[0], inverse_resolution)
+    key_y = key_of(origin[1], inverse_resolution)
+    key_z = key_of(origin[2], inverse_resolution)
     first = cell_of(window, key_x, key_y, key_z)
     for i in range(len(stops)):
         last = _stop_cell(window, stops, i, inverse_resolution)
@@ -213,12 +202,10 @@ def cast_rays(stops, hits, origin, resolution_m, window):
 
 @njit(cache=True, nogil=True)
 def _stop_cell(window, stops, i, inverse_resolution):
-    return cell_of(
-        window,
-        key_of(stops[i, 0], inverse_resolution),
-        key_of(stops[i, 1], inverse_resolution),
-        key_of(stops[i, 2], inverse_resolution),
-    )
+    x = key_of(stops[i, 0], inverse_resolution)
+    y = key_of(stops[i, 1], inverse_resolution)
+    z = key_of(stops[i, 2], inverse_resolution)
+    return cell_of(window, x, y, z)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -35,6 +35,12 @@ def centre_of(key, resolution_m):
     return (float64(key - KEY_ZERO) + 0.5) * resolution_m
 
 
+@njit(cache=True, nogil=True, inline="always")
+def have_keys(x, y, z):
+    """Return whether three floored coordinates, as float64 keys, lie in the key range; NaN does not."""
+    return (x >= 0) & (x < KEY_COUNT) & (y >= 0) & (y < KEY_COUNT) & (z >= 0) & (z < KEY_COUNT)
+
+
 @njit(cache=True, nogil=True)
 def spread(key):
     """Return the 16 bits of a key spread to every third bit."""
@@ -82,6 +88,5 @@ def codes_of(points_world, resolution_m):
         x = np.floor(inverse_resolution * points_world[i, 0]) + KEY_ZERO
         y = np.floor(inverse_resolution * points_world[i, 1]) + KEY_ZERO
         z = np.floor(inverse_resolution * points_world[i, 2]) + KEY_ZERO
-        inside = (x >= 0) & (x < KEY_COUNT) & (y >= 0) & (y < KEY_COUNT) & (z >= 0) & (z < KEY_COUNT)
-        codes[i] = morton(int64(x), int64(y), int64(z)) if inside else int64(-1)
+        codes[i] = morton(int64(x), int64(y), int64(z)) if have_keys(x, y, z) else int64(-1)
     return codes

@@ -7,7 +7,16 @@ from numba import njit
 from numpy import float32, float64, int64
 
 from mapper.octree.blocks import slot_of
-from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_COUNT, KEY_ZERO, centre_of, gather, morton
+from mapper.octree.keys import (
+    BLOCK_BITS,
+    BLOCK_VOXELS,
+    KEY_COUNT,
+    KEY_ZERO,
+    centre_of,
+    gather,
+    have_keys,
+    morton,
+)
 
 HIT, STOPPED_UNKNOWN, STOPPED_RANGE = 1, 2, 3
 """Outcomes of a ray: it ended in an occupied voxel, in an unknown one, or at the range or map's border."""
@@ -36,17 +45,13 @@ def values_at(table, points_world, resolution_m):
     for start in range(0, n, _CHUNK):
         size = min(_CHUNK, n - start)
         for j in range(size):
-            x_m[j], y_m[j], z_m[j] = (
-                points_world[start + j, 0],
-                points_world[start + j, 1],
-                points_world[start + j, 2],
-            )
+            point = points_world[start + j]
+            x_m[j], y_m[j], z_m[j] = point[0], point[1], point[2]
         for j in range(size):  # this loop vectorises: one array per axis, no branch
             x = np.floor(inverse_resolution * x_m[j]) + KEY_ZERO
             y = np.floor(inverse_resolution * y_m[j]) + KEY_ZERO
             z = np.floor(inverse_resolution * z_m[j]) + KEY_ZERO
-            inside = (x >= 0) & (x < KEY_COUNT) & (y >= 0) & (y < KEY_COUNT) & (z >= 0) & (z < KEY_COUNT)
-            codes[j] = morton(int64(x), int64(y), int64(z)) if inside else _NOWHERE
+            codes[j] = morton(int64(x), int64(y), int64(z)) if have_keys(x, y, z) else _NOWHERE
         for j in range(size):
             found[start + j] = _value_at(table, codes[j])
     return found

@@ -51,25 +51,28 @@ def leaves_of_nodes(values, masks):
     codes, depths, found = np.empty(n, int64), np.empty(n, uint8), np.empty(n, float32)
     pending = np.zeros(KEY_BITS + 1, int64)  # per depth on the path: children still to come
     prefix = np.zeros(KEY_BITS + 2, int64)
-    depth, count = 0, 0
+    depth, count, verdict = 0, 0, WHOLE
     for i in range(n):
         if depth < 0:
-            return TreeLeaves(codes[:count], depths[:count], found[:count]), TRAILING
+            verdict = TRAILING
+            break
         if masks[i] == 0:
             codes[count] = prefix[depth] << (3 * (KEY_BITS - depth))
             depths[count], found[count] = depth, values[i]
             count += 1
             depth -= 1
         elif depth == KEY_BITS:
-            return TreeLeaves(codes[:count], depths[:count], found[:count]), TOO_DEEP
+            verdict = TOO_DEEP
+            break
         else:
             pending[depth] = masks[i]
         while depth >= 0 and pending[depth] == 0:
             depth -= 1
         if depth >= 0:
             depth = enter_next_child(pending, prefix, depth)
-    leaves = TreeLeaves(codes[:count], depths[:count], found[:count])
-    return leaves, WHOLE if depth < 0 else CUT_SHORT
+    if depth >= 0 and verdict == WHOLE:
+        verdict = CUT_SHORT
+    return TreeLeaves(codes[:count], depths[:count], found[:count]), verdict
 
 
 @njit(cache=True, nogil=True)
@@ -99,14 +102,11 @@ def leaves_of_words(words, node_count, free, occupied):
         free: Log-odds of free leaves.
         occupied: Log-odds of occupied leaves.
     """
-    codes, depths, values = (
-        np.empty(node_count, int64),
-        np.empty(node_count, uint8),
-        np.empty(node_count, float32),
-    )
+    codes, depths = np.empty(node_count, int64), np.empty(node_count, uint8)
+    values = np.empty(node_count, float32)
     pending = np.zeros(KEY_BITS + 1, int64)  # per depth on the path: the word, finished children zeroed
     prefix = np.zeros(KEY_BITS + 2, int64)
-    count, nodes, at = 0, 1, 1
+    count, nodes, at, verdict = 0, 1, 1, WHOLE
     pending[0] = words[0]
     depth = 0
     while depth >= 0:
@@ -121,23 +121,26 @@ def leaves_of_words(words, node_count, free, occupied):
         prefix[depth + 1] = (prefix[depth] << 3) | child
         nodes += 1
         if nodes > node_count:
-            return TreeLeaves(codes[:count], depths[:count], values[:count]), nodes, WHOLE
+            break
         if state == 3:
             depth += 1
             if depth == KEY_BITS:
-                return TreeLeaves(codes[:count], depths[:count], values[:count]), nodes, TOO_DEEP
-            if at == len(words):
-                return TreeLeaves(codes[:count], depths[:count], values[:count]), nodes, CUT_SHORT
-            if words[at] == 0:
-                return TreeLeaves(codes[:count], depths[:count], values[:count]), nodes, CHILDLESS
+                verdict = TOO_DEEP
+            elif at == len(words):
+                verdict = CUT_SHORT
+            elif words[at] == 0:
+                verdict = CHILDLESS
+            if verdict != WHOLE:
+                break
             pending[depth] = words[at]
             at += 1
         else:
             codes[count] = prefix[depth + 1] << (3 * (KEY_BITS - depth - 1))
             depths[count], values[count] = depth + 1, free if state == 1 else occupied
             count += 1
-    leaves = TreeLeaves(codes[:count], depths[:count], values[:count])
-    return leaves, nodes, WHOLE if at == len(words) else TRAILING
+    if depth < 0 and at < len(words):
+        verdict = TRAILING
+    return TreeLeaves(codes[:count], depths[:count], values[:count]), nodes, verdict
 
 
 @njit(cache=True, nogil=True)
