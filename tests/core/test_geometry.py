@@ -150,7 +150,7 @@ def test_fit_rigid_refuses_too_few_unequal_or_coinciding_points():
         g.fit_rigid(points, points, with_scale=True)
 
 
-def test_is_rigid_knows_a_motion_from_what_only_looks_like_one():
+def test_is_rigid_refuses_matrices_that_only_resemble_a_motion():
     T = g.exp(np.array([0.3, -0.2, 0.9]), np.array([1.0, 2.0, 3.0]))
     assert g.is_rigid(T)
     assert g.is_rigid(np.stack([T, np.eye(4)]))

@@ -38,7 +38,7 @@ DESK = Rectangle(2, 0.75, (0.3, -1.5), (2.9, 1.5))
 
 
 def pose(x, y, z, *, yaw_deg, down_deg, roll_deg=0.0):
-    """T_room_camera of a camera that looks along yaw (0 is +x) and down."""
+    """T_room_camera of a camera facing along yaw (0 is +x) and down."""
     yaw, down, roll = np.radians([yaw_deg, down_deg, roll_deg])
     R_room_level_camera = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     R = rotation_exp(np.array([0.0, 0.0, yaw])) @ R_room_level_camera
@@ -111,7 +111,7 @@ def test_a_room_is_levelled_from_any_world(seed, down_deg):
     assert abs(floor_height_m(level, T_world_room)) < 0.02
 
 
-def test_the_first_pose_stands_at_the_origin_and_looks_along_x():
+def test_the_first_pose_is_at_the_origin_and_faces_along_x():
     scans, trajectory, _ = log_of(ROOM, around())
     T_level_first = level_of(scans, trajectory).T_level_world @ trajectory.T_world_body[0]
     np.testing.assert_allclose(T_level_first[:3, 3], [0.0, 0.0, 1.4], atol=0.02)
@@ -121,7 +121,7 @@ def test_the_first_pose_stands_at_the_origin_and_looks_along_x():
     assert (T_level_first[:3, :3] @ AXES["rgbd"].up)[2] > 0.8
 
 
-def test_a_camera_that_looks_straight_down_takes_its_heading_from_its_own_up():
+def test_a_camera_facing_straight_down_takes_its_heading_from_its_own_up():
     poses = [
         pose(x, 0.0, 1.4, yaw_deg=0.0, down_deg=d) for x, d in zip((0, 0.5, 1.0), (90, 30, 30), strict=True)
     ]
@@ -161,7 +161,7 @@ def test_a_desk_with_things_below_it_is_no_floor():
     assert -0.1 < floor_height_m(level, T_world_room) < 0.05
 
 
-def test_a_dominant_wall_in_front_of_a_camera_that_looks_down_is_not_up():
+def test_a_dominant_wall_in_front_of_a_camera_facing_down_is_not_up():
     floor_strip = Rectangle(2, 0.0, (1.6, -3.0), (2.0, 3.0))
     poses = [pose(1.0, y, 1.4, yaw_deg=5 * y, down_deg=35.0) for y in np.linspace(-1.5, 1.5, 10)]
     scans, trajectory, T_world_room = log_of([WALLS[0], floor_strip], poses)
@@ -176,7 +176,7 @@ def test_two_walls_are_enough():
     assert tilt_deg(level, T_world_room) < 0.5
 
 
-def test_one_wall_tells_one_tilt_and_says_so():
+def test_one_wall_determines_one_tilt_and_the_detail_reports_it():
     poses = [pose(0.0, y, 1.4, yaw_deg=0.0, down_deg=15.0, roll_deg=6.0) for y in np.linspace(-1, 1, 10)]
     scans, trajectory, T_world_room = log_of(WALLS[:1], poses)
     level = level_of(scans, trajectory)
@@ -186,7 +186,7 @@ def test_one_wall_tells_one_tilt_and_says_so():
     assert "the tilt along them is the camera's" in level.detail
 
 
-def test_without_any_plane_the_camera_says_what_is_up():
+def test_without_any_plane_up_is_the_camera_s():
     rng = np.random.default_rng(0)
     trajectory = Trajectory(np.arange(4) * MS, np.array([pose(0, 0, 1, yaw_deg=0, down_deg=20)] * 4))
     cloud = Scan(0, rng.uniform(-2, 2, (4000, 3)).astype(np.float32))
@@ -216,7 +216,7 @@ SENSOR_AXES = [
 
 
 @pytest.mark.parametrize("R_body_sensor", SENSOR_AXES)
-def test_an_accelerometer_of_any_axes_tells_up(R_body_sensor):
+def test_an_accelerometer_of_any_axes_gives_up(R_body_sensor):
     poses = [
         pose(0, 0, 1.4, yaw_deg=y, down_deg=20 + 15 * np.sin(y / 15), roll_deg=10 * np.cos(y / 15))
         for y in range(0, 90, 3)
@@ -228,7 +228,7 @@ def test_an_accelerometer_of_any_axes_tells_up(R_body_sensor):
     assert tilt_deg(level, T_world_room) < 0.5
 
 
-def test_an_accelerometer_that_cannot_tell_its_axes_gives_way_to_planes():
+def test_an_accelerometer_with_ambiguous_axes_is_replaced_by_planes():
     still = [pose(0.02 * k, 0, 1.4, yaw_deg=0, down_deg=30) for k in range(8)]
     scans, trajectory, T_world_room = log_of(ROOM, still)
     accelerations = readings_of(trajectory, T_world_room, SENSOR_AXES[1], noise_mps2=0.5)
@@ -239,7 +239,7 @@ def test_an_accelerometer_that_cannot_tell_its_axes_gives_way_to_planes():
 
 
 @pytest.mark.parametrize(("shift_ns", "noise_mps2"), [(10**12, 0.1), (0, 30.0)])
-def test_useless_readings_give_way_to_planes_and_say_why(shift_ns, noise_mps2):
+def test_useless_readings_are_replaced_by_planes_with_the_reason(shift_ns, noise_mps2):
     scans, trajectory, T_world_room = log_of(ROOM, around())
     readings = readings_of(trajectory, T_world_room, np.eye(3), noise_mps2=noise_mps2)
     late = Accelerations(readings.stamps_ns + shift_ns, readings.acceleration_mps2)
@@ -248,7 +248,7 @@ def test_useless_readings_give_way_to_planes_and_say_why(shift_ns, noise_mps2):
     assert "accelerometer" in level.detail
 
 
-def test_a_body_with_other_axes_can_say_so():
+def test_a_body_may_have_other_axes():
     R_camera_lidar = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # x forward, z up
     T_camera_lidar = transform(R_camera_lidar, np.zeros(3))
     scans, trajectory, T_world_room = log_of(ROOM, around())
@@ -276,7 +276,7 @@ def test_a_log_without_poses_is_refused():
 
 
 @pytest.mark.skipif(not FR1_XYZ.is_dir(), reason=f"{FR1_XYZ} is not here")
-def test_a_real_desk_is_levelled_as_its_motion_capture_says():
+def test_a_real_desk_is_levelled_as_by_motion_capture():
     truth = read_tum(FR1_XYZ / "groundtruth.txt")
     camera = PinholeCamera(640, 480, 517.3, 516.5, 318.6, 255.3)
     rows = [line.split() for line in (FR1_XYZ / "depth.txt").read_text().splitlines() if line[0] != "#"]

@@ -38,7 +38,7 @@ def test_a_large_box_equals_scipy():
     np.testing.assert_array_equal(squares_to_centres(targets), expected)
 
 
-def test_no_target_is_told_apart_and_never_overflows():
+def test_no_target_has_its_own_value_and_never_overflows():
     assert (squares_to_centres(np.zeros((3, 4, 5), np.bool_)) == NONE).all()
     far = np.zeros((1, 12_000, 3), np.bool_)
     far[0, 0, 0] = True
@@ -100,7 +100,7 @@ def test_a_box_of_the_octree_lies_where_it_was_asked_for(octree):
     ]
 
 
-def test_the_known_box_holds_every_voxel_and_a_margin(octree):
+def test_the_known_box_contains_every_voxel_and_a_margin(octree):
     box, centres = known_box(octree), octree.leaves().centres_world
     assert (box.low_world_m < centres.min(axis=0) - 0.1).all()
     assert (box.high_world_m > centres.max(axis=0) + 0.1).all()

@@ -87,7 +87,7 @@ def test_a_new_plan_replaces_the_old_one_and_the_same_plan_gives_the_same_bytes(
     assert (run.path / "run.mcap").read_bytes() == first
 
 
-def test_the_json_says_all_there_is_to_know(run, plan, grid):
+def test_the_json_contains_the_whole_plan(run, plan, grid):
     write_plan(run, plan, grid=grid)
     record = json.loads((run.path / "plan.json").read_text())
     assert record["waypoints_world_m"] == [[-0.5, 1.0], [1.5, 2.0]]

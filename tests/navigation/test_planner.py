@@ -170,7 +170,7 @@ def test_the_nearest_free_point_really_is_free():
     assert plan_2d(grid, start, np.array([1.0, 2.0]), config=PlanConfig()).length_m > 2.5
 
 
-def test_a_robot_too_large_for_the_map_is_told_so():
+def test_a_robot_too_large_for_the_map_is_refused():
     with pytest.raises(PlanError, match="nowhere in the map is there room for a radius of 3 m"):
         plan_2d(
             room_with_a_wall(), np.array([-1.0, 2.0]), np.array([1.0, 2.0]), config=PlanConfig(radius_m=3.0)

@@ -55,7 +55,7 @@ def grid(octree, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def walk(source):
-    """Return two places of the walk in opposite rooms, x and y."""
+    """Return two positions of the walk in opposite rooms, x and y."""
     positions = source.truth.positions_world
     return positions[len(positions) // 6, :2], positions[len(positions) * 2 // 3, :2]
 

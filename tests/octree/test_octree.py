@@ -157,7 +157,7 @@ def test_leaves_agree_with_queries():
     assert octree.memory_bytes >= 4 * len(octree)
 
 
-def test_what_was_never_seen_is_unknown():
+def test_voxels_that_no_ray_crossed_are_unknown():
     octree = octree_of(random_scans(2))
     strange = np.array([[1e4, 0, 0], [-1e4, 0, 0], [np.nan, 0, 0], [0, np.inf, 0], [500.0, 500.0, 500.0]])
 

@@ -72,7 +72,7 @@ def test_what_no_ray_ended_in_has_no_attributes():
     assert (found.last_seen_ns[free] == NEVER_SEEN).all()
 
 
-def test_queries_agree_with_leaves_and_nothing_is_known_elsewhere():
+def test_queries_agree_with_leaves_and_find_nothing_elsewhere():
     octree = mapped()
     centres, found = octree.leaves().centres_world, octree.attributes.of_leaves()
 

@@ -115,7 +115,7 @@ def test_boxes_count_the_voxels_that_they_overlap(octree, points, edge_m):
     np.testing.assert_array_equal(counts.occupied + counts.free + counts.unknown, np.maximum(total, 1))
 
 
-def test_boxes_tell_obstacles_and_free_space():
+def test_boxes_count_obstacles_and_free_space():
     octree = OctreeMap(OctreeConfig())
     octree.insert_points(np.array([[1.025, 0.025, 0.025]], np.float32), np.array([0.025, 0.025, 0.025]))
     lower = np.array([[0.2, 0.01, 0.01], [0.2, 0.01, 0.01], [1.01, 0.01, 0.01], [0.2, -0.01, 0.01]])

@@ -1,4 +1,4 @@
-"""A map seen from another frame: what lies at each voxel's centre, and nothing forgotten."""
+"""Maps resampled into another frame: the value at each voxel's centre, and nothing lost."""
 
 import numpy as np
 import pytest
@@ -75,7 +75,7 @@ def test_attributes_come_along():
     assert here.colored.any()
 
 
-def test_a_map_is_not_placed_where_keys_end():
+def test_a_map_beyond_the_key_range_is_refused():
     T_map_world = np.eye(4)
     T_map_world[0, 3] = 3276.0
 

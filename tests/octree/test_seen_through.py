@@ -31,7 +31,7 @@ def test_while_no_run_is_long_enough_the_map_is_octomap_s():
         np.testing.assert_array_equal(plain.log_odds.view(np.int32), policy.log_odds.view(np.int32))
 
 
-def test_a_voxel_is_released_by_a_run_of_scans_that_saw_it_free():
+def test_a_voxel_is_released_by_a_run_of_scans_in_which_it_is_free():
     config = OctreeConfig(dynamic="seen-through", seen_through_scans=3)
     miss = np.log(0.4 / 0.6)
 

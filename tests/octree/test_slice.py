@@ -86,7 +86,7 @@ def test_the_band_is_measured_from_the_floor(height_m, inside):
     assert (grid.cells == OCCUPIED).sum() == 1 + inside
 
 
-def test_speckles_fall_back_to_what_else_their_columns_saw():
+def test_without_speckles_their_columns_other_voxels_count():
     octree = scanned(wall((1.025, -0.5), (1.025, 0.5)))
     scanned([[0.525, 0.025, 0.725]], (0.525, 0.025, 1.0), octree=octree)  # a speck over free space
     scanned([[1.525, 1.525, 0.325]], (1.525, 1.525, 0.325), octree=octree)  # one in the unknown

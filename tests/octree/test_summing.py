@@ -32,7 +32,7 @@ def test_five_maps_add_up_as_in_octomap_to_the_last_bit():
     assert min(theirs.values()) < lowest  # so there was something to clamp
 
 
-def test_the_overlap_counts_what_both_know():
+def test_the_overlap_counts_voxels_known_in_both_maps():
     first, second = mapped(1), mapped(2)
     a, b = as_dict(first), as_dict(second)
 

@@ -1,4 +1,4 @@
-"""Scans placed in a map of Gaussians: small_gicp's voxelised GICP finds the same; the map forgets."""
+"""Scans placed in a map of Gaussians: small_gicp's voxelised GICP finds the same; old cells are dropped."""
 
 import numpy as np
 import pytest
@@ -62,7 +62,7 @@ def test_a_map_is_the_same_whether_its_tables_had_to_grow_or_not(monkeypatch):
     assert answers[0] == answers[1]
 
 
-def test_cells_that_nothing_touched_for_long_are_forgotten():
+def test_cells_that_no_cloud_touched_for_long_are_dropped():
     rng = np.random.default_rng(5)
     here = prepared(room(rng, n=4000), voxel_m=VOXEL_M)
     there = exp(np.zeros(3), np.array([100.0, 0.0, 0.0]))

@@ -1,4 +1,4 @@
-"""Maps judged against worlds that are known exactly, still ones and such in which boxes move."""
+"""Map quality against exact worlds, static ones and ones with moving boxes."""
 
 import json
 
@@ -53,8 +53,8 @@ def updates_of(source):
     return [pack(caster.cast(entry.scan(), poses[i])) for i, entry in enumerate(source.log().entries())]
 
 
-def merged(updates, **knobs):
-    octree = OctreeMap(OctreeConfig(**knobs))
+def merged(updates, **settings):
+    octree = OctreeMap(OctreeConfig(**settings))
     for update in updates:
         octree.merge(update)
     return octree
@@ -130,7 +130,7 @@ def test_the_policy_leaves_fewer_ghosts_and_spares_the_walls(busy):
     assert after["occupied precision"] > before["occupied precision"]
 
 
-def test_the_scene_file_says_where_the_boxes_were(tmp_path):
+def test_the_scene_file_has_the_poses_of_the_boxes(tmp_path):
     config = BUSY.model_copy(update={"duration_s": 0.2, "moving_boxes": 2})
     write_tum_log(tmp_path / "busy", config)
     write_tum_log(tmp_path / "still", config.model_copy(update={"moving_boxes": 0}))
