@@ -10,6 +10,7 @@ from typing import Any, TypeVar, get_args
 from pydantic import ValidationError
 
 from mapper.config.build import BuildConfig
+from mapper.config.refusals import refusal
 from mapper.config.sensors import DEFAULTS
 from mapper.core.config import Config
 from mapper.core.errors import ConfigError, MapperWarning
@@ -192,6 +193,4 @@ def _checked(model: type[AnyConfig], tree: dict[str, Any], where: str) -> AnyCon
     try:
         return model.model_validate(tree)
     except ValidationError as error:
-        first = error.errors()[0]
-        name = ".".join(str(part) for part in first["loc"]) or "configuration"
-        raise ConfigError(f"{where}: {name}: {first['msg']}") from None
+        raise ConfigError(f"{where}: {refusal(model, error.errors()[0])}") from None

@@ -116,7 +116,10 @@ def test_spelled_out_overrides_win(desk_log, tmp_path):
     [
         (["build", "nowhere", "--out", "run"], "mapper: nowhere: no such file or folder"),
         (["build", "LOG", "--out", "RUN"], "pass --overwrite to replace it"),
-        (["build", "LOG", "--out", "run", "--set", "a.b=1"], "mapper: overrides: a: Extra inputs"),
+        (
+            ["build", "LOG", "--out", "run", "--set", "a.b=1"],
+            "mapper: overrides: a: unknown; known are source",
+        ),
         (["build", "LOG", "--out", "run", "--last", "4", "--quiet"], "mapper: only 5 of 5 frames read"),
         (["build", "LOG", "--out", "run", "--config", "no.toml"], "mapper: no.toml: cannot be read"),
         (["fuse", "nowhere"], "mapper: nowhere: no such run folder"),
@@ -128,7 +131,10 @@ def test_spelled_out_overrides_win(desk_log, tmp_path):
             "mapper: no exporter 'jpeg'; want one of octomap, native, ply, voxels",
         ),
         (["export", "RUN", "--as", "ply", "--out", "a.obj"], "mapper: a.obj: ply files end with .ply"),
-        (["export", "RUN", "--as", "tum", "--set", "a.b=1"], "mapper: overrides: a: Extra inputs"),
+        (
+            ["export", "RUN", "--as", "tum", "--set", "a.b=1"],
+            "mapper: overrides: a: unknown; known are source",
+        ),
         (["eval", "nowhere"], "mapper: nowhere: no such run folder"),
         (["eval", "RUN", "--map", "nowhere"], "mapper: nowhere: no such reference for a map"),
         (["eval", "RUN", "--tolerance", "2"], "mapper: --map-world, --register and --tolerance tell how"),

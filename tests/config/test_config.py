@@ -53,10 +53,20 @@ def test_one_knob_keeps_the_kind_of_the_file_and_its_default_detector(toml):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("octree.resolution=0.1", "overrides: octree.resolution: Extra inputs are not permitted"),
+        ("octree.resolution=0.1", "overrides: octree.resolution: unknown; did you mean resolution_m?"),
         ("octree.resolution_m=-1", "overrides: octree.resolution_m: Input should be greater than 0"),
-        ("odometry.previous_frames=2", "odometry.local-map.previous_frames: Extra inputs are not permitted"),
-        ("odometry.kind=zip", "overrides: odometry: Input tag 'zip' found using 'kind' does not match any"),
+        (
+            "odometry.previous_frames=2",
+            "odometry.local-map.previous_frames: unknown; odometry.kind=isvd has it",
+        ),
+        ("odometry.max_deph_m=2", "odometry.local-map.max_deph_m: unknown; did you mean max_depth_m?"),
+        ("resolution_m=0.1", "overrides: resolution_m: unknown; did you mean octree.resolution_m?"),
+        ("odometry.detector.x=1", "detector.uniform-orb.x: unknown; known are kind, max_features, threshold"),
+        (
+            "odometry.kind=zip",
+            "odometry: Input tag 'zip' found using 'kind' does not match any of the expected tags: 'isvd',"
+            " 'local-map', 'pnp', 'wheels'",
+        ),
         ("workers=many", "overrides: workers: Input should be a valid integer"),
         ("workers", "override 'workers': want key.path=value"),
         ("workers.x.y=1", "overrides: workers: Input should be a valid integer"),
@@ -73,7 +83,9 @@ def test_a_mistake_is_named_in_one_line(override, message):
 def test_a_mistake_in_a_file_names_the_file(toml):
     path = toml("[slice]\nmax_height = 2\n")
 
-    with pytest.raises(ConfigError, match=r"lab\.toml: slice\.max_height: Extra inputs are not permitted"):
+    with pytest.raises(
+        ConfigError, match=r"lab\.toml: slice\.max_height: unknown; did you mean max_height_m\?"
+    ):
         load_config(path, ["workers=1"])
 
 

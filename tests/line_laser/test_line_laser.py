@@ -183,7 +183,7 @@ def test_a_calibration_file_gives_back_what_was_written(tmp_path):
         ("exponent = -1.013", "exponent = 1.013", "range.exponent: Input should be less than 0"),
         ("slope = 0.0447\n", "", "lateral.slope: Field required"),
         ("offset = -1.4267", "offset = -9.0", r"-5.15 px/cm at reach_m = 1.9, want > 0"),
-        ("width_px", "widht_px", "widht_px: Extra inputs|width_px: Field required"),
+        ("width_px", "widht_px", "widht_px: unknown; did you mean width_px|width_px: Field required"),
     ],
 )
 def test_a_calibration_file_is_checked(tmp_path, before, after, why):

@@ -203,7 +203,7 @@ def test_the_same_drive_gives_the_same_map(driven):
             "encoders.txt: the wheelbase is unknown; calibrate with --wheelbase, or",
         ),
         (("nowhere",), "nowhere: no such folder"),
-        (("images", "--set", "stripe.edge=1"), "stripe.edge: Extra inputs are not permitted"),
+        (("images", "--set", "stripe.edge=1"), "stripe.edge: unknown; "),
         (
             ("images", "--labels", "shots.csv"),
             "shots.csv: of board.jpg and others, but images are 1000.000000.jpg",

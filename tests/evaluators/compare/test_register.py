@@ -193,7 +193,7 @@ def test_it_can_be_watched_in_rerun(clouds, tmp_path):
         ),
         (
             ("{log}@1", "{log}@0", "--method", "icp", "--set", "registration.nonsense=1"),
-            "Extra inputs are not permitted",
+            "registration.icp.nonsense: unknown; known are ",
         ),
     ],
 )
