@@ -1,14 +1,55 @@
 """Base class of all settings, and the types of their fields."""
 
-from typing import Annotated
+import json
+import re
+from typing import Annotated, Any, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 Ratio = Annotated[float, Field(ge=0.0, le=1.0)]
 """A ratio from 0 to 1."""
+
+_BRACKETS = re.compile(r"[\[\](){}]")
+_SQUARE = str.maketrans("()", "[]")
 
 
 class Config(BaseModel):
     """Base of all settings: frozen, and unknown names are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, ser_json_inf_nan="constants")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _split_lists(cls, given: Any) -> Any:
+        """Split text where the setting is a list: "1,2", "[1, 2]" and "(1, 2)" mean the same.
+
+        The elements of an override stay text, which the model parses.
+        """
+        if not isinstance(given, dict):
+            return given
+        return {
+            name: _elements(value) if isinstance(value, str) and cls._is_list(name) else value
+            for name, value in given.items()
+        }
+
+    @classmethod
+    def _is_list(cls, name: str) -> bool:
+        """Return whether a setting is a list whose text nothing else parses."""
+        field = cls.model_fields.get(name)
+        if field is None or any(isinstance(step, BeforeValidator) for step in field.metadata):
+            return False
+        kinds = (field.annotation, *get_args(field.annotation))
+        return any(get_origin(kind) in (tuple, list) for kind in kinds)
+
+
+def _elements(text: str) -> Any:
+    """Return the elements of a list as text, of a list of lists as JSON has them; else the text as it is."""
+    text = text.strip()
+    inner = text[1:-1] if text[:1] + text[-1:] in ("[]", "()") else text
+    if not _BRACKETS.search(inner):
+        elements = [element.strip(" \t\"'") for element in inner.split(",")]
+        return elements if elements[-1] else elements[:-1]
+    try:
+        return json.loads(text.translate(_SQUARE))
+    except ValueError:
+        return text

@@ -1,9 +1,11 @@
 import json
+import re
 
 import pytest
 
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_config, load_run_config, overridden
+from mapper.core.config import Config
 from mapper.core.errors import ConfigError, MapperWarning
 from mapper.features.config import SurfConfig
 from mapper.octree.config import OctreeConfig
@@ -146,6 +148,60 @@ def test_any_configuration_can_be_overridden():
 
     assert config.sensor.axial_noise_ratio == 0.0
     assert config.seed == 5
+
+
+CAMERA = [f"source.camera.{name}=1" for name in ("fx_px", "fy_px", "cx_px", "cy_px")]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["0.1,0.2,0,0,0", "0.1, 0.2, 0, 0, 0,", "[0.1,0.2,0,0,0]", "(0.1, 0.2, 0, 0, 0)", "[0.1, 2e-1, 0, 0, 0]"],
+)
+def test_every_spelling_of_a_list_is_understood(text):
+    config = load_config(overrides=[*CAMERA, f"source.camera.distortion={text}"])
+    assert config.source.camera.distortion == (0.1, 0.2, 0.0, 0.0, 0.0)
+
+
+def test_lists_in_any_part_are_understood():
+    overrides = ["odometry.kind=icp", "odometry.pair_distances_m=[1.5, 0.5]"]
+    assert load_config(overrides=overrides, sensor="lidar").odometry.pair_distances_m == (1.5, 0.5)
+    mounted = load_config(overrides=["source.wheels.body_in_base=(0, 0, 1, 0, 0, 0, 1)"]).source.wheels
+    assert mounted.body_in_base == (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+
+class Lists(Config):
+    names: tuple[str, ...] | None = None
+    pairs: tuple[tuple[float, float], ...] = ()
+    parts: tuple[OctreeConfig, ...] = ()
+    text: str = ""
+
+
+@pytest.mark.parametrize(
+    ("override", "want"),
+    [
+        ("names=icp, 'gicp'", Lists(names=("icp", "gicp"))),
+        ("names=[]", Lists(names=())),
+        ("pairs=((1, 2), (3, 4))", Lists(pairs=((1.0, 2.0), (3.0, 4.0)))),
+        ('parts=[{"resolution_m": 0.1}]', Lists(parts=(OctreeConfig(resolution_m=0.1),))),
+        ("text=1,2", Lists(text="1,2")),
+    ],
+)
+def test_lists_of_text_lists_and_parts_are_understood(override, want):
+    assert overridden(Lists(), [override]) == want
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("0.1,0.2", "source.camera.distortion: 2 values are too few"),
+        ("0,0,0,0,0,0", "source.camera.distortion: Tuple should have at most 5 items"),
+        ("0,a,0,0,0", "source.camera.distortion.1: Input should be a valid number"),
+        ("[0,0,0,0,0", "source.camera.distortion: want a list, as in 1,2,3"),
+    ],
+)
+def test_a_list_that_is_none_is_refused_with_the_reason(text, why):
+    with pytest.raises(ConfigError, match=re.escape(why)):
+        load_config(overrides=[*CAMERA, f"source.camera.distortion={text}"])
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.rglob("*.toml")), ids=lambda p: p.stem)
