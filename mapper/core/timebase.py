@@ -1,5 +1,7 @@
 """Time as int nanoseconds: exact text conversion and nearest-stamp association."""
 
+import re
+from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
 
 import numpy as np
@@ -9,6 +11,7 @@ from mapper.core.errors import DataError
 
 NS_PER_S = 1_000_000_000
 _LARGEST_S = (2**63 - 1) // NS_PER_S
+_DATE = re.compile(r"(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(?:\.(\d{1,9}))?Z?")
 
 MAX_TRUTH_GAP_NS = 20_000_000
 """Limit between the stamps of a frame and of its true pose: that of TUM's tools."""
@@ -32,6 +35,24 @@ def ns_from_seconds_text(text: str) -> int:
     if not -_LARGEST_S <= seconds <= _LARGEST_S:
         raise DataError(f"stamp {text!r} lies more than 292 years from zero, which 64 bits cannot hold")
     return int(seconds * NS_PER_S)
+
+
+def ns_from_date_text(text: str) -> int:
+    """Parse a date and time of day, UTC, exactly: "1970-01-01 00:00:01.000000002" becomes 1000000002.
+
+    Raises:
+        DataError: The text is no such date, or has more than nine decimals.
+    """
+    found = _DATE.fullmatch(text)
+    try:
+        if found is None:
+            raise ValueError("want YYYY-MM-DD hh:mm:ss with at most nine decimals")
+        moment = datetime.fromisoformat(f"{found[1]}T{found[2]}").replace(tzinfo=UTC)
+    except ValueError as error:
+        raise DataError(f"stamp {text!r} is no date and time: {error}") from None
+    since_epoch = moment - datetime.fromtimestamp(0, tz=UTC)
+    whole_s = since_epoch.days * 86400 + since_epoch.seconds
+    return whole_s * NS_PER_S + int((found[3] or "0").ljust(9, "0"))
 
 
 def seconds_text_from_ns(stamp_ns: int) -> str:

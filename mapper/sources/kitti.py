@@ -1,8 +1,9 @@
-"""KITTI odometry: velodyne/*.bin with calib.txt, poses.txt and times.txt (Geiger et al. 2012).
+"""KITTI: velodyne/*.bin with calib.txt, poses.txt and times.txt (Geiger et al. 2012).
 
 The benchmark keeps ``sequences/00/velodyne`` and ``poses/00.txt``; SemanticKITTI and converters of other
 logs put ``poses.txt`` beside ``velodyne``. Where ``calib.txt`` has the pose of the LiDAR in the camera, poses
-are the camera's; else they are the LiDAR's own.
+are the camera's; else they are the LiDAR's own. Raw recordings (Geiger et al. 2013) keep scans in
+``velodyne_points/data`` and their times in ``velodyne_points/timestamps.txt``, without poses.
 """
 
 from pathlib import Path
@@ -16,13 +17,15 @@ from mapper.sources.config import SourceConfig
 from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, has_clouds, scan_log
 from mapper.sources.text import parse_numbers, rows
 
-LOOKED_FOR = "velodyne/000000.bin or sequences/00/velodyne/000000.bin (KITTI)"
+LOOKED_FOR = (
+    "velodyne/000000.bin, sequences/00/velodyne/000000.bin or velodyne_points/data/0000000000.bin (KITTI)"
+)
 
 _ROUGHLY_RIGID = 1e-3  # calib.txt has 12 digits; anything further off is no rotation
 
 
 def recognise(path: Path) -> bool:
-    """Tell whether a path is a sequence with ``velodyne`` in it, or holds such sequences."""
+    """Tell whether a path is a sequence with one of the folders of scans in it, or holds such sequences."""
     return bool(_sequences(path))
 
 
@@ -38,7 +41,8 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         names = ", ".join(str(folder.relative_to(path)) for folder in sequences)
         raise SourceError(f"{path}: holds {len(sequences)} sequences; open one of {names}")
     sequence = sequences[0]
-    files, notes = clouds_in(sequence / "velodyne", config.pattern)
+    scans = _scans(sequence)
+    files, notes = clouds_in(scans, config.pattern)
     if not files:
         raise SourceError(f"{sequence}: no scan matches source.pattern={config.pattern}")
     at = sequence.resolve()
@@ -46,7 +50,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         sequence,
         files,
         kind="kitti",
-        stamps_file=first_of([sequence], STAMP_FILES),
+        stamps_file=first_of([sequence, scans.parent], STAMP_FILES),
         truth_file=first_of([sequence, at.parent.parent / "poses"], ["poses.txt", f"{at.name}.txt"]),
         config=config,
         T_posed_lidar=_read_calibration(sequence / "calib.txt"),
@@ -55,10 +59,16 @@ def read_log(path: Path, config: SourceConfig) -> Log:
 
 
 def _sequences(path: Path) -> list[Path]:
-    if has_clouds(path / "velodyne"):
+    if has_clouds(_scans(path)):
         return [path]
     folders = [*path.glob("sequences/*"), *path.glob("*")]
-    return sorted(folder for folder in folders if has_clouds(folder / "velodyne"))
+    return sorted(folder for folder in folders if has_clouds(_scans(folder)))
+
+
+def _scans(sequence: Path) -> Path:
+    """Return the folder of a sequence's scans, which need not exist."""
+    raw = sequence / "velodyne_points" / "data"
+    return raw if has_clouds(raw) else sequence / "velodyne"
 
 
 def _read_calibration(path: Path) -> Transform | None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import SourceError
 from mapper.core.timebase import NS_PER_S, Stamps, ns_from_seconds_text
 from mapper.sources.numbered import stamp_at
-from mapper.sources.text import parse_stamp, table
+from mapper.sources.text import parse_date, parse_stamp, rows
 
 RATE_HZ = 10.0
 
@@ -95,8 +95,14 @@ def line_of_each(files: Sequence[Path], total: int) -> NDArray[np.int64] | None:
 
 def _listed(path: Path, files: Sequence[Path], wording: Wording) -> Stamps:
     stamps_ns = []
-    for where, words in table(path, "a stamp"):
-        stamps_ns.append(_epoch_ns(words[0]) or parse_stamp(words[0], where=where))
+    for number, words in rows(path):
+        where = f"{path}:{number}"
+        if len(words) == 2 and "-" in words[0][1:]:  # KITTI's raw recordings: date and time of day
+            stamps_ns.append(parse_date(" ".join(words), where=where))
+        elif len(words) == 1:
+            stamps_ns.append(_epoch_ns(words[0]) or parse_stamp(words[0], where=where))
+        else:
+            raise SourceError(f"{where}: {len(words)} columns, want 1: a stamp")
     lines = line_of_each(files, len(stamps_ns))
     if lines is None or lines.max() >= len(stamps_ns):
         raise SourceError(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError, SourceError
 from mapper.core.geometry import Array, Transform, is_rigid, transform
 from mapper.core.rotations import rotation_from_quaternion
-from mapper.core.timebase import Stamps, ns_from_seconds_text
+from mapper.core.timebase import Stamps, ns_from_date_text, ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
 
 
@@ -59,6 +59,18 @@ def parse_stamp(text: str, *, where: str) -> int:
     """
     try:
         return ns_from_seconds_text(text)
+    except DataError as error:
+        raise SourceError(f"{where}: {error}") from None
+
+
+def parse_date(text: str, *, where: str) -> int:
+    """Return a date and time of day, UTC, as nanoseconds since 1970.
+
+    Raises:
+        SourceError: The text is no such date; the message starts with ``where``.
+    """
+    try:
+        return ns_from_date_text(text)
     except DataError as error:
         raise SourceError(f"{where}: {error}") from None
 

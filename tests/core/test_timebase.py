@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapper.core.errors import DataError
-from mapper.core.timebase import nearest, ns_from_seconds_text, seconds_text_from_ns
+from mapper.core.timebase import nearest, ns_from_date_text, ns_from_seconds_text, seconds_text_from_ns
 
 STAMPS = st.integers(-(10**18), 9 * 10**18)
 
@@ -26,6 +26,35 @@ def test_any_stamp_survives_the_way_through_text(stamp_ns):
 )
 def test_text_is_parsed_without_a_float(text, stamp_ns):
     assert ns_from_seconds_text(text) == stamp_ns
+
+
+@pytest.mark.parametrize(
+    ("text", "stamp_ns"),
+    [
+        ("2011-09-26 13:02:25.594360375", 1317042145594360375),
+        ("2011-09-26T13:02:25Z", 1317042145000000000),
+        ("1970-01-01 00:00:00.5", 500_000_000),
+        ("1969-12-31 23:59:59.999999999", -1),
+        ("2012-02-29 00:00:00", 1330473600000000000),
+    ],
+)
+def test_dates_are_parsed_to_the_nanosecond(text, stamp_ns):
+    assert ns_from_date_text(text) == stamp_ns
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "2011-09-26",
+        "2011-02-30 00:00:00",
+        "2011-09-26 25:00:00",
+        "26.9.2011 13:02:25",
+        "2011-09-26 13:02:25.0000000001",
+    ],
+)
+def test_what_is_no_date_is_refused(text):
+    with pytest.raises(DataError, match="is no date and time"):
+        ns_from_date_text(text)
 
 
 @pytest.mark.parametrize(

@@ -75,6 +75,33 @@ def test_the_layout_of_the_benchmark(tmp_path, opened):
     np.testing.assert_allclose(source.truth.T_world_body, T_WORLD_LIDAR, atol=1e-12)
 
 
+def raw_drive(folder, numbers=range(N), lines=N):
+    """A drive as KITTI's raw recordings keep it."""
+    (scans(folder, numbers) / "velodyne").rename(folder / "data")
+    (folder / "velodyne_points").mkdir()
+    (folder / "data").rename(folder / "velodyne_points/data")
+    text = "".join(f"2011-09-26 13:02:{25 + i}.594360375\n" for i in range(lines))
+    (folder / "velodyne_points/timestamps.txt").write_text(text)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("opened", "kind"), [("", "kitti"), ("drive", "kitti"), ("drive/velodyne_points", "clouds")]
+)
+def test_a_raw_recording_has_the_times_of_its_list(tmp_path, opened, kind):
+    raw_drive(tmp_path / "drive", numbers=[0, 1, 3], lines=4)  # drives lack scans, but not their lines
+    source = open_source(tmp_path / opened)
+    assert (source.kind, source.notes) == (kind, [])
+    first_ns = 1317042145594360375
+    assert stamps_of(source) == [first_ns, first_ns + NS_PER_S, first_ns + 3 * NS_PER_S]
+
+
+def test_a_date_that_is_none_is_named_with_its_line(tmp_path):
+    (raw_drive(tmp_path) / "velodyne_points/timestamps.txt").write_text("2011-13-26 13:02:25.5\n" * N)
+    with pytest.raises(SourceError, match=r"timestamps\.txt:1: stamp '2011-13-26 13:02:25\.5' is no date"):
+        open_source(tmp_path)
+
+
 def test_several_sequences_are_named(tmp_path):
     scans(tmp_path / "sequences/00")
     scans(tmp_path / "sequences/11")
