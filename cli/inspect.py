@@ -20,6 +20,8 @@ def inspect(
 ) -> None:
     """Tell what is in a log: topics, rates, gaps, calibration, truth, and what mapper build would do with it.
 
+    Exit status 1 means that nothing can be mapped.
+
     Example: mapper inspect drive.mcap
     """
     import dataclasses
@@ -31,7 +33,7 @@ def inspect(
     prepare_libraries()
     overrides = set_ or []
     found = inspect_log(log, load_source_config(None, overrides))
-    if found.log is None:
+    if found.log is None or found.problem is not None:
         plan = f"nothing: {found.problem}"
     else:
         config = load_config(None, overrides, sensor=found.log.sensor)
@@ -44,6 +46,8 @@ def inspect(
         print(json.dumps(facts, ensure_ascii=False, indent=1))
     else:
         print("\n".join(_lines(found, plan)))
+    if found.problem is not None:
+        raise typer.Exit(1)
 
 
 def _lines(found: "Inspection", plan: str) -> Iterator[str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.errors import FrameError, SourceError
-from mapper.core.frames import Scan, Sensor
+from mapper.core.frames import Frame, PinholeCamera, RgbdFrame, Scan, Sensor
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.sources import open_source
@@ -63,7 +63,7 @@ class LogFacts:
         kind: Which format it is in.
         sensor: "rgbd" or "lidar".
         frames: How its frames follow each other.
-        content: The first frame that can be read, in words.
+        content: The first frame that can be read, in words, or that none can.
         calibration: The camera, in words; None of a LiDAR.
         truth: What truth there is, in words; None without.
         wheels: How the readings of its wheels follow each other; None without.
@@ -92,8 +92,8 @@ class Inspection:
     Attributes:
         path: What was opened.
         topics: Every topic, of a recording.
-        log: What can be mapped; None if nothing can.
-        problem: Why nothing can; None if something can.
+        log: Its frames; None if it has none.
+        problem: Why nothing can be mapped; None if something can.
     """
 
     path: Path
@@ -109,13 +109,14 @@ def inspect_log(path: Path, config: SourceConfig) -> Inspection:
         SourceError: It is no log of a known format, or is damaged beyond reading.
     """
     if not (path.exists() and recordings.recognise(path)):
-        return Inspection(path, [], _facts(open_source(path, config)), None)
+        return _inspected(path, [], open_source(path, config))
     reader = RecordingReader(recordings.open_recording(path))
     topics = [_topic(series) for series in reader.series.values()]
     try:
-        return Inspection(path, topics, _facts(selected(recording_log(reader, config), config)), None)
+        log = selected(recording_log(reader, config), config)
     except SourceError as error:
         return Inspection(path, topics, None, str(error))
+    return _inspected(path, topics, log)
 
 
 def timing_of(stamps_ns: Stamps) -> Timing:
@@ -138,50 +139,50 @@ def _topic(series: Series) -> TopicFacts:
     return TopicFacts(topic.name, topic.type, topic.encoding, timing_of(series.stamps_ns))
 
 
-def _facts(source: Log) -> LogFacts:
-    content, calibration = _first_frame(source)
-    return LogFacts(
+def _inspected(path: Path, topics: Sequence[TopicFacts], source: Log) -> Inspection:
+    first, problem = _first_frame(source)
+    log = LogFacts(
         name=source.name,
         kind=source.kind,
         sensor=source.sensor,
         frames=timing_of(source.stamps_ns),
-        content=content,
-        calibration=calibration,
+        content=problem if first is None else _content_text(first),
+        calibration=_calibration_text(first.camera) if isinstance(first, RgbdFrame) else None,
         truth=None if source.truth is None else _truth_text(source.truth, source.stamps_ns),
         wheels=None if source.wheels is None else timing_of(source.wheels.stamps_ns),
         wheels_path_m=0.0 if source.wheels is None else source.wheels.path_length_m,
         readings=0 if source.accelerations is None else len(source.accelerations.stamps_ns),
         notes=list(source.notes),
     )
+    return Inspection(path, topics, log, problem or None)
 
 
-def _first_frame(source: Log) -> tuple[str, str | None]:
-    """Return the first readable frame and its camera's calibration, in words."""
+def _first_frame(source: Log) -> tuple[Frame | None, str]:
+    """Return the first frame that can be read, else None and the reason."""
     reason = "there is none"
     for entry in source.entries():
         try:
-            frame = entry.load()
+            return entry.load(), ""
         except FrameError as error:
             reason = str(error)
-            continue
-        if isinstance(frame, Scan):
-            far_m = float(np.linalg.norm(frame.points_body, axis=1).max(initial=0.0))
-            timed = "with" if frame.times_s is not None else "without"
-            return (
-                f"scans, the first of {len(frame.points_body)} points to {far_m:.0f} m, {timed} times",
-                None,
-            )
-        camera = frame.camera
-        measured = float((frame.depth_m > 0.0).mean())
-        colour = "colour" if frame.image.ndim == 3 else "grey"
-        size = f"{camera.width_px}×{camera.height_px} px"
-        numbers = ", ".join(f"{v:g}" for v in (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px))
-        distortion = ", ".join(f"{k:g}" for k in camera.distortion) if any(camera.distortion) else "none"
-        return (
-            f"{colour} and depth of {size}, the first {measured:.0%} measured",
-            f"fx fy cx cy {numbers} px, distortion {distortion}",
-        )
-    return f"no frame can be read: {reason}", None
+    return None, f"no frame can be read: {reason}"
+
+
+def _content_text(frame: Frame) -> str:
+    if isinstance(frame, Scan):
+        far_m = float(np.linalg.norm(frame.points_body, axis=1).max(initial=0.0))
+        timed = "with" if frame.times_s is not None else "without"
+        return f"scans, the first of {len(frame.points_body)} points to {far_m:.0f} m, {timed} times"
+    measured = float((frame.depth_m > 0.0).mean())
+    colour = "colour" if frame.image.ndim == 3 else "grey"
+    size = f"{frame.camera.width_px}×{frame.camera.height_px} px"
+    return f"{colour} and depth of {size}, the first {measured:.0%} measured"
+
+
+def _calibration_text(camera: PinholeCamera) -> str:
+    numbers = ", ".join(f"{v:g}" for v in (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px))
+    distortion = ", ".join(f"{k:g}" for k in camera.distortion) if any(camera.distortion) else "none"
+    return f"fx fy cx cy {numbers} px, distortion {distortion}"
 
 
 def _truth_text(truth: Trajectory, stamps_ns: Stamps) -> str:

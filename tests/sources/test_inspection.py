@@ -7,15 +7,17 @@ from mapper.core.errors import SourceError
 from mapper.export.mcap_log import McapLog
 from mapper.sources.config import SourceConfig
 from mapper.sources.inspection import inspect_log, timing_of
-from tests.support.command_line import mapper
+from tests.support.command_line import invoke
 from tests.support.recordings import CAMERA, COLOR, DEPTH, shots, write
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS
 
 MS = 1_000_000
 
 
-def printed(*arguments):
-    return mapper("inspect", *arguments).stdout
+def printed(*arguments, status=0):
+    result = invoke("inspect", *arguments)
+    assert result.exit_code == status, result.output
+    return result.stdout
 
 
 def test_timing_tells_rates_and_gaps():
@@ -87,6 +89,23 @@ def test_the_verb_prints_a_table_and_json(tmp_path):
     assert "choose others" not in printed(
         log, "--set", f"source.topics.color={COLOR}", "--set", f"source.topics.depth={DEPTH}"
     )
+
+
+def test_the_exit_status_is_1_where_nothing_can_be_mapped(tmp_path, tiny_tum_log):
+    only_colour = [message for message in shots(3) if message.topic == COLOR]
+    log = write(tmp_path / "log.mcap", only_colour)
+    text = printed(log, status=1)
+    assert "mapper build  nothing: " in text
+    assert COLOR in text
+    assert json.loads(printed(log, "--json", status=1))["build"].startswith("nothing: ")
+
+    damaged = tiny_tum_log(3)
+    for path in (damaged / "depth").iterdir():
+        path.write_bytes(b"")
+    text = printed(damaged, status=1)
+    assert "frames        3: " in text
+    assert "mapper build  nothing: no frame can be read: " in text
+    assert "empty file" in text
 
 
 def test_what_is_no_log_is_refused(tmp_path):
