@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mapper.core.errors import SourceError
-from mapper.sources import clouds, kitti, mbag, numbered, poznan, tum
+from mapper.sources import clouds, icl_nuim, kitti, mbag, numbered, poznan, tum
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.ros import files as recordings
@@ -13,9 +13,9 @@ from mapper.sources.wheel_files import read_wheels
 
 __all__ = ["open_source"]
 
-# The first that recognises a path reads it. Poznań's images are numbered too, so it comes before numbered
-# images; any log's folder may have clouds in it, so clouds come last.
-_FORMATS = (tum, mbag, poznan, numbered, kitti, recordings, clouds)
+# The first that recognises a path reads it. Images of ICL-NUIM and Poznań are numbered too, so these come
+# before numbered images; any log's folder may have clouds in it, so clouds come last.
+_FORMATS = (icl_nuim, tum, mbag, poznan, numbered, kitti, recordings, clouds)
 _DEFAULTS = SourceConfig()
 
 
@@ -23,8 +23,8 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> Log:
     """Return a recorded log, recognised by its files, with the configured selection of its frames.
 
     Args:
-        path: Folder of a TUM, Poznań, 7-Scenes, Redwood or KITTI log or of clouds, an mbag file or its
-            folder, an MCAP file, or a ROS bag.
+        path: Folder of a TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood or KITTI log or of clouds, an mbag file or
+            its folder, an MCAP file, or a ROS bag.
         config: Selection, pairing, camera, and what the files of a log do not state.
 
     Raises:

@@ -1,7 +1,7 @@
 """Intrinsics of a log, and the cameras of well-known data sets."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mapper.core.errors import SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
@@ -17,7 +17,7 @@ class Calibration:
     Attributes:
         origin: Where it comes from, for messages.
         fx_px: Focal length along a row.
-        fy_px: Focal length along a column.
+        fy_px: Focal length along a column; negative where the camera's y axis points up (ICL-NUIM).
         cx_px: Principal point's column.
         cy_px: Principal point's row.
         distortion: (k1, k2, p1, p2, k3).
@@ -33,6 +33,11 @@ class Calibration:
     distortion: _Distortion = NO_DISTORTION
     size_px: tuple[int, int] | None = None
     depth_units_per_m: float | None = None
+
+    def with_y_down(self) -> "Calibration":
+        """Return the same camera with its y axis mirrored, so that fy is positive."""
+        k1, k2, p1, p2, k3 = self.distortion
+        return replace(self, fy_px=-self.fy_px, distortion=(k1, k2, -p1, p2, k3))
 
     def camera(self, *, width_px: int, height_px: int) -> PinholeCamera:
         """Return the camera of images of this size.
@@ -74,6 +79,8 @@ FREIBURG = {
     "3": Calibration("camera of TUM freiburg3", 535.4, 539.2, 320.1, 247.6, size_px=_VGA),
 }
 SEVEN_SCENES = Calibration("camera of 7-Scenes", 585.0, 585.0, 320.0, 240.0, size_px=_VGA)
+# https://www.doc.ic.ac.uk/~ahanda/VaFRIC/codes.html (Handa et al. 2014)
+ICL_NUIM = Calibration("camera of ICL-NUIM", 481.2, -480.0, 319.5, 239.5, size_px=_VGA)
 PRIMESENSE = Calibration("PrimeSense's nominal camera", 525.0, 525.0, 319.5, 239.5, size_px=_VGA)
 
 _FREIBURG_NAME = re.compile(r"(?:^|[^a-z])(?:freiburg|fr)([123])(?!\d)", re.IGNORECASE)

@@ -1,7 +1,8 @@
 """RGB-D logs made of image files: their frames, their camera and their accelerometer."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from mapper.sources.calibration_file import FILE_NAMES, read_calibration
 from mapper.sources.config import CameraConfig
 from mapper.sources.images import check_size, read_colour, read_depth_m, read_grey, scan_of
 from mapper.sources.text import parse_numbers, parse_stamp, table, time_order
+
+_MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +87,8 @@ def rgbd_log(
 
     Args:
         pairs: Its frames, in strictly increasing time.
-        calibration: Intrinsics of all of them; the first colour image that can be read gives their size.
+        calibration: Intrinsics of all of them; the first colour image that can be read gives their size. With
+            fy < 0 the truth is in left-handed frames, whose y points up: both are mirrored, not the images.
         depth_units_per_m: Depth image units per metre.
         path: What was opened: a folder, or a file in the folder of the log.
         name: As of :class:`Log`.
@@ -96,6 +100,10 @@ def rgbd_log(
         SourceError: No colour image can be read, they are not of the calibration's size, or a line of
             ``accelerometer.txt`` is malformed.
     """
+    if calibration.fy_px < 0.0:
+        calibration = calibration.with_y_down()
+        truth = truth and replace(truth, T_world_body=_MIRROR_Y @ truth.T_world_body @ _MIRROR_Y)
+        notes = [*notes, "fy < 0: the camera's y axis points up; y of camera and truth is mirrored"]
     camera = _camera_of(pairs, calibration)
     accelerations, acceleration_notes = read_accelerations(path if path.is_dir() else path.parent)
 
@@ -141,7 +149,10 @@ def find_calibration(
     stated = known if path is None else read_calibration(path)
     units_per_m = depth_units_per_m if stated is None else stated.depth_units_per_m or depth_units_per_m
     if config is not None:
-        return configured(config), config.depth_factor or units_per_m
+        calibration = configured(config)
+        if stated is not None:  # the sign is the convention of the log's truth
+            calibration = replace(calibration, fy_px=math.copysign(calibration.fy_px, stated.fy_px))
+        return calibration, config.depth_factor or units_per_m
     if stated is None:
         raise SourceError(
             f"{folder}: intrinsics unknown; put a calibration.toml with fx_px, fy_px, cx_px and cy_px there, "

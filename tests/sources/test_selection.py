@@ -59,5 +59,7 @@ def test_what_is_no_log_says_what_was_looked_for(tmp_path):
         open_source(tmp_path / "nowhere")
     (tmp_path / "notes.txt").write_text("hello")
     for path in (tmp_path, tmp_path / "notes.txt"):
-        with pytest.raises(SourceError, match=r"known format; looked for rgb\.txt.*mbag.*Poznań.*7-Scenes"):
+        with pytest.raises(
+            SourceError, match=r"known format; looked for associations\.txt.*rgb\.txt.*mbag.*Poznań.*7-Scenes"
+        ):
             open_source(path)

@@ -1,0 +1,124 @@
+"""ICL-NUIM folders: associations.txt, rgb/N.png, depth/N.png and *.gt.freiburg (Handa et al. 2014).
+
+Lines of ``associations.txt`` are ``N depth/N.png N rgb/N.png``, of the truth ``N tx ty tz qx qy qz qw``;
+N counts the frames, 30 a second. The published camera has fy = -480 px: rows of the images run down as usual,
+but the y axes of camera and world point up, so that both frames are left-handed.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from mapper.core.errors import SourceError
+from mapper.core.geometry import Transform
+from mapper.core.trajectory import Trajectory
+from mapper.sources.base import Log
+from mapper.sources.calibration import ICL_NUIM
+from mapper.sources.config import SourceConfig
+from mapper.sources.numbered import RATE_HZ, find_images, stamp_at
+from mapper.sources.rgbd import FramePair, find_calibration, present, rgbd_log
+from mapper.sources.text import parse_numbers, pose_from_numbers, rows, table, time_order, truth_from
+
+DEPTH_UNITS_PER_M = 5000.0
+LOOKED_FOR = "associations.txt of N depth/N.png N rgb/N.png (ICL-NUIM)"
+
+_LIST = "associations.txt"
+_LINE = "1 depth/1.png 1 rgb/1.png"
+_TRUTHS = ("*.gt.freiburg", "groundtruth.txt")
+_NUMBER = re.compile(r"\d{1,6}")  # a stamp of the epoch has more digits
+
+
+def recognise(path: Path) -> bool:
+    """Tell whether a path is a folder with associations by frame number, or with ICL-NUIM's truth."""
+    return _lists_numbers(path / _LIST) or (_has_truth(path) and find_images(path) is not None)
+
+
+def read_log(path: Path, config: SourceConfig) -> Log:
+    """Return the log of an ICL-NUIM folder.
+
+    Raises:
+        SourceError: A file is malformed, none of the listed images exists, or they are of another size than
+            the data set's and there is no calibration.
+    """
+    rate_hz = config.rate_hz or RATE_HZ
+    pairs, notes = _read_pairs(path, rate_hz)
+    calibration, units_per_m = find_calibration(
+        path, config.camera, known=ICL_NUIM, depth_units_per_m=DEPTH_UNITS_PER_M
+    )
+    if calibration is ICL_NUIM and not _has_truth(path):
+        notes.append(
+            f"camera assumed to be the {ICL_NUIM.origin}; if not, put a calibration.toml beside the log"
+        )
+    truth, truth_notes = _read_truth(path, rate_hz)
+    return rgbd_log(
+        pairs,
+        calibration,
+        depth_units_per_m=units_per_m,
+        path=path,
+        name=path.resolve().name,
+        kind="icl-nuim",
+        truth=truth,
+        notes=[*notes, *truth_notes],
+    )
+
+
+def _has_truth(folder: Path) -> bool:
+    return any(folder.glob(_TRUTHS[0]))
+
+
+def _lists_numbers(path: Path) -> bool:
+    """Tell whether the first line of a list, which need not exist, pairs images named by its numbers."""
+    if not path.is_file():
+        return False
+    words = next((words for _, words in rows(path)), [])
+    return len(words) == 4 and all(
+        _NUMBER.fullmatch(number) is not None and Path(image).stem == number
+        for number, image in (words[:2], words[2:])
+    )
+
+
+def _read_pairs(folder: Path, rate_hz: float) -> tuple[list[FramePair], list[str]]:
+    """Return the pairs of the list, or without one those of images with the same number."""
+    if (folder / _LIST).is_file():
+        pairs, notes = _read_list(folder / _LIST, rate_hz)
+    elif images := find_images(folder):
+        stamped = [(stamp_at(pair.number, rate_hz=rate_hz), pair) for pair in images.pairs]
+        pairs = [FramePair(stamp_ns, pair.colour, stamp_ns, pair.depth) for stamp_ns, pair in stamped]
+        notes = list(images.notes)
+    else:
+        raise SourceError(f"{folder}: no colour and depth images with the same numbers; want {LOOKED_FOR}")
+    order, order_notes = time_order(np.array([pair.stamp_ns for pair in pairs], dtype=np.int64), what=_LIST)
+    return [pairs[i] for i in order], [*notes, *order_notes]
+
+
+def _read_list(path: Path, rate_hz: float) -> tuple[list[FramePair], list[str]]:
+    listed = []
+    for where, words in table(path, "number", "depth/number.png", "number", "rgb/number.png"):
+        if not (words[0].isdecimal() and words[2].isdecimal()):
+            raise SourceError(f"{where}: {' '.join(words)!r}, want frame numbers, as in: {_LINE}")
+        colour, depth = sorted((words[:2], words[2:]), key=lambda side: "depth" in side[1])
+        stamp_ns, depth_stamp_ns = (stamp_at(int(number), rate_hz=rate_hz) for number, _ in (colour, depth))
+        listed.append(FramePair(stamp_ns, path.parent / colour[1], depth_stamp_ns, path.parent / depth[1]))
+    has_colour = present(pair.colour for pair in listed)
+    has_depth = present(pair.depth for pair in listed)
+    pairs = [pair for pair, *has in zip(listed, has_colour, has_depth, strict=True) if all(has)]
+    if not pairs:
+        raise SourceError(f"{path}: none of its {len(listed)} pairs of images exists")
+    if len(pairs) == len(listed):
+        return pairs, []
+    return pairs, [f"{_LIST}: {len(listed) - len(pairs)} of {len(listed)} listed pairs do not exist; dropped"]
+
+
+def _read_truth(folder: Path, rate_hz: float) -> tuple[Trajectory | None, list[str]]:
+    """Return the poses of the file of truth, by frame number, left-handed as published."""
+    path = next((path for name in _TRUTHS for path in sorted(folder.glob(name))), None)
+    if path is None:
+        return None, []
+    poses: list[tuple[int, Transform | None]] = []
+    for where, words in table(path, "number", "tx", "ty", "tz", "qx", "qy", "qz", "qw"):
+        number, *pose = parse_numbers(words, where=where)
+        if not number >= 0.0 or number != int(number):
+            raise SourceError(f"{where}: {words[0]} is no frame number")
+        poses.append((stamp_at(int(number), rate_hz=rate_hz), pose_from_numbers(np.array(pose))))
+    return truth_from(poses, what=path.name)
