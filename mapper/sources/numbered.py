@@ -1,13 +1,15 @@
-"""Folders of numbered images: 7-Scenes (Shotton et al. 2013) and Redwood (Choi et al. 2015).
+"""Folders of numbered images: 7-Scenes (Shotton et al. 2013), Redwood (Choi et al. 2015) and the like.
 
 7-Scenes keeps ``frame-000000.color.png``, ``.depth.png`` and ``.pose.txt`` together; Redwood keeps colour
-and depth in two folders and the poses in one ``.log``. Names such as ``000001-000000033369.jpg`` carry a
-number and microseconds; other names carry a number only, and stamps follow from the frame rate.
+(``rgb*``, ``color*``, ``image*``) and depth (``depth*``) in two folders and the poses in one ``.log``. Names
+such as ``000001-000000033369.jpg`` carry a number and microseconds; others carry a number only, and stamps
+follow from the frame rate.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +28,8 @@ DEPTH_UNITS_PER_M = 1000.0
 RATE_HZ = 30.0
 LOOKED_FOR = "frame-000000.color.png and .depth.png (7-Scenes), numbered images in rgb/ and depth/ (Redwood)"
 
-_COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images")
+_COLOUR_FOLDER = re.compile(r"rgb|colou?r|image", re.IGNORECASE)
+_DEPTH_FOLDER = re.compile(r"(?:^|[^a-z])depth", re.IGNORECASE)
 _IMAGE_ENDINGS = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 _NUMBERED = re.compile(r"\D*(?P<number>\d+)(?:-(?P<microseconds>\d+))?\D*")
 _SEVEN_SCENES = re.compile(r"frame-\d+\.color\.\w+")
@@ -49,6 +52,21 @@ class NumberedImages:
 
     pairs: Sequence[NumberedPair]
     notes: Sequence[str]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Place:
+    """Images of one kind in a folder.
+
+    Attributes:
+        name: Of the folder.
+        numbered: Path and microseconds of the images whose names have one number, by that number.
+        total: How many images there are, whatever their names.
+    """
+
+    name: str
+    numbered: Mapping[int, tuple[Path, int | None]]
+    total: int
 
 
 def recognise(path: Path) -> bool:
@@ -96,23 +114,45 @@ def read_log(path: Path, config: SourceConfig) -> Log:
 
 
 def find_images(folder: Path) -> NumberedImages | None:
-    """Return the numbered pairs of a folder, in ``rgb/`` and ``depth/`` or side by side; None without any."""
+    """Return the numbered pairs of a folder, in two folders of it or side by side; None without any.
+
+    Of several ways to pair images that with the most pairs is taken, and of equal ones that with the shortest
+    names of folders.
+    """
     if not folder.is_dir():
         return None
-    colour_folder = next((folder / name for name in _COLOUR_FOLDERS if (folder / name).is_dir()), None)
-    if colour_folder is not None and (folder / "depth").is_dir():
-        colour, depth = _by_number(colour_folder, r""), _by_number(folder / "depth", r"")
-    else:
-        colour, depth = _by_number(folder, r"colou?r|rgb"), _by_number(folder, r"depth")
-    both = sorted(colour.keys() & depth.keys())
+    inside = sorted((path for path in folder.iterdir() if path.is_dir()), key=lambda p: (len(p.name), p.name))
+    depth_places = [_in_folder(path) for path in inside if _DEPTH_FOLDER.search(path.name)]
+    colour_places = [
+        _in_folder(path)
+        for path in inside
+        if _COLOUR_FOLDER.match(path.name) and not _DEPTH_FOLDER.search(path.name)
+    ]
+    beside = (_in_folder(folder, r"colou?r|rgb"), _in_folder(folder, r"depth"))
+    colour, depth = max(
+        [*product(colour_places, depth_places), beside], key=lambda places: len(_common(*places))
+    )
+    both = sorted(_common(colour, depth))
     if not both:
         return None
     notes = [
-        f"{len(images) - len(both)} {what} images have no partner of the same number; left out"
-        for what, images in (("colour", colour), ("depth", depth))
-        if len(images) > len(both)
+        f"{place.total - len(both)} {what} images have no partner of the same number; left out"
+        for what, place in (("colour", colour), ("depth", depth))
+        if place.total > len(both)
     ]
-    pairs = [NumberedPair(n, colour[n][0], depth[n][0], colour[n][1]) for n in both]
+    total = max(place.total for place in (*colour_places, *depth_places, *beside))
+    if 2 * len(both) < total:
+        notes.append(
+            f"only {len(both)} pairs are read of {total} images, less than half; "
+            "names of colour and depth must have the same numbers"
+        )
+    for taken, places in ((colour, colour_places), (depth, depth_places)):
+        others = [place.name for place in places if place is not taken and _common(place, taken)]
+        if taken in places and others:
+            notes.append(f"{taken.name}/ is read, not {', '.join(f'{name}/' for name in others)}")
+    pairs = [
+        NumberedPair(n, colour.numbered[n][0], depth.numbered[n][0], colour.numbered[n][1]) for n in both
+    ]
     return NumberedImages(pairs, notes)
 
 
@@ -140,15 +180,23 @@ def _sequences(path: Path) -> list[Path]:
     return sorted(folder for folder in path.glob("seq-*") if find_images(folder) is not None)
 
 
-def _by_number(folder: Path, word: str) -> dict[int, tuple[Path, int | None]]:
-    """Return path and microseconds of a folder's numbered images whose names contain the word, by number."""
-    found: dict[int, tuple[Path, int | None]] = {}
-    for path in sorted(folder.iterdir()):
-        name = _NUMBERED.fullmatch(path.stem)
-        if name and path.suffix.lower() in _IMAGE_ENDINGS and re.search(word, path.stem, re.IGNORECASE):
+def _in_folder(folder: Path, word: str = "") -> _Place:
+    """Return the images of a folder whose names contain the word."""
+    images = [
+        path
+        for path in sorted(folder.iterdir())
+        if path.suffix.lower() in _IMAGE_ENDINGS and re.search(word, path.stem, re.IGNORECASE)
+    ]
+    numbered: dict[int, tuple[Path, int | None]] = {}
+    for path in images:
+        if name := _NUMBERED.fullmatch(path.stem):
             microseconds = name["microseconds"]
-            found[int(name["number"])] = (path, None if microseconds is None else int(microseconds))
-    return found
+            numbered[int(name["number"])] = (path, None if microseconds is None else int(microseconds))
+    return _Place(folder.name, numbered, len(images))
+
+
+def _common(colour: _Place, depth: _Place) -> Set[int]:
+    return colour.numbered.keys() & depth.numbered.keys()
 
 
 def _read_truth(folder: Path, pairs: Sequence[FramePair]) -> tuple[Trajectory | None, list[str]]:

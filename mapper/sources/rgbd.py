@@ -173,6 +173,16 @@ def _camera_of(pairs: Sequence[FramePair], calibration: Calibration) -> PinholeC
     raise SourceError(f"none of {len(pairs)} colour images can be read; the first: {first_reason}")
 
 
+def unpaired_note(alone: int, total: int, *, max_gap_s: float) -> list[str]:
+    """Return a note on colour images without a depth image near in time, if there are any."""
+    if not alone:
+        return []
+    left_out = "left out"
+    if 2 * alone > total:
+        left_out = "more than half of the log is left out (source.max_pair_gap_s)"
+    return [f"{alone} of {total} colour images have no depth image within {max_gap_s * 1e3:g} ms; {left_out}"]
+
+
 def present(paths: Iterable[Path]) -> list[bool]:
     """Tell which files exist, listing each folder once: a stat per file is slow on network disks."""
     listings: dict[Path, frozenset[str]] = {}

@@ -13,7 +13,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.calibration import freiburg_camera
 from mapper.sources.config import SourceConfig
-from mapper.sources.rgbd import FramePair, find_calibration, present, rgbd_log
+from mapper.sources.rgbd import FramePair, find_calibration, present, rgbd_log, unpaired_note
 from mapper.sources.text import (
     parse_numbers,
     parse_stamp,
@@ -119,9 +119,7 @@ def _paired(
             f"{path}: no colour image has a depth image within {max_gap_s * 1e3:g} ms; "
             f"the closest pair is {int(gap_ns.min()) / NS_PER_S:g} s apart (source.max_pair_gap_s)"
         )
-    if alone := len(gap_ns) - len(paired):
-        without = f"no depth image within {max_gap_s * 1e3:g} ms"
-        notes.append(f"{alone} of {len(gap_ns)} colour images have {without}; left out")
+    notes += unpaired_note(len(gap_ns) - len(paired), len(gap_ns), max_gap_s=max_gap_s)
     return [
         FramePair(
             stamp_ns=int(colour.stamps_ns[i]),

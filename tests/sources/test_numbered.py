@@ -1,3 +1,5 @@
+import shutil
+
 import numpy as np
 import pytest
 
@@ -82,6 +84,62 @@ def test_images_without_a_partner_are_counted(tmp_path):
     assert len(source) == 1
     assert "1 colour images have no partner of the same number; left out" in source.notes
     assert "1 depth images have no partner of the same number; left out" in source.notes
+
+
+@pytest.mark.parametrize(
+    ("colour", "depth"),
+    [("rgb_png", "depth_png"), ("color_left", "depth"), ("Images", "Depth"), ("colour", "kinect-depth")],
+)
+def test_folders_of_other_names_are_found(tmp_path, colour, depth):
+    folder = redwood(tmp_path, [f"{i}" for i in range(7)], colour=colour)
+    (folder / "depth").rename(folder / depth)
+    source = open_source(folder)
+    assert (source.kind, len(source)) == ("redwood", 7)
+    assert [note for note in source.notes if "left out" in note or "read" in note] == []
+
+
+def test_the_images_with_the_most_pairs_are_read(tmp_path):
+    """Two pictures beside the folders once made a log of two frames."""
+    folder = redwood(tmp_path, [f"{i:04d}" for i in range(9)], colour="rgb_png")
+    (folder / "depth").rename(folder / "depth_png")
+    for i in range(2):
+        write_picture(folder / f"color_{i}.png", folder / f"depth_{i}.png", i)
+    source = open_source(folder)
+    assert len(source) == 9
+    assert {entry.files.colour.parent.name for entry in source.entries()} == {"rgb_png"}
+
+
+def test_of_several_folders_the_shortest_name_is_read_and_the_others_are_named(tmp_path):
+    folder = redwood(tmp_path, ["1", "2", "3"])
+    shutil.copytree(folder / "depth", folder / "depth_filtered")
+    shutil.copytree(folder / "depth", folder / "depth_colorized")
+    shutil.copytree(folder / "rgb", folder / "rgb_mask")
+    source = open_source(folder)
+    files = next(source.entries()).files
+    assert (files.colour.parent.name, files.depth.parent.name) == ("rgb", "depth")
+    assert "depth/ is read, not depth_filtered/, depth_colorized/" in source.notes
+    assert "rgb/ is read, not rgb_mask/" in source.notes
+
+
+def test_a_log_of_less_than_half_of_its_images_is_noted(tmp_path):
+    folder = redwood(tmp_path, ["1", "2", "3", "4", "5"])
+    assert not any("less than half" in note for note in open_source(folder).notes)
+    for number in (3, 4, 5):
+        (folder / f"depth/{number}.png").rename(folder / f"depth/at_{number}.25.png")
+    notes = open_source(folder).notes
+    assert "3 depth images have no partner of the same number; left out" in notes
+    want = "only 2 pairs are read of 5 images, less than half; names of colour and depth must have the same"
+    assert any(note.startswith(want) for note in notes)
+
+
+def test_pairs_beside_a_folder_of_more_images_are_noted(tmp_path):
+    folder = redwood(tmp_path, [f"{i}" for i in range(9)], colour="color_raw")
+    for path in (folder / "depth").iterdir():
+        path.rename(path.with_name(f"{path.stem}.5.png"))
+    write_picture(folder / "color_0.png", folder / "depth_0.png", 0)
+    source = open_source(folder)
+    assert len(source) == 1
+    assert any(note.startswith("only 1 pairs are read of 9 images, less than half") for note in source.notes)
 
 
 def test_redwood_trajectory_counts_images_from_zero(tmp_path):

@@ -49,6 +49,15 @@ def test_colour_without_near_depth_is_left_out_and_counted(tiny_tum_log):
     assert source.notes == ["2 of 5 colour images have no depth image within 20 ms; left out"]
 
 
+def test_more_than_half_left_out_is_noted_with_the_setting(tiny_tum_log):
+    log = tiny_tum_log(5)
+    edit(log / "depth.txt", lambda text: "\n".join(text.splitlines()[:-3]))
+    assert open_source(log).notes == [
+        "3 of 5 colour images have no depth image within 20 ms; "
+        "more than half of the log is left out (source.max_pair_gap_s)"
+    ]
+
+
 def test_the_pair_gap_is_inclusive_to_the_nanosecond(tiny_tum_log):
     log = tiny_tum_log(3)
     assert len(open_source(log, SourceConfig(max_pair_gap_s=0.009999))) == 3

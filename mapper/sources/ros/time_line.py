@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import SourceError
 from mapper.core.timebase import NS_PER_S, Stamps, nearest
+from mapper.sources.rgbd import unpaired_note
 from mapper.sources.ros.index import Series
 from mapper.sources.text import time_order
 
@@ -68,9 +69,7 @@ def paired(
             f"{max_gap_s * 1e3:g} ms; the closest are {min(closest_ns) / NS_PER_S:g} s apart "
             "(source.max_pair_gap_s)"
         )
-    if alone := len(sound_color) - len(i):
-        without = f"no depth image within {max_gap_s * 1e3:g} ms"
-        notes.append(f"{alone} of {len(sound_color)} colour images have {without}; left out")
+    notes += unpaired_note(len(sound_color) - len(i), len(sound_color), max_gap_s=max_gap_s)
     notes += _end_note(color, depth)
     kept = _without_overlap(color.stamps_ns[i], _epochs(color.stamps_ns[i]))
     notes += _overlap_note(color.topic.name, int((~kept).sum()), len(kept))

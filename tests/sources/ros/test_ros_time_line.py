@@ -96,7 +96,8 @@ def test_a_topic_that_stops_is_told():
     found, notes = pairs(range(0, 10_000, 100), range(0, 4_000, 100))
     assert len(found) == 40
     assert notes == [
-        "60 of 100 colour images have no depth image within 20 ms; left out",
+        "60 of 100 colour images have no depth image within 20 ms; "
+        "more than half of the log is left out (source.max_pair_gap_s)",
         "/d stops 6.0 s before /a",
     ]
     assert pairs(range(0, 4_000, 100), range(0, 10_000, 100))[1] == ["/a stops 6.0 s before /d"]
