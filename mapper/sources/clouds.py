@@ -6,7 +6,7 @@ from mapper.core.errors import SourceError
 from mapper.core.frames import Scan
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
-from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, is_cloud_name, scan_log
+from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, is_cloud_name, most_clouds, scan_log
 from mapper.sources.scans import ScanEntry
 
 LOOKED_FOR = "two or more clouds, .bin .pcd .ply .xyz .npy .las .laz, or .txt .csv with a number in the name"
@@ -31,12 +31,19 @@ def read_log(path: Path, config: SourceConfig) -> Log:
             f"{path}: one cloud is no log; open the folder of its scans, "
             "or align it to another: mapper register SOURCE TARGET"
         )
-    folders = _folders(path)
-    if len(folders) != 1:
-        names = ", ".join(folder.name for folder in folders)
-        raise SourceError(f"{path}: holds {len(folders)} folders of clouds; open one of {names}")
-    folder = folders[0]
-    files, notes = clouds_in(folder, config.pattern)
+    readable: list[tuple[Path, list[Path], list[str]]] = []
+    refused: list[str] = []
+    for folder in _folders(path):
+        try:
+            readable.append((folder, *clouds_in(folder, config.pattern)))
+        except SourceError as error:
+            refused.append(str(error))
+    if not readable:
+        raise SourceError(refused[0])
+    if len(readable) > 1:
+        names = ", ".join(folder.name for folder, _, _ in readable)
+        raise SourceError(f"{path}: holds {len(readable)} folders of clouds; open one of {names}")
+    folder, files, notes = readable[0]
     if not files:
         raise SourceError(f"{folder}: no cloud matches source.pattern={config.pattern}")
     return scan_log(
@@ -46,7 +53,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         stamps_file=first_of((folder, path), STAMP_FILES),
         truth_file=first_of((folder, path), TRUTH_FILES),
         config=config,
-        notes=notes,
+        notes=[*notes, *refused],
     )
 
 
@@ -70,4 +77,4 @@ def _folders(path: Path) -> list[Path]:
 
 
 def _has_two(folder: Path) -> bool:
-    return len(clouds_in(folder)[0]) >= 2
+    return most_clouds(folder) >= 2

@@ -14,7 +14,7 @@ from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform, nearest_rotation, transform
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
-from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, has_clouds, scan_log
+from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, most_clouds, scan_log
 from mapper.sources.text import parse_numbers, rows
 
 LOOKED_FOR = (
@@ -59,16 +59,16 @@ def read_log(path: Path, config: SourceConfig) -> Log:
 
 
 def _sequences(path: Path) -> list[Path]:
-    if has_clouds(_scans(path)):
+    if most_clouds(_scans(path)):
         return [path]
     folders = [*path.glob("sequences/*"), *path.glob("*")]
-    return sorted(folder for folder in folders if has_clouds(_scans(folder)))
+    return sorted(folder for folder in folders if most_clouds(_scans(folder)))
 
 
 def _scans(sequence: Path) -> Path:
     """Return the folder of a sequence's scans, which need not exist."""
     raw = sequence / "velodyne_points" / "data"
-    return raw if has_clouds(raw) else sequence / "velodyne"
+    return raw if most_clouds(raw) else sequence / "velodyne"
 
 
 def _read_calibration(path: Path) -> Transform | None:

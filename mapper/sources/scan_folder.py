@@ -5,12 +5,14 @@ from collections.abc import Iterable, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 
+import numpy as np
+
 from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform, inverse
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
-from mapper.sources.cloud_files import ENDINGS
+from mapper.sources.cloud_files import EMPTY, ENDINGS, why_no_points
 from mapper.sources.config import SourceConfig
 from mapper.sources.scan_stamps import in_order, line_of_each, scan_stamps
 from mapper.sources.scans import ScanEntry
@@ -21,6 +23,8 @@ from mapper.sources.tum import read_truth
 STAMP_FILES = ("times.txt", "stamps.txt", "timestamps.txt")
 
 _TEXT_ENDINGS = (".txt", ".csv")
+_LOOKED_AT = 5
+"""Text files of a folder that are tried before it is taken for one of clouds."""
 
 
 def is_cloud_name(path: Path) -> bool:
@@ -29,9 +33,9 @@ def is_cloud_name(path: Path) -> bool:
     return ending in ENDINGS and (ending not in _TEXT_ENDINGS or path.stem[-1:].isdecimal())
 
 
-def has_clouds(folder: Path) -> bool:
-    """Tell whether any file of a folder, which need not exist, is called as a cloud is."""
-    return any(map(is_cloud_name, _files(folder)))
+def most_clouds(folder: Path) -> int:
+    """Return how many files of a folder, which need not exist, are named as clouds of one format."""
+    return max(map(len, _by_ending(folder).values()))
 
 
 def clouds_in(folder: Path, pattern: str | None = None) -> tuple[list[Path], list[str]]:
@@ -40,21 +44,27 @@ def clouds_in(folder: Path, pattern: str | None = None) -> tuple[list[Path], lis
     Args:
         folder: Its own files count, not those of its folders; it need not exist.
         pattern: Glob of the names; None takes the ending that most of the clouds have.
+
+    Raises:
+        SourceError: There are text files only, and no points in them.
     """
-    paths = _files(folder)
     if pattern is not None:
-        matching = (path for path in paths if fnmatch(path.name, pattern))
-        return in_order(path for path in matching if path.suffix.lower() in ENDINGS), []
-    by_ending: dict[str, list[Path]] = {ending: [] for ending in ENDINGS}
-    for path in filter(is_cloud_name, paths):
-        by_ending[path.suffix.lower()].append(path)
-    most = max(by_ending.values(), key=len)
-    notes = [
-        f"{len(paths)} {ending} files left out; source.pattern chooses others"
-        for ending, paths in by_ending.items()
-        if paths and paths is not most
-    ]
-    return in_order(most), notes
+        matching = [path for path in _files(folder) if fnmatch(path.name, pattern)]
+        by_ending = {"": [path for path in matching if path.suffix.lower() in ENDINGS]}
+    else:
+        by_ending = _by_ending(folder)
+    chosen: list[Path] = []
+    notes, refused = [], []
+    for ending, paths in sorted(by_ending.items(), key=lambda item: -len(item[1])):
+        if reason := _why_no_points(paths):
+            refused.append(f"{len(paths)} {paths[0].suffix} files are no clouds: {reason}")
+        elif paths and chosen:
+            notes.append(f"{len(paths)} {ending} files left out; source.pattern chooses others")
+        else:
+            chosen = chosen or paths
+    if refused and not chosen:
+        raise SourceError(f"{folder}: {refused[0]}; want lines of x y z")
+    return in_order(chosen), [*notes, *(f"{reason}; left out" for reason in refused)]
 
 
 def first_of(folders: Iterable[Path], names: Sequence[str]) -> Path | None:
@@ -108,6 +118,27 @@ def scan_log(
         truth=truth,
         notes=[*notes, *stamp_notes, *order_notes, *truth_notes],
     )
+
+
+def _by_ending(folder: Path) -> dict[str, list[Path]]:
+    by_ending: dict[str, list[Path]] = {ending: [] for ending in ENDINGS}
+    for path in filter(is_cloud_name, _files(folder)):
+        by_ending[path.suffix.lower()].append(path)
+    return by_ending
+
+
+def _why_no_points(paths: Sequence[Path]) -> str | None:
+    """Return why some files are no clouds; None if one of a few that are looked at may be."""
+    if not paths or paths[0].suffix.lower() not in _TEXT_ENDINGS:
+        return None
+    reason, paths = None, sorted(paths)
+    for index in np.unique(np.linspace(0, len(paths) - 1, _LOOKED_AT).astype(int)):
+        found = why_no_points(paths[index])
+        if found is None:
+            return None
+        if reason is None or reason.endswith(EMPTY):  # an image without objects has an empty file of labels
+            reason = f"{paths[index].name}: {found}"
+    return reason
 
 
 def _files(folder: Path) -> list[Path]:

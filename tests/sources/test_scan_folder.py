@@ -110,6 +110,66 @@ def test_names_sort_by_time_even_where_text_would_not(tmp_path):
     assert first_x(source) == [points_of(i)[0, 0] for i in (2, 0, 1)]
 
 
+KITTI_LABELS = "Car 0.00 0 -1.57 614.24 181.78 727.31 284.77 1.57 1.73 4.15 1.65 1.87 46.70 -1.65\n"
+YOLO_LABELS = "".join(f"{i % 3} 0.5{i} 0.41 0.1 0.2\n" for i in range(12))
+TRACKS = "".join(f"7,{i},614.2,181.7,113.1,102.9,1,-1,-1,-1\n" for i in range(12))
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (KITTI_LABELS, r"'Car 0\.00 0 -1\.57 614\.24 .*' is not three or more numbers"),
+        (YOLO_LABELS, "the first column holds whole numbers only, as classes of objects do"),
+        (TRACKS, "the first column holds whole numbers only, as classes of objects do"),
+        ("0.51 0.41 0.1\n0.51 0.41 0.1\n", "2 lines, want 10 points or more"),
+        ("1 2 3\n" * 20 + "1 2 DontCare\n", "'1 2 DontCare' is not three or more numbers"),
+        ("", "the file is empty"),
+    ],
+)
+@pytest.mark.parametrize("pattern", [None, "0*.txt"])
+def test_a_folder_of_labels_is_refused_with_the_reason(tmp_path, text, reason, pattern):
+    folder = tmp_path / "label_2"
+    folder.mkdir()
+    for i in range(20):
+        (folder / f"{i:06d}.txt").write_text("" if i == 0 else text)
+    for opened in (folder, tmp_path):
+        with pytest.raises(
+            SourceError, match=rf"label_2: 20 \.txt files are no clouds: 0000\d\d\.txt: {reason}"
+        ):
+            open_source(opened, SourceConfig(pattern=pattern))
+
+
+def test_labels_beside_clouds_are_left_out_with_a_note(tmp_path):
+    folder = cloud_folder(tmp_path / "log/scans", [f"{i:03d}.pcd.npy" for i in range(3)])
+    for i in range(9):
+        (folder / f"{i:03d}.txt").write_text(KITTI_LABELS)
+    labels = tmp_path / "log/labels"
+    labels.mkdir()
+    for i in range(3):
+        (labels / f"{i:03d}.txt").write_text(YOLO_LABELS)
+    source = open_source(tmp_path / "log")
+    assert len(source) == 3
+    assert any(note.startswith("9 .txt files are no clouds: 000.txt: 'Car 0.00") for note in source.notes)
+    assert any(
+        "labels: 3 .txt files are no clouds: 000.txt: the first column" in note for note in source.notes
+    )
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x y z\n" + "".join(f"{i} 0.5 {i}.25\n" for i in range(12)),
+        "".join(f"{i} {2 * i} {-i}\n" for i in range(12)),
+        "".join(f"{-i} 0.5 {i}.25\n" for i in range(12)),
+        "".join(f"{i}.5;0.5;1;0\n" for i in range(12)),
+    ],
+)
+def test_points_in_whole_numbers_are_no_labels(tmp_path, text):
+    for i in range(3):
+        (tmp_path / f"{i}.txt").write_text(text)
+    assert len(next(open_source(tmp_path).entries()).load().points_body) >= 11
+
+
 @pytest.mark.parametrize("listed", ["times.txt", "stamps.txt", "timestamps.txt"])
 def test_a_list_of_stamps(tmp_path, listed):
     folder = cloud_folder(tmp_path, ["a.npy", "b.npy", "c.npy"])

@@ -4,14 +4,14 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from mapper.core.errors import FrameError
-from mapper.sources.cloud_files.bare import read_bin, read_npy, read_text
+from mapper.sources.cloud_files.bare import EMPTY, read_bin, read_npy, read_text, why_no_points
 from mapper.sources.cloud_files.las import read_las
 from mapper.sources.cloud_files.parsing import Columns
 from mapper.sources.cloud_files.pcd import read_pcd
 from mapper.sources.cloud_files.ply import read_ply
 from mapper.sources.cloud_files.raw import RawCloud, cloud_from
 
-__all__ = ["ENDINGS", "RawCloud", "read_cloud"]
+__all__ = ["EMPTY", "ENDINGS", "RawCloud", "read_cloud", "why_no_points"]
 
 _READERS: Mapping[str, Callable[[Path], Columns]] = {
     ".bin": read_bin,

@@ -7,11 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.errors import FrameError
-from mapper.sources.cloud_files.parsing import Column, Columns, refusing_damage
+from mapper.sources.cloud_files.parsing import MIN_POINTS, Column, Columns, refusing_damage
 
 RECORD_BYTES = 16
 
 _HEADER_LINES = 100
+_HEAD_BYTES = 1 << 16
+_MAX_CLASS = 1000
+_QUOTED = 60
+EMPTY = "the file is empty"
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?|nan|inf)", re.IGNORECASE)
 
 
@@ -66,6 +70,37 @@ def read_text(path: Path) -> Columns:
     if len(names) == values.shape[1]:
         return {name: values[:, column] for column, name in enumerate(names)}
     return _xyz(values)
+
+
+def why_no_points(path: Path) -> str | None:
+    """Return why the first lines of a text file cannot be points; None where they can.
+
+    Labels of objects, which are text files with numbered names too, have words in their lines, fewer lines
+    than a cloud has points, or a class as the first column.
+    """
+    try:
+        with path.open("rb") as stream:
+            head, is_cut = stream.read(_HEAD_BYTES), bool(stream.read(1))
+    except OSError as error:
+        return f"cannot be read: {error.strerror}"
+    text = head.decode("utf-8-sig", errors="replace").replace(",", " ").replace(";", " ")
+    lines = text.split("\n")[: -1 if is_cut else None]
+    names, skipped = _header(text)
+    if skipped is None:
+        first = next((line.strip() for line in lines if line.strip()), "")
+        return f"{first[:_QUOTED]!r} is not three or more numbers" if first else EMPTY
+    rows = [line.split() for line in lines[skipped:] if line.strip()]
+    if wrong := next((row for row in rows if not all(map(_NUMBER.fullmatch, row))), None):
+        return f"{' '.join(wrong)[:_QUOTED]!r} is not three or more numbers"
+    if len(rows) < MIN_POINTS and not is_cut:
+        return f"{len(rows)} lines, want {MIN_POINTS} points or more"
+    if {"x", "y", "z"} <= set(names):
+        return None
+    x, *others = np.array([row[:3] for row in rows], dtype=np.float64).T
+    is_class = bool(((x == np.rint(x)) & (x >= 0.0) & (x < _MAX_CLASS)).all())
+    if is_class and any((other != np.rint(other)).any() for other in others):
+        return "the first column holds whole numbers only, as classes of objects do"
+    return None
 
 
 def _header(text: str) -> tuple[list[str], int | None]:

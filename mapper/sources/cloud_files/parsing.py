@@ -14,6 +14,9 @@ Column = NDArray[np.number[Any]]
 Columns = Mapping[str, Column]
 """(N,) values of each field of a cloud, by its name in the file."""
 
+MIN_POINTS = 10
+"""Fewer points show no surface that anything could be aligned to."""
+
 _LONGEST_REASON = 150
 
 

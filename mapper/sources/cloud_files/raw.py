@@ -9,11 +9,8 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import Points32
-from mapper.sources.cloud_files.parsing import Column, Columns
+from mapper.sources.cloud_files.parsing import MIN_POINTS, Column, Columns
 from mapper.sources.point_times import time_field
-
-MIN_POINTS = 10
-"""Fewer points show no surface that anything could be aligned to."""
 
 _MAX_RANGE_M = 1000.0  # the longest automotive sensors see 0.5 km; a room in millimetres is beyond it
 _AWAY_RATIO = 10.0  # times the cloud's own size, and it cannot be a sweep around its origin
