@@ -28,12 +28,18 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> Log:
         config: Selection, pairing, camera, and what the files of a log do not state.
 
     Raises:
-        SourceError: Nothing is there, no format fits, the log is malformed or nothing of it is selected.
+        SourceError: Nothing is there, no format fits, the log is malformed, nothing of it is selected, or it
+            has no frame such as is to be its body.
     """
     if not path.exists():
         raise SourceError(f"{path}: no such file or folder")
     for log_format in _FORMATS:
         if log_format.recognise(path):
+            if config.body_frame is not None and log_format is not recordings:
+                raise SourceError(
+                    f"{path}: source.body_frame={config.body_frame}: only a recording's tf has such a frame; "
+                    "leave it out"
+                )
             log: Log = log_format.read_log(path, config)
             if log.wheels is None and path.is_dir():
                 wheels, notes = read_wheels(path, config.wheels, sensor=log.sensor)

@@ -69,7 +69,8 @@ class SourceConfig(Config):
     topics: TopicsConfig = TopicsConfig()
     wheels: WheelsConfig = WheelsConfig()
     body_frame: str | None = None
-    """Frame in a bag's tf that is a LiDAR's body, e.g. base_link; None is the cloud's own frame."""
+    """Frame in a recording's tf that is a LiDAR's body, e.g. base_link; None is the cloud's own frame. The body
+    of RGB-D frames is the camera."""
     pattern: str | None = None
     """Glob of the names of a LiDAR log's clouds, e.g. ``os1_*.bin``; None is all with the usual ending."""
     stamps_file: Path | None = None

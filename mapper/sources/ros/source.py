@@ -70,6 +70,11 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
 
 
 def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -> _Frames:
+    if config.body_frame is not None:
+        raise SourceError(
+            f"{reader.recording.path}: source.body_frame={config.body_frame}: the body of RGB-D frames is "
+            "the camera; leave it out, or choose clouds with source.topics.points=…"
+        )
     color, depth = topics.color, topics.depth
     where = f"{reader.recording.path}"
     i, j, notes = paired(color, depth, max_gap_s=config.max_pair_gap_s, where=where)

@@ -249,3 +249,24 @@ def test_a_damaged_first_image_file_does_not_hide_the_log(tiny_tum_log, tmp_path
     with pytest.raises(FrameError, match="truncated JPEG"):
         again[0].load()
     assert again[1].load().image.shape == (48, 64, 3)
+
+
+@pytest.mark.parametrize("name", ["log.mcap", "log.bag"])
+def test_another_body_is_refused_where_the_camera_is_the_body(tmp_path, name):
+    log = write(tmp_path / name, shots(3))
+    with pytest.raises(
+        SourceError, match=r"body_frame=base_link: the body of RGB-D frames is the camera; leave"
+    ):
+        open_source(log, SourceConfig(body_frame="base_link"))
+
+
+def test_another_body_is_refused_where_there_is_no_tf(tiny_tum_log, tmp_path):
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    for i in range(2):
+        np.save(scans / f"{i}.npy", np.random.default_rng(i).normal(0.0, 9.0, (20, 3)))
+    for log in (tiny_tum_log(2), scans):
+        with pytest.raises(
+            SourceError, match=r"body_frame=base_link: only a recording's tf has such a frame"
+        ):
+            open_source(log, SourceConfig(body_frame="base_link"))
