@@ -80,7 +80,8 @@ def _log_rows(log: "LogFacts") -> list[tuple[str, str]]:
         )
     if log.readings:
         rows.append(("accelerations", f"{log.readings} readings"))
-    return [*rows, *(("note", note) for note in log.notes)]
+    rows += [("note", note) for note in log.notes]
+    return rows + [("warning", warning) for warning in log.warnings]
 
 
 def _timing_text(timing: "Timing") -> str:

@@ -27,6 +27,7 @@ from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 from mapper.sources.chained import chained
 from mapper.sources.config import SourceConfig
+from mapper.sources.depth_scale import depth_warnings
 
 _FIXED_BY_FIRST_SESSION = ("odometry", "level")
 
@@ -62,6 +63,7 @@ def append(
     """
     _refuse_unfit(config, run)
     first = open_log(run)
+    second = replace(second, notes=[*second.notes, *depth_warnings(second)])
     source = chained(first, second)
     for note in source.notes:
         progress.note(note)

@@ -25,6 +25,10 @@ from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.stored_tracking import save_tracking
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
+from mapper.sources.depth_scale import depth_warnings
+
+_MAX_CAMERA_HEIGHT_M = 4.0
+"""Median height above the floor, in a hand, on a robot or upstairs; wrong units of depth multiply it by 5."""
 
 
 def build(
@@ -50,6 +54,10 @@ def build(
         TrackingError: Too few frames could be tracked; what there is stays in ``OUT.partial``.
         RunError: OUT is there already, or cannot be made.
     """
+    warnings = depth_warnings(source)
+    for warning in warnings:
+        progress.note(warning)
+    source = replace(source, notes=[*source.notes, *warnings])
     with write_run(out, first_manifest(source), config, overwrite=overwrite) as writer:
         with writer.clock.stage("track"):
             tracking = track_log(source, config, progress=progress, observer=observer)
@@ -64,6 +72,10 @@ def build(
             level = _level(source, tracking.trajectory(), config)
         observer.on_levelled(level.T_level_world)
         tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
+        if warning := _height_warning(source, tracking.trajectory()):
+            progress.note(warning)
+            known = writer.manifest.input
+            writer.update(input=known.model_copy(update={"notes": (*known.notes, warning)}))
         save_tracking(writer, from_tracking(tracking, source.truth))
         writer.update(
             solve=solved.report,
@@ -71,6 +83,14 @@ def build(
         )
         fuse_into(writer, source, config, progress, observer=observer)
     return load_run(out)
+
+
+def _height_warning(source: Log, trajectory: Trajectory) -> str:
+    """Return a sentence about a camera that is implausibly high above the floor; empty if it is not."""
+    height_m = float(np.median(trajectory.positions_world[:, 2]))
+    if source.sensor != "rgbd" or height_m <= _MAX_CAMERA_HEIGHT_M:
+        return ""
+    return f"the camera is {height_m:.1f} m above the floor; is source.camera.depth_factor right?"
 
 
 def _level(source: Log, trajectory: Trajectory, config: BuildConfig) -> Level:

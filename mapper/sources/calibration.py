@@ -55,10 +55,11 @@ class Calibration:
         return PinholeCamera(width_px, height_px, *numbers, distortion=self.distortion)
 
 
-def configured(camera: CameraConfig) -> Calibration:
-    """Return the intrinsics that a configuration sets."""
-    numbers = (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px)
-    return Calibration("source.camera", *numbers, distortion=camera.distortion)
+def configured(camera: CameraConfig | None) -> Calibration | None:
+    """Return the intrinsics that a configuration sets; None if it sets none."""
+    if camera is None or camera.intrinsics_px is None:
+        return None
+    return Calibration("source.camera", *camera.intrinsics_px, distortion=camera.distortion)
 
 
 _VGA = (640, 480)

@@ -1,23 +1,39 @@
 """Which part of a log is used, and what the log does not tell by itself."""
 
 from pathlib import Path
+from typing import Self
 
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from mapper.core.config import Config
 
 
 class CameraConfig(Config):
-    """Intrinsics that override what the log or its folder's name says."""
+    """Intrinsics, all four, and depth units that override what the log or its folder's name says."""
 
-    fx_px: PositiveFloat
-    fy_px: PositiveFloat
-    cx_px: float
-    cy_px: float
+    fx_px: PositiveFloat | None = None
+    fy_px: PositiveFloat | None = None
+    cx_px: float | None = None
+    cy_px: float | None = None
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2, k3 (OpenCV's order)."""
     depth_factor: PositiveFloat | None = None
     """Depth image units per metre; None keeps the log's own (5000 for TUM)."""
+
+    @property
+    def intrinsics_px(self) -> tuple[float, float, float, float] | None:
+        """fx, fy, cx and cy; None where they are the log's own."""
+        if self.fx_px is None or self.fy_px is None or self.cx_px is None or self.cy_px is None:
+            return None
+        return self.fx_px, self.fy_px, self.cx_px, self.cy_px
+
+    @model_validator(mode="after")
+    def _intrinsics_are_whole(self) -> Self:
+        numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px)
+        given = any(number is not None for number in numbers) or any(self.distortion)
+        if given and self.intrinsics_px is None:
+            raise ValueError("want fx_px, fy_px, cx_px and cy_px, all four; depth_factor may stand alone")
+        return self
 
 
 class TopicsConfig(Config):
@@ -69,8 +85,8 @@ class SourceConfig(Config):
     topics: TopicsConfig = TopicsConfig()
     wheels: WheelsConfig = WheelsConfig()
     body_frame: str | None = None
-    """Frame in a recording's tf that is a LiDAR's body, e.g. base_link; None is the cloud's own frame. The body
-    of RGB-D frames is the camera."""
+    """Frame in a recording's tf that is a LiDAR's body, e.g. base_link; None is the cloud's own frame.
+    The body of RGB-D frames is the camera."""
     pattern: str | None = None
     """Glob of the names of a LiDAR log's clouds, e.g. ``os1_*.bin``; None is all with the usual ending."""
     stamps_file: Path | None = None

@@ -13,6 +13,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
+from mapper.sources.depth_scale import depth_warnings
 from mapper.sources.ros import files as recordings
 from mapper.sources.ros.index import Series
 from mapper.sources.ros.reader import RecordingReader
@@ -70,6 +71,7 @@ class LogFacts:
         wheels_path_m: Length of their path, metres.
         readings: How many accelerations there are.
         notes: What opening it had to leave out or assume.
+        warnings: What is implausible about its depth.
     """
 
     name: str
@@ -83,6 +85,7 @@ class LogFacts:
     wheels_path_m: float
     readings: int
     notes: Sequence[str]
+    warnings: Sequence[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +156,7 @@ def _inspected(path: Path, topics: Sequence[TopicFacts], source: Log) -> Inspect
         wheels_path_m=0.0 if source.wheels is None else source.wheels.path_length_m,
         readings=0 if source.accelerations is None else len(source.accelerations.stamps_ns),
         notes=list(source.notes),
+        warnings=depth_warnings(source),
     )
     return Inspection(path, topics, log, problem or None)
 

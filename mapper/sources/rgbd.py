@@ -149,10 +149,11 @@ def find_calibration(
     stated = known if path is None else read_calibration(path)
     units_per_m = depth_units_per_m if stated is None else stated.depth_units_per_m or depth_units_per_m
     if config is not None:
-        calibration = configured(config)
+        units_per_m = config.depth_factor or units_per_m
+    if chosen := configured(config):
         if stated is not None:  # the sign is the convention of the log's truth
-            calibration = replace(calibration, fy_px=math.copysign(calibration.fy_px, stated.fy_px))
-        return calibration, config.depth_factor or units_per_m
+            chosen = replace(chosen, fy_px=math.copysign(chosen.fy_px, stated.fy_px))
+        return chosen, units_per_m
     if stated is None:
         raise SourceError(
             f"{folder}: intrinsics unknown; put a calibration.toml with fx_px, fy_px, cx_px and cy_px there, "

@@ -111,6 +111,10 @@ def test_a_run_s_own_json_gives_the_same_configuration(tmp_path):
     [
         ("octree.resolution_m=inf", "octree.resolution_m: Input should be a finite number"),
         ("slice.min_height_m=nan", "slice.min_height_m: Input should be a finite number"),
+        (
+            "source.camera.fx_px=500",
+            "source.camera: .*want fx_px, fy_px, cx_px and cy_px, all four; depth_factor",
+        ),
         ("slice.min_height_m=1.2", "slice: .*max_height_m 1.2 must be above min_height_m 1.2"),
     ],
 )

@@ -191,6 +191,13 @@ def test_intrinsics_unknown_says_the_remedy(tiny_tum_log):
         open_source(log)
 
 
+def test_the_users_depth_factor_leaves_the_camera_alone(tiny_tum_log):
+    log = tiny_tum_log(2)
+    camera = next(open_source(log).entries()).camera
+    entry = next(open_source(log, SourceConfig(camera=CameraConfig(depth_factor=1000))).entries())
+    assert (entry.camera, entry.files.depth_units_per_m) == (camera, 1000)
+
+
 def test_the_users_camera_wins_over_the_file(tiny_tum_log):
     camera = CameraConfig(fx_px=50, fy_px=51, cx_px=32, cy_px=24, depth_factor=1000)
     entry = next(iter(open_source(tiny_tum_log(2), SourceConfig(camera=camera)).entries()))

@@ -135,9 +135,8 @@ def _camera(reader: RecordingReader, topics: CameraTopics, config: SourceConfig)
     name = topics.color.topic.name
     first = _first_image(reader, topics.color)
     width_px, height_px = size_of(first, where=f"{reader.recording.path}: {name}")
-    if config.camera is not None:
-        calibration = configured(config.camera)
-    else:
+    calibration = configured(config.camera)
+    if calibration is None:
         info = topics.info and reader.firsts.get(topics.info.topic.name)
         if topics.info is None or not isinstance(info, CameraMessage):
             raise SourceError(

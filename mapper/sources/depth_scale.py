@@ -1,0 +1,209 @@
+"""Plausibility of an RGB-D log's depth: its range, and its scale against the true or the wheels' motion."""
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from mapper.core.errors import FrameError
+from mapper.core.frames import RgbdFrame
+from mapper.core.geometry import Array, Transform, angle_between, apply, inverse
+from mapper.core.timebase import NS_PER_S
+from mapper.core.trajectory import Trajectory
+from mapper.sensing.wheel_kinematics import pose_at
+from mapper.sources.base import Log
+
+_FRAMES = 8
+"""Frames, spread over the log, whose depth is looked at, and from which pairs begin."""
+
+_MIN_MEASURED_SHARE = 0.05
+_NEAR_M, _FAR_M = 0.1, 8.0
+"""Least median and largest 90th percentile of depth that cameras deliver; farther surfaces return little."""
+
+_PAIR_WITHIN_NS = NS_PER_S // 2
+_MAX_POSE_GAP_NS = NS_PER_S // 5
+_MIN_MOTION_M = 0.03
+_MAX_TURN_RAD = 0.2
+"""A pair's motion: far enough for the noise of depth, and little turned, for mountings are not exact."""
+
+_FEATURES = 500
+_MAX_DESCRIPTOR_RATIO = 0.8
+_MIN_MATCHES = 25
+_MIN_AGREEING_SHARE = 0.4
+_MAX_RESIDUAL_SHARE = 0.25
+"""A match agrees with a scale if its points then lie within this share of the motion from each other."""
+
+_MIN_PAIRS = 3
+_MAX_SPREAD = 1.15
+_MAX_SCALE_ERROR = 1.25
+"""Depth cameras, truth and wheels err by a few per cent; wrong units by a factor of 4 or 5, or of 1000."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Features:
+    """ORB features that have depth: (N, 3) points in the camera's frame, and (N, 32) descriptors."""
+
+    points_camera: Array
+    descriptors: cv2.typing.MatLike
+
+
+def depth_warnings(log: Log) -> list[str]:
+    """Return what is implausible about an RGB-D log's depth, a sentence each; a few frames are read.
+
+    Scale: features that are matched between two frames move by the known motion, of truth or else of wheels,
+    at one scale of depth only. Range: without such a motion there is no scale to compare with, but cameras
+    deliver depth of some ranges only.
+    """
+    if log.sensor != "rgbd":
+        return []
+    spread = np.unique(np.linspace(0, len(log) - 1, _FRAMES).astype(int)).tolist()
+    frames = {index: frame for index in spread if (frame := _read(log, index)) is not None}
+    if not frames:
+        return []
+    measured = float(np.median([(frame.depth_m > 0.0).mean() for frame in frames.values()]))
+    if measured < _MIN_MEASURED_SHARE:
+        return [f"depth: {1.0 - measured:.1%} of the pixels measured nothing: 0, or the limit of 16 bits"]
+    if (scale := _scale_of_log(log, frames)) is None:
+        return _range_warning(log, frames.values())
+    if 1.0 / _MAX_SCALE_ERROR < scale < _MAX_SCALE_ERROR:
+        return []
+    wrong = f"{1.0 / scale:.2g} times too large" if scale < 1.0 else f"{scale:.2g} times too small"
+    whose = "wheels' motion" if log.truth is None else "true motion"
+    units_per_m = _units_per_m(log)
+    fitting = "" if units_per_m is None else f"={_rounded(units_per_m / scale):g} fits, not {units_per_m:g}"
+    return [
+        f"depth: {wrong} for the {whose} of the camera; source.camera.depth_factor{fitting or ' is wrong'}"
+    ]
+
+
+def _range_warning(log: Log, frames: Collection[RgbdFrame]) -> list[str]:
+    spans_m = [
+        np.percentile(frame.depth_m[frame.depth_m > 0.0], (50.0, 90.0))
+        for frame in frames
+        if frame.depth_m.any()
+    ]
+    median_m, far_m = np.median(spans_m, axis=0)
+    if median_m < _NEAR_M:
+        found = f"half of it is within {median_m:.2g} m"
+    elif far_m > _FAR_M:
+        found = f"a tenth of it is beyond {far_m:.2g} m"
+    else:
+        return []
+    units_per_m = _units_per_m(log)
+    setting = "source.camera.depth_factor" + ("" if units_per_m is None else f"={units_per_m:g}")
+    return [f"depth: {found}, but cameras measure {_NEAR_M:g} to {_FAR_M:g} m; is {setting} right?"]
+
+
+def _scale_of_log(log: Log, frames: Mapping[int, RgbdFrame]) -> float | None:
+    """Return the factor that depth lacks by several pairs of frames; None where too few agree on one."""
+    motion = log.wheels if log.truth is None else log.truth
+    if motion is None:
+        return None
+    scales = []
+    for first, second, T_first_second in _pairs(log, motion, frames.keys()):
+        frame = _read(log, second)
+        if frame is not None and (scale := _scale(frames[first], frame, T_first_second)) is not None:
+            scales.append(scale)
+    median = float(np.median(scales)) if scales else 1.0
+    agreeing = [scale for scale in scales if 1.0 / _MAX_SPREAD < scale / median < _MAX_SPREAD]
+    return median if len(agreeing) >= _MIN_PAIRS else None
+
+
+def _pairs(log: Log, motion: Trajectory, anchors: Collection[int]) -> Iterator[tuple[int, int, Transform]]:
+    """Yield each anchor, the frame soon after it that moved farthest, and T_first_second."""
+
+    def pose(index: int) -> Transform | None:
+        return pose_at(motion, int(log.stamps_ns[index]), max_gap_ns=_MAX_POSE_GAP_NS)
+
+    for first in anchors:
+        T_world_first = pose(first)
+        if T_world_first is None:
+            continue
+        last_ns = log.stamps_ns[first] + _PAIR_WITHIN_NS
+        end = max(first + 2, int(np.searchsorted(log.stamps_ns, last_ns, side="right")))
+        farthest_m, farthest = _MIN_MOTION_M, None
+        for second in range(first + 1, min(end, len(log))):
+            T_world_second = pose(second)
+            if T_world_second is None:
+                continue
+            T_first_second = inverse(T_world_first) @ T_world_second
+            distance_m = float(np.linalg.norm(T_first_second[:3, 3]))
+            turn_rad = angle_between(np.eye(3), T_first_second[:3, :3])
+            if distance_m >= farthest_m and turn_rad <= _MAX_TURN_RAD:
+                farthest_m, farthest = distance_m, (first, second, T_first_second)
+        if farthest is not None:
+            yield farthest
+
+
+def _scale(first: RgbdFrame, second: RgbdFrame, T_first_second: Transform) -> float | None:
+    """Return the factor that depth lacks for the matched points to move as known; None if matches disagree.
+
+    With scale s a point of both frames has s·p₁ = R·s·p₂ + t, so s·(p₁ − R·p₂) = t.
+    """
+    one, other = _features(first), _features(second)
+    pairs = _matched(one, other)
+    if len(pairs) < _MIN_MATCHES:
+        return None
+    R = T_first_second.copy()
+    R[:3, 3] = 0.0
+    t = T_first_second[:3, 3]
+    distance_m = float(np.linalg.norm(t))
+    moved = one.points_camera[pairs[:, 0]] - apply(R, other.points_camera[pairs[:, 1]])
+    along_m = moved @ t / distance_m
+    candidates = distance_m / along_m[along_m > 0.0]
+    if not len(candidates):
+        return None
+    residuals_m = np.linalg.norm(candidates[:, None, None] * moved - t, axis=2)
+    agreeing = residuals_m < _MAX_RESIDUAL_SHARE * distance_m
+    best = agreeing[int(agreeing.sum(axis=1).argmax())]
+    if best.mean() < _MIN_AGREEING_SHARE:
+        return None
+    return float(distance_m / np.median(along_m[best]))
+
+
+def _features(frame: RgbdFrame) -> _Features:
+    keypoints, descriptors = cv2.ORB.create(_FEATURES).detectAndCompute(frame.gray, None)
+    pixels = np.array([keypoint.pt for keypoint in keypoints]).reshape(-1, 2)
+    columns, rows = np.rint(pixels).astype(int).T
+    depth_m = frame.depth_m[rows, columns].astype(np.float64)
+    kept = depth_m > 0.0
+    camera = frame.camera
+    ideal = camera.undistort(pixels[kept])
+    rays = (ideal - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
+    points = np.column_stack([rays, np.ones(len(rays))]) * depth_m[kept, None]
+    return _Features(points, np.zeros((0, 32), np.uint8) if descriptors is None else descriptors[kept])
+
+
+def _matched(one: _Features, other: _Features) -> Array:
+    """Return (N, 2) indices of features that are each other's nearest, and clearly so."""
+    if len(one.descriptors) < 2 or len(other.descriptors) < 2:
+        return np.zeros((0, 2), dtype=int)
+    matcher = cv2.BFMatcher.create(cv2.NORM_HAMMING)
+    back = {m.trainIdx: m.queryIdx for m in matcher.match(other.descriptors, one.descriptors)}
+    found = [
+        (best.queryIdx, best.trainIdx)
+        for best, next_best in matcher.knnMatch(one.descriptors, other.descriptors, k=2)
+        if best.distance < _MAX_DESCRIPTOR_RATIO * next_best.distance
+        and back.get(best.queryIdx) == best.trainIdx
+    ]
+    return np.array(found, dtype=int).reshape(-1, 2)
+
+
+def _read(log: Log, index: int) -> RgbdFrame | None:
+    try:
+        frame = log.entry_at(index).load(colour=False)
+    except FrameError:
+        return None  # it is counted when the log is read
+    return frame if isinstance(frame, RgbdFrame) else None
+
+
+def _units_per_m(log: Log) -> float | None:
+    files = log.entry_at(0).files
+    return None if files is None else files.depth_units_per_m
+
+
+def _rounded(units_per_m: float) -> float:
+    """Return a number of two digits, or of one where that is within the error of the scale."""
+    coarse = float(f"{units_per_m:.1g}")
+    return coarse if abs(coarse / units_per_m - 1.0) < 0.1 else float(f"{units_per_m:.2g}")

@@ -1,0 +1,170 @@
+"""Depth in the wrong units is noticed, and the setting named, before and after a build."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from logs_made import MemoryEntry, log_in_memory
+from test_cli import mapper
+
+from mapper.config.loading import load_config
+from mapper.core.frames import PinholeCamera, RgbdFrame
+from mapper.core.timebase import NS_PER_S
+from mapper.pipeline.build import build
+from mapper.run.folder import load_run
+from mapper.simulation import CameraSimulator
+from mapper.simulation.config import SynthConfig, SynthWheelsConfig
+from mapper.sources import open_source
+from mapper.sources.base import Log
+from mapper.sources.config import CameraConfig, SourceConfig
+from mapper.sources.depth_scale import depth_warnings
+
+CAMERA = PinholeCamera(40, 30, 30.0, 30.0, 19.5, 14.5)
+
+
+def desk(log, factor):
+    return open_source(log, SourceConfig(camera=CameraConfig(depth_factor=factor)))
+
+
+@pytest.mark.parametrize("factor", [4300, 5000, 5700])
+def test_depth_that_fits_the_truth_is_silent(desk_log, factor):
+    assert depth_warnings(desk(desk_log, factor)) == []
+
+
+@pytest.mark.parametrize(
+    ("factor", "wrong"),
+    [
+        (1000, "5 times too large"),
+        (3500, "1.4 times too large"),
+        (25000, "5 times too small"),
+        (7000, "1.4 times too small"),
+    ],
+)
+def test_a_wrong_factor_is_found_by_the_truth_and_the_right_one_is_named(desk_log, factor, wrong):
+    assert depth_warnings(desk(desk_log, factor)) == [
+        f"depth: {wrong} for the true motion of the camera; "
+        f"source.camera.depth_factor=5000 fits, not {factor}"
+    ]
+
+
+def in_other_units(source, scale):
+    """The same log, but for depth that is wrong by a factor."""
+
+    def entry_at(index):
+        frame = source.entry_at(index).load()
+        wrong = RgbdFrame(frame.stamp_ns, frame.image, frame.depth_m * np.float32(scale), frame.camera)
+        return MemoryEntry(frame.stamp_ns, wrong)
+
+    return Log(
+        path=source.path, name="wrong", kind="memory", sensor="rgbd", stamps_ns=source.stamps_ns,
+        entry_at=entry_at, wheels=source.wheels,
+    )  # fmt: skip
+
+
+def test_wheels_are_enough():
+    config = SynthConfig(
+        duration_s=6.0, frame_rate_hz=10.0, width_px=320, height_px=240, texture_px_per_m=64,
+        posters_per_room=3, furniture_per_room=4, wheels=SynthWheelsConfig(),
+    )  # fmt: skip
+    log = CameraSimulator(config).log()
+    assert depth_warnings(in_other_units(log, 1.0)) == []
+    (warning,) = depth_warnings(in_other_units(log, 0.2))
+    too_small = "depth: 5 times too small for the wheels' motion of the camera"
+    assert warning == f"{too_small}; source.camera.depth_factor is wrong"
+
+
+def plain(depths_m, *, image=None):
+    """A log of images without texture, each of one depth."""
+    image = np.zeros((30, 40), np.uint8) if image is None else image
+    return log_in_memory([
+        MemoryEntry(i * NS_PER_S, RgbdFrame(i * NS_PER_S, image, np.full((30, 40), m, np.float32), CAMERA))
+        for i, m in enumerate(depths_m)
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("depths_m", "warning"),
+    [
+        ([0.2, 2.0, 7.9], None),
+        ([0.0, 2.0, 2.0], None),
+        (
+            [7.0, 12.0, 13.0],
+            "depth: a tenth of it is beyond 12 m, but cameras measure 0.1 to 8 m; is source.camera",
+        ),
+        (
+            [0.002, 0.002],
+            "depth: half of it is within 0.002 m, but cameras measure 0.1 to 8 m; is source.camera",
+        ),
+        ([0.0, 0.0, 2.0], "depth: 100.0% of the pixels measured nothing: 0, or the limit of 16 bits"),
+    ],
+)
+def test_depth_without_any_motion_is_held_against_what_cameras_deliver(depths_m, warning):
+    found = depth_warnings(plain(depths_m))
+    assert len(found) == (warning is not None)
+    assert warning is None or found[0].startswith(warning)
+
+
+def test_motion_that_no_scale_fits_says_nothing_of_depth(desk_log):
+    """The truth of another log, say: this is not a matter of units."""
+    source = desk(desk_log, 5000)
+    truth = source.truth
+    random = np.random.default_rng(3).permutation(len(truth))
+    T_world_body = truth.T_world_body[random]
+    shuffled = Log(
+        path=source.path, name="shuffled", kind="tum", sensor="rgbd", stamps_ns=source.stamps_ns,
+        entry_at=source.entry_at, truth=type(truth)(truth.stamps_ns, T_world_body),
+    )  # fmt: skip
+    assert depth_warnings(shuffled) == []
+
+
+def test_frames_that_cannot_be_read_and_scans_are_left_alone():
+    assert depth_warnings(log_in_memory([MemoryEntry(0, OSError())], sensor="lidar")) == []
+
+
+def millimetres_for_redwood(desk_log, folder):
+    """The desk as a Redwood log, whose depth is taken to be in millimetres, but is in units of 0.2 mm."""
+    for kind in ("rgb", "depth"):
+        (folder / kind).mkdir(parents=True)
+        for number, path in enumerate(sorted((desk_log / kind).iterdir())):
+            shutil.copy(path, folder / kind / f"{number:04d}.png")
+    lines = (desk_log / "calibration.toml").read_text().splitlines()
+    (folder / "calibration.toml").write_text("\n".join(line for line in lines if "depth_factor" not in line))
+    return folder
+
+
+def test_inspect_and_build_tell_and_the_setting_alone_mends_it(desk_log, tmp_path):
+    log = millimetres_for_redwood(desk_log, tmp_path / "log")
+    text = mapper("inspect", log).stdout
+    assert "source.camera.depth_factor=1000 right?" in " ".join(
+        line for line in text.splitlines() if line.startswith("warning")
+    )
+    facts = json.loads(mapper("inspect", log, "--json").stdout)
+    assert len(facts["log"]["warnings"]) == 1
+
+    result = mapper(
+        "build",
+        log,
+        "--out",
+        tmp_path / "run",
+        "--set",
+        "odometry.max_depth_m=30",
+        "--set",
+        "slice.max_height_m=9",
+    )
+    assert "depth: a tenth of it is beyond" in result.stderr
+    notes = load_run(tmp_path / "run").manifest.input.notes
+    assert any(note.startswith("depth: a tenth of it is beyond") for note in notes)
+
+    mended = mapper("inspect", log, "--set", "source.camera.depth_factor=5000").stdout
+    assert "warning" not in mended
+
+
+def test_a_camera_above_every_ceiling_is_noted(desk_log, tmp_path):
+    """Levelled, the camera of a log in the wrong units stands higher than any hand reaches."""
+    config = load_config(overrides=["odometry.max_depth_m=30", "slice.max_height_m=9"])
+    for factor, is_high in ((5000, False), (1000, True)):
+        log = desk(desk_log, factor)
+        run = build(log, config, tmp_path / f"{factor}")
+        high = [note for note in run.manifest.input.notes if "m above the floor; is source.camera" in note]
+        assert bool(high) == is_high
