@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from mapper.core.config import Config, Ratio
 from mapper.features.config import DetectorConfig, OrbConfig, SurfConfig, UniformOrbConfig
@@ -136,6 +136,32 @@ class WheelsOdometryConfig(WheelNoiseConfig):
     """Features by which loops recognise images; scans are recognised by their points."""
 
 
+class GivenOdometryConfig(WheelNoiseConfig):
+    """Known poses as the odometry: frames are read only as keyframes, for loops; their noise is constant."""
+
+    kind: Literal["given"] = "given"
+    path: Path | None = None
+    """TUM text of the camera's or LiDAR's poses; a relative path starts in the working directory, or else in
+    the log's folder. None is the log's own truth."""
+    max_gap_s: PositiveFloat = 0.2
+    """Largest gap between two poses across which they are interpolated; frames in longer ones are lost."""
+    least_m: PositiveFloat = 0.01
+    """Error of a factor's translation."""
+    path_share: NonNegativeFloat = 0.0
+    """What is added to it, as a share of the metres in between: for poses that drift."""
+    least_rad: PositiveFloat = 0.005
+    """Error of a factor's rotation."""
+    turn_share: NonNegativeFloat = 0.0
+    """What is added to it, as a share of the radians turned."""
+    rad_per_m: NonNegativeFloat = 0.0
+    """What is added to it per metre in between."""
+    keyframe_distance_m: PositiveFloat = 0.3
+    keyframe_angle_rad: PositiveFloat = 0.2
+    """A frame this far, or turned this much, from the last keyframe is one itself."""
+    detector: Annotated[OrbConfig | UniformOrbConfig, Field(discriminator="kind")] = UniformOrbConfig()
+    """Features by which loops recognise images; scans are recognised by their points."""
+
+
 FrameOdometryConfig = (
     IsvdOdometryConfig
     | LocalMapConfig
@@ -147,4 +173,6 @@ FrameOdometryConfig = (
 )
 """Settings of the methods that use the frames' images or scans."""
 
-OdometryConfig = Annotated[FrameOdometryConfig | WheelsOdometryConfig, Field(discriminator="kind")]
+OdometryConfig = Annotated[
+    FrameOdometryConfig | WheelsOdometryConfig | GivenOdometryConfig, Field(discriminator="kind")
+]

@@ -8,6 +8,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.odometry.base import FrameOdometry, Odometry
 from mapper.odometry.config import (
     FrameOdometryConfig,
+    GivenOdometryConfig,
     IsvdOdometryConfig,
     LocalMapConfig,
     OdometryConfig,
@@ -26,26 +27,37 @@ if TYPE_CHECKING:
     from mapper.odometry.scan_to_map.scan_matcher import ScanMatcher
 
 
-def build_odometry(config: OdometryConfig, wheels: Trajectory | None = None) -> Odometry[Any]:
+def build_odometry(config: OdometryConfig, poses: Trajectory | None = None) -> Odometry[Any]:
     """Return the odometry that the settings choose, before its first frame; its module is imported only now.
 
     Args:
         config: Settings of one method.
-        wheels: T_odom_body of the log's wheel odometry; None if it has none.
+        poses: T_odom_body of the log's wheel odometry, or known poses, as ``poses_for`` returns them.
 
     Raises:
-        ConfigError: Wheel odometry is chosen, and the log has none.
+        ConfigError: Wheel odometry or known poses are chosen, and the log has none.
     """
-    if not isinstance(config, WheelsOdometryConfig):
-        return build_frame_odometry(config)
-    if wheels is None:
-        raise ConfigError(
-            "odometry.kind=wheels: the log has no wheel odometry; put wheels.txt or encoders.txt into "
-            "its folder, or name a recording's topic: --set source.topics.wheels=/odom"
-        )
-    from mapper.odometry.wheel_odometry import WheelsOdometry
+    match config:
+        case WheelsOdometryConfig():
+            from mapper.odometry.wheel_odometry import WheelsOdometry
 
-    return WheelsOdometry(config, wheels)
+            if poses is None:
+                raise ConfigError(
+                    "odometry.kind=wheels: the log has no wheel odometry; put wheels.txt or encoders.txt into "
+                    "its folder, or name a recording's topic: --set source.topics.wheels=/odom"
+                )
+            return WheelsOdometry(config, poses)
+        case GivenOdometryConfig():
+            from mapper.odometry.given_poses import GivenOdometry
+
+            if poses is None:
+                raise ConfigError(
+                    "odometry.kind=given: the log has no truth; name a file of poses: "
+                    "--set odometry.path=poses.tum"
+                )
+            return GivenOdometry(config, poses)
+        case _:
+            return build_frame_odometry(config)
 
 
 def build_frame_odometry(config: FrameOdometryConfig) -> FrameOdometry[Any]:

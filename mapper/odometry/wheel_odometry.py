@@ -15,7 +15,7 @@ from mapper.features.frame_view import FrameView
 from mapper.graph.model import BetweenFactor
 from mapper.graph.wheel_factors import WheelNode, wheel_factor
 from mapper.odometry.base import Diagnostics, FrameResult, lost_frame
-from mapper.odometry.config import LocalMapConfig, WheelsOdometryConfig
+from mapper.odometry.config import GivenOdometryConfig, LocalMapConfig, WheelsOdometryConfig
 from mapper.odometry.keyframe_distance import is_far
 from mapper.odometry.local_map.image_observation import observe_image
 from mapper.odometry.scan_to_map.config import GicpOdometryConfig
@@ -32,7 +32,10 @@ class WheelsOdometry:
     readings frames are lost, but the wheels kept counting: the next keyframe has a factor across the gap.
     """
 
-    def __init__(self, config: WheelsOdometryConfig, wheels: Trajectory) -> None:
+    method = "wheels"
+    readings = "the wheels' readings"
+
+    def __init__(self, config: WheelsOdometryConfig | GivenOdometryConfig, wheels: Trajectory) -> None:
         """Start before the first frame.
 
         Args:
@@ -80,10 +83,10 @@ class WheelsOdometry:
             T_node_body=inverse(keyframe.T_odom_body) @ T_odom_body,
             T_world_body=self._T_world_body,
             is_keyframe=keyframe is not last,
-            diagnostics=Diagnostics(0, 0, 0, 0.0, "m", "wheels"),
+            diagnostics=Diagnostics(0, 0, 0, 0.0, "m", self.method),
             factors=factors,
             links=factors,
-            twist=twist_at(self._wheels, int(np.searchsorted(self._wheels.stamps_ns, stamp_ns))),
+            twist=self._twist(stamp_ns),
         )
 
     def view(self, observation: FrameRef, twist: Twist | None = None, /) -> FrameView:
@@ -108,8 +111,12 @@ class WheelsOdometry:
     def _vocabulary(self) -> Vocabulary:
         return load_vocabulary()
 
+    def _twist(self, stamp_ns: int) -> Twist | None:
+        """Return the body's motion at a time, by the readings around it."""
+        return twist_at(self._wheels, int(np.searchsorted(self._wheels.stamps_ns, stamp_ns)))
+
     def _lost(self, stamp_ns: int) -> FrameResult:
         """Return the result of a frame at whose stamp there are no readings."""
         first_ns, last_ns = self._wheels.stamps_ns[[0, -1]]
         where = "in a gap of" if first_ns < stamp_ns < last_ns else "outside"
-        return lost_frame(stamp_ns, self._T_world_body, method=f"lost {where} the wheels' readings")
+        return lost_frame(stamp_ns, self._T_world_body, method=f"lost {where} {self.readings}")

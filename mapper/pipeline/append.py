@@ -13,6 +13,7 @@ from mapper.loops.closure import LoopClosure
 from mapper.loops.config import KeyframeLoopsConfig
 from mapper.loops.factory import build_keyframe_loop_detector
 from mapper.odometry.factory import build_odometry
+from mapper.odometry.given_poses import poses_for
 from mapper.odometry.node_offset import NodeOffset
 from mapper.pipeline.components import component_of
 from mapper.pipeline.fuse import carry_times, fuse_into
@@ -74,7 +75,7 @@ def append(
         known = before.graph.T_world_node.keys()
         with writer.clock.stage("track"):
             session = source.sessions[-1].log
-            start = _after(before, first, session.wheels, config, progress)
+            start = _after(before, first, poses_for(config.odometry, session), config, progress)
             tracking = track_log(session, config, progress=progress, start=start)
         refuse_a_fragment(tracking, config, sensor=source.sensor)
         _refuse_unconnected(second, run, tracking.loops, known)
@@ -117,7 +118,7 @@ def _manifest(run: Run, source: Log, config: SourceConfig) -> Manifest:
 def _after(
     before: StoredTracking,
     first: Log,
-    wheels: Trajectory | None,
+    poses: Trajectory | None,
     config: BuildConfig,
     progress: Progress,
 ) -> Start:
@@ -127,7 +128,7 @@ def _after(
     detector = build_keyframe_loop_detector(config.loops, config.graph.solve)
     views = reobserve(first, before.trajectory, set(graph.stamps_ns.values()), config, progress=progress)
     detector.preload(graph, {node: views[stamp_ns] for node, stamp_ns in graph.stamps_ns.items()})
-    odometry = build_odometry(config.odometry, wheels)
+    odometry = build_odometry(config.odometry, poses)
     offset_odometry = NodeOffset(odometry, first_node=max(graph.T_world_node) + 1)
     known = [factor for factor in graph.factors if factor.origin != "loop"]
     return Start(

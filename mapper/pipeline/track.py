@@ -4,7 +4,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, FrameError, TrackingError
@@ -17,6 +17,7 @@ from mapper.loops.detector import LoopDetector
 from mapper.loops.factory import build_loop_detector
 from mapper.odometry.base import FrameResult, Odometry
 from mapper.odometry.factory import build_odometry
+from mapper.odometry.given_poses import poses_for
 from mapper.run.frame_records import records_of
 from mapper.run.observers import NULL_OBSERVER, Observer, Step
 from mapper.run.stored_tracking import StoredTracking
@@ -24,10 +25,14 @@ from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef, Log, Skipped
 
-_HINTS: Mapping[Sensor | Literal["wheels"], str] = {
+_BY_POSES = ("wheels", "given")
+"""Kinds of odometry that look at no frame, but take over poses."""
+
+_HINTS: Mapping[str, str] = {
     "rgbd": "is there texture, and depth within max_depth_m, in the images?",
     "lidar": "do the scans overlap, and are their units metres?",
     "wheels": "do the wheels' readings cover the frames' times, without gaps beyond odometry.max_gap_s?",
+    "given": "do the given poses cover the frames' times, without gaps beyond odometry.max_gap_s?",
 }
 
 
@@ -84,14 +89,14 @@ def first_session(source: Log, config: BuildConfig) -> Start:
     """Return the start of a log that is the first of its place.
 
     Raises:
-        ConfigError: The odometry needs wheels and the log has none, or the loops need feature counts.
+        ConfigError: The odometry needs wheels or poses and there are none, or the loops need feature counts.
     """
-    if config.odometry.kind == "wheels" and config.loops.kind == "thesis":
+    if config.odometry.kind in _BY_POSES and config.loops.kind == "thesis":
         raise ConfigError(
-            "loops.kind=thesis looks from frames with many features, and odometry.kind=wheels counts none; "
-            "want loops.kind=places, scans or none"
+            "loops.kind=thesis looks from frames with many features, and "
+            f"odometry.kind={config.odometry.kind} counts none; want loops.kind=places, scans or none"
         )
-    odometry = build_odometry(config.odometry, source.wheels)
+    odometry = build_odometry(config.odometry, poses_for(config.odometry, source))
     return Start(odometry, build_loop_detector(config.loops, config.graph.solve), PoseGraph())
 
 
@@ -142,7 +147,7 @@ def track_log(
             tracks.append(track)
             observer.on_frame(Step(entry, track, view, odometry.matches, detector))
     graph.add_factors(odometry.finish())
-    if config.odometry.kind != "wheels":  # else they have had their say
+    if config.odometry.kind not in _BY_POSES:  # whose factors are of the wheels, or of better poses
         graph.add_factors(wheel_factors(graph.stamps_ns, source.wheels, config.graph.wheels))
     loops = (*start.loops, *detector.closures())
     graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")
@@ -163,7 +168,7 @@ def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: 
         raise TrackingError(
             f"none of {len(tracking.skipped)} frames could be read; the first: {tracking.skipped[0].reason}"
         )
-    hint = _HINTS["wheels" if config.odometry.kind == "wheels" else sensor]
+    hint = _HINTS[config.odometry.kind if config.odometry.kind in _BY_POSES else sensor]
     raise TrackingError(
         f"only {placed} of {read} frames read could be tracked, want at least {enough:.0f}; "
         f"{hint} (min_tracked_frames and min_tracked_ratio set the limit)"
