@@ -145,11 +145,11 @@ class GivenOdometryConfig(WheelNoiseConfig):
     the log's folder. None is the log's own truth."""
     max_gap_s: PositiveFloat = 0.2
     """Largest gap between two poses across which they are interpolated; frames in longer ones are lost."""
-    least_m: PositiveFloat = 0.01
-    """Error of a factor's translation."""
+    least_m: PositiveFloat = 0.002
+    """Error of a factor's translation; the default is motion capture's."""
     path_share: NonNegativeFloat = 0.0
     """What is added to it, as a share of the metres in between: for poses that drift."""
-    least_rad: PositiveFloat = 0.005
+    least_rad: PositiveFloat = 0.002
     """Error of a factor's rotation."""
     turn_share: NonNegativeFloat = 0.0
     """What is added to it, as a share of the radians turned."""
