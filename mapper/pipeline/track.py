@@ -26,7 +26,7 @@ from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef, Log, Skipped
 
 _BY_POSES = ("wheels", "given")
-"""Kinds of odometry that look at no frame, but take over poses."""
+"""Kinds of odometry without tracking: frames have the poses of wheels, or known ones."""
 
 _HINTS: Mapping[str, str] = {
     "rgbd": "is there texture, and depth within max_depth_m, in the images?",
@@ -147,7 +147,9 @@ def track_log(
             tracks.append(track)
             observer.on_frame(Step(entry, track, view, odometry.matches, detector))
     graph.add_factors(odometry.finish())
-    if config.odometry.kind not in _BY_POSES:  # whose factors are of the wheels, or of better poses
+    if (
+        config.odometry.kind not in _BY_POSES
+    ):  # the wheels are in its factors already, or poses better than theirs
         graph.add_factors(wheel_factors(graph.stamps_ns, source.wheels, config.graph.wheels))
     loops = (*start.loops, *detector.closures())
     graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")

@@ -23,7 +23,7 @@ from mapper.sources.tum import read_truth
 STAMP_FILES = ("times.txt", "stamps.txt", "timestamps.txt")
 
 _TEXT_ENDINGS = (".txt", ".csv")
-_LOOKED_AT = 5
+_SAMPLED = 5
 """Text files of a folder that are tried before it is taken for one of clouds."""
 
 
@@ -132,7 +132,7 @@ def _why_no_points(paths: Sequence[Path]) -> str | None:
     if not paths or paths[0].suffix.lower() not in _TEXT_ENDINGS:
         return None
     reason, paths = None, sorted(paths)
-    for index in np.unique(np.linspace(0, len(paths) - 1, _LOOKED_AT).astype(int)):
+    for index in np.unique(np.linspace(0, len(paths) - 1, _SAMPLED).astype(int)):
         found = why_no_points(paths[index])
         if found is None:
             return None
