@@ -43,8 +43,8 @@ def build_odometry(config: OdometryConfig, poses: Trajectory | None = None) -> O
 
             if poses is None:
                 raise ConfigError(
-                    "odometry.kind=wheels: the log has no wheel odometry; put wheels.txt or encoders.txt into "
-                    "its folder, or name a recording's topic: --set source.topics.wheels=/odom"
+                    "odometry.kind=wheels: the log has no wheel odometry; put wheels.txt or encoders.txt "
+                    "into its folder, or name a recording's topic: --set source.topics.wheels=/odom"
                 )
             return WheelsOdometry(config, poses)
         case GivenOdometryConfig():

@@ -8,7 +8,7 @@ import pytest
 from evaluators.metrics.occupancy import assess_by_distance, check_metrics
 from mapper.config.loading import load_config
 from mapper.core.deskew import twist_at
-from mapper.core.errors import ConfigError, FrameError, TrackingError
+from mapper.core.errors import ConfigError, TrackingError
 from mapper.core.geometry import angle_between, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.features.frame_view import ImageView, ScanView
@@ -24,6 +24,7 @@ from mapper.simulation.config import SynthConfig, SynthWheelsConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source
 from mapper.sources.chained import chained
+from tests.support.logs import CountedReads
 from tests.support.paths import CONFIGS
 from tests.support.wheeled_worlds import EXACT, FLAT, STREET_ON_WHEELS
 
@@ -36,25 +37,6 @@ def scene():
 @pytest.fixture(scope="module")
 def flat(scene):
     return CameraSimulator(FLAT, scene).log()
-
-
-class Watched:
-    """A log that counts how often its frames are read, and of which some cannot be."""
-
-    def __init__(self, source, damaged=()):
-        self.damaged, self.reads = damaged, []
-        self.log = replace(source, entry_at=lambda index: WatchedEntry(self, index, source.entry_at(index)))
-
-
-class WatchedEntry:
-    def __init__(self, watched, index, entry):
-        self.watched, self.index, self.entry, self.stamp_ns = watched, index, entry, entry.stamp_ns
-
-    def load(self, *, colour=True):
-        self.watched.reads.append(self.index)
-        if self.index in self.watched.damaged:
-            raise FrameError(f"frame {self.index}: damaged")
-        return self.entry.load(colour=colour)
 
 
 def by_wheels(*overrides):
@@ -74,7 +56,7 @@ def wheels_with(source, keep):
 
 
 def test_no_frame_is_read_and_every_one_lies_where_it_was_taken(flat):
-    watched = Watched(flat)
+    watched = CountedReads(flat)
     tracking = track_log(watched.log, by_wheels(), progress=SILENT)
     assert watched.reads == []
     path, truth = tracking.trajectory(), flat.truth
@@ -142,7 +124,7 @@ def test_a_log_without_wheels_is_refused_with_the_remedy(flat):
 
 
 def test_loops_read_keyframes_only_and_skip_a_damaged_one(flat):
-    watched = Watched(flat, damaged={0})
+    watched = CountedReads(flat, damaged={0})
     tracking = track_log(watched.log, by_wheels("loops.kind=places"), progress=SILENT)
     nodes = set(tracking.graph.stamps_ns.values())
     keyframes = [k for k, entry in enumerate(flat.entries()) if entry.stamp_ns in nodes]
@@ -197,6 +179,6 @@ def test_a_later_session_keeps_its_wheels_on_the_common_clock(flat):
 
 def test_the_configuration_that_is_shipped_reads_no_frame(flat):
     config = load_config(CONFIGS / "wheels.toml")
-    watched = Watched(flat)
+    watched = CountedReads(flat)
     assert len(track_log(watched.log, config, progress=SILENT).placed) == len(flat)
     assert watched.reads == []

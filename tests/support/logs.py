@@ -1,11 +1,12 @@
 """Logs whose frames lie in memory."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mapper.core.errors import FrameError
 from mapper.sources.base import Log
 
 
@@ -36,3 +37,22 @@ def log_in_memory(entries: list[MemoryEntry], *, name: str = "memory", **facts: 
         entry_at=entries.__getitem__,
         **({"sensor": "rgbd"} | facts),
     )
+
+
+class CountedReads:
+    """A log that counts how often its frames are read, and of which some cannot be."""
+
+    def __init__(self, source, damaged=()):
+        self.damaged, self.reads = damaged, []
+        self.log = replace(source, entry_at=lambda index: CountedEntry(self, index, source.entry_at(index)))
+
+
+class CountedEntry:
+    def __init__(self, counted, index, entry):
+        self.counted, self.index, self.entry, self.stamp_ns = counted, index, entry, entry.stamp_ns
+
+    def load(self, *, colour=True):
+        self.counted.reads.append(self.index)
+        if self.index in self.counted.damaged:
+            raise FrameError(f"frame {self.index}: damaged")
+        return self.entry.load(colour=colour)

@@ -5,8 +5,6 @@ import shutil
 
 import numpy as np
 import pytest
-from logs_made import MemoryEntry, log_in_memory
-from test_cli import mapper
 
 from mapper.config.loading import load_config
 from mapper.core.frames import PinholeCamera, RgbdFrame
@@ -19,6 +17,8 @@ from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.depth_scale import depth_warnings
+from tests.support.command_line import mapper
+from tests.support.logs import MemoryEntry, log_in_memory
 
 CAMERA = PinholeCamera(40, 30, 30.0, 30.0, 19.5, 14.5)
 

@@ -4,10 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from evaluators.evaluate import evaluate
-from test_cli import mapper
-from test_wheels_odometry import FLAT, STREET_ON_WHEELS, Watched
 
+from evaluators.metrics.evaluate import evaluate
 from mapper.config.loading import load_config
 from mapper.core.errors import ConfigError, DataError, TrackingError
 from mapper.core.geometry import angle_between, exp, interpolate, inverse
@@ -23,6 +21,9 @@ from mapper.simulation import CameraSimulator, make_scene
 from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source
 from mapper.sources.trajectory_files import write_tum
+from tests.support.command_line import mapper
+from tests.support.logs import CountedReads
+from tests.support.wheeled_worlds import FLAT, STREET_ON_WHEELS
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +54,7 @@ def poses_at(truth, keep):
 )
 def test_every_frame_has_the_pose_of_the_truth(log, loops, request):
     source = request.getfixturevalue(log)
-    watched = Watched(source)
+    watched = CountedReads(source)
     tracking = track_log(
         watched.log,
         given(f"loops.kind={loops}", "odometry.keyframe_distance_m=1", sensor=source.sensor),

@@ -4,9 +4,8 @@ import shutil
 
 import numpy as np
 import pytest
-from conftest import CALIBRATION, write_picture
-from evaluators.evaluate import evaluate
 
+from evaluators.metrics.evaluate import evaluate
 from mapper.config.loading import load_config
 from mapper.core.errors import SourceError
 from mapper.core.geometry import exp
@@ -17,6 +16,7 @@ from mapper.pipeline.build import build
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig
 from mapper.sources.trajectory_files import write_tum
+from tests.support.tum_logs import CALIBRATION, write_picture
 
 MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 POSES = np.array([exp(np.array([0.1 * i, -0.2, 0.3 * i]), np.array([i, 2.0, -0.5 * i])) for i in range(4)])
