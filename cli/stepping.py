@@ -1,4 +1,4 @@
-"""``--step``: a build that waits for Enter after every frame, as the thesis's tool did."""
+"""``--step``: a build that waits for Enter after every frame (Somlyai, PhD thesis, §3.6)."""
 
 import sys
 from typing import TYPE_CHECKING

@@ -58,7 +58,7 @@ class Accuracy:
     """Errors of measured depths from a plane.
 
     Attributes:
-        max_error_m: Δd, the largest error (eq. 2.46).
+        max_error_m: Δd, the largest error (Somlyai, PhD thesis, eq. 2.46).
         max_error_99_m: Δd without the worst 1 % of the pixels.
         mean_error_m: Positive where the plane is measured too far away.
         std_m: s, the standard deviation.

@@ -1,4 +1,4 @@
-"""Distance of one cloud from another (Nagy, Gálai & Benedek 2016, §IV)."""
+"""Distance of one cloud from another (Nagy, Gálai & Benedek 2016, §4.1)."""
 
 from dataclasses import dataclass
 

@@ -26,7 +26,7 @@ SENSOR, NUMBERS, ACCURACY, RESIDUALS = "sensor.toml", "depth.csv", "accuracy.png
 
 _RAW: Rgb = (38, 145, 87)
 _FILTERED: Rgb = (214, 69, 37)
-"""Green before DIF and red after, as in the thesis's figure 2.16."""
+"""Green before DIF and red after, as in Somlyai (PhD thesis), figure 2.16."""
 
 _MM = 1e3
 _COLUMNS = 4

@@ -15,7 +15,7 @@ def back_project(
     stride_px: int = 1,
     max_depth_m: float = np.inf,
 ) -> NDArray[np.float32]:
-    """Return the measured pixels as points (Somlyai (PhD thesis), alg. 3, eq. 2.47–2.48).
+    """Return the measured pixels as points (Somlyai, PhD thesis, alg. 3, eq. 2.47).
 
     Args:
         depth_m: (H, W) float32 metres along the optical axis; 0 or NaN is no return.

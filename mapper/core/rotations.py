@@ -50,7 +50,7 @@ def quaternion_from_rotation(R: Array) -> Array:
 
 
 def rotation_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
-    """Return Rz(yaw) · Ry(pitch) · Rx(roll) (Somlyai (PhD thesis), eq. 2.19–2.22)."""
+    """Return Rz(yaw) · Ry(pitch) · Rx(roll) (Somlyai, PhD thesis, eq. 2.24–2.28)."""
     cr, sr = np.cos(roll_rad), np.sin(roll_rad)
     cp, sp = np.cos(pitch_rad), np.sin(pitch_rad)
     cy, sy = np.cos(yaw_rad), np.sin(yaw_rad)
@@ -66,8 +66,8 @@ def rotation_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Ar
 def euler_from_rotation(R: Array) -> tuple[float, float, float]:
     """Return (roll, pitch, yaw) in radians with ``rotation_from_euler(...) == R``.
 
-    At gimbal lock (pitch = ±π/2) only roll ∓ yaw is defined: roll is set to 0 (Somlyai (PhD thesis),
-    eq. 2.29–2.33).
+    Somlyai (PhD thesis), eq. 2.29–2.31. At gimbal lock (pitch = ±π/2) only roll ∓ yaw is defined: roll is set
+    to 0, where the thesis sets yaw to 0 (eq. 2.32, 2.33).
     """
     sine = float(np.clip(-R[2, 0], -1.0, 1.0))
     pitch = float(np.arcsin(sine))

@@ -36,7 +36,7 @@ class GraphConfig(Config):
 
     solve: Literal["batch", "proportional", "none"] = "batch"
     """"batch": least squares over all factors, by GTSAM; "proportional": each loop's error is distributed
-    along the path in turn (Somlyai, PhD thesis, §4.1.4); "none": keep the odometry's own estimate."""
+    along the path in turn (Somlyai, PhD thesis, §4.3); "none": keep the odometry's own estimate."""
     robust: Literal["gnc", "none"] | KernelKind = "gnc"
     """Rejection of false loops: "gnc" classifies each (Yang et al. 2020), the kernels
     "cauchy", "huber" and "dcs" (Agarwal et al. 2013) weigh each by its residual, "none" keeps all.

@@ -1,4 +1,4 @@
-"""Proportional loop correction: a loop's error distributed along the path (Somlyai, PhD thesis, §4.1.4)."""
+"""Proportional loop correction: a loop's error distributed along the path (Somlyai, PhD thesis, §4.3)."""
 
 from collections.abc import Mapping
 

@@ -81,7 +81,7 @@ def up_px(height_px: int, rows_px: Array) -> Array:
 
 
 def ahead_m(calibration: LineLaserCalibration, rows_px: Array) -> Array:
-    """Return how far ahead the stripe lies that is seen in these rows (eq. 2.44)."""
+    """Return how far ahead the stripe lies that is seen in these rows (Somlyai, PhD thesis, eq. 2.44)."""
     law = calibration.range
     height = 100.0 * up_px(calibration.height_px, rows_px) / calibration.height_px
     result: Array = 1e-3 * law.scale_mm * height**law.exponent
@@ -96,7 +96,7 @@ def row_px(calibration: LineLaserCalibration, range_m: float) -> float:
 
 
 def right_m(calibration: LineLaserCalibration, columns_px: Array, rows_px: Array) -> Array:
-    """Return how far to the right it lies (eq. 2.45); x counts from the image's middle, as in Algorithm 2."""
+    """Return how far to the right it lies (Somlyai, PhD thesis, eq. 2.45); x is 0 in the image's middle."""
     law = calibration.lateral
     x = columns_px - 0.5 * (calibration.width_px - 1)
     result: Array = _CM * x / (law.slope * up_px(calibration.height_px, rows_px) + law.offset)

@@ -69,14 +69,14 @@ THESIS = LineLaserCalibration(
     range=RangeLaw(scale_mm=47366.0, exponent=-1.013),
     lateral=LateralLaw(slope=0.0447, offset=-1.4267),
 )
-"""The sensor of the thesis, eq. 2.44 and 2.45, and the farthest point it could measure."""
+"""The sensor of Somlyai (PhD thesis), eq. 2.44 and 2.45, and the farthest point it could measure."""
 
 
 Degrees = Annotated[float, Field(ge=0.0, lt=360.0)]
 
 
 class StripeConfig(Config):
-    """Settings of the stripe detection."""
+    """Settings of the stripe detection (Somlyai, PhD thesis, §2.5.2)."""
 
     hue_from_deg: Degrees = 355.0
     hue_to_deg: Degrees = 10.0
@@ -96,7 +96,7 @@ class StripeConfig(Config):
 
 
 class LineLaserMapConfig(Config):
-    """The grids: Algorithm 2's before the vehicle, and the one of the world."""
+    """The grids: the local one before the vehicle (Somlyai, PhD thesis, alg. 2), and the world's."""
 
     cell_m: PositiveFloat = 0.01
     """Edge of a cell of the local grid D[r, e]."""

@@ -1,5 +1,7 @@
 """Detection of the laser stripe in an image: each published method on its own, and their combination.
 
+Somlyai (PhD thesis), §2.5.2; equations and figures are numbered as there.
+
 Every method takes an image to the (H, W) uint8 response that it leaves; 0 is a pixel that it rejects.
 """
 

@@ -1,4 +1,4 @@
-"""From the stripe's rows to points before the vehicle, and to the local grid (Algorithm 2)."""
+"""Ranges from the stripe's rows, and the local grid before the vehicle (Somlyai, PhD thesis, alg. 2)."""
 
 from dataclasses import dataclass
 
@@ -65,7 +65,7 @@ def line_scan(
 
 
 def local_grid(scan: LineScan, config: LineLaserMapConfig) -> NDArray[np.uint8]:
-    """Return D[r, e] as the thesis's Algorithm 2 fills it: 1 where something stands.
+    """Return D[r, e] (Somlyai, PhD thesis, alg. 2): 1 where something stands.
 
     Row 0 is at the vehicle, and the middle column ahead of it; columns go to the right.
     """

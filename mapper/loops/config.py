@@ -20,7 +20,7 @@ class ImageVerificationConfig(Config):
     match: MatchConfig = MatchConfig(filter="none", max_ratio=0.85)
     """How descriptors are paired."""
     min_matches: PositiveInt = 45
-    """Fewer paired features are no loop (Zhao et al. 2020, §2.5)."""
+    """Fewer paired features are no loop (Zhao et al. 2020, §1.3, step 5)."""
     registration: IsvdConfig = IsvdConfig()
     """ISVD on the paired points gives the first motion."""
     max_depth_m: PositiveFloat = 5.0
@@ -140,7 +140,7 @@ class ScanLoopsConfig(KeyframeLoopsConfig):
 
 
 class ThesisLoopsConfig(Config):
-    """Sharp frames are compared with the keyframes near their estimate (Somlyai, PhD thesis, §4.1.4)."""
+    """Sharp frames are compared with the keyframes near their estimate (Somlyai, PhD thesis, §4.3)."""
 
     kind: Literal["thesis"] = "thesis"
     keyframe_interval: PositiveInt = 20

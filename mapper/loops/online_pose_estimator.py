@@ -75,7 +75,7 @@ class IncrementalPoseEstimator:
 
 
 class ProportionalPoseEstimator:
-    """Pose estimator by proportional correction of the odometry's path (Somlyai, PhD thesis, §4.1.4)."""
+    """Pose estimator by proportional correction of the odometry's path (Somlyai, PhD thesis, §4.3)."""
 
     def __init__(self) -> None:
         self._T_world_node: dict[int, Transform] = {}

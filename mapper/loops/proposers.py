@@ -12,7 +12,7 @@ from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 
 
 class PoseProposer(Generic[Place]):
-    """Pose proposer: places seen from nearby in nearly the same direction (Somlyai, PhD thesis, §4.1.4)."""
+    """Pose proposer: places seen from nearby in nearly the same direction (Somlyai, PhD thesis, §4.3)."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Loop closure of Somlyai (PhD thesis, §4.1.4), step by step."""
+"""Loop closure of Somlyai (PhD thesis, §4.3), step by step."""
 
 from bisect import bisect_right
 from collections import deque

@@ -1,4 +1,4 @@
-"""Proposer of images with similar visual words, by a bag of words (Zhao et al. 2020, §2.5)."""
+"""Proposer of images with similar visual words, by a bag of words (Zhao et al. 2020, §1.3)."""
 
 from functools import lru_cache
 

@@ -17,7 +17,7 @@ def rng():
 
 
 def brute_force(target, source, alpha_rad, config):
-    """Return one slice of the accumulator, summed over 3×3 bins, as C3 writes it."""
+    """Return one slice of the accumulator, summed over 3×3 bins (Nagy et al. 2016, alg. 1)."""
     half = int(np.ceil((config.max_offset_m + config.margin_m) / config.bin_m))
     offsets = target[:, None] - turned(source, alpha_rad)[None]
     bins = np.floor(offsets.reshape(-1, 2) / config.bin_m + 0.5).astype(int) + half

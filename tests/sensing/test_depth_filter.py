@@ -15,7 +15,7 @@ DEPTHS = arrays(
 
 
 def dif_by_the_book(depth_m):
-    """Thesis algorithm 4, word for word."""
+    """Somlyai (PhD thesis), alg. 4, line by line."""
     filtered = np.zeros_like(depth_m)
     for y, x in np.ndindex(depth_m.shape):
         patch = depth_m[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].astype(np.float64)

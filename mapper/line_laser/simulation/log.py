@@ -22,7 +22,7 @@ from mapper.simulation.streams import Stream, rng_of
 from mapper.sources.trajectory_files import write_tum
 
 BOARD_M = 0.4
-_BOARD_STEP_M = 0.2  # as the thesis calibrated: every 20 cm nearer
+_BOARD_STEP_M = 0.2  # as in Somlyai (PhD thesis), §2.5.3: every 20 cm nearer
 _NEAREST_M = 0.5
 _START_NS = 1_000 * NS_PER_S
 _READING_NS, _FINE_NS = 50_000_000, 20_000_000

@@ -2,8 +2,9 @@
 
 Camera and laser look level and straight ahead, one above the other, and the sheet falls to the floor at
 the reach. So the stripe's height in the image is a/d + b of the distance d, whatever the column, which for
-b near 0 is the thesis's power law (eq. 2.44). Its lateral law (eq. 2.45) has another horizon, b = 8.9 on the
-scale of 100, which no pinhole with a flat sheet can have beside the first; here it comes out near 0 too.
+b near 0 is the power law of Somlyai (PhD thesis), eq. 2.44. The lateral law (eq. 2.45) has another horizon,
+b = 8.9 on the scale of 100, which no pinhole with a flat sheet can have beside the first; here it comes out
+near 0 too.
 """
 
 from dataclasses import dataclass
