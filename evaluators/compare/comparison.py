@@ -80,7 +80,7 @@ def compare(source: Log, config: CompareConfig, folder: Path, *, progress: Progr
         source: The log.
         config: Which methods, and how they are compared.
         folder: Where the results of finished methods are kept: what is there is not run again.
-        progress: Told how far each method is, and of frames that cannot be read.
+        progress: Receives each method's counts, and notes of frames that cannot be read.
 
     Raises:
         ConfigError: No method of such a name, or none of them can use the log.
@@ -153,7 +153,7 @@ class MethodJob:
         source: The log.
         config: How methods are compared.
         method: Its name.
-        progress: Told how far it is.
+        progress: Receives stages, counts and notes.
     """
 
     source: Log

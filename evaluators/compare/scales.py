@@ -13,7 +13,7 @@ AnyConfig = TypeVar("AnyConfig", bound=Config)
 _INDOORS = 0.1
 """A depth camera sees 4 m where a LiDAR sees 40."""
 _MAX_CAMERA_TILT_RAD = 1.05
-"""A camera carried by hand looks down on tables."""
+"""A hand-held camera is tilted down to tables."""
 
 
 def registrations_for(sensor: Sensor) -> list[Any]:

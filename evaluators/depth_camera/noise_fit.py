@@ -25,7 +25,7 @@ class NoiseFit:
     Attributes:
         form: Which terms it has.
         noise: The coefficients a, b, c.
-        uncertainty: (3,) standard errors of these from how the measurements lie about the curve; NaN where
+        uncertainty: (3,) standard errors of these from the residuals of the fit; NaN where
             there are no more measurements than coefficients.
         misfit_ratio: RMS of the measurements about the curve, as a share of it.
         low_m: Least distance that was measured.

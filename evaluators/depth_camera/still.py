@@ -86,7 +86,7 @@ def depth_at(
         distance_m: Depth of the plane where the optical axis meets it.
         patch: What shows nothing but the plane; None is the middle third of the image, each way.
         keep_tilt: Compare with a plane across the axis, as the thesis does.
-        progress: Told of frames that show no plane.
+        progress: Receives notes of frames that show no plane.
 
     Raises:
         DataError: The patch reaches beyond the image, no frame shows a plane there, or it is elsewhere.

@@ -27,7 +27,7 @@ class DepthStudy:
         is_known: Whether the planes' distances were given, rather than fitted.
         levels: From near to far.
         fit: The noise before DIF.
-        maps: Where in the image the errors lie.
+        maps: Errors by position in the image.
     """
 
     logs: Sequence[str]
@@ -50,11 +50,11 @@ def study_depth(
 
     Args:
         sources: RGB-D logs of one camera.
-        distances_m: Of the plane before which the camera stands in each; None looks for planes.
-        patch: Where in the image to look, or the usual place.
+        distances_m: Of the plane before which the camera stands in each; None searches for planes.
+        patch: Part of the image that is used; None is the usual one.
         keep_tilt: As :func:`evaluators.depth_camera.still.depth_at`.
         most_frames: As :func:`evaluators.depth_camera.tiles.depth_of_planes`.
-        progress: Told how far it is.
+        progress: Receives stages, counts and notes.
 
     Raises:
         DataError: A log does not show what it should, or depths that do not scatter.

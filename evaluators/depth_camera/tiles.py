@@ -56,9 +56,9 @@ def depth_of_planes(
 
     Args:
         source: RGB-D log.
-        patch: Where in the image to look; None is everywhere.
+        patch: Part of the image that is used; None is all.
         most_frames: About so many, evenly chosen, are enough; None takes all.
-        progress: Told how far it is.
+        progress: Receives stages, counts and notes.
 
     Returns:
         The distances, from near to far, and the frame that shows most planes.

@@ -82,7 +82,7 @@ def study(config: LineLaserConfig, seeds: Sequence[int], *, progress: Progress =
     Args:
         config: How the stripe is found.
         seeds: Each another room, other things on its walls and other noise.
-        progress: Told of every seed of a scene, and of Table 2.1.
+        progress: Receives the count of scenes and seeds, and of Table 2.1.
     """
     found: dict[str, list[Mapping[Method, Counts]]] = {name: [] for name in SCENES}
     measured_m: dict[float, list[float]] = {range_m: [] for range_m in TABLE_2_1}

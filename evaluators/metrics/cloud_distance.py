@@ -35,7 +35,7 @@ class DistanceTo:
         self._tree = kd_tree(points_target)
 
     def of(self, points_source: Points32, T_target_source: Transform) -> CloudDistance:
-        """Return how far the cloud P, (M, 3) metres in its own frame, lies from Q under a motion.
+        """Return the distance of the cloud P, (M, 3) metres in its own frame, from Q under a motion.
 
         Raises:
             DataError: It is empty.

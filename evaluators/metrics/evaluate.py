@@ -36,7 +36,7 @@ class Assessment:
 
     Attributes:
         metrics: Every number, the errors first.
-        matched: The poses that have a true one, laid over it; None without truth.
+        matched: The poses that have a true one, aligned with it; None without truth.
         lengths: Errors over the segments of each length; empty without truth.
     """
 
@@ -69,7 +69,7 @@ def assess(
     Args:
         estimate: The trajectory.
         truth: True poses of the body, or None if they are not known.
-        alignment: How the estimate is laid over the truth first.
+        alignment: How the estimate is aligned with the truth first.
         frames_ns: Stamps of all frames of the log, of which the estimate should have poses; None takes the
             time that the truth covers instead.
         lengths_m: Of the segments of the relative errors; None chooses them by the length of the true path.

@@ -24,7 +24,7 @@ _PAIR_VOXELS = 3.0
 """How far apart the points of a pair may be while a reference is registered."""
 
 World = Literal["truth", "map"]
-"""World that a reference lies in: that of the log's truth, or the run's own, which is levelled."""
+"""World of a reference: that of the log's truth, or the run's own, which is levelled."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +32,7 @@ class MapQuality:
     """Comparison of a map with a reference.
 
     Attributes:
-        metrics: Every number; the first says how the reference was laid.
+        metrics: Every number; the first names the alignment of the reference.
         check: The voxels that they come from.
     """
 
@@ -48,10 +48,10 @@ def map_quality(
     Args:
         run: A finished run.
         reference: What to compare it with.
-        world: In which the reference lies; None is the truth's for the world of a synthetic log, else the
+        world: World of the reference; None is the truth's for the world of a synthetic log, else the
             run's own.
         voxels: How far apart the surfaces may be, in voxels.
-        register: Refine how the reference is laid by point-to-plane ICP with the run's cloud.
+        register: Refine the alignment of the reference by point-to-plane ICP with the run's cloud.
 
     Raises:
         DataError: The log has no truth to lay the reference by, the two share no known surface, or there are
@@ -110,7 +110,7 @@ def _registered(
 def _distances(
     reference: Reference, check: OccupancyCheck, cloud: Points32, T_map_reference: Transform
 ) -> list[Metric]:
-    """Return modified Hausdorff and median distances: both ways, but from a world known exactly none."""
+    """Return modified Hausdorff and median distances in both directions; from an exact world in none."""
     T_reference_map = inverse(T_map_reference)
     if reference.signed_distance_m is not None:
         distances_m = np.abs(reference.signed_distance_m(apply(T_reference_map, cloud.astype(np.float64))))

@@ -39,7 +39,7 @@ class Reference:
             is known exactly.
         signed_distance_m: Of a world that is known exactly, else None.
         log_odds_at: Of a map, else None.
-        in_truth: It lies in the world of the log's truth.
+        in_truth: It is in the world of the log's truth.
     """
 
     name: str

@@ -15,7 +15,7 @@ class Metric:
     """One measured number.
 
     Attributes:
-        name: What a reader would call it, with whatever it depends on: "ATE RMSE, SE(3)-aligned".
+        name: Name for a reader, with what it depends on: "ATE RMSE, SE(3)-aligned".
         value: A finite number; what could not be measured is not a metric.
         unit: "m", "rad", "s", or what was counted: "pairs", "frames".
     """

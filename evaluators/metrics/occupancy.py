@@ -30,13 +30,13 @@ class OccupancyCheck:
     """Every voxel that can be assessed, and whether it is right.
 
     Attributes:
-        occupied: (O, 3) keys of the map's occupied voxels where the reference knows anything.
+        occupied: (O, 3) keys of the map's occupied voxels where the reference is known.
         right: (O,) whether the reference has a surface within the tolerance.
         surface: (S, 3) keys of the voxels that the reference's surfaces pass through.
         found: (S,) whether the map has an occupied voxel within the tolerance.
-        seen: (S,) found, or at least known to the map: what it never saw it cannot have missed.
-        free_right: (F,) for free voxels of the map that the reference knows, whether it is not solid there.
-        open_free: (G,) for voxels of the reference's open space that the map knows, whether they are free.
+        seen: (S,) found, or at least known in the map: an unknown surface is not missed.
+        free_right: (F,) for free voxels of the map, known in the reference, whether it is not solid there.
+        open_free: (G,) for voxels of the reference's open space, known in the map, whether they are free.
         voxels: The tolerance.
         resolution_m: Edge of a voxel.
     """
@@ -91,7 +91,7 @@ def assess_by_distance(
         voxels: The tolerance.
 
     Raises:
-        DataError: The map is empty, or knows no surface.
+        DataError: The map is empty, or has no surface.
     """
     leaves, occupied = _known(octree)
     edge_m = leaves.resolution_m
@@ -123,12 +123,12 @@ def assess_by_points(
     Args:
         octree: The map.
         points_world: (N, 3) metres, in the map's world, so dense that no voxel of a surface is left out.
-        log_odds_at: What the reference knows of the map's world; None knows surfaces alone, so that every
-            occupied voxel is assessed and no free one.
+        log_odds_at: Log-odds of the reference in the map's world; None if only its surfaces are known, so
+            that every occupied voxel is assessed and no free one.
         voxels: The tolerance.
 
     Raises:
-        DataError: The map is empty, or knows none of the surfaces.
+        DataError: The map is empty, or has none of the surfaces.
     """
     leaves, occupied = _known(octree)
     keys = leaves.keys.astype(np.int64)

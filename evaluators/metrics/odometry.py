@@ -63,8 +63,8 @@ class OdometryRun:
         frames: Frames that it was given.
         failures: Frames that it could not place, or registrations that did not converge.
         seconds: Of the CPU, without what is common to all methods.
-        trajectory: T_world_body, laid over the truth where there is one.
-        matched: The poses that have a true one, laid over it; None without truth or with too few.
+        trajectory: T_world_body, aligned with the truth where there is one.
+        matched: The poses that have a true one, aligned with it; None without truth or with too few.
         errors: Of these; nothing is known without truth or with too few.
         steps_m: (S,) errors of the translation over one step; empty where no two poses are one apart.
         broke: Why the method did not come to the end of the log; empty when it did.
@@ -101,7 +101,7 @@ def step_for(stamps_ns: Stamps) -> Step:
 
 
 def assess_run(run: OdometryRun, truth: Trajectory | None, step: Step) -> OdometryRun:
-    """Return a run with its path laid over the truth, and its errors; as it is where too few poses have one.
+    """Return a run with its path aligned with the truth, and its errors; as it is where few poses have one.
 
     Args:
         run: With a trajectory in any frame.
@@ -126,7 +126,7 @@ def assess_run(run: OdometryRun, truth: Trajectory | None, step: Step) -> Odomet
 
 
 def path_errors(matched: Matched, step: Step) -> PathErrors:
-    """Return the errors of a path that lies over the truth, the relative ones over a step."""
+    """Return the errors of a path aligned with the truth, the relative ones over a step."""
     steps_m, steps_rad = _step_errors(matched, step.delta, step.unit)
     return PathErrors(
         ate_m=ate(matched).rmse,

@@ -1,4 +1,4 @@
-"""Sharpness of a map, without any reference: how well scans that are laid over each other agree.
+"""Sharpness of a map, without any reference: how well overlapping scans agree.
 
 It separates a good trajectory from a bad one only as far as the sensor is right: scans that are wrong alike
 agree.
@@ -22,7 +22,7 @@ from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 
 RADIUS_M: dict[Sensor, float] = {"rgbd": 0.2, "lidar": 0.5}
-"""Of the patches: small enough for walls to be flat, large against what scans are laid wrong by."""
+"""Of the patches: small enough for walls to be flat, large against the errors of poses."""
 
 _FRAMES, _POINTS, _PATCHES = 100, 200_000, 5_000
 _MIN_NEIGHBOURS = 15
@@ -56,12 +56,12 @@ class Views:
 
 
 def views_of(source: Log, trajectory: Trajectory, *, progress: Progress = SILENT) -> Views:
-    """Return evenly chosen points of evenly chosen scans, laid out by a trajectory: enough, whatever the log.
+    """Return evenly chosen points of evenly chosen scans at a trajectory's poses, enough of any log.
 
     Args:
         source: The log.
         trajectory: T_world_body of its frames.
-        progress: Told how far it is.
+        progress: Receives stages, counts and notes.
 
     Raises:
         DataError: No frame of the log has a pose.
@@ -96,7 +96,7 @@ def sharpness_metrics(views: Views, *, radius_m: float) -> list[Metric]:
     (Droeschel, Stückler & Behnke 2014), plane variance its least eigenvalue (Razlaw et al. 2015).
 
     Args:
-        views: The scans, laid out.
+        views: The scans at their poses.
         radius_m: Of the patches.
 
     Raises:

@@ -48,13 +48,13 @@ class Matched:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity:
-    """The motion and scale that lay an estimate over the truth: ``truth ≈ scale · R · map + t``."""
+    """The motion and scale that align an estimate with the truth: ``truth ≈ scale · R · map + t``."""
 
     T_truth_map: Transform
     scale: float = 1.0
 
     def moved(self, matched: Matched) -> Matched:
-        """Return the same pairs with the estimate laid over the truth."""
+        """Return the same pairs with the estimate aligned with the truth."""
         T_map_body = matched.T_map_body.copy()
         T_map_body[:, :3, 3] *= self.scale
         return Matched(matched.stamps_ns, self.T_truth_map @ T_map_body, matched.T_truth_body)
@@ -131,7 +131,7 @@ def associate(
 
 
 def align(matched: Matched, kind: AlignmentKind) -> Similarity:
-    """Return the motion that lays the estimate over the truth with the least squared distance of positions.
+    """Return the motion that aligns the estimate with the truth at the least squared distance of positions.
 
     "none" moves nothing; "yaw" shifts, and turns about z (Zhang & Scaramuzza 2018), which is all that is open
     where z is up in both worlds; "se3" fits a rigid motion (Arun et al. 1987), "sim3" a scale as well

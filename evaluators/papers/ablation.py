@@ -130,7 +130,7 @@ class _VariantRun:
         self._tracks: list[FrameResult] = []
 
     def add(self, frame: Frame) -> None:
-        """Track the next frame, and look for loops from it."""
+        """Track the next frame, and search loops from it."""
         observation = self._odometry.observe(frame)
         track = self._odometry.track(observation)
         self._tracks.append(track)

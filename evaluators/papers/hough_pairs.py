@@ -161,7 +161,7 @@ def find_pairs(logs: Path) -> list[Pair]:
     """Return the pairs of a folder: those of its ``pairs.toml``, or else those made of its logs.
 
     A log is the folder or one in it. Of LiDAR logs with truth, scans evenly chosen are left out one by one;
-    two sensors' clouds of one moment are a pair where an extrinsic calibration ties them, as RELLIS-3D's do.
+    two sensors' clouds of one moment are a pair where there is an extrinsic calibration, as in RELLIS-3D.
 
     Raises:
         ConfigError: ``pairs.toml`` cannot be read.
@@ -207,7 +207,7 @@ def _made_of(folder: Path) -> list[Pair]:
 
 
 def _cross_sensor(folder: Path) -> list[Pair]:
-    """Return the clouds of one moment that an extrinsic of a folder, ``vel2os1.yaml``, ties."""
+    """Return the simultaneous clouds of a folder with an extrinsic calibration, ``vel2os1.yaml``."""
     pairs: list[Pair] = []
     for path in sorted(folder.glob("*2*.yaml")):
         for split in re.finditer("2", path.stem):

@@ -81,7 +81,7 @@ class PaperTable:
 
     Attributes:
         name: "Table 5.1".
-        title: What it tells, in a line.
+        title: Its content, in a line.
         source: As ``published.json`` gives it.
         metric: "ATE RMSE"; what is printed in the cells.
         unit: "m"; empty where it differs by column, whose text then ends in its own, e.g. "x [mm]".
@@ -102,13 +102,13 @@ class PaperTable:
 
 @dataclass(frozen=True, slots=True)
 class PaperPath:
-    """A trajectory worth a picture, in files.
+    """A trajectory to be drawn, in files.
 
     Attributes:
         row: The sequence, e.g. "fr1/xyz".
         method: "ISVD+LC".
         ate_m: ATE RMSE in metres, SE(3)-aligned.
-        estimate: TUM file, already laid over the truth.
+        estimate: TUM file, already aligned with the truth.
         truth: TUM file.
     """
 

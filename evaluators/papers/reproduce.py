@@ -1,4 +1,4 @@
-"""A paper's tables measured again on whatever of its logs are at hand; work that was stopped goes on."""
+"""A paper's tables measured again on those of its logs that are at hand; stopped work is resumed."""
 
 import json
 from collections.abc import Mapping
@@ -36,7 +36,7 @@ class Request:
         logs: Folder in which to look for its logs.
         given: Logs of other names, by the paper's names.
         tables: Which, e.g. "5.1"; empty is all.
-        seeds: How many draws of whatever is random.
+        seeds: Number of draws of all that is random.
         cut: Which frames are used.
     """
 
@@ -70,7 +70,7 @@ def reproduce(
         request: What to measure.
         out: Folder for tables, pictures, trajectories and finished cells; an unfinished one is completed.
         workers: Where to measure; a scheduler's workers see the logs and ``out`` under the same paths.
-        progress: Told how far it is.
+        progress: Receives stages, counts and notes.
 
     Raises:
         SourceError: None of the paper's logs is there.

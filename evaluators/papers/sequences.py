@@ -35,9 +35,9 @@ def find_sequences(folder: Path, names: Sequence[str], given: Mapping[str, Path]
     """Find a paper's sequences in a folder, which may be one of them itself, and in the folders in it.
 
     Args:
-        folder: Where to look.
+        folder: Folder that is searched.
         names: As the paper calls them, e.g. "fr1/xyz".
-        given: Where logs of other names lie; these win.
+        given: Paths of logs of other names; these win.
 
     Raises:
         SourceError: The folder is missing, or none of the sequences is there.

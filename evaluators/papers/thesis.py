@@ -111,7 +111,7 @@ class ThesisJob:
         return table == "5.5" and self.seed == 0
 
     def _keep(self, setting: str, estimate: Trajectory, truth: Trajectory) -> None:
-        """Write both trajectories, the estimate laid over the truth."""
+        """Write both trajectories, the estimate aligned with the truth."""
         T_truth_map = align(associate(estimate, truth), "se3").T_truth_map
         write_tum(self._path(setting), estimate.moved(T_truth_map))
         first_ns, last_ns = estimate.stamps_ns[0], estimate.stamps_ns[-1]

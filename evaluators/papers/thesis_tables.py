@@ -43,7 +43,7 @@ class Ablation:
     """A table: some sequences, each with settings that differ in one thing.
 
     Attributes:
-        table: Without what we measure; the thesis's figures of logs that nobody else has are in it.
+        table: Without what we measure; the thesis's figures of its own logs are in it.
         printed: The thesis's figures of logs that may be at hand.
         sequences: And how many of their first frames are used; None is all.
         settings: By what they are called in the table.

@@ -89,7 +89,7 @@ def draw_path(
 
     Args:
         axes: Where.
-        matched: The path, laid over the truth.
+        matched: The path, aligned with the truth.
         errors_m: (N,) distances from the truth.
         most_m: Error of the strongest colour; None is the largest.
 

@@ -43,7 +43,7 @@ def register_config(method: str, sensor: Sensor) -> RegisterConfig:
     """Return a known method's configuration, scaled to a sensor's range.
 
     Raises:
-        ConfigError: The method looks for the ground, and a camera's frame has its z ahead.
+        ConfigError: The method searches the ground, and a camera's frame has its z ahead.
     """
     member: Any = _METHODS[method]
     if sensor == "lidar" or member is IsvdOdometryConfig:

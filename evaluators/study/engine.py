@@ -35,7 +35,7 @@ def run_study(
         folder: Where results are kept; with a scheduler, a place that all of its workers see.
         workers: Where the jobs run.
         attempts: How often a job is begun before it has failed.
-        progress: Told of the jobs that are left, so that the expected end holds, and of failures.
+        progress: Receives the count of the jobs that are left, so that the expected end holds, and failures.
 
     Raises:
         RunError: Another process is at work on the folder.

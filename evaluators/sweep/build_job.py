@@ -45,7 +45,7 @@ class BuildJob:
         """Return the build's numbers, one record.
 
         Raises:
-            MapperError: As the build says.
+            MapperError: As ``build`` raises.
         """
         forget_peak_memory()
         self.scratch.mkdir(parents=True, exist_ok=True)

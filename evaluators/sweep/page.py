@@ -53,7 +53,7 @@ def _statuses(records: Sequence[Record]) -> list[str]:
 
 
 def _compared(groups: Groups, quantity: Quantity) -> str:
-    """Return a row for each log and a column for each way to build, and a drawing of it."""
+    """Return a row for each log and a column for each kind of build, and a drawing of it."""
     variants = list(next(iter(groups.values())))
     rows = []
     for log, of_log in groups.items():

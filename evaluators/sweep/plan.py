@@ -41,7 +41,7 @@ class BuildName:
         log: Its name, unique in the sweep.
         method: Its name.
         configuration: Its name.
-        seed: None if the build has no use for one, or none was asked for.
+        seed: None if nothing in the build is random, or none was asked for.
     """
 
     log: str
@@ -113,7 +113,7 @@ def run_sweep(
     Args:
         plan: The builds.
         workers: Where the builds run; each keeps to one core.
-        progress: Told how far it is.
+        progress: Receives stages, counts and notes.
 
     Raises:
         ConfigError: As for ``run_study``.

@@ -30,7 +30,7 @@ class BuildConfig(Config):
     mesh: MeshConfig = MeshConfig()
     costmap: CostmapConfig = CostmapConfig()
     min_tracked_frames: PositiveInt = 10
-    """With fewer frames tracked there is no map worth the name, and the build ends in an error."""
+    """With fewer frames tracked no map is made, and the build ends in an error."""
     min_tracked_ratio: Ratio = 0.2
     """The same, as a share of the frames that could be read."""
     workers: NonNegativeInt = 2

@@ -1,1 +1,1 @@
-"""Examination of a machine and an installation, before a log is at stake."""
+"""Examination of a machine and an installation, before a log is built."""

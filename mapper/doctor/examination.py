@@ -22,7 +22,7 @@ _MACHINE: tuple[Callable[[], Finding], ...] = (
 
 
 def examine(*, progress: Progress = SILENT) -> list[Finding]:
-    """Look at the machine, then try every library in a process of its own, one per processor at a time."""
+    """Check the machine, then try every library in a process of its own, one per processor at a time."""
     least = requirements()
     findings = [look() for look in _MACHINE]
     with progress.stage("try") as report:

@@ -10,10 +10,10 @@ Verdict = Literal["well", "warning", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing looked at.
+    """Result of one check.
 
     Attributes:
-        name: What was looked at.
+        name: What was checked.
         verdict: "warning" is worth knowing; "failed" keeps some verb from working.
         detail: What was seen, in one line.
         remedy: What to do about it; empty when all is well.

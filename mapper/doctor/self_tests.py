@@ -1,4 +1,4 @@
-"""A tiny job with a known answer for every library that we stand on.
+"""Self-tests: a tiny job with a known answer for every library that is used.
 
 ``python -m mapper.doctor.self_tests NAME`` does one of them in a process of its own, so that a library whose
 compiled code crashes takes nothing else with it.
@@ -17,7 +17,7 @@ _TOLERANCE_M = 0.01
 
 
 class WrongAnswerError(Exception):
-    """A library ran, and was wrong."""
+    """A library ran, and gave a wrong answer."""
 
 
 def gtsam(_folder: Path) -> None:

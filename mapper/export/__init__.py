@@ -1,1 +1,1 @@
-"""Writers of the products users take away."""
+"""Writers of a run's products: files for other programs, pictures, recordings, reports."""

@@ -1,4 +1,4 @@
-"""The slice, inflated, as nav2's map_server loads costs."""
+"""Costmap: the inflated slice as files that nav2's map_server loads."""
 
 from pathlib import Path
 
@@ -56,7 +56,7 @@ def occupancy_values(costmap: Costmap) -> NDArray[np.uint8]:
 
 
 def _picture(values: NDArray[np.uint8]) -> bytes:
-    """Return a PNG: the dearer, the redder; obstacles dark, unknown grey."""
+    """Return a PNG: redder with the cost, obstacles dark, unknown grey."""
     share = np.clip(values, 0, _INSCRIBED).astype(np.float32)[..., None] / _INSCRIBED
     bgr = (1.0 - share) * FREE_CELL[::-1] + share * (40.0, 60.0, 225.0)
     bgr[values == _LETHAL] = OCCUPIED_CELL[::-1]

@@ -1,4 +1,4 @@
-"""The kinds of file that a run can be taken away as, and the one way to write any of them."""
+"""Exports of a run: the kinds of file, and the function that writes any of them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

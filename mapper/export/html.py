@@ -1,4 +1,4 @@
-"""Pages that hold all they show and load nothing from anywhere."""
+"""Self-contained HTML pages: they load nothing."""
 
 from collections.abc import Iterable
 from html import escape

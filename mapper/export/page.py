@@ -1,4 +1,4 @@
-"""The page that every picture is drawn on.
+"""Page of every picture: an empty figure, and its file.
 
 Matplotlib is driven through its objects: pyplot would keep global state and pick a GUI backend.
 """

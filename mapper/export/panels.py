@@ -112,7 +112,7 @@ def draw_boxes(axes: "Axes", values: Mapping[str, Array]) -> None:
 
 
 def by_logarithm(axes: "Axes") -> None:
-    """Lay what was drawn out by its logarithm, with ticks at 1, 2, 5 where powers of ten are too few."""
+    """Give an axis of x a logarithmic scale, with ticks at 1, 2, 5 where powers of ten are too few."""
     from matplotlib.ticker import LogLocator
 
     axes.set_xscale("log")

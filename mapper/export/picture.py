@@ -44,7 +44,7 @@ def write_summary(
     title: str,
     lines: Sequence[str] = (),
 ) -> None:
-    """Draw the trajectory over the slice, and what its loops tie together.
+    """Draw the trajectory over the slice, with its loops.
 
     Args:
         path: PNG file to write.
@@ -64,14 +64,14 @@ def write_summary(
         reference = truth.positions_world
         axes.plot(*reference[:, :2].T, color=hex_of(TRUTH), linewidth=2.6, alpha=0.65, label="truth")
     axes.plot(*positions[:, :2].T, color=hex_of(ESTIMATE), linewidth=1.3, label="estimate")
-    _tie(axes, loops_world)
+    _draw_loops(axes, loops_world)
     _mark(axes, positions[0], color=START, marker="o", label="start")
     _mark(axes, positions[-1], color=END, marker="s", label="end")
     _finish_map(axes, low, high)
     save(figure, path)
 
 
-def _tie(axes: "Axes", loops_world: Array) -> None:
+def _draw_loops(axes: "Axes", loops_world: Array) -> None:
     """Draw loops as lines between dots: most are so short that a line alone would not be seen."""
     label = f"{len(loops_world)} loops"
     for ends in loops_world[:, :, :2]:
@@ -92,7 +92,7 @@ def write_path(
 
     Args:
         path: PNG file to write.
-        grid: What the path lies over, world frame.
+        grid: Background of the path, world frame.
         waypoints_world: (N, 2) or (N, 3) metres, seen from above.
         radius_m: Of the robot.
         title: Headline.
@@ -176,7 +176,7 @@ def write_cloud_views(
 ) -> None:
     """Draw a coloured cloud from above and from an oblique side, with the trajectory through it.
 
-    What lies over the camera's head is left out of both, so that ceilings do not hide the rooms.
+    Points above the highest camera position are left out of both, so that ceilings do not hide the rooms.
 
     Args:
         path: PNG file to write.

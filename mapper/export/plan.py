@@ -18,7 +18,7 @@ from mapper.runtime.atomic import write_text
 
 
 def write_plan(run: Run, plan: Plan, *, grid: OccupancyGrid) -> None:
-    """Write ``plan.json`` and ``plan.png``, and put the path into ``run.mcap``; an earlier plan gives way.
+    """Write ``plan.json`` and ``plan.png``, and put the path into ``run.mcap``; an earlier plan is replaced.
 
     Args:
         run: A finished run.
@@ -39,7 +39,7 @@ def write_plan(run: Run, plan: Plan, *, grid: OccupancyGrid) -> None:
 
 
 def draw_plan(folder: Path, plan: Plan, *, grid: OccupancyGrid) -> None:
-    """Write ``plan.json`` and ``plan.png`` into a map's folder; an earlier plan gives way.
+    """Write ``plan.json`` and ``plan.png`` into a map's folder; an earlier plan is replaced.
 
     Args:
         folder: Of a run, or of a merged map.

@@ -21,7 +21,7 @@ BELIEVED = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolvedGraph:
-    """A graph, what the solver made of it, and how.
+    """A graph, its solution, and the effort of the solver.
 
     Attributes:
         path: The file that the graph came from.

@@ -1,4 +1,4 @@
-"""A least-squares problem in GTSAM's words, and the descent that solves it."""
+"""Least-squares problems of GTSAM's factors, and the descent that solves them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Effort:
     """Termination criteria: a number of iterations, or an improvement below this share of the error.
 
     Attributes:
-        report: Told the iterations done, and how many there may be; in the end, how many there were.
+        report: Receives the iterations done, and how many there may be; in the end, how many there were.
     """
 
     max_iterations: int

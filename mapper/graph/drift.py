@@ -1,4 +1,4 @@
-"""Drift of the odometry between two nodes, and how well a loop agrees with it."""
+"""Drift of the odometry between two nodes, and the innovations of loops against it."""
 
 from __future__ import annotations
 
@@ -13,28 +13,29 @@ from mapper.core.geometry import Array, Transform, adjoint, inverse, log
 from mapper.graph.model import BetweenFactor
 
 _MOST_TRIED = 5
-"""Loops between the same two parts that are tried as their tie."""
+"""Loops between the same two parts that are tried as their connection."""
 
 
 def innovations(known: Sequence[BetweenFactor], loops: Sequence[BetweenFactor]) -> Array:
-    """Return how well each loop fits what odometry alone says: its squared Mahalanobis distance.
+    """Return the squared Mahalanobis distance of each loop from the odometry's prediction.
 
     Along the spanning tree of the surest known factors, poses are chained and first-order covariances add
-    up in the world's tangent space (Barfoot & Furgale 2014, eq. 55 without the fourth-order terms). It is
-    as wide as odometry claims to have drifted: over a long way a large disagreement says little. Parts that
-    only loops connect are connected by the loop that the others between them fit best.
+    up in the world's tangent space (Barfoot & Furgale 2014, eq. 55 without the fourth-order terms). The
+    covariance grows with the path, so over a long one a large disagreement is likely. Parts that only loops
+    connect are connected by the loop that the others between them fit best.
 
     Args:
         known: Factors that are inliers for certain.
         loops: Factors that may be outliers.
 
     Returns:
-        (len(loops),) χ² of six degrees of freedom; 0 of a tie, and of a loop to a node without known factors.
+        (len(loops),) χ² of six degrees of freedom; 0 of a loop that connects two parts, or leads to a node
+        without known factors.
     """
     tree = _spanning_tree(known)
     while between := tree.between_first_parts(loops):
         tried = between[:: -(-len(between) // _MOST_TRIED)]
-        trees = [_spanning_tree([*known, tie]) for tie in tried]
+        trees = [_spanning_tree([*known, connection]) for connection in tried]
         best = min(range(len(tried)), key=lambda k: float(np.median([*map(trees[k].innovation, between)])))
         known, tree = [*known, tried[best]], trees[best]
     return np.array([tree.innovation(loop) for loop in loops])
@@ -84,7 +85,7 @@ class _Tree:
         return float(error @ np.linalg.solve(drift + np.linalg.inv(loop.information), error))
 
     def _common(self, a: int, b: int) -> int:
-        """Return the deepest node that both ways to the root pass."""
+        """Return the deepest node on both paths to the root."""
         while a != b:
             if self.places[a].depth < self.places[b].depth:
                 a, b = b, a

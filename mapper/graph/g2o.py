@@ -24,12 +24,12 @@ _SHORTEST = 1e-9
 def write_g2o(path: Path, graph: PoseGraph) -> None:
     """Write ``VERTEX_SE3:QUAT``, ``FIX`` of the first node, and ``EDGE_SE3:QUAT`` with every digit.
 
-    What g2o has no words for stands behind a ``#`` at the line's end, where other readers do not look:
+    Data without a g2o tag stand behind a ``#`` at the line's end, which other readers ignore:
     ``# stamp_ns 1305031102175304000`` of a node, ``# origin loop`` of a factor. The information is that of
     the rotation vector (rad⁻²), as GTSAM takes it; the g2o library itself means half-angles.
 
     Raises:
-        GraphError: The graph has no nodes, which no file could say.
+        GraphError: The graph has no nodes.
     """
     if not graph.T_world_node:
         raise GraphError(f"{path}: a graph without nodes is not written; was any frame tracked?")
@@ -60,9 +60,9 @@ def read_g2o(path: Path, *, guess_loops: bool = False, progress: Progress = SILE
 
     Args:
         path: The file.
-        guess_loops: An edge that does not say its origin is a loop if its ids do not follow each other;
+        guess_loops: An edge without an origin is a loop if its ids do not follow each other;
             otherwise it counts as odometry.
-        progress: Told how many edges have such information.
+        progress: Receives a note of how many edges have such information.
 
     Raises:
         GraphError: The file cannot be read, has no vertices, or a line has an unknown tag, a wrong
@@ -119,7 +119,7 @@ class _Table:
     notes: list[str] = field(default_factory=list)
 
     def refuse(self, path: Path, bad: NDArray[np.bool_], why: str) -> None:
-        """Blame the first line that has anything bad, if any has."""
+        """Raise an error that names the first line with a bad value, if there is one."""
         lines = bad.reshape(len(self.lines), -1).any(axis=1)
         if lines.any():
             raise GraphError(f"{path}:{self.lines[int(np.argmax(lines))]}: {why}")

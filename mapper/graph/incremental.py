@@ -1,4 +1,4 @@
-"""A pose graph that stays solved while it grows: iSAM2 (Kaess et al. 2012) by GTSAM."""
+"""Incremental solver of a growing pose graph: iSAM2 (Kaess et al. 2012) by GTSAM."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _HUBER = Kernel("huber", GraphConfig().robust_width)
 
 
 class IncrementalSolver:
-    """Believed poses of a growing graph. Loops are under Huber's kernel, which never quite lets go of one.
+    """Current poses of a growing graph. Loops are under Huber's kernel, which never ignores one altogether.
 
     Nodes and factors wait until ``update``, and a node without factors waits on; a waiting node is where
     it was put. Every connected component keeps its first node where that was put. When a loop joins two
@@ -29,7 +29,7 @@ class IncrementalSolver:
         self._restart()
 
     def _restart(self) -> None:
-        """Forget what is solved: everything waits."""
+        """Drop the solution: everything waits."""
         import gtsam
 
         self._isam = gtsam.ISAM2()

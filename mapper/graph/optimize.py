@@ -35,7 +35,7 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
     Args:
         graph: At least one node; it is not changed.
         config: Which solve, and when to stop.
-        progress: Told the iterations of each component, and how many there may be.
+        progress: Receives the iterations of each component, and how many there may be.
 
     Returns:
         The poses of every node in the graph's order; ``iterations`` sums over the components.
@@ -56,7 +56,7 @@ def optimize(graph: PoseGraph, config: GraphConfig, *, progress: Progress = SILE
             T_world_node = distribute(graph)
         case "batch":
             T_world_node = dict(graph.T_world_node)
-            for nodes, factors in _tied_components(graph):
+            for nodes, factors in _connected_components(graph):
                 loops = [k for k in factors if graph.factors[k].origin == "loop"]
                 known = [k for k in factors if graph.factors[k].origin != "loop"]
                 part = Part(
@@ -80,7 +80,7 @@ def _errors(terms: Sequence["gtsam.NonlinearFactor"], values: "gtsam.Values") ->
     return tuple(term.error(values) for term in terms)
 
 
-def _tied_components(graph: PoseGraph) -> list[tuple[list[int], list[int]]]:
+def _connected_components(graph: PoseGraph) -> list[tuple[list[int], list[int]]]:
     """Return (nodes, indices of their factors) of every component that has any factor."""
     parts = components(graph)
     component_of = {node: part for part, nodes in enumerate(parts) for node in nodes}

@@ -1,4 +1,4 @@
-"""Our nodes and factors in GTSAM's words; its tangent order is ours: (rotation, translation)."""
+"""Nodes and factors as GTSAM's; its tangent order is ours: (rotation, translation)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Kernel:
 
     Attributes:
         kind: "huber" (1964), "cauchy" or "dcs", Dynamic Covariance Scaling (Agarwal et al. 2013).
-        width: Norm of the whitened residual, in sigmas, from which the kernel bites.
+        width: Norm of the whitened residual, in sigmas, from which the kernel weighs less.
     """
 
     kind: KernelKind

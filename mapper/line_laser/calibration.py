@@ -1,4 +1,4 @@
-"""The laws from the stripe's place in the image to a place before the vehicle, and their fit to shots."""
+"""Calibration: the laws from the stripe's pixel to a point before the vehicle, and their fit to shots."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -65,7 +65,7 @@ class Fit:
 
     Attributes:
         calibration: The laws with their covariances.
-        range_errors_m: (N,) by each shot: what the law says minus what was measured.
+        range_errors_m: (N,) by each shot: the law's value minus the measured one.
         width_errors_m: (M,) by each shot with a width likewise.
     """
 
@@ -75,13 +75,13 @@ class Fit:
 
 
 def up_px(height_px: int, rows_px: Array) -> Array:
-    """Return how many pixels above the image's lower edge rows lie."""
+    """Return the heights of rows above the image's lower edge, in pixels."""
     above_px: Array = height_px - 0.5 - rows_px
     return above_px
 
 
 def ahead_m(calibration: LineLaserCalibration, rows_px: Array) -> Array:
-    """Return how far ahead the stripe lies that is seen in these rows (Somlyai, PhD thesis, eq. 2.44)."""
+    """Return the ranges ahead of a stripe in these rows, metres (Somlyai, PhD thesis, eq. 2.44)."""
     law = calibration.range
     height = 100.0 * up_px(calibration.height_px, rows_px) / calibration.height_px
     result: Array = 1e-3 * law.scale_mm * height**law.exponent
@@ -89,14 +89,14 @@ def ahead_m(calibration: LineLaserCalibration, rows_px: Array) -> Array:
 
 
 def row_px(calibration: LineLaserCalibration, range_m: float) -> float:
-    """Return the row in which the stripe is seen that lies so far ahead: the inverse of :func:`ahead_m`."""
+    """Return the row of a stripe at a range: the inverse of :func:`ahead_m`."""
     law = calibration.range
     height = float((1e3 * range_m / law.scale_mm) ** (1.0 / law.exponent))
     return calibration.height_px * (1.0 - height / 100.0) - 0.5
 
 
 def right_m(calibration: LineLaserCalibration, columns_px: Array, rows_px: Array) -> Array:
-    """Return how far to the right it lies (Somlyai, PhD thesis, eq. 2.45); x is 0 in the image's middle."""
+    """Return its lateral offsets, metres to the right (Somlyai, PhD thesis, eq. 2.45)."""
     law = calibration.lateral
     x = columns_px - 0.5 * (calibration.width_px - 1)
     result: Array = _CM * x / (law.slope * up_px(calibration.height_px, rows_px) + law.offset)

@@ -1,4 +1,4 @@
-"""A line-laser sensor: its calibration file, how its stripe is found, and the map made of what it saw."""
+"""Settings of the line laser: its calibration file, stripe detection, maps and simulation."""
 
 from typing import Annotated, Self
 
@@ -82,7 +82,7 @@ class StripeConfig(Config):
     hue_to_deg: Degrees = 10.0
     """The hues of the laser (figure 2.2); they may pass through 0."""
     saturation_threshold: Level = 64
-    """Of what has a hue worth the name; the thesis gives none."""
+    """Of pixels whose hue is used: grey has none; the thesis gives no threshold."""
     intensity_threshold: Level = 250
     """Of the red channel (eq. 2.39; figure 2.3)."""
     weight_threshold: Level = 40

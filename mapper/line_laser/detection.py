@@ -46,7 +46,7 @@ def intensity(red: Response, *, threshold: int) -> Response:
     """Return the brightness of bright pixels (eq. 2.39).
 
     Args:
-        red: (H, W) red channel: light of the laser is red whatever it falls on (section 2.5.2).
+        red: (H, W) red channel: light of the laser is red whatever it falls on (§2.5.2).
         threshold: k.
     """
     return _at_least(red, threshold)

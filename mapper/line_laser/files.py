@@ -56,7 +56,7 @@ def read_shots(
         path: Lines ``image,range_m[,width_m]``, or the folder with such a ``shots.csv``: images of a board
             that faces the sensor, in the middle of the image, and how far and how wide it is.
         config: How its stripe is found.
-        progress: Told of every image.
+        progress: Receives the count of images.
 
     Raises:
         SourceError: A file is missing or malformed, or the images differ in size.

@@ -1,4 +1,4 @@
-"""Local views joined by the wheels' poses into one map of log-odds (Moravec & Elfes 1985)."""
+"""Map of log-odds (Moravec & Elfes 1985) of scans at the poses by wheel odometry."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -38,7 +38,7 @@ def map_scans(
         scans: The scan of each image, in order.
         T_world_sensor: (N, 4, 4) where the sensor was, x ahead, y left; only the plane counts.
         config: Size of a cell and the probabilities.
-        progress: Told of every scan.
+        progress: Receives the count of scans.
 
     Raises:
         DataError: No scan saw anything.

@@ -1,4 +1,4 @@
-"""A folder of images, and maybe wheels, as scans and as one map."""
+"""Scans of a folder of images, and one map of them where wheel odometry gives their poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -84,7 +84,7 @@ def sensor_poses(wheels: Path, calibration: LineLaserCalibration) -> tuple[Traje
 
     Args:
         wheels: ``encoders.txt`` or ``wheels.txt``, or a file of either kind.
-        calibration: Tells what carries the sensor.
+        calibration: Gives the vehicle that carries the sensor.
 
     Raises:
         SourceError: The file is malformed, or the wheelbase is needed and unknown.
@@ -114,7 +114,7 @@ def drive(
         scans: In time order.
         T_world_sensor: Sensor poses by wheel odometry.
         config: Of the map.
-        progress: Told of every scan.
+        progress: Receives the count of scans.
 
     Raises:
         DataError: No image was taken while the wheels were read, or none shows a stripe.

@@ -97,7 +97,7 @@ def discrepancy(T_i_j: Transform, T_world_i: Transform, T_world_j: Transform) ->
 
 
 def exceeds(miss: Discrepancy, limit: Discrepancy) -> bool:
-    """Tell whether a discrepancy is larger than a limit in either part."""
+    """Return whether a discrepancy is larger than a limit in either part."""
     return miss.translation_m > limit.translation_m or miss.rotation_rad > limit.rotation_rad
 
 

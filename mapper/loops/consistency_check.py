@@ -75,7 +75,7 @@ class ConsistencyCheck:
     def _agree(
         self, other: LoopClosure, new: LoopClosure, near_i: dict[int, NodePath], near_j: dict[int, NodePath]
     ) -> bool:
-        """Tell whether the other loop, carried over along the path at both its ends, is the new one."""
+        """Return whether the other loop, carried over along the path at both its ends, is the new one."""
         if other.i not in near_i or new.T_i_j is None or other.T_i_j is None:
             return False
         T_i_other = inverse(self._estimator.pose_of(new.i)) @ self._estimator.pose_of(other.i)

@@ -70,7 +70,7 @@ class SplitRun(Config):
     """Result of cutting a run's map into tiles."""
 
     part_bytes: dict[int, int]
-    """Size of the file of each tile in which the run knows any voxel."""
+    """Size of the file of each tile in which the run has a known voxel."""
     voxels: int
     """Known ones, in the run's own map."""
     has_colors: bool
@@ -86,7 +86,7 @@ class JoinedTile(Config):
     last: tuple[int, int]
     """Just after the last column."""
     overlaps: tuple[Overlap, ...]
-    """Of each run that knows any voxel here, with the sum of those before."""
+    """Of each run with a known voxel here, with the sum of those before."""
     top: tuple[float, int]
     """Log-odds and mask of the tile's top in the ``.ot`` file."""
     color: tuple[int, int, int]
@@ -158,7 +158,7 @@ def join_tile(
     Args:
         workspace: Where.
         tile: Which.
-        runs: Places in the list of those that know any voxel here.
+        runs: Places in the list of those with a known voxel here.
         has_colors: Whether the map has any.
         follows_ground: Whether the slice's band does.
     """

@@ -77,7 +77,7 @@ def merge(
         out: Folder to create; until it is whole it is called ``OUT.partial``.
         tile_m: About how long the edge of a tile is.
         workers: Where the jobs run; those of a Dask cluster must see the same files.
-        progress: Told how far it is.
+        progress: Receives stages, counts and notes.
         overwrite: Replace a map that is there, once the new one is whole.
 
     Raises:

@@ -32,26 +32,26 @@ class RunInMap(Config):
     T_map_world: tuple[tuple[float, ...], ...]
     """4 × 4."""
     placed: str
-    """How its pose is known."""
+    """Source of its pose."""
     voxels: int = 0
     """Known ones, in its own map."""
     shared_voxels: int = 0
-    """Those that the sum of the runs before it knew as well."""
+    """Those that are known in the sum of the runs before it as well."""
     agreement: float | None = None
-    """Of the shared voxels that either takes for occupied, the share that both do."""
+    """Of the shared voxels that are occupied in either, the share that is in both."""
 
 
 class Tile(Config):
     """A cube of the map, with a map file of its own."""
 
     name: str
-    """The way down the octree, a digit for the child taken at each depth; names the file."""
+    """The path down the octree, a digit for the child taken at each depth; names the file."""
     lower_m: Corner
     upper_m: Corner
     voxels: int
     """Known ones."""
     runs: tuple[int, ...]
-    """Places in the list of the runs that know any voxel here."""
+    """Places in the list of the runs with a known voxel here."""
 
 
 class MapManifest(Config):

@@ -35,7 +35,7 @@ class Stages:
     Attributes:
         runner: Keeps their results, so that a merge that was stopped goes on where it was.
         executor: Where they run.
-        progress: Told how many are done.
+        progress: Receives how many are done.
         costs: Of the jobs of every stage so far, in no order.
     """
 

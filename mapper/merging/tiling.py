@@ -43,7 +43,7 @@ class Tiling:
         return block_codes >> (3 * (self.levels - BLOCK_BITS))
 
     def name_of(self, tile: int) -> str:
-        """Return the way down the octree: a digit 0 … 7 for the child taken at each depth."""
+        """Return the path down the octree: a digit 0 … 7 for the child taken at each depth."""
         return f"{tile:0{self.depth}o}"
 
     def first_key(self, tile: int) -> NDArray[np.int64]:

@@ -45,11 +45,11 @@ def append(
     """Track a log as a later session of a run's place, solve both as one graph, and map them together.
 
     The run stays as it is, and the new one has its world: the first node of the first session does not move.
-    No gate holds between the sessions until loops tie them, but two tests and another loop that agrees do.
+    No drift gate holds between the sessions until loops connect them; the other tests do.
 
     Args:
         second: The later log.
-        run: A finished run; its log must be there still, for its keyframes are looked at again.
+        run: A finished run; its log must be there still, since its keyframes are observed again.
         config: The run's own but for what may differ: ``source`` is the second log's, and loops, solver and
             map may have other settings.
         out: Run folder to create.
@@ -103,7 +103,7 @@ def _refuse_unfit(config: BuildConfig, run: Run) -> None:
 
 
 def _manifest(run: Run, source: Log, config: SourceConfig) -> Manifest:
-    """Return the manifest to begin with: what is not said again of both sessions holds from the first."""
+    """Return the manifest to begin with: the first session's, without what is measured again of both."""
     known = run.manifest.input
     appended = (*known.appended, appended_log(source.sessions[-1], config))
     return Manifest(

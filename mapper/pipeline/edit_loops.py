@@ -30,7 +30,7 @@ _LOOPS: Mapping[Sensor, PlaceLoopsConfig | ScanLoopsConfig] = {
     "rgbd": PlaceLoopsConfig(),
     "lidar": ScanLoopsConfig(),
 }
-"""How the frames of a run are compared that looked for no loops itself."""
+"""How frames are compared in a run that was built without loops."""
 
 
 def edit_loops(
@@ -89,7 +89,7 @@ def edit_loops(
 
 
 def _held(loops: Sequence[LoopClosure], pair: Pair) -> int | None:
-    """Return where the accepted loop between two nodes stands, either way round."""
+    """Return the index of the accepted loop between two nodes, in either order."""
     for place, loop in enumerate(loops):
         if loop.verdict == "accepted" and {loop.i, loop.j} == set(pair):
             return place

@@ -56,7 +56,7 @@ def fuse(
 ) -> Run:
     """Make a run's maps again, with another octree, slice, cloud or MCAP configuration or along other poses.
 
-    What a frame saw is taken from the old run where pose and rays are the same; the maps are those of fusing
+    A frame's update is taken from the old run where pose and rays are the same; the maps are those of fusing
     everything from scratch. The run stays as it is until the new maps are whole, and files that are not ours
     stay in it.
 
@@ -92,7 +92,7 @@ def fuse_changed(
         source: The log that the run was built from.
         run: A finished run, with the configuration to fuse by.
         changed: What replaces the run's own; None keeps that.
-        solve: What the manifest says of the solve that changed it; None keeps what it says.
+        solve: Record of the solve that changed it, for the manifest; None keeps the old one.
         progress: Receives stages, counts and notes.
 
     Raises:
@@ -132,7 +132,7 @@ def _with_trajectory(run: Run, trajectory: Trajectory) -> StoredTracking:
 
 
 def _copy_kept_files(folder: Path, new: Path) -> None:
-    """Copy what was tracked, and whatever a user has put there; what was made from the old maps goes."""
+    """Copy the results of tracking and a user's own files; what was made from the old maps is left out."""
     made_again = files.names_of("maps", "exported maps") | {files.FORMER_SCAN_UPDATES}
     for child in folder.iterdir():
         if child.name in made_again:
@@ -152,7 +152,7 @@ def fuse_into(
     before: Path | None = None,
     observer: Observer = NULL_OBSERVER,
 ) -> None:
-    """Fuse a draft's trajectory and write everything that is made from the maps."""
+    """Fuse the trajectory of an unfinished run and write everything that is made from the maps."""
     results = load_results(Run(writer.folder, config, writer.manifest))
     if not config.mcap.frame_times:
         results = replace(results, frame_ms={})

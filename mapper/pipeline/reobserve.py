@@ -1,4 +1,4 @@
-"""Frames that were tracked long ago, seen again: what a finished run does not keep of them."""
+"""Views of a finished run's frames, observed again from the log, since a run does not keep them."""
 
 from collections.abc import Collection
 
@@ -21,11 +21,11 @@ def reobserve(
     *,
     progress: Progress = SILENT,
 ) -> dict[int, FrameView]:
-    """Return what the odometry of a configuration sees in some frames of a log, by stamp.
+    """Return the views of some frames of a log, by stamp, as a configuration's odometry makes them.
 
     Args:
         source: The log.
-        trajectory: Where the body was: scans are deskewed by its motion.
+        trajectory: Poses of the body: scans are deskewed by its motion.
         stamps_ns: Of the frames; each has a pose.
         config: Which odometry.
         progress: Receives the stage and its counts.

@@ -11,7 +11,7 @@ from mapper.loops.closure import LoopClosure, apply_solution
 from mapper.run.manifest import Solve
 
 MIN_WEIGHT = 0.5
-"""A loop that the solver lets count for less is rejected, and is no factor of the solved graph."""
+"""A loop with less weight in the solution is rejected, and is no factor of the solved graph."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,7 +21,7 @@ class Solved:
     Attributes:
         graph: Nodes as solved, with the factors that hold.
         loops: Every loop candidate with its final verdict.
-        report: What the manifest says of the solve.
+        report: Record of the solve for the manifest.
     """
 
     graph: PoseGraph

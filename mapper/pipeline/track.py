@@ -74,7 +74,7 @@ class Start:
 
     Attributes:
         odometry: Before its first frame.
-        detector: Knows the places of earlier sessions.
+        detector: With the places of earlier sessions.
         graph: Of earlier sessions, without loops.
         loops: The candidates of earlier sessions.
     """
@@ -147,9 +147,7 @@ def track_log(
             tracks.append(track)
             observer.on_frame(Step(entry, track, view, odometry.matches, detector))
     graph.add_factors(odometry.finish())
-    if (
-        config.odometry.kind not in _BY_POSES
-    ):  # the wheels are in its factors already, or poses better than theirs
+    if config.odometry.kind not in _BY_POSES:  # which then gave the odometry its factors
         graph.add_factors(wheel_factors(graph.stamps_ns, source.wheels, config.graph.wheels))
     loops = (*start.loops, *detector.closures())
     graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")

@@ -1,4 +1,4 @@
-"""Fingerprint of a log: tells inputs apart by names, sizes and lists, without reading every image."""
+"""Fingerprint of a log: a hash of names, sizes and lists, without reading every image."""
 
 import hashlib
 import os

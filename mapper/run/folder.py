@@ -1,4 +1,4 @@
-"""The folder a build leaves: what is in it, how it is filled, and how other verbs read it."""
+"""Run folder: reading a finished run, and writing a new one."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -44,7 +44,7 @@ class Run:
     Attributes:
         path: Its folder.
         config: What it was built with, every default spelled out.
-        manifest: What it says about itself.
+        manifest: Its ``manifest.json``.
     """
 
     path: Path
@@ -69,7 +69,7 @@ class Run:
         return read_closures(self.path / files.LOOPS)
 
     def records(self) -> list[FrameRecord]:
-        """Return what became of every frame."""
+        """Return the outcome of every frame."""
         return read_records(self.path / files.FRAMES)
 
     def frame_ms(self) -> dict[int, float]:
@@ -106,7 +106,7 @@ def load_run(path: Path) -> Run:
 
 
 def moved_log(run: Run, *logs: Path) -> Run:
-    """Return the run, knowing that its logs lie elsewhere by now.
+    """Return the run with its logs at other paths.
 
     Raises:
         RunError: It was made from another number of logs.
@@ -193,7 +193,7 @@ class RunWriter:
 
 @contextmanager
 def write_run(out: Path, manifest: Manifest, config: BuildConfig, *, overwrite: bool) -> Iterator[RunWriter]:
-    """Yield a draft that becomes the run OUT on success and stays behind as ``OUT.partial`` otherwise.
+    """Yield the writer of a run that becomes OUT on success and stays behind as ``OUT.partial`` otherwise.
 
     A failure or an interruption is written into the manifest; a killed process leaves it at "building".
 
@@ -227,7 +227,7 @@ def first_manifest(source: Log) -> Manifest:
 
 
 def appended_log(session: Session, config: SourceConfig) -> AppendedLog:
-    """Return what the manifest says of a log that was appended."""
+    """Return the manifest's entry of an appended log."""
     return AppendedLog(
         **_facts(session.log),
         source=config,

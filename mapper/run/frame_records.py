@@ -32,14 +32,14 @@ _NOTHING = Diagnostics(features=0, matches=0, inliers=0, residual=0.0, residual_
 
 @dataclass(frozen=True, slots=True)
 class FrameRecord:
-    """One frame's fate.
+    """Outcome of one frame.
 
     Attributes:
         stamp_ns: The frame's stamp.
         outcome: "tracked", "lost" (read, but not placed) or "skipped" (could not be read).
         node: Graph node that its pose is relative to; None unless tracked.
         is_keyframe: The frame is that node.
-        diagnostics: How tracking went; all zero for a skipped frame.
+        diagnostics: Figures on its tracking; all zero for a skipped frame.
     """
 
     stamp_ns: int

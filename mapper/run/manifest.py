@@ -178,7 +178,7 @@ def now_text() -> str:
 
 
 def is_merged_map(folder: Path) -> bool:
-    """Tell whether a folder holds a merged map, not a run."""
+    """Return whether a folder holds a merged map, not a run."""
     try:
         return '"kind": "merged map"' in (folder / MANIFEST_NAME).read_text(encoding="utf-8")[:200]
     except (OSError, UnicodeDecodeError):

@@ -22,9 +22,9 @@ class Step:
 
     Attributes:
         entry: The frame; loading it again gives its image.
-        track: What tracking made of it.
+        track: Its result.
         view: Returns the features that it was tracked by; computed at each call.
-        matches: Gives those that hold its pose, and where they were before; the same.
+        matches: Returns the matches behind its pose; computed at each call.
         detector: The loops so far, and the current estimates of node poses.
     """
 
@@ -39,15 +39,15 @@ class Observer(Protocol):
     """Observer of a build; its arguments are read-only."""
 
     def on_frame(self, step: Step, /) -> None:
-        """See a frame that was read, in time order, in the thread that tracks."""
+        """Receive a frame that was read, in time order, in the thread that tracks."""
         ...
 
     def on_levelled(self, T_level_world: Transform, /) -> None:
-        """See where the odometry's world lies in the levelled one, once the graph is solved."""
+        """Receive the pose of the odometry's world in the levelled one, once the graph is solved."""
         ...
 
     def on_mapped(self, run: "Run", results: "RunResults", maps: "Maps", /) -> None:
-        """See the results; the run's folder still has the name of one that is being built."""
+        """Receive the results; the run's folder still has the name of one that is being built."""
         ...
 
 

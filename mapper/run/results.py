@@ -21,7 +21,7 @@ class RunResults:
     Attributes:
         trajectory: Final body poses in the levelled world; at least one.
         graph: Nodes at the solution, same world.
-        records: What became of every frame.
+        records: Outcome of every frame.
         loops: Every loop candidate with its verdict.
         frame_ms: Milliseconds that each frame took, by stamp; empty leaves them out.
         truth: True body poses, aligned with the trajectory, if known.

@@ -21,7 +21,7 @@ class StoredTracking:
     """A log that has been tracked.
 
     Attributes:
-        records: What became of every frame, in time order.
+        records: Outcome of every frame, in time order.
         skipped: The frames that could not be read, and why.
         frame_ms: Wall milliseconds that each frame took, by stamp.
         trajectory: Body poses of the frames that were placed.
@@ -73,7 +73,7 @@ class StoredTracking:
 
 
 def load_tracking(run: Run) -> StoredTracking:
-    """Return what a finished run keeps."""
+    """Return the stored tracking of a finished run."""
     return StoredTracking(
         records=run.records(),
         skipped=[Skipped(frame.stamp_ns, frame.reason) for frame in run.manifest.skipped],

@@ -15,7 +15,7 @@ MANIFEST_NAME = "manifest.json"
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary sibling to write; on success it takes ``path``'s place, on failure it vanishes."""
+    """Yield a temporary sibling to write; on success it takes ``path``'s place, on failure it is removed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     # The ending stays last: writers such as OpenCV's choose the format by it.
     part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
@@ -52,7 +52,7 @@ def atomic_folder(
     Args:
         out: Folder to create.
         overwrite: Replace a folder of ours that is there; it stays untouched until the new one is whole.
-        keeps: Tells whether what an earlier process left in ``OUT.partial`` is still of use.
+        keeps: Returns whether the files that an earlier process left in ``OUT.partial`` can be kept.
 
     Raises:
         RunError: OUT exists and may not be replaced, or another process is filling ``OUT.partial``.

@@ -266,7 +266,7 @@ class _DaskCluster(AbstractContextManager["_DaskCluster"]):
     """Executor of a Dask scheduler's workers."""
 
     def __init__(self, scheduler: str) -> None:
-        if not _ADDRESS.fullmatch(scheduler):  # Dask itself would try for a while before it said so
+        if not _ADDRESS.fullmatch(scheduler):  # Dask itself would try for a while first
             raise ConfigError(f"scheduler {scheduler!r}: not an address; want tcp://HOST:PORT")
         try:
             import distributed

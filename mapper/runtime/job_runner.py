@@ -69,7 +69,7 @@ class JobRunner:
 
     Attributes:
         folder: Where the results are; a Dask cluster's workers must see it as well.
-        progress: Told of damaged files.
+        progress: Receives notes of damaged files.
     """
 
     folder: Path

@@ -16,7 +16,7 @@ class Progress(Protocol):
         ...
 
     def note(self, message: str) -> None:
-        """Tell something worth knowing, in one line."""
+        """Receive a note of one line."""
         ...
 
 

@@ -1,1 +1,1 @@
-"""What sensors do to a measurement, and how to undo it."""
+"""Sensor models: depth filter, depth noise, wheel kinematics."""

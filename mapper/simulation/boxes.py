@@ -55,7 +55,7 @@ class Boxes:
         return distances
 
     def occupied(self, points_world: Points) -> NDArray[np.bool_]:
-        """Tell for each of (N, 3) points whether it lies inside or on a solid."""
+        """Return for each of (N, 3) points whether it is inside or on a solid."""
         inside: NDArray[np.bool_] = self.signed_distance_m(points_world) <= 0.0
         return inside
 

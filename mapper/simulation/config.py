@@ -1,4 +1,4 @@
-"""Synthetic worlds, the way through them, and the camera or LiDAR that records it."""
+"""Settings of synthetic logs: the world, the path through it, and the camera or LiDAR."""
 
 from collections.abc import Mapping
 from typing import Annotated, Literal, Self

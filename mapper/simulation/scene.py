@@ -56,7 +56,7 @@ class _Footprint:
     height_m: float
 
     def overlaps(self, other: "_Footprint") -> bool:
-        """Tell whether two footprints share ground."""
+        """Return whether two footprints overlap."""
         return all(self.low[k] < other.high[k] and other.low[k] < self.high[k] for k in (0, 1))
 
     def distance_m(self, points: Array) -> float:

@@ -106,7 +106,7 @@ def _patches(shape: tuple[int, ...], rng: np.random.Generator) -> Field32:
 
 
 def _out_of_range(depth_m: DepthImage, sensor: SensorConfig, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Tell where nothing returns: too near, too far, and ever more in between."""
+    """Return the pixels without a return: too near, too far, and ever more in between."""
     near, far = max(sensor.min_depth_m, 1e-6), sensor.max_depth_m
     lost: NDArray[np.bool_] = (depth_m < near) | (depth_m > far)
     if far > sensor.fade_depth_m:
@@ -119,7 +119,7 @@ def _out_of_range(depth_m: DepthImage, sensor: SensorConfig, rng: np.random.Gene
 def _unseen(
     rendering: Rendering, focal_px: float, dropout_ratio: float, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
-    """Tell where the pattern is not found: in shadow, at a slant, at edges, and here and there."""
+    """Return the pixels where the pattern is not found: in shadow, at a slant, at edges, some at random."""
     depth_m = rendering.depth_m
     chance = np.where(_in_shadow(depth_m, focal_px), np.float32(1.0), np.float32(_SPECKLE_CHANCE))
     ragged = np.float32(_GRAZING_COSINE) + np.float32(_GRAZING_SPREAD) * _patches(depth_m.shape, rng)
@@ -133,7 +133,7 @@ def _unseen(
 
 
 def _in_shadow(depth_m: DepthImage, focal_px: float) -> NDArray[np.bool_]:
-    """Tell which pixels the projector, a baseline to the camera's right, cannot light.
+    """Return which pixels the projector, a baseline to the camera's right, cannot light.
 
     Seen from the projector a pixel of depth z lies f · b / z further left. Where something further right
     in the image ends up at the same place or left of it, that something is nearer and takes the light.

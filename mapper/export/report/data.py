@@ -55,7 +55,7 @@ class Chapter:
 
 
 def chapter_of(run: Run, name: str, figures: Sequence[Figure]) -> Chapter:
-    """Return what a report says of a run.
+    """Return a run's part of a report.
 
     Raises:
         MapperError: A file of the run cannot be read.

@@ -1,4 +1,4 @@
-"""The page: what can be said in words and tables is here; ``page.js`` draws the rest."""
+"""HTML of the report: words and tables; ``page.js`` draws the curves and plans."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -107,7 +107,7 @@ def _figures(chapters: Sequence[Chapter]) -> list[list[str]]:
 
 
 def _side_by_side(chapters: Sequence[Chapter], of: Any) -> list[list[str]]:
-    """Return a row for everything that some run has a value of."""
+    """Return a row for each name that any run has a value of."""
     columns: list[Mapping[str, str]] = [of(chapter) for chapter in chapters]
     names = dict.fromkeys(name for column in columns for name in column)
     return [[name, *(column.get(name, "–") for column in columns)] for name in names]

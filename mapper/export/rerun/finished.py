@@ -13,7 +13,7 @@ from mapper.run.results import RunResults, load_results
 
 
 def show_run(run: Run, target: str) -> None:
-    """Tell a finished run to a target: FILE.rrd, "spawn", "connect" or "connect:URL".
+    """Send a finished run to a target: FILE.rrd, "spawn", "connect" or "connect:URL".
 
     Raises:
         ConfigError: The target is none.
@@ -31,7 +31,7 @@ def show_run(run: Run, target: str) -> None:
 
 
 def log_run(log: RerunLog, results: RunResults, maps: Maps) -> None:
-    """Log what is known once the maps are made."""
+    """Log the results of a run, its maps included."""
     paths = {"estimate": results.trajectory}
     if results.truth is not None:
         paths["truth"] = results.truth
@@ -57,7 +57,7 @@ def extent(results: RunResults, maps: Maps) -> Array:
 
 
 def in_words(run: Run, *, name: str) -> str:
-    """Return a run as Markdown: its counts, its settings that matter, its times."""
+    """Return a run as Markdown: its log, counts, odometry and times."""
     manifest = run.manifest
     counts, timing = manifest.counts, manifest.timing
     rows: Iterable[tuple[str, str]] = (

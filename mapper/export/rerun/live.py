@@ -119,7 +119,7 @@ class LiveRerun:
     def _show_features(
         self, view: ImageView, matches: FeatureMatches | None, drawn: Callable[[Array], Array]
     ) -> None:
-        """Log the features, those that hold the pose in another colour, and the ways that these came."""
+        """Log the features, the inliers in another colour, and lines from the inliers' previous pixels."""
         nothing = FeatureMatches(np.zeros(len(view), np.bool_), np.full((len(view), 2), np.nan))
         held = matches or nothing
         dots = rr.Points2D(

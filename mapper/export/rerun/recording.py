@@ -228,7 +228,7 @@ class RerunLog:
         return blueprint_for(looking_at, self.camera if self._has_images else None)
 
     def look_at(self, corners: Array) -> None:
-        """Arrange the viewer anew, looking at what lies between two (2, 3) corners, metres."""
+        """Arrange the viewer anew, looking at the box between two (2, 3) corners, metres."""
         self._stream.send_blueprint(self.blueprint(corners))
 
     def about(self, markdown: str) -> None:

@@ -32,8 +32,8 @@ def record_registration(
         target: FILE.rrd, "spawn", "connect" or "connect:URL", as ``streaming`` takes it.
         points_target: (N, 3) metres; the recording's world is the target's frame.
         points_source: (M, 3) metres, source frame.
-        stages: What there is to say of each, and T_target_source by then.
-        sensor: Tells which way is up.
+        stages: A line of text on each, and T_target_source after it.
+        sensor: Decides which axis is up.
         name: What the viewer calls the recording.
 
     Raises:

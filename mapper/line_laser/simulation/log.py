@@ -37,7 +37,7 @@ def write_line_laser_log(out: Path, config: LineLaserSynthConfig, *, progress: P
     Args:
         out: Folder to make; it must not exist.
         config: What to record.
-        progress: Told of every image.
+        progress: Receives the count of images.
 
     Raises:
         SourceError: ``out`` exists, or cannot be written.

@@ -1,6 +1,6 @@
 """Settings of the Hough registration (Nagy, Gálai & Benedek 2016).
 
-Every length in metres is a setting, also those that nobody turns: for depth cameras all are shrunk alike.
+Every length in metres is a setting, also those rarely changed: for depth cameras all are scaled alike.
 """
 
 from typing import Annotated, Literal

@@ -35,7 +35,7 @@ class PlanarFit:
     overlap: float
 
     def is_near(self, other: "PlanarFit", config: OverlapConfig) -> bool:
-        """Tell whether two are the same motion."""
+        """Return whether two are the same motion."""
         turn = np.angle(np.exp(1j * (self.alpha_rad - other.alpha_rad)))
         return bool(
             np.hypot(self.dx_m - other.dx_m, self.dy_m - other.dy_m) <= config.distinct_m

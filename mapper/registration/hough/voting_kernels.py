@@ -104,7 +104,7 @@ def _maxima(smooth, votes, offsets, half_bins):
 
 @njit(cache=True, nogil=True)
 def _is_maximum(smooth, row, column):
-    """Tell whether no neighbour is higher, and none that comes before is as high."""
+    """Return whether no neighbour is higher, and none that comes before is as high."""
     here, edge = smooth[row, column], len(smooth)
     for i in range(max(row - 1, 0), min(row + 2, edge)):
         for j in range(max(column - 1, 0), min(column + 2, edge)):

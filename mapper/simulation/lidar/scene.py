@@ -1,4 +1,4 @@
-"""Outdoor scenes around a closed way: a block of streets, or a yard with few things in it."""
+"""Outdoor scenes around a closed route: a block of streets, or a yard with few things in it."""
 
 import math
 from dataclasses import dataclass, field
