@@ -39,6 +39,17 @@ def flat(scene):
     return CameraSimulator(FLAT, scene).log()
 
 
+class BlankEntry:
+    """An entry whose image may be of a wall without texture."""
+
+    def __init__(self, entry, *, is_blank):
+        self.entry, self.is_blank, self.stamp_ns = entry, is_blank, entry.stamp_ns
+
+    def load(self, *, colour=True):
+        frame = self.entry.load(colour=colour)
+        return replace(frame, image=np.full_like(frame.image, 128)) if self.is_blank else frame
+
+
 def by_wheels(*overrides):
     return load_config(None, ["odometry.kind=wheels", "loops.kind=none", *overrides])
 
@@ -130,6 +141,22 @@ def test_loops_read_keyframes_only_and_skip_a_damaged_one(flat):
     keyframes = [k for k, entry in enumerate(flat.entries()) if entry.stamp_ns in nodes]
     assert watched.reads == keyframes
     assert len(tracking.placed) == len(flat)
+
+
+@pytest.mark.parametrize("blank_frames", [(0,), range(6, 49), range(49)])
+def test_keyframes_without_features_close_no_loop_and_end_nothing(flat, blank_frames):
+    log = replace(flat, entry_at=lambda i: BlankEntry(flat.entry_at(i), is_blank=i in blank_frames))
+    tracking = track_log(
+        log, by_wheels("loops.kind=places", "loops.min_gap_s=0.1", "loops.min_gap_m=0.1"), progress=SILENT
+    )
+    assert len(tracking.placed) == len(flat)
+    blank_ns = {flat.entry_at(i).stamp_ns for i in blank_frames}
+    stamps_ns = tracking.graph.stamps_ns
+    assert not any(
+        {stamps_ns[loop.i], stamps_ns[loop.j]} & blank_ns
+        for loop in tracking.loops
+        if loop.verdict == "accepted"
+    )
 
 
 def test_keyframes_are_recognised_by_images_or_scans(flat):

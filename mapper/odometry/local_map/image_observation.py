@@ -64,7 +64,7 @@ class ImageObservation:
             stamp_ns=self.stamp_ns,
             pixels=self.pixels,
             sigma_px=self.weights[:, 0] ** -0.5,
-            descriptors=self.bits.view(np.uint8).reshape(len(self), -1),
+            descriptors=self.bits.view(np.uint8).reshape(len(self), 32),
             points_camera=self.points_camera,
             intrinsics=self.intrinsics[:4],
             T_body_camera=self.T_body_camera,
