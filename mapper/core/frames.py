@@ -109,6 +109,7 @@ class Scan:
         origin_body: (3,) float64, metres, body frame: origin of the rays.
         colors: (N, 3) uint8 RGB of each point, where the sensor has colour.
         times_s: (N,) float32 seconds after ``stamp_ns`` of each point, where the file has them.
+        far_returns: How many more were left out, for no sensor reaches as far.
     """
 
     stamp_ns: int
@@ -116,6 +117,7 @@ class Scan:
     origin_body: Array = field(default_factory=lambda: np.zeros(3))
     colors: NDArray[np.uint8] | None = None
     times_s: NDArray[np.float32] | None = None
+    far_returns: int = 0
 
     def __post_init__(self) -> None:
         shape = self.points_body.shape

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.core.deskew import STILL, Twist, deskewed, twist_at
-from mapper.core.errors import FrameError
+from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Frame, PinholeCamera, Points32, RgbdFrame, Scan
 from mapper.core.geometry import Transform
 from mapper.core.trajectory import Trajectory
@@ -16,7 +16,7 @@ from mapper.mapping.cloud import CloudBuilder, Colors, height_colors
 from mapper.mapping.config import FuseSettings, McapConfig
 from mapper.mapping.thumbnails import encode_jpeg, shrunk_camera
 from mapper.navigation.traversable import traversable
-from mapper.octree.casting import Caster
+from mapper.octree.casting import Caster, reach_m
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.scan_update import ScanUpdate, pack
@@ -101,7 +101,10 @@ class _Job:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Fused:
-    """A frame's update, or the reason why there is none; its scan if it was read."""
+    """A frame's update, or the reason why there is none; its scan if it was read.
+
+    ``unreached`` counts the points that were left out, for the octree's keys do not reach them.
+    """
 
     job: _Job
     update: ScanUpdate | None = None
@@ -109,6 +112,7 @@ class _Fused:
     scan: Scan | None = None
     snapshot: Snapshot | ScanSnapshot | None = None
     reason: str = ""
+    unreached: int = 0
 
 
 def fuse_log(
@@ -135,7 +139,7 @@ def fuse_log(
         after: Receives the frames' updates.
     """
     octree, cloud = OctreeMap(config.octree), CloudBuilder(config.cloud.voxel_m)
-    casters, moved = _Casters(config.octree), 0
+    casters, moved, unreached = _Casters(config.octree), 0, 0
 
     def prepare(job: _Job) -> _Fused:
         return _prepared(job, config, casters.caster)
@@ -155,10 +159,16 @@ def fuse_log(
                 octree.merge(fused.update)
             after.add(fused.cached)
             moved += fused.job.cached is None
+            unreached += fused.unreached
             if fused.scan is not None and fused.job.feeds_cloud:
                 _add_to_cloud(cloud, fused.scan, fused.job.T_world_body)
             if fused.snapshot is not None:
                 on_snapshot(fused.snapshot)
+    if unreached:
+        progress.note(
+            f"{unreached} points lie farther than {reach_m(config.octree.resolution_m):g} m from the map's "
+            f"origin, beyond the reach of {config.octree.resolution_m:g} m voxels; left out"
+        )
     if before is not None:
         progress.note(f"fused again: {moved} of {len(trajectory)} frames, which had moved or were not known")
     grid, floor = cut_slice(octree, config.slice), traversable(octree, config.traversable)
@@ -221,8 +231,28 @@ def _prepared(job: _Job, config: FuseSettings, caster: Caster) -> _Fused:
     if job.cached is not None:
         return _Fused(job, job.cached.update(), job.cached, scan, snapshot)
     assert scan is not None
-    update = pack(caster.cast(scan, job.T_world_body))
-    return _Fused(job, update, cache_update(job.entry.stamp_ns, job.T_world_body, update), scan, snapshot)
+    unreached = 0
+    try:
+        update = pack(caster.cast(scan, job.T_world_body))
+    except DataError:  # not asked before: looking at every point of every scan would cost more
+        scan, unreached = _within_reach(scan, job.T_world_body, config.octree)
+        update = pack(caster.cast(scan, job.T_world_body))
+    cached = cache_update(job.entry.stamp_ns, job.T_world_body, update)
+    return _Fused(job, update, cached, scan, snapshot, unreached=unreached)
+
+
+def _within_reach(scan: Scan, T_world_body: Transform, config: OctreeConfig) -> tuple[Scan, int]:
+    """Return a scan without the points that are too far from the map's origin to have keys, and their number.
+
+    A single return that is damaged, and yet not beyond what a sensor reaches, must not end a build.
+    """
+    points_world = scan.points_body @ T_world_body[:3, :3].T + T_world_body[:3, 3]
+    # Two voxels short of the reach: the octree rounds points to single precision and to voxels' centres.
+    limit_m = reach_m(config.resolution_m) - 2.0 * config.resolution_m
+    kept = np.abs(points_world).max(axis=1) < limit_m
+    colors = None if scan.colors is None else scan.colors[kept]
+    reached = Scan(scan.stamp_ns, scan.points_body[kept], scan.origin_body, colors)
+    return reached, len(kept) - int(kept.sum())
 
 
 def _snapshot(frame: Frame, scan: Scan, config: McapConfig) -> Snapshot | ScanSnapshot:

@@ -94,7 +94,7 @@ class Caster:
             resolution_m = self.config.resolution_m
             raise DataError(
                 f"octree: {outside} of {total} points are not finite or not within "
-                f"±{_reach_m(resolution_m):g} m, the reach of {resolution_m:g} m voxels; "
+                f"±{reach_m(resolution_m):g} m, the reach of {resolution_m:g} m voxels; "
                 "drop them or raise resolution_m"
             )
 
@@ -108,11 +108,12 @@ def origin_key(origin: NDArray[np.float32], resolution_m: float) -> NDArray[np.i
     keys = np.floor((1.0 / resolution_m) * origin.astype(np.float64)) + KEY_ZERO
     if not ((keys >= 0) & (keys < KEY_COUNT)).all():
         raise DataError(
-            f"octree: sensor origin {origin.tolist()} is not within ±{_reach_m(resolution_m):g} m, "
+            f"octree: sensor origin {origin.tolist()} is not within ±{reach_m(resolution_m):g} m, "
             f"the reach of {resolution_m:g} m voxels; raise resolution_m or shift the map"
         )
     return keys.astype(np.int64)
 
 
-def _reach_m(resolution_m: float) -> float:
+def reach_m(resolution_m: float) -> float:
+    """Return how far from the map's origin, along each axis, voxels have keys."""
     return KEY_ZERO * resolution_m

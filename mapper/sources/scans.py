@@ -3,10 +3,13 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from mapper.core.errors import FrameError
 from mapper.core.frames import Scan
 from mapper.sources.base import ImageFiles
 from mapper.sources.cloud_files import read_cloud
+from mapper.sources.cloud_files.raw import MIN_POINTS
 from mapper.sources.point_times import relative_times_s
+from mapper.sources.valid_returns import FARTHEST_M, valid_returns
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,17 +23,25 @@ class ScanEntry:
     files: ImageFiles | None = None
 
     def load(self, *, colour: bool = True) -> Scan:
-        """Read the cloud, with the time of each point where the file has it.
+        """Read the cloud, with the time of each point where the file has it; far returns are left out.
 
         Raises:
             FrameError: The file is missing, damaged, empty or not in metres around the sensor.
         """
         cloud = read_cloud(self.path, scale=self.scale)
+        points_body, rows, far = valid_returns(cloud.points)
+        if len(points_body) < MIN_POINTS:
+            raise FrameError(
+                f"{self.path}: {far} of {len(cloud.points)} points are farther than {FARTHEST_M:g} m, which "
+                "no sensor reaches"
+            )
+        kept = slice(None) if rows is None else rows
         return Scan(
             stamp_ns=self.stamp_ns,
-            points_body=cloud.points,
-            colors=cloud.colors if colour else None,
-            times_s=None if cloud.times is None else relative_times_s(cloud.times, self.stamp_ns),
+            points_body=points_body,
+            colors=cloud.colors[kept] if colour and cloud.colors is not None else None,
+            times_s=None if cloud.times is None else relative_times_s(cloud.times[kept], self.stamp_ns),
+            far_returns=far,
         )
 
     def scan(self) -> Scan:

@@ -11,12 +11,11 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, apply
 from mapper.sources.point_times import relative_times_s, time_field
 from mapper.sources.ros.messages import CloudMessage
-from mapper.sources.ros.valid_returns import valid_returns
+from mapper.sources.valid_returns import valid_returns
 
 Field = tuple[str, int, str, int]
 """Name, offset in a point in bytes, numpy's name of the type with its byte order, and number of values."""
 
-_FARTHEST_M = 5000.0
 _SEPARATE_COLOURS = (("r", "g", "b"), ("red", "green", "blue"))
 _PACKED_COLOURS = ("rgb", "rgba")
 
@@ -62,7 +61,7 @@ def scan_from(message: CloudMessage, *, T_body_frame: Transform, with_colours: b
     """Return the valid points of a cloud, in the body frame.
 
     Drivers write missing returns as points that are not finite or at the sensor itself; points beyond the
-    reach of every sensor are damage.
+    reach of every sensor are damage, and are counted.
 
     Args:
         message: The cloud.
@@ -77,7 +76,7 @@ def scan_from(message: CloudMessage, *, T_body_frame: Transform, with_colours: b
     names = points.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
         raise FrameError(f"{where}: points of {', '.join(names)}; want x, y and z")
-    points_body, rows = valid_returns(_coordinates(points), farthest_m=_FARTHEST_M)
+    points_body, rows, far = valid_returns(_coordinates(points))
     kept = slice(None) if rows is None else rows
     T_body_points = T_body_frame @ message.T_frame_points
     if not np.array_equal(T_body_points, np.eye(4)):
@@ -89,6 +88,7 @@ def scan_from(message: CloudMessage, *, T_body_frame: Transform, with_colours: b
         origin_body=T_body_points[:3, 3],
         colors=_colours(points, names, kept) if with_colours else None,
         times_s=None if times is None else relative_times_s(points[times][kept], message.stamp_ns),
+        far_returns=far,
     )
 
 
