@@ -38,6 +38,7 @@ def convert(
     """
     from mapper.config.loading import load_source_config
     from mapper.sources import open_source
+    from mapper.sources.reading_checks import ReadingChecks
     from mapper.sources.writers import left_out, write_log
 
     prepare_libraries()
@@ -47,9 +48,12 @@ def convert(
     progress = progress_for(quiet=quiet)
     for note in (*source.notes, *left_out(source, as_.value)):
         progress.note(note)
+    checks = ReadingChecks(source)
     with progress.stage("convert") as report:
-        skipped = write_log(source, out, kind=as_.value, on_progress=lambda done: report(done, len(source)))
-    for skip in skipped:
-        progress.note(f"skipped: {skip.reason}")
+        skipped = write_log(
+            checks.log, out, kind=as_.value, on_progress=lambda done: report(done, len(source))
+        )
+    for note in (*(f"skipped: {skip.reason}" for skip in skipped), *checks.notes()):
+        progress.note(note)
     if not quiet:
         print(f"{out}: {len(source) - len(skipped)} frames as {as_.value}, {len(skipped)} skipped")

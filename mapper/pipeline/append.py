@@ -77,6 +77,7 @@ def append(
             session = source.sessions[-1].log
             start = _after(before, first, poses_for(config.odometry, session), config, progress)
             tracking = track_log(session, config, progress=progress, start=start)
+        writer.note_input(tracking.notes)
         refuse_a_fragment(tracking, config, sensor=source.sensor)
         _refuse_unconnected(second, run, tracking.loops, known)
         with writer.clock.stage("solve"):

@@ -62,6 +62,7 @@ def build(
         with writer.clock.stage("track"):
             tracking = track_log(source, config, progress=progress, observer=observer)
             tracking = largest_component(tracking, progress=progress)
+        writer.note_input(tracking.notes)
         save_tracking(writer, from_tracking(tracking, source.truth))
         refuse_a_fragment(tracking, config, sensor=source.sensor)
         with writer.clock.stage("solve"):

@@ -24,6 +24,7 @@ from mapper.run.stored_tracking import StoredTracking
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef, Log, Skipped
+from mapper.sources.reading_checks import ReadingChecks
 
 _BY_POSES = ("wheels", "given")
 """Kinds of odometry without tracking: frames have the poses of wheels, or known ones."""
@@ -46,6 +47,7 @@ class TrackingResult:
         graph: Nodes at the odometry's estimates, with every factor, those of the loops last.
         loops: Every loop candidate with its verdict.
         frame_ms: Wall milliseconds that each frame took to read, detect and track, by stamp.
+        notes: What is suspicious about the frames that were read, a sentence each.
     """
 
     tracks: tuple[FrameResult, ...]
@@ -53,6 +55,7 @@ class TrackingResult:
     graph: PoseGraph
     loops: tuple[LoopClosure, ...]
     frame_ms: Mapping[int, float]
+    notes: Sequence[str] = ()
 
     @property
     def placed(self) -> list[FrameResult]:
@@ -128,7 +131,8 @@ def track_log(
             observation = Skipped(entry.stamp_ns, str(error))
         return entry, observation, time.perf_counter() - began
 
-    observations = ordered_map(observe, source.entries(), workers=config.workers)
+    checks = ReadingChecks(source)
+    observations = ordered_map(observe, checks.log.entries(), workers=config.workers)
     with progress.stage("track") as report:
         for done, (entry, observation, observed_s) in enumerate(observations, start=1):
             report(done, len(source))
@@ -146,12 +150,15 @@ def track_log(
             graph.add_factors(track.factors)
             tracks.append(track)
             observer.on_frame(Step(entry, track, view, odometry.matches, detector))
+    notes = checks.notes()
+    for note in notes:
+        progress.note(note)
     graph.add_factors(odometry.finish())
     if config.odometry.kind not in _BY_POSES:  # which then gave the odometry its factors
         graph.add_factors(wheel_factors(graph.stamps_ns, source.wheels, config.graph.wheels))
     loops = (*start.loops, *detector.closures())
     graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")
-    return TrackingResult(tuple(tracks), tuple(skipped), graph, loops, frame_ms)
+    return TrackingResult(tuple(tracks), tuple(skipped), graph, loops, frame_ms, notes)
 
 
 def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: Sensor) -> None:

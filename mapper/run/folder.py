@@ -1,6 +1,6 @@
 """Run folder: reading a finished run, and writing a new one."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import zip_longest
@@ -185,6 +185,16 @@ class RunWriter:
     def update(self, **parts: Any) -> None:
         """Replace fields of the manifest."""
         self.manifest = self.manifest.model_copy(update=parts)
+
+    def note_input(self, notes: Sequence[str]) -> None:
+        """Add notes on the log that was read last."""
+        known = self.manifest.input
+        if known.appended:
+            *others, last = known.appended
+            last = last.model_copy(update={"notes": (*last.notes, *notes)})
+            self.update(input=known.model_copy(update={"appended": (*others, last)}))
+        else:
+            self.update(input=known.model_copy(update={"notes": (*known.notes, *notes)}))
 
     def save(self) -> None:
         """Write the manifest as it stands."""

@@ -41,7 +41,7 @@ class InputLog(Config):
     kind: str
     fingerprint: str
     notes: tuple[str, ...] = ()
-    """What opening the log had to leave out or assume."""
+    """What opening and reading the log had to leave out or assume, and what is suspicious in its frames."""
 
 
 class AppendedLog(InputLog):

@@ -1,6 +1,6 @@
 """Facts of a log, without building anything from it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.depth_scale import depth_warnings
+from mapper.sources.reading_checks import ReadingChecks
 from mapper.sources.ros import files as recordings
 from mapper.sources.ros.index import Series
 from mapper.sources.ros.reader import RecordingReader
@@ -22,6 +23,8 @@ from mapper.sources.selection import selected
 
 _GAP_PERIODS = 3.0
 """Median periods that a pause must exceed to be a gap."""
+_MOST_LOADED = 200
+"""Frames of an RGB-D log that are loaded, evenly spread: a second or two of reading, whatever its length."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +146,9 @@ def _topic(series: Series) -> TopicFacts:
 
 
 def _inspected(path: Path, topics: Sequence[TopicFacts], source: Log) -> Inspection:
-    first, problem = _first_frame(source)
+    checks = ReadingChecks(source)
+    damage = list(_damage(checks))  # loads grey images, before the first is loaded in colour
+    first, problem = _first_frame(checks.log)
     log = LogFacts(
         name=source.name,
         kind=source.kind,
@@ -155,7 +160,7 @@ def _inspected(path: Path, topics: Sequence[TopicFacts], source: Log) -> Inspect
         wheels=None if source.wheels is None else timing_of(source.wheels.stamps_ns),
         wheels_path_m=0.0 if source.wheels is None else source.wheels.path_length_m,
         readings=0 if source.accelerations is None else len(source.accelerations.stamps_ns),
-        notes=list(source.notes),
+        notes=[*source.notes, *damage, *checks.notes()],
         warnings=depth_warnings(source),
     )
     return Inspection(path, topics, log, problem or None)
@@ -187,6 +192,34 @@ def _calibration_text(camera: PinholeCamera) -> str:
     numbers = ", ".join(f"{v:g}" for v in (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px))
     distortion = ", ".join(f"{k:g}" for k in camera.distortion) if any(camera.distortion) else "none"
     return f"fx fy cx cy {numbers} px, distortion {distortion}"
+
+
+def _damage(checks: ReadingChecks) -> Iterator[str]:
+    """Load frames from all over an RGB-D log, and yield a note if some cannot be read.
+
+    Around images that repeat all frames are loaded, so that the checks know where that begins and ends. Scans
+    are not loaded: as text, a single one may take seconds.
+    """
+    if checks.log.sensor == "lidar":
+        return
+    step = -(-len(checks.log) // _MOST_LOADED)
+    looked_at = range(0, len(checks.log), step)
+    if reasons := _unreadable(checks.log, looked_at):
+        yield f"{len(reasons)} of {len(looked_at)} frames looked at cannot be read; the first: {reasons[0]}"
+    for run in (*checks.repeated("image", fewest=2), *checks.repeated("depth", fewest=2)):
+        _unreadable(checks.log, range(max(run.start - step, 0), run.start))
+        _unreadable(checks.log, range(run.stop, min(run.stop + step, len(checks.log))))
+
+
+def _unreadable(log: Log, indices: Iterable[int]) -> list[str]:
+    """Load some frames and return why others cannot be loaded."""
+    reasons = []
+    for index in indices:
+        try:
+            log.entry_at(index).load(colour=False)
+        except FrameError as error:
+            reasons.append(str(error))
+    return reasons
 
 
 def _truth_text(truth: Trajectory, stamps_ns: Stamps) -> str:

@@ -1,0 +1,122 @@
+"""Checks of a log's frames while they are read: images that repeat, and far returns."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Literal
+
+import numpy as np
+from isal import isal_zlib
+
+from mapper.core.frames import DepthImage, Frame, Image, Scan
+from mapper.core.timebase import NS_PER_S
+from mapper.sources.base import FrameRef, ImageFiles, Log
+from mapper.sources.valid_returns import FARTHEST_M
+
+FROZEN_FRAMES = 10
+"""So many frames with the very same pixels are noted: a camera's noise makes even two of them differ, and
+drivers repeat a frame or two when a sensor is late."""
+FROZEN_DEPTHS = 5
+"""As ``FROZEN_FRAMES``, of depth images, whose noise is stronger."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Reading:
+    """What the checks keep of a frame: checksums of its two images, or the number of its far returns."""
+
+    image: int | None = None
+    depth: int | None = None
+    far_returns: int = 0
+
+
+class ReadingChecks:
+    """Checks of the frames that are loaded, in any thread and any order.
+
+    Attributes:
+        log: The log to be read: the same frames, each of which is checked when it is loaded.
+    """
+
+    def __init__(self, log: Log) -> None:
+        self._stamps_ns = log.stamps_ns
+        self._readings: dict[int, _Reading] = {}
+        self.log = replace(log, entry_at=lambda index: _CheckedEntry(self, index, log.entry_at(index)))
+
+    def add(self, index: int, frame: Frame) -> None:
+        """Take in frame ``index`` of the log; what was loaded first counts, be it in colour or in grey."""
+        if index not in self._readings:
+            self._readings[index] = _reading_of(frame)
+
+    def repeated(self, what: Literal["image", "depth"], *, fewest: int) -> list[range]:
+        """Return the runs of so many frames or more with the same images.
+
+        A frame that was not loaded, or could not be, counts as those around it.
+        """
+        loaded = sorted(
+            index for index, reading in self._readings.items() if getattr(reading, what) is not None
+        )
+        same = [
+            list(run) for _, run in groupby(loaded, key=lambda index: getattr(self._readings[index], what))
+        ]
+
+        return [range(run[0], run[-1] + 1) for run in same if run[-1] + 1 - run[0] >= fewest]
+
+    def notes(self) -> list[str]:
+        """Return what is suspicious about the frames loaded so far, a sentence each."""
+        return [
+            *(
+                f"{self._named(run)} show the same image; was the camera frozen?"
+                for run in self.repeated("image", fewest=FROZEN_FRAMES)
+            ),
+            *(
+                f"{self._named(run)} have the same depth image; was the depth camera frozen?"
+                for run in self.repeated("depth", fewest=FROZEN_DEPTHS)
+            ),
+            *self._far_returns(),
+        ]
+
+    def _named(self, run: range) -> str:
+        begin_s, end_s = ((self._stamps_ns[[run[0], run[-1]]] - self._stamps_ns[0]) / NS_PER_S).tolist()
+        return f"frames {run[0]} … {run[-1]}, {begin_s:.1f} … {end_s:.1f} s after the first,"
+
+    def _far_returns(self) -> Iterator[str]:
+        counts = [reading.far_returns for reading in self._readings.values() if reading.far_returns]
+        if counts:
+            yield (
+                f"{sum(counts)} returns in {len(counts)} of {len(self._readings)} scans are farther than "
+                f"{FARTHEST_M:g} m, which no sensor reaches; left out"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class _CheckedEntry:
+    """An entry whose frame is checked when it is loaded; see :class:`mapper.sources.base.FrameRef`."""
+
+    checks: ReadingChecks
+    index: int
+    entry: FrameRef
+
+    @property
+    def stamp_ns(self) -> int:
+        return self.entry.stamp_ns
+
+    @property
+    def files(self) -> ImageFiles | None:
+        return self.entry.files
+
+    def load(self, *, colour: bool = True) -> Frame:
+        frame = self.entry.load(colour=colour)
+        self.checks.add(self.index, frame)
+        return frame
+
+    def scan(self) -> Scan:
+        return self.entry.scan()
+
+
+def _reading_of(frame: Frame) -> _Reading:
+    if isinstance(frame, Scan):
+        return _Reading(far_returns=frame.far_returns)
+    return _Reading(image=_checksum(frame.image), depth=_checksum(frame.depth_m))
+
+
+def _checksum(image: Image | DepthImage) -> int:
+    return int(isal_zlib.crc32(np.ascontiguousarray(image)))

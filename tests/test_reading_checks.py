@@ -1,0 +1,111 @@
+"""Images that repeat and returns beyond reach are noted, by a build and by an inspection."""
+
+import shutil
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from logs_made import MemoryEntry, log_in_memory
+
+from mapper.config.loading import load_config
+from mapper.core.errors import FrameError
+from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
+from mapper.core.timebase import NS_PER_S
+from mapper.pipeline.build import build
+from mapper.sources import inspection, open_source
+from mapper.sources.config import SourceConfig
+from mapper.sources.inspection import inspect_log
+from mapper.sources.reading_checks import FROZEN_DEPTHS, FROZEN_FRAMES, ReadingChecks
+
+CAMERA = PinholeCamera(8, 6, 6.0, 6.0, 3.5, 2.5)
+
+
+def log_of(images, depths):
+    """A log at 10 Hz whose frame i has the image and the depth of seeds images[i] and depths[i]."""
+    entries = []
+    for i, seeds in enumerate(zip(images, depths, strict=True)):
+        image = np.random.default_rng(seeds[0]).integers(0, 256, (6, 8, 3), dtype=np.uint8)
+        depth_m = np.random.default_rng(seeds[1]).uniform(1.0, 2.0, (6, 8)).astype(np.float32)
+        entries.append(MemoryEntry(i * NS_PER_S // 10, RgbdFrame(i * NS_PER_S // 10, image, depth_m, CAMERA)))
+    return log_in_memory(entries)
+
+
+def notes_on(log, order=None):
+    checks = ReadingChecks(log)
+    for index in range(len(log)) if order is None else order:
+        with suppress(FrameError):
+            checks.log.entry_at(index).load()
+    return checks.notes()
+
+
+def frozen(n, first, count):
+    return [first if first <= i < first + count else i for i in range(n)]
+
+
+def test_a_frozen_camera_is_noted_with_its_frames_and_times():
+    log = log_of(frozen(40, 7, FROZEN_FRAMES + 2), range(100, 140))
+    noted = ["frames 7 … 18, 0.7 … 1.8 s after the first, show the same image; was the camera frozen?"]
+    assert notes_on(log) == noted
+    assert notes_on(log, np.random.default_rng(0).permutation(40).tolist()) == noted
+    assert notes_on(log_of(frozen(40, 7, FROZEN_FRAMES - 1), range(100, 140))) == []
+
+
+def test_depth_that_repeats_is_noted():
+    noted = notes_on(log_of(range(20), frozen(20, 12, FROZEN_DEPTHS)))
+    assert noted == [
+        "frames 12 … 16, 1.2 … 1.6 s after the first, have the same depth image; was the depth camera frozen?"
+    ]
+    assert notes_on(log_of(range(20), frozen(20, 12, FROZEN_DEPTHS - 1))) == []
+
+
+def test_a_damaged_frame_among_the_same_ones_hides_nothing():
+    log = log_of(frozen(30, 5, 20), range(100, 130))
+    entries = [log.entry_at(i) for i in range(30)]
+    entries[14] = MemoryEntry(entries[14].stamp_ns, FrameError("damaged"))
+    assert notes_on(log_in_memory(entries))[0].startswith("frames 5 … 24, ")
+
+
+def test_the_same_image_now_and_again_is_no_frozen_camera():
+    assert notes_on(log_of([i % 2 for i in range(60)], [i % 3 for i in range(60)])) == []
+
+
+def test_far_returns_are_counted_over_the_log():
+    points = np.ones((20, 3), np.float32)
+    entries = [MemoryEntry(i, Scan(i, points, far_returns=i % 3)) for i in range(6)]
+    assert notes_on(log_in_memory(entries, sensor="lidar")) == [
+        "6 returns in 4 of 6 scans are farther than 5000 m, which no sensor reaches; left out"
+    ]
+
+
+@pytest.fixture(scope="module")
+def frozen_log(desk_log, tmp_path_factory):
+    """The log of the desk whose colour images 0 … 13 are the same, byte by byte."""
+    log = shutil.copytree(desk_log, tmp_path_factory.mktemp("logs") / "frozen")
+    images = sorted((log / "rgb").iterdir())
+    for image in images[1:14]:
+        shutil.copyfile(images[0], image)
+    return log
+
+
+NOTE = "frames 0 … 13, 0.0 … 0.9 s after the first, show the same image; was the camera frozen?"
+
+
+def test_an_inspection_notes_it_whatever_part_of_the_log_it_loads(frozen_log, monkeypatch):
+    assert NOTE in inspect_log(frozen_log, SourceConfig()).log.notes
+    monkeypatch.setattr(inspection, "_MOST_LOADED", 8)
+    assert NOTE in inspect_log(frozen_log, SourceConfig()).log.notes
+
+
+def test_an_inspection_counts_what_cannot_be_read(desk_log, tmp_path):
+    log = shutil.copytree(desk_log, tmp_path / "log")
+    for image in sorted((log / "depth").iterdir())[4:7]:
+        image.write_bytes(image.read_bytes()[:100])
+    notes = inspect_log(log, SourceConfig()).log.notes
+    assert [note.split(": ")[0] for note in notes] == ["3 of 31 frames looked at cannot be read; the first"]
+
+
+def test_a_build_notes_it_in_the_manifest(frozen_log, tmp_path):
+    config = load_config(None, ["loops.kind=none", "min_tracked_ratio=0", "min_tracked_frames=2"])
+    run = build(open_source(frozen_log), config, tmp_path / "run")
+    assert NOTE in run.manifest.input.notes
+    assert run.manifest.counts.listed == 31
