@@ -192,6 +192,15 @@ def isal(_folder: Path) -> None:
     _expect(isal_zlib.decompress(isal_zlib.compress(b"mapper")) == b"mapper", "the bytes came back others")
 
 
+def simplejpeg(_folder: Path) -> None:
+    """Encode an image and decode it."""
+    import simplejpeg
+
+    grey = np.full((8, 8, 1), 128, np.uint8)
+    found = simplejpeg.decode_jpeg(simplejpeg.encode_jpeg(grey, colorspace="GRAY"), "GRAY")
+    _expect(np.array_equal(found, grey), "a grey image came back another")
+
+
 def zstandard(_folder: Path) -> None:
     """Compress and decompress."""
     import zstandard
@@ -267,6 +276,7 @@ SELF_TESTS: dict[str, Callable[[Path], None]] = {
     "rerun-sdk": rerun,
     "rich": rich,
     "rosbags": rosbags,
+    "simplejpeg": simplejpeg,
     "typer": typer,
     "zstandard": zstandard,
 }

@@ -30,6 +30,7 @@ _LIBRARIES = (
     "opencv-contrib-python-headless",
     "pydantic",
     "rosbags",
+    "simplejpeg",
 )
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
-from mapper.sources import png
+from mapper.sources import jpeg, png
 from mapper.sources.base import ImageFile
 
 SATURATED = 65535
@@ -21,7 +21,6 @@ FINE_UNITS_PER_M = 5000.0
 # A camera's calibration holds for the pixels as stored, so a rotation tag must not turn them.
 _RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 _GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-_JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 _PNG_END = b"IEND\xae\x42\x60\x82"
 
 
@@ -147,12 +146,14 @@ def _eight_bit(image: NDArray[np.uint8] | NDArray[np.uint16], where: str) -> Ima
 
 
 def _decoded(data: bytes, flags: int, where: str) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """Decode a file; plain PNGs come as they are stored, everything else as OpenCV's flags say."""
+    """Decode a file; plain PNGs come as they are stored, everything else as the flags, OpenCV's, say."""
     if not data:
         raise FrameError(f"{where}: empty file")
     try:
         if png.is_plain(data):
             return png.decode(data)
+        if data.startswith(jpeg.START):
+            return jpeg.decode(data, colour=flags != _GREY)
         _check_whole(data)
         image: NDArray[np.uint8] | None = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except (DataError, cv2.error) as error:
@@ -163,10 +164,8 @@ def _decoded(data: bytes, flags: int, where: str) -> NDArray[np.uint8] | NDArray
 
 
 def _check_whole(data: bytes) -> None:
-    """Refuse a file without its end marker: OpenCV reports truncation on stderr only."""
+    """Refuse a PNG without its last chunk: OpenCV reports truncation on stderr only."""
     tail = data.rstrip(b"\0")[-64:]
-    if data.startswith(_JPEG_START) and _JPEG_END not in tail:
-        raise DataError("truncated JPEG: it ends before its end marker")
     if data.startswith(png.SIGNATURE) and _PNG_END not in tail:
         raise DataError("truncated PNG: it ends before its last chunk")
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mapper.core.errors import DataError, FrameError
-from mapper.sources import png
+from mapper.sources import jpeg, png
 from mapper.sources.images import read_colour, read_depth_m, read_grey
 from tests.support.tum_logs import picture
 
@@ -107,6 +107,61 @@ def test_a_cut_jpeg_is_refused_quietly(tmp_path, capfd, keep):
     with pytest.raises(FrameError, match=r"c\.jpg: truncated JPEG"):
         read_grey(path)
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    "options", [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]]
+)
+@pytest.mark.parametrize("grey", [False, True])
+def test_jpeg_equals_opencv(options, grey):
+    rgb, _ = picture(3, width_px=80, height_px=60)
+    pixels = rgb[:, :, 0] if grey else rgb[:, :, ::-1]
+    data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 90, *options])[1]
+    for colour, flags in ((True, cv2.IMREAD_COLOR_RGB), (False, cv2.IMREAD_GRAYSCALE)):
+        np.testing.assert_array_equal(jpeg.decode(data.tobytes(), colour=colour), cv2.imdecode(data, flags))
+
+
+def damaged(data, how, rng):
+    """Damage the scan of a JPEG, of which its second half is a part, in one way."""
+    at = int(rng.integers(len(data) // 2, len(data) - 1000))
+    match how:
+        case "cut, and ended":
+            return data[:at] + b"\xff\xd9"
+        case "overwritten":
+            return data[:at] + rng.bytes(1000) + data[at + 1000 :]
+        case "repeated":
+            return data[:at] + data[at - 1000 :]
+        case "left out":
+            return data[: at - 1000] + data[at:]
+
+
+@pytest.mark.parametrize("how", ["cut, and ended", "overwritten", "repeated", "left out"])
+def test_a_damaged_jpeg_is_refused_quietly(tmp_path, capfd, how):
+    rgb, _ = picture(0, width_px=320, height_px=240)
+    data = cv2.imencode(".jpg", rgb)[1].tobytes()
+    path = tmp_path / "c.jpg"
+    rng = np.random.default_rng(0)
+    reasons = []
+    for _ in range(50):
+        path.write_bytes(damaged(data, how, rng))
+        try:
+            read_colour(path)
+        except FrameError as error:
+            reasons.append(str(error))
+    assert (
+        len(reasons) >= 48
+    )  # rarely as many blocks follow as before, and nothing shows that they are others
+    assert all("c.jpg: damaged JPEG: " in reason for reason in reasons)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_jpeg_of_countless_scans_is_refused(tmp_path):
+    data = cv2.imencode(".jpg", picture(0)[0], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    scan = data.rindex(b"\xff\xda")
+    path = tmp_path / "c.jpg"
+    path.write_bytes(data[:-2] + 10_000 * data[scan:-2] + data[-2:])
+    with pytest.raises(FrameError, match=r"c\.jpg: damaged JPEG: 10\d\d\d scans, want 500 at most"):
+        read_grey(path)
 
 
 def test_a_jpeg_followed_by_padding_is_whole(tmp_path):
