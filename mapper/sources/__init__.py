@@ -33,6 +33,8 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> Log:
     """
     if not path.exists():
         raise SourceError(f"{path}: no such file or folder")
+    if not (path.is_dir() or path.is_file()):
+        raise SourceError(f"{path}: a device or a pipe; want a file or a folder")
     for log_format in _FORMATS:
         if log_format.recognise(path):
             if config.body_frame is not None and log_format is not recordings:

@@ -1,5 +1,6 @@
 """Image files as arrays: whole and of the right kind, or an error that names the file."""
 
+from pathlib import Path
 from typing import cast
 
 import cv2
@@ -11,6 +12,7 @@ from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
 from mapper.sources import jpeg, png
 from mapper.sources.base import ImageFile
+from mapper.sources.regular_files import read_regular
 
 SATURATED = 65535
 """The largest 16-bit depth is a sensor's way to say "nothing" (7-Scenes) or "too far": no measurement."""
@@ -22,6 +24,8 @@ FINE_UNITS_PER_M = 5000.0
 _RGB = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 _GREY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 _PNG_END = b"IEND\xae\x42\x60\x82"
+_MOST_FILE_BYTES = 512 << 20
+"""Size of an image file, beyond which it is none: more than 100 megapixels take without compression."""
 
 
 def read_colour(path: ImageFile) -> Image:
@@ -126,12 +130,28 @@ def bytes_of(path: ImageFile) -> bytes:
     """Return an image file's bytes.
 
     Raises:
-        FrameError: The file is missing or cannot be read.
+        FrameError: The file is missing, cannot be read, is no regular file, or too large.
     """
     try:
+        if isinstance(path, Path):
+            return read_regular(path, most_bytes=_MOST_FILE_BYTES)
         return path.read_bytes()
     except OSError as error:
         raise FrameError(f"{path}: cannot be read: {error.strerror}") from None
+    except DataError as error:
+        raise FrameError(f"{path}: {error}") from None
+
+
+def image_bytes(path: ImageFile) -> bytes:
+    """Return an image file's bytes to be copied into another log: nothing but an image is.
+
+    Raises:
+        FrameError: As :func:`bytes_of`, or the file is no image.
+    """
+    data = bytes_of(path)
+    if not data.startswith((png.SIGNATURE, jpeg.START)):
+        _decoded(data, cv2.IMREAD_UNCHANGED, f"{path}")
+    return data
 
 
 def _png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:

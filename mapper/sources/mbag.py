@@ -16,7 +16,8 @@ from mapper.core.timebase import ns_from_seconds_text
 from mapper.sources.base import Log
 from mapper.sources.calibration import freiburg_camera
 from mapper.sources.config import SourceConfig
-from mapper.sources.rgbd import FramePair, find_calibration, present, rgbd_log
+from mapper.sources.regular_files import present, within
+from mapper.sources.rgbd import FramePair, find_calibration, rgbd_log
 from mapper.sources.text import (
     parse_numbers,
     parse_stamp,
@@ -44,7 +45,8 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     """Return the log of an mbag file, or of the one in a folder.
 
     Raises:
-        SourceError: The file is empty or malformed, none of its images exists, or the camera is unknown.
+        SourceError: The file is empty or malformed, an image lies outside of its folder, none exists, or the
+            camera is unknown.
     """
     file = _mbag_file(path)
     if file is None:
@@ -102,7 +104,7 @@ def _parse(file: Path, number: int, words: list[str]) -> tuple[FramePair, list[s
         raise SourceError(f"{where}: {len(words)} fields, want 10: timestamp; rgb; depth; x … qw")
     stamp_ns = parse_stamp(words[0], where=where)
     # The thesis's own recordings were made on Windows.
-    colour, depth = (file.parent / word.replace("\\", "/") for word in words[1:3])
+    colour, depth = (within(file.parent, word.replace("\\", "/"), where=where) for word in words[1:3])
     # The format has one stamp a line; an image named by its stamp, as TUM's are, still tells its own.
     depth_stamp_ns = ns_from_seconds_text(depth.stem) if _STAMP_NAME.fullmatch(depth.stem) else stamp_ns
     return FramePair(stamp_ns, colour, depth_stamp_ns, depth), words[3:]

@@ -15,6 +15,7 @@ from mapper.sources.calibration import Calibration, configured
 from mapper.sources.calibration_file import FILE_NAMES, read_calibration
 from mapper.sources.config import CameraConfig
 from mapper.sources.images import check_size, read_colour, read_depth_m, read_grey, scan_of
+from mapper.sources.regular_files import refuse_links_out
 from mapper.sources.text import parse_numbers, parse_stamp, table, time_order
 
 _MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -97,15 +98,17 @@ def rgbd_log(
         notes: What finding all these had to leave out or assume.
 
     Raises:
-        SourceError: No colour image can be read, they are not of the calibration's size, or a line of
-            ``accelerometer.txt`` is malformed.
+        SourceError: No colour image can be read, they are not of the calibration's size, an image is a link
+            out of the log, or a line of ``accelerometer.txt`` is malformed.
     """
     if calibration.fy_px < 0.0:
         calibration = calibration.with_y_down()
         truth = truth and replace(truth, T_world_body=_MIRROR_Y @ truth.T_world_body @ _MIRROR_Y)
         notes = [*notes, "fy < 0: the camera's y axis points up; y of camera and truth is mirrored"]
+    folder = path if path.is_dir() else path.parent
+    refuse_links_out((file for pair in pairs for file in (pair.colour, pair.depth)), log=folder)
     camera = _camera_of(pairs, calibration)
-    accelerations, acceleration_notes = read_accelerations(path if path.is_dir() else path.parent)
+    accelerations, acceleration_notes = read_accelerations(folder)
 
     def entry_at(index: int) -> RgbdEntry:
         pair = pairs[index]
@@ -182,21 +185,6 @@ def unpaired_note(alone: int, total: int, *, max_gap_s: float) -> list[str]:
     if 2 * alone > total:
         left_out = "more than half of the log is left out (source.max_pair_gap_s)"
     return [f"{alone} of {total} colour images have no depth image within {max_gap_s * 1e3:g} ms; {left_out}"]
-
-
-def present(paths: Iterable[Path]) -> list[bool]:
-    """Tell which files exist, listing each folder once: a stat per file is slow on network disks."""
-    listings: dict[Path, frozenset[str]] = {}
-    found = []
-    for path in paths:
-        if path.parent not in listings:
-            listings[path.parent] = _listing(path.parent)
-        found.append(path.name in listings[path.parent])
-    return found
-
-
-def _listing(folder: Path) -> frozenset[str]:
-    return frozenset(path.name for path in folder.iterdir()) if folder.is_dir() else frozenset()
 
 
 def read_accelerations(folder: Path) -> tuple[Accelerations | None, list[str]]:

@@ -11,20 +11,19 @@ from mapper.core.geometry import Array, Transform, is_rigid, transform
 from mapper.core.rotations import rotation_from_quaternion
 from mapper.core.timebase import Stamps, ns_from_date_text, ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
+from mapper.sources.regular_files import read_text
 
 
 def read_lines(path: Path) -> list[str]:
     """Return a text file's lines.
 
     Raises:
-        SourceError: The file is missing, unreadable or not text.
+        SourceError: The file is missing, unreadable, no regular file, too large or not text.
     """
     try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise SourceError(f"{path}: not a text file") from None
+        return read_text(path).splitlines()
+    except DataError as error:
+        raise SourceError(str(error)) from None
 
 
 def rows(path: Path, *, separator: str | None = None) -> Iterator[tuple[int, list[str]]]:

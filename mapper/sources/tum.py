@@ -13,7 +13,8 @@ from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.calibration import freiburg_camera
 from mapper.sources.config import SourceConfig
-from mapper.sources.rgbd import FramePair, find_calibration, present, rgbd_log, unpaired_note
+from mapper.sources.regular_files import present, within
+from mapper.sources.rgbd import FramePair, find_calibration, rgbd_log, unpaired_note
 from mapper.sources.text import (
     parse_numbers,
     parse_stamp,
@@ -43,7 +44,8 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     """Return the log of a TUM folder: each colour image with its nearest depth image.
 
     Raises:
-        SourceError: A list is missing, empty or malformed, no two images pair, or the camera is unknown.
+        SourceError: A list is missing, empty or malformed, an image lies outside of the folder, no two images
+            pair, or the camera is unknown.
     """
     notes: list[str] = []
     colour = _read_list(path, "rgb.txt", notes)
@@ -93,7 +95,7 @@ def _read_list(folder: Path, name: str, notes: list[str]) -> _ImageList:
     stamps_ns, paths = [], []
     for where, words in table(path, "stamp", "filename"):
         stamps_ns.append(parse_stamp(words[0], where=where))
-        paths.append(folder / words[1])
+        paths.append(within(folder, words[1], where=where))
     if not paths:
         raise SourceError(f"{path}: empty list; want lines of: stamp filename")
     exists = present(paths)

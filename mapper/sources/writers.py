@@ -16,7 +16,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.runtime.atomic import new_folder, write_bytes, write_text
 from mapper.sources.base import Accelerations, FrameRef, Log, Skipped
 from mapper.sources.calibration_file import calibration_text
-from mapper.sources.images import FINE_UNITS_PER_M, bytes_of, encode_colour, encode_depth
+from mapper.sources.images import FINE_UNITS_PER_M, encode_colour, encode_depth, image_bytes
 from mapper.sources.kitti_writing import write_kitti_log
 from mapper.sources.mbag import HEADER
 from mapper.sources.trajectory_files import write_tum
@@ -143,8 +143,8 @@ def _write_images(entry: FrameRef, out: Path) -> _Written:
         depth_stamp = seconds_text_from_ns(files.depth_stamp_ns)
         colour = Path("rgb", stamp + files.colour.suffix)
         depth = Path("depth", depth_stamp + files.depth.suffix)
-        write_bytes(out / colour, bytes_of(files.colour))
-        write_bytes(out / depth, bytes_of(files.depth))
+        write_bytes(out / colour, image_bytes(files.colour))
+        write_bytes(out / depth, image_bytes(files.depth))
         return _Written(entry.stamp_ns, colour, depth, files.depth_stamp_ns, files.depth_units_per_m)
     frame = _load(entry)
     colour, depth = Path("rgb", f"{stamp}.png"), Path("depth", f"{stamp}.png")

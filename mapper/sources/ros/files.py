@@ -20,7 +20,7 @@ def recognise(path: Path) -> bool:
     """Tell whether a path is named as a recording, or a folder as ROS 2 records it."""
     if path.is_dir():
         return bool(_parts(path))
-    return path.suffix in (*_ENDINGS, _PACKED)
+    return path.suffix in (*_ENDINGS, _PACKED) and path.is_file()
 
 
 def read_log(path: Path, config: SourceConfig) -> Log:

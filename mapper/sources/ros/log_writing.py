@@ -7,7 +7,7 @@ from pathlib import Path
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import RgbdFrame, Scan
 from mapper.sources.base import FrameRef, ImageFiles, Log, Skipped
-from mapper.sources.images import bytes_of, read_colour, read_depth_m
+from mapper.sources.images import image_bytes, read_colour, read_depth_m
 from mapper.sources.ros.encode_ros import (
     SerializedMessage,
     camera_info_message,
@@ -137,7 +137,7 @@ def _colour_of_files(stamp_ns: int, files: ImageFiles) -> SerializedMessage:
         rgb = read_colour(files.colour)
         return image_message(stamp_ns, topic, rgb, encoding="rgb8", frame=_CAMERA_FRAME)
     return compressed_image_message(
-        stamp_ns, f"{topic}/compressed", bytes_of(files.colour), format_=format_, frame=_CAMERA_FRAME
+        stamp_ns, f"{topic}/compressed", image_bytes(files.colour), format_=format_, frame=_CAMERA_FRAME
     )
 
 
@@ -149,7 +149,7 @@ def _depth_of_files(files: ImageFiles) -> SerializedMessage:
     return compressed_image_message(
         stamp_ns,
         f"{topic}/compressedDepth",
-        _DEPTH_HEADER + bytes_of(files.depth),
+        _DEPTH_HEADER + image_bytes(files.depth),
         format_="16UC1; compressedDepth png",
         frame=_CAMERA_FRAME,
     )

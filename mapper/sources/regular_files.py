@@ -1,0 +1,126 @@
+"""Files of a log: regular ones within its folder, and of a bounded size."""
+
+import os
+import stat
+from collections.abc import Iterable
+from pathlib import Path, PurePath
+
+from mapper.core.errors import DataError, SourceError
+
+MOST_TEXT_BYTES = 256 << 20
+"""Size of a log's text files, beyond which they are taken for something else: the true poses of ten hours at
+100 Hz fill it, and as lines it takes a few gigabytes of memory."""
+
+
+def read_regular(path: Path, *, most_bytes: int) -> bytes:
+    """Return a file's bytes.
+
+    Args:
+        path: A regular file, or a link to one; devices and pipes may never end, or never begin.
+        most_bytes: Size of the largest file that is read.
+
+    Raises:
+        OSError: It cannot be read.
+        DataError: It is no regular file, or larger; the message does not name it.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # else opening a pipe waits for its writer
+    with os.fdopen(descriptor, "rb") as file:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise DataError("no regular file")
+        if status.st_size > most_bytes:
+            raise DataError(f"{status.st_size} bytes, want {most_bytes} at most")
+        return file.read()
+
+
+def read_text(path: Path) -> str:
+    """Return the text of one of a log's files, which is UTF-8.
+
+    Raises:
+        DataError: It cannot be read, is no regular file, too large or no text; the message says which file.
+    """
+    try:
+        return read_regular(path, most_bytes=MOST_TEXT_BYTES).decode("utf-8")
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise DataError(f"{path}: not a text file") from None
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from None
+
+
+def within(folder: Path, name: str, *, where: str) -> Path:
+    """Return the path of a file that a list in a log's folder names.
+
+    Args:
+        folder: Where the names begin.
+        name: Relative to it.
+        where: Place of the name, for the message.
+
+    Raises:
+        SourceError: The name leads out of the folder, or is none.
+    """
+    path = PurePath(name)
+    if path.is_absolute() or ".." in path.parts or "\0" in name:
+        raise SourceError(
+            f"{where}: {name!r} leads out of the log's folder; want the name of a file within it"
+        )
+    return folder / path
+
+
+def present(paths: Iterable[Path]) -> list[bool]:
+    """Tell which files exist, listing each folder once: a stat per file is slow on network disks.
+
+    What is neither a regular file nor a link to one does not.
+    """
+    listings: dict[Path, frozenset[str]] = {}
+    found = []
+    for path in paths:
+        if path.parent not in listings:
+            listings[path.parent] = frozenset(
+                entry.name for entry in _entries(path.parent) if _is_regular(entry)
+            )
+        found.append(path.name in listings[path.parent])
+    return found
+
+
+def refuse_links_out(paths: Iterable[Path], *, log: Path) -> None:
+    """Refuse files that are links out of their log: what is made of it could hold any file of the machine.
+
+    A log's folder may be a link itself, and so may the folders in it, to wherever its files are kept.
+
+    Args:
+        paths: Files in the log's folder and in folders of it.
+        log: The log's folder.
+
+    Raises:
+        SourceError: A file is a link to what lies neither in the log nor in the file's own folder.
+    """
+    names: dict[Path, set[str]] = {}
+    for path in paths:
+        names.setdefault(path.parent, set()).add(path.name)
+    for folder, wanted in names.items():
+        homes = [os.path.realpath(home) + os.sep for home in (log, folder)]
+        for entry in _entries(folder):
+            if entry.is_symlink() and entry.name in wanted:
+                target = os.path.realpath(entry.path)
+                if not target.startswith(tuple(homes)):
+                    raise SourceError(
+                        f"{entry.path}: a link to {target}, out of the log; copy the file, or let its folder "
+                        "be the link"
+                    )
+
+
+def _entries(folder: Path) -> list[os.DirEntry[str]]:
+    try:
+        with os.scandir(folder) as entries:
+            return list(entries)
+    except (OSError, ValueError):  # there is none, or its name cannot be one
+        return []
+
+
+def _is_regular(entry: os.DirEntry[str]) -> bool:
+    try:
+        return entry.is_file()
+    except OSError:  # a link that cannot be followed
+        return False
