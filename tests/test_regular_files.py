@@ -126,6 +126,7 @@ def test_nothing_but_images_is_copied_into_a_converted_log(tiny_tum_log, tmp_pat
     secret.write_text("root:x:0:0:root")
     out = tmp_path / ("out.mcap" if kind == "mcap" else "out")
     skipped = write_log(open_source(log), out, kind=kind)
-    assert [skip.reason for skip in skipped] == [f"{secret}: not an image that OpenCV can decode (15 bytes)"]
+    (skip,) = skipped
+    assert skip.reason.startswith(f"{secret}: not an image of a known format (15 bytes)")
     written = [out] if kind == "mcap" else [path for path in out.rglob("*") if path.is_file()]
     assert not any(b"root:x" in path.read_bytes() for path in written)

@@ -12,6 +12,7 @@ from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
 from mapper.sources import jpeg, png
 from mapper.sources.base import ImageFile
+from mapper.sources.image_size import check_pixels
 from mapper.sources.regular_files import read_regular
 
 SATURATED = 65535
@@ -170,6 +171,7 @@ def _decoded(data: bytes, flags: int, where: str) -> NDArray[np.uint8] | NDArray
     if not data:
         raise FrameError(f"{where}: empty file")
     try:
+        check_pixels(data)
         if png.is_plain(data):
             return png.decode(data)
         if data.startswith(jpeg.START):

@@ -17,6 +17,19 @@ _MOST_SCANS = 500
 costs as much time as a whole image, be it of a few bytes."""
 
 
+def size_of(data: bytes) -> tuple[int, int]:
+    """Return the width and height of a JPEG file, pixels, by its header.
+
+    Raises:
+        DataError: The header is damaged.
+    """
+    try:
+        height_px, width_px, _, _ = simplejpeg.decode_jpeg_header(data)
+    except ValueError as error:
+        raise _damage(error) from None
+    return width_px, height_px
+
+
 def decode(data: bytes, *, colour: bool) -> Image:
     """Return the (H, W, 3) RGB or (H, W) grey pixels of a JPEG file.
 
@@ -29,8 +42,11 @@ def decode(data: bytes, *, colour: bool) -> Image:
     try:
         pixels: Image = simplejpeg.decode_jpeg(data, "RGB" if colour else "GRAY")
     except ValueError as error:
-        reason = str(error)
-        if "Premature end" in reason:
-            raise DataError("truncated JPEG: it ends before its end marker") from None
-        raise DataError(f"damaged JPEG: {reason}") from None
+        raise _damage(error) from None
     return pixels if colour else pixels[:, :, 0]
+
+
+def _damage(error: ValueError) -> DataError:
+    if "Premature end" in str(error):
+        return DataError("truncated JPEG: it ends before its end marker")
+    return DataError(f"damaged JPEG: {error}")

@@ -22,6 +22,18 @@ _HEADER_START, _HEADER_END = 16, 33
 _BYTES_PER_PIXEL = {(8, 2): 3, (16, 0): 2}  # by (bits, colour type): RGB and grey
 
 
+def size_of(data: bytes) -> tuple[int, int]:
+    """Return the width and height of a PNG file, pixels, by its header.
+
+    Raises:
+        DataError: The file ends within it.
+    """
+    if len(data) < _HEADER_END:
+        raise DataError("truncated PNG: it ends within its header")
+    width_px, height_px, *_ = _HEADER.unpack_from(data, _HEADER_START)
+    return width_px, height_px
+
+
 def is_plain(data: bytes) -> bool:
     """Tell whether ``data`` starts a PNG that :func:`decode` reads: RGB 8 or grey 16 bit, not interlaced."""
     if not data.startswith(SIGNATURE + b"\x00\x00\x00\x0dIHDR") or len(data) < _HEADER_END:
@@ -39,12 +51,15 @@ def decode(data: bytes) -> NDArray[np.uint8] | NDArray[np.uint16]:
     width, height, bits, colour_type, *_ = _HEADER.unpack_from(data, _HEADER_START)
     bytes_per_pixel = _BYTES_PER_PIXEL[bits, colour_type]
     row = width * bytes_per_pixel
+    size = height * (row + 1)
+    inflate = isal_zlib.decompressobj()
     try:
-        filtered = np.frombuffer(isal_zlib.decompress(_compressed(data)), np.uint8)
+        # A byte more than announced, so that a file with more of them does not pass for a whole one.
+        filtered = np.frombuffer(inflate.decompress(_compressed(data), size + 1), np.uint8)
     except _InflateError:
         raise DataError("damaged PNG: its compressed pixels cannot be read") from None
-    if filtered.size != height * (row + 1):
-        raise DataError(f"damaged PNG: {filtered.size} bytes of pixels, want {height * (row + 1)}")
+    if filtered.size != size or not inflate.eof:
+        raise DataError(f"damaged PNG: {filtered.size} bytes of pixels, want {size}")
     pixels = np.empty((height, row), np.uint8)
     if not _unfilter(filtered.reshape(height, row + 1), pixels, bytes_per_pixel):
         raise DataError("damaged PNG: a row with an unknown filter")
