@@ -11,6 +11,7 @@ from mapper.core.frames import Image
 
 START = b"\xff\xd8\xff"
 
+_END = b"\xff\xd9"
 _SCAN = b"\xff\xda"
 _MOST_SCANS = 500
 """Scans that a progressive file may have, as libjpeg-turbo's own programs limit them: usual are ten, and each
@@ -26,7 +27,7 @@ def size_of(data: bytes) -> tuple[int, int]:
     try:
         height_px, width_px, _, _ = simplejpeg.decode_jpeg_header(data)
     except ValueError as error:
-        raise _damage(error) from None
+        raise _damage(data, error) from None
     return width_px, height_px
 
 
@@ -42,11 +43,11 @@ def decode(data: bytes, *, colour: bool) -> Image:
     try:
         pixels: Image = simplejpeg.decode_jpeg(data, "RGB" if colour else "GRAY")
     except ValueError as error:
-        raise _damage(error) from None
+        raise _damage(data, error) from None
     return pixels if colour else pixels[:, :, 0]
 
 
-def _damage(error: ValueError) -> DataError:
-    if "Premature end" in str(error):
+def _damage(data: bytes, error: ValueError) -> DataError:
+    if _END not in data:
         return DataError("truncated JPEG: it ends before its end marker")
     return DataError(f"damaged JPEG: {error}")
