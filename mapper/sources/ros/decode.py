@@ -2,7 +2,7 @@
 
 from mapper.core.errors import DataError
 from mapper.sources.ros.messages import Message
-from mapper.sources.ros.recording import Topic
+from mapper.sources.ros.recording import Topic, check_block_size
 
 _ZSTD = b"\x28\xb5\x2f\xfd"  # how its frames begin, and no CDR message does
 
@@ -18,6 +18,7 @@ def decompressed(topic: Topic, data: memoryview) -> memoryview:
     import zstandard
 
     try:
+        check_block_size(zstandard.frame_content_size(data))
         return memoryview(zstandard.decompress(data))
     except (zstandard.ZstdError, MemoryError) as error:
         raise DataError(f"a message that cannot be decompressed: {error}") from None

@@ -17,18 +17,29 @@ from isal import isal_zlib
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
 from mcap.records import Channel, Schema
 
 from mapper.core.errors import DataError
-from mapper.sources.ros.recording import BlockRecording, Contents, Part, Span, Topic, open_blocks, ros2_name
+from mapper.sources.ros.recording import (
+    MOST_BLOCK_BYTES,
+    BlockRecording,
+    Contents,
+    Part,
+    Span,
+    Topic,
+    check_block_size,
+    open_blocks,
+    ros2_name,
+)
 
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_CHUNK = struct.Struct(
-    "<QQQII"
-)  # first and last time, unpacked size and CRC, length of the compression's name
+_CHUNK = struct.Struct("<QQQII")  # first, last time, unpacked size and CRC, length of the compression's name
+_CHUNK_INDEX = struct.Struct("<QQQQ")  # first, last time, place and length of the chunk's record
+_STATISTICS = struct.Struct("<Q2x4x4x4xI")  # messages, of the counts of other records that of chunks
+_FOOTER = struct.Struct("<BQQQI")  # a whole record: opcode, length, places of summary and its offsets, CRC
+_CRC_BYTES = 4
 _MAX_LZ4_RATIO = 255  # one byte of LZ4 expands to no more
 
 
@@ -75,10 +86,14 @@ class _Contents(Contents):
                 if channel in self._topics:  # else the chunk that defines it is lost
                     yield Part(self._topics[channel], log_ns, start + _MESSAGE.size, length - _MESSAGE.size)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._add_definition(opcode, bytes(data[start : start + length]))
+                self.add_definition(opcode, bytes(data[start : start + length]))
 
-    def _add_definition(self, opcode: int, record: bytes) -> None:
-        """Keep a schema or a channel."""
+    def add_definition(self, opcode: int, record: bytes) -> None:
+        """Keep a schema or a channel.
+
+        Raises:
+            DataError: It is damaged.
+        """
         stream = ReadDataStream(BytesIO(record))
         try:
             if opcode == Opcode.SCHEMA:
@@ -90,25 +105,64 @@ class _Contents(Contents):
 
 
 def _summarised(file: BinaryIO) -> _Contents | None:
-    """Return the contents by the summary at the end of a whole file; None without one."""
-    try:
-        summary = make_reader(file).get_summary()
-    except (McapError, OSError, ValueError, struct.error):
-        return None
-    if summary is None or summary.statistics is None:
-        return None
-    if summary.statistics.chunk_count != len(summary.chunk_indexes) or not summary.chunk_indexes:
-        return None
+    """Return the contents by the summary at the end of a file; None without one, or if it is damaged."""
     contents = _Contents()
-    for schema in summary.schemas.values():
-        contents.add_schema(schema)
-    for channel in summary.channels.values():
-        contents.add_channel(channel)
-    contents.blocks = sorted(
-        Span(index.chunk_start_offset, index.chunk_length) for index in summary.chunk_indexes
+    chunk_count = -1
+    try:
+        summary, end = _summary(file)
+        for opcode, start, length in _records(summary):
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                contents.add_definition(opcode, bytes(summary[start : start + length]))
+            elif opcode == Opcode.CHUNK_INDEX:
+                _, _, at, chunk_length = _CHUNK_INDEX.unpack_from(summary, start)
+                contents.blocks.append(Span(at, chunk_length))
+            elif opcode == Opcode.STATISTICS:
+                contents.expected, chunk_count = _STATISTICS.unpack_from(summary, start)
+    except (DataError, struct.error):
+        return None
+    contents.blocks.sort()
+    is_sound = (
+        contents.blocks
+        and chunk_count == len(contents.blocks)
+        and contents.are_apart()
+        and sum(contents.blocks[-1]) <= end
+        and all(_is_chunk(file, span) for span in contents.blocks)
     )
-    contents.expected = summary.statistics.message_count
-    return contents
+    return contents if is_sound else None
+
+
+def _summary(file: BinaryIO) -> tuple[memoryview, int]:
+    """Return the records of a file's summary, and where it begins.
+
+    Raises:
+        DataError: There is none, or its place or its checksum is wrong.
+    """
+    size = file.seek(0, os.SEEK_END)
+    end = max(size - len(_MAGIC) - _FOOTER.size, len(_MAGIC))
+    file.seek(end)
+    footer = file.read(_FOOTER.size)
+    if len(footer) < _FOOTER.size or file.read() != _MAGIC:
+        raise DataError("a file that was cut off")
+    opcode, length, start, _, crc = _FOOTER.unpack(footer)
+    if (opcode, length) != (Opcode.FOOTER, _FOOTER.size - _RECORD.size):
+        raise DataError("a file whose footer is damaged")
+    if not (len(_MAGIC) <= start < end and end - start <= MOST_BLOCK_BYTES):
+        raise DataError("a file without a summary")
+    file.seek(start)
+    summary = file.read(end - start)
+    if crc and isal_zlib.crc32(footer[:-_CRC_BYTES], isal_zlib.crc32(summary)) != crc:
+        raise DataError("a summary whose checksum is wrong")
+    return memoryview(summary), start
+
+
+def _is_chunk(file: BinaryIO, span: Span) -> bool:
+    """Tell whether a chunk of this length lies there."""
+    file.seek(span.start)
+    header = file.read(_RECORD.size)
+    return len(header) == _RECORD.size and _RECORD.unpack(header) == (
+        Opcode.CHUNK,
+        span.length - _RECORD.size,
+    )
 
 
 def _walked(file: BinaryIO, path: Path) -> _Contents:
@@ -119,7 +173,7 @@ def _walked(file: BinaryIO, path: Path) -> _Contents:
     is_whole = False
     while at + _RECORD.size <= size:
         opcode, length = _RECORD.unpack(file.read(_RECORD.size))
-        if at + _RECORD.size + length > size:
+        if opcode == 0 or at + _RECORD.size + length > size:  # zeros: what was not written to its end
             break
         if opcode == Opcode.DATA_END:
             is_whole = True
@@ -146,6 +200,7 @@ def _unpack(stored: bytes) -> memoryview:
     at += _CHUNK.size
     compression = stored[at : at + name_length]
     packed = memoryview(stored)[at + name_length + 8 :]  # the length of what follows: all of it
+    check_block_size(size)
     data = _decompressed(packed, compression, size)
     if len(data) != size:
         raise DataError(f"a chunk of {len(data)} bytes, want {size}")
@@ -169,7 +224,7 @@ def _decompressed(packed: memoryview, compression: bytes, size: int) -> memoryvi
             return memoryview(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1))
     except (zstandard.ZstdError, RuntimeError, MemoryError) as error:  # RuntimeError is lz4's
         raise DataError(f"a chunk that cannot be decompressed: {error}") from None
-    raise DataError(f"a chunk compressed as {compression!r}; known are zstd and lz4")
+    raise DataError(f"a chunk compressed as {compression!r:.20}; known are zstd and lz4")
 
 
 def _records(data: memoryview) -> Iterator[tuple[int, int, int]]:

@@ -5,11 +5,18 @@ from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, Protocol
 
 from mapper.core.errors import DataError, FrameError, SourceError
 
+MOST_BLOCK_BYTES = 512 << 20
+"""Size of a block, stored or unpacked, beyond which it is taken for damage: recorders write blocks of a few
+megabytes, or of one message."""
+_MOST_UNPACKED_RATIO = 200
+"""Times a file's own size that its blocks may unpack to: logs unpack to less than ten times their size, and a
+hostile file could keep its reader busy for days."""
 _CACHE_BYTES = 64 << 20
 
 
@@ -127,6 +134,10 @@ class Contents(ABC):
             "are no whole record; read as far as it goes"
         )
 
+    def are_apart(self) -> bool:
+        """Tell whether every block ends before the next begins: a damaged index may name one many times."""
+        return all(a.start + a.length <= b.start for a, b in pairwise(self.blocks))
+
 
 class BlockRecording:
     """Recording made of blocks that are each stored, compressed and checked on their own."""
@@ -152,11 +163,19 @@ class BlockRecording:
 
     def messages(self) -> Iterator[Recorded]:
         """Yield every message that can be read, in the order of the file."""
-        count = damaged = damaged_bytes = 0
+        count = damaged = damaged_bytes = unpacked_bytes = 0
         blocks, expected = self._contents.blocks, self._contents.expected
+        most_bytes = max(_MOST_UNPACKED_RATIO * self.path.stat().st_size, MOST_BLOCK_BYTES)
         for number, span in enumerate(blocks):
+            if unpacked_bytes > most_bytes:
+                self.notes.append(
+                    f"{self.path.name}: {number} of {len(blocks)} chunks unpack to {unpacked_bytes} bytes, "
+                    f"more than {_MOST_UNPACKED_RATIO} times the file's size; read no further"
+                )
+                break
             try:
                 data = self._load(number)
+                unpacked_bytes += len(data)
                 for topic, log_ns, offset, length in self._contents.split(data):
                     count += 1
                     place = Place(number, offset, length)
@@ -195,6 +214,7 @@ class BlockRecording:
 
     def _load(self, number: int) -> memoryview:
         start, length = self._contents.blocks[number]
+        check_block_size(length)
         try:
             with self.path.open("rb") as file:
                 file.seek(start)
@@ -202,6 +222,16 @@ class BlockRecording:
         except OSError as error:
             raise DataError(f"cannot be read: {error.strerror}") from None
         return self._unpack(stored)
+
+
+def check_block_size(size: int) -> None:
+    """Refuse a block that is stored in, or announces, too many bytes.
+
+    Raises:
+        DataError: They are more than ``MOST_BLOCK_BYTES``.
+    """
+    if size > MOST_BLOCK_BYTES:
+        raise DataError(f"a chunk of {size} bytes; more than {MOST_BLOCK_BYTES} are taken for damage")
 
 
 def open_blocks(

@@ -16,11 +16,21 @@ import lz4.frame
 
 from mapper.core.errors import DataError
 from mapper.core.timebase import NS_PER_S
-from mapper.sources.ros.recording import BlockRecording, Contents, Part, Span, Topic, open_blocks, ros2_name
+from mapper.sources.ros.recording import (
+    BlockRecording,
+    Contents,
+    Part,
+    Span,
+    Topic,
+    check_block_size,
+    open_blocks,
+    ros2_name,
+)
 
 _MAGIC = b"#ROSBAG V2.0\n"
 _LENGTH = struct.Struct("<I")
 _MESSAGE, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 5, 6, 7  # the values of a header's op
+_MOST_HEADER_BYTES = 1 << 20  # a header holds a few names and numbers
 _Fields = Mapping[bytes, bytes]
 
 
@@ -90,7 +100,7 @@ def _indexed(file: BinaryIO) -> _Contents | None:
             contents.blocks.append(Span(at, start + length - at))
     except (DataError, KeyError, IndexError, struct.error, UnicodeDecodeError):
         return None
-    return contents if contents.blocks else None
+    return contents if contents.blocks and contents.are_apart() else None
 
 
 def _walked(file: BinaryIO, path: Path) -> _Contents:
@@ -101,6 +111,8 @@ def _walked(file: BinaryIO, path: Path) -> _Contents:
     with suppress(DataError):
         while at < size:
             fields, start, length = _record_at(file, at, size)
+            if not fields:  # zeros, as a file system leaves them where a file was not written to its end
+                break
             if fields.get(b"op") == bytes([_CHUNK]):
                 contents.blocks.append(Span(at, start + length - at))
             at = start + length
@@ -116,13 +128,22 @@ def _unpack(stored: bytes) -> memoryview:
     try:
         if compression == b"none":
             return data
+        (size,) = _LENGTH.unpack(fields[b"size"])
+        check_block_size(size)
+        # A byte more than announced, so that a chunk with more of them does not pass for a whole one.
         if compression == b"lz4":
-            return memoryview(lz4.frame.decompress(data))
-        if compression == b"bz2":
-            return memoryview(bz2.decompress(data))
+            unpacked = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+        elif compression == b"bz2":
+            unpacked = bz2.BZ2Decompressor().decompress(data, max_length=size + 1)
+        else:
+            raise DataError(f"a chunk compressed as {compression!r:.20}; known are none, lz4 and bz2")
+    except (KeyError, struct.error):
+        raise DataError("a chunk that does not say what it is") from None
     except (OSError, ValueError, RuntimeError, MemoryError) as error:  # RuntimeError is lz4's
         raise DataError(f"a chunk that cannot be decompressed: {error}") from None
-    raise DataError(f"a chunk compressed as {compression!r}; known are none, lz4 and bz2")
+    if len(unpacked) != size:
+        raise DataError(f"a chunk of {len(unpacked)} bytes or more, want {size}")
+    return memoryview(unpacked)
 
 
 def _record_at(file: BinaryIO, at: int, size: int) -> tuple[_Fields, int, int]:
@@ -130,8 +151,8 @@ def _record_at(file: BinaryIO, at: int, size: int) -> tuple[_Fields, int, int]:
     file.seek(at)
     (header_length,) = _LENGTH.unpack(file.read(_LENGTH.size).ljust(_LENGTH.size, b"\xff"))
     start = at + _LENGTH.size + header_length + _LENGTH.size
-    if start > size:
-        raise DataError("a record that ends after the file")
+    if start > size or header_length > _MOST_HEADER_BYTES:
+        raise DataError("a record that ends after the file, or whose header is damaged")
     fields = _fields(file.read(header_length))
     (length,) = _LENGTH.unpack(file.read(_LENGTH.size))
     if start + length > size:

@@ -1,0 +1,149 @@
+"""Recordings that announce too much cost what is good about them, and neither memory nor time."""
+
+import bz2
+import struct
+import tracemalloc
+from pathlib import Path
+
+import lz4.frame
+import pytest
+import zstandard
+from messages_made import shots, write
+
+from mapper.core.errors import DataError
+from mapper.sources import open_source
+from mapper.sources.ros import mcap_file, recording, ros1_bag
+from mapper.sources.ros.decode import decompressed
+from mapper.sources.ros.mcap_file import open_mcap
+from mapper.sources.ros.recording import Topic
+from mapper.sources.ros.ros1_bag import open_bag
+
+FOOTER_BYTES = 1 + 8 + 20 + 8
+PACK = {"lz4": lz4.frame.compress, "bz2": bz2.compress}
+
+
+def bag_record(data: bytes, **fields: bytes) -> bytes:
+    header = b"".join(
+        struct.pack("<I", len(name) + 1 + len(value)) + name.encode() + b"=" + value
+        for name, value in fields.items()
+    )
+    return struct.pack("<I", len(header)) + header + struct.pack("<I", len(data)) + data
+
+
+def bag_chunk(content: bytes, compression: str, *, size: int | None = None) -> bytes:
+    size = len(content) if size is None else size
+    packed = PACK[compression](content)
+    return bag_record(packed, op=b"\x05", compression=compression.encode(), size=struct.pack("<I", size))
+
+
+def mcap_chunk(content: bytes) -> bytes:
+    packed = zstandard.compress(content)
+    body = struct.pack("<QQQII", 0, 1, len(content), 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
+    return struct.pack("<BQ", 6, len(body)) + body
+
+
+@pytest.mark.parametrize("compression", PACK)
+def test_a_bag_s_chunk_is_unpacked_no_further_than_it_announces(compression):
+    content = bytes(range(256)) * 40
+    assert bytes(ros1_bag._unpack(bag_chunk(content, compression))) == content
+    for size in (0, 100, len(content) - 1, len(content) + 1):
+        with pytest.raises(DataError, match=rf"a chunk of \d+ bytes or more, want {size}"):
+            ros1_bag._unpack(bag_chunk(content, compression, size=size))
+    bomb = bag_chunk(bytes(64 << 20), compression, size=1000)
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError, match="a chunk of 1001 bytes or more, want 1000"):
+            ros1_bag._unpack(bomb)
+        assert tracemalloc.get_traced_memory()[1] < len(bomb) + (1 << 20)
+    finally:
+        tracemalloc.stop()
+
+
+def test_no_chunk_is_unpacked_that_announces_too_much(monkeypatch):
+    monkeypatch.setattr(recording, "MOST_BLOCK_BYTES", 1 << 20)
+    content = bytes((1 << 20) + 1)
+    too_much = "a chunk of 1048577 bytes; more than 1048576 are taken for damage"
+    for unpack, chunk in (
+        (mcap_file._unpack, mcap_chunk(content)),
+        (ros1_bag._unpack, bag_chunk(content, "lz4")),
+        (ros1_bag._unpack, bag_chunk(content, "bz2")),
+    ):
+        with pytest.raises(DataError, match=too_much):
+            unpack(chunk)
+    with pytest.raises(DataError, match=too_much):
+        decompressed(Topic("/t", "x/msg/Y", "cdr"), memoryview(zstandard.compress(content)))
+
+
+def test_reading_ends_where_a_file_unpacks_to_many_times_its_size(tmp_path, monkeypatch):
+    path = tmp_path / "log.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n" + 50 * mcap_chunk(bytes(1 << 20)))
+    monkeypatch.setattr(recording, "MOST_BLOCK_BYTES", 1 << 20)
+    opened = open_mcap(path)
+    assert list(opened.messages()) == []
+    assert (
+        "log.mcap: 2 of 50 chunks unpack to 2097152 bytes, more than 200 times the file's size"
+        in opened.notes[1]
+    )
+
+
+def damaged_index(path: Path, position: int, layout: str, value: int) -> None:
+    """Overwrite a number of the first chunk index of an MCAP file, and let the file have no checksum."""
+    data = bytearray(path.read_bytes())
+    start, _, _ = struct.unpack_from("<QQI", data, len(data) - FOOTER_BYTES + 9)
+    struct.pack_into("<I", data, len(data) - 12, 0)
+    at = start
+    while data[at] != 8:  # the opcode of a chunk index
+        at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
+    struct.pack_into(layout, data, at + 9 + position, value)
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("position", [16, 24], ids=["place", "length"])
+@pytest.mark.parametrize("value", [0, 1, 9, 100, 1 << 20, 1 << 40, 1 << 63, (1 << 64) - 1])
+def test_an_mcap_file_whose_index_is_damaged_is_walked(tmp_path, position, value):
+    path = write(tmp_path / "log.mcap", shots(6))
+    expected = [bytes(message.data) for message in open_mcap(path).messages()]
+    damaged_index(path, position, "<Q", value)
+    opened = open_mcap(path)
+    assert [bytes(message.data) for message in opened.messages()] == expected
+    assert len(open_source(path)) == 6
+
+
+def test_an_mcap_summary_whose_checksum_is_wrong_is_not_used(tmp_path):
+    path = write(tmp_path / "log.mcap", shots(6))
+    data = bytearray(path.read_bytes())
+    start, _, crc = struct.unpack_from("<QQI", data, len(data) - FOOTER_BYTES + 9)
+    assert crc
+    topic = data.index(b"/cam", start)
+    data[topic + 1] ^= 1
+    path.write_bytes(data)
+    assert {message.topic.name.split("/")[1] for message in open_mcap(path).messages()} == {"cam"}
+
+
+def test_a_bag_s_index_that_names_a_chunk_twice_is_not_used(tmp_path):
+    path = write(tmp_path / "log.bag", shots(6))
+    expected = [bytes(message.data) for message in open_bag(path).messages()]
+    data = path.read_bytes()
+    path.write_bytes(data + data[last_record(data) :])
+    assert [bytes(message.data) for message in open_bag(path).messages()] == expected
+
+
+def last_record(data: bytes) -> int:
+    """Return where the last record of a bag begins, which is about one of its chunks."""
+    at = last = len(b"#ROSBAG V2.0\n")
+    while at < len(data):
+        last = at
+        (header,) = struct.unpack_from("<I", data, at)
+        (length,) = struct.unpack_from("<I", data, at + 4 + header)
+        at += 8 + header + length
+    return last
+
+
+@pytest.mark.parametrize("name", ["log.mcap", "log.bag"])
+def test_zeros_after_what_was_written_are_no_records(tmp_path, name):
+    path = write(tmp_path / name, shots(6))
+    whole = path.read_bytes()
+    with path.open("r+b") as file:
+        file.truncate(len(whole) - 50)
+        file.truncate(1 << 33)  # a hole of 8 GiB, as a file system leaves it after a power cut
+    assert len(open_source(path)) == 6
