@@ -17,7 +17,8 @@ from mapper.sources.base import Log
 from mapper.sources.calibration import ICL_NUIM
 from mapper.sources.config import SourceConfig
 from mapper.sources.numbered import RATE_HZ, find_images, stamp_at
-from mapper.sources.rgbd import FramePair, find_calibration, present, rgbd_log
+from mapper.sources.regular_files import present
+from mapper.sources.rgbd import FramePair, find_calibration, rgbd_log
 from mapper.sources.text import parse_numbers, pose_from_numbers, rows, table, time_order, truth_from
 
 DEPTH_UNITS_PER_M = 5000.0

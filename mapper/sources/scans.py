@@ -7,7 +7,7 @@ from mapper.core.errors import FrameError
 from mapper.core.frames import Scan
 from mapper.sources.base import ImageFiles
 from mapper.sources.cloud_files import read_cloud
-from mapper.sources.cloud_files.raw import MIN_POINTS
+from mapper.sources.cloud_files.parsing import MIN_POINTS
 from mapper.sources.point_times import relative_times_s
 from mapper.sources.valid_returns import FARTHEST_M, valid_returns
 

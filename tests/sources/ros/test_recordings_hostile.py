@@ -8,7 +8,6 @@ from pathlib import Path
 import lz4.frame
 import pytest
 import zstandard
-from messages_made import shots, write
 
 from mapper.core.errors import DataError
 from mapper.sources import open_source
@@ -17,6 +16,7 @@ from mapper.sources.ros.decode import decompressed
 from mapper.sources.ros.mcap_file import open_mcap
 from mapper.sources.ros.recording import Topic
 from mapper.sources.ros.ros1_bag import open_bag
+from tests.support.recordings import shots, write
 
 FOOTER_BYTES = 1 + 8 + 20 + 8
 PACK = {"lz4": lz4.frame.compress, "bz2": bz2.compress}

@@ -5,7 +5,6 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from logs_made import MemoryEntry, log_in_memory
 
 from mapper.config.loading import load_config
 from mapper.core.errors import FrameError
@@ -16,6 +15,7 @@ from mapper.sources import inspection, open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.inspection import inspect_log
 from mapper.sources.reading_checks import FROZEN_DEPTHS, FROZEN_FRAMES, ReadingChecks
+from tests.support.logs import MemoryEntry, log_in_memory
 
 CAMERA = PinholeCamera(8, 6, 6.0, 6.0, 3.5, 2.5)
 
