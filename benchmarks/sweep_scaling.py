@@ -50,7 +50,7 @@ CALM = {  # as it comes, each of a cluster's processes takes 2 to 3 % of a core 
 
 
 def main() -> None:
-    """Run every crew in turn, as often as asked for."""
+    """Run every kind of workers in turn, as often as asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=4.0)
@@ -76,30 +76,30 @@ def main() -> None:
 
 
 def compare(place: Path, rounds: int) -> None:
-    """Print the seconds and the CPU seconds of each crew."""
+    """Print the seconds and the CPU seconds of each kind of workers."""
     best: dict[str, float] = {}
-    print(f"{'crew':<14}{'round':>6}{'seconds':>9}{'CPU':>9}{'ratio':>8}")
+    print(f"{'workers':<14}{'round':>6}{'seconds':>9}{'CPU':>9}{'ratio':>8}")
     for number in range(1, rounds + 1):
-        for crew in ("1 process", "2 processes", "Dask, 2"):
-            out = place / f"{crew}-{number}".replace(" ", "")
-            if crew.startswith("Dask"):
+        for workers in ("1 process", "2 processes", "Dask, 2"):
+            out = place / f"{workers}-{number}".replace(" ", "")
+            if workers.startswith("Dask"):
                 before = getrusage(RUSAGE_CHILDREN)
                 with cluster(place) as address:
                     seconds = timed(place, out, "--scheduler", address)
             else:
                 before = getrusage(RUSAGE_CHILDREN)
-                seconds = timed(place, out, "--processes", crew[0])
+                seconds = timed(place, out, "--processes", workers[0])
             after = getrusage(RUSAGE_CHILDREN)
             cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-            best[crew] = min(best.get(crew, seconds), seconds)
-            ratio = best["1 process"] / best[crew]
-            print(f"{crew:<14}{number:>6}{seconds:>9.1f}{cpu:>9.1f}{ratio:>8.2f}", flush=True)
+            best[workers] = min(best.get(workers, seconds), seconds)
+            ratio = best["1 process"] / best[workers]
+            print(f"{workers:<14}{number:>6}{seconds:>9.1f}{cpu:>9.1f}{ratio:>8.2f}", flush=True)
 
 
-def timed(place: Path, out: Path, *crew: str) -> float:
+def timed(place: Path, out: Path, *workers: str) -> float:
     """Return the seconds of one sweep, all of whose cells must finish."""
     began = time.monotonic()
-    command = [*COMMAND, str(place / "sweep.toml"), "--out", str(out), *crew, "--quiet"]
+    command = [*COMMAND, str(place / "sweep.toml"), "--out", str(out), *workers, "--quiet"]
     subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
     seconds = time.monotonic() - began
     failures = [cell for cell in map(read, finished(out)) if cell["failure"]]

@@ -4,7 +4,7 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Protocol
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field, PositiveFloat
@@ -51,37 +51,6 @@ class Clouds:
     T_target_source: Transform | None
 
 
-class Pair(Protocol):
-    """A scan and a map that have not been read yet; picklable."""
-
-    @property
-    def name(self) -> str:
-        """The pair's name."""
-        ...
-
-    @property
-    def sensor(self) -> str:
-        """The sensor of the scan."""
-        ...
-
-    @property
-    def within(self) -> tuple[float, float]:
-        """Tolerance of a right answer: metres and degrees."""
-        ...
-
-    def identity(self) -> str:
-        """Return text that differs for any other pair, and after the files have changed."""
-        ...
-
-    def clouds(self) -> Clouds:
-        """Read both.
-
-        Raises:
-            MapperError: One of them cannot be read.
-        """
-        ...
-
-
 class PairConfig(Config):
     """One ``[[pair]]`` of ``pairs.toml``."""
 
@@ -107,7 +76,16 @@ class PairsConfig(Config):
 
 @dataclass(frozen=True, slots=True)
 class GivenPair:
-    """Two cloud files."""
+    """Two cloud files.
+
+    Attributes:
+        name: The pair's name.
+        sensor: That of the scan.
+        scan: File of the scan.
+        map: File of the map.
+        T_map_scan: Rows of the scan's (4, 4) pose in the map, if that is known.
+        within: Tolerance of a right answer: metres and degrees.
+    """
 
     name: str
     sensor: str
@@ -133,7 +111,14 @@ class GivenPair:
 
 @dataclass(frozen=True, slots=True)
 class LogPair:
-    """A scan of a log, and a map of those around it at their true poses."""
+    """A scan of a log, and a map of those around it at their true poses.
+
+    Attributes:
+        log: The log.
+        index: Of the scan, among those with a true pose.
+        sensor: ``ALL_RINGS`` or ``FEW_RINGS``.
+        within: Tolerance of a right answer: metres and degrees.
+    """
 
     log: Path
     index: int
@@ -155,6 +140,10 @@ class LogPair:
         if self.sensor == ALL_RINGS:
             return pair
         return Clouds(pair.target, fewer_rings(pair.source), pair.T_target_source)
+
+
+Pair = GivenPair | LogPair
+"""A scan and a map that have not been read yet; can be pickled."""
 
 
 def find_pairs(logs: Path) -> list[Pair]:

@@ -13,9 +13,9 @@ from evaluators.papers.layout import compares, file_name
 from evaluators.papers.model import PaperCell, PaperPath, PaperTable, Reproduction
 from evaluators.pictures.path_errors import add_color_bar, draw_path
 from mapper.core.geometry import Array
-from mapper.export.page import FAINT, INK, LINE, hex_of, save
+from mapper.export.page import INK, LINE, hex_of, save
 from mapper.export.palette import ESTIMATE, TRUTH
-from mapper.export.panels import draw_boxes, page, panel
+from mapper.export.panels import caption, draw_boxes, page, panel
 from mapper.sources.trajectory_files import read_tum
 
 if TYPE_CHECKING:
@@ -76,9 +76,7 @@ def _write_curves(path: Path, table: PaperTable) -> None:
         ours = {cell.column: cell.ours for cell in cells if cell.ours}
         _draw_curve(axes, printed, color=hex_of(TRUTH), label="printed")
         _draw_curve(axes, ours, color=hex_of(ESTIMATE), label="ours")
-        axes.set_title(row, fontsize=9, color=INK)
-        axes.set_xlabel(table.axis, color=FAINT, fontsize=8)
-        axes.set_ylabel(f"{table.metric}, {table.unit}", color=FAINT, fontsize=8)
+        caption(axes, title=row, x=table.axis, y=f"{table.metric}, {table.unit}")
         axes.set_ylim(bottom=0.0)
         axes.grid(color=LINE, linewidth=0.4)
         axes.legend(**_LEGEND)
@@ -112,8 +110,7 @@ def _write_boxes(path: Path, table: PaperTable) -> None:
         draw_boxes(axes, {cell.column: np.array(cell.ours) for cell in cells})
         axes.set_xscale("linear")
         axes.set_xlim(left=0.0)
-        axes.set_title(row, fontsize=9, color=INK)
-        axes.set_xlabel(f"{table.metric}, {table.unit}", color=FAINT, fontsize=8)
+        caption(axes, title=row, x=f"{table.metric}, {table.unit}")
         axes.legend(**_LEGEND)
     save(figure, path)
 
@@ -126,7 +123,7 @@ def _write_scenes(path: Path, tables: Sequence[PaperTable], *, title: str) -> No
     for number, column in enumerate(columns):
         axes = panel(figure, number, columns=across, rows=down, left_in=left_in)
         draw_boxes(axes, {_short(table): _figures_of(table, column) for table in tables})
-        axes.set_title(column, fontsize=9, color=INK)
+        caption(axes, title=column)
     save(figure, path)
 
 
@@ -153,7 +150,7 @@ def _write_paths(path: Path, paths: Sequence[PaperPath]) -> None:
     for number, (each, pairs, errors) in enumerate(zip(paths, matched, errors_m, strict=True)):
         axes = panel(figure, number, columns=across, rows=down)
         add_color_bar(axes, draw_path(axes, pairs, errors, most_m=most_m[each.row]))
-        axes.set_title(f"{each.row}, {each.method}: ATE {each.ate_m:.4f} m", fontsize=9, color=INK)
+        caption(axes, title=f"{each.row}, {each.method}: ATE {each.ate_m:.4f} m")
     save(figure, path)
 
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from mapper.core.geometry import Array
 from mapper.core.trajectory import Trajectory
-from mapper.export.page import FAINT, INK, LINE, hex_of, save
+from mapper.export.page import FAINT, LINE, hex_of, save
 from mapper.export.palette import END, START, TRUTH
-from mapper.export.panels import by_logarithm, color_of, draw_boxes, extent, page, panel, widest_axes
+from mapper.export.panels import by_logarithm, caption, color_of, draw_boxes, extent, page, panel, widest_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,7 +54,7 @@ def write_paths(
             axes.plot(*seen.T, color=hex_of(color_of(number)), linewidth=1.0)
             axes.plot(*seen[0], "o", color=hex_of(START), markersize=4)
             axes.plot(*seen[-1], "s", color=hex_of(END), markersize=4)
-        axes.set_title(f"{name}: {captions[name]}", fontsize=9, color=INK)
+        caption(axes, title=f"{name}: {captions[name]}")
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
         axes.set_aspect("equal")
@@ -76,11 +76,10 @@ def write_path_errors(
     figure = page(title, columns=2, rows=1, width_in=5.6, height_in=4.4)
     axes = panel(figure, 0, columns=2, rows=1)
     _draw_shares(axes, positions_m, list(positions_m))
-    axes.set_xlabel("distance from the truth, m", color=FAINT, fontsize=8)
-    axes.set_ylabel("share of the poses", color=FAINT, fontsize=8)
+    caption(axes, x="distance from the truth, m", y="share of the poses")
     axes = panel(figure, 1, columns=2, rows=1)
     draw_boxes(axes, steps_m)
-    axes.set_xlabel(f"error of the motion over {step}, m", color=FAINT, fontsize=8)
+    caption(axes, x=f"error of the motion over {step}, m")
     save(figure, path)
 
 
@@ -103,10 +102,8 @@ def write_registration_errors(
         axes = panel(figure, number, columns=len(errors_m), rows=1, beside_in=_LEGEND_IN)
         axes.axvline(max_error_m, color=FAINT, linewidth=0.8, linestyle="dashed")
         _draw_shares(axes, of_name, names)
-        axes.set_title(kind, fontsize=9, color=INK)
-        axes.set_xlabel("distance from the truth, m", color=FAINT, fontsize=8)
-        if number == 0:
-            axes.set_ylabel("share of the pairs", color=FAINT, fontsize=8)
+        shares = "share of the pairs" if number == 0 else ""
+        caption(axes, title=kind, x="distance from the truth, m", y=shares)
     lines, labels = axes.get_legend_handles_labels()
     figure.legend(lines, labels, loc="center right", fontsize=8, frameon=False)
     save(figure, path)

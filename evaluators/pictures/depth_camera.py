@@ -15,7 +15,7 @@ from evaluators.depth_camera.study import DepthStudy, records_of
 from evaluators.tables.table import csv_text
 from mapper.export.page import FAINT, INK, LINE, hex_of, save
 from mapper.export.palette import Rgb
-from mapper.export.panels import page, panel
+from mapper.export.panels import caption, page, panel
 from mapper.runtime.atomic import MANIFEST_NAME, write_text
 from mapper.sensing.depth_noise import depth_sigma_m
 
@@ -124,11 +124,10 @@ def _draw_known(
         axes.plot(*np.array(known).T, marker, color=FAINT, markersize=5, label=label, fillstyle="none")
 
 
-def _finish(axes: "Axes", what: str) -> None:
+def _finish(axes: "Axes", quantity: str) -> None:
     axes.set_xlim(left=0.0)
     axes.set_ylim(bottom=0.0)
-    axes.set_xlabel("distance, m", color=FAINT, fontsize=8)
-    axes.set_ylabel(what, color=FAINT, fontsize=8)
+    caption(axes, x="distance, m", y=quantity)
     axes.grid(color=LINE, linewidth=0.4)
     axes.legend(loc="upper left", fontsize=8, framealpha=0.92, edgecolor=LINE)
 
@@ -163,6 +162,6 @@ def write_residuals(path: Path, maps: Sequence[ResidualMap], *, title: str) -> N
         axes.imshow(one.image, cmap="gray", vmin=0, vmax=255)
         shown = axes.imshow(_MM * one.error_m, cmap="RdBu_r", vmin=-most_mm, vmax=most_mm)
         figure.colorbar(shown, cax=beside).ax.tick_params(labelsize=7, colors=FAINT)
-        axes.set_title(f"{one.caption}; mm", fontsize=9, color=INK)
+        caption(axes, title=f"{one.caption}; mm")
         axes.set_axis_off()
     save(figure, path)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from evaluators.metrics.occupancy import OccupancyCheck
 from evaluators.pictures.path_errors import made_folder
 from mapper.core.geometry import Array
-from mapper.export.page import FAINT, INK, hex_of, save
+from mapper.export.page import hex_of, save
 from mapper.export.palette import ESTIMATE, OCCUPIED_CELL, TRUTH, UNKNOWN_CELL, Rgb
-from mapper.export.panels import page, panel
+from mapper.export.panels import caption, page, panel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,11 +57,9 @@ def write_map_errors(folder: Path, check: OccupancyCheck, *, title: str) -> Path
     for number, (name, axes_xyz) in enumerate((("from above", (0, 1)), ("from the side", (0, 2)))):
         axes = panel(figure, number, columns=2, rows=1)
         _draw(axes, [cell[:, axes_xyz] for cell in cells], paints, edge_m=edge_m)
-        axes.set_title(name, fontsize=9, color=INK)
-        axes.set_xlabel("x (m)", color=FAINT, fontsize=8)
-        axes.set_ylabel("xyz"[axes_xyz[1]] + " (m)", color=FAINT, fontsize=8)
-    for label, (_, color) in kinds.items():
-        axes.plot([], [], "s", color=hex_of(color), label=label)
+        caption(axes, title=name, x="x (m)", y="xyz"[axes_xyz[1]] + " (m)")
+    for kind, (_, color) in kinds.items():
+        axes.plot([], [], "s", color=hex_of(color), label=kind)
     axes.legend(loc="upper right", fontsize=8, framealpha=0.92)
     save(figure, picture)
     return picture

@@ -12,7 +12,7 @@ from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S
 from mapper.export.page import FAINT, INK, LINE, hex_of, save
 from mapper.export.palette import END, ESTIMATE, START, TRUTH
-from mapper.export.panels import draw_boxes, extent, page, panel, widest_axes
+from mapper.export.panels import caption, draw_boxes, extent, page, panel, widest_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,17 +52,17 @@ def write_trajectory_errors(folder: Path, found: Assessment, *, title: str) -> P
     path_axes, position_axes, length_axes, rotation_axes = (
         panel(figure, number, columns=2, rows=2) for number in range(4)
     )
-    path_axes.set_title("over the truth, seen from where it is widest", fontsize=9, color=INK)
+    caption(path_axes, title="over the truth, seen from where it is widest")
     add_color_bar(path_axes, draw_path(path_axes, matched, errors_m))
-    for axes, values, name in (
+    for axes, values, quantity in (
         (position_axes, errors_m, "distance from the truth, m"),
         (rotation_axes, np.degrees(matched.rotation_errors_rad), "angle to the truth, °"),
     ):
-        _draw_over_time(axes, elapsed / NS_PER_S if timed else elapsed, values, name=name)
-        axes.set_xlabel("s" if timed else "poses", color=FAINT, fontsize=8)
+        _draw_over_time(axes, elapsed / NS_PER_S if timed else elapsed, values, quantity=quantity)
+        caption(axes, x="s" if timed else "poses")
     if relative_percent:
         draw_boxes(length_axes, relative_percent)
-        length_axes.set_xlabel("error of the translation over a segment, %", color=FAINT, fontsize=8)
+        caption(length_axes, x="error of the translation over a segment, %")
     else:
         length_axes.text(0.5, 0.5, "too short a path", color=FAINT, transform=length_axes.transAxes)
     save(figure, picture)
@@ -112,8 +112,7 @@ def draw_path(
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal")
-    axes.set_xlabel("m", color=FAINT, fontsize=8)
-    axes.set_ylabel("m", color=FAINT, fontsize=8)
+    caption(axes, x="m", y="m")
     return colored
 
 
@@ -125,14 +124,14 @@ def add_color_bar(axes: "Axes", colored: "LineCollection") -> None:
     bar.set_label("distance from the truth, m", fontsize=7, color=FAINT)
 
 
-def _draw_over_time(axes: "Axes", elapsed: Array, values: Array, *, name: str) -> None:
+def _draw_over_time(axes: "Axes", elapsed: Array, values: Array, *, quantity: str) -> None:
     axes.plot(elapsed, values, color=hex_of(ESTIMATE), linewidth=1.0)
-    for label, value, style in (
+    for name, value, style in (
         ("RMSE", float(np.sqrt(np.mean(values**2))), "dashed"),
         ("median", float(np.median(values)), "dotted"),
     ):
-        axes.axhline(value, color=INK, linewidth=0.8, linestyle=style, label=f"{label} {value:.3g}")
+        axes.axhline(value, color=INK, linewidth=0.8, linestyle=style, label=f"{name} {value:.3g}")
     axes.set_ylim(bottom=0.0)
-    axes.set_ylabel(name, color=FAINT, fontsize=8)
+    caption(axes, y=quantity)
     axes.grid(color=LINE, linewidth=0.4)
     axes.legend(loc="best", fontsize=7, framealpha=0.9, edgecolor=LINE)

@@ -92,6 +92,16 @@ def panel(
     return axes
 
 
+def caption(axes: "Axes", *, title: str = "", x: str = "", y: str = "") -> None:
+    """Write a panel's title and the names of its axes, those that are given."""
+    if title:
+        axes.set_title(title, fontsize=9, color=INK)
+    if x:
+        axes.set_xlabel(x, color=FAINT, fontsize=8)
+    if y:
+        axes.set_ylabel(y, color=FAINT, fontsize=8)
+
+
 def draw_boxes(axes: "Axes", values: Mapping[str, Array]) -> None:
     """Draw boxes from quartile to quartile, whiskers from the 5th to the 95th percentile."""
     boxes = axes.boxplot(
