@@ -10,7 +10,7 @@ from textwrap import wrap
 from evaluators.metrics.metric import Metric
 from mapper.loops.closure import LoopClosure
 from mapper.run.folder import Run
-from mapper.run.frame_records import FrameRecord
+from mapper.run.frame_outcomes import FrameRecord
 
 _LINE_WIDTH = 110
 _SHOWN = ("ATE RMSE", "RPE translation RMSE", "RPE rotation RMSE", "path length", "start-to-end offset")

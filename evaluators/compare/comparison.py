@@ -24,8 +24,8 @@ from mapper.core.geometry import inverse
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, Stamps
 from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.run.fingerprint import fingerprint
-from mapper.runtime.job_runner import Job, Record
 from mapper.runtime.progress import SILENT, Progress
+from mapper.runtime.resumable_jobs import Job, Record
 from mapper.sources.base import FrameRef, Log, Skipped
 
 _WARM_UP_FRAMES = 2

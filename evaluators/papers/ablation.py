@@ -16,7 +16,13 @@ from mapper.graph.model import PoseGraph
 from mapper.loops.factory import build_loop_detector
 from mapper.odometry.base import FrameResult
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
-from mapper.odometry.isvd import IsvdObservation, IsvdOdometry, RegisterPair, matched_pairs, shared_points
+from mapper.odometry.isvd_odometry import (
+    IsvdObservation,
+    IsvdOdometry,
+    RegisterPair,
+    matched_pairs,
+    shared_points,
+)
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import TrackingResult, refuse_a_fragment
 from mapper.registration.base import Alignment

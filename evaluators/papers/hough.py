@@ -16,7 +16,7 @@ from evaluators.tables.table import Record, Value
 from mapper.core.geometry import Transform, angle_between, inverse
 from mapper.core.rotations import euler_from_rotation
 from mapper.registration.hough.config import HoughGicpConfig, HoughNdtConfig
-from mapper.runtime.job_runner import Job
+from mapper.runtime.resumable_jobs import Job
 
 OFFSET_M = 10.0
 METHODS: dict[str, HoughNdtConfig | HoughGicpConfig] = {

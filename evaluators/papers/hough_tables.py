@@ -21,7 +21,7 @@ from evaluators.papers.hough_pairs import (
 from evaluators.papers.model import PaperCell, PaperTable, Reproduction
 from evaluators.papers.published import published
 from evaluators.tables.table import Record, Value
-from mapper.runtime.job_runner import JobResult
+from mapper.runtime.resumable_jobs import JobResult
 
 NEAR_M = 0.03
 """A final MPD below it is the paper's success."""

@@ -16,7 +16,7 @@ from mapper.config.build import BuildConfig
 from mapper.core.errors import DataError
 from mapper.core.trajectory import Trajectory
 from mapper.run.fingerprint import fingerprint
-from mapper.runtime.job_runner import Job, JobResult
+from mapper.runtime.resumable_jobs import Job, JobResult
 from mapper.sources import open_source
 from mapper.sources.base import Log
 

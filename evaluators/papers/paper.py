@@ -8,7 +8,7 @@ from typing import Any
 from evaluators.papers.measurements import Measurement
 from evaluators.papers.model import PaperPath, PaperTable
 from mapper.core.errors import ConfigError
-from mapper.runtime.job_runner import JobResult
+from mapper.runtime.resumable_jobs import JobResult
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,8 @@ from evaluators.study.engine import CELLS, run_study
 from mapper.core.errors import ConfigError, DataError
 from mapper.runtime.atomic import resumable_folder, write_text
 from mapper.runtime.executor import IN_PROCESS, Workers
-from mapper.runtime.job_runner import Job, JobResult
 from mapper.runtime.progress import SILENT, Progress
+from mapper.runtime.resumable_jobs import Job, JobResult
 
 PaperName = Literal["thesis", "zhao", "hough"]
 

@@ -127,7 +127,7 @@ def _thinned(scan: Scan) -> Scan:
 def _by_features(
     target: Frame, source: Frame, config: IsvdOdometryConfig
 ) -> tuple[Alignment, dict[str, float]]:
-    from mapper.odometry.isvd import IsvdOdometry, matched_pairs, shared_points
+    from mapper.odometry.isvd_odometry import IsvdOdometry, matched_pairs, shared_points
     from mapper.registration.isvd import Isvd
 
     if not isinstance(target, RgbdFrame) or not isinstance(source, RgbdFrame):

@@ -8,8 +8,8 @@ from typing import TypeVar
 from evaluators.study.versions import SameVersions, versions
 from mapper.runtime.atomic import locked
 from mapper.runtime.executor import IN_PROCESS, Workers, make_executor
-from mapper.runtime.job_runner import Job, JobResult, JobRunner
 from mapper.runtime.progress import SILENT, Progress
+from mapper.runtime.resumable_jobs import Job, JobResult, JobRunner
 
 CELLS = "cells"
 """Folder of the results beside a study's tables."""

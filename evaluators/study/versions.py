@@ -10,7 +10,7 @@ from typing import Any
 import mapper
 from mapper.core.errors import ConfigError
 from mapper.run.manifest import library_versions
-from mapper.runtime.job_runner import Record
+from mapper.runtime.resumable_jobs import Record
 
 
 def versions() -> dict[str, str]:

@@ -8,7 +8,7 @@ from evaluators.sweep.tables import sweep_records
 from evaluators.tables.parquet import write_parquet
 from evaluators.tables.table import Record, csv_text
 from mapper.runtime.atomic import write_text
-from mapper.runtime.job_runner import JobResult
+from mapper.runtime.resumable_jobs import JobResult
 
 FILES = CSV, PARQUET, PAGE = "results.csv", "results.parquet", "summary.html"
 

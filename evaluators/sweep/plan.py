@@ -23,8 +23,8 @@ from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.run.fingerprint import fingerprint
 from mapper.runtime.atomic import resumable_folder, write_text
 from mapper.runtime.executor import IN_PROCESS, Workers
-from mapper.runtime.job_runner import Job, JobResult
 from mapper.runtime.progress import SILENT, Progress
+from mapper.runtime.resumable_jobs import Job, JobResult
 from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig

@@ -6,7 +6,7 @@ from statistics import median
 
 from evaluators.sweep.plan import RUNS, BuildName, Plan
 from evaluators.tables.table import MISSING, Column, Record, Value, decimals, text_table
-from mapper.runtime.job_runner import JobResult
+from mapper.runtime.resumable_jobs import JobResult
 
 _WHOLE = 0.995
 COVERED_ALIKE = 0.95

@@ -48,14 +48,14 @@ class Exporter:
 _MESH_ENDINGS = (".ply", ".obj", ".glb")
 
 EXPORTERS = {
-    "octomap": Exporter("octree for OctoMap and ROS", "run_files:octomap", "map.bt", (".bt", ".ot")),
-    "native": Exporter("octree with all attributes", "run_files:native", "map.octree", (".octree",)),
-    "ply": Exporter("coloured cloud", "run_files:cloud", "cloud.ply", (".ply",)),
+    "octomap": Exporter("octree for OctoMap and ROS", "stored_files:octomap", "map.bt", (".bt", ".ot")),
+    "native": Exporter("octree with all attributes", "stored_files:native", "map.octree", (".octree",)),
+    "ply": Exporter("coloured cloud", "stored_files:cloud", "cloud.ply", (".ply",)),
     "voxels": Exporter("occupied voxels' centres", "voxels:centres", "voxels.ply", (".ply",)),
     "voxel-mesh": Exporter("occupied voxels as cubes", "voxels:cubes", "voxel_mesh.ply", _MESH_ENDINGS),
     "mesh": Exporter("coloured surface", "mesh:surface", "mesh.ply", _MESH_ENDINGS, settings="mesh"),
     "grid": Exporter(
-        "slice for nav2", "run_files:grid", "slice.yaml", (".yaml", ".yml"), beside=(".pgm", ".png")
+        "slice for nav2", "stored_files:grid", "slice.yaml", (".yaml", ".yml"), beside=(".pgm", ".png")
     ),
     "costmap": Exporter(
         "slice inflated for nav2",
@@ -65,12 +65,14 @@ EXPORTERS = {
         beside=(".pgm", ".png"),
         settings="costmap",
     ),
-    "tum": Exporter("trajectory as TUM text", "run_files:tum", "trajectory.tum", (".tum", ".txt")),
-    "kitti": Exporter("trajectory as KITTI text", "run_files:kitti", "trajectory.kitti", (".kitti", ".txt")),
+    "tum": Exporter("trajectory as TUM text", "stored_files:tum", "trajectory.tum", (".tum", ".txt")),
+    "kitti": Exporter(
+        "trajectory as KITTI text", "stored_files:kitti", "trajectory.kitti", (".kitti", ".txt")
+    ),
     "foxglove-layout": Exporter(
         "how Foxglove is to show run.mcap", "foxglove_layout:layout", "foxglove_layout.json", (".json",)
     ),
-    "g2o": Exporter("pose graph", "run_files:g2o", "graph.g2o", (".g2o",)),
+    "g2o": Exporter("pose graph", "stored_files:g2o", "graph.g2o", (".g2o",)),
 }
 
 

@@ -10,7 +10,7 @@ from mapper.export.palette import TRUTH
 from mapper.loops.closure import Discrepancy, LoopClosure
 from mapper.mapping.cloud import height_colors
 from mapper.mapping.fusion import Maps, ScanSnapshot, Snapshot
-from mapper.run.frame_records import FrameRecord
+from mapper.run.frame_outcomes import FrameRecord
 from mapper.run.results import RunResults
 
 BODY = "body"

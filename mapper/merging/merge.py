@@ -25,8 +25,8 @@ from mapper.run.fingerprint import fingerprint
 from mapper.run.manifest import is_merged_map
 from mapper.runtime.atomic import MANIFEST_NAME, atomic_folder
 from mapper.runtime.executor import IN_PROCESS, Workers, make_executor
-from mapper.runtime.job_runner import JobRunner
 from mapper.runtime.progress import SILENT, Progress
+from mapper.runtime.resumable_jobs import JobRunner
 
 DEFAULT_TILE_M = 50.0
 

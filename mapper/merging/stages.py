@@ -9,8 +9,8 @@ from typing import NamedTuple, TypeVar
 from mapper.core.config import Config
 from mapper.core.errors import RunError
 from mapper.runtime.executor import Executor
-from mapper.runtime.job_runner import Job, JobRunner, Record
 from mapper.runtime.progress import Progress
+from mapper.runtime.resumable_jobs import Job, JobRunner, Record
 from mapper.runtime.timing import peak_memory_mb
 
 Result = TypeVar("Result", bound=Config)

@@ -64,7 +64,7 @@ def build_frame_odometry(config: FrameOdometryConfig) -> FrameOdometry[Any]:
     """Return the odometry that the settings choose among those that use the frames' images or scans."""
     match config:
         case IsvdOdometryConfig():
-            from mapper.odometry.isvd import IsvdOdometry
+            from mapper.odometry.isvd_odometry import IsvdOdometry
 
             return IsvdOdometry(config)
         case LocalMapConfig():

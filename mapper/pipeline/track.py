@@ -18,7 +18,7 @@ from mapper.loops.factory import build_loop_detector
 from mapper.odometry.base import FrameResult, Odometry
 from mapper.odometry.factory import build_odometry
 from mapper.odometry.given_poses import poses_for
-from mapper.run.frame_records import records_of
+from mapper.run.frame_outcomes import records_of
 from mapper.run.observers import NULL_OBSERVER, Observer, Step
 from mapper.run.stored_tracking import StoredTracking
 from mapper.runtime.ordered_map import ordered_map

@@ -16,7 +16,7 @@ from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure, read_closures
 from mapper.run import files
 from mapper.run.fingerprint import fingerprint
-from mapper.run.frame_records import FrameRecord, read_frame_ms, read_records
+from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records
 from mapper.run.manifest import (
     AppendedLog,
     Input,

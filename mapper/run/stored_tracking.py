@@ -10,7 +10,7 @@ from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure, write_closures
 from mapper.run import files
 from mapper.run.folder import Run, RunWriter
-from mapper.run.frame_records import FrameRecord, write_frame_ms, write_records
+from mapper.run.frame_outcomes import FrameRecord, write_frame_ms, write_records
 from mapper.run.manifest import SkippedFrame
 from mapper.sources.base import Skipped
 from mapper.sources.trajectory_files import write_tum

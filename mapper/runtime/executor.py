@@ -5,30 +5,22 @@ cluster has to run the same version of this package on the same files: its worke
 """
 
 import logging
-import os
-import pickle
 import re
-import signal
-import threading
-import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
-from functools import partial
-from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
 
-from mapper.core.errors import ConfigError, DependencyError, MapperError
+from mapper.core.errors import ConfigError, DependencyError
 from mapper.runtime.threads import one_thread_per_library
+from mapper.runtime.worker_process import Failure, Work, WorkerProcess, _reason, attempt
 
 if TYPE_CHECKING:
     from distributed import Future
 
 R = TypeVar("R")
-Work = Callable[[], Any]
 
 _ANSWER_S = 10.0
 _ADDRESS = re.compile(r"(tcp|tls|wss?)://.+:\d+")
@@ -53,20 +45,6 @@ class Workers:
 
 IN_PROCESS = Workers()
 """One job at a time, in this process."""
-
-
-@dataclass(frozen=True, slots=True)
-class Failure:
-    """Result of a job that did not finish.
-
-    Attributes:
-        reason: One line: a MapperError's message, another exception's type, message and place, or how the
-            worker ended.
-        attempts: How often the job was begun.
-    """
-
-    reason: str
-    attempts: int
 
 
 class Executor(Protocol):
@@ -142,23 +120,6 @@ def run_jobs(
         yield index, outcome
 
 
-def _attempt(job: Work) -> Any:
-    """Return a job's result, or a Failure."""
-    try:
-        return job()
-    except Exception as error:
-        return Failure(_reason(error), 1)
-
-
-def _reason(error: BaseException) -> str:
-    message = " ".join(str(error).split())
-    if isinstance(error, MapperError):
-        return "; ".join([message, *getattr(error, "__notes__", ())])
-    where = traceback.extract_tb(error.__traceback__)
-    place = f" ({Path(where[-1].filename).name}:{where[-1].lineno})" if where else ""
-    return f"{type(error).__name__}: {message}{place}"
-
-
 class _InProcess(AbstractContextManager["_InProcess"]):
     """Executor that runs jobs in this process."""
 
@@ -172,7 +133,7 @@ class _InProcess(AbstractContextManager["_InProcess"]):
         self._index, self._job = index, job
 
     def next_done(self) -> tuple[int, Any]:
-        return self._index, _attempt(self._job)
+        return self._index, attempt(self._job)
 
 
 class _ProcessPool(AbstractContextManager["_ProcessPool"]):
@@ -180,8 +141,8 @@ class _ProcessPool(AbstractContextManager["_ProcessPool"]):
 
     def __init__(self, count: int) -> None:
         self._count = count
-        self._idle: list[_Worker] = []
-        self._busy: dict[Connection, tuple[_Worker, int]] = {}
+        self._idle: list[WorkerProcess] = []
+        self._busy: dict[Connection, tuple[WorkerProcess, int]] = {}
 
     def __exit__(self, *_: object) -> None:
         for worker in [*self._idle, *(worker for worker, _ in self._busy.values())]:
@@ -191,7 +152,7 @@ class _ProcessPool(AbstractContextManager["_ProcessPool"]):
         return self._count
 
     def submit(self, index: int, job: Work) -> None:
-        worker = self._idle.pop() if self._idle else _Worker()
+        worker = self._idle.pop() if self._idle else WorkerProcess()
         with suppress(BrokenPipeError):  # it ended while idle; next_done will find the pipe closed
             worker.connection.send(job)
         self._busy[worker.connection] = worker, index
@@ -206,60 +167,6 @@ class _ProcessPool(AbstractContextManager["_ProcessPool"]):
             return index, Failure(worker.exit_reason(), 1)
         self._idle.append(worker)
         return index, outcome
-
-
-class _Worker:
-    """A spawned process that runs the jobs sent to it, one at a time, and ends with its parent."""
-
-    def __init__(self) -> None:
-        context = get_context("spawn")  # a forked copy of a process with threads may hang
-        self.connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
-        self._process.start()
-        theirs.close()  # so that the pipe ends with the process
-
-    def kill(self) -> None:
-        """End the process at once."""
-        self._process.kill()
-        self._process.join()
-        self.connection.close()
-
-    def exit_reason(self) -> str:
-        """Return how the process ended, after its end of the pipe has closed."""
-        self._process.join()
-        self.connection.close()
-        code = self._process.exitcode or 0
-        if code < 0:
-            return f"its worker was killed by {signal.Signals(-code).name}"
-        return f"its worker ended with exit status {code}"
-
-
-def _serve(connection: Connection) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
-    one_thread_per_library()
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
-    while True:
-        try:
-            packed = connection.recv_bytes()
-        except EOFError:
-            return
-        outcome = _attempt(partial(_unpacked, packed))
-        try:
-            connection.send(outcome)
-        except (pickle.PicklingError, TypeError, AttributeError) as error:
-            connection.send(Failure(_reason(error), 1))
-
-
-def _unpacked(packed: bytes) -> Any:
-    return pickle.loads(packed)()
-
-
-def _exit_with_parent() -> None:
-    """Exit once the parent has: a killed one cannot end its workers, and a second run must not meet them."""
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 class _DaskCluster(AbstractContextManager["_DaskCluster"]):
@@ -330,4 +237,4 @@ class _DaskCluster(AbstractContextManager["_DaskCluster"]):
 
 def _attempt_with_limits(job: Work) -> Any:
     one_thread_per_library()
-    return _attempt(job)
+    return attempt(job)

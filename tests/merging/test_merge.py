@@ -25,7 +25,7 @@ from mapper.octree.slice import cut_slice
 from mapper.run.files import SUMMARY
 from mapper.run.folder import load_run, write_run
 from mapper.run.manifest import Input, Manifest
-from mapper.runtime import job_runner
+from mapper.runtime import resumable_jobs
 from mapper.runtime.executor import Workers, run_jobs
 from mapper.sources.trajectory_files import write_tum
 from tests.support.octree_maps import COLORED, CONFIG, as_dict, mapped, total
@@ -88,7 +88,7 @@ def test_the_bytes_are_the_same_for_one_process_two_processes_and_any_order(
     MERGE(as_built(runs), tmp_path / "two", workers=Workers(2))
     assert bytes_of(tmp_path / "two") == bytes_of(merged.path)
 
-    monkeypatch.setattr(job_runner, "run_jobs", shuffled_jobs)
+    monkeypatch.setattr(resumable_jobs, "run_jobs", shuffled_jobs)
     monkeypatch.setattr("mapper.merging.merge.draw", lambda *_: None)
     MERGE(as_built(runs), tmp_path / "shuffled")
     assert bytes_of(tmp_path / "shuffled") == bytes_of(merged.path, but=SUMMARY)
@@ -176,7 +176,7 @@ def test_a_merge_that_was_stopped_goes_on_where_it_was(runs, merged, tmp_path, m
         return run_jobs(some, executor, attempts=1)
 
     monkeypatch.setattr("mapper.merging.merge.join_tile", join)
-    monkeypatch.setattr(job_runner, "run_jobs", jobs)
+    monkeypatch.setattr(resumable_jobs, "run_jobs", jobs)
     with pytest.raises(RunError, match=r"join \d+: OSError: the disk is gone.*\(and 1 more\).*to go on"):
         MERGE(as_built(runs), out)
     assert not out.exists()

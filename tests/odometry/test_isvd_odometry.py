@@ -9,7 +9,7 @@ from mapper.core.geometry import apply, exp, inverse, mean_rotation
 from mapper.features.base import Features
 from mapper.features.config import OrbConfig
 from mapper.odometry.config import IsvdOdometryConfig
-from mapper.odometry.isvd import IsvdObservation, IsvdOdometry
+from mapper.odometry.isvd_odometry import IsvdObservation, IsvdOdometry
 
 CAMERA = PinholeCamera(640, 480, 500.0, 500.0, 320.0, 240.0)
 

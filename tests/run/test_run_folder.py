@@ -8,7 +8,7 @@ from mapper.core.errors import RunError, TrackingError
 from mapper.odometry.base import Diagnostics
 from mapper.run.fingerprint import fingerprint
 from mapper.run.folder import load_run, write_run
-from mapper.run.frame_records import FrameRecord, read_frame_ms, read_records, write_frame_ms, write_records
+from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records, write_frame_ms, write_records
 from mapper.run.manifest import Input, Manifest, read_manifest
 from mapper.runtime.atomic import atomic_folder, partial_of
 

@@ -50,7 +50,7 @@ from mapper.mapping.fusion import Snapshot
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import OccupancyGrid
-from mapper.run.frame_records import FrameRecord
+from mapper.run.frame_outcomes import FrameRecord
 
 APPLICATION = "mapper"
 BODY = "world/body"

@@ -9,7 +9,7 @@ from mapper.core.errors import ConfigError, SourceError
 from mapper.core.frames import Scan
 from mapper.core.geometry import apply, rotation_exp, transform
 from mapper.core.trajectory import trajectory_from
-from mapper.runtime.job_runner import JobResult
+from mapper.runtime.resumable_jobs import JobResult
 from mapper.sources.trajectory_files import read_kitti, write_kitti
 from tests.support.paths import DATA
 from tests.support.street_scans import on_street, street, view

@@ -19,8 +19,8 @@ from mapper.core.trajectory import trajectory_from
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import TrackingResult, track_log
-from mapper.runtime.job_runner import JobResult
 from mapper.runtime.progress import SILENT
+from mapper.runtime.resumable_jobs import JobResult
 from mapper.sources import open_source
 from mapper.sources.trajectory_files import read_tum
 from tests.support.paths import FR1_XYZ, ROOT

@@ -14,7 +14,7 @@ from evaluators.sweep.plan import plan_sweep, run_sweep
 from evaluators.sweep.tables import QUANTITIES, best_of, grouped, summary_text, sweep_records
 from mapper.core.errors import ConfigError, RunError, SourceError
 from mapper.runtime.executor import Workers
-from mapper.runtime.job_runner import Job, JobResult
+from mapper.runtime.resumable_jobs import Job, JobResult
 from tests.support.chromium import CHROMIUM, MISSING, Page
 from tests.support.command_line import mapper
 

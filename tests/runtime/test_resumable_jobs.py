@@ -10,7 +10,7 @@ from evaluators.study.engine import run_study
 from mapper.core.errors import DataError, RunError
 from mapper.runtime.atomic import locked
 from mapper.runtime.executor import Workers
-from mapper.runtime.job_runner import Job
+from mapper.runtime.resumable_jobs import Job
 from tests.support.counted_jobs import Work, told, until
 from tests.support.paths import ROOT
 
@@ -139,7 +139,7 @@ def test_killed_in_the_middle_it_goes_on_and_runs_nothing_finished_twice(diary, 
     script.write_text(
         "from pathlib import Path\n"
         "from evaluators.study.engine import run_study\n"
-        "from mapper.runtime.job_runner import Job\n"
+        "from mapper.runtime.resumable_jobs import Job\n"
         "from mapper.runtime.executor import Workers\n"
         "from tests.support.counted_jobs import Work\n"
         "if __name__ == '__main__':\n"

@@ -11,8 +11,9 @@ from typing import Any
 
 from mapper.core.errors import DataError
 from mapper.runtime.atomic import write_text
-from mapper.runtime.executor import Executor, Failure, run_jobs
+from mapper.runtime.executor import Executor, run_jobs
 from mapper.runtime.progress import SILENT, Progress
+from mapper.runtime.worker_process import Failure
 
 Record = Mapping[str, Any]
 """Names with text, finite numbers, None, or lists and mappings of these."""
