@@ -74,7 +74,7 @@ def test_frames_that_cannot_be_read_are_noted_and_left_out(tiny_tum_log, tmp_pat
 
     result = mapper("vocabulary", "train", log, "--out", tmp_path / "v.words")
 
-    assert "not an image that OpenCV can decode" in result.stderr
+    assert "not an image of a known format (8 bytes)" in result.stderr
     assert "trained on 7 images of log" in result.stdout
 
 

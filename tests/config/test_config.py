@@ -67,7 +67,7 @@ def test_one_knob_keeps_the_kind_of_the_file_and_its_default_detector(toml):
         (
             "odometry.kind=zip",
             "odometry: Input tag 'zip' found using 'kind' does not match any of the expected tags: 'isvd',"
-            " 'local-map', 'pnp', 'wheels'",
+            " 'local-map', 'pnp', 'gicp', 'icp', 'kiss-icp', 'hough-ndt', 'wheels', 'given'",
         ),
         ("workers=many", "overrides: workers: Input should be a valid integer"),
         ("workers", "override 'workers': want key.path=value"),

@@ -12,6 +12,7 @@ from mapper.core.geometry import angle_between, exp, interpolate, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.odometry.config import GivenOdometryConfig
+from mapper.odometry.factory import build_odometry
 from mapper.odometry.given_poses import poses_for
 from mapper.pipeline.build import build
 from mapper.pipeline.track import refuse_a_fragment, track_log
@@ -169,14 +170,14 @@ def test_mistakes_are_named_with_the_remedy(flat, tmp_path):
 
 def test_a_scan_is_deskewed_by_the_poses_around_it_unless_these_are_sparse(street):
     truth = street.truth
-    odometry = GivenOdometryConfig().build(truth)
+    odometry = build_odometry(GivenOdometryConfig(), truth)
     entries = list(street.entries())
     tracks = [odometry.track(odometry.read(entry)) for entry in entries]
     assert tracks[5].twist.translation_mps == pytest.approx(
         (inverse(truth.T_world_body[4]) @ truth.T_world_body[6])[:3, 3] / 0.2, rel=0.05, abs=0.05
     )
     sparse = Trajectory(truth.stamps_ns[::50], truth.T_world_body[::50])
-    odometry = GivenOdometryConfig().build(sparse)
+    odometry = build_odometry(GivenOdometryConfig(), sparse)
     assert odometry.track(odometry.read(entries[10])).twist is None
 
 
