@@ -54,6 +54,9 @@ class FrameResult:
             be more accurate; until then these connect the node to the path.
         twist: Assumed motion of the body during a scan's sweep; None if nothing was deskewed.
         is_sharp: False if the frame is unfit for place recognition: a scan swept in unknown motion.
+        doubts: Why the pose may be wrong, a phrase each; empty if nothing speaks against it.
+        covariance: (6, 6) of the pose in the body's tangent (rotation, translation), rad² and m²: relative to
+            ``node``, or for a keyframe to the keyframe before it. None if nothing measured it.
     """
 
     stamp_ns: int
@@ -66,6 +69,8 @@ class FrameResult:
     links: Sequence[BetweenFactor] = field(default_factory=tuple)
     twist: Twist | None = None
     is_sharp: bool = True
+    doubts: tuple[str, ...] = ()
+    covariance: Array | None = None
 
 
 def lost_frame(

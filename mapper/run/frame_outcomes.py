@@ -5,15 +5,26 @@ import io
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
+
+import numpy as np
 
 from mapper.core.errors import DataError, RunError
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.runtime.atomic import write_text
 from mapper.sources.base import Skipped
 
-Outcome = Literal["tracked", "lost", "skipped"]
+Outcome = Literal["tracked", "doubtful", "lost", "skipped"]
+_OUTCOMES: Mapping[str, Outcome] = {outcome: outcome for outcome in get_args(Outcome)}
 
+_SIGMAS = (
+    "sigma_roll_rad",
+    "sigma_pitch_rad",
+    "sigma_yaw_rad",
+    "sigma_x_m",
+    "sigma_y_m",
+    "sigma_z_m",
+)
 _COLUMNS = (
     "stamp_ns",
     "outcome",
@@ -26,7 +37,10 @@ _COLUMNS = (
     "residual",
     "residual_unit",
     "unobservable",
+    "doubts",
+    *_SIGMAS,
 )
+_DOUBTS_JOINED_BY = "; "
 _NOTHING = Diagnostics(features=0, matches=0, inliers=0, residual=0.0, residual_unit="", method="")
 
 
@@ -36,10 +50,14 @@ class FrameRecord:
 
     Attributes:
         stamp_ns: The frame's stamp.
-        outcome: "tracked", "lost" (read, but not placed) or "skipped" (could not be read).
-        node: Graph node that its pose is relative to; None unless tracked.
+        outcome: "tracked", "doubtful" (placed, but the pose may be wrong), "lost" (read, but not placed) or
+            "skipped" (could not be read).
+        node: Graph node that its pose is relative to; None unless placed.
         is_keyframe: The frame is that node.
         diagnostics: Figures on its tracking; all zero for a skipped frame.
+        doubts: Why the pose may be wrong, a phrase each.
+        sigmas: Standard deviations of the pose relative to its node, or of a keyframe's to the keyframe
+            before it: rotation about and translation along the body's x, y, z (rad, m). None if unknown.
     """
 
     stamp_ns: int
@@ -47,6 +65,8 @@ class FrameRecord:
     node: int | None
     is_keyframe: bool
     diagnostics: Diagnostics
+    doubts: tuple[str, ...] = ()
+    sigmas: tuple[float, ...] | None = None
 
 
 def records_of(tracks: Iterable[FrameResult], skipped: Iterable[Skipped]) -> list[FrameRecord]:
@@ -54,10 +74,12 @@ def records_of(tracks: Iterable[FrameResult], skipped: Iterable[Skipped]) -> lis
     records = [
         FrameRecord(
             stamp_ns=track.stamp_ns,
-            outcome="lost" if track.node is None else "tracked",
+            outcome=_outcome(track),
             node=track.node,
             is_keyframe=track.is_keyframe,
             diagnostics=track.diagnostics,
+            doubts=track.doubts,
+            sigmas=None if track.covariance is None else tuple(np.sqrt(np.diag(track.covariance)).tolist()),
         )
         for track in tracks
     ]
@@ -85,6 +107,8 @@ def write_records(path: Path, records: Iterable[FrameRecord]) -> None:
                 repr(float(how.residual)),
                 how.residual_unit,
                 how.unobservable,
+                _DOUBTS_JOINED_BY.join(record.doubts),
+                *("" if record.sigmas is None else repr(sigma) for sigma in record.sigmas or _SIGMAS),
             ]
         )
     write_text(path, text.getvalue())
@@ -129,11 +153,19 @@ def read_frame_ms(path: Path) -> dict[int, float]:
         raise DataError(f"{path}: not a list of stamp_ns,ms: {error}") from None
 
 
+def _outcome(track: FrameResult) -> Outcome:
+    if track.node is None:
+        return "lost"
+    return "doubtful" if track.doubts else "tracked"
+
+
 def _record(row: dict[str, str]) -> FrameRecord:
-    outcomes: dict[str, Outcome] = {"tracked": "tracked", "lost": "lost", "skipped": "skipped"}
+    # Older runs have neither doubts nor sigmas.
+    doubts = row.get("doubts") or ""
+    sigmas = [row.get(name) or "" for name in _SIGMAS]
     return FrameRecord(
         stamp_ns=int(row["stamp_ns"]),
-        outcome=outcomes[row["outcome"]],
+        outcome=_OUTCOMES[row["outcome"]],
         node=int(row["node"]) if row["node"] else None,
         is_keyframe=row["is_keyframe"] == "1",
         diagnostics=Diagnostics(
@@ -146,4 +178,6 @@ def _record(row: dict[str, str]) -> FrameRecord:
             # Older runs have this column as "unseen", or not at all.
             unobservable=row.get("unobservable", row.get("unseen", "")),
         ),
+        doubts=tuple(doubts.split(_DOUBTS_JOINED_BY)) if doubts else (),
+        sigmas=tuple(map(float, sigmas)) if all(sigmas) else None,
     )

@@ -68,7 +68,10 @@ class Input(InputLog):
 
 
 class Counts(Config):
-    """Counts of frames, nodes, factors and voxels; every listed frame is skipped, lost or tracked."""
+    """Counts of frames, nodes, factors and voxels.
+
+    Every listed frame is skipped, lost, doubtful or tracked.
+    """
 
     listed: int = 0
     read: int = 0
@@ -77,6 +80,8 @@ class Counts(Config):
     """Could not be read; ``skipped`` says why."""
     lost: int = 0
     """Read, but not placed."""
+    doubtful: int = 0
+    """Placed, but the pose may be wrong; ``frames.csv`` says why."""
     tracked: int = 0
     nodes: int = 0
     factors: int = 0

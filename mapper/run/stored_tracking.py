@@ -105,6 +105,7 @@ def save_tracking(writer: RunWriter, tracked: StoredTracking) -> None:
             "read": len(outcomes) - outcomes.count("skipped"),
             "skipped": outcomes.count("skipped"),
             "lost": outcomes.count("lost"),
+            "doubtful": outcomes.count("doubtful"),
             "tracked": outcomes.count("tracked"),
             "nodes": len(graph.T_world_node),
             "factors": len(graph.factors),
