@@ -75,6 +75,9 @@ class KeyframeOdometryConfig(Config):
     """Depth noise of the sensor, as measured by ``mapper sensor depth``, which replaces the disparity's."""
     depth_residual: bool = True
     """bf / z is a third residual of poses and bundles; without it only pixels (Zhao et al. 2020, eq. 5–7)."""
+    readout_s: float | None = None
+    """Rolling shutter: time from the first row's exposure to the last row's; 0 is a global shutter. None
+    estimates it from the log."""
     local_search_px: PositiveFloat = 4.0
     """Search radius around the projected landmarks of the local map in the finest octave; raise it for images
     of higher resolution."""

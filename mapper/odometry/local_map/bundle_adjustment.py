@@ -209,3 +209,58 @@ def adjust(poses, free, points, first_edge, edges, measured, weights, intrinsics
             limit = CHI2_2DOF if np.isnan(measured[e, 2]) else CHI2_3DOF
             active[e] = z > 0.05 and chi2(r, weights[e]) <= limit
     return poses, points, active
+
+
+@njit(cache=True, nogil=True)
+def common_parameter(poses, free, points, first_edge, edges, measured, weights, intrinsics, active, slopes):
+    """Return the information on a parameter common to all edges, and the gradient of half their χ².
+
+    Poses and points are eliminated, so the parameter's Gauss–Newton step is −gradient / information.
+
+    Args:
+        poses: As for ``adjust``, at its solution, likewise all but the last two.
+        free: As for ``adjust``.
+        points: As for ``adjust``.
+        first_edge: As for ``adjust``.
+        edges: As for ``adjust``.
+        measured: As for ``adjust``.
+        weights: As for ``adjust``.
+        intrinsics: As for ``adjust``.
+        active: (E,) edges that take part.
+        slopes: (E, 2) change of the residuals of u and v with the parameter.
+    """
+    cameras = int(free.max()) + 1
+    Hcc, bc = np.empty((cameras, 6, 6)), np.empty((cameras, 6))
+    Hpp, bp = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
+    W = np.zeros((len(edges), 6, 3))
+    blocks = Hcc, bc, Hpp, bp, W
+    _linearise(poses, free, points, edges, measured, weights, intrinsics, active, False, blocks)
+    coupling_c, coupling_p = np.zeros((cameras, 6)), np.zeros((len(points), 3))
+    r = np.empty(3)
+    J = np.empty((3, 3))
+    J_pose = np.empty((3, 6))
+    information = gradient = 0.0
+    for e in range(len(edges)):
+        if not active[e]:
+            continue
+        c, p = edges[e, 0], edges[e, 1]
+        T = poses[c]
+        x, y, z = residual(T, points[p], measured[e], intrinsics, r)
+        projection_jacobian(x, y, z, intrinsics, False, J)
+        pose_jacobian(x, y, z, J, J_pose)
+        f = free[c]
+        for i in range(2):
+            ws = weights[e, i] * slopes[e, i]
+            information += ws * slopes[e, i]
+            gradient += ws * r[i]
+            for a in range(3):
+                coupling_p[p, a] += ws * (J[i, 0] * T[0, a] + J[i, 1] * T[1, a] + J[i, 2] * T[2, a])
+            if f >= 0:
+                for a in range(6):
+                    coupling_c[f, a] += ws * J_pose[i, a]
+    for f in range(cameras):  # the residuals' own gradient gives way to that of the coupling
+        bc[f] = coupling_c[f]
+    bp[:] = coupling_p
+    moved_c, moved_p = _step(free, first_edge, edges, active, blocks, 0.0)
+    information -= (coupling_c * moved_c).sum() + (coupling_p * moved_p).sum()
+    return information, gradient

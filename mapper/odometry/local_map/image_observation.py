@@ -1,6 +1,6 @@
 """Observation of one RGB-D frame: features with depth, as arrays for the compiled kernels."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,11 @@ from mapper.features.frame_view import ImageView
 from mapper.features.hamming import Bits, pack
 from mapper.features.window_matching import FeatureGrid, sort_into_grid
 from mapper.odometry.config import KeyframeOdometryConfig
+from mapper.odometry.local_map.pixel_motion import depth_velocity, pixel_velocity, row_phase
 from mapper.places.vocabulary import Vocabulary
 from mapper.sensing.depth_noise import feature_depth_m, feature_depth_sigma_m
+
+_MIN_DEPTH_M = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,22 +26,26 @@ class ImageObservation:
 
     Attributes:
         stamp_ns: The frame's stamp.
-        pixels: (N, 2) undistorted pixels.
+        pixels: (N, 2) undistorted pixels, as they were read.
+        depth_m: (N,) as they were read; NaN without depth.
         octave: (N,) int32 pyramid level.
         bits: (N, 4) uint64 descriptors.
         words: (N,) int32 visual words.
-        measured: (N, 3) u, v and virtual disparity bf / z in pixels; NaN in the third column without depth
-            or if it is not used.
+        measured: (N, 3) u, v and virtual disparity bf / z in pixels, as a global shutter would have read them
+            when the middle row was read; NaN in the third column without depth or if it is not used.
         weights: (N, 3) inverse variances of the three, px⁻².
-        points_camera: (N, 3) metres; NaN without depth.
+        points_camera: (N, 3) metres, of ``measured``; NaN without depth.
         grid: Index of the features, which are sorted by its cells.
         intrinsics: (5,) fx, fy, cx, cy, bf in pixels (bf in pixel metres).
         size_px: Image width and height.
         T_body_camera: (4, 4) pose of the camera in the body frame.
+        sweep_camera: (6,) motion of the camera while the rows were read, in its own axes (rotation,
+            translation), that ``measured`` allows for; 0 for a global shutter.
     """
 
     stamp_ns: int
     pixels: Array
+    depth_m: Array
     octave: NDArray[np.int32]
     bits: Bits
     words: NDArray[np.int32]
@@ -49,6 +56,7 @@ class ImageObservation:
     intrinsics: Array
     size_px: tuple[int, int]
     T_body_camera: Transform
+    sweep_camera: Array
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -56,13 +64,37 @@ class ImageObservation:
     @property
     def has_depth(self) -> NDArray[np.bool_]:
         """(N,) which features have depth."""
-        return ~np.isnan(self.points_camera[:, 2])
+        return ~np.isnan(self.depth_m)
+
+    def swept(self, sweep_camera: Array) -> "ImageObservation":
+        """Return the observation with the shift of each row by another motion of the camera taken out."""
+        if not (sweep_camera.any() or self.sweep_camera.any()):
+            return self
+        depth_m = np.where(self.has_depth, self.depth_m, _usual(self.depth_m))
+        pixels = self.pixels - self.row_shift(self.pixels, depth_m, sweep_camera)
+        phase = row_phase(self.pixels, self.size_px[1])
+        z = self.depth_m - phase * depth_velocity(self.pixels, depth_m, self.intrinsics, sweep_camera)
+        z = np.maximum(z, 0.5 * self.depth_m)
+        disparity_px = np.where(np.isnan(self.measured[:, 2]), np.nan, self.intrinsics[4] / z)
+        return replace(
+            self,
+            measured=np.column_stack([pixels, disparity_px]),
+            points_camera=back_projected(pixels, z, self.intrinsics),
+            sweep_camera=sweep_camera,
+        )
+
+    def row_shift(self, pixels: Array, depth_m: Array, sweep_camera: Array | None = None) -> Array:
+        """Return by how much (N, 2) pixels shift until their row is read, from the middle row on."""
+        depth_m = np.maximum(depth_m, _MIN_DEPTH_M)
+        sweep_camera = self.sweep_camera if sweep_camera is None else sweep_camera
+        phase = row_phase(pixels, self.size_px[1])
+        return phase[:, np.newaxis] * pixel_velocity(pixels, depth_m, self.intrinsics, sweep_camera)
 
     def view(self) -> ImageView:
         """Return the view for place recognition."""
         return ImageView(
             stamp_ns=self.stamp_ns,
-            pixels=self.pixels,
+            pixels=self.measured[:, :2],
             sigma_px=self.weights[:, 0] ** -0.5,
             descriptors=self.bits.view(np.uint8).reshape(len(self), 32),
             points_camera=self.points_camera,
@@ -110,18 +142,31 @@ def observe_image(
         # Without depth the weight is not used, but it is a factor in sums.
         known_px = config.virtual_baseline_px_m / depth_m**2 * sigma_m
         disparity_sigma_px = np.where(np.isnan(depth_m), disparity_sigma_px, known_px)
-    rays = (pixels - intrinsics[2:4]) / intrinsics[:2]
     return ImageObservation(
         stamp_ns=frame.stamp_ns,
         pixels=pixels,
+        depth_m=depth_m,
         octave=octave,
         bits=bits,
         words=vocabulary.words_of(bits),
         measured=np.column_stack([pixels, disparity_px]),
         weights=np.column_stack([sigma_px, sigma_px, disparity_sigma_px]) ** -2.0,
-        points_camera=np.column_stack([rays * depth_m[:, None], depth_m]),
+        points_camera=back_projected(pixels, depth_m, intrinsics),
         grid=grid,
         intrinsics=intrinsics,
         size_px=(camera.width_px, camera.height_px),
         T_body_camera=frame.T_body_camera,
+        sweep_camera=np.zeros(6),
     )
+
+
+def back_projected(pixels: Array, depth_m: Array, intrinsics: Array) -> Points:
+    """Return the (N, 3) points, camera frame, of undistorted (N, 2) pixels and their depths."""
+    rays = (pixels - intrinsics[2:4]) / intrinsics[:2]
+    return np.column_stack([rays * depth_m[:, np.newaxis], depth_m])
+
+
+def _usual(depth_m: Array) -> float:
+    """Return the median depth, for features without; 1 m if none has any."""
+    known = depth_m[~np.isnan(depth_m)]
+    return float(np.median(known)) if known.size else 1.0

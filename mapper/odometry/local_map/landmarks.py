@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, adjoint, apply, inverse
-from mapper.odometry.local_map.bundle_adjustment import adjust
+from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameter
 from mapper.odometry.local_map.growing_table import GrowingTable
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmark_kernels import count_observers, observations_of
+from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.registration.reprojection import normal_matrix
 
 Ids = NDArray[np.int32]
@@ -34,12 +35,14 @@ class Keyframe:
         T_camera_world: (4, 4) current estimate.
         landmark_of_feature: (N,) int32 landmark of each feature, −1 for none.
         origin: First keyframe of its sub-map; sub-maps are not connected to each other.
+        twist_camera: (6,) velocity of the camera in its own axes, rad/s and m/s; 0 if it is unknown.
     """
 
     observation: ImageObservation
     T_camera_world: Transform
     landmark_of_feature: Ids
     origin: int
+    twist_camera: Array
 
 
 class LandmarkMap:
@@ -49,7 +52,8 @@ class LandmarkMap:
     can traverse them without Python objects.
     """
 
-    def __init__(self, *, scale_factor: float) -> None:
+    def __init__(self, *, scale_factor: float, readout: ReadoutTime) -> None:
+        self.readout = readout
         self.keyframes: list[Keyframe] = []
         self.landmarks = GrowingTable(
             position=((3,), np.float64),
@@ -67,8 +71,10 @@ class LandmarkMap:
             feature=((), np.int32),
             measured=((3,), np.float64),
             weights=((3,), np.float64),
+            slope=((2,), np.float64),
         )
         self.scale_factor = scale_factor
+        self._observed_with_s = readout.seconds
         self._first_landmark: list[int] = []
 
     def add_keyframe(
@@ -79,6 +85,7 @@ class LandmarkMap:
         *,
         new: NDArray[np.bool_],
         neighbour: int | None,
+        twist_camera: Array,
     ) -> int:
         """Add a keyframe that observes known landmarks, and create landmarks from its ``new`` features.
 
@@ -88,6 +95,7 @@ class LandmarkMap:
             landmark_of_feature: (N,) known landmark of each feature, −1 for none.
             new: (N,) features with depth that become landmarks.
             neighbour: A keyframe of the same sub-map; None begins a new one.
+            twist_camera: (6,) as in ``Keyframe``.
 
         Returns:
             The keyframe's index.
@@ -110,7 +118,9 @@ class LandmarkMap:
             observers=0,
         )
         origin = index if neighbour is None else self.keyframes[neighbour].origin
-        self.keyframes.append(Keyframe(observation, T_camera_world, landmark_of_feature, origin))
+        self.keyframes.append(
+            Keyframe(observation, T_camera_world, landmark_of_feature, origin, twist_camera)
+        )
         self._link(index)
         return index
 
@@ -122,13 +132,19 @@ class LandmarkMap:
         ray = self.landmarks["position"][ids] - centre_world
         self.landmarks["observers"][ids] += 1
         self.landmarks["direction"][ids] += ray / np.linalg.norm(ray, axis=1, keepdims=True)
+        observation = keyframe.observation
         self.landmarks["newest"][ids] = self._observations.append(
             len(features),
             older=self.landmarks["newest"][ids],
             keyframe=index,
             feature=features,
-            measured=keyframe.observation.measured[features],
-            weights=keyframe.observation.weights[features],
+            measured=observation.measured[features],
+            weights=observation.weights[features],
+            slope=-observation.row_shift(
+                observation.pixels[features],
+                apply(keyframe.T_camera_world, self.landmarks["position"][ids])[:, 2],
+                keyframe.twist_camera,
+            ),
         )
 
     def shared_counts(self, landmarks: Ids) -> NDArray[np.int64]:
@@ -193,23 +209,49 @@ class LandmarkMap:
         free = np.full(len(keyframe_ids), -1, np.int32)
         free[np.searchsorted(keyframe_ids, movable)] = np.arange(len(movable))
         rows = np.repeat(np.arange(len(landmarks)), np.diff(first))
+        edges = np.column_stack([local, rows]).astype(np.int32)
+        measured, weights = (
+            self._observations["measured"][observations],
+            self._observations["weights"][observations],
+        )
+        intrinsics = self.keyframes[index].observation.intrinsics
         poses, points, agree = adjust(
             np.array([self.keyframes[k].T_camera_world for k in keyframe_ids]),
             free,
             self.landmarks["position"][landmarks],
             first,
-            np.column_stack([local, rows]).astype(np.int32),
-            self._observations["measured"][observations],
-            self._observations["weights"][observations],
-            self.keyframes[index].observation.intrinsics,
+            edges,
+            measured,
+            weights,
+            intrinsics,
             _BUNDLE_ROUNDS,
             _BUNDLE_ITERATIONS,
         )
+        if self.readout.is_estimated:
+            slopes = self._observations["slope"][observations]
+            self.readout.learn(
+                *common_parameter(
+                    poses, free, points, first, edges, measured, weights, intrinsics, agree, slopes
+                )
+            )
         for k, f in zip(keyframe_ids, free, strict=True):
             if f >= 0:
                 self.keyframes[k].T_camera_world = poses[np.searchsorted(keyframe_ids, k)]
         self.landmarks["position"][landmarks] = points
         self._unlink(observations[~agree])
+
+    def follow_readout(self) -> None:
+        """Observe all keyframes' landmarks anew if the readout time has changed."""
+        if self.readout.seconds == self._observed_with_s:
+            return
+        by_s = self.readout.seconds - self._observed_with_s
+        self._observed_with_s = self.readout.seconds
+        for keyframe in self.keyframes:
+            keyframe.observation = keyframe.observation.swept(
+                keyframe.observation.sweep_camera + by_s * keyframe.twist_camera
+            )
+        rows = slice(self._observations.size)
+        self._observations["measured"][rows, :2] += by_s * self._observations["slope"][rows]
 
     def _unlink(self, observations: Ids) -> None:
         keyframes, features = self._observations["keyframe"], self._observations["feature"]

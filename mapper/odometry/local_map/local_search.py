@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, Transform
+from mapper.core.geometry import Array, Transform, apply
 from mapper.features.hamming import Bits
 from mapper.features.window_matching import match_windows
 from mapper.odometry.config import KeyframeOdometryConfig
@@ -65,6 +65,7 @@ class LocalSearch:
         feature = self.match_near(
             observation,
             pixels,
+            apply(T_camera_world, landmarks["position"][visible])[:, 2],
             octave,
             landmarks["bits"][visible],
             search_px=config.local_search_px,
@@ -99,6 +100,7 @@ class LocalSearch:
         self,
         observation: ImageObservation,
         pixels: Array,
+        depth_m: Array,
         octave: NDArray[np.int32],
         bits: Bits,
         *,
@@ -106,8 +108,13 @@ class LocalSearch:
         taken: NDArray[np.bool_],
         max_ratio: float,
     ) -> Ids:
-        """Return, per predicted pixel, the matching feature or −1; the radius grows with the octave."""
+        """Return, per pixel and depth predicted for the middle row's time, the matching feature or −1.
+
+        The radius grows with the octave.
+        """
         grid = observation.grid
+        if observation.sweep_camera.any():
+            pixels = pixels + observation.row_shift(pixels, depth_m)
         matched: Ids = match_windows(
             pixels,
             octave,

@@ -46,10 +46,12 @@ class MotionPoseTracker:
         T_camera_world = self._predicted(observation.stamp_ns, last, before_last)
         known, points_world, landmark = self._known_points(last)
         pixels = project(T_camera_world, points_world, observation.intrinsics)
+        depth_m = apply(T_camera_world, points_world)[:, 2]
         for search_px in (self._config.search_px, 2.0 * self._config.search_px):
             feature = self._search.match_near(
                 observation,
                 pixels,
+                depth_m,
                 last.observation.octave[known],
                 last.observation.bits[known],
                 search_px=search_px,

@@ -19,7 +19,9 @@ from mapper.odometry.local_map.image_observation import ImageObservation, observ
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
 from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
 from mapper.odometry.local_map.pose_tracker import PoseTracker, TrackedPose, unmatched
+from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.odometry.local_map.relocalizer import Relocalizer
+from mapper.odometry.local_map.rolling_shutter import RollingShutter
 from mapper.places.vocabulary import load_vocabulary
 
 _MIN_START_FEATURES = 100
@@ -43,7 +45,9 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
     def __init__(self, config: KeyframeOdometryConfig, make_tracker: MakePoseTracker) -> None:
         self._config = config
         self._detector = build_detector(config.detector)
-        self._map = LandmarkMap(scale_factor=self._detector.scale_factor)
+        readout = ReadoutTime(config.readout_s, windows_sharing=config.bundle_keyframes)
+        self._shutter = RollingShutter(readout)
+        self._map = LandmarkMap(scale_factor=self._detector.scale_factor, readout=readout)
         self._vocabulary = load_vocabulary(config.vocabulary)
         self._relocalizer = Relocalizer(config, self._map, self._vocabulary)
         self._tracker = make_tracker(self._map, self._relocalizer)
@@ -63,9 +67,11 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
 
     def track(self, observation: ImageObservation) -> FrameResult:
         """Track the next frame, in time order."""
+        observation = self._shutter.predicted(observation)
         tracked_pose = None if self._last is None else self._find_pose(observation, self._last)
         if tracked_pose is None:
             return self._not_found(observation)
+        tracked_pose = self._without_row_shifts(tracked_pose)
         # The motion before a gap does not predict the motion after it.
         before_last = None if self._lost_frames else self._last
         self._lost_frames = self._unknown_frames = 0
@@ -77,9 +83,9 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         links = [self._factor(reference, tracked_pose.reference)] if is_keyframe else []
         return self._result(tracked_pose, is_keyframe=is_keyframe, links=links)
 
-    def view(self, observation: ImageObservation, _twist: Twist | None = None, /) -> ImageView:
-        """Return the view for place recognition. Pure."""
-        return observation.view()
+    def view(self, observation: ImageObservation, twist: Twist | None = None, /) -> ImageView:
+        """Return the view for place recognition, by the readout time as it is known now."""
+        return (observation if twist is None else self._shutter.corrected(observation, twist)).view()
 
     def matches(self) -> FeatureMatches | None:
         """Return the features matched to landmarks, and these landmarks' pixels in an earlier frame."""
@@ -135,6 +141,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         T_camera_world = inverse(observation.T_body_camera) if last is None else last.T_camera_world
         start = TrackedPose(observation, T_camera_world, unmatched(observation), 0, 0, 0.0, "start")
         self._lost_frames = self._unknown_frames = 0
+        self._shutter.restart()
         self._before_last, self._last = None, self._add_keyframe(start, neighbour=None)
         return self._result(self._last, is_keyframe=True)
 
@@ -146,6 +153,14 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
                 return tracked_pose
         candidates = self._relocalizer.candidates(observation, inverse(last.T_camera_world)[:3, 3])
         return self._relocalizer.best_among(candidates, observation, method="relocalised")
+
+    def _without_row_shifts(self, tracked_pose: TrackedPose) -> TrackedPose:
+        """Return a pose without the error of a rolling shutter."""
+        if self._lost_frames or self._last is None:
+            self._shutter.restart()
+            return tracked_pose
+        ids = tracked_pose.landmark_of_feature
+        return self._shutter.refined(tracked_pose, self._last, self._map.landmarks["position"][ids[ids >= 0]])
 
     def _near_features(self, observation: ImageObservation) -> int:
         """Return the number of features near enough to become landmarks."""
@@ -163,14 +178,17 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             tracked_pose.landmark_of_feature,
             new=self._new_landmarks(tracked_pose),
             neighbour=neighbour,
+            twist_camera=self._shutter.twist_camera,
         )
         self._relocalizer.add(index)
         self._map.refine(index, window=config.bundle_keyframes)
+        self._map.follow_readout()
         self._map.cull()
         self._decision.restart()
         keyframe = self._map.keyframes[index]
         return replace(
             tracked_pose,
+            observation=keyframe.observation,
             T_camera_world=keyframe.T_camera_world,
             landmark_of_feature=keyframe.landmark_of_feature,
             reference=index,
@@ -209,6 +227,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             is_keyframe=is_keyframe,
             diagnostics=diagnostics,
             links=links,
+            twist=self._shutter.twist_body(tracked_pose.observation),
         )
 
     def _lost(self, observation: ImageObservation) -> FrameResult:

@@ -76,7 +76,9 @@ def rms_px(
     features: NDArray[np.integer],
 ) -> float:
     """Return the root mean square distance, in pixels, between projected points and their features."""
-    residual_px = project(T_camera_world, points_world, observation.intrinsics) - observation.pixels[features]
+    residual_px = (
+        project(T_camera_world, points_world, observation.intrinsics) - observation.measured[features, :2]
+    )
     return math.sqrt(float((residual_px**2).sum(axis=1).mean()))
 
 

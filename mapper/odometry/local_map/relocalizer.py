@@ -80,7 +80,7 @@ class Relocalizer:
         points_world = self._map.landmarks["position"][ids]
         found = ransac_p3p(
             points_world,
-            observation.pixels[features],
+            observation.measured[features, :2],
             observation.intrinsics,
             tolerance_px=self._config.ransac_tolerance_px,
             iterations=self._config.ransac_iterations,
