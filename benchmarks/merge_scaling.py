@@ -34,7 +34,7 @@ from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import read_map
 from mapper.run.folder import Run, load_run, write_run
 from mapper.run.manifest import Input, Manifest
-from mapper.simulation.config import SCENES
+from mapper.simulation.config import LIDAR_SCENES
 from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source
 from mapper.sources.base import Log
@@ -203,7 +203,7 @@ def main() -> None:
     arguments = parser.parse_args()
     log = arguments.log or arguments.work / "street"
     if not log.exists():
-        write_lidar_log(log, SCENES["street"])
+        write_lidar_log(log, LIDAR_SCENES["street"])
     source = open_source(log)
     for resolution_m in arguments.resolutions:
         folder = arguments.work / f"{resolution_m:g}"

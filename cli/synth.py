@@ -1,14 +1,17 @@
 """``mapper synth``: a synthetic log with exact truth."""
 
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
 
 from cli.console import progress_for
 from cli.environment import prepare_libraries
 from cli.options import Quiet, assignments, merged
+
+Settings = TypeVar("Settings")
 
 
 class SensorKind(StrEnum):
@@ -19,11 +22,19 @@ class SensorKind(StrEnum):
     LINE_LASER = "line-laser"
 
 
-class LidarScene(StrEnum):
-    """Surroundings of a LiDAR."""
+class SceneName(StrEnum):
+    """Surroundings of a camera or of a LiDAR."""
 
+    FLAT = "flat"
+    CORRIDOR = "corridor"
+    HALL = "hall"
+    WHITE_ROOM = "white-room"
+    TWIN_ROOMS = "twin-rooms"
     STREET = "street"
     COURTYARD = "courtyard"
+    FIELD = "field"
+    TUNNEL = "tunnel"
+    STAIRCASE = "staircase"
 
 
 def synth(
@@ -39,13 +50,24 @@ def synth(
         typer.Option(metavar="METRES", help="rgbd: stand still before a bare wall so far away."),
     ] = None,
     scene: Annotated[
-        LidarScene | None, typer.Option(help="lidar: a car round a block, or a yard crossed by hand.")
+        SceneName | None,
+        typer.Option(
+            help="rgbd: flat, corridor, hall, white-room or twin-rooms; "
+            "lidar: street, courtyard, field, tunnel, staircase or flat."
+        ),
     ] = None,
     rings: Annotated[int | None, typer.Option(help="lidar: beams, one above the other.")] = None,
     wheels: Annotated[
         bool, typer.Option("--wheels", help="Wheels carry the sensor; wheels.txt holds their odometry.")
     ] = False,
     noise: Annotated[float | None, typer.Option(help="Times the sensor's noise; 0 is exact.")] = None,
+    uncalibrated: Annotated[
+        bool,
+        typer.Option(
+            "--uncalibrated",
+            help="rgbd: rolling shutter, late depth, lens and depth errors that no calibration mentions.",
+        ),
+    ] = False,
     seed: Annotated[int | None, typer.Option(help="Another scene, another way through it.")] = None,
     set_: Annotated[
         list[str] | None,
@@ -53,7 +75,7 @@ def synth(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Ray-cast a walk through a furnished flat, or a drive through streets, as a log with exact truth.
+    """Ray-cast a walk through rooms, or a LiDAR's way through streets or stairs, as a log with exact truth.
 
     Example: mapper synth logs/spin --path spin --seconds 10 --set sensor.exposure_s=0.01, or: mapper synth
     logs/yard --sensor lidar --scene courtyard --rings 16
@@ -67,6 +89,7 @@ def synth(
                 "--scene": scene,
                 "--rings": rings,
                 "--wheels": wheels or None,
+                "--uncalibrated": uncalibrated or None,
             },
             f"--sensor {sensor}",
         )
@@ -74,27 +97,37 @@ def synth(
         return
 
     from mapper.config.loading import overridden
-    from mapper.simulation.config import SCENES, SynthConfig, SynthWheelsConfig
+    from mapper.simulation.config import CAMERA_SCENES, LIDAR_SCENES, UNCALIBRATED, SynthWheelsConfig
 
     common = {"duration_s": seconds, "seed": seed}
     carried = {"wheels": SynthWheelsConfig() if wheels else None}
     if sensor is SensorKind.RGBD:
         from mapper.simulation import write_tum_log
 
-        _refuse({"--scene": scene, "--rings": rings}, f"--sensor {sensor}")
+        _refuse({"--rings": rings}, f"--sensor {sensor}")
+        start = _scene(CAMERA_SCENES, scene or SceneName.FLAT, sensor)
+        carried |= {"sensor": start.sensor.model_copy(update=UNCALIBRATED if uncalibrated else {})}
         if plane_at is not None:
             _refuse({"--path": path}, "--plane-at")
         given = common | {"path": path, "rooms": rooms} | _at_wall(plane_at) | _camera_noise(noise)
-        flat = overridden(SynthConfig().model_copy(update=carried), merged(assignments(given), set_))
+        indoors = overridden(start.model_copy(update=carried), merged(assignments(given), set_))
         prepare_libraries()
         with progress_for(quiet=quiet).stage("render") as report:
-            write_tum_log(out, flat, on_progress=report)
+            write_tum_log(out, indoors, on_progress=report)
     else:
         from mapper.simulation.lidar import write_lidar_log
 
-        _refuse({"--path": path, "--rooms": rooms, "--plane-at": plane_at}, f"--sensor {sensor}")
+        _refuse(
+            {
+                "--path": path,
+                "--rooms": rooms,
+                "--plane-at": plane_at,
+                "--uncalibrated": uncalibrated or None,
+            },
+            f"--sensor {sensor}",
+        )
         given = common | {"sensor.rings": rings} | _lidar_noise(noise)
-        outdoors = SCENES[scene or LidarScene.STREET].model_copy(update=carried)
+        outdoors = _scene(LIDAR_SCENES, scene or SceneName.STREET, sensor).model_copy(update=carried)
         outdoors = overridden(outdoors, merged(assignments(given), set_))
         prepare_libraries()
         with progress_for(quiet=quiet).stage("scan") as report:
@@ -123,6 +156,17 @@ def _line_laser(
             f"{out}: a drive with a line laser; calibrate with mapper sensor line-laser-calibrate "
             f"{out}/shots --reach {config.reach_m:g} {vehicle} --out C.toml"
         )
+
+
+def _scene(known: Mapping[str, Settings], name: SceneName, sensor: SensorKind) -> Settings:
+    """Return the settings of a scene by its name."""
+    from mapper.core.errors import ConfigError
+
+    if name not in known:
+        raise ConfigError(
+            f"--scene {name}: has no meaning with --sensor {sensor}; want one of {', '.join(known)}"
+        )
+    return known[name]
 
 
 def _refuse(options: dict[str, object], beside: str) -> None:

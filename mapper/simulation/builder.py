@@ -109,6 +109,14 @@ class Builder:
         self.rows.append((cx, cy, low[2] + halves[2], *halves, place.yaw_rad + turn_rad))
         self.skins.append(tuple((faces or {}).get(face, skin) for face in range(FACES)))
 
+    def repeat(self, numbers: Sequence[int], *, shift_m: float) -> None:
+        """Add boxes once more, so far along x."""
+        for i in numbers:
+            x, *rest = self.rows[i]
+            self.names.append(self.names[i])
+            self.rows.append((x + shift_m, *rest))
+            self.skins.append(self.skins[i])
+
     def boxes(self) -> Boxes:
         """Return the solids."""
         table = np.array(self.rows, dtype=np.float64).reshape(-1, 7)

@@ -1,7 +1,7 @@
 """Settings of synthetic logs: the world, the path through it, and the camera or LiDAR."""
 
 from collections.abc import Mapping
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
@@ -27,6 +27,18 @@ class SensorConfig(Config):
     """Standard deviation of the image noise in grey levels."""
     exposure_s: NonNegativeFloat = 0.0
     """Motion during this time blurs the image; 0 is a perfect shutter."""
+    readout_s: NonNegativeFloat = 0.0
+    """Rolling shutter: from the first row of an image to its last; the stamp is that of the middle row."""
+    depth_delay_s: float = 0.0
+    """How much later than the colour image its depth is measured."""
+    radial_k1: float = 0.0
+    radial_k2: float = 0.0
+    """Distortion of the lens (Brown 1971), which the log's calibration does not mention."""
+    depth_scale: PositiveFloat = 1.0
+    """Multiplies every depth, as wrong units do."""
+    disparity_warp_px: NonNegativeFloat = 0.0
+    """Standard deviation over the image of a smooth error of the disparity, the same in all frames (Herrera
+    et al. 2012), in pixels at 640 px; depth is wrong by its square times this over 43.5 m px."""
 
 
 class SynthWheelsConfig(Config):
@@ -42,11 +54,40 @@ class SynthWheelsConfig(Config):
     """Standard deviation of the heading after a metre of uneven floor; it grows with the way's root."""
 
 
+class DisturbanceConfig(Config):
+    """What disturbs a recording; by default nothing does."""
+
+    gap_start_s: NonNegativeFloat = 0.0
+    gap_duration_s: NonNegativeFloat = 0.0
+    """For this long all frames are missing."""
+    freeze_start_s: NonNegativeFloat = 0.0
+    freeze_duration_s: NonNegativeFloat = 0.0
+    """For this long the frame before is repeated, image and depth, while the camera moves on."""
+    hand_start_s: NonNegativeFloat = 0.0
+    hand_duration_s: NonNegativeFloat = 0.0
+    """For this long a hand is held before the lens and moves with the camera."""
+    hand_share: Annotated[float, Field(gt=0.0, le=1.0)] = 0.75
+    """About how much of the image it covers."""
+    hand_distance_m: PositiveFloat = 0.45
+    """Below the sensor's ``min_depth_m`` it has no depth."""
+    gain_step_s: NonNegativeFloat = 0.0
+    """The image's brightness jumps at every multiple of this time; 0 never."""
+    gain_factor: Annotated[float, Field(ge=1.0)] = 3.0
+    """Largest factor by which it is brighter or darker, in turns; what gets brighter than white is white."""
+
+
 class SynthConfig(Config):
     """One synthetic log: the same configuration gives the same bytes."""
 
     seed: NonNegativeInt = 0
 
+    scene: Literal["flat", "hall", "twin-rooms"] = "flat"
+    """"flat": a ring of rooms; "hall": one hall or corridor with closed doors; "twin-rooms": two rooms that
+    are alike to the last thing, 10 m apart on a corridor."""
+    hall_length_m: Annotated[float, Field(ge=4.0)] = 15.0
+    hall_width_m: Annotated[float, Field(ge=2.0)] = 13.0
+    hall_clearance_m: Annotated[float, Field(ge=0.6)] = 4.5
+    """From the walls of a hall to the way round, which is the nearest that the camera comes to them."""
     rooms: Annotated[int, Field(ge=4, multiple_of=2)] = 4
     """Rooms of the flat, in two rows; doors join them to one ring."""
     room_size_m: Annotated[float, Field(ge=3.6)] = 4.4
@@ -56,6 +97,10 @@ class SynthConfig(Config):
     posters_per_room: NonNegativeInt = 8
     moving_boxes: NonNegativeInt = 0
     """Boxes that travel round the flat all the time."""
+    people: NonNegativeInt = 0
+    """People who each cross the view once, within two metres of the camera."""
+    texture_contrast: Ratio = 1.0
+    """Contrast of all textures and of the light; with 0 everything is evenly white, and only depth varies."""
     texture_px_per_m: PositiveInt = 256
     """Detail of walls and floors; smaller is faster to make and enough for small images."""
 
@@ -94,6 +139,7 @@ class SynthConfig(Config):
     """For this long the lens is covered: black images without depth; 0 never."""
     image_format: Literal["png", "jpg"] = "png"
     """How colour images are stored; "jpg" is a fifth of the size and not exact."""
+    disturbances: DisturbanceConfig = DisturbanceConfig()
 
     @model_validator(mode="after")
     def _wheels_stay_on_the_floor(self) -> Self:
@@ -101,6 +147,68 @@ class SynthConfig(Config):
             raise ValueError("path desk moves up and down, which wheels do not; want loop or spin")
         return self
 
+    @model_validator(mode="after")
+    def _hall_has_room_for_the_way(self) -> Self:
+        narrow_m = min(self.hall_length_m, self.hall_width_m)
+        if self.scene == "hall" and 2.0 * self.hall_clearance_m + 0.4 > narrow_m:
+            raise ValueError(
+                f"hall_clearance_m {self.hall_clearance_m:g}: leaves no way through a {narrow_m:g} m; "
+                f"want at most {narrow_m / 2.0 - 0.2:.2f}"
+            )
+        if self.scene != "flat" and self.path == "desk":
+            raise ValueError(f"path desk: scene {self.scene} has no desk; want loop, spin or wall")
+        return self
+
+
+_LATER = {
+    SynthConfig: {
+        *("moving_boxes", "wheels", "scene", "hall_length_m", "hall_width_m", "hall_clearance_m"),
+        *("people", "texture_contrast", "disturbances"),
+    },
+    SensorConfig: {
+        *("readout_s", "depth_delay_s", "radial_k1", "radial_k2", "depth_scale", "disparity_warp_px"),
+    },
+}
+"""Settings that came after the first logs."""
+
+
+def set_or_first(config: SynthConfig, *, exclude: set[str]) -> dict[str, Any]:
+    """Return the settings, without later ones at their defaults: so older logs' files keep their bytes."""
+    settings = config.model_dump(mode="json", exclude=exclude)
+    for part, into in ((config, settings), (config.sensor, settings["sensor"])):
+        for name in _LATER[type(part)]:
+            if getattr(part, name) == type(part).model_fields[name].default:
+                into.pop(name, None)
+    return settings
+
+
+CAMERA_SCENES: Mapping[str, SynthConfig] = {
+    "flat": SynthConfig(),
+    "corridor": SynthConfig(
+        scene="hall",
+        hall_length_m=22.0,
+        hall_width_m=4.5,
+        hall_clearance_m=1.8,
+        room_height_m=3.0,
+        furniture_per_room=3,
+        posters_per_room=12,
+    ),
+    "hall": SynthConfig(scene="hall", room_height_m=4.5, furniture_per_room=3, posters_per_room=12),
+    "white-room": SynthConfig(texture_contrast=0.0, posters_per_room=0),
+    "twin-rooms": SynthConfig(scene="twin-rooms"),
+}
+"""Where ``mapper synth`` begins with a camera."""
+
+UNCALIBRATED: Mapping[str, float] = {
+    "exposure_s": 0.008,
+    "readout_s": 0.03,
+    "depth_delay_s": 0.015,
+    "radial_k1": 0.03,
+    "radial_k2": -0.06,
+    "depth_scale": 1.01,
+    "disparity_warp_px": 0.2,
+}
+"""Settings of a sensor whose errors a factory calibration leaves, as those of a real Kinect."""
 
 IDEAL_SENSOR = SensorConfig(
     axial_noise_ratio=0.0,
@@ -149,10 +257,12 @@ class LidarSynthConfig(Config):
 
     seed: NonNegativeInt = 0
 
-    scene: Literal["street", "courtyard"] = "street"
-    """"street": round a block between facades; "courtyard": a yard with few things in it."""
+    scene: Literal["street", "courtyard", "field", "tunnel", "staircase", "flat"] = "street"
+    """"street": round a block between facades; "courtyard": a yard with few things in it; "field": open
+    ground with fewer; "tunnel": a smooth tube, there and back; "staircase": up, a storey a lap; "flat": the
+    rooms of the synthetic camera."""
     loop_m: Annotated[float, Field(ge=30.0)] = 300.0
-    """Length of the closed route, along which the scene is built."""
+    """Length of the closed route, along which the scene is built; staircase and flat have their own."""
     slope_rad: Annotated[float, Field(ge=0.0, lt=0.3)] = 0.01
     """Mean slope of the ground."""
     undulation_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
@@ -198,7 +308,45 @@ COURTYARD = LidarSynthConfig(
 Its sweeps are free of motion: with poses half a second apart, the turning within a sweep is unknown.
 """
 
-SCENES: Mapping[str, LidarSynthConfig] = {"street": STREET, "courtyard": COURTYARD}
+_PUCK = LidarSensorConfig(
+    rings=16, lowest_ring_rad=-0.2618, highest_ring_rad=0.2618, azimuth_steps=900, min_range_m=0.3
+)
+"""The rings of a Velodyne VLP-16."""
+
+LIDAR_SCENES: Mapping[str, LidarSynthConfig] = {
+    "street": STREET,
+    "courtyard": COURTYARD,
+    "field": LidarSynthConfig(
+        scene="field", loop_m=120.0, undulation_m=0.2, speed_mps=3.0, mount_height_m=1.4, sensor=_PUCK
+    ),
+    "tunnel": LidarSynthConfig(
+        scene="tunnel", loop_m=200.0, slope_rad=0.0, undulation_m=0.0, speed_mps=3.0, sensor=_PUCK
+    ),
+    "staircase": LidarSynthConfig(
+        scene="staircase",
+        slope_rad=0.0,
+        undulation_m=0.0,
+        laps=3.0,
+        overlap_m=0.0,
+        rate_hz=5.0,
+        speed_mps=0.5,
+        mount_height_m=1.3,
+        tilt_rad=0.15,
+        yaw_swing_rad=0.3,
+        sensor=_PUCK,
+    ),
+    "flat": LidarSynthConfig(
+        scene="flat",
+        slope_rad=0.0,
+        undulation_m=0.0,
+        overlap_m=2.0,
+        rate_hz=5.0,
+        speed_mps=0.8,
+        mount_height_m=1.3,
+        tilt_rad=0.1,
+        sensor=_PUCK,
+    ),
+}
 """Where ``mapper synth`` begins."""
 
 IDEAL_LIDAR = LidarSensorConfig(range_noise_m=0.0, dropout_ratio=0.0, min_range_m=0.0)

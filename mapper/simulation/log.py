@@ -11,7 +11,7 @@ from mapper.core.timebase import seconds_text_from_ns
 from mapper.runtime.atomic import new_folder
 from mapper.runtime.ordered_map import ordered_map
 from mapper.simulation.boxes import write_scene
-from mapper.simulation.config import SynthConfig
+from mapper.simulation.config import SynthConfig, set_or_first
 from mapper.simulation.path import seconds_of
 from mapper.simulation.source import CameraSimulator
 from mapper.sources.calibration_file import calibration_text
@@ -78,9 +78,8 @@ def _write(folder: Path, simulator: CameraSimulator, on_progress: Callable[[int,
     (folder / "calibration.toml").write_text(calibration, encoding="utf-8")
     if log.wheels is not None:
         write_wheels(folder, log.wheels, sensor=log.sensor)
-    unset = {name for name in ("moving_boxes", "wheels") if not getattr(config, name)}
-    unset |= {"wall_distance_m"} if config.path != "wall" else set()
-    settings = config.model_dump(mode="json", exclude=unset)  # so that older logs' files keep their bytes
+    unset = {"wall_distance_m"} if config.path != "wall" else set()
+    settings = set_or_first(config, exclude=unset)
     moving = simulator.movers.as_json(seconds_of(simulator.truth.stamps_ns))
     write_scene(folder / "scene.json", simulator.scene.boxes, settings, moving=moving)
 

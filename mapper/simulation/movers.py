@@ -1,4 +1,4 @@
-"""Boxes that travel round the flat, low enough that the camera passes above them; never part of the truth."""
+"""What moves in the world and is never part of the truth: boxes, low enough for the camera, and people."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,6 +9,8 @@ from mapper.core.geometry import Array
 from mapper.simulation.boxes import Boxes
 from mapper.simulation.builder import ORIGIN, Builder, Faces, Skin
 from mapper.simulation.config import SynthConfig
+from mapper.simulation.path import Motion
+from mapper.simulation.people import PARTS, Walkers, build_people, make_walkers
 from mapper.simulation.plan import closed_spline
 from mapper.simulation.scene import Scene
 from mapper.simulation.streams import Stream, rng_of
@@ -21,14 +23,15 @@ _SAMPLES_PER_POINT = 400
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Movers:
-    """Boxes on the closed way round, each at its own constant speed.
+    """Boxes on the closed way round and people on straight ways, each at its own constant speed.
 
     Attributes:
-        still: The boxes with their middles above the world's origin.
+        still: The boxes, then all parts of the people, standing on the world's origin.
         faces: How they look, in the textures of the scene; None if there are no boxes.
         route: (R, 2) control points of the way, as in ``Plan``.
         starts_m: (M,) where along the way each box is at the start.
         speeds_mps: (M,) negative against the walker's direction.
+        walkers: The ways of the people.
     """
 
     still: Boxes
@@ -36,6 +39,7 @@ class Movers:
     route: Array
     starts_m: Array
     speeds_mps: Array
+    walkers: Walkers
 
     def __len__(self) -> int:
         return len(self.still)
@@ -45,6 +49,7 @@ class Movers:
         parameter, along_m = _lengths(self.route)
         here_m = np.mod(self.starts_m + self.speeds_mps * time_s, along_m[-1])
         xy = closed_spline(self.route, np.interp(here_m, along_m, parameter))
+        xy = np.concatenate([xy, np.repeat(self.walkers.at(time_s), PARTS, axis=0)])
         return replace(self.still, centers_world=self.still.centers_world + np.pad(xy, ((0, 0), (0, 1))))
 
     def scene_at(self, scene: Scene, time_s: float) -> Scene:
@@ -73,8 +78,8 @@ class Movers:
         return [{**row, "centers_m": centers[:, i].tolist()} for i, row in enumerate(rows)]
 
 
-def make_movers(config: SynthConfig, scene: Scene) -> Movers:
-    """Return the moving boxes of a configuration, spread over the way round."""
+def make_movers(config: SynthConfig, scene: Scene, motion: Motion) -> Movers:
+    """Return the moving boxes of a configuration, spread over the way round, and the people it meets."""
     rng, count = rng_of(config.seed, Stream.MOVERS), config.moving_boxes
     builder = Builder()
     for _ in range(count):
@@ -88,7 +93,10 @@ def make_movers(config: SynthConfig, scene: Scene) -> Movers:
     lap_m = float(_lengths(scene.plan.route)[1][-1])
     starts_m = lap_m * (np.arange(count) + rng.uniform(0.2, 0.8, count)) / max(count, 1)
     speeds_mps = rng.uniform(_SLOWEST_MPS, _FASTEST_MPS, count) * rng.choice([-1.0, 1.0], count)
-    return Movers(builder.boxes(), builder.faces() if count else None, scene.plan.route, starts_m, speeds_mps)
+    build_people(config, scene, builder)
+    faces = builder.faces() if builder.names else None
+    walkers = make_walkers(config, motion)
+    return Movers(builder.boxes(), faces, scene.plan.route, starts_m, speeds_mps, walkers)
 
 
 def _lengths(route: Array) -> tuple[Array, Array]:

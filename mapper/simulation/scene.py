@@ -1,9 +1,11 @@
-"""The furnished flat: walls, floors, ceilings, doors, furniture and pictures."""
+"""The scene of a camera: walls, floors, ceilings, doors, furniture and pictures."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import assert_never
 
 import numpy as np
 
+from mapper.core.frames import Image
 from mapper.core.geometry import Array
 from mapper.simulation import surfaces
 from mapper.simulation.atlas import Atlas, build_atlas
@@ -15,6 +17,7 @@ from mapper.simulation.plan import (
     DESK_SIZE_M,
     DOOR_HEIGHT_M,
     DOOR_WIDTH_M,
+    TWIN_DISTANCE_M,
     WALL_M,
     Plan,
     Room,
@@ -26,6 +29,7 @@ from mapper.simulation.streams import Stream, rng_of
 from mapper.simulation.workshop import Workshop
 
 _SLAB_M = 0.2
+_WHITE = np.array([232.0, 230.0, 226.0])
 _ROUTE_CLEARANCE_M = 0.5
 _TRIES = 40
 
@@ -66,12 +70,37 @@ class _Footprint:
 
 
 def make_scene(config: SynthConfig) -> Scene:
-    """Return the flat of a configuration; its seed decides everything that is left open."""
+    """Return the scene of a configuration; its seed decides everything that is left open."""
     plan = make_plan(config, rng_of(config.seed, Stream.PLAN))
     builder = Builder()
     rng = rng_of(config.seed, Stream.FURNITURE)
     studio = Studio(builder, Workshop(builder, rng, px_per_m=config.texture_px_per_m), rng)
-    strips = [_room_surfaces(config, builder, room, number) for number, room in enumerate(plan.rooms)]
+    match config.scene:
+        case "flat":
+            _flat(config, studio, plan)
+        case "hall":
+            _hall(config, studio, plan)
+        case "twin-rooms":
+            _twin_rooms(config, studio, plan)
+        case _:
+            assert_never(config.scene)
+    faces, textures = builder.faces(), builder.textures
+    if config.texture_contrast < 1.0:
+        textures = [_whitened(texture, config.texture_contrast) for texture in textures]
+        shades = 1.0 - config.texture_contrast * (1.0 - faces.shades)
+        faces = replace(faces, shades=shades)
+    return Scene(builder.boxes(), faces, build_atlas(textures), plan)
+
+
+def _whitened(texture: Image, contrast: float) -> Image:
+    """Return a texture of which a share is left, the rest white."""
+    image: Image = np.rint(contrast * texture + (1.0 - contrast) * _WHITE).astype(np.uint8)
+    return image
+
+
+def _flat(config: SynthConfig, studio: Studio, plan: Plan) -> None:
+    """Build the rooms, their doors, and a desk in the first of them."""
+    strips = [_room_surfaces(config, studio.builder, room, number) for number, room in enumerate(plan.rooms)]
     footprints: list[_Footprint] = []
     for wall in plan.walls:
         _build_wall(config, studio, wall, plan=plan, strips=strips)
@@ -85,24 +114,89 @@ def make_scene(config: SynthConfig) -> Scene:
     for room in plan.rooms:
         _furnish(config, studio, room, keep_free=keep_free, footprints=footprints)
         _hang_pictures(config, studio, room, plan=plan, footprints=footprints)
-    return Scene(builder.boxes(), builder.faces(), build_atlas(builder.textures), plan)
 
 
-def _room_surfaces(config: SynthConfig, builder: Builder, room: Room, number: int) -> Skin:
+def _hall(config: SynthConfig, studio: Studio, plan: Plan) -> None:
+    """Build one room with painted walls, closed doors along its sides, and little else."""
+    (room,) = plan.rooms
+    strips = [_room_surfaces(config, studio.builder, room, 0, plain=True)]
+    for wall in plan.walls:
+        _build_wall(config, studio, wall, plan=plan, strips=strips)
+    footprints = _close_doors(studio, room)
+    _furnish(config, studio, room, keep_free=route_points(plan), footprints=footprints)
+    _hang_pictures(config, studio, room, plan=plan, footprints=footprints)
+
+
+def _close_doors(studio: Studio, room: Room) -> list[_Footprint]:
+    """Add closed doors with a sign beside each, some metres apart along all four walls."""
+    size, footprints = (0.95, 0.05, 2.05), []
+    width_m, depth_m = room.x1_m - room.x0_m, room.y1_m - room.y0_m
+    for yaw_rad, length_m, back_m in (
+        (0.0, width_m, depth_m),
+        (np.pi, width_m, depth_m),
+        (-np.pi / 2, depth_m, width_m),
+        (np.pi / 2, depth_m, width_m),
+    ):
+        wall = Place(float(room.center_m[0]), float(room.center_m[1]), yaw_rad)
+        at_m = -length_m / 2 + studio.rng.uniform(0.8, 2.5)
+        while at_m < length_m / 2 - 1.2:
+            place = Place(*wall.world(at_m, -back_m / 2 + 0.03), yaw_rad)
+            footprints.append(_footprint(place, (size[0] + 0.9, 0.4, size[2])))
+            front = {3: studio.shop.front((size[0], size[2]), columns=1, rows=2)}
+            low = (-size[0] / 2, -size[1] / 2, 0.0)
+            studio.builder.box("door", place, low=low, size=size, skin=studio.shop.wood(), faces=front)
+            sign = (0.2, 0.02, 0.14)
+            faces = {3: studio.shop.document((sign[0], sign[2]))}
+            low = (size[0] / 2 + 0.1, -0.03, 1.5)
+            studio.builder.box("sign", place, low=low, size=sign, skin=studio.shop.paint(), faces=faces)
+            at_m += studio.rng.uniform(3.0, 6.0)
+    return footprints
+
+
+def _twin_rooms(config: SynthConfig, studio: Studio, plan: Plan) -> None:
+    """Build one room, copy all of it, and lay the corridor before both."""
+    first, _, corridor = plan.rooms
+    number = len(plan.rooms) - 1
+    strips = [_room_surfaces(config, studio.builder, first, 0)] * 2
+    begin = len(studio.builder.names)
+    corridor_strip = _room_surfaces(config, studio.builder, corridor, number, plain=True)
+    own = len(studio.builder.names)
+    strips.append(corridor_strip)
+    ours = [wall for wall in plan.walls if 0 in (wall.room_below, wall.room_above)]
+    shift = np.array([TWIN_DISTANCE_M, 0.0])
+    footprints: list[_Footprint] = []
+    for wall in ours:
+        _build_wall(config, studio, wall, plan=plan, strips=strips)
+        if wall.door_m is not None:
+            footprints.append(_hang_door(studio, wall, wall.door_m))
+    keep_free = np.vstack([route_points(plan), route_points(plan) - shift])
+    _furnish(config, studio, first, keep_free=keep_free, footprints=footprints)
+    _hang_pictures(config, studio, first, plan=plan, footprints=footprints)
+    studio.builder.repeat([*range(begin), *range(own, len(studio.builder.names))], shift_m=TWIN_DISTANCE_M)
+    for wall in plan.walls:
+        if not {0, 1} & {wall.room_below, wall.room_above}:
+            _build_wall(config, studio, wall, plan=plan, strips=strips)
+    _hang_pictures(config, studio, corridor, plan=plan, footprints=[])
+
+
+def _room_surfaces(
+    config: SynthConfig, builder: Builder, room: Room, number: int, *, plain: bool = False
+) -> Skin:
     """Add a room's floor and ceiling; return the strip of wall covering that runs once around it."""
     rng = rng_of(config.seed, Stream.SURFACES, number)
     px_per_m = float(config.texture_px_per_m)
     x0, y0 = room.x0_m - WALL_M / 2, room.y0_m - WALL_M / 2
     width, depth = room.x1_m - room.x0_m + WALL_M, room.y1_m - room.y0_m + WALL_M
     shape = (round(depth * px_per_m), round(width * px_per_m))
-    floor = surfaces.FLOORS[(number + config.seed) % len(surfaces.FLOORS)](rng, shape, px_per_m)
-    ceiling = surfaces.plaster(rng, shape, px_per_m)
+    pave = surfaces.linoleum if plain else surfaces.FLOORS[(number + config.seed) % len(surfaces.FLOORS)]
+    floor = pave(rng, shape, px_per_m)
+    ceiling = (surfaces.painted if plain else surfaces.plaster)(rng, shape, px_per_m)
     for name, low, image in (("floor", -_SLAB_M, floor), ("ceiling", config.room_height_m, ceiling)):
         skin = Skin(builder.texture(image))
         builder.box(name, ORIGIN, low=(x0, y0, low), size=(width, depth, _SLAB_M), skin=skin)
     around = 2 * (room.x1_m - room.x0_m + room.y1_m - room.y0_m)
     strip = (round(config.room_height_m * px_per_m), round(around * px_per_m))
-    covering = surfaces.WALLS[(number + config.seed) % len(surfaces.WALLS)]
+    covering = surfaces.painted if plain else surfaces.WALLS[(number + config.seed) % len(surfaces.WALLS)]
     return Skin(builder.texture(covering(rng, strip, px_per_m)), px_per_m)
 
 

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.frames import DepthImage, Image
-from mapper.simulation.config import SensorConfig
-from mapper.simulation.noise import Field32
+from mapper.simulation.config import SensorConfig, SynthConfig
+from mapper.simulation.noise import Field32, fractal
 from mapper.simulation.raycast import Rendering
+from mapper.simulation.streams import Stream, rng_of
 
 BASELINE_M = 0.075
 """Between projector and infrared camera (Khoshelham & Elberink 2012)."""
@@ -25,7 +26,12 @@ _TINY_M, _ONE = np.float32(1e-3), np.float32(1.0)
 
 
 def observe(
-    rendering: Rendering, *, focal_px: float, sensor: SensorConfig, rng: np.random.Generator
+    rendering: Rendering,
+    *,
+    focal_px: float,
+    sensor: SensorConfig,
+    rng: np.random.Generator,
+    warp_px: Field32 | None = None,
 ) -> tuple[Image, DepthImage]:
     """Return the (H, W, 3) uint8 colour and (H, W) float32 depth in metres that the sensor reports.
 
@@ -36,15 +42,27 @@ def observe(
         focal_px: Focal length of the rendering.
         sensor: How good the sensor is.
         rng: This frame's own noise.
+        warp_px: (H, W) constant error of the disparity; None is none.
     """
     image_rng, depth_rng, loss_rng = rng.spawn(3)
     image = _grainy(rendering.rgb, sensor.image_noise_levels, image_rng)
-    depth_m = _noisy_depth(rendering.depth_m, sensor, depth_rng)
+    measured_m = rendering.depth_m if warp_px is None else _warped(rendering.depth_m, warp_px)
+    depth_m = _noisy_depth(measured_m, sensor, depth_rng)
+    if sensor.depth_scale != 1.0:
+        depth_m *= np.float32(sensor.depth_scale)
     lost = _out_of_range(rendering.depth_m, sensor, loss_rng)
     if sensor.dropout_ratio > 0.0:
         lost |= _unseen(rendering, focal_px, sensor.dropout_ratio, loss_rng)
     depth_m[lost] = 0.0
     return image, depth_m
+
+
+def warp_of(config: SynthConfig) -> Field32:
+    """Return the (H, W) constant error of a camera's disparity, pixels at 640 px across."""
+    shape = (config.height_px, config.width_px)
+    cell_px = (shape[0] / 3.0, shape[1] / 4.0)
+    smooth = fractal(rng_of(config.seed, Stream.WARP), shape, cell_px=cell_px, octaves=2)
+    return np.float32(config.sensor.disparity_warp_px) * smooth
 
 
 def axial_sigma_m(depth_m: NDArray[np.floating]) -> Field32:
@@ -68,6 +86,12 @@ def _whole_normals(rng: np.random.Generator, shape: tuple[int, ...], *, sigma: f
     quantiles = [NormalDist(0.0, sigma).inv_cdf((k + 0.5) / 256.0) for k in range(256)]
     picks = np.frombuffer(rng.bytes(math.prod(shape)), dtype=np.uint8)
     return np.rint(quantiles).astype(np.int16)[picks].reshape(shape)
+
+
+def _warped(depth_m: DepthImage, warp_px: Field32) -> DepthImage:
+    """Return depths whose disparities are wrong by so much (Herrera et al. 2012, eq. 5)."""
+    inverse_m = 1.0 / np.maximum(depth_m, _TINY_M) + warp_px / np.float32(BASELINE_M * DISPARITY_FOCAL_PX)
+    return np.asarray(1.0 / np.maximum(inverse_m, _TINY_M), dtype=np.float32)
 
 
 def _noisy_depth(depth_m: DepthImage, sensor: SensorConfig, rng: np.random.Generator) -> DepthImage:

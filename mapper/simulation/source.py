@@ -10,20 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.frames import Frame, PinholeCamera, RgbdFrame, Scan, Sensor
-from mapper.core.geometry import Array, angle_between
+from mapper.core.geometry import Array
 from mapper.core.trajectory import Trajectory
 from mapper.simulation.config import LidarSynthConfig, SynthConfig
+from mapper.simulation.disturbances import between, disturbed, shown_frames
 from mapper.simulation.movers import Movers, make_movers
 from mapper.simulation.path import Motion, frame_stamps, make_motion, seconds_of
-from mapper.simulation.raycast import Rendering, render
+from mapper.simulation.raycast import Rendering
 from mapper.simulation.scene import Scene, make_scene
-from mapper.simulation.sensor import observe
+from mapper.simulation.sensor import observe, warp_of
+from mapper.simulation.shutter import Shutter
 from mapper.simulation.streams import Stream, rng_of
 from mapper.simulation.wheel_readings import counted
 from mapper.sources.base import ImageFiles, Log
-
-_BLUR_STEP_PX = 2.0
-_MAX_SUBEXPOSURES = 12
 
 
 def camera_of(config: SynthConfig) -> PinholeCamera:
@@ -106,20 +105,27 @@ class CameraSimulator:
         camera: The camera.
         motion: Its pose at any time.
         truth: Exact T_world_camera of every frame, also of those that the log drops.
-        kept: Indices of the frames that are in the log; the first always is.
+        kept: Indices of the frames that are in the log.
     """
 
     def __init__(self, config: SynthConfig, scene: Scene | None = None) -> None:
         self.config = config
         self.scene = make_scene(config) if scene is None else scene
-        self.movers: Movers = make_movers(config, self.scene)
         self.camera = camera_of(config)
         self.motion: Motion = make_motion(config, self.scene)
+        self.movers: Movers = make_movers(config, self.scene, self.motion)
+        self._shutter = Shutter(
+            self.camera, config.sensor, self.motion, partial(self.movers.scene_at, self.scene)
+        )
         stamps_ns = frame_stamps(config, self.motion)
         self.truth = Trajectory(stamps_ns, self.motion.poses(seconds_of(stamps_ns)))
         chances = rng_of(config.seed, Stream.DROPS).random(len(stamps_ns))
         chances[0] = 1.0
-        self.kept: NDArray[np.intp] = np.flatnonzero(chances >= config.drop_ratio)
+        self._times_s = seconds_of(stamps_ns)
+        self._shown = shown_frames(config.disturbances, self._times_s)
+        gap = between(self._times_s, config.disturbances.gap_start_s, config.disturbances.gap_duration_s)
+        self.kept: NDArray[np.intp] = np.flatnonzero((chances >= config.drop_ratio) & ~gap)
+        self._warp_px = warp_of(config) if config.sensor.disparity_warp_px > 0.0 else None
 
     def log(self) -> Log:
         """Return the log that the camera records."""
@@ -134,48 +140,24 @@ class CameraSimulator:
         return log.subset(self.kept)
 
     def render(self, index: int) -> Rendering:
-        """Return the exact image and depth of a frame, blurred by motion during the exposure."""
-        middle_s = seconds_of(self.truth.stamps_ns[index : index + 1])
-        scene = self.movers.scene_at(self.scene, float(middle_s[0]))
-        exact = render(scene, self.camera, self.truth.T_world_body[index])
-        exposure_s = self.config.sensor.exposure_s
-        if exposure_s == 0.0:
-            return exact
-        count = self._subexposures(index)
-        offsets_s = exposure_s * ((np.arange(count) + 0.5) / count - 0.5)
-        total = np.zeros(exact.rgb.shape, dtype=np.uint16)
-        times_s = middle_s + offsets_s
-        for time_s, T_world_camera in zip(times_s, self.motion.poses(times_s), strict=True):
-            scene = self.movers.scene_at(self.scene, float(time_s))
-            total += render(scene, self.camera, T_world_camera).rgb
-        blurred = ((total + count // 2) // count).astype(np.uint8)
-        return Rendering(blurred, exact.depth_m, exact.surface, exact.cosine)
-
-    def _subexposures(self, index: int) -> int:
-        """Return how many images make a smooth blur: one for each two pixels of motion at a metre."""
-        half_s = self.config.sensor.exposure_s / 2.0
-        middle_s = seconds_of(self.truth.stamps_ns[index : index + 1])
-        begin, end = self.motion.poses(middle_s + np.array([-half_s, half_s]))
-        turn_px = angle_between(begin[:3, :3], end[:3, :3]) * self.camera.fx_px
-        shift_px = float(np.linalg.norm(end[:3, 3] - begin[:3, 3])) * self.camera.fx_px
-        return int(np.clip(math.ceil((turn_px + shift_px) / _BLUR_STEP_PX), 1, _MAX_SUBEXPOSURES))
+        """Return a frame's image and depth before the sensor's noise."""
+        time_s = float(self._times_s[index])
+        exact = self._shutter.take(time_s, self.truth.T_world_body[index])
+        return disturbed(exact, self.config, time_s)
 
     def observe(self, index: int, colour: bool = True) -> RgbdFrame:
         """Return a frame as the sensor reports it, in grey where ``colour`` is false."""
-        if self._covered(index):
+        shown = int(self._shown[index])
+        if between(self._times_s[shown], self.config.blackout_start_s, self.config.blackout_duration_s):
             shape = (self.camera.height_px, self.camera.width_px)
             image, depth_m = np.zeros((*shape, 3), dtype=np.uint8), np.zeros(shape, dtype=np.float32)
         else:
             image, depth_m = observe(
-                self.render(index),
+                self.render(shown),
                 focal_px=self.camera.fx_px,
                 sensor=self.config.sensor,
-                rng=rng_of(self.config.seed, Stream.SENSOR, index),
+                rng=rng_of(self.config.seed, Stream.SENSOR, shown),
+                warp_px=self._warp_px,
             )
         frame = RgbdFrame(int(self.truth.stamps_ns[index]), image, depth_m, self.camera)
         return frame if colour else replace(frame, image=frame.gray)
-
-    def _covered(self, index: int) -> bool:
-        start_s = self.config.blackout_start_s
-        time_s = float(seconds_of(self.truth.stamps_ns[index]))
-        return start_s <= time_s < start_s + self.config.blackout_duration_s

@@ -17,6 +17,10 @@ class Stream(IntEnum):
     MOVERS = 6
     GROUND = 7
     WHEELS = 8
+    PEOPLE = 9
+    HAND = 10
+    GAINS = 11
+    WARP = 12
 
 
 def rng_of(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:

@@ -27,6 +27,7 @@ Surface = Callable[[np.random.Generator, tuple[int, int], float], Image]
 """(rng, (H, W) in pixels, pixels per metre) -> image."""
 
 _PLASTERS: tuple[Color, ...] = ((214, 205, 186), (186, 202, 196), (208, 186, 164), (196, 196, 206))
+_PAINTS: tuple[Color, ...] = ((214, 212, 204), (204, 210, 206), (216, 206, 190))
 _WALLPAPERS: tuple[Color, ...] = ((206, 196, 160), (150, 170, 150), (172, 150, 150), (140, 156, 180))
 WOODS: tuple[Color, ...] = (
     (168, 120, 76),
@@ -50,6 +51,23 @@ def plaster(rng: np.random.Generator, shape: tuple[int, int], px_per_m: float) -
     image = shaded(image, cv2.GaussianBlur(stains, (0, 0), max(0.008 * px_per_m, 0.3)))
     _crack(rng, image, px_per_m)
     _chip(rng, image, px_per_m, per_m2=24.0)
+    return image
+
+
+def painted(rng: np.random.Generator, shape: tuple[int, int], px_per_m: float) -> Image:
+    """An even coat of paint with few marks, as in offices."""
+    gain = 0.03 * fractal(rng, shape, cell_px=(1.5 * px_per_m, 1.5 * px_per_m), octaves=3)
+    image = tinted(_PAINTS[rng.integers(len(_PAINTS))], gain)
+    _chip(rng, image, px_per_m, per_m2=2.5)
+    return image
+
+
+def linoleum(rng: np.random.Generator, shape: tuple[int, int], px_per_m: float) -> Image:
+    """A plain marbled floor with scuffs and joints every two metres."""
+    gain = 0.04 * fractal(rng, shape, cell_px=(0.15 * px_per_m, 0.15 * px_per_m), octaves=4)
+    image = tinted(jittered(rng, (134, 142, 138), 14.0), gain)
+    image[:: max(int(2.0 * px_per_m), 1)] = (96, 100, 98)
+    _chip(rng, image, px_per_m, per_m2=5.0)
     return image
 
 

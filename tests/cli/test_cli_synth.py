@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from mapper.simulation.config import UNCALIBRATED
 from tests.support.command_line import invoke
 
 TINY = ["--path", "desk", "--seconds", "0.2", "--set", "width_px=64", "--set", "height_px=48", "--quiet"]
@@ -51,3 +52,42 @@ def test_an_option_of_the_other_sensor_is_refused(tmp_path, sensor, option):
     assert result.exit_code == 1
     assert f"{option[0]} {option[1]}: has no meaning with --sensor {sensor}" in result.stderr
     assert not (tmp_path / "log").exists()
+
+
+@pytest.mark.parametrize(
+    ("scene", "name", "setting"),
+    [
+        ("corridor", "hall_width_m", 4.5),
+        ("white-room", "texture_contrast", 0.0),
+        ("flat", "room_size_m", 4.4),
+    ],
+)
+def test_a_cameras_scene_begins_with_its_own_settings(tmp_path, scene, name, setting):
+    small = ["--seconds", "0.1", *TINY[4:], "--set", "texture_px_per_m=8"]
+    arguments = ["synth", str(tmp_path / "log"), "--scene", scene, "--set", "sensor.readout_s=0.01", *small]
+    assert invoke(*arguments).exit_code == 0
+    config = json.loads((tmp_path / "log/scene.json").read_text())["config"]
+    assert config[name] == setting
+    assert config["sensor"]["readout_s"] == 0.01
+    assert "depth_scale" not in config["sensor"]
+
+
+def test_an_uncalibrated_sensor_has_every_error_but_those_set_by_hand(tmp_path):
+    arguments = ["synth", str(tmp_path / "log"), "--uncalibrated", "--set", "sensor.depth_scale=1.03", *TINY]
+    assert invoke(*arguments).exit_code == 0
+    sensor = json.loads((tmp_path / "log/scene.json").read_text())["config"]["sensor"]
+    assert sensor["depth_scale"] == 1.03
+    assert {name: sensor[name] for name in UNCALIBRATED if name != "depth_scale"} == {
+        name: value for name, value in UNCALIBRATED.items() if name != "depth_scale"
+    }
+    refused = invoke("synth", str(tmp_path / "other"), "--sensor", "lidar", "--uncalibrated")
+    assert "--uncalibrated True: has no meaning with --sensor lidar" in refused.stderr
+
+
+@pytest.mark.parametrize("scene", ["tunnel", "staircase"])
+def test_a_lidar_goes_into_tunnels_and_up_stairs(tmp_path, scene):
+    small = ["--seconds", "1", "--set", "sensor.azimuth_steps=60", "--rings", "4", "--quiet"]
+    assert (
+        invoke("synth", str(tmp_path / "log"), "--sensor", "lidar", "--scene", scene, *small).exit_code == 0
+    )
+    assert json.loads((tmp_path / "log/scene.json").read_text())["config"]["scene"] == scene

@@ -7,7 +7,14 @@ import pytest
 
 from mapper.core.errors import DataError, SourceError
 from mapper.core.geometry import angle_between, apply, inverse
-from mapper.simulation.config import COURTYARD, IDEAL_LIDAR, STREET, LidarSensorConfig, LidarSynthConfig
+from mapper.simulation.config import (
+    COURTYARD,
+    IDEAL_LIDAR,
+    LIDAR_SCENES,
+    STREET,
+    LidarSensorConfig,
+    LidarSynthConfig,
+)
 from mapper.simulation.lidar import (
     LidarSimulator,
     make_outdoor_scene,
@@ -29,8 +36,13 @@ def exact(config, **knobs):
     return config.model_copy(update={"sensor": EXACT, **knobs})
 
 
-@pytest.fixture(scope="module", params=[STREET, COURTYARD], ids=["street", "courtyard"])
+@pytest.fixture(scope="module", params=LIDAR_SCENES.values(), ids=LIDAR_SCENES)
 def source(request):
+    return LidarSimulator(exact(request.param))
+
+
+@pytest.fixture(scope="module", params=[STREET, COURTYARD], ids=["street", "courtyard"])
+def outdoors(request):
     return LidarSimulator(exact(request.param))
 
 
@@ -72,11 +84,11 @@ def test_undoing_the_motion_puts_every_point_on_a_surface(source):
         assert distances_m(source.scene, undistorted_world(source, index, scan)).max() < 1e-4
 
 
-def test_leaving_the_motion_in_does_not(source):
-    index = len(source.truth) // 3
-    scan = source.observe(index)
-    points_world = apply(source.truth.T_world_body[index], scan.points_body.astype(float))
-    assert np.percentile(distances_m(source.scene, points_world), 90) > 0.02
+def test_leaving_the_motion_in_does_not(outdoors):
+    index = len(outdoors.truth) // 3
+    scan = outdoors.observe(index)
+    points_world = apply(outdoors.truth.T_world_body[index], scan.points_body.astype(float))
+    assert np.percentile(distances_m(outdoors.scene, points_world), 90) > 0.02
 
 
 def test_two_frozen_scans_lie_on_the_same_surfaces_by_their_true_motion(source):
@@ -89,8 +101,8 @@ def test_two_frozen_scans_lie_on_the_same_surfaces_by_their_true_motion(source):
     assert np.linalg.norm(T_world_second[:3, 3] - T_world_first[:3, 3]) > 0.3
 
 
-def test_the_same_seed_is_the_same_log_and_another_is_not(source):
-    config = source.config.model_copy(update={"sensor": LidarSensorConfig(**SMALL)})
+def test_the_same_seed_is_the_same_log_and_another_is_not(outdoors):
+    config = outdoors.config.model_copy(update={"sensor": LidarSensorConfig(**SMALL)})
     once, again = (LidarSimulator(config) for _ in range(2))
     other = LidarSimulator(config.model_copy(update={"seed": 1}))
     late = again.observe(5)  # before the others: no scan depends on what was asked for before

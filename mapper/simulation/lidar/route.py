@@ -2,16 +2,18 @@
 
 import math
 from dataclasses import dataclass
+from typing import assert_never
 
 import numpy as np
 
 from mapper.core.geometry import Array
 from mapper.core.rotations import rotation_from_quaternion
 from mapper.core.timebase import NS_PER_S, Stamps
-from mapper.simulation.config import LidarSynthConfig
+from mapper.simulation.config import LidarSynthConfig, SynthConfig
+from mapper.simulation.lidar.staircase import ROUTE_SIZE_M, heights_m
 from mapper.simulation.lidar.terrain import Ground
 from mapper.simulation.path import START_NS
-from mapper.simulation.plan import closed_spline
+from mapper.simulation.plan import closed_spline, make_plan
 from mapper.simulation.streams import Stream, rng_of
 
 _CONTROL_STEP_M = 2.0
@@ -19,6 +21,9 @@ _SAMPLES_PER_STEP = 40
 _LARGEST_CORNER_M = 8.0
 _CORNER_SHARE = 0.35
 _SWAY_M = 0.4
+_TUNNEL_TURN_M = 1.0
+_TUNNEL_START_SHARE = 0.77
+"""Of the way from the middle of the lower side: just after the turn at the left end."""
 _SPEED_SWING, _SPEED_PERIOD_S = 0.25, 9.0
 
 
@@ -31,11 +36,13 @@ class Route:
         size_m: Width and depth of the rectangle that it follows.
         travelled_m: (S + 1,) distance from the start at equal steps of the spline's parameter; the last is
             the length of the whole way.
+        climbs: Whether it leads up a staircase.
     """
 
     control: Array
     size_m: tuple[float, float]
     travelled_m: Array
+    climbs: bool = False
 
     @property
     def length_m(self) -> float:
@@ -53,6 +60,12 @@ class Route:
         headings: Array = np.arctan2(ahead[:, 1], ahead[:, 0])
         return headings
 
+    def heights_m(self, along_m: Array) -> Array:
+        """Return (N,) heights of the way above the ground at (N,) distances from the start."""
+        if not self.climbs:
+            return np.zeros(len(along_m))
+        return heights_m(self.points(along_m), along_m / self.length_m)
+
     def _parameter(self, along_m: Array) -> Array:
         grid = np.linspace(0.0, len(self.control), len(self.travelled_m))
         parameter: Array = np.interp(np.mod(along_m, self.length_m), self.travelled_m, grid)
@@ -61,6 +74,32 @@ class Route:
 
 def make_route(config: LidarSynthConfig) -> Route:
     """Return the way of a configuration: about ``loop_m`` long, swaying a little in its lane."""
+    match config.scene:
+        case "street" | "courtyard" | "field":
+            return _round_a_block(config)
+        case "tunnel":
+            size_m = (config.loop_m / 2.0, 2.0 * _TUNNEL_TURN_M)
+            control = _rounded_rectangle(size_m, radius_m=_TUNNEL_TURN_M, step_m=_TUNNEL_TURN_M)
+            start = round(_TUNNEL_START_SHARE * len(control))
+            control = np.roll(control, -start, axis=0)
+            return Route(control, size_m, _travelled_m(control))
+        case "staircase":
+            control = _rounded_rectangle(ROUTE_SIZE_M, radius_m=ROUTE_SIZE_M[1] / 2.0, step_m=0.3)
+            return Route(control, ROUTE_SIZE_M, _travelled_m(control), climbs=True)
+        case "flat":
+            control = make_plan(flat_of(config), rng_of(config.seed, Stream.PLAN)).route
+            width_m, depth_m = np.ptp(control, axis=0).tolist()
+            return Route(control, (width_m, depth_m), _travelled_m(control))
+        case _:
+            assert_never(config.scene)
+
+
+def flat_of(config: LidarSynthConfig) -> SynthConfig:
+    """Return the flat in which a LiDAR moves."""
+    return SynthConfig(seed=config.seed, texture_px_per_m=16)
+
+
+def _round_a_block(config: LidarSynthConfig) -> Route:
     rng = rng_of(config.seed, Stream.PLAN)
     aspect = rng.uniform(1.2, 1.6)
     # A rectangle of this perimeter, made longer by what its rounded corners cut off.
@@ -70,19 +109,23 @@ def make_route(config: LidarSynthConfig) -> Route:
         radius_m = _LARGEST_CORNER_M
         short_m = (config.loop_m + (8.0 - 2.0 * math.pi) * radius_m) / (2.0 * (1.0 + aspect))
     size_m = (aspect * short_m, short_m)
-    control = _rounded_rectangle(size_m, radius_m=radius_m)
+    control = _rounded_rectangle(size_m, radius_m=radius_m, step_m=_CONTROL_STEP_M)
     angle_rad = np.linspace(0.0, 2.0 * np.pi, len(control), endpoint=False)
     rates, phases_rad = np.arange(2, 7), rng.uniform(0.0, 2.0 * np.pi, 5)
     sway_m = _SWAY_M * np.sin(angle_rad[:, None] * rates + phases_rad).mean(axis=1)
     along = np.roll(control, -1, axis=0) - np.roll(control, 1, axis=0)
     left = np.column_stack([-along[:, 1], along[:, 0]]) / np.linalg.norm(along, axis=1, keepdims=True)
     control = control + sway_m[:, None] * left
+    return Route(control, size_m, _travelled_m(control))
+
+
+def _travelled_m(control: Array) -> Array:
     parameter = np.linspace(0.0, len(control), _SAMPLES_PER_STEP * len(control) + 1)
     steps_m = np.linalg.norm(np.diff(closed_spline(control, parameter), axis=0), axis=1)
-    return Route(control, size_m, np.concatenate([[0.0], np.cumsum(steps_m)]))
+    return np.concatenate([[0.0], np.cumsum(steps_m)])
 
 
-def _rounded_rectangle(size_m: tuple[float, float], *, radius_m: float) -> Array:
+def _rounded_rectangle(size_m: tuple[float, float], *, radius_m: float, step_m: float) -> Array:
     """Return (R, 2) points around the origin, anticlockwise from the middle of the lower side."""
     half_sides = np.array([size_m[0], size_m[1], size_m[0], size_m[1]]) / 2.0 - radius_m
     corner_m = math.pi / 2.0 * radius_m
@@ -92,7 +135,7 @@ def _rounded_rectangle(size_m: tuple[float, float], *, radius_m: float) -> Array
         lengths += [2.0 * half, corner_m]
     knots_m = np.cumsum([0.0, *lengths, half_sides[0]])
     headings_rad = np.repeat(np.arange(5) * math.pi / 2.0, 2)
-    count = round(knots_m[-1] / _CONTROL_STEP_M)
+    count = round(knots_m[-1] / step_m)
     fine = 200 * count
     middles_m = (np.arange(fine) + 0.5) * knots_m[-1] / fine
     heading = np.interp(middles_m, knots_m, headings_rad)
@@ -131,7 +174,8 @@ class Drive:
         T_world_lidar = np.tile(np.eye(4), (len(times_s), 1, 1))
         T_world_lidar[:, :3, :3] = np.stack([np.cross(left, up), left, up], axis=2)
         T_world_lidar[:, :2, 3] = points
-        T_world_lidar[:, 2, 3] = self.ground.height_m(points) + config.mount_height_m
+        height_m = self.ground.height_m(points) + config.mount_height_m
+        T_world_lidar[:, 2, 3] = height_m + self.route.heights_m(along_m)
         if config.tilt_rad > 0.0:
             half_rad = 0.5 * config.tilt_rad * self._sine(times_s, 0.23, 1)
             toward_rad = 2.0 * np.pi * 0.07 * times_s + self.phases_rad[2]

@@ -1,20 +1,24 @@
-"""Outdoor scenes around a closed route: a block of streets, or a yard with few things in it."""
+"""Scenes around a closed route: streets, a yard, a field, a tunnel, a staircase, a flat."""
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import compress
+from typing import assert_never
 
 import numpy as np
 
 from mapper.core.geometry import Array
-from mapper.simulation.builder import Place
+from mapper.simulation.builder import ORIGIN, Place
 from mapper.simulation.config import LidarSynthConfig
 from mapper.simulation.lidar import things
 from mapper.simulation.lidar.cast import World, sort_into_cells
 from mapper.simulation.lidar.facades import row
-from mapper.simulation.lidar.route import Route, make_route
-from mapper.simulation.lidar.solids import Site, Solids
+from mapper.simulation.lidar.route import Route, flat_of, make_route
+from mapper.simulation.lidar.solids import Shape, Site, Solids
+from mapper.simulation.lidar.staircase import build_staircase, storeys_of
 from mapper.simulation.lidar.terrain import Ground, make_ground
+from mapper.simulation.scene import make_scene
 from mapper.simulation.streams import Stream, rng_of
 
 _FACADE_M = 8.0
@@ -22,7 +26,19 @@ _FACADE_M = 8.0
 _HOUSE_M, _SMALLEST_BLOCK_M = 11.0, 10.0
 _CLEARANCE_M, _YARD_CLEARANCE_M = 1.5, 2.0
 _YARD_MARGIN_M = 5.0
+_FIELD_MARGIN_M = 25.0
+_TUNNEL_END_M, _TUNNEL_SIDE_M, _TUNNEL_HEIGHT_M = 3.0, 2.5, 4.5
 _TRIES = 40
+
+Count = tuple[Callable[[Site, Place, np.random.Generator], None], int, int]
+"""A thing, and how many of it there are at least and at most."""
+_YARD_THINGS: Sequence[Count] = (
+    (things.tree, 4, 7),
+    (things.bench, 2, 4),
+    (things.bicycle, 2, 5),
+    (things.bin_, 0, 2),
+)
+_FIELD_THINGS: Sequence[Count] = ((things.tree, 3, 5), (things.bush, 2, 4), (things.pole, 1, 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,8 +69,22 @@ def make_outdoor_scene(config: LidarSynthConfig) -> OutdoorScene:
     )
     site = Site(ground)
     rng = rng_of(config.seed, Stream.FURNITURE)
-    build = _street if config.scene == "street" else _courtyard
-    build(site, route, rng)
+    match config.scene:
+        case "street":
+            _street(site, route, rng)
+        case "courtyard":
+            _courtyard(site, route, rng)
+        case "field":
+            _scatter(site, route, rng, _FIELD_THINGS, margin_m=_FIELD_MARGIN_M)
+        case "tunnel":
+            _tunnel(site, route)
+        case "staircase":
+            build_staircase(site, storeys=storeys_of(config.laps))
+        case "flat":
+            boxes = make_scene(flat_of(config)).boxes
+            return OutdoorScene(Solids(boxes, np.full(len(boxes), Shape.BOX)), ground, route)
+        case _:
+            assert_never(config.scene)
     return OutdoorScene(site.solids(), ground, route)
 
 
@@ -91,17 +121,35 @@ def _courtyard(site: Site, route: Route, rng: np.random.Generator) -> None:
         side, height = sides[number], float(rng.uniform(2.2, 7.0))
         center = (side.length_m / 2.0, 0.2, height / 2.0 - 0.75)
         site.add("wall", side.outwards(), center=center, size=(side.length_m, 0.4, height + 1.5))
+    _scatter(site, route, rng, _YARD_THINGS, margin_m=_YARD_MARGIN_M - 1.0)
+
+
+def _scatter(
+    site: Site, route: Route, rng: np.random.Generator, counts: Sequence[Count], *, margin_m: float
+) -> None:
+    """Set things anywhere but on the way, up to so far outside of it."""
+    width, depth = (size + 2 * margin_m for size in route.size_m)
     free, taken = _free_points(route), np.empty((0, 2))
-    counts = (things.tree, 4, 7), (things.bench, 2, 4), (things.bicycle, 2, 5), (things.bin_, 0, 2)
     for build, fewest, most in counts:
         for _ in range(int(rng.integers(fewest, most + 1))):
-            spots = rng.uniform(-0.5, 0.5, (_TRIES, 2)) * (width - 2.0, depth - 2.0)
+            spots = rng.uniform(-0.5, 0.5, (_TRIES, 2)) * (width, depth)
             fits = (_distance_m(s, free) > _YARD_CLEARANCE_M and _distance_m(s, taken) > 2.5 for s in spots)
             spot = next(compress(spots, fits), None)
             if spot is not None:
                 taken = np.vstack([taken, spot])
                 place = Place(float(spot[0]), float(spot[1]), float(rng.uniform(-np.pi, np.pi)))
                 build(site, place, rng)
+
+
+def _tunnel(site: Site, route: Route) -> None:
+    """Two walls, a roof and a wall at each end, all smooth."""
+    length, width = route.size_m[0] + 2 * _TUNNEL_END_M, route.size_m[1] + 2 * _TUNNEL_SIDE_M
+    high, thick = _TUNNEL_HEIGHT_M, 0.4
+    for side in (-0.5, 0.5):
+        across, along = side * (width + thick), side * (length + thick)
+        site.add("wall", ORIGIN, center=(0.0, across, high / 2 - 0.25), size=(length, thick, high + 0.5))
+        site.add("wall", ORIGIN, center=(along, 0.0, high / 2 - 0.25), size=(thick, width, high + 0.5))
+    site.add("roof", ORIGIN, center=(0.0, 0.0, high + thick / 2), size=(length, width, thick))
 
 
 def _kerb(site: Site, line: Place, length_m: float, *, free: Array, rng: np.random.Generator) -> None:
