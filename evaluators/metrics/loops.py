@@ -36,7 +36,7 @@ def loop_metrics(
     found = (np.abs(along_m[:, np.newaxis] - found_m) <= looked_every_m).any(axis=1)
     return [
         Metric("loops", len(accepted), "loops"),
-        Metric("loops wrongly accepted", sum(_wrong(accepted, truth)), "loops"),
+        Metric("loops wrongly accepted", sum(wrong_loops(accepted, truth)), "loops"),
         Metric("true revisits", int(revisits.sum()), "keyframes"),
         Metric("true revisits with a loop", int((found & revisits).sum()), "keyframes"),
     ]
@@ -65,8 +65,8 @@ def _along(keyframes_ns: Stamps, truth: Trajectory) -> Array:
     return along_m
 
 
-def _wrong(accepted: Sequence[LoopClosure], truth: Trajectory) -> list[bool]:
-    """Return for each loop that the truth covers whether it is wrong."""
+def wrong_loops(accepted: Sequence[LoopClosure], truth: Trajectory) -> list[bool]:
+    """Return for each loop that the truth covers whether its measurement is wrong."""
     stamps_ns = np.array([(loop.stamp_i_ns, loop.stamp_j_ns) for loop in accepted], np.int64).reshape(-1, 2)
     index, gap_ns = nearest(truth.stamps_ns, stamps_ns.ravel())
     ends = index.reshape(-1, 2)
