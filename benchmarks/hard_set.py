@@ -1,0 +1,254 @@
+"""The hard set: logs on which tracking has reason to fail, and whether a run that fails says so.
+
+    python benchmarks/hard_set.py CACHE [--data DATA] [--only NAME…] [--seed 1] [--set key=value] [--json OUT]
+    python benchmarks/hard_set.py CACHE --neighbours --only NAME
+
+Logs are made once by `mapper synth` and kept in CACHE. With DATA also `tum_fr1_xyz`, `kitti_00` and
+`mulran_kaist03` in it are mapped, at several strides. Each log is tracked, searched for loops and solved with
+the default settings; no map is made.
+
+`ATE` RMSE of what is placed, SE(3)-aligned, in metres; `path` is the truth's. `tracked`, `doubtful` and
+`lost` frames. `f/r` is the share of right frames that are called doubtful. `wrong`: windows of 1 s whose
+relative pose is off by more than 0.2 m or 5 degrees and, where covariances are known, by more than 5 sigma;
+`silent`: those without a frame that is doubtful or lost (evaluators/metrics/silent_failures.py). `false`:
+accepted loops farther than 0.2 m or 0.1 rad from the truth, of all accepted (evaluators/metrics/loops.py).
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from hard_logs import HARD_LOGS
+
+from cli.main import app
+from evaluators.metrics.loops import wrong_loops
+from evaluators.metrics.silent_failures import check_doubts
+from evaluators.metrics.trajectory import align, associate, ate
+from mapper.config.loading import load_config
+from mapper.core.errors import MapperError
+from mapper.pipeline.components import largest_component
+from mapper.pipeline.solve import solve
+from mapper.pipeline.track import refuse_a_fragment, track_log
+from mapper.run.frame_outcomes import records_of
+from mapper.runtime.progress import SILENT
+from mapper.sources import open_source
+from mapper.sources.base import Log
+
+REAL_LOGS: Mapping[str, Sequence[int]] = {
+    "tum_fr1_xyz": (1, 5, 10, 15, 30),
+    "kitti_00": (1, 2, 3),
+    "mulran_kaist03": (1, 2, 3),
+}
+"""Folders of real logs, and at which strides they are mapped."""
+
+NEIGHBOURS: Mapping[str, Sequence[Sequence[str]]] = {
+    "rgbd": (
+        *([f"odometry.max_depth_m={value}"] for value in (3.0, 5.0, 6.0)),
+        *([f"odometry.detector.max_features={value}"] for value in (800, 1300)),
+        *([f"odometry.keyframe_ratio={value}"] for value in (0.65, 0.85)),
+        ["odometry.bundle_keyframes=7"],
+        ["odometry.local_keyframes=10"],
+        ["odometry.search_px=20"],
+    ),
+    "lidar": (
+        *([f"odometry.max_range_m={value}"] for value in (60.0, 80.0)),
+        *([f"odometry.voxel_m={value}"] for value in (0.3, 0.5)),
+        *([f"odometry.keyframe_distance_m={value}"] for value in (0.7, 1.4)),
+        *([f"odometry.cell_m={value}"] for value in (0.4, 0.7)),
+        ["odometry.max_pair_distance_m=0.7"],
+        ["odometry.keyframe_angle_rad=0.3"],
+    ),
+}
+"""Ten settings beside the defaults by sensor; strides 2 and 3 make them twelve."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Result of one log; numbers are None where the log was refused.
+
+    Attributes:
+        log: Its name, with its stride.
+        frames: Frames of the log.
+        path_m: Length of the true path.
+        tracked: Frames that are placed, and of which nothing is doubted.
+        doubtful: Frames that are placed with a doubt.
+        lost: Frames that are not placed.
+        ate_m: RMSE of the placed frames.
+        flagged_right_ratio: Share of the right frames that are called doubtful.
+        wrong: Windows that are wrong.
+        silent: Windows that are wrong, and nothing is said.
+        silent_at_s: When they begin.
+        worst_silent_m: Largest error of their translations.
+        loops: Accepted loops.
+        false_loops: Those of them that are wrong.
+        seconds: Wall time of tracking and solving.
+        refused: Why no path was made; empty if one was.
+    """
+
+    log: str
+    frames: int
+    path_m: float
+    tracked: int = 0
+    doubtful: int = 0
+    lost: int = 0
+    ate_m: float | None = None
+    flagged_right_ratio: float | None = None
+    wrong: int | None = None
+    silent: int | None = None
+    silent_at_s: tuple[float, ...] = ()
+    worst_silent_m: float | None = None
+    loops: int | None = None
+    false_loops: int | None = None
+    seconds: float = 0.0
+    refused: str = ""
+
+
+HEADER = (
+    f"{'log':<22} {'frames':>6} {'path m':>7} {'ATE m':>8} {'tracked':>7} {'doubtf.':>7} {'lost':>5} "
+    f"{'f/r %':>6} {'wrong':>5} {'silent':>6} {'worst m':>7} {'loops':>5} {'false':>5} {'s':>6}"
+)
+
+
+def line(row: Row) -> str:
+    """Return a row of the table."""
+    start = f"{row.log:<22} {row.frames:>6} {row.path_m:>7.2f} "
+    if row.ate_m is None or row.flagged_right_ratio is None:
+        return f"{start}refused: {row.refused}"
+    return (
+        f"{start}{row.ate_m:>8.4f} {row.tracked:>7} {row.doubtful:>7} {row.lost:>5} "
+        f"{100 * row.flagged_right_ratio:>6.1f} {row.wrong:>5} {row.silent:>6} {row.worst_silent_m:>7.2f} "
+        f"{row.loops:>5} {row.false_loops:>5} {row.seconds:>6.1f}"
+    )
+
+
+def mapped(log: Log, name: str, overrides: Sequence[str] = ()) -> Row:
+    """Track and solve a log as ``mapper build`` does, and compare with the truth.
+
+    Raises:
+        SystemExit: The log has no truth.
+    """
+    if log.truth is None:
+        raise SystemExit(f"{log.path}: has no truth to measure against")
+    stamps_ns = log.stamps_ns
+    during = (log.truth.stamps_ns >= stamps_ns[0]) & (log.truth.stamps_ns <= stamps_ns[-1])
+    path_m = float(np.linalg.norm(np.diff(log.truth.positions_world[during], axis=0), axis=1).sum())
+    config = load_config(None, overrides, sensor=log.sensor)
+    began = time.perf_counter()
+    row = Row(name, len(log), path_m)
+    try:
+        tracking = largest_component(track_log(log, config, progress=SILENT), progress=SILENT)
+        refuse_a_fragment(tracking, config, sensor=log.sensor)
+        solved = solve(tracking.graph, tracking.loops, config.graph)
+        tracking = replace(tracking, graph=solved.graph, loops=solved.loops)
+        tracking = largest_component(tracking, progress=SILENT)
+        seconds = time.perf_counter() - began
+        trajectory, records = tracking.trajectory(), records_of(tracking.tracks, tracking.skipped)
+        matched = associate(trajectory, log.truth)
+        rmse_m = ate(align(matched, "se3").moved(matched)).rmse
+    except MapperError as error:
+        return replace(row, refused=str(error))
+    check = check_doubts(trajectory, records, log.truth)
+    accepted = [loop for loop in tracking.loops if loop.verdict == "accepted"]
+    outcomes = [record.outcome for record in records]
+    return replace(
+        row,
+        tracked=outcomes.count("tracked"),
+        doubtful=outcomes.count("doubtful"),
+        lost=outcomes.count("lost") + outcomes.count("skipped"),
+        ate_m=rmse_m,
+        flagged_right_ratio=check.flagged_right_ratio,
+        wrong=check.wrong,
+        silent=check.silent,
+        silent_at_s=check.silent_at_s,
+        worst_silent_m=check.worst_m,
+        loops=len(accepted),
+        false_loops=sum(wrong_loops(accepted, log.truth)),
+        seconds=seconds,
+    )
+
+
+def logs(cache: Path, data: Path | None, only: Sequence[str], seed: int) -> Iterator[tuple[str, Log]]:
+    """Yield every log with its name; synthetic ones are made where they are not there yet.
+
+    Raises:
+        SystemExit: A name is unknown.
+    """
+    real = {name: strides for name, strides in REAL_LOGS.items() if data and (data / name).exists()}
+    if unknown := set(only) - set(HARD_LOGS) - set(real):
+        raise SystemExit(f"no log is called {', '.join(sorted(unknown))}; want of {[*HARD_LOGS, *real]}")
+    for name, hard in HARD_LOGS.items():
+        if not only or name in only:
+            folder = cache / (name if seed == 1 else f"{name}_s{seed}")
+            if not folder.exists():
+                arguments = ["synth", str(folder), *hard.arguments, "--seed", str(seed), "--quiet"]
+                app(arguments, standalone_mode=False)
+            yield folder.name, open_source(folder)
+    for name, strides in real.items():
+        if data and (not only or name in only):
+            log = open_source(data / name)
+            for stride in strides:
+                yield f"{name}:{stride}", log.subset(np.arange(0, len(log), stride))
+
+
+def neighbours(log: Log, name: str, overrides: Sequence[str]) -> list[Row]:
+    """Map a log with the defaults, with ten neighbouring settings, and at every 2nd and 3rd frame."""
+    rows = [mapped(log, name, overrides)]
+    print(line(rows[0]), flush=True)
+    for setting in NEIGHBOURS[log.sensor]:
+        rows.append(mapped(log, setting[0].removeprefix("odometry."), [*overrides, *setting]))
+        print(line(rows[-1]), flush=True)
+    for stride in (2, 3):
+        rows.append(mapped(log.subset(np.arange(0, len(log), stride)), f"stride {stride}", overrides))
+        print(line(rows[-1]), flush=True)
+    errors_m = [np.inf if row.ate_m is None else row.ate_m for row in rows[1:]]
+    median_m, worst_m = float(np.median(errors_m)), max(errors_m)
+    silent = max(row.silent or 0 for row in rows)
+    print(
+        f"{name}: {len(errors_m)} neighbours: ATE median {median_m:.4f} m, worst {worst_m:.4f} m "
+        f"({worst_m / median_m:.2f} times the median); most silent windows {silent}"
+    )
+    return rows
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("cache", type=Path, help="folder of the synthetic logs")
+    parser.add_argument("--data", type=Path, help="folder of the real logs")
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="these logs")
+    parser.add_argument("--seed", type=int, default=1, help="of the synthetic logs")
+    parser.add_argument("--set", dest="overrides", action="append", default=[], help="key.path=value")
+    parser.add_argument("--neighbours", action="store_true", help="12 neighbouring settings on each log")
+    parser.add_argument("--json", type=Path, help="file for the table as JSON")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    arguments.cache.mkdir(parents=True, exist_ok=True)
+    print(HEADER)
+    rows: list[Row] = []
+    for name, log in logs(arguments.cache, arguments.data, arguments.only, arguments.seed):
+        if arguments.neighbours:
+            rows += neighbours(log, name, arguments.overrides)
+        else:
+            rows.append(mapped(log, name, arguments.overrides))
+            print(line(rows[-1]), flush=True)
+        if arguments.json:
+            arguments.json.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+    if not arguments.neighbours:
+        silent = [row.log for row in rows if row.silent]
+        false = sum(row.false_loops or 0 for row in rows)
+        refused = [row.log for row in rows if row.refused]
+        print(
+            f"{len(rows)} logs: silent failures in {len(silent)} ({', '.join(silent) or 'none'}), "
+            f"{false} false loops, refused {len(refused)} ({', '.join(refused) or 'none'})"
+        )
+
+
+if __name__ == "__main__":
+    main()
