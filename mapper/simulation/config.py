@@ -200,13 +200,13 @@ CAMERA_SCENES: Mapping[str, SynthConfig] = {
 """Where ``mapper synth`` begins with a camera."""
 
 UNCALIBRATED: Mapping[str, float] = {
-    "exposure_s": 0.008,
-    "readout_s": 0.03,
-    "depth_delay_s": 0.015,
-    "radial_k1": 0.03,
-    "radial_k2": -0.06,
+    "exposure_s": 0.012,
+    "readout_s": 0.033,
+    "depth_delay_s": 0.02,
+    "radial_k1": 0.05,
+    "radial_k2": -0.1,
     "depth_scale": 1.01,
-    "disparity_warp_px": 0.2,
+    "disparity_warp_px": 0.3,
 }
 """Settings of a sensor whose errors a factory calibration leaves, as those of a real Kinect."""
 

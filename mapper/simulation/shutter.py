@@ -17,8 +17,8 @@ from mapper.simulation.scene import Scene
 
 _BLUR_STEP_PX = 2.0
 _MAX_SUBEXPOSURES = 12
-_ROLL_STEP_PX = 0.5
-_MAX_BANDS = 48
+_ROLL_STEP_PX = 1.0
+_MAX_BANDS = 24
 _INVERSION_STEPS = 30
 
 
