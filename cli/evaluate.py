@@ -138,7 +138,7 @@ def evaluate(
             "--map-world, --register and --tolerance tell how to compare with --map, which is missing"
         )
     if sharp_log is not None:
-        metrics += _sharpness_of(sharp_log, trajectory)
+        metrics += _sharpness_of(sharp_log, run.tracked_trajectory() if run else trajectory)
     print(_text(metrics, found, Format.JSON if json else format_))
     if plot is not None:
         from evaluators.pictures.map_agreement import write_map_errors

@@ -63,6 +63,7 @@ def _figures(run: "Run") -> "list[Figure]":
     return [
         Figure("log", run.manifest.input.title),
         Figure("frames tracked", f"{counts.tracked} of {counts.listed}"),
+        Figure("frames doubtful", str(counts.doubtful)),
         Figure("frames lost", str(counts.lost)),
         Figure("frames skipped", str(counts.skipped)),
         Figure("nodes", str(counts.nodes)),

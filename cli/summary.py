@@ -20,7 +20,7 @@ def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
     """Return what a run amounts to, a line per fact."""
     counts, timing = run.manifest.counts, run.manifest.timing
     rows = [
-        ("frames", f"{counts.tracked} tracked, {counts.lost} lost, {counts.skipped} skipped"),
+        ("frames", counts.frames_text),
         ("keyframes", f"{counts.nodes}, with {counts.factors} factors"),
         ("loops", _loops_text(run.loops())),
         *((metric.name, _value_text(metric)) for metric in metrics if metric.name.startswith(_SHOWN)),

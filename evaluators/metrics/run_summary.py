@@ -29,6 +29,7 @@ def summary(run: Run, *, alignment: AlignmentKind = "se3") -> dict[str, Value]:
     return {
         "listed_frames": counts.listed,
         "tracked_frames": counts.tracked,
+        "doubtful_frames": counts.doubtful,
         "coverage_ratio": counts.tracked / counts.listed if counts.listed else None,
         "matched_poses": 0 if matched is None else len(matched),
         "ate_m": errors.ate_m,

@@ -134,7 +134,7 @@ def _in_order(points: Points32, colors: Colors, triangles: Triangles) -> Surface
 
 def _views(run: Run, progress: Progress) -> Iterator[_View]:
     """Yield the frames to fuse, read and rectified ahead in threads."""
-    trajectory = run.trajectory()
+    trajectory = run.tracked_trajectory()
     stride = run.config.mesh.frame_stride
     T_world_body = dict(
         zip(trajectory.stamps_ns[::stride].tolist(), trajectory.T_world_body[::stride], strict=True)

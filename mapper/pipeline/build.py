@@ -70,10 +70,10 @@ def build(
         tracking = replace(tracking, graph=solved.graph, loops=solved.loops)
         tracking = largest_component(tracking, progress=progress)
         with writer.clock.stage("level"):
-            level = _level(source, tracking.trajectory(), config)
+            level = _level(source, tracking.tracked_trajectory(), config)
         observer.on_levelled(level.T_level_world)
         tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
-        if warning := _height_warning(source, tracking.trajectory()):
+        if warning := _height_warning(source, tracking.tracked_trajectory()):
             progress.note(warning)
             known = writer.manifest.input
             writer.update(input=known.model_copy(update={"notes": (*known.notes, warning)}))

@@ -18,12 +18,12 @@ DISCONNECTED = "disconnected"
 
 
 def largest_component(tracking: TrackingResult, *, progress: Progress) -> TrackingResult:
-    """Return the component with most frames, and note how many frames are left out.
+    """Return the component with most tracked frames, and note how many frames are left out.
 
     After a loss the odometry may begin a new component. Until a loop connects the two, their relative pose
     is unknown, and a map of both would be a guess: the frames left out count as lost.
     """
-    frames = Counter(track.node for track in tracking.placed)
+    frames = Counter(track.node for track in tracking.tracked)
     parts = components(tracking.graph)
     largest = max(parts, key=lambda nodes: sum(frames[node] for node in nodes), default=[])
     return component_of(tracking, largest[0], progress=progress) if largest else tracking
@@ -60,7 +60,15 @@ def _lost_unless(track: FrameResult, kept: Set[int]) -> FrameResult:
     nothing = Diagnostics(
         track.diagnostics.features, 0, 0, 0.0, track.diagnostics.residual_unit, DISCONNECTED
     )
-    return replace(track, node=None, T_node_body=np.eye(4), is_keyframe=False, diagnostics=nothing)
+    return replace(
+        track,
+        node=None,
+        T_node_body=np.eye(4),
+        is_keyframe=False,
+        diagnostics=nothing,
+        doubts=(),
+        covariance=None,
+    )
 
 
 def _refused_unless(loop: LoopClosure, kept: Set[int]) -> LoopClosure:

@@ -32,6 +32,7 @@ from mapper.run.folder import (
     refuse_another_log,
     write_run,
 )
+from mapper.run.frame_outcomes import FrameRecord
 from mapper.run.manifest import Solve, Status, Timing
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.results import RunResults, load_results
@@ -128,7 +129,20 @@ def _with_trajectory(run: Run, trajectory: Trajectory) -> StoredTracking:
         raise RunError(f"{run.path}: none of the trajectory's {len(trajectory)} stamps is one of the run's")
     graph = tracked.graph
     moved = {node: T_world_body.get(graph.stamps_ns[node], T) for node, T in graph.T_world_node.items()}
-    return replace(tracked, trajectory=trajectory, graph=PoseGraph(moved, graph.stamps_ns, graph.factors))
+    records = [_given(record) if record.stamp_ns in T_world_body else record for record in tracked.records]
+    return replace(
+        tracked,
+        records=records,
+        trajectory=trajectory,
+        graph=PoseGraph(moved, graph.stamps_ns, graph.factors),
+    )
+
+
+def _given(record: FrameRecord) -> FrameRecord:
+    """Return the record of a frame whose pose a user gave: no doubt of the tracking concerns that pose."""
+    if record.outcome != "doubtful":
+        return record
+    return replace(record, outcome="tracked", doubts=(), sigmas=None, pose_in_node=None)
 
 
 def _copy_kept_files(folder: Path, new: Path) -> None:
@@ -165,7 +179,7 @@ def fuse_into(
         ):
             maps = fuse_log(
                 source,
-                trajectory,
+                results.tracked,
                 config,
                 progress=progress,
                 on_snapshot=lambda snapshot: log_snapshot(log, snapshot),

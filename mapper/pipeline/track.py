@@ -18,6 +18,7 @@ from mapper.loops.factory import build_loop_detector
 from mapper.odometry.base import FrameResult, Odometry
 from mapper.odometry.factory import build_odometry
 from mapper.odometry.given_poses import poses_for
+from mapper.run.doubtful_frames import placed_by_neighbours
 from mapper.run.frame_outcomes import records_of
 from mapper.run.observers import NULL_OBSERVER, Observer, Step
 from mapper.run.stored_tracking import StoredTracking
@@ -62,11 +63,23 @@ class TrackingResult:
         """The results of the frames that were not lost."""
         return [track for track in self.tracks if track.node is not None]
 
+    @property
+    def tracked(self) -> list[FrameResult]:
+        """The results of the frames that were placed without a doubt."""
+        return [track for track in self.placed if not track.doubts]
+
     def trajectory(self) -> Trajectory:
         """Return T_world_body = T_world_node · T_node_body of every frame that was not lost."""
+        return self._poses(self.placed)
+
+    def tracked_trajectory(self) -> Trajectory:
+        """Return the same of the frames that were placed without a doubt."""
+        return self._poses(self.tracked)
+
+    def _poses(self, tracks: Sequence[FrameResult]) -> Trajectory:
         return trajectory_from(
             (track.stamp_ns, self.graph.T_world_node[track.node] @ track.T_node_body)
-            for track in self.tracks
+            for track in tracks
             if track.node is not None
         )
 
@@ -165,30 +178,35 @@ def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: 
     """Refuse to make a map from too little.
 
     Raises:
-        TrackingError: Fewer frames were tracked than the configuration asks for.
+        TrackingError: Fewer frames were tracked, without a doubt, than the configuration asks for.
     """
-    read, placed = len(tracking.tracks), len(tracking.placed)
+    read, tracked = len(tracking.tracks), len(tracking.tracked)
     enough = max(config.min_tracked_frames, config.min_tracked_ratio * read)
-    if placed >= enough:
+    if tracked >= enough:
         return
     if read == 0 and tracking.skipped:
         raise TrackingError(
             f"none of {len(tracking.skipped)} frames could be read; the first: {tracking.skipped[0].reason}"
         )
     hint = _HINTS[config.odometry.kind if config.odometry.kind in _BY_POSES else sensor]
+    doubtful = len(tracking.placed) - tracked
+    found = f"only {tracked} of {read} frames read could be tracked"
+    if doubtful:
+        found += f", {doubtful} more are doubtful"
     raise TrackingError(
-        f"only {placed} of {read} frames read could be tracked, want at least {enough:.0f}; "
-        f"{hint} (min_tracked_frames and min_tracked_ratio set the limit)"
+        f"{found}, want at least {enough:.0f}; {hint} "
+        "(min_tracked_frames and min_tracked_ratio set the limit)"
     )
 
 
 def from_tracking(tracking: TrackingResult, truth: Trajectory | None) -> StoredTracking:
     """Return what the first pass over a log found."""
+    records = records_of(tracking.tracks, tracking.skipped)
     return StoredTracking(
-        records=records_of(tracking.tracks, tracking.skipped),
+        records=records,
         skipped=tracking.skipped,
         frame_ms=tracking.frame_ms,
-        trajectory=tracking.trajectory(),
+        trajectory=placed_by_neighbours(tracking.trajectory(), tracking.graph, records),
         graph=tracking.graph,
         loops=tracking.loops,
         truth=truth,

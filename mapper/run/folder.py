@@ -15,6 +15,7 @@ from mapper.graph.g2o import read_g2o
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure, read_closures
 from mapper.run import files
+from mapper.run.doubtful_frames import without_doubtful
 from mapper.run.fingerprint import fingerprint
 from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records
 from mapper.run.manifest import (
@@ -52,8 +53,12 @@ class Run:
     manifest: Manifest
 
     def trajectory(self) -> Trajectory:
-        """Return the solved body poses of all tracked frames, in the levelled world."""
+        """Return the solved body poses of all placed frames, doubtful ones too, in the levelled world."""
         return read_tum(self.path / files.TRAJECTORY)
+
+    def tracked_trajectory(self) -> Trajectory:
+        """Return the poses of the frames that maps are made from: those that are not doubtful."""
+        return without_doubtful(self.trajectory(), self.records())
 
     def truth(self) -> Trajectory | None:
         """Return the true body poses, in the truth's own frame, if the log has them."""

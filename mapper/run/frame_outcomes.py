@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -10,6 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from mapper.core.errors import DataError, RunError
+from mapper.core.rotations import quaternion_from_rotation
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.runtime.atomic import write_text
 from mapper.sources.base import Skipped
@@ -25,6 +26,7 @@ _SIGMAS = (
     "sigma_y_m",
     "sigma_z_m",
 )
+_POSE = tuple(f"in_node_{name}" for name in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"))
 _COLUMNS = (
     "stamp_ns",
     "outcome",
@@ -39,6 +41,7 @@ _COLUMNS = (
     "unobservable",
     "doubts",
     *_SIGMAS,
+    *_POSE,
 )
 _DOUBTS_JOINED_BY = "; "
 _NOTHING = Diagnostics(features=0, matches=0, inliers=0, residual=0.0, residual_unit="", method="")
@@ -58,6 +61,8 @@ class FrameRecord:
         doubts: Why the pose may be wrong, a phrase each.
         sigmas: Standard deviations of the pose relative to its node, or of a keyframe's to the keyframe
             before it: rotation about and translation along the body's x, y, z (rad, m). None if unknown.
+        pose_in_node: Of a doubtful frame that is no node: its pose as tracked, x y z (m) and qx qy qz qw, to
+            which neighbours were added. None of all others.
     """
 
     stamp_ns: int
@@ -67,6 +72,7 @@ class FrameRecord:
     diagnostics: Diagnostics
     doubts: tuple[str, ...] = ()
     sigmas: tuple[float, ...] | None = None
+    pose_in_node: tuple[float, ...] | None = None
 
 
 def records_of(tracks: Iterable[FrameResult], skipped: Iterable[Skipped]) -> list[FrameRecord]:
@@ -80,6 +86,7 @@ def records_of(tracks: Iterable[FrameResult], skipped: Iterable[Skipped]) -> lis
             diagnostics=track.diagnostics,
             doubts=track.doubts,
             sigmas=None if track.covariance is None else tuple(np.sqrt(np.diag(track.covariance)).tolist()),
+            pose_in_node=_pose_in_node(track),
         )
         for track in tracks
     ]
@@ -108,7 +115,8 @@ def write_records(path: Path, records: Iterable[FrameRecord]) -> None:
                 how.residual_unit,
                 how.unobservable,
                 _DOUBTS_JOINED_BY.join(record.doubts),
-                *("" if record.sigmas is None else repr(sigma) for sigma in record.sigmas or _SIGMAS),
+                *_cells(record.sigmas, len(_SIGMAS)),
+                *_cells(record.pose_in_node, len(_POSE)),
             ]
         )
     write_text(path, text.getvalue())
@@ -159,10 +167,25 @@ def _outcome(track: FrameResult) -> Outcome:
     return "doubtful" if track.doubts else "tracked"
 
 
+def _pose_in_node(track: FrameResult) -> tuple[float, ...] | None:
+    if _outcome(track) != "doubtful" or track.is_keyframe:
+        return None
+    T = track.T_node_body
+    return (*T[:3, 3].tolist(), *quaternion_from_rotation(T[:3, :3]).tolist())
+
+
+def _cells(values: tuple[float, ...] | None, count: int) -> list[str]:
+    return [""] * count if values is None else [repr(value) for value in values]
+
+
+def _numbers(row: Mapping[str, str], names: Sequence[str]) -> tuple[float, ...] | None:
+    """Return the numbers in some columns; None if one is empty, or the run is older than the column."""
+    cells = [row.get(name) or "" for name in names]
+    return tuple(map(float, cells)) if all(cells) else None
+
+
 def _record(row: dict[str, str]) -> FrameRecord:
-    # Older runs have neither doubts nor sigmas.
-    doubts = row.get("doubts") or ""
-    sigmas = [row.get(name) or "" for name in _SIGMAS]
+    doubts = row.get("doubts") or ""  # older runs have none
     return FrameRecord(
         stamp_ns=int(row["stamp_ns"]),
         outcome=_OUTCOMES[row["outcome"]],
@@ -179,5 +202,6 @@ def _record(row: dict[str, str]) -> FrameRecord:
             unobservable=row.get("unobservable", row.get("unseen", "")),
         ),
         doubts=tuple(doubts.split(_DOUBTS_JOINED_BY)) if doubts else (),
-        sigmas=tuple(map(float, sigmas)) if all(sigmas) else None,
+        sigmas=_numbers(row, _SIGMAS),
+        pose_in_node=_numbers(row, _POSE),
     )

@@ -92,6 +92,11 @@ class Counts(Config):
     """Known leaves of the octree."""
     cloud_points: int = 0
 
+    @property
+    def frames_text(self) -> str:
+        """How many frames had which outcome."""
+        return f"{self.tracked} tracked, {self.doubtful} doubtful, {self.lost} lost, {self.skipped} skipped"
+
 
 class SkippedFrame(Config):
     """A frame that could not be read."""

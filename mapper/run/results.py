@@ -10,6 +10,7 @@ from mapper.core.timebase import MAX_TRUTH_GAP_NS, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure
+from mapper.run.doubtful_frames import without_doubtful
 from mapper.run.folder import Run
 from mapper.run.frame_outcomes import FrameRecord
 
@@ -19,7 +20,7 @@ class RunResults:
     """A tracked log.
 
     Attributes:
-        trajectory: Final body poses in the levelled world; at least one.
+        trajectory: Final body poses in the levelled world, of doubtful frames too; at least one.
         graph: Nodes at the solution, same world.
         records: Outcome of every frame.
         loops: Every loop candidate with its verdict.
@@ -33,6 +34,11 @@ class RunResults:
     loops: Sequence[LoopClosure]
     frame_ms: Mapping[int, float]
     truth: Trajectory | None
+
+    @property
+    def tracked(self) -> Trajectory:
+        """The poses of the frames that maps are made from: those that are not doubtful."""
+        return without_doubtful(self.trajectory, self.records)
 
 
 def load_results(run: Run) -> RunResults:

@@ -9,6 +9,7 @@ from mapper.graph.g2o import write_g2o
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure, write_closures
 from mapper.run import files
+from mapper.run.doubtful_frames import placed_by_neighbours
 from mapper.run.folder import Run, RunWriter
 from mapper.run.frame_outcomes import FrameRecord, write_frame_ms, write_records
 from mapper.run.manifest import SkippedFrame
@@ -39,7 +40,10 @@ class StoredTracking:
     truth: Trajectory | None
 
     def solved(self, graph: PoseGraph, loops: Sequence[LoopClosure]) -> "StoredTracking":
-        """Return the same frames with the graph at another solution: each moves along with its node."""
+        """Return the same frames with the graph at another solution: each moves along with its node.
+
+        Doubtful frames are then placed by their neighbours again.
+        """
         node_of = {record.stamp_ns: record.node for record in self.records if record.node is not None}
         before, after = self.graph.T_world_node, graph.T_world_node
         T_after_before = {node: after[node] @ inverse(before[node]) for node in before}
@@ -52,7 +56,8 @@ class StoredTracking:
                 self.trajectory.stamps_ns.tolist(), self.trajectory.T_world_body, strict=True
             )
         ]
-        return replace(self, trajectory=trajectory_from(moved), graph=graph, loops=loops)
+        trajectory = placed_by_neighbours(trajectory_from(moved), graph, self.records)
+        return replace(self, trajectory=trajectory, graph=graph, loops=loops)
 
     def then(self, later: "StoredTracking", *, truth: Trajectory | None) -> "StoredTracking":
         """Return this log followed by a later one whose graph and loops hold those of this one already."""

@@ -92,7 +92,7 @@ def test_a_build_on_images_loads_nothing_that_only_scans_recordings_and_viewers_
 def test_build_prints_a_table(desk_log, tmp_path):
     result = mapper("build", desk_log, "--out", tmp_path / "run", "--first", 3, "--last", 24, "--stride", 2)
 
-    assert "11 tracked, 0 lost, 0 skipped" in result.stdout
+    assert "11 tracked, 0 doubtful, 0 lost, 0 skipped" in result.stdout
     for row in ("keyframes", "ATE RMSE, SE(3)-aligned", "path length", "peak memory", "trajectory.tum"):
         assert row in result.stdout
     source = load_run(tmp_path / "run").config.source

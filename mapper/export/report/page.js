@@ -104,7 +104,7 @@
       const error = runs[run].error;
       return error && { xs: error.t, ys: error.m };
     }
-    const placed = frames[key].map((value, i) => frames.outcome[i] === "tracked" || key === "ms" || key === "features" ? value : null);
+    const placed = frames[key].map((value, i) => frames.outcome[i] === "tracked" || frames.outcome[i] === "doubtful" || key === "ms" || key === "features" ? value : null);
     return placed.some((value) => value !== null) ? { xs: frames.t, ys: placed } : null;
   }
 

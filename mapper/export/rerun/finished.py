@@ -62,7 +62,7 @@ def in_words(run: Run, *, name: str) -> str:
     counts, timing = manifest.counts, manifest.timing
     rows: Iterable[tuple[str, str]] = (
         ("log", f"{manifest.input.title} ({manifest.input.kind})"),
-        ("frames", f"{counts.tracked} tracked, {counts.lost} lost, {counts.skipped} skipped"),
+        ("frames", counts.frames_text),
         ("graph", f"{counts.nodes} nodes, {counts.factors} factors"),
         ("loops", f"{counts.loops} of {counts.loop_candidates} candidates hold"),
         ("octree", f"{counts.leaves} leaves of {run.config.octree.resolution_m:g} m"),
