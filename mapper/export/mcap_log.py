@@ -6,6 +6,8 @@ What each viewer makes of the topics (Foxglove's documentation; Rerun 0.41's imp
 topic                  schema                        Foxglove            Rerun
 =====================  ============================  ==================  ===========================
 /tf                    foxglove.FrameTransform       transform tree      Transform3D
+/pose                  geometry_msgs/msg/            pose with an        a bare record
+                       PoseWithCovarianceStamped     ellipsoid
 /camera/image          foxglove.CompressedImage      image               EncodedImage
 /camera/calibration    foxglove.CameraCalibration    projection          Pinhole
 /trajectory/NAME       foxglove.PosesInFrame         line or axes        InstancePoses3D
@@ -56,7 +58,7 @@ from zstandard import ZstdError
 
 from mapper.core.errors import DataError
 from mapper.core.frames import PinholeCamera
-from mapper.core.geometry import Points, Transform
+from mapper.core.geometry import Array, Points, Transform
 from mapper.core.trajectory import Trajectory
 from mapper.export.foxglove_messages import (
     WORLD,
@@ -71,9 +73,11 @@ from mapper.export.foxglove_messages import (
 from mapper.export.palette import ESTIMATE, FACTORS, PLAN, Rgb
 from mapper.export.ros_messages import (
     OCCUPANCY_GRID,
+    UNCERTAIN_POSE,
     Value,
     encode_occupancy_grid,
     encode_record,
+    encode_uncertain_pose,
     record_definition,
 )
 from mapper.graph.model import BetweenFactor
@@ -294,6 +298,15 @@ class McapLog:
             text = definition(OCCUPANCY_GRID).encode()
             self._register(topic, OCCUPANCY_GRID, encoding="ros2msg", text=text)
         self._write(topic, encode_occupancy_grid(grid, stamp_ns=stamp_ns, frame_id=WORLD), stamp_ns)
+
+    def pose(self, stamp_ns: int, T_world_body: Transform, covariance: Array) -> None:
+        """Log a pose with its (6, 6) covariance in the body's tangent (rotation, translation) on /pose."""
+        check_stamp(stamp_ns)
+        if "/pose" not in self._channels:
+            text = definition(UNCERTAIN_POSE).encode()
+            self._register("/pose", UNCERTAIN_POSE, encoding="ros2msg", text=text)
+        data = encode_uncertain_pose(T_world_body, covariance, stamp_ns=stamp_ns, frame_id=WORLD)
+        self._write("/pose", data, stamp_ns)
 
     def diagnostics(self, stamp_ns: int, record: Mapping[str, Value]) -> None:
         """Log one frame's numbers and words on /diagnostics."""

@@ -5,6 +5,7 @@ from mapper.graph.model import Origin
 Rgb = tuple[int, int, int]
 
 ESTIMATE: Rgb = (214, 69, 37)
+DOUBTFUL: Rgb = (240, 176, 0)
 TRUTH: Rgb = (45, 108, 178)
 START: Rgb = (38, 145, 87)
 END: Rgb = (30, 33, 41)

@@ -13,10 +13,12 @@ from mapper.core.geometry import Array
 from mapper.core.trajectory import Trajectory
 from mapper.export.grid import grid_image
 from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure, save
-from mapper.export.palette import END, ESTIMATE, FACTORS, PLAN, START, TRUTH, UNKNOWN_CELL, Rgb
+from mapper.export.palette import DOUBTFUL, END, ESTIMATE, FACTORS, PLAN, START, TRUTH, UNKNOWN_CELL, Rgb
 from mapper.export.panels import color_of
+from mapper.export.path_band import SIGMAS, band_image, stretches
 from mapper.graph.model import PoseGraph, Solution
 from mapper.octree.slice import FREE, OCCUPIED, OccupancyGrid
+from mapper.run.pose_covariances import UncertainPoses
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,8 +45,9 @@ def write_summary(
     loops_world: Array,
     title: str,
     lines: Sequence[str] = (),
+    poses: UncertainPoses | None = None,
 ) -> None:
-    """Draw the trajectory over the slice, with its loops.
+    """Draw the trajectory over the slice, with its loops, its uncertainty and its doubtful stretches.
 
     Args:
         path: PNG file to write.
@@ -54,21 +57,46 @@ def write_summary(
         loops_world: (L, 2, 3) ends of the loop closures, metres, world frame.
         title: Headline.
         lines: Figures worth knowing, shown below the headline.
+        poses: The trajectory with its covariances, if known.
     """
     positions = trajectory.positions_world
     reached = [positions] if truth is None else [positions, truth.positions_world]
     low, high = _extent(grid, reached)
     figure, axes = _map_page(title, lines, aspect=float(np.divide(*(high - low)[::-1])))
     _draw_over(axes, grid_image(grid), grid)
+    if poses is not None:
+        _draw_band(axes, poses, low, high)
     if truth is not None:
         reference = truth.positions_world
         axes.plot(*reference[:, :2].T, color=hex_of(TRUTH), linewidth=2.6, alpha=0.65, label="truth")
     axes.plot(*positions[:, :2].T, color=hex_of(ESTIMATE), linewidth=1.3, label="estimate")
+    if poses is not None:
+        _draw_doubtful(axes, poses)
     _draw_loops(axes, loops_world)
     _mark(axes, positions[0], color=START, marker="o", label="start")
     _mark(axes, positions[-1], color=END, marker="s", label="end")
     _finish_map(axes, low, high)
     save(figure, path)
+
+
+def _draw_band(axes: "Axes", poses: UncertainPoses, low: Array, high: Array) -> None:
+    """Draw how far off the path may be, seen from above, the first node being right."""
+    half_widths_m = SIGMAS * poses.horizontal_sigmas_m
+    if not np.isfinite(half_widths_m).any():
+        return
+    image = band_image(poses.trajectory.positions_world, half_widths_m, low=low, high=high)
+    axes.imshow(image, origin="lower", extent=(low[0], high[0], low[1], high[1]))
+    label = f"{SIGMAS:g} σ, at most {np.nanmax(half_widths_m):.2g} m"
+    axes.fill([], [], facecolor=hex_of(ESTIMATE), alpha=0.25, label=label)
+
+
+def _draw_doubtful(axes: "Axes", poses: UncertainPoses) -> None:
+    """Draw the stretches whose poses may be wrong over the estimate."""
+    label = f"{int(poses.is_doubtful.sum())} doubtful frames"
+    for stretch in stretches(poses.is_doubtful):
+        ends = poses.trajectory.positions_world[stretch, :2].T
+        axes.plot(*ends, ".-", color=hex_of(DOUBTFUL), linewidth=2.6, markersize=4.0, label=label)
+        label = ""
 
 
 def _draw_loops(axes: "Axes", loops_world: Array) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from mapper.core.errors import DataError
+from mapper.core.geometry import Array, Transform
 from mapper.octree.slice import OccupancyGrid
 from mapper.sources.ros.typestore import (
     custom_typestore,
@@ -21,6 +22,7 @@ from mapper.sources.ros.typestore import (
 Value = int | float | str
 
 OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
+UNCERTAIN_POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 _FIELD_TYPES: dict[type, str] = {int: "int64", float: "float64", str: "string"}
 
@@ -40,6 +42,28 @@ def encode_occupancy_grid(grid: OccupancyGrid, *, stamp_ns: int, frame_id: str) 
     )
     header = make_header(stamp_ns, frame_id)
     return serialize(make_message(OCCUPANCY_GRID, header=header, info=info, data=grid.cells.ravel()))
+
+
+def encode_uncertain_pose(
+    T_frame_body: Transform, covariance: Array, *, stamp_ns: int, frame_id: str
+) -> bytes:
+    """Return a geometry_msgs/msg/PoseWithCovarianceStamped.
+
+    Args:
+        T_frame_body: (4, 4) pose of the body.
+        covariance: (6, 6) in the body's tangent (rotation, translation); ROS wants (translation, rotation)
+            along the frame's axes.
+        stamp_ns: The message's time.
+        frame_id: The frame.
+    """
+    to_axes = np.zeros((6, 6))
+    to_axes[:3, 3:] = to_axes[3:, :3] = T_frame_body[:3, :3]
+    pose = make_message(
+        "geometry_msgs/msg/PoseWithCovariance",
+        pose=make_pose(T_frame_body),
+        covariance=(to_axes @ covariance @ to_axes.T).ravel(),
+    )
+    return serialize(make_message(UNCERTAIN_POSE, header=make_header(stamp_ns, frame_id), pose=pose))
 
 
 def record_definition(record: Mapping[str, Value]) -> str:

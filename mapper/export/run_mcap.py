@@ -4,6 +4,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict
 
+import numpy as np
+
 from mapper.export.foxglove_messages import WORLD
 from mapper.export.mcap_log import McapLog
 from mapper.export.palette import TRUTH
@@ -31,6 +33,15 @@ def log_results(log: McapLog, results: RunResults) -> None:
         results.trajectory.stamps_ns, results.trajectory.T_world_body, strict=True
     ):
         log.transform(int(stamp_ns), T_world_body, parent=WORLD, child=BODY)
+    if results.poses is not None:
+        for stamp_ns, T_world_body, covariance in zip(
+            results.poses.trajectory.stamps_ns.tolist(),
+            results.poses.trajectory.T_world_body,
+            results.poses.covariances,
+            strict=True,
+        ):
+            if np.isfinite(covariance).all():
+                log.pose(stamp_ns, T_world_body, covariance)
     for record in results.records:
         log.diagnostics(record.stamp_ns, _fields(record, results.frame_ms))
     for loop in results.loops:
@@ -91,6 +102,7 @@ def _fields(record: FrameRecord, frame_ms: Mapping[int, float]) -> dict[str, int
         "node": -1 if record.node is None else record.node,
         "is_keyframe": int(record.is_keyframe),
         **asdict(record.diagnostics),
+        "doubts": "; ".join(record.doubts),
     }
     if frame_ms:
         fields["ms"] = frame_ms.get(record.stamp_ns, 0.0)

@@ -58,11 +58,11 @@ def between(
     return gtsam.BetweenFactorPose3(factor.i, factor.j, _pose3(factor.T_i_j), noise)
 
 
-def anchor(node: int, T_world_node: Transform) -> gtsam.PriorFactorPose3:
+def anchor(node: int, T_world_node: Transform, sigmas: PoseSigmas = _ANCHOR) -> gtsam.PriorFactorPose3:
     """Return the prior that holds a component's first node."""
     import gtsam
 
-    return gtsam.PriorFactorPose3(node, _pose3(T_world_node), _noise(_ANCHOR.information))
+    return gtsam.PriorFactorPose3(node, _pose3(T_world_node), _noise(sigmas.information))
 
 
 def values_of(T_world_node: Mapping[int, Transform], nodes: Iterable[int]) -> gtsam.Values:

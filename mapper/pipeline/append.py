@@ -23,7 +23,7 @@ from mapper.pipeline.track import Start, from_tracking, refuse_a_fragment, track
 from mapper.run import files
 from mapper.run.folder import Run, appended_log, load_run, open_log, write_run
 from mapper.run.manifest import Manifest, Timing, library_versions, now_text
-from mapper.run.stored_tracking import StoredTracking, load_tracking, save_tracking
+from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 from mapper.sources.chained import chained
@@ -85,7 +85,7 @@ def append(
             solved = solve(tracking.graph, tracking.loops, config.graph)
         _refuse_unconnected(second, run, solved.loops, known)
         later = from_tracking(replace(tracking, graph=solved.graph, loops=solved.loops), None)
-        save_tracking(writer, before.solved(solved.graph, solved.loops).then(later, truth=source.truth))
+        save_solved(writer, before.solved(solved.graph, solved.loops).then(later, truth=source.truth))
         writer.update(solve=solved.report)
         fuse_into(writer, source, joined, progress, before=files.scan_updates_path(run.path))
     return load_run(out)

@@ -22,7 +22,7 @@ from mapper.run.folder import (
 )
 from mapper.run.manifest import Levelling
 from mapper.run.observers import NULL_OBSERVER, Observer
-from mapper.run.stored_tracking import save_tracking
+from mapper.run.stored_tracking import save_solved, save_tracking
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 from mapper.sources.depth_scale import depth_warnings
@@ -77,7 +77,8 @@ def build(
             progress.note(warning)
             known = writer.manifest.input
             writer.update(input=known.model_copy(update={"notes": (*known.notes, warning)}))
-        save_tracking(writer, from_tracking(tracking, source.truth))
+        with writer.clock.stage("solve"):
+            save_solved(writer, from_tracking(tracking, source.truth))
         writer.update(
             solve=solved.report,
             levelling=Levelling(method=level.method, detail=level.detail),

@@ -36,7 +36,7 @@ from mapper.run.frame_outcomes import FrameRecord
 from mapper.run.manifest import Solve, Status, Timing
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.results import RunResults, load_results
-from mapper.run.stored_tracking import StoredTracking, load_tracking, save_tracking
+from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
 from mapper.runtime.progress import SILENT, Progress
 from mapper.runtime.timing import peak_memory_mb
 from mapper.sources.base import Log
@@ -106,7 +106,7 @@ def fuse_changed(
         carry_times(writer, manifest.timing)
         _copy_kept_files(run.path, writer.folder)
         if changed is not None:
-            save_tracking(writer, changed)
+            save_solved(writer, changed)
             for name in files.names_of("poses"):
                 (writer.folder / name).unlink(missing_ok=True)
         if solve is not None:
@@ -227,6 +227,7 @@ def _write_pictures(writer: RunWriter, maps: Maps, results: RunResults) -> None:
         ).reshape(-1, 2, 3),
         title=writer.manifest.input.title,
         lines=lines,
+        poses=results.poses,
     )
     if len(maps.cloud_points_world):
         write_cloud_views(

@@ -1,6 +1,7 @@
 """Doubtful frames: placed by the tracked frames around them, and kept out of the maps."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,10 +30,37 @@ def without_doubtful(trajectory: Trajectory, records: Iterable[FrameRecord]) -> 
     return Trajectory(trajectory.stamps_ns[kept], trajectory.T_world_body[kept])
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """Pose of a doubtful frame.
+
+    Attributes:
+        T_world_body: (4, 4) in the world of the graph.
+        variances: (6,) relative to the node, tangent of the body (rotation, translation); None if unknown.
+    """
+
+    T_world_body: Transform
+    variances: Array | None
+
+
 def placed_by_neighbours(
     trajectory: Trajectory, graph: PoseGraph, records: Sequence[FrameRecord]
 ) -> Trajectory:
-    """Return the trajectory with each doubtful frame that is no node where its neighbours suggest it.
+    """Return the trajectory with the estimates of ``estimates_of_doubtful`` in it."""
+    estimates = estimates_of_doubtful(trajectory, graph, records)
+    if not estimates:
+        return trajectory
+    T_world_body = trajectory.T_world_body.copy()
+    for index, stamp_ns in enumerate(trajectory.stamps_ns.tolist()):
+        if stamp_ns in estimates:
+            T_world_body[index] = estimates[stamp_ns].T_world_body
+    return Trajectory(trajectory.stamps_ns, T_world_body)
+
+
+def estimates_of_doubtful(
+    trajectory: Trajectory, graph: PoseGraph, records: Sequence[FrameRecord]
+) -> dict[int, Estimate]:
+    """Return, by stamp, where each doubtful frame lies that is no node.
 
     The frame gets the information-weighted mean of two estimates, in the tangent of the first: its own pose,
     T_world_node · T_node_body with the covariance of its tracking, and the motion at constant velocity from
@@ -45,46 +73,44 @@ def placed_by_neighbours(
         graph: Nodes at their solution.
         records: Outcome of every frame.
     """
-    doubtful = [record for record in records if record.pose_in_node is not None]
-    if not doubtful:
-        return trajectory
     tracked = without_doubtful(trajectory, records)
-    T_world_body = trajectory.T_world_body.copy()
-    index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
-    variances: dict[int, Array | None] = {}
-    for record in doubtful:
-        if record.node is None or record.pose_in_node is None or record.stamp_ns not in index_of:
+    by_motion: dict[int, Array | None] = {}
+    estimates = {}
+    for record in records:
+        if record.node is None or record.pose_in_node is None:
             continue
         position, quaternion = np.split(np.array(record.pose_in_node), [3])
         T_own = graph.T_world_node[record.node] @ transform(rotation_from_quaternion(quaternion), position)
-        T_world_body[index_of[record.stamp_ns]] = _between(record, T_own, tracked, variances)
-    return Trajectory(trajectory.stamps_ns, T_world_body)
+        own = Estimate(T_own, None if record.sigmas is None else np.square(record.sigmas))
+        estimates[record.stamp_ns] = _between(record.stamp_ns, own, tracked, by_motion)
+    return estimates
 
 
 def _between(
-    record: FrameRecord, T_own: Transform, tracked: Trajectory, variances: dict[int, Array | None]
-) -> Transform:
-    after = int(np.searchsorted(tracked.stamps_ns, record.stamp_ns))
+    stamp_ns: int, own: Estimate, tracked: Trajectory, middle_variances: dict[int, Array | None]
+) -> Estimate:
+    """Return the mean of a frame's own pose and the motion around it; adds to ``middle_variances``."""
+    after = int(np.searchsorted(tracked.stamps_ns, stamp_ns))
     if not 0 < after < len(tracked):
-        return T_own
+        return own
     begin_ns, end_ns = (int(stamp_ns) for stamp_ns in tracked.stamps_ns[[after - 1, after]])
     gap_ns = end_ns - begin_ns
     if gap_ns > MAX_GAP_NS:
-        return T_own
-    if gap_ns not in variances:
-        variances[gap_ns] = _middle_variances(tracked, gap_ns)
-    at_middle = variances[gap_ns]
+        return own
+    if gap_ns not in middle_variances:
+        middle_variances[gap_ns] = _middle_variances(tracked, gap_ns)
+    at_middle = middle_variances[gap_ns]
     if at_middle is None:
-        return T_own
-    fraction = (record.stamp_ns - begin_ns) / gap_ns
+        return own
+    fraction = (stamp_ns - begin_ns) / gap_ns
     T_moved = interpolate(tracked.T_world_body[after - 1], tracked.T_world_body[after], fraction)
-    if record.sigmas is None:
-        return T_moved
     # Under a constant acceleration the error of the straight line grows as f · (1 − f).
     by_motion = at_middle * (4.0 * fraction * (1.0 - fraction)) ** 2 + _LEAST_VARIANCE
-    own = np.square(record.sigmas)
-    step = np.concatenate(log(inverse(T_own) @ T_moved)) * own / (own + by_motion)
-    return T_own @ exp(step[:3], step[3:])
+    if own.variances is None:
+        return Estimate(T_moved, by_motion)
+    weight = own.variances / (own.variances + by_motion)
+    step = weight * np.concatenate(log(inverse(own.T_world_body) @ T_moved))
+    return Estimate(own.T_world_body @ exp(step[:3], step[3:]), weight * by_motion)
 
 
 def _middle_variances(tracked: Trajectory, gap_ns: int) -> Array | None:

@@ -8,6 +8,7 @@ from mapper.runtime.atomic import MANIFEST_NAME
 
 TRAJECTORY = "trajectory.tum"
 KEYFRAMES = "keyframes.tum"
+POSES = "poses.csv"
 TRUTH = "truth.tum"
 GRAPH = "graph.g2o"
 LOOPS = "loops.jsonl"
@@ -61,6 +62,12 @@ def _grid(stem: str) -> tuple[str, ...]:
 RUN_FILES = (
     RunFiles(
         (TRAJECTORY, KEYFRAMES), "poses of the body in the levelled world: z up, floor at 0", "tracking"
+    ),
+    RunFiles(
+        (POSES,),
+        "the same poses, outcome and covariance of each: upper triangle, in the body's tangent (rotation, "
+        "translation), the first node fixed",
+        "tracking",
     ),
     RunFiles((TRUTH,), "the log's own truth, in its own frame, where there is any", "tracking"),
     RunFiles((GRAPH,), "the pose graph at its solution", "tracking"),

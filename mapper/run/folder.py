@@ -29,6 +29,7 @@ from mapper.run.manifest import (
     now_text,
     read_manifest,
 )
+from mapper.run.pose_covariances import UncertainPoses, read_poses
 from mapper.runtime.atomic import atomic_folder, partial_of, write_text
 from mapper.runtime.timing import Stopwatch
 from mapper.sources import open_source
@@ -59,6 +60,11 @@ class Run:
     def tracked_trajectory(self) -> Trajectory:
         """Return the poses of the frames that maps are made from: those that are not doubtful."""
         return without_doubtful(self.trajectory(), self.records())
+
+    def poses(self) -> UncertainPoses | None:
+        """Return the same poses with their covariance; None in a run of before 2026-11-22."""
+        path = self.path / files.POSES
+        return read_poses(path) if path.exists() else None
 
     def truth(self) -> Trajectory | None:
         """Return the true body poses, in the truth's own frame, if the log has them."""

@@ -13,6 +13,7 @@ from mapper.loops.closure import LoopClosure
 from mapper.run.doubtful_frames import without_doubtful
 from mapper.run.folder import Run
 from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.pose_covariances import UncertainPoses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,6 +27,7 @@ class RunResults:
         loops: Every loop candidate with its verdict.
         frame_ms: Milliseconds that each frame took, by stamp; empty leaves them out.
         truth: True body poses, aligned with the trajectory, if known.
+        poses: The trajectory with its covariances, if known.
     """
 
     trajectory: Trajectory
@@ -34,6 +36,7 @@ class RunResults:
     loops: Sequence[LoopClosure]
     frame_ms: Mapping[int, float]
     truth: Trajectory | None
+    poses: UncertainPoses | None = None
 
     @property
     def tracked(self) -> Trajectory:
@@ -46,7 +49,7 @@ def load_results(run: Run) -> RunResults:
     trajectory, truth = run.trajectory(), run.truth()
     if truth is not None:
         truth = aligned_truth(truth, trajectory)
-    return RunResults(trajectory, run.graph(), run.records(), run.loops(), run.frame_ms(), truth)
+    return RunResults(trajectory, run.graph(), run.records(), run.loops(), run.frame_ms(), truth, run.poses())
 
 
 def aligned_truth(truth: Trajectory, trajectory: Trajectory) -> Trajectory | None:

@@ -13,6 +13,7 @@ from mapper.run.doubtful_frames import placed_by_neighbours
 from mapper.run.folder import Run, RunWriter
 from mapper.run.frame_outcomes import FrameRecord, write_frame_ms, write_records
 from mapper.run.manifest import SkippedFrame
+from mapper.run.pose_covariances import uncertain_poses, write_poses
 from mapper.sources.base import Skipped
 from mapper.sources.trajectory_files import write_tum
 
@@ -88,6 +89,13 @@ def load_tracking(run: Run) -> StoredTracking:
         loops=run.loops(),
         truth=run.truth(),
     )
+
+
+def save_solved(writer: RunWriter, tracked: StoredTracking) -> None:
+    """Write the files of ``save_tracking``, and with which covariance the solution gives every pose."""
+    save_tracking(writer, tracked)
+    poses = uncertain_poses(tracked.trajectory, tracked.graph, tracked.records)
+    write_poses(writer.folder / files.POSES, poses)
 
 
 def save_tracking(writer: RunWriter, tracked: StoredTracking) -> None:

@@ -48,6 +48,8 @@ def record_of(i):
     return {"features": 1000 + i, "residual": 0.25 * i, "method": "map" if i else "first"}
 
 
+COVARIANCE = np.diag([1e-4, 2e-4, 3e-4, 0.01, 0.02, 0.03])  # about and along x, y, z of the body
+COVARIANCE[0, 5] = COVARIANCE[5, 0] = 1e-3
 GRID = OccupancyGrid(np.array([[-1, 0, 100], [0, 0, -1]], np.int8), np.array([-1.5, 2.25]), resolution_m=0.05)
 
 
@@ -64,6 +66,7 @@ def write_run(path):
             log.image(stamp_ns, encode_jpeg(image, width_px=320, quality=80), frame="camera")
             log.calibration(stamp_ns, shrunk_camera(CAMERA, width_px=320), frame="camera")
             log.diagnostics(stamp_ns, record_of(i))
+            log.pose(stamp_ns, T, COVARIANCE)
         log.trajectory(FIRST_NS, trajectory, name="estimate")
         log.factors(FIRST_NS, factors_of(trajectory), T_world_node=dict(enumerate(trajectory.T_world_body)))
         log.cloud(FIRST_NS, points, colors=colors, name="octree")
@@ -104,7 +107,7 @@ def test_the_file_is_whole_indexed_and_counted(run):
         messages = [(channel.topic, m) for _, channel, m in reader.iter_messages()]
     statistics = summary.statistics
     counts = {summary.channels[i].topic: n for i, n in statistics.channel_message_counts.items()}
-    every_frame = ["/tf", "/camera/image", "/camera/calibration", "/diagnostics"]
+    every_frame = ["/tf", "/camera/image", "/camera/calibration", "/diagnostics", "/pose"]
     assert {topic: n for topic, n in counts.items() if n > 1} == dict.fromkeys(every_frame, FRAMES)
     assert statistics.message_count == len(messages) == sum(counts.values())
     assert (statistics.message_start_time, statistics.message_end_time) == (
@@ -173,7 +176,7 @@ def test_cloud_keeps_positions_and_colours(run):
 
 
 def test_ros_messages_are_what_a_ros_library_reads(run):
-    path, *_ = run
+    path, trajectory, *_ = run
     store = get_typestore(Stores.ROS2_HUMBLE)
     [(schema, message)] = raw_on(path, "/map/slice")
     grid = store.deserialize_cdr(message.data, schema.name)
@@ -184,6 +187,16 @@ def test_ros_messages_are_what_a_ros_library_reads(run):
     assert (grid.info.origin.position.x, grid.info.origin.position.y) == (-1.5, 2.25)
     np.testing.assert_array_equal(grid.data.reshape(2, 3), GRID.cells)
     assert store.serialize_cdr(grid, schema.name) == message.data
+
+    for (schema, message), T in zip(raw_on(path, "/pose"), trajectory.T_world_body, strict=True):
+        stamped = store.deserialize_cdr(message.data, schema.name)
+        assert stamped.header.frame_id == "world"
+        assert stamped.pose.pose.position.x == T[0, 3]
+        covariance = stamped.pose.covariance.reshape(6, 6)  # (x, y, z, about x, y, z) of the world
+        R = T[:3, :3]
+        np.testing.assert_allclose(covariance[:3, :3], R @ COVARIANCE[3:, 3:] @ R.T, atol=1e-15)
+        np.testing.assert_allclose(covariance[3:, 3:], R @ COVARIANCE[:3, :3] @ R.T, atol=1e-15)
+        np.testing.assert_allclose(covariance[:3, 3:], R @ COVARIANCE[3:, :3] @ R.T, atol=1e-15)
 
     records = raw_on(path, "/diagnostics")
     schema = records[0][0]

@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 
 from mapper.core.trajectory import Trajectory
-from mapper.export.palette import ESTIMATE, FACTORS, TRUTH
+from mapper.export.palette import DOUBTFUL, ESTIMATE, FACTORS, TRUTH
+from mapper.export.path_band import band_image, stretches
 from mapper.export.picture import splat, write_cloud_views, write_summary
 from mapper.mapping.cloud import height_colors
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from mapper.run.pose_covariances import UncertainPoses
 
 
 def room():
@@ -146,3 +148,53 @@ def test_height_colours_run_from_blue_to_red():
     assert high[0] > high[2] + 50
     assert height_colors(np.empty(0)).shape == (0, 3)
     assert len(np.unique(height_colors(np.full(5, 1.0)), axis=0)) == 1
+
+
+def uncertain(trajectory, sigmas_m, doubtful=()):
+    covariances = np.zeros((len(trajectory), 6, 6))
+    covariances[:, 3:, 3:] = np.square(sigmas_m)[:, np.newaxis, np.newaxis] * np.eye(3)
+    covariances[np.isnan(sigmas_m)] = np.nan
+    is_doubtful = np.zeros(len(trajectory), np.bool_)
+    is_doubtful[list(doubtful)] = True
+    return UncertainPoses(trajectory, is_doubtful, covariances)
+
+
+def test_summary_shows_what_is_uncertain_and_what_is_doubtful(tmp_path):
+    drawing = {
+        "grid": room(),
+        "trajectory": loop(),
+        "truth": None,
+        "loops_world": NO_LOOPS,
+        "title": "a room",
+    }
+    pictures = []
+    for name, poses in {
+        "plain": None,
+        "certain": uncertain(loop(), np.full(200, 1e-4)),
+        "uncertain": uncertain(loop(), np.linspace(0.0, 0.1, 200), doubtful=range(50, 80)),
+    }.items():
+        write_summary(tmp_path / f"{name}.png", poses=poses, **drawing)
+        pictures.append(cv2.imread(str(tmp_path / f"{name}.png")))
+    plain, certain, doubted = pictures
+    band = tuple(round(60 / 255 * c + 195 / 255 * 255) for c in ESTIMATE)
+    assert pixels_like(doubted, band) > 5 * max(pixels_like(certain, band), 100)
+    assert pixels_like(doubted, DOUBTFUL) > 500
+    assert pixels_like(plain, DOUBTFUL) == pixels_like(certain, DOUBTFUL) == 0
+
+
+def test_a_band_is_as_wide_as_told_and_has_gaps():
+    positions = np.column_stack([np.linspace(0.0, 10.0, 101), np.full(101, 5.0)])
+    half_widths_m = np.full(101, 0.5)
+    half_widths_m[60:70] = np.nan
+    image = band_image(positions, half_widths_m, low=np.zeros(2), high=np.array([10.0, 10.0]))
+    painted = image[:, :, 3] > 0
+    pixel_m = 10.0 / image.shape[1]
+    assert painted[:, 600].sum() * pixel_m == pytest.approx(1.0, abs=0.03)
+    assert painted[:, 1290].sum() == 0
+    assert set(np.unique(image[:, :, 3])) == {0, 60}
+
+
+def test_stretches_reach_to_the_poses_beside_them():
+    marked = np.array([True, False, False, True, True, False, True])
+    assert list(stretches(marked)) == [slice(0, 2), slice(2, 6), slice(5, 7)]
+    assert list(stretches(np.zeros(5, np.bool_))) == []

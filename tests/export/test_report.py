@@ -68,6 +68,21 @@ def test_the_numbers_are_the_run_s(runs):
     ]
 
 
+def test_uncertainty_and_doubt_are_the_poses_s(runs):
+    chapter = chapter_of(runs[0], "desk", [])
+    path, poses = drawn(chapter)["path"], runs[0].poses()
+    np.testing.assert_allclose(path["band_m"], 2.0 * poses.horizontal_sigmas_m, rtol=2e-3, atol=1e-12)
+    np.testing.assert_allclose(path["band_3d_m"], 2.0 * poses.position_sigmas_m, rtol=2e-3, atol=1e-12)
+    assert path["band_m"][-1] > 0.0
+    assert path["doubtful"] == [False] * 31
+    records = list(chapter.results.records)
+    records[7] = replace(records[7], outcome="doubtful", doubts=("jump",))
+    doubted = replace(chapter, results=replace(chapter.results, records=records, poses=None))
+    path = drawn(doubted)["path"]
+    assert [k for k, is_doubtful in enumerate(path["doubtful"]) if is_doubtful] == [7]
+    assert path["band_m"] is None
+
+
 def test_the_errors_are_the_terms_of_the_ate(runs):
     run = runs[0]
     errors_m = np.array(drawn(chapter_of(run, "desk", []))["error"]["m"])

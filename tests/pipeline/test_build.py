@@ -82,6 +82,15 @@ def test_the_graph_is_the_trajectory_s(run):
         np.testing.assert_allclose(graph.T_world_node[node], T_by_stamp[stamp_ns], atol=1e-9)
 
 
+def test_poses_are_less_certain_the_farther_they_are(run):
+    poses = run.poses()
+    np.testing.assert_allclose(poses.trajectory.T_world_body, run.trajectory().T_world_body, atol=1e-12)
+    assert not poses.is_doubtful.any()
+    np.testing.assert_array_equal(poses.covariances[0], np.zeros((6, 6)))
+    sigmas_m = poses.position_sigmas_m
+    assert 0.0 < sigmas_m[10] < sigmas_m[-1] < 0.2
+
+
 def test_the_maps_agree_with_each_other(run):
     octree = read_map(run.path / "map.ot")
     grid = read_grid(run.path / "slice.yaml")
@@ -104,6 +113,7 @@ def test_the_log_holds_the_whole_story(run):
         for channel, count in summary.statistics.channel_message_counts.items()
     }
     assert topics["/tf"] == 31 + 4
+    assert topics["/pose"] == 31
     assert topics["/diagnostics"] == 31
     assert topics["/camera/image"] == 4
     assert {"/trajectory/estimate", "/trajectory/truth", "/graph/factors"} <= set(topics)

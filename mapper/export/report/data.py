@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, nearest
 from mapper.export.grid import grid_image, read_grid
+from mapper.export.path_band import SIGMAS
 from mapper.loops.closure import LoopClosure
 from mapper.mapping.thumbnails import encode_jpeg
 from mapper.octree.slice import OccupancyGrid
@@ -81,7 +82,8 @@ def drawn(chapter: Chapter) -> dict[str, Any]:
             "ms": _rounded([results.frame_ms.get(record.stamp_ns, math.nan) for record in records]),
         },
         "residual_unit": residual_unit(results),
-        "path": _path(results.trajectory.stamps_ns, results.trajectory.positions_world, seconds),
+        "path": _path(results.trajectory.stamps_ns, results.trajectory.positions_world, seconds)
+        | _uncertainty(results),
         "truth": None
         if results.truth is None
         else _path(results.truth.stamps_ns, results.truth.positions_world, seconds),
@@ -122,6 +124,18 @@ class _Seconds:
 def _path(stamps_ns: NDArray[np.int64], positions: NDArray[np.float64], seconds: _Seconds) -> dict[str, Any]:
     x, y, z = ([round(float(value), 3) for value in column] for column in positions.T)
     return {"t": seconds(stamps_ns), "x": x, "y": y, "z": z}
+
+
+def _uncertainty(results: RunResults) -> dict[str, Any]:
+    """Return the half width of the band around the path from above, and in space, and what is doubtful."""
+    doubtful_ns = {record.stamp_ns for record in results.records if record.outcome == "doubtful"}
+    stamps_ns = results.trajectory.stamps_ns.tolist()
+    poses = results.poses
+    return {
+        "doubtful": [stamp_ns in doubtful_ns for stamp_ns in stamps_ns],
+        "band_m": None if poses is None else _rounded((SIGMAS * poses.horizontal_sigmas_m).tolist()),
+        "band_3d_m": None if poses is None else _rounded((SIGMAS * poses.position_sigmas_m).tolist()),
+    }
 
 
 def _errors(results: RunResults, seconds: _Seconds) -> dict[str, Any] | None:

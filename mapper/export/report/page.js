@@ -67,6 +67,11 @@
     }
   }
 
+  /** A line below a legend that tells what a colour is, and has nothing to click. */
+  function keyOf(figure, color, text) {
+    element(figure.querySelector(".legend"), "span", { class: "key", style: `--of: ${color}` }, text);
+  }
+
   /** Call back with the corners, in pixels, of a box that is dragged over a figure. */
   function onDrag(svg, zoom) {
     let began = null, box = null;
@@ -102,10 +107,34 @@
     if (key === "residual" && runs[run].residual_unit !== unit) return null;
     if (key === "error") {
       const error = runs[run].error;
-      return error && { xs: error.t, ys: error.m };
+      const { t, band_3d_m: band } = runs[run].path;
+      return error && { xs: error.t, ys: error.m, band: band && { xs: t, ys: band } };
     }
     const placed = frames[key].map((value, i) => frames.outcome[i] === "tracked" || frames.outcome[i] === "doubtful" || key === "ms" || key === "features" ? value : null);
     return placed.some((value) => value !== null) ? { xs: frames.t, ys: placed } : null;
+  }
+
+  /** Times [from, to] between which the path is doubtful, from the pose before to the pose after. */
+  function doubtfulTimes({ t, doubtful }) {
+    const found = [];
+    doubtful.forEach((is, i) => {
+      if (!is) return;
+      if (i && doubtful[i - 1]) found[found.length - 1][1] = t[Math.min(i + 1, t.length - 1)];
+      else found.push([t[Math.max(i - 1, 0)], t[Math.min(i + 1, t.length - 1)]]);
+    });
+    return found;
+  }
+
+  /** Outline of what lies between zero and the band's height; a gap where that is not known. */
+  function areaOf({ xs, ys }, toX, toY) {
+    let d = "", begin = null;
+    for (let i = 0; i <= xs.length; i++) {
+      const known = i < xs.length && ys[i] !== null;
+      if (known) d += `${begin === null ? `M${toX(xs[i]).toFixed(1)} ${toY(0).toFixed(1)}` : ""}L${toX(xs[i]).toFixed(1)} ${toY(ys[i]).toFixed(1)}`;
+      else if (begin !== null) d += `L${toX(xs[i - 1]).toFixed(1)} ${toY(0).toFixed(1)}Z`;
+      begin = known ? xs[i] : null;
+    }
+    return d;
   }
 
   let zoomed = null; // [from, to] in seconds, shared by all curves
@@ -117,6 +146,8 @@
     if (unit) figure.querySelector("figcaption").textContent += `, ${unit}`;
     const entries = series.map((one) => ({ ...one, on: true, color: colorOf(one.run), label: runs[one.run].name }));
     legend(figure, entries, () => draw());
+    if (series.some((one) => one.band)) keyOf(figure, "var(--faint)", "shaded: 2 σ of the position, the first pose being right");
+    if (series.some((one) => runs[one.run].path.doubtful.includes(true))) keyOf(figure, "var(--doubtful)", "doubtful frames");
     const svg = element(figure, "svg", { role: "img", "aria-label": figure.querySelector("figcaption").textContent });
     const readOut = element(figure, "div", { class: "read-out" });
     let toX, fromX, line;
@@ -133,6 +164,8 @@
       const [from, to] = zoomed || [Math.min(...times.map((t) => t[0])), Math.max(...times.map((t) => t[t.length - 1]))];
       let top = 0;
       for (const one of all) one.ys.forEach((y, i) => { if (y !== null && one.xs[i] >= from && one.xs[i] <= to && y > top) top = y; });
+      const highest = 3 * top; // a band that is far wider must not flatten the curve
+      for (const one of all) if (one.band) one.band.ys.forEach((y, i) => { if (y !== null && one.band.xs[i] >= from && one.band.xs[i] <= to && y > top) top = Math.min(y, highest); });
       top = top || 1;
       const right = width - MARGIN.right, bottom = height - MARGIN.bottom;
       toX = (t) => MARGIN.left + (t - from) / (to - from || 1) * (right - MARGIN.left);
@@ -147,6 +180,12 @@
       const clip = `clip-${key}-${unit}`;
       element(element(svg, "clipPath", { id: clip }), "rect",
         { x: MARGIN.left, y: 0, width: right - MARGIN.left, height: bottom + 1 });
+      for (const one of visible) {
+        for (const [begin, end] of doubtfulTimes(runs[one.run].path))
+          element(svg, "rect", { class: "doubtful", "clip-path": `url(#${clip})`, x: toX(begin), width: Math.max(toX(end) - toX(begin), 2), y: MARGIN.top, height: bottom - MARGIN.top });
+        if (one.band)
+          element(svg, "path", { class: "band", "clip-path": `url(#${clip})`, style: `fill: ${one.color}`, d: areaOf(one.band, toX, toY) });
+      }
       for (const one of visible)
         element(svg, "path", { class: "line", "clip-path": `url(#${clip})`, style: `stroke: ${one.color}`, d: pathOf(one.xs, one.ys, toX, toY) });
       line = element(svg, "line", { class: "cursor", y1: MARGIN.top, y2: bottom, visibility: "hidden" });
@@ -181,9 +220,13 @@
     const index = Number(figure.dataset.of), run = runs[index], { slice } = run;
     const held = run.loops.filter((loop) => loop.ends && loop.verdict === "accepted");
     const refused = run.loops.filter((loop) => loop.ends && loop.verdict === "rejected");
+    const { doubtful, band_m: band } = run.path, doubted = doubtful.filter(Boolean).length;
+    const widest = band ? Math.max(0, ...band.filter((width) => width !== null)) : 0;
     const layers = [
+      { id: "band", label: `2 σ, at most ${short(widest)} m`, color: colorOf(index), on: true, there: widest > 0 },
       { id: "truth", label: "truth", color: "var(--truth)", on: true, there: Boolean(run.truth) },
       { id: "estimate", label: "estimate", color: colorOf(index), on: true, there: true },
+      { id: "doubtful", label: `${doubted} doubtful frames`, color: "var(--doubtful)", on: true, there: doubted > 0 },
       { id: "accepted", label: `${held.length} loops that hold`, color: "var(--accepted)", on: true, there: held.length > 0 },
       { id: "rejected", label: `${refused.length} refused`, color: "var(--rejected)", on: false, there: refused.length > 0 },
     ].filter((layer) => layer.there);
@@ -210,7 +253,9 @@
       for (const layer of layers.filter((one) => one.on)) {
         const group = element(svg, "g", { class: `layer-${layer.id}`, style: `stroke: ${layer.color}` });
         const path = { truth: run.truth, estimate: run.path }[layer.id];
-        if (path)
+        if (layer.id === "band" || layer.id === "doubtful")
+          drawStretches(group, layer.id === "band" ? band : doubtful.map((is, i) => is || doubtful[i + 1] ? 0 : null));
+        else if (path)
           element(group, "path", { class: "line", "stroke-dasharray": layer.id === "truth" ? "5 3" : "none", d: pathOf(path.x, path.y, toX, toY) });
         else
           for (const loop of layer.id === "accepted" ? held : refused) {
@@ -223,6 +268,16 @@
       element(svg, "line", { x1: 8, x2: 8 + bar * scale, y1: height - 8, y2: height - 8, style: "stroke: var(--ink)", "stroke-width": 3 });
       element(svg, "text", { x: 8, y: height - 14 }, `${bar} m`);
       dot = element(svg, "circle", { class: "here", r: 5, visibility: "hidden", style: `fill: ${colorOf(index)}; stroke: white; stroke-width: 2` });
+    }
+
+    /** Lines between poses, as wide as told in metres where that is above zero; none where it is null. */
+    function drawStretches(group, halfWidths) {
+      const { x, y } = run.path, stride = halfWidths === band ? Math.ceil(x.length / 3000) : 1;
+      for (let i = 0; i + stride < x.length; i += stride) {
+        if (halfWidths[i] === null) continue;
+        const width = halfWidths[i] ? { "stroke-width": Math.max(2 * halfWidths[i] * scale, 1).toFixed(1) } : {};
+        element(group, "line", { x1: toX(x[i]).toFixed(1), y1: toY(y[i]).toFixed(1), x2: toX(x[i + stride]).toFixed(1), y2: toY(y[i + stride]).toFixed(1), ...width });
+      }
     }
 
     function place(seconds) {

@@ -1,0 +1,141 @@
+"""Marginal covariances of a pose graph's nodes, each connected component's first node held."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mapper.core.errors import GraphError
+from mapper.core.geometry import Array
+from mapper.graph.batch import problem_of
+from mapper.graph.components import components
+from mapper.graph.model import PoseGraph, PoseSigmas
+from mapper.graph.terms import anchor, between, values_of
+
+if TYPE_CHECKING:
+    import gtsam
+
+_HELD = PoseSigmas(rotation_rad=1e-6, translation_m=1e-6)
+"""Of the first node: next to nothing beside any factor's, and yet within the digits of a solve."""
+_DIMENSION = 6
+
+
+def node_covariances(graph: PoseGraph) -> dict[int, Array]:
+    """Return the (6, 6) covariance of every node's pose, given all factors and the first node's pose.
+
+    Tangent of the node (rotation, translation), rad² and m². Each connected component is held at its first
+    node, whose covariance is zero. The information is linearised where the nodes are; of its inverse
+    only the blocks of nodes that share a clique are computed (Takahashi, Fagan & Chin 1973; on cliques as in
+    Kaess & Dellaert 2009, §4), since the whole inverse is dense.
+
+    Raises:
+        GraphError: Some node is not determined.
+    """
+    import gtsam
+
+    covariances = {node: np.zeros((_DIMENSION, _DIMENSION)) for node in graph.T_world_node}
+    parts = components(graph)
+    part_of = {node: number for number, nodes in enumerate(parts) for node in nodes}
+    terms: list[list[gtsam.NonlinearFactor]] = [[] for _ in parts]
+    for factor in graph.factors:
+        terms[part_of[factor.i]].append(between(factor))
+    for nodes, known in zip(parts, terms, strict=True):
+        if not known:
+            continue
+        problem = problem_of([*known, anchor(nodes[0], graph.T_world_node[nodes[0]], _HELD)])
+        linear = problem.linearize(values_of(graph.T_world_node, nodes))
+        try:
+            net = linear.eliminateSequential(gtsam.Ordering.ColamdGaussianFactorGraph(linear))
+        except RuntimeError as error:  # how GTSAM's C++ exceptions arrive, several lines long
+            raise GraphError(
+                f"covariances of {len(nodes)} nodes from node {nodes[0]}: {' '.join(str(error).split())}"
+            ) from None
+        covariances |= _recover(_supernodes([net.at(k) for k in range(net.size())]))
+        covariances[nodes[0]] = np.zeros((_DIMENSION, _DIMENSION))
+    return covariances
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Supernode:
+    """Consecutive nodes of the elimination that depend on the same later ones.
+
+    Attributes:
+        nodes: The eliminated nodes, and the later nodes that they depend on.
+        R: (6f, 6f) upper triangular: the square root of the information of the f eliminated nodes.
+        S: (6f, 6s) the same towards the s later ones.
+        parent: Number of the supernode that holds all of the later ones; None of the last.
+    """
+
+    nodes: Sequence[int]
+    R: Array
+    S: Array
+    parent: int | None
+
+
+def _supernodes(conditionals: Sequence[gtsam.GaussianConditional]) -> list[_Supernode]:
+    """Return the supernodes of an elimination, the last eliminated first."""
+    turn = {conditional.keys()[0]: k for k, conditional in enumerate(conditionals)}
+    later = [sorted(conditional.keys()[1:], key=turn.__getitem__) for conditional in conditionals]
+    groups: list[list[int]] = []  # of turns, the last eliminated first
+    group_of: dict[int, int] = {}
+    for k in reversed(range(len(conditionals))):
+        after = turn[later[k][0]] if later[k] else -1
+        if after >= 0 and groups[group_of[after]][-1] == after and later[k][1:] == later[after]:
+            groups[group_of[after]].append(k)
+            group_of[k] = group_of[after]
+        else:
+            group_of[k] = len(groups)
+            groups.append([k])
+    made = []
+    for group in groups:
+        turns = group[::-1]
+        front = [conditionals[k].keys()[0] for k in turns]
+        behind = later[turns[-1]]
+        nodes = [*front, *behind]
+        rows = np.zeros((_DIMENSION * len(front), _DIMENSION * len(nodes)))
+        place = {node: index for index, node in enumerate(nodes)}
+        for index, k in enumerate(turns):
+            block = slice(_DIMENSION * index, _DIMENSION * (index + 1))
+            rows[block, block] = conditionals[k].R()
+            parents = [place[node] for node in conditionals[k].keys()[1:]]
+            if parents:
+                rows[block, _scalars(parents)] = conditionals[k].S()
+        split = _DIMENSION * len(front)
+        parent = group_of[turn[behind[0]]] if behind else None
+        made.append(_Supernode(nodes, rows[:, :split], rows[:, split:], parent))
+    return made
+
+
+def _recover(supernodes: Sequence[_Supernode]) -> dict[int, Array]:
+    """Return the diagonal blocks of (RᵀR)⁻¹, from the last eliminated supernode down."""
+    known: list[Array] = []
+    covariances = {}
+    for supernode in supernodes:
+        front, behind = len(supernode.R), supernode.S.shape[1]
+        R_inverse = np.linalg.inv(supernode.R)
+        covariance = np.empty((front + behind, front + behind))
+        covariance[:front, :front] = R_inverse @ R_inverse.T
+        if supernode.parent is not None:
+            place = {node: index for index, node in enumerate(supernodes[supernode.parent].nodes)}
+            scalars = _scalars([place[node] for node in supernode.nodes[front // _DIMENSION :]])
+            of_behind = known[supernode.parent][np.ix_(scalars, scalars)]
+            share = R_inverse @ supernode.S
+            across = -share @ of_behind
+            covariance[:front, :front] -= across @ share.T
+            covariance[:front, front:], covariance[front:, :front] = across, across.T
+            covariance[front:, front:] = of_behind
+        known.append(covariance)
+        for index, node in enumerate(supernode.nodes[: front // _DIMENSION]):
+            block = slice(_DIMENSION * index, _DIMENSION * (index + 1))
+            own = covariance[block, block]
+            covariances[int(node)] = 0.5 * (own + own.T)
+    return covariances
+
+
+def _scalars(blocks: Sequence[int]) -> Array:
+    """Return the indices of the rows of some nodes."""
+    first = _DIMENSION * np.asarray(blocks, np.int64)
+    return (first[:, np.newaxis] + np.arange(_DIMENSION)).ravel()
