@@ -11,7 +11,7 @@ _GAP_INTERVALS = 3.0
 
 
 def frame_coverage(frames_ns: Stamps, poses_ns: Stamps) -> list[Metric]:
-    """Return which share of a log's frames has a pose, and how long the longest run without one is.
+    """Return which share of a log's frames has a pose, and the gaps: frames without, and pauses of the log.
 
     A pose belongs to the frame that it is nearest to, within half the usual interval of frames and 20 ms.
 
@@ -25,7 +25,7 @@ def frame_coverage(frames_ns: Stamps, poses_ns: Stamps) -> list[Metric]:
     return [
         Metric("coverage, frames with a pose", 100.0 * float(tracked.mean()), "%"),
         Metric("frames without a pose", int((~tracked).sum()), "frames"),
-        *_gap_metrics(_untracked_s(frames_ns, tracked)),
+        *_gap_metrics(np.concatenate([_untracked_s(frames_ns, tracked), _pauses_s(frames_ns, tracked)])),
     ]
 
 
@@ -50,6 +50,14 @@ def _gap_metrics(gaps_s: NDArray[np.float64]) -> list[Metric]:
         Metric("gaps", len(gaps_s), "gaps"),
         Metric("longest gap", float(gaps_s.max(initial=0.0)), "s"),
     ]
+
+
+def _pauses_s(frames_ns: Stamps, tracked: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the pauses between frames with poses that are longer than usual."""
+    pauses_ns = np.diff(frames_ns).astype(np.float64)
+    usual_ns = float(np.median(pauses_ns)) if len(pauses_ns) else 0.0
+    between = tracked[:-1] & tracked[1:]
+    return pauses_ns[between & (pauses_ns > _GAP_INTERVALS * usual_ns)] / NS_PER_S
 
 
 def _untracked_s(frames_ns: Stamps, tracked: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -63,6 +63,7 @@ _LOWEST_PERCENT = 0.5
 _NEAR_SENSOR_M = 12.0
 _MIN_SENSOR_HEIGHT_M = 0.15
 _MIN_FLOOR_POINTS = 100
+_FLOOR_SEEN = "floor "
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,11 +75,13 @@ class Level:
             x = y = 0 and heads along +x.
         method: Source of the vertical: "accelerometer", "planes" or "camera".
         detail: Quality of the vertical and source of the floor; a sentence for the manifest.
+        has_floor: The floor was seen; else its height is a guess.
     """
 
     T_level_world: Transform
     method: str
     detail: str
+    has_floor: bool = True
 
 
 def find_level(
@@ -118,7 +121,8 @@ def find_level(
         heights_m = _heights(scans, up_world)
         floor_m, floor_detail = _floor(patches, heights_m, up_world=up_world, tolerance_m=tolerance_m)
     T_level_world = _frame(trajectory.T_world_body[0], up_world, floor_m, axes)
-    return Level(T_level_world, method, f"{up_detail}; {floor_detail}")
+    has_floor = floor_detail.startswith(_FLOOR_SEEN)
+    return Level(T_level_world, method, f"{up_detail}; {floor_detail}", has_floor)
 
 
 def _up(
@@ -245,7 +249,7 @@ def _floor(
         chosen = int(np.flatnonzero(medians_m <= medians_m.min() + _NEAR_FLOOR_M)[0])
         floor_m = float(medians_m[chosen])
         if (heights_m < floor_m - _NEAR_FLOOR_M).mean() <= _MAX_BELOW_FLOOR_RATIO:
-            return floor_m, f"floor seen in {len(surfaces[chosen])} of {len(patches)} patches"
+            return floor_m, f"{_FLOOR_SEEN}seen in {len(surfaces[chosen])} of {len(patches)} patches"
     lowest_m = float(np.percentile(heights_m, _LOWEST_PERCENT))
     return lowest_m, f"no floor seen: z = 0 is where the lowest {_LOWEST_PERCENT} % of the points end"
 
@@ -267,7 +271,7 @@ def _floor_below(
         levels = levels_of(below_m, tolerance_m=tolerance_m, least=least)
         if levels:
             floor_m = float(np.median(below_m[levels[0]]))
-            return floor_m + float(sensor_world @ up_world), f"floor {-floor_m:.2f} m below the sensor"
+            return floor_m + float(sensor_world @ up_world), f"{_FLOOR_SEEN}{-floor_m:.2f} m below the sensor"
     return None, "no floor seen below the sensor: the floor is put at the first pose"
 
 

@@ -22,7 +22,8 @@ from mapper.merging.tiling import tiling_for
 from mapper.octree.config import OctreeConfig
 from mapper.run import files
 from mapper.run.fingerprint import fingerprint
-from mapper.run.manifest import is_merged_map
+from mapper.run.manifest import RunWarning, is_merged_map
+from mapper.run.warnings import merge_warnings
 from mapper.runtime.atomic import MANIFEST_NAME, atomic_folder
 from mapper.runtime.executor import IN_PROCESS, Workers, make_executor
 from mapper.runtime.progress import SILENT, Progress
@@ -117,6 +118,10 @@ def merge(
         for note in missing:
             progress.note(note)
         manifest = _completed(manifest, workspace, split, joined, columns, [*warnings, *missing])
+        apart = [warning.text for run in manifest.runs for warning in _warnings_of(run)]
+        for note in apart:
+            progress.note(note)
+        manifest = manifest.model_copy(update={"notes": (*manifest.notes, *apart)})
         if grid is not None:
             write_grid(folder, files.SLICE, grid)
             draw(folder / files.SUMMARY, grid, placed, manifest)
@@ -263,6 +268,10 @@ def _completed(
             "notes": tuple(notes),
         }
     )
+
+
+def _warnings_of(run: RunInMap) -> list[RunWarning]:
+    return merge_warnings(Path(run.path).name, agreement=run.agreement, shared_voxels=run.shared_voxels)
 
 
 def _clean(workspace: Workspace, joined: Mapping[int, JoinedTile]) -> None:

@@ -19,16 +19,16 @@ from mapper.pipeline.components import component_of
 from mapper.pipeline.fuse import carry_times, fuse_into
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import Start, from_tracking, refuse_a_fragment, track_log
+from mapper.pipeline.track import Start, depth_cautions, from_tracking, refuse_a_fragment, track_log
 from mapper.run import files
 from mapper.run.folder import Run, appended_log, load_run, open_log, write_run
 from mapper.run.manifest import Manifest, Timing, library_versions, now_text
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
+from mapper.run.warnings import INPUT_KINDS
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 from mapper.sources.chained import chained
 from mapper.sources.config import SourceConfig
-from mapper.sources.depth_scale import depth_warnings
 
 _FIXED_BY_FIRST_SESSION = ("odometry", "level")
 
@@ -64,9 +64,8 @@ def append(
     """
     _refuse_unfit(config, run)
     first = open_log(run)
-    second = replace(second, notes=[*second.notes, *depth_warnings(second)])
-    source = chained(first, second)
-    for note in source.notes:
+    source, warnings = chained(first, second), depth_cautions(second)
+    for note in (*source.notes, *(warning.sentence for warning in warnings)):
         progress.note(note)
     joined = config.model_copy(update={"source": run.config.source})
     with write_run(out, _manifest(run, source, config.source), joined, overwrite=overwrite) as writer:
@@ -77,7 +76,7 @@ def append(
             session = source.sessions[-1].log
             start = _after(before, first, poses_for(config.odometry, session), config, progress)
             tracking = track_log(session, config, progress=progress, start=start)
-        writer.note_input(tracking.notes)
+        writer.warn([*warnings, *tracking.warnings])
         refuse_a_fragment(tracking, config, sensor=source.sensor)
         _refuse_unconnected(second, run, tracking.loops, known)
         with writer.clock.stage("solve"):
@@ -112,6 +111,7 @@ def _manifest(run: Run, source: Log, config: SourceConfig) -> Manifest:
         libraries=library_versions(),
         input=known.model_copy(update={"appended": appended}),
         levelling=run.manifest.levelling,
+        warnings=tuple(warning for warning in run.manifest.warnings if warning.kind in INPUT_KINDS),
         timing=Timing(started=now_text()),
     )
 

@@ -13,19 +13,18 @@ from mapper.mapping.levelling import AXES, Level, find_level
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.fuse import fuse_into
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import from_tracking, refuse_a_fragment, track_log
+from mapper.pipeline.track import depth_cautions, from_tracking, refuse_a_fragment, track_log
 from mapper.run.folder import (
     Run,
     first_manifest,
     load_run,
     write_run,
 )
-from mapper.run.manifest import Levelling
+from mapper.run.manifest import Levelling, RunWarning
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.stored_tracking import save_solved, save_tracking
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
-from mapper.sources.depth_scale import depth_warnings
 
 _MAX_CAMERA_HEIGHT_M = 4.0
 """Median height above the floor, in a hand, on a robot or upstairs; wrong units of depth multiply it by 5."""
@@ -54,15 +53,15 @@ def build(
         TrackingError: Too few frames could be tracked; what there is stays in ``OUT.partial``.
         RunError: OUT is there already, or cannot be made.
     """
-    warnings = depth_warnings(source)
+    warnings = depth_cautions(source)
     for warning in warnings:
-        progress.note(warning)
-    source = replace(source, notes=[*source.notes, *warnings])
+        progress.note(warning.sentence)
     with write_run(out, first_manifest(source), config, overwrite=overwrite) as writer:
+        writer.warn(warnings)
         with writer.clock.stage("track"):
             tracking = track_log(source, config, progress=progress, observer=observer)
             tracking = largest_component(tracking, progress=progress)
-        writer.note_input(tracking.notes)
+        writer.warn(tracking.warnings)
         save_tracking(writer, from_tracking(tracking, source.truth))
         refuse_a_fragment(tracking, config, sensor=source.sensor)
         with writer.clock.stage("solve"):
@@ -75,13 +74,12 @@ def build(
         tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
         if warning := _height_warning(source, tracking.tracked_trajectory()):
             progress.note(warning)
-            known = writer.manifest.input
-            writer.update(input=known.model_copy(update={"notes": (*known.notes, warning)}))
+            writer.warn([RunWarning(kind="depth", sentence=warning, weight="doubt")])
         with writer.clock.stage("solve"):
             save_solved(writer, from_tracking(tracking, source.truth))
         writer.update(
             solve=solved.report,
-            levelling=Levelling(method=level.method, detail=level.detail),
+            levelling=Levelling(method=level.method, detail=level.detail, has_floor=level.has_floor),
         )
         fuse_into(writer, source, config, progress, observer=observer)
     return load_run(out)

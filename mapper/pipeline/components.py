@@ -11,10 +11,8 @@ from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.pipeline.track import TrackingResult
+from mapper.run.frame_outcomes import DISCONNECTED
 from mapper.runtime.progress import Progress
-
-DISCONNECTED = "disconnected"
-"""``Diagnostics.method`` of a frame that was placed, but in a part of the path that is left out."""
 
 
 def largest_component(tracking: TrackingResult, *, progress: Progress) -> TrackingResult:

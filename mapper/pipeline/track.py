@@ -20,11 +20,13 @@ from mapper.odometry.factory import build_odometry
 from mapper.odometry.given_poses import poses_for
 from mapper.run.doubtful_frames import placed_by_neighbours
 from mapper.run.frame_outcomes import records_of
+from mapper.run.manifest import RunWarning
 from mapper.run.observers import NULL_OBSERVER, Observer, Step
 from mapper.run.stored_tracking import StoredTracking
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef, Log, Skipped
+from mapper.sources.depth_scale import depth_warnings
 from mapper.sources.reading_checks import ReadingChecks
 
 _BY_POSES = ("wheels", "given")
@@ -48,7 +50,7 @@ class TrackingResult:
         graph: Nodes at the odometry's estimates, with every factor, those of the loops last.
         loops: Every loop candidate with its verdict.
         frame_ms: Wall milliseconds that each frame took to read, detect and track, by stamp.
-        notes: What is suspicious about the frames that were read, a sentence each.
+        warnings: What is suspicious about the frames that were read.
     """
 
     tracks: tuple[FrameResult, ...]
@@ -56,7 +58,7 @@ class TrackingResult:
     graph: PoseGraph
     loops: tuple[LoopClosure, ...]
     frame_ms: Mapping[int, float]
-    notes: Sequence[str] = ()
+    warnings: Sequence[RunWarning] = ()
 
     @property
     def placed(self) -> list[FrameResult]:
@@ -163,15 +165,18 @@ def track_log(
             graph.add_factors(track.factors)
             tracks.append(track)
             observer.on_frame(Step(entry, track, view, odometry.matches, detector))
-    notes = checks.notes()
-    for note in notes:
-        progress.note(note)
+    warnings = [
+        *(RunWarning(kind="frozen", sentence=note, weight="doubt") for note in checks.frozen()),
+        *(RunWarning(kind="far returns", sentence=note) for note in checks.far_returns()),
+    ]
+    for warning in warnings:
+        progress.note(warning.sentence)
     graph.add_factors(odometry.finish())
     if config.odometry.kind not in _BY_POSES:  # which then gave the odometry its factors
         graph.add_factors(wheel_factors(graph.stamps_ns, source.wheels, config.graph.wheels))
     loops = (*start.loops, *detector.closures())
     graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")
-    return TrackingResult(tuple(tracks), tuple(skipped), graph, loops, frame_ms, notes)
+    return TrackingResult(tuple(tracks), tuple(skipped), graph, loops, frame_ms, warnings)
 
 
 def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: Sensor) -> None:
@@ -197,6 +202,11 @@ def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: 
         f"{found}, want at least {enough:.0f}; {hint} "
         "(min_tracked_frames and min_tracked_ratio set the limit)"
     )
+
+
+def depth_cautions(source: Log) -> list[RunWarning]:
+    """Return what is implausible about an RGB-D log's depth, before it is tracked."""
+    return [RunWarning(kind="depth", sentence=text, weight="doubt") for text in depth_warnings(source)]
 
 
 def from_tracking(tracking: TrackingResult, truth: Trajectory | None) -> StoredTracking:

@@ -23,6 +23,7 @@ from mapper.run.manifest import (
     Input,
     InputLog,
     Manifest,
+    RunWarning,
     Timing,
     is_merged_map,
     library_versions,
@@ -197,8 +198,10 @@ class RunWriter:
         """Replace fields of the manifest."""
         self.manifest = self.manifest.model_copy(update=parts)
 
-    def note_input(self, notes: Sequence[str]) -> None:
-        """Add notes on the log that was read last."""
+    def warn(self, warnings: Sequence[RunWarning]) -> None:
+        """Add what reading a log found; its sentences are notes on the log that was read last, too."""
+        self.update(warnings=(*self.manifest.warnings, *warnings))
+        notes = [warning.sentence for warning in warnings]
         known = self.manifest.input
         if known.appended:
             *others, last = known.appended

@@ -43,6 +43,9 @@ _COLUMNS = (
     *_SIGMAS,
     *_POSE,
 )
+DISCONNECTED = "disconnected"
+"""``Diagnostics.method`` of a frame that was placed, but in a part of the path that is left out."""
+
 _DOUBTS_JOINED_BY = "; "
 _NOTHING = Diagnostics(features=0, matches=0, inliers=0, residual=0.0, residual_unit="", method="")
 

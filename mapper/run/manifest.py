@@ -98,6 +98,30 @@ class Counts(Config):
         return f"{self.tracked} tracked, {self.doubtful} doubtful, {self.lost} lost, {self.skipped} skipped"
 
 
+Weight = Literal["note", "doubt", "break"]
+
+
+class RunWarning(Config):
+    """Something suspicious about a run."""
+
+    kind: str
+    """E.g. "gap", "loops", "depth"; docs/VERDICT.md lists them."""
+    sentence: str
+    """What was found, with the value and the limit."""
+    suggestion: str = ""
+    """What to try."""
+    where: str = ""
+    """Seconds of the log."""
+    weight: Weight = "note"
+    """"note": worth knowing; "doubt": the map may be wrong; "break": a part of it is missing or wrong."""
+
+    @property
+    def text(self) -> str:
+        """All of it in one line."""
+        place = f" (at {self.where})" if self.where else ""
+        return f"{self.sentence}{place}{f'; try: {self.suggestion}' if self.suggestion else ''}"
+
+
 class SkippedFrame(Config):
     """A frame that could not be read."""
 
@@ -121,6 +145,8 @@ class Levelling(Config):
 
     method: str
     detail: str
+    has_floor: bool = True
+    """The floor was seen; else its height is a guess."""
 
 
 class Timing(Config):
@@ -153,6 +179,8 @@ class Manifest(Config):
     input: Input
     counts: Counts = Counts()
     skipped: tuple[SkippedFrame, ...] = ()
+    warnings: tuple[RunWarning, ...] = ()
+    """All that is suspicious about the run, what weighs most first; older runs have none."""
     solve: Solve | None = None
     levelling: Levelling | None = None
     timing: Timing = Timing()

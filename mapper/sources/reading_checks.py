@@ -62,6 +62,10 @@ class ReadingChecks:
 
     def notes(self) -> list[str]:
         """Return what is suspicious about the frames loaded so far, a sentence each."""
+        return [*self.frozen(), *self.far_returns()]
+
+    def frozen(self) -> list[str]:
+        """Return where a camera seems to have been frozen, a sentence each."""
         return [
             *(
                 f"{self._named(run)} show the same image; was the camera frozen?"
@@ -71,14 +75,14 @@ class ReadingChecks:
                 f"{self._named(run)} have the same depth image; was the depth camera frozen?"
                 for run in self.repeated("depth", fewest=FROZEN_DEPTHS)
             ),
-            *self._far_returns(),
         ]
 
     def _named(self, run: range) -> str:
         begin_s, end_s = ((self._stamps_ns[[run[0], run[-1]]] - self._stamps_ns[0]) / NS_PER_S).tolist()
         return f"frames {run[0]} … {run[-1]}, {begin_s:.1f} … {end_s:.1f} s after the first,"
 
-    def _far_returns(self) -> Iterator[str]:
+    def far_returns(self) -> Iterator[str]:
+        """Yield a sentence about the returns that were left out, if there were any."""
         counts = [reading.far_returns for reading in self._readings.values() if reading.far_returns]
         if counts:
             yield (

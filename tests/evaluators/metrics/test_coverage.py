@@ -55,3 +55,10 @@ def test_poses_without_times_have_no_coverage():
     numbered, timed = Trajectory(np.arange(100), poses), Trajectory(FRAMES_NS, poses)
     assert "longest gap" not in values_of(assess(numbered, numbered).metrics)
     assert values_of(assess(timed, timed).metrics)["coverage, share of the truth's time"] == 100.0
+
+
+def test_a_pause_of_the_log_is_a_gap_too():
+    frames_ns = np.array([*range(0, 1000, 100), *range(3000, 4000, 100)], np.int64) * 1_000_000
+    found = {metric.name: metric.value for metric in frame_coverage(frames_ns, frames_ns)}
+    assert (found["gaps"], found["longest gap"]) == (1, 2.1)
+    assert found["frames without a pose"] == 0
