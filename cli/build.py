@@ -64,6 +64,10 @@ def build(
             metavar="FILE.rrd|spawn|connect[:URL]", help="Show the build in Rerun while it goes on."
         ),
     ] = None,
+    strict: Annotated[
+        bool,
+        typer.Option("--strict", help="Exit with status 1 if the run is not trusted; it is written whole."),
+    ] = False,
     step: Annotated[
         bool, typer.Option("--step", help="With --rerun: wait for Enter after each frame.")
     ] = False,
@@ -86,6 +90,17 @@ def build(
         from cli.summary import summary_text
 
         print(summary_text(run, metrics))
+    if strict:
+        _refuse_untrusted(run)
+
+
+def _refuse_untrusted(run: "Run") -> None:
+    from mapper.core.errors import UntrustedError
+    from mapper.run.verdict import verdict_on
+
+    verdict = verdict_on(run)
+    if verdict.state != "trusted":
+        raise UntrustedError(f"{run.path}: {verdict.state}: {verdict.sentences[0]}")
 
 
 def built(

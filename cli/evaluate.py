@@ -140,6 +140,10 @@ def evaluate(
     if sharp_log is not None:
         metrics += _sharpness_of(sharp_log, run.tracked_trajectory() if run else trajectory)
     print(_text(metrics, found, Format.JSON if json else format_))
+    if run is not None and not json and format_ in (Format.TEXT, Format.MARKDOWN):
+        from cli.summary import verdict_text
+
+        print(f"\n{verdict_text(run)}")
     if plot is not None:
         from evaluators.pictures.map_agreement import write_map_errors
         from evaluators.pictures.path_errors import write_trajectory_errors

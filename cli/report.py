@@ -53,6 +53,7 @@ def _figures(run: "Run") -> "list[Figure]":
     from evaluators.metrics.metric import shown
     from mapper.export.report.data import Figure
     from mapper.run.files import KEYFRAMES
+    from mapper.run.verdict import verdict_on
     from mapper.sources.trajectory_files import read_tum
 
     counts, truth = run.manifest.counts, run.truth()
@@ -62,6 +63,7 @@ def _figures(run: "Run") -> "list[Figure]":
         metrics += loop_metrics(run.loops(), read_tum(run.path / KEYFRAMES).stamps_ns, truth)
     return [
         Figure("log", run.manifest.input.title),
+        Figure("verdict", verdict_on(run).state),
         Figure("frames tracked", f"{counts.tracked} of {counts.listed}"),
         Figure("frames doubtful", str(counts.doubtful)),
         Figure("frames lost", str(counts.lost)),

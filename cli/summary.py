@@ -11,8 +11,10 @@ from evaluators.metrics.metric import Metric
 from mapper.loops.closure import LoopClosure
 from mapper.run.folder import Run
 from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.verdict import verdict_on
 
 _LINE_WIDTH = 110
+_SHOWN_NOTES = frozenset({"gap", "lost", "doubtful", "skipped", "levelling"})
 _SHOWN = ("ATE RMSE", "RPE translation RMSE", "RPE rotation RMSE", "path length", "start-to-end offset")
 
 
@@ -38,9 +40,27 @@ def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
         ("peak memory", f"{timing.peak_memory_mb:.0f} MB"),
         ("files", _files_text(run.files())),
         ("in", str(run.path)),
+        *_verdict_rows(run),
     ]
     width = max(len(name) for name, _ in rows)
     return "\n".join(_row(name, text, indent=width + 2) for name, text in rows)
+
+
+def verdict_text(run: Run) -> str:
+    """Return the verdict on a run, a line per sentence."""
+    rows = _verdict_rows(run)
+    return "\n".join(_row(name, text, indent=len("verdict") + 2) for name, text in rows)
+
+
+def _verdict_rows(run: Run) -> list[tuple[str, str]]:
+    """Return the verdict, and below it why the run is not trusted and what to try."""
+    verdict = verdict_on(run)
+    notes = [
+        warning.text
+        for warning in run.manifest.warnings
+        if warning.weight == "note" and warning.kind in _SHOWN_NOTES
+    ]
+    return [("verdict", verdict.state), *(("", text) for text in (*verdict.sentences, *notes))]
 
 
 def _loops_text(loops: Sequence[LoopClosure]) -> str:

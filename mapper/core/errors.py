@@ -28,6 +28,10 @@ class TrackingError(MapperError):
     """A log of which too little could be tracked for a map."""
 
 
+class UntrustedError(MapperError):
+    """A run that is written whole, but whose verdict is not "trusted"."""
+
+
 class GraphError(MapperError):
     """A pose graph that is inconsistent or cannot be solved."""
 

@@ -12,7 +12,7 @@ from mapper.export.palette import ESTIMATE
 SIGMAS = 2.0
 """Half the band's width, in standard deviations: in one direction 95 % of the errors lie within."""
 
-_LONGER_SIDE_PX = 2000
+_LONGER_SIDE_PX = 1000
 _ALPHA = 60
 
 

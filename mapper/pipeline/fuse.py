@@ -22,6 +22,7 @@ from mapper.mapping.fusion import Maps, fuse_log
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.scan_update_file import ScanUpdateWriter, open_scan_updates
+from mapper.pipeline.judge import judge
 from mapper.run import files
 from mapper.run.folder import (
     Run,
@@ -37,7 +38,6 @@ from mapper.run.manifest import Solve, Status, Timing
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.results import RunResults, load_results
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
-from mapper.run.warnings import find_warnings
 from mapper.runtime.progress import SILENT, Progress
 from mapper.runtime.timing import peak_memory_mb
 from mapper.sources.base import Log
@@ -192,7 +192,7 @@ def fuse_into(
             log_maps(log, maps, stamp_ns=int(trajectory.stamps_ns[0]))
             _write_maps(writer.folder, maps)
             _write_pictures(writer, maps, results)
-    writer.update(warnings=tuple(find_warnings(results, writer.manifest)))
+    judge(writer, source, config, results, progress=progress)
     counts = writer.manifest.counts.model_copy(
         update={"leaves": len(maps.octree), "cloud_points": len(maps.cloud_points_world)}
     )

@@ -118,8 +118,39 @@ class RunWarning(Config):
     @property
     def text(self) -> str:
         """All of it in one line."""
-        place = f" (at {self.where})" if self.where else ""
-        return f"{self.sentence}{place}{f'; try: {self.suggestion}' if self.suggestion else ''}"
+        text = f"{self.sentence} (at {self.where})" if self.where else self.sentence
+        return f"{text}; try: {self.suggestion}" if self.suggestion else text
+
+
+class Trial(Config):
+    """Other settings of the odometry, tried on a short stretch in which frames were lost or doubtful."""
+
+    where: str
+    """Seconds of the log."""
+    frames: int
+    unplaced: int
+    """Frames lost or doubtful there by the run's own settings, tracked from the stretch's first frame."""
+    tried: dict[str, int] = Field(default_factory=dict)
+    """The same by each other setting."""
+
+    @property
+    def text(self) -> str:
+        """What to try: the setting that lost and doubted least, if any helped by half."""
+        best = min(self.tried, key=self.tried.__getitem__, default="")
+        if best and self.tried[best] < self.unplaced and self.tried[best] <= self.unplaced // 2:
+            return (
+                f"--set {best} (of {self.frames} frames at {self.where}, {self.tried[best]} were lost or "
+                f"doubtful with it, {self.unplaced} without)"
+            )
+        return f"nothing tried helped ({', '.join(self.tried) or 'no other setting applies'})"
+
+
+class Verdict(Config):
+    """Whether a run is to be trusted."""
+
+    state: Literal["trusted", "doubtful", "broken in parts"]
+    sentences: tuple[str, ...] = ()
+    """Why it is not, and what to try."""
 
 
 class SkippedFrame(Config):
@@ -181,6 +212,10 @@ class Manifest(Config):
     skipped: tuple[SkippedFrame, ...] = ()
     warnings: tuple[RunWarning, ...] = ()
     """All that is suspicious about the run, what weighs most first; older runs have none."""
+    trial: Trial | None = None
+    """Made where too many frames were lost or doubtful."""
+    verdict: Verdict | None = None
+    """None in runs of before 2026-11-22."""
     solve: Solve | None = None
     levelling: Levelling | None = None
     timing: Timing = Timing()

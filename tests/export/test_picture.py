@@ -189,8 +189,8 @@ def test_a_band_is_as_wide_as_told_and_has_gaps():
     image = band_image(positions, half_widths_m, low=np.zeros(2), high=np.array([10.0, 10.0]))
     painted = image[:, :, 3] > 0
     pixel_m = 10.0 / image.shape[1]
-    assert painted[:, 600].sum() * pixel_m == pytest.approx(1.0, abs=0.03)
-    assert painted[:, 1290].sum() == 0
+    assert painted[:, 300].sum() * pixel_m == pytest.approx(1.0, abs=0.03)
+    assert painted[:, 645].sum() == 0
     assert set(np.unique(image[:, :, 3])) == {0, 60}
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from mapper.core.errors import ConfigError
 from mapper.export.html import document, section
 from mapper.export.report.data import Chapter, drawn, residual_unit, views_uri
+from mapper.run.verdict import verdict_on
 from mapper.runtime.atomic import write_text
 
 _CURVES = (
@@ -48,6 +49,7 @@ def page_of(chapters: Sequence[Chapter]) -> str:
         header=_header(chapters),
         main=[
             section("Summary", _table(["", *_names(chapters)], _figures(chapters))),
+            section("Verdict", _columns(starmap(_verdict, enumerate(chapters)))),
             section("Plans", _HINT + _columns(starmap(_plan, enumerate(chapters)))),
             section("Over time", _curves(chapters)),
             section("Loops", "".join(starmap(_loops, enumerate(chapters)))),
@@ -170,6 +172,20 @@ def _curves(chapters: Sequence[Chapter]) -> str:
         f"<figcaption>{title}</figcaption></figure>"
         for key, title, unit in curves
     )
+
+
+def _verdict(number: int, chapter: Chapter) -> str:
+    """Return why a run is not trusted, and below it what is worth knowing."""
+    verdict = verdict_on(chapter.run)
+    notes = [warning.text for warning in chapter.run.manifest.warnings if warning.weight == "note"]
+    told = "".join(
+        f'<li class="{kind}">{escape(text)}</li>'
+        for kind, texts in (("heavy", verdict.sentences), ("note", notes))
+        for text in texts
+    )
+    listed = f"<ul>{told}</ul>" if told else ""
+    title = f"{escape(chapter.name)}: {verdict.state}"
+    return f'<div class="verdict" data-of="{number}"><h3>{title}</h3>{listed}</div>'
 
 
 def _loops(number: int, chapter: Chapter) -> str:

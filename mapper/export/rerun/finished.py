@@ -10,6 +10,7 @@ from mapper.export.run_maps import maps_of, snapshots_of
 from mapper.mapping.fusion import Maps
 from mapper.run.folder import Run
 from mapper.run.results import RunResults, load_results
+from mapper.run.verdict import verdict_on
 
 
 def show_run(run: Run, target: str) -> None:
@@ -59,9 +60,10 @@ def extent(results: RunResults, maps: Maps) -> Array:
 def in_words(run: Run, *, name: str) -> str:
     """Return a run as Markdown: its log, counts, odometry and times."""
     manifest = run.manifest
-    counts, timing = manifest.counts, manifest.timing
+    counts, timing, verdict = manifest.counts, manifest.timing, verdict_on(run)
     rows: Iterable[tuple[str, str]] = (
         ("log", f"{manifest.input.title} ({manifest.input.kind})"),
+        ("verdict", " ".join([verdict.state, *verdict.sentences])),
         ("frames", counts.frames_text),
         ("graph", f"{counts.nodes} nodes, {counts.factors} factors"),
         ("loops", f"{counts.loops} of {counts.loop_candidates} candidates hold"),

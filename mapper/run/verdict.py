@@ -1,0 +1,38 @@
+"""Verdict on a run: trusted, doubtful, or broken in parts, by its warnings."""
+
+from collections.abc import Sequence
+
+from mapper.run.folder import Run
+from mapper.run.manifest import RunWarning, Trial, Verdict
+from mapper.run.results import load_results
+from mapper.run.warnings import find_warnings
+
+TRACKING_KINDS = frozenset({"lost", "doubtful", "left out"})
+"""Kinds of warnings that other settings of the odometry may mend."""
+
+
+def verdict_of(warnings: Sequence[RunWarning], trial: Trial | None = None) -> Verdict:
+    """Return the verdict: the heaviest weight of any warning, and the sentences that weigh more than a note.
+
+    Args:
+        warnings: As ``find_warnings`` returns them.
+        trial: What a trial of other settings found, which is the suggestion for frames lost and doubtful.
+    """
+    heavy = [with_trial(warning, trial) for warning in warnings if warning.weight != "note"]
+    weights = {warning.weight for warning in heavy}
+    state = "broken in parts" if "break" in weights else "doubtful" if "doubt" in weights else "trusted"
+    return Verdict(state=state, sentences=tuple(warning.text for warning in heavy))
+
+
+def with_trial(warning: RunWarning, trial: Trial | None) -> RunWarning:
+    """Return the warning with what a trial found as its suggestion, if it is one of tracking."""
+    if trial is None or warning.kind not in TRACKING_KINDS or warning.weight == "note":
+        return warning
+    return warning.model_copy(update={"suggestion": trial.text})
+
+
+def verdict_on(run: Run) -> Verdict:
+    """Return the verdict on a finished run; on one of before 2026-11-22 it is found now, without a trial."""
+    if run.manifest.verdict is not None:
+        return run.manifest.verdict
+    return verdict_of(find_warnings(load_results(run), run.manifest))
