@@ -3,9 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from mapper.graph.components import align_components, components
 from mapper.graph.config import GraphConfig
-from mapper.graph.model import PoseGraph, Solution
+from mapper.graph.drift import innovations
+from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
 from mapper.loops.closure import LoopClosure, apply_solution
 from mapper.run.manifest import Solve
@@ -44,18 +47,23 @@ def solve(graph: PoseGraph, loops: Sequence[LoopClosure], config: GraphConfig) -
     solution = optimize(graph, config)
     loops = apply_solution(loops, graph.T_world_node, solution, min_weight=MIN_WEIGHT)
     others = [factor for factor in graph.factors if factor.origin != "loop"]
-    held = [loop.factor for loop in loops if loop.verdict == "accepted"]
-    return Solved(
-        PoseGraph(solution.T_world_node, graph.stamps_ns, [*others, *held]),
-        loops,
-        _report(solution, graph),
-    )
-
-
-def _report(solution: Solution, graph: PoseGraph) -> Solve:
-    return Solve(
+    held = [loop for loop in loops if loop.verdict == "accepted"]
+    factors = [loop.factor for loop in held]
+    report = Solve(
         error_before=solution.error_before,
         error_after=solution.error_after,
         iterations=solution.iterations,
         components=len(components(graph)),
     )
+    if tried := len(graph.factors) - len(others):
+        report = report.model_copy(update={"loops_rejected": 1.0 - len(held) / tried})
+    if held:
+        before = [loop.before for loop in held if loop.before is not None]
+        report = report.model_copy(
+            update={
+                "loop_residual_m": float(np.median([miss.translation_m for miss in before])),
+                "loop_residual_rad": float(np.median([miss.rotation_rad for miss in before])),
+                "loop_residual_sigma": float(np.median(np.sqrt(innovations(others, factors)))),
+            }
+        )
+    return Solved(PoseGraph(solution.T_world_node, graph.stamps_ns, [*others, *factors]), loops, report)

@@ -169,6 +169,15 @@ class Solve(Config):
     iterations: int
     components: int = 1
     """Connected components of the graph; each is solved on its own."""
+    loop_residual_m: float | None = None
+    loop_residual_rad: float | None = None
+    """Median distance and angle of the accepted loops from odometry's poses, before the solve; None without
+    loops."""
+    loop_residual_sigma: float | None = None
+    """Median Mahalanobis distance of the accepted loops from the prediction of odometry and wheels: 2.3 where
+    all information is honest, many times that where odometry was wrong somewhere and did not know."""
+    loops_rejected: float | None = None
+    """Share of the loops that reached the solver and were rejected by it."""
 
 
 class Levelling(Config):
