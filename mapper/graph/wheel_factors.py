@@ -1,13 +1,15 @@
-"""Relative-pose factors between keyframes from wheel odometry."""
+"""Relative-pose factors between keyframes from wheel odometry, and motions that wheels rule out."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
+
+import numpy as np
 
 from mapper.core.geometry import Transform, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.graph.config import WheelFactorsConfig, WheelNoiseConfig
+from mapper.graph.gate import compare
 from mapper.graph.model import BetweenFactor, Origin, PoseSigmas
 from mapper.sensing.wheel_kinematics import Odometer, pose_at
 
@@ -21,6 +23,55 @@ class WheelNode:
     T_odom_body: Transform
 
 
+_SLACK_M, _SLACK_RAD = 0.2, 0.1
+"""How far a motion may be from the wheels' whatever their noise: of clocks, mountings and uneven floors."""
+
+
+class WheelMeasurements:
+    """Wheel odometry beside another odometry: factors between its nodes, as these come."""
+
+    def __init__(self, wheels: Trajectory | None, config: WheelFactorsConfig) -> None:
+        """Start before the first node.
+
+        Args:
+            wheels: T_odom_body; None without wheels.
+            config: Whether they are used, and their noise.
+        """
+        self._config = config
+        self._wheels = wheels if config.use else None
+        self._odometer = None if self._wheels is None else Odometer(self._wheels)
+        self._last: WheelNode | None = None
+
+    def link(self, node: int, stamp_ns: int) -> list[BetweenFactor]:
+        """Return the factor to a new node, in time order, from the last one whose wheel pose is known."""
+        here = self._at(node, stamp_ns)
+        if here is None:
+            return []
+        last, self._last = self._last, here
+        return [] if last is None else [self._factor(last, here)]
+
+    def contradiction(self, T_begin_end: Transform, begin_ns: int, end_ns: int) -> str:
+        """Return why a body's motion (4, 4) between two times cannot be, by the wheels; empty if it can."""
+        begin, end = self._at(0, begin_ns), self._at(1, end_ns)
+        if begin is None or end is None:
+            return ""
+        driven = self._factor(begin, end)
+        covariance = np.linalg.inv(driven.information)
+        apart = compare(T_begin_end, driven.T_i_j, covariance, slack_m=_SLACK_M, slack_rad=_SLACK_RAD)
+        return "" if apart.is_possible else f"{apart}, by the wheels"
+
+    def _at(self, node: int, stamp_ns: int) -> WheelNode | None:
+        if self._wheels is None:
+            return None
+        max_gap_ns = round(self._config.max_gap_s * NS_PER_S)
+        T_odom_body = pose_at(self._wheels, stamp_ns, max_gap_ns=max_gap_ns)
+        return None if T_odom_body is None else WheelNode(node, stamp_ns, T_odom_body)
+
+    def _factor(self, i: WheelNode, j: WheelNode) -> BetweenFactor:
+        assert self._odometer is not None  # there are wheel poses
+        return wheel_factor(i, j, self._odometer, self._config, origin="wheel")
+
+
 def wheel_factors(
     stamps_ns: Mapping[int, int], wheels: Trajectory | None, config: WheelFactorsConfig
 ) -> list[BetweenFactor]:
@@ -31,16 +82,9 @@ def wheel_factors(
         wheels: T_odom_body; None without wheels.
         config: Whether they are used, and their noise.
     """
-    if wheels is None or not config.use:
-        return []
-    max_gap_ns = round(config.max_gap_s * NS_PER_S)
-    known = [
-        WheelNode(node, stamp_ns, T_odom_node)
-        for node, stamp_ns in sorted(stamps_ns.items(), key=lambda item: item[1])
-        if (T_odom_node := pose_at(wheels, stamp_ns, max_gap_ns=max_gap_ns)) is not None
-    ]
-    odometer = Odometer(wheels)
-    return [wheel_factor(i, j, odometer, config, origin="wheel") for i, j in pairwise(known)]
+    measurements = WheelMeasurements(wheels, config)
+    in_time_order = sorted(stamps_ns.items(), key=lambda item: item[1])
+    return [factor for node, stamp_ns in in_time_order for factor in measurements.link(node, stamp_ns)]
 
 
 def wheel_factor(

@@ -3,6 +3,7 @@
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Generic, Protocol
 
 import numpy as np
@@ -16,7 +17,8 @@ from mapper.loops.base import Place, Proposer, Verifier, verify_proposal
 from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy, exceeds
 from mapper.loops.config import KeyframeLoopsConfig
 from mapper.loops.consistency_check import ConsistencyCheck
-from mapper.loops.odometry_chain import OdometryChain, allowed
+from mapper.loops.drift_gate import MIN_CONFLICTS, DriftGate
+from mapper.loops.odometry_chain import OdometryChain
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 from mapper.loops.proposers import PoseProposer
 from mapper.odometry.base import FrameResult
@@ -41,6 +43,10 @@ class LoopDetector(Protocol):
         """Return the (4, 4) current estimate of a node's pose, with the loops so far."""
         ...
 
+    def notes(self) -> Sequence[str]:
+        """Return what is suspicious about the loops so far, a sentence each."""
+        ...
+
 
 class NoLoopDetector:
     """Loop detector that finds nothing; its estimate is the odometry's."""
@@ -60,6 +66,10 @@ class NoLoopDetector:
         """Return the odometry's (4, 4) pose of a node."""
         return self._T_world_node[node]
 
+    def notes(self) -> Sequence[str]:
+        """Return nothing."""
+        return ()
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Search:
@@ -74,7 +84,7 @@ class KeyframeLoopDetector(Generic[Place]):
     """Loop detector that compares keyframes with known places.
 
     A candidate is measured (``Verifier``), its disagreement with the current estimate compared with the drift
-    that the odometry may have since (``OdometryChain``), and held back until a loop from another keyframe
+    that odometry and wheels may have since (``DriftGate``), and held back until a loop from another keyframe
     nearby agrees (``ConsistencyCheck``).
     """
 
@@ -100,13 +110,11 @@ class KeyframeLoopDetector(Generic[Place]):
         self._chain = chain
         self._verifier = verifier
         self._proposer_for = proposer_for
-        self._consistency = ConsistencyCheck(
-            chain,
-            estimator,
-            config.gate,
-            min_agreeing=config.min_agreeing,
-            within_m=config.agreement_path_m,
+        consistency_check = partial(
+            ConsistencyCheck, chain, estimator, config.gate, within_m=config.agreement_path_m
         )
+        self._consistency = consistency_check(min_agreeing=config.min_agreeing)
+        self._gate = DriftGate(config.gate, chain, estimator, consistency_check(min_agreeing=MIN_CONFLICTS))
         self._proposer: Proposer[Place] | None = None
         self._places: dict[int, Place] = {}
         self._preloaded = 0
@@ -157,7 +165,7 @@ class KeyframeLoopDetector(Generic[Place]):
             if proposal.proposed_by == "nearby" and proposal.node in self._disconnected:
                 continue
             known = self._places[proposal.node]
-            closure = self._gated(verify_proposal(proposal, node, known, place, self._verifier))
+            closure = self._gate.checked(verify_proposal(proposal, node, known, place, self._verifier))
             self._closures[closure.i, closure.j] = closure
             if closure.verdict == "accepted":
                 self._hold_back(closure)
@@ -171,6 +179,10 @@ class KeyframeLoopDetector(Generic[Place]):
     def current_estimate(self, node: int) -> Transform:
         """Return the (4, 4) current estimate of a node's pose, with the loops so far."""
         return self._estimator.pose_of(node)
+
+    def notes(self) -> Sequence[str]:
+        """Return a sentence about loops that agree with each other, but not with odometry or wheels."""
+        return self._gate.notes()
 
     def _search_from(self, track: FrameResult) -> _Search | None:
         """Return the search to make from here; None where too little has changed since the last."""
@@ -203,23 +215,6 @@ class KeyframeLoopDetector(Generic[Place]):
         by_time = bisect_right(self._searches, max_stamp_ns, key=lambda search: search.stamp_ns)
         by_path = bisect_right(self._searches, max_path_m, key=lambda search: search.path_m)
         return self._preloaded + min(by_time, by_path)
-
-    def _gated(self, closure: LoopClosure) -> LoopClosure:
-        """Reject a measurement that the odometry cannot have drifted by."""
-        path = self._chain.between(closure.i, closure.j)
-        if closure.T_i_j is None or path is None:
-            return closure
-        miss = discrepancy(
-            closure.T_i_j, self._estimator.pose_of(closure.i), self._estimator.pose_of(closure.j)
-        )
-        limit = allowed(self._config.gate, path)
-        if not exceeds(miss, limit):
-            return closure
-        reason = (
-            f"gate: {miss.translation_m:.2f} m and {miss.rotation_rad:.2f} rad off, at most "
-            f"{limit.translation_m:.2f} m and {limit.rotation_rad:.2f} rad after {path.path_m:.1f} m of path"
-        )
-        return replace(closure, verdict="rejected", reason=reason)
 
     def _hold_back(self, closure: LoopClosure) -> None:
         """Keep a measured loop as a hypothesis, and accept all that are confirmed now."""

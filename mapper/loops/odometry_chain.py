@@ -1,4 +1,4 @@
-"""Path lengths between the nodes of a pose graph, and the drift that odometry may have on them."""
+"""Paths between the nodes of a pose graph, and the drift that odometry and wheels may have on them."""
 
 import heapq
 from collections.abc import Iterable, Sequence
@@ -9,22 +9,61 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from mapper.core.geometry import rotation_log
+from mapper.core.geometry import Array, adjoint, inverse, rotation_log
 from mapper.graph.model import BetweenFactor
 from mapper.loops.closure import Discrepancy
 from mapper.loops.config import GateConfig
 
+_MAX_STEP_M, _MAX_STEP_RAD = 1.0, 0.5
+"""Largest standard deviations of an odometry's step: a motion that surfaces leave open is still predicted."""
+
 
 @dataclass(frozen=True, slots=True)
 class NodePath:
-    """Shortest path between two nodes, over odometry and loops."""
+    """Best path between two nodes, over odometry, wheels and loops."""
 
     path_m: float
     turned_rad: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Drift:
+    """Best path from one node to another, and its uncertainty.
+
+    Attributes:
+        path: Its length.
+        covariance: (6, 6) of the last node's pose in the first, in the last's tangent (rotation,
+            translation), rad² and m²: those of the steps, added up to first order (Barfoot & Furgale 2014,
+            eq. 55).
+        by_wheels: Whether it leads over a wheel factor.
+    """
+
+    path: NodePath
+    covariance: Array
+    by_wheels: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Edge:
+    """A factor, as a step of a path.
+
+    Attributes:
+        factor: The factor.
+        covariance: (6, 6) of its j.
+        path_m: Its distance.
+        turned_rad: Its angle.
+        cost: What shortest paths minimise: distance, angle, and their standard deviations.
+    """
+
+    factor: BetweenFactor
+    covariance: Array
+    path_m: float
+    turned_rad: float
+    cost: float
+
+
 class OdometryChain:
-    """Odometry chain: the factors between nodes, and how long each is.
+    """Odometry chain: the factors between nodes, how long each is, and how uncertain.
 
     Loops are factors as well, so a place seen again is close to everything that was seen around it before:
     the uncertainty between two nodes is that of the best path between them, not of the time that has passed.
@@ -36,17 +75,16 @@ class OdometryChain:
     """
 
     def __init__(self) -> None:
-        self._neighbours: dict[int, list[tuple[int, float, float]]] = {}
+        self._edges: dict[int, list[tuple[int, _Edge]]] = {}
         self._ends_i: list[int] = []
         self._ends_j: list[int] = []
 
     def add(self, factors: Iterable[BetweenFactor]) -> None:
         """Add factors between nodes."""
         for factor in factors:
-            path_m = float(np.linalg.norm(factor.T_i_j[:3, 3]))
-            turned_rad = float(np.linalg.norm(rotation_log(factor.T_i_j[:3, :3])))
-            for a, b in ((factor.i, factor.j), (factor.j, factor.i)):
-                self._neighbours.setdefault(a, []).append((b, path_m, turned_rad))
+            edge = _edge(factor)
+            self._edges.setdefault(factor.i, []).append((factor.j, edge))
+            self._edges.setdefault(factor.j, []).append((factor.i, edge))
             self._ends_i.append(factor.i)
             self._ends_j.append(factor.j)
 
@@ -60,17 +98,37 @@ class OdometryChain:
         connected: NDArray[np.bool_] = labels[np.array(others, np.intp)] == labels[node]
         return connected
 
-    def between(self, a: int, b: int) -> NodePath | None:
-        """Return the shortest path between two nodes (Dijkstra 1959), None if they are disconnected."""
-        return self._search(a, until=b, within_m=float("inf")).get(b)
+    def between(self, a: int, b: int) -> Drift | None:
+        """Return the best path from one node to another (Dijkstra 1959), None if they are disconnected."""
+        reached, steps = self._search(a, until=b, within_m=float("inf"))
+        if b not in reached:
+            return None
+        way: list[tuple[int, _Edge]] = []
+        node = b
+        while node != a:
+            before, edge = steps[node]
+            way.append((node, edge))
+            node = before
+        covariance = np.zeros((6, 6))
+        for node, edge in reversed(way):
+            covariance = _carried(covariance, edge, node)
+        return Drift(reached[b], covariance, any(edge.factor.origin == "wheel" for _, edge in way))
 
     def around(self, node: int, *, within_m: float) -> dict[int, NodePath]:
         """Return the nodes no farther along the path than a limit, with the path to each."""
-        return self._search(node, until=None, within_m=within_m)
+        return self._search(node, until=None, within_m=within_m)[0]
 
-    def _search(self, start: int, *, until: int | None, within_m: float) -> dict[int, NodePath]:
-        """Grow outwards by metres plus radians, which a hand-held camera collects at similar rates."""
+    def _search(
+        self, start: int, *, until: int | None, within_m: float
+    ) -> tuple[dict[int, NodePath], dict[int, tuple[int, _Edge]]]:
+        """Grow outwards by metres plus radians, which a hand-held camera collects at similar rates.
+
+        Returns:
+            The path to each node that was reached, and the last step to it: from which node, by which edge.
+        """
         reached: dict[int, NodePath] = {}
+        steps: dict[int, tuple[int, _Edge]] = {}
+        best: dict[int, float] = {start: 0.0}
         queue = [(0.0, start, 0.0, 0.0)]
         while queue:
             cost, node, path_m, turned_rad = heapq.heappop(queue)
@@ -79,11 +137,37 @@ class OdometryChain:
             reached[node] = NodePath(path_m, turned_rad)
             if node == until:
                 break
-            for other, more_m, more_rad in self._neighbours.get(node, ()):
-                if other not in reached and path_m + more_m <= within_m:
-                    step = (cost + more_m + more_rad, other, path_m + more_m, turned_rad + more_rad)
+            for other, edge in self._edges.get(node, ()):
+                further = cost + edge.cost
+                if other in reached or path_m + edge.path_m > within_m:
+                    continue
+                if further < best.get(other, float("inf")):
+                    best[other], steps[other] = further, (node, edge)
+                    step = (further, other, path_m + edge.path_m, turned_rad + edge.turned_rad)
                     heapq.heappush(queue, step)
-        return reached
+        return reached, steps
+
+
+def _edge(factor: BetweenFactor) -> _Edge:
+    covariance = np.linalg.inv(factor.information)
+    if factor.origin == "odometry":
+        least = np.diag([_MAX_STEP_RAD**-2.0] * 3 + [_MAX_STEP_M**-2.0] * 3)
+        covariance = np.linalg.inv(factor.information + least)
+    path_m = float(np.linalg.norm(factor.T_i_j[:3, 3]))
+    turned_rad = float(np.linalg.norm(rotation_log(factor.T_i_j[:3, :3])))
+    sigma_rad, sigma_m = (float(np.trace(block)) ** 0.5 for block in (covariance[:3, :3], covariance[3:, 3:]))
+    return _Edge(factor, covariance, path_m, turned_rad, path_m + turned_rad + sigma_m + sigma_rad)
+
+
+def _carried(covariance: Array, edge: _Edge, end: int) -> Array:
+    """Return the covariance of a path's end after one more step, in the tangent of the step's end."""
+    factor = edge.factor
+    if factor.j == end:
+        to_end, step = adjoint(inverse(factor.T_i_j)), edge.covariance
+    else:
+        to_end = adjoint(factor.T_i_j)
+        step = to_end @ edge.covariance @ to_end.T
+    return to_end @ covariance @ to_end.T + step
 
 
 def allowed(config: GateConfig, path: NodePath) -> Discrepancy:

@@ -2,6 +2,8 @@
 
 from typing import Literal, Protocol
 
+import numpy as np
+
 from mapper.core.geometry import Transform, inverse
 from mapper.graph.incremental import IncrementalSolver
 from mapper.graph.model import PoseGraph
@@ -105,9 +107,10 @@ class ProportionalPoseEstimator:
 
 
 def _first_estimate(track: FrameResult, T_world_node: dict[int, Transform]) -> Transform:
+    """Return the pose by the surest link to an earlier node; by the odometry, if there is none."""
     if not track.links:
         return track.T_world_body
-    link = track.links[0]
+    link = min(track.links, key=lambda link: float(np.trace(np.linalg.inv(link.information))))
     T_world_new: Transform = T_world_node[link.i] @ link.T_i_j
     return T_world_new
 

@@ -62,6 +62,10 @@ class ThesisLoopDetector:
         """Return the (4, 4) current estimate of a node's pose, with the loops so far."""
         return self._estimator.pose_of(node)
 
+    def notes(self) -> Sequence[str]:
+        """Return nothing: no loop is held against the odometry."""
+        return ()
+
     def _search(self, node: int, seen: ImageView) -> None:
         min_gap_ns = round(self._config.min_gap_s * NS_PER_S)
         old = bisect_right(

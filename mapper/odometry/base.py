@@ -100,6 +100,14 @@ class FeatureMatches:
     previous_px: Array
 
 
+class MotionCheck(Protocol):
+    """Other measurement of the body's motion, which holds whatever the images show."""
+
+    def contradiction(self, T_begin_end: Transform, begin_ns: int, end_ns: int) -> str:
+        """Return why a motion (4, 4) between two times cannot be; empty if it can, or nothing is known."""
+        ...
+
+
 Observation = TypeVar("Observation")
 
 

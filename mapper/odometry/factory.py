@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, assert_never
 
 from mapper.core.errors import ConfigError
 from mapper.core.trajectory import Trajectory
-from mapper.odometry.base import FrameOdometry, Odometry
+from mapper.odometry.base import FrameOdometry, MotionCheck, Odometry
 from mapper.odometry.config import (
     FrameOdometryConfig,
     GivenOdometryConfig,
@@ -27,12 +27,15 @@ if TYPE_CHECKING:
     from mapper.odometry.scan_to_map.scan_matcher import ScanMatcher
 
 
-def build_odometry(config: OdometryConfig, poses: Trajectory | None = None) -> Odometry[Any]:
+def build_odometry(
+    config: OdometryConfig, poses: Trajectory | None = None, motion_check: MotionCheck | None = None
+) -> Odometry[Any]:
     """Return the odometry that the settings choose, before its first frame; its module is imported only now.
 
     Args:
         config: Settings of one method.
         poses: T_odom_body of the log's wheel odometry, or known poses, as ``poses_for`` returns them.
+        motion_check: Another measurement of the motion, which rules out poses after a gap.
 
     Raises:
         ConfigError: Wheel odometry or known poses are chosen, and the log has none.
@@ -57,10 +60,12 @@ def build_odometry(config: OdometryConfig, poses: Trajectory | None = None) -> O
                 )
             return GivenOdometry(config, poses)
         case _:
-            return build_frame_odometry(config)
+            return build_frame_odometry(config, motion_check)
 
 
-def build_frame_odometry(config: FrameOdometryConfig) -> FrameOdometry[Any]:
+def build_frame_odometry(
+    config: FrameOdometryConfig, motion_check: MotionCheck | None = None
+) -> FrameOdometry[Any]:
     """Return the odometry that the settings choose among those that use the frames' images or scans."""
     match config:
         case IsvdOdometryConfig():
@@ -71,12 +76,12 @@ def build_frame_odometry(config: FrameOdometryConfig) -> FrameOdometry[Any]:
             from mapper.odometry.local_map.motion_tracker import MotionPoseTracker
             from mapper.odometry.local_map.odometry import KeyframeOdometry
 
-            return KeyframeOdometry(config, partial(MotionPoseTracker, config))
+            return KeyframeOdometry(config, partial(MotionPoseTracker, config), motion_check)
         case PnpConfig():
             from mapper.odometry.local_map.odometry import KeyframeOdometry
             from mapper.odometry.local_map.pnp_tracker import PnpPoseTracker
 
-            return KeyframeOdometry(config, PnpPoseTracker)
+            return KeyframeOdometry(config, PnpPoseTracker, motion_check)
         case GicpOdometryConfig() | IcpOdometryConfig() | KissOdometryConfig() | HoughOdometryConfig():
             from mapper.odometry.scan_to_map.odometry import ScanOdometry
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, LoopError
-from mapper.core.trajectory import Trajectory
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import KeyframeLoopsConfig
@@ -19,7 +18,14 @@ from mapper.pipeline.components import component_of
 from mapper.pipeline.fuse import carry_times, fuse_into
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import Start, depth_cautions, from_tracking, refuse_a_fragment, track_log
+from mapper.pipeline.track import (
+    Start,
+    depth_cautions,
+    from_tracking,
+    refuse_a_fragment,
+    track_log,
+    wheels_beside,
+)
 from mapper.run import files
 from mapper.run.folder import Run, appended_log, load_run, open_log, write_run
 from mapper.run.manifest import Manifest, Timing, library_versions, now_text
@@ -74,7 +80,7 @@ def append(
         known = before.graph.T_world_node.keys()
         with writer.clock.stage("track"):
             session = source.sessions[-1].log
-            start = _after(before, first, poses_for(config.odometry, session), config, progress)
+            start = _after(before, first, session, config, progress)
             tracking = track_log(session, config, progress=progress, start=start)
         writer.warn([*warnings, *tracking.warnings])
         refuse_a_fragment(tracking, config, sensor=source.sensor)
@@ -119,7 +125,7 @@ def _manifest(run: Run, source: Log, config: SourceConfig) -> Manifest:
 def _after(
     before: StoredTracking,
     first: Log,
-    poses: Trajectory | None,
+    session: Log,
     config: BuildConfig,
     progress: Progress,
 ) -> Start:
@@ -129,7 +135,8 @@ def _after(
     detector = build_keyframe_loop_detector(config.loops, config.graph.solve)
     views = reobserve(first, before.trajectory, set(graph.stamps_ns.values()), config, progress=progress)
     detector.preload(graph, {node: views[stamp_ns] for node, stamp_ns in graph.stamps_ns.items()})
-    odometry = build_odometry(config.odometry, poses)
+    poses, wheels = poses_for(config.odometry, session), wheels_beside(session, config)
+    odometry = build_odometry(config.odometry, poses, wheels)
     offset_odometry = NodeOffset(odometry, first_node=max(graph.T_world_node) + 1)
     known = [factor for factor in graph.factors if factor.origin != "loop"]
     return Start(

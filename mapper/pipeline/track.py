@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -10,8 +10,8 @@ from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, FrameError, TrackingError
 from mapper.core.frames import Sensor
 from mapper.core.trajectory import Trajectory, trajectory_from
-from mapper.graph.model import PoseGraph
-from mapper.graph.wheel_factors import wheel_factors
+from mapper.graph.model import BetweenFactor, PoseGraph
+from mapper.graph.wheel_factors import WheelMeasurements
 from mapper.loops.closure import LoopClosure
 from mapper.loops.detector import LoopDetector
 from mapper.loops.factory import build_loop_detector
@@ -114,7 +114,9 @@ def first_session(source: Log, config: BuildConfig) -> Start:
             "loops.kind=thesis looks from frames with many features, and "
             f"odometry.kind={config.odometry.kind} counts none; want loops.kind=places, scans or none"
         )
-    odometry = build_odometry(config.odometry, poses_for(config.odometry, source))
+    odometry = build_odometry(
+        config.odometry, poses_for(config.odometry, source), wheels_beside(source, config)
+    )
     return Start(odometry, build_loop_detector(config.loops, config.graph.solve), PoseGraph())
 
 
@@ -137,6 +139,8 @@ def track_log(
     tracks: list[FrameResult] = []
     skipped: list[Skipped] = []
     frame_ms: dict[int, float] = {}
+    wheels = wheels_beside(source, config)
+    wheel_factors: list[BetweenFactor] = []
 
     def observe(entry: FrameRef) -> tuple[FrameRef, Any, float]:
         began = time.perf_counter()
@@ -160,7 +164,9 @@ def track_log(
             view = partial(odometry.view, observation, track.twist)
             if track.is_keyframe and track.node is not None:
                 graph.add_node(track.node, track.stamp_ns, track.T_world_body)
-                detector.add(track.node, track, view)
+                driven = wheels.link(track.node, track.stamp_ns)
+                detector.add(track.node, replace(track, links=(*track.links, *driven)), view)
+                wheel_factors += driven
             frame_ms[track.stamp_ns] = 1e3 * (observed_s + time.perf_counter() - began)
             graph.add_factors(track.factors)
             tracks.append(track)
@@ -168,15 +174,21 @@ def track_log(
     warnings = [
         *(RunWarning(kind="frozen", sentence=note, weight="doubt") for note in checks.frozen()),
         *(RunWarning(kind="far returns", sentence=note) for note in checks.far_returns()),
+        *(RunWarning(kind="conflict", sentence=note, weight="doubt") for note in detector.notes()),
     ]
     for warning in warnings:
         progress.note(warning.sentence)
     graph.add_factors(odometry.finish())
-    if config.odometry.kind not in _BY_POSES:  # which then gave the odometry its factors
-        graph.add_factors(wheel_factors(graph.stamps_ns, source.wheels, config.graph.wheels))
+    graph.add_factors(wheel_factors)
     loops = (*start.loops, *detector.closures())
     graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")
     return TrackingResult(tuple(tracks), tuple(skipped), graph, loops, frame_ms, warnings)
+
+
+def wheels_beside(source: Log, config: BuildConfig) -> WheelMeasurements:
+    """Return the wheels that a log has beside its odometry; nothing where they are the odometry."""
+    wheels = None if config.odometry.kind in _BY_POSES else source.wheels
+    return WheelMeasurements(wheels, config.graph.wheels)
 
 
 def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: Sensor) -> None:

@@ -12,7 +12,7 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import Transform, exp, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.features.frame_view import ImageView
-from mapper.graph.model import BetweenFactor
+from mapper.graph.model import BetweenFactor, PoseSigmas
 from mapper.loops.closure import LoopClosure, discrepancy
 from mapper.loops.config import GateConfig, NoLoopsConfig, PlaceLoopsConfig, ThesisLoopsConfig
 from mapper.loops.detector import LoopDetector
@@ -30,14 +30,19 @@ def drifting(truth: Sequence[Transform]) -> list[Transform]:
 
 
 def walk(
-    detector: LoopDetector, room: Room, *, poses: Sequence[Transform] | None = None, features=None
+    detector: LoopDetector,
+    room: Room,
+    *,
+    poses: Sequence[Transform] | None = None,
+    features=None,
+    information=LINK,
 ) -> list[ImageView]:
-    """Feed a loop detector with the walk; ``poses`` are the odometry's."""
+    """Feed a loop detector with the walk; ``poses`` are the odometry's, ``information`` that of its steps."""
     truth = walked()
     poses = drifting(truth) if poses is None else poses
     views = [room.view(T, k * NS_PER_S // 2) for k, T in enumerate(truth)]
     for k, T_world_body in enumerate(poses):
-        links = [BetweenFactor(k - 1, k, inverse(poses[k - 1]) @ T_world_body, LINK)] if k else []
+        links = [BetweenFactor(k - 1, k, inverse(poses[k - 1]) @ T_world_body, information)] if k else []
         count = 500 if features is None else features[k]
         detector.add(
             k, track(k, views[k].stamp_ns, T_world_body, links, features=count), partial(views.__getitem__, k)
@@ -96,7 +101,7 @@ def test_the_gate_refuses_what_odometry_rules_out():
         slack_m=0.01, slack_rad=0.01, drift_ratio=0.0, drift_rad_per_m=0.0, drift_rad_per_rad=0.0
     )
     detector = build_loop_detector(PlaceLoopsConfig(places=PLACES, gate=gate), "batch")
-    walk(detector, Room(1))
+    walk(detector, Room(1), information=PoseSigmas(rotation_rad=1e-5, translation_m=1e-5).information)
     assert not accepted(detector)
     assert any(loop.reason.startswith("gate: ") for loop in detector.closures())
 

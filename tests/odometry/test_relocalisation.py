@@ -1,5 +1,7 @@
 """Relocalisation after a loss: a known place is recognised, an unknown one begins a sub-map."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -130,3 +132,42 @@ def test_of_two_weak_poses_that_of_more_inliers_counts(frames, order):
 
     assert sum(tracked_pose is not None for tracked_pose in alone) > 1
     assert best.inliers == max(tracked_pose.inliers for tracked_pose in alone if tracked_pose is not None)
+
+
+class Stands:
+    """A motion check by which the body stood still at first, and then was carried off."""
+
+    def __init__(self, until_ns: int) -> None:
+        self._until_ns = until_ns
+
+    def contradiction(self, _T_begin_end, _begin_ns: int, end_ns: int) -> str:
+        return "" if end_ns <= self._until_ns else "carried off"
+
+
+@BOTH
+def test_a_place_that_only_looks_known_begins_a_sub_map(frames, config):
+    """After the darkness the very same room is seen, but the wheels say that it is another one."""
+    dark = seconds(4.5, 5.5)
+    log = [*frames[: dark.start], *map(blank, frames[dark]), *frames[dark.stop :][:8]]
+    odometry = build_frame_odometry(config, Stands(frames[dark.start].stamp_ns))
+
+    tracks = tracked(log, odometry)
+
+    back = next(track for track in tracks[dark.stop :] if track.node is not None)
+    assert back.diagnostics.method == "start"
+    assert tracks.index(back) - dark.stop <= 1  # at once, instead of after ``max_lost_frames``
+    assert len(components(graph_of(tracks, odometry))) == 2
+
+
+@BOTH
+def test_after_a_gap_of_the_log_looks_do_not_decide_alone(frames, config):
+    """No frame was lost, but two seconds are missing, in which the wheels drove elsewhere."""
+    before = frames[seconds(0.0, 1.0)]
+    after = [replace(frame, stamp_ns=frame.stamp_ns + 2_000_000_000) for frame in frames[seconds(0.5, 1.0)]]
+    fooled, warned = (
+        tracked([*before, *after], build_frame_odometry(config, check))
+        for check in (None, Stands(before[-1].stamp_ns))
+    )
+    assert fooled[len(before)].node is not None
+    assert fooled[len(before)].diagnostics.method != "start"
+    assert any(track.diagnostics.method == "start" for track in warned[len(before) :])

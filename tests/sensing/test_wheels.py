@@ -12,7 +12,7 @@ from mapper.core.errors import SourceError
 from mapper.core.geometry import angle_between, exp, inverse, transform
 from mapper.core.trajectory import Trajectory
 from mapper.graph.config import WheelFactorsConfig
-from mapper.graph.wheel_factors import wheel_factors
+from mapper.graph.wheel_factors import WheelMeasurements, wheel_factors
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log
@@ -89,6 +89,16 @@ def test_there_and_back_is_a_long_path():
     (factor,) = wheel_factors({0: 0, 1: S}, there_and_back, WheelFactorsConfig())
     np.testing.assert_allclose(factor.T_i_j, np.eye(4), atol=1e-12)
     assert factor.information[5, 5] ** -0.5 == pytest.approx(0.01 + 0.05 * 5.0)
+
+
+def test_a_motion_that_the_wheels_did_not_make_is_named():
+    wheels = WheelMeasurements(on_a_line(21), WheelFactorsConfig())
+    driven = transform(np.eye(3), [10.0, 0.0, 0.0])
+    assert wheels.contradiction(driven, 0, 2 * S) == ""
+    assert wheels.contradiction(transform(np.eye(3), [9.0, 0.5, 0.0]), 0, 2 * S) == ""  # 5 % of the way
+    assert wheels.contradiction(np.eye(4), 0, 2 * S).startswith("10.00 m and 0.00 rad off, at most 2.")
+    assert wheels.contradiction(np.eye(4), 0, 9 * S) == ""  # no readings, so nothing is known
+    assert WheelMeasurements(None, WheelFactorsConfig()).contradiction(np.eye(4), 0, 2 * S) == ""
 
 
 def test_without_wheels_or_when_switched_off_there_are_no_factors():

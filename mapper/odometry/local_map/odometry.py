@@ -9,11 +9,19 @@ from numpy.typing import NDArray
 from mapper.core.deskew import Twist
 from mapper.core.frames import Frame
 from mapper.core.geometry import Transform, inverse
+from mapper.core.timebase import NS_PER_S
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
-from mapper.odometry.base import Diagnostics, FeatureMatches, FrameOdometry, FrameResult, lost_frame
+from mapper.odometry.base import (
+    Diagnostics,
+    FeatureMatches,
+    FrameOdometry,
+    FrameResult,
+    MotionCheck,
+    lost_frame,
+)
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.image_observation import ImageObservation, observe_image
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
@@ -32,6 +40,9 @@ the next frame does not begin weak."""
 _FACTORS_PER_KEYFRAME = 4
 """Factors of each keyframe, to the earlier ones that share most landmarks with it."""
 
+_STEADY_NS = NS_PER_S
+"""After a longer gap the frame before says little about where this one was taken."""
+
 MakePoseTracker = Callable[[LandmarkMap, Relocalizer], PoseTracker]
 
 
@@ -42,8 +53,21 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
     so ``finish`` returns all factors.
     """
 
-    def __init__(self, config: KeyframeOdometryConfig, make_tracker: MakePoseTracker) -> None:
+    def __init__(
+        self,
+        config: KeyframeOdometryConfig,
+        make_tracker: MakePoseTracker,
+        motion_check: MotionCheck | None = None,
+    ) -> None:
+        """Start before the first frame.
+
+        Args:
+            config: Settings.
+            make_tracker: Makes the pose tracker.
+            motion_check: Rules out poses after a gap; None if nothing but the images tells of the motion.
+        """
         self._config = config
+        self._motion_check = motion_check
         self._detector = build_detector(config.detector)
         readout = ReadoutTime(config.readout_s, windows_sharing=config.bundle_keyframes)
         self._shutter = RollingShutter(readout)
@@ -149,10 +173,33 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         """Track from the last frame; if that fails, or it was lost, relocalise among similar keyframes."""
         if self._lost_frames == 0:
             tracked_pose = self._tracker.track(observation, last, self._before_last)
-            if tracked_pose is not None:
+            steadily = observation.stamp_ns - last.observation.stamp_ns <= _STEADY_NS
+            if tracked_pose is not None and (steadily or self._is_possible(tracked_pose)):
                 return tracked_pose
         candidates = self._relocalizer.candidates(observation, inverse(last.T_camera_world)[:3, 3])
-        return self._relocalizer.best_among(candidates, observation, method="relocalised")
+        return self._relocalizer.best_among(
+            candidates, observation, method="relocalised", is_possible=self._is_possible
+        )
+
+    def _is_possible(self, tracked_pose: TrackedPose) -> bool:
+        """Return whether a pose after a gap is possible by the motion since, where something else tells it.
+
+        Looks alone cannot tell two rooms apart that are furnished alike. The motion is that since the last
+        tracked frame, and that since the keyframe that was recognised, if it is of another sub-map.
+        """
+        check, last = self._motion_check, self._last
+        if check is None or last is None:
+            return True
+        keyframes, now = self._map.keyframes, tracked_pose.observation
+        known = keyframes[tracked_pose.reference]
+        since = last if known.origin == keyframes[last.reference].origin else known
+        T_begin_end = inverse(_body_pose(since.observation, since.T_camera_world)) @ _body_pose(
+            now, tracked_pose.T_camera_world
+        )
+        if not check.contradiction(T_begin_end, since.observation.stamp_ns, now.stamp_ns):
+            return True
+        self._unknown_frames = self._config.max_lost_frames  # another place, so a sub-map may begin at once
+        return False
 
     def _without_row_shifts(self, tracked_pose: TrackedPose) -> TrackedPose:
         """Return a pose without the error of a rolling shutter."""

@@ -1,6 +1,6 @@
 """Relocaliser: the pose of a frame by descriptors alone, without a prediction, after a jump or a loss."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -39,7 +39,12 @@ class Relocalizer:
         self._index.add(keyframe, self._vocabulary.vector(words))
 
     def best_among(
-        self, keyframes: Iterable[int], observation: ImageObservation, *, method: str
+        self,
+        keyframes: Iterable[int],
+        observation: ImageObservation,
+        *,
+        method: str,
+        is_possible: Callable[[TrackedPose], bool] = lambda _: True,
     ) -> TrackedPose | None:
         """Return the first pose that many landmarks agree with, else that of most inliers; None if not found.
 
@@ -48,7 +53,9 @@ class Relocalizer:
         best: TrackedPose | None = None
         for k in keyframes:
             tracked_pose = self._match_keyframe(k, observation, method=method)
-            if tracked_pose is not None and (best is None or tracked_pose.inliers > best.inliers):
+            if tracked_pose is None or not is_possible(tracked_pose):
+                continue
+            if best is None or tracked_pose.inliers > best.inliers:
                 best = tracked_pose
                 if best.inliers >= self._config.weak_inliers:
                     break

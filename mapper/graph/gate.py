@@ -1,0 +1,69 @@
+"""Chi-square gate: whether two measurements of a relative pose can both be right, by their uncertainty."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.core.geometry import Array, Transform, inverse, log
+
+_LIMIT_CHI2 = 22.458
+"""99.9 % of χ² with six degrees of freedom (Bar-Shalom, Li & Kirubarajan 2001, §1.5.4)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Disagreement of two relative poses, and how much of it their uncertainty explains.
+
+    Attributes:
+        translation_m: Distance between the two positions.
+        rotation_rad: Angle between the two orientations.
+        allowed_m: Largest distance that is likely, in the least certain direction.
+        allowed_rad: Largest angle that is likely, about the least certain axis.
+        sigmas: Mahalanobis distance.
+    """
+
+    translation_m: float
+    rotation_rad: float
+    allowed_m: float
+    allowed_rad: float
+    sigmas: float
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether both can be right."""
+        return self.sigmas**2 <= _LIMIT_CHI2
+
+    def __str__(self) -> str:
+        return (
+            f"{self.translation_m:.2f} m and {self.rotation_rad:.2f} rad off, at most {self.allowed_m:.2f} m "
+            f"and {self.allowed_rad:.2f} rad ({self.sigmas:.1f} sigma, at most {_LIMIT_CHI2**0.5:.1f})"
+        )
+
+
+def compare(
+    T_i_j: Transform, T_i_j_predicted: Transform, covariance: Array, *, slack_m: float, slack_rad: float
+) -> Comparison:
+    """Return how far a relative pose is from its prediction.
+
+    Args:
+        T_i_j: (4, 4) measured.
+        T_i_j_predicted: (4, 4) predicted.
+        covariance: (6, 6) of both together, in j's tangent (rotation, translation), rad² and m².
+        slack_m: Distance that is possible without any uncertainty: errors that no covariance describes.
+        slack_rad: Angle that is.
+    """
+    miss = inverse(T_i_j) @ T_i_j_predicted
+    twist = np.concatenate(log(miss))
+    slack = np.square([slack_rad] * 3 + [slack_m] * 3) / _LIMIT_CHI2
+    total = covariance + np.diag(slack)
+    allowed_rad, allowed_m = (
+        float(np.sqrt(_LIMIT_CHI2 * np.linalg.eigvalsh(block)[-1]))
+        for block in (total[:3, :3], total[3:, 3:])
+    )
+    return Comparison(
+        float(np.linalg.norm(miss[:3, 3])),
+        float(np.linalg.norm(twist[:3])),
+        allowed_m,
+        allowed_rad,
+        float(np.sqrt(twist @ np.linalg.solve(total, twist))),
+    )

@@ -1,0 +1,50 @@
+import numpy as np
+import pytest
+
+from mapper.core.geometry import exp, transform
+from mapper.graph.gate import compare
+
+NOTHING = np.zeros((6, 6))
+
+
+def shifted(x_m: float, yaw_rad: float = 0.0) -> np.ndarray:
+    T = exp(np.array([0.0, 0.0, yaw_rad]), np.zeros(3))
+    T[0, 3] = x_m
+    return T
+
+
+def test_without_uncertainty_the_slack_is_the_limit():
+    for miss_m, is_possible in ((0.99, True), (1.01, False)):
+        apart = compare(shifted(miss_m), np.eye(4), NOTHING, slack_m=1.0, slack_rad=0.1)
+        assert apart.is_possible is is_possible
+        assert apart.allowed_m == pytest.approx(1.0)
+        assert apart.allowed_rad == pytest.approx(0.1)
+
+
+def test_both_parts_of_a_miss_count_together():
+    assert compare(shifted(0.9), np.eye(4), NOTHING, slack_m=1.0, slack_rad=0.1).is_possible
+    assert compare(shifted(0.0, 0.09), np.eye(4), NOTHING, slack_m=1.0, slack_rad=0.1).is_possible
+    assert not compare(shifted(0.9, 0.09), np.eye(4), NOTHING, slack_m=1.0, slack_rad=0.1).is_possible
+
+
+def test_uncertainty_allows_more_in_its_own_direction_only():
+    covariance = np.diag([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    assert compare(shifted(4.0), np.eye(4), covariance, slack_m=0.1, slack_rad=0.1).is_possible
+    aside = transform(np.eye(3), [0.0, 4.0, 0.0])
+    assert not compare(aside, np.eye(4), covariance, slack_m=0.1, slack_rad=0.1).is_possible
+
+
+def test_honest_measurements_pass_but_for_one_in_a_thousand():
+    rng = np.random.default_rng(0)
+    root = np.diag([0.02] * 3 + [0.1] * 3)
+    possible = 0
+    for _ in range(5000):
+        twist = root @ rng.standard_normal(6)
+        T = exp(twist[:3], twist[3:])
+        possible += compare(T, np.eye(4), root @ root, slack_m=1e-9, slack_rad=1e-9).is_possible
+    assert 0.998 <= possible / 5000 < 1.0
+
+
+def test_the_numbers_are_told():
+    told = str(compare(shifted(3.0, 0.2), np.eye(4), NOTHING, slack_m=1.0, slack_rad=0.5))
+    assert told.startswith("3.00 m and 0.20 rad off, at most 1.00 m and 0.50 rad (")
