@@ -114,6 +114,27 @@ def normal_matrix(T_camera_world, points, measured, weights, intrinsics):
 
 
 @njit(cache=True, nogil=True)
+def scores(T_camera_world, points, measured, weights, intrinsics):
+    """Return each point's (N, 6) gradient of −½ χ² at exp(δ) · T_camera_world, and its (N,) χ².
+
+    Arguments as for ``refine_pose``.
+    """
+    gradients, squares = np.zeros((len(points), 6)), np.empty(len(points))
+    r = np.empty(3)
+    J = np.empty((3, 3))
+    J_pose = np.empty((3, 6))
+    for n in range(len(points)):
+        x, y, z = residual(T_camera_world, points[n], measured[n], intrinsics, r)
+        projection_jacobian(x, y, z, intrinsics, not np.isnan(measured[n, 2]), J)
+        pose_jacobian(x, y, z, J, J_pose)
+        squares[n] = chi2(r, weights[n])
+        for i in range(3):
+            for a in range(6):
+                gradients[n, a] += weights[n, i] * r[i] * J_pose[i, a]
+    return gradients, squares
+
+
+@njit(cache=True, nogil=True)
 def classify(T, points, measured, weights, intrinsics, inlier):
     """Mark as inliers the points in front of the camera whose χ² passes the 95 % test; return how many."""
     r = np.empty(3)
