@@ -56,7 +56,7 @@ class WheelMeasurements:
         if begin is None or end is None:
             return ""
         driven = self._factor(begin, end)
-        covariance = np.linalg.inv(driven.information)
+        covariance = np.asarray(np.linalg.inv(driven.information), np.float64)
         apart = compare(T_begin_end, driven.T_i_j, covariance, slack_m=_SLACK_M, slack_rad=_SLACK_RAD)
         return "" if apart.is_possible else f"{apart}, by the wheels"
 

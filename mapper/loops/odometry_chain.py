@@ -149,10 +149,9 @@ class OdometryChain:
 
 
 def _edge(factor: BetweenFactor) -> _Edge:
-    covariance = np.linalg.inv(factor.information)
-    if factor.origin == "odometry":
-        least = np.diag([_MAX_STEP_RAD**-2.0] * 3 + [_MAX_STEP_M**-2.0] * 3)
-        covariance = np.linalg.inv(factor.information + least)
+    least = np.diag([_MAX_STEP_RAD**-2.0] * 3 + [_MAX_STEP_M**-2.0] * 3)
+    information = factor.information + least if factor.origin == "odometry" else factor.information
+    covariance = np.asarray(np.linalg.inv(information), np.float64)
     path_m = float(np.linalg.norm(factor.T_i_j[:3, 3]))
     turned_rad = float(np.linalg.norm(rotation_log(factor.T_i_j[:3, :3])))
     sigma_rad, sigma_m = (float(np.trace(block)) ** 0.5 for block in (covariance[:3, :3], covariance[3:, 3:]))
