@@ -14,7 +14,7 @@ from mapper.run.frame_outcomes import DISCONNECTED, FrameRecord
 from mapper.run.manifest import Manifest, RunWarning, Weight
 from mapper.run.results import RunResults
 
-INPUT_KINDS = frozenset({"log", "depth", "frozen", "far returns"})
+INPUT_KINDS = frozenset({"log", "depth", "frozen", "far returns", "conflict"})
 """Kinds that are found while the log is read; a finished run has them in its manifest alone."""
 
 _GAP_INTERVALS, _LEAST_GAP_S = 3.0, 0.5
