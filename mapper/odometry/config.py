@@ -107,6 +107,8 @@ class KeyframeOdometryConfig(Config):
     """β: largest distance between a projected point and its pixel for an inlier of P3P."""
     ransac_seed: NonNegativeInt = 0
     """Seed of P3P's samples."""
+    align_depth: bool = False
+    """Where an image has few landmarks, its depth image is aligned to those of the keyframes."""
     min_agreement_ratio: Ratio = 0.3
     """A pose that a smaller share of the matches agrees with is refused: repeated structure gave 0.28."""
     relocalisation_keyframes: PositiveInt = 5
@@ -117,6 +119,9 @@ class LocalMapConfig(KeyframeOdometryConfig):
     """Tracking by constant velocity against a local map of keyframes, refined by local bundle adjustment."""
 
     kind: Literal["local-map"] = "local-map"
+    align_depth: bool = True
+    """Where an image has few landmarks, its depth image is aligned to those of the keyframes; false where
+    depth is unreliable."""
     search_px: PositiveFloat = 15.0
     """Search radius around the predicted pixel in the finest octave, doubled once when too little matches;
     raise it for fast motion."""

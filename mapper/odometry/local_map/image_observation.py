@@ -13,6 +13,7 @@ from mapper.features.frame_view import ImageView
 from mapper.features.hamming import Bits, pack
 from mapper.features.window_matching import FeatureGrid, sort_into_grid
 from mapper.odometry.config import KeyframeOdometryConfig
+from mapper.odometry.local_map.depth_surfaces import DepthCells, depth_cells
 from mapper.odometry.local_map.pixel_motion import depth_velocity, pixel_velocity, row_phase
 from mapper.places.vocabulary import Vocabulary
 from mapper.sensing.depth_noise import feature_depth_m, feature_depth_sigma_m
@@ -41,6 +42,7 @@ class ImageObservation:
         T_body_camera: (4, 4) pose of the camera in the body frame.
         sweep_camera: (6,) motion of the camera while the rows were read, in its own axes (rotation,
             translation), that ``measured`` allows for; 0 for a global shutter.
+        depth_cells: The depth image, reduced; None if it is not aligned.
     """
 
     stamp_ns: int
@@ -57,6 +59,7 @@ class ImageObservation:
     size_px: tuple[int, int]
     T_body_camera: Transform
     sweep_camera: Array
+    depth_cells: DepthCells | None = None
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -157,6 +160,7 @@ def observe_image(
         size_px=(camera.width_px, camera.height_px),
         T_body_camera=frame.T_body_camera,
         sweep_camera=np.zeros(6),
+        depth_cells=depth_cells(frame.depth_m, camera) if config.align_depth else None,
     )
 
 

@@ -5,6 +5,9 @@ from mapper.odometry.local_map.pose_tracker import TrackedPose
 
 _MIN_GAP = 4
 """Frames for which the last keyframe is young."""
+_DEPTH_OVERLAP = 0.9
+"""With less overlap of the surfaces a frame without landmarks becomes a keyframe: what is left may not show
+every motion."""
 _YOUNG_RATIO = 0.5
 """``keyframe_ratio`` while the last keyframe is young and the inliers are not weak: for fast motion."""
 
@@ -31,8 +34,13 @@ class KeyframeDecision:
         config, inliers = self._config, tracked_pose.inliers
         self._frames += 1
         self._most_inliers = max(self._most_inliers, inliers)
+        if tracked_pose.doubts:
+            return False
         if self._frames >= config.max_keyframe_gap:
             return True
+        if tracked_pose.depth is not None and inliers < config.min_inliers:
+            textured = near_features >= config.weak_inliers and self._frames >= _MIN_GAP
+            return textured or tracked_pose.depth.overlap < _DEPTH_OVERLAP
         kept_ratio = inliers / self._most_inliers
         if self._frames < _MIN_GAP and inliers >= config.weak_inliers:
             return kept_ratio < _YOUNG_RATIO

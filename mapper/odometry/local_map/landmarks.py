@@ -36,6 +36,8 @@ class Keyframe:
         landmark_of_feature: (N,) int32 landmark of each feature, −1 for none.
         origin: First keyframe of its sub-map; sub-maps are not connected to each other.
         twist_camera: (6,) velocity of the camera in its own axes, rad/s and m/s; 0 if it is unknown.
+        depth_link: A keyframe whose surfaces the frame's depth image was aligned to, and the (6, 6)
+            information of that alignment, camera tangent; None if its landmarks were many.
     """
 
     observation: ImageObservation
@@ -43,6 +45,7 @@ class Keyframe:
     landmark_of_feature: Ids
     origin: int
     twist_camera: Array
+    depth_link: tuple[int, Array] | None = None
 
 
 class LandmarkMap:
@@ -86,6 +89,7 @@ class LandmarkMap:
         new: NDArray[np.bool_],
         neighbour: int | None,
         twist_camera: Array,
+        depth_link: tuple[int, Array] | None = None,
     ) -> int:
         """Add a keyframe that observes known landmarks, and create landmarks from its ``new`` features.
 
@@ -96,6 +100,7 @@ class LandmarkMap:
             new: (N,) features with depth that become landmarks.
             neighbour: A keyframe of the same sub-map; None begins a new one.
             twist_camera: (6,) as in ``Keyframe``.
+            depth_link: As in ``Keyframe``.
 
         Returns:
             The keyframe's index.
@@ -119,7 +124,7 @@ class LandmarkMap:
         )
         origin = index if neighbour is None else self.keyframes[neighbour].origin
         self.keyframes.append(
-            Keyframe(observation, T_camera_world, landmark_of_feature, origin, twist_camera)
+            Keyframe(observation, T_camera_world, landmark_of_feature, origin, twist_camera, depth_link)
         )
         self._link(index)
         return index
@@ -194,11 +199,13 @@ class LandmarkMap:
         """Adjust a keyframe, its most covisible ones and their landmarks; drop observations that disagree.
 
         Keyframes outside the window that observe these landmarks take part but stay fixed, as does the first
-        of a sub-map.
+        of a sub-map, and as do those that were placed by their depth image too: their landmarks are few.
         """
         covisible = self.covisible(index, min_shared=MIN_SHARED_LANDMARKS)
         members = [index, *(k for k, _ in covisible[: window - 1])]
-        movable = sorted(k for k in members if k != self.keyframes[k].origin)
+        movable = sorted(
+            k for k in members if k != self.keyframes[k].origin and self.keyframes[k].depth_link is None
+        )
         if not movable:
             return
         landmarks = self.landmarks_of_any(members, except_for=np.empty(0, np.int32))
@@ -299,3 +306,15 @@ class LandmarkMap:
         to_camera = adjoint(inverse(observation.T_body_camera))
         H_body: Array = to_camera.T @ H_camera @ to_camera
         return H_body + _WEAK_PRIOR
+
+    def depth_information(self, target: int, source: int) -> Array:
+        """Return the (6, 6) information of the source's pose in the target from their depth images.
+
+        Zero if they were not aligned. Tangent of the source's body, (rotation, translation).
+        """
+        keyframe = self.keyframes[source]
+        if keyframe.depth_link is None or keyframe.depth_link[0] != target:
+            return np.zeros((6, 6))
+        to_camera = adjoint(inverse(keyframe.observation.T_body_camera))
+        H_body: Array = to_camera.T @ keyframe.depth_link[1] @ to_camera
+        return H_body

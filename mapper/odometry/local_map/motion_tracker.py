@@ -43,7 +43,7 @@ class MotionPoseTracker:
         self, observation: ImageObservation, last: TrackedPose, before_last: TrackedPose | None
     ) -> TrackedPose | None:
         """Search the last frame's points near the pixels that constant velocity predicts."""
-        T_camera_world = self._predicted(observation.stamp_ns, last, before_last)
+        T_camera_world = predicted(observation.stamp_ns, last, before_last)
         known, points_world, landmark = self._known_points(last)
         pixels = project(T_camera_world, points_world, observation.intrinsics)
         depth_m = apply(T_camera_world, points_world)[:, 2]
@@ -72,18 +72,6 @@ class MotionPoseTracker:
             observation, T_camera_world, landmark_of_feature, reference=last.reference, method="map"
         )
 
-    def _predicted(self, stamp_ns: int, last: TrackedPose, before_last: TrackedPose | None) -> Transform:
-        """Return T_camera_world under constant velocity, also across dropped frames."""
-        if before_last is None:
-            return last.T_camera_world
-        t0, t1 = before_last.observation.stamp_ns, last.observation.stamp_ns
-        steps = (stamp_ns - t1) / (t1 - t0)
-        if steps > _MAX_PREDICTED_STEPS:
-            return last.T_camera_world
-        rotation_rad, translation_m = log(last.T_camera_world @ inverse(before_last.T_camera_world))
-        T_camera_world: Transform = exp(steps * rotation_rad, steps * translation_m) @ last.T_camera_world
-        return T_camera_world
-
     def _known_points(self, tracked_pose: TrackedPose) -> tuple[NDArray[np.intp], Points, Ids]:
         """Return the features with a known 3D point: indices, (M, 3) world points, landmark or −1.
 
@@ -97,3 +85,16 @@ class MotionPoseTracker:
         points_world[is_landmark] = landmarks["position"][ids[is_landmark]]
         known = np.flatnonzero(is_landmark | is_near)
         return known, points_world[known], np.where(is_landmark, ids, -1)[known].astype(np.int32)
+
+
+def predicted(stamp_ns: int, last: TrackedPose, before_last: TrackedPose | None) -> Transform:
+    """Return T_camera_world under constant velocity, also across dropped frames."""
+    if before_last is None:
+        return last.T_camera_world
+    t0, t1 = before_last.observation.stamp_ns, last.observation.stamp_ns
+    steps = (stamp_ns - t1) / (t1 - t0)
+    if steps > _MAX_PREDICTED_STEPS:
+        return last.T_camera_world
+    rotation_rad, translation_m = log(last.T_camera_world @ inverse(before_last.T_camera_world))
+    T_camera_world: Transform = exp(steps * rotation_rad, steps * translation_m) @ last.T_camera_world
+    return T_camera_world

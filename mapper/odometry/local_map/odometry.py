@@ -23,6 +23,7 @@ from mapper.odometry.base import (
     lost_frame,
 )
 from mapper.odometry.config import KeyframeOdometryConfig
+from mapper.odometry.local_map.depth_tracker import DepthTracker
 from mapper.odometry.local_map.image_observation import ImageObservation, observe_image
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
 from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
@@ -77,6 +78,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._tracker = make_tracker(self._map, self._relocalizer)
         self._last: TrackedPose | None = None
         self._before_last: TrackedPose | None = None
+        self._depth = DepthTracker(config, self._map)
         self._decision = KeyframeDecision(config)
         self._lost_frames = 0  # since the last tracked one
         self._unknown_frames = 0  # those of them with enough features to begin a sub-map
@@ -139,7 +141,9 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             earlier = [(k, shared) for k, shared in self._map.covisible(j, min_shared=1) if k < j]
             strong = [k for k, shared in earlier if shared >= MIN_SHARED_LANDMARKS]
             weak = [k for k, _ in earlier[:1]] or [self._map.previous(j)]
-            factors += [self._factor(i, j) for i in strong[:_FACTORS_PER_KEYFRAME] or weak]
+            linked = [keyframe.depth_link[0]] if keyframe.depth_link is not None else []
+            chosen = strong[:_FACTORS_PER_KEYFRAME] or linked or weak
+            factors += [self._factor(i, j) for i in dict.fromkeys([*chosen, *linked])]
         return factors
 
     def _factor(self, i: int, j: int) -> BetweenFactor:
@@ -149,11 +153,12 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             for keyframe in (self._map.keyframes[i], self._map.keyframes[j])
         )
         T_i_j = inverse(T_world_i) @ T_world_j
-        return BetweenFactor(i, j, T_i_j, with_model_error(self._map.information(i, j), T_i_j))
+        information = self._map.information(i, j) + self._map.depth_information(i, j)
+        return BetweenFactor(i, j, T_i_j, with_model_error(information, T_i_j))
 
     def _not_found(self, observation: ImageObservation) -> FrameResult:
         """Return a lost frame, or begin a new sub-map with it once enough frames matched no landmarks."""
-        if self._near_features(observation) >= _MIN_START_FEATURES:
+        if self._near_features(observation) >= _MIN_START_FEATURES or self._depth.can_start(observation):
             self._unknown_frames += 1
             if self._last is None or 0 < self._config.max_lost_frames < self._unknown_frames:
                 return self._begin_sub_map(observation)
@@ -167,19 +172,22 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._lost_frames = self._unknown_frames = 0
         self._shutter.restart()
         self._before_last, self._last = None, self._add_keyframe(start, neighbour=None)
+        self._depth.began(observation)
         return self._result(self._last, is_keyframe=True)
 
     def _find_pose(self, observation: ImageObservation, last: TrackedPose) -> TrackedPose | None:
         """Track from the last frame; if that fails, or it was lost, relocalise among similar keyframes."""
         if self._lost_frames == 0:
             tracked_pose = self._tracker.track(observation, last, self._before_last)
+            tracked_pose = self._depth.supported(observation, last, self._before_last, tracked_pose)
             steadily = observation.stamp_ns - last.observation.stamp_ns <= _STEADY_NS
             if tracked_pose is not None and (steadily or self._is_possible(tracked_pose)):
                 return tracked_pose
         candidates = self._relocalizer.candidates(observation, inverse(last.T_camera_world)[:3, 3])
-        return self._relocalizer.best_among(
+        relocalised = self._relocalizer.best_among(
             candidates, observation, method="relocalised", is_possible=self._is_possible
         )
+        return self._depth.supported(observation, relocalised or last, None, relocalised)
 
     def _is_possible(self, tracked_pose: TrackedPose) -> bool:
         """Return whether a pose after a gap is possible by the motion since, where something else tells it.
@@ -226,6 +234,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             new=self._new_landmarks(tracked_pose),
             neighbour=neighbour,
             twist_camera=self._shutter.twist_camera,
+            depth_link=tracked_pose.depth_link,
         )
         self._relocalizer.add(index)
         self._map.refine(index, window=config.bundle_keyframes)
@@ -266,6 +275,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             residual_unit="px",
             method=tracked_pose.method,
         )
+        if tracked_pose.depth is not None:
+            diagnostics = tracked_pose.depth.diagnostics(diagnostics)
         return FrameResult(
             stamp_ns=tracked_pose.observation.stamp_ns,
             node=tracked_pose.reference,
@@ -275,6 +286,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             diagnostics=diagnostics,
             links=links,
             twist=self._shutter.twist_body(tracked_pose.observation),
+            doubts=tracked_pose.doubts,
         )
 
     def _lost(self, observation: ImageObservation) -> FrameResult:

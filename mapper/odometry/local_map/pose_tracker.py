@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points, Transform, apply
+from mapper.odometry.local_map.depth_alignment import DepthAlignment
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import Ids
 from mapper.registration.reprojection import refine_pose
@@ -30,6 +31,8 @@ class TrackedPose:
         matches: Number of proposed pairs.
         residual_px: Root mean square image residual of the inliers.
         method: Step that found the pose, e.g. "map", "fallback" or "relocalised".
+        depth: Alignment of the depth image that took part in the pose; None if landmarks alone gave it.
+        doubts: Why the pose may be wrong, a phrase each.
     """
 
     observation: ImageObservation
@@ -39,11 +42,18 @@ class TrackedPose:
     matches: int
     residual_px: float
     method: str
+    depth: DepthAlignment | None = None
+    doubts: tuple[str, ...] = ()
 
     @property
     def inliers(self) -> int:
         """Number of features that agree with the pose."""
         return int((self.landmark_of_feature >= 0).sum())
+
+    @property
+    def depth_link(self) -> tuple[int, Array] | None:
+        """The reference and the (6, 6) information of the depth image's alignment to it, if there is one."""
+        return None if self.depth is None else (self.reference, self.depth.information)
 
 
 class PoseTracker(Protocol):

@@ -1,0 +1,194 @@
+"""Tracking by depth where an image has little texture: the second leg of the local map's odometry."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from mapper.core.geometry import Transform
+from mapper.core.timebase import NS_PER_S
+from mapper.odometry.config import KeyframeOdometryConfig
+from mapper.odometry.local_map.depth_alignment import (
+    DEPTH_ONLY,
+    DepthAlignment,
+    Landmarks,
+    align_depth,
+    observes_all,
+)
+from mapper.odometry.local_map.depth_surfaces import DepthCells, DepthSurface, surface_of
+from mapper.odometry.local_map.image_observation import ImageObservation
+from mapper.odometry.local_map.landmarks import LandmarkMap
+from mapper.odometry.local_map.motion_tracker import predicted
+from mapper.odometry.local_map.pose_tracker import TrackedPose, unmatched
+
+_MIN_VISIBLE_RATIO = 0.3
+_MIN_AGREEING_RATIO = 0.7
+_MIN_WEAKEST_RATIO = 0.5
+"""A wrong pose can have most points on the floor or on one wall, so every direction of the normals counts."""
+_MAX_CONTRADICTING_RATIO = 0.15
+_SPEED_SIGMA = 0.5
+"""Metres and radians per second by which a predicted motion may err: one sigma for a camera in a hand."""
+_MAX_UNOBSERVED_S = 1.0
+"""After so long on a prediction in any direction a frame is lost."""
+_LEAST_ELAPSED_S = 0.01
+
+
+class DepthTracker:
+    """Pose of frames of few landmarks by their depth image, against the surfaces of the last keyframes."""
+
+    def __init__(self, config: KeyframeOdometryConfig, landmark_map: LandmarkMap) -> None:
+        self._config = config
+        self._map = landmark_map
+        self._surfaces: dict[int, DepthSurface] = {}  # of the frames last used, by stamp
+        self._keyframes: list[int] = []  # those among them
+        self._observed_ns = 0  # when every motion was last observed
+
+    def can_start(self, observation: ImageObservation) -> bool:
+        """Return whether a map can begin with a frame although it has few features."""
+        cells = observation.depth_cells
+        return cells is not None and observes_all(surface_of(cells))
+
+    def began(self, observation: ImageObservation) -> None:
+        """Take note of a sub-map's first frame."""
+        self._observed_ns = observation.stamp_ns
+        self._surfaces.clear()
+
+    def supported(
+        self,
+        observation: ImageObservation,
+        last: TrackedPose,
+        before_last: TrackedPose | None,
+        found: TrackedPose | None,
+    ) -> TrackedPose | None:
+        """Return a frame's pose by landmarks and depth together, where there are few landmarks.
+
+        Args:
+            observation: The frame.
+            last: The last frame that was tracked.
+            before_last: The one before it, if it predicts the motion.
+            found: The pose from landmarks alone; None if they gave none.
+
+        Returns:
+            ``found`` itself if its landmarks are many, or if the depth image disagrees with the keyframes;
+            None if there is no pose.
+        """
+        if found is not None and found.inliers >= self._config.weak_inliers:
+            self._observed_ns = observation.stamp_ns
+            return found
+        T_predicted = predicted(observation.stamp_ns, last, before_last)
+        starts = [T_predicted] if found is None else [found.T_camera_world, T_predicted]
+        for T_camera_world in starts:
+            alignment = self._aligned(observation, T_camera_world, T_predicted, last, found)
+            if alignment is not None and _agrees(alignment):
+                return self._fused(observation, alignment, found)
+        if found is not None:
+            self._observed_ns = observation.stamp_ns
+        return found
+
+    def _aligned(
+        self,
+        observation: ImageObservation,
+        T_camera_world: Transform,
+        T_predicted: Transform,
+        last: TrackedPose,
+        found: TrackedPose | None,
+    ) -> DepthAlignment | None:
+        surfaces, T_surfaces_world = self._models(observation, last)
+        if observation.depth_cells is None or not surfaces:
+            return None
+        unsure_s = max((observation.stamp_ns - self._observed_ns) / NS_PER_S, _LEAST_ELAPSED_S)
+        ids = unmatched(observation) if found is None else found.landmark_of_feature
+        features = np.flatnonzero(ids >= 0)
+        return align_depth(
+            observation.depth_cells,
+            surfaces,
+            T_surfaces_world,
+            keyframes=len(self._keyframes),
+            T_camera_world=T_camera_world,
+            T_prior=T_predicted,
+            prior=np.eye(6) / (_SPEED_SIGMA * unsure_s) ** 2,
+            landmarks=Landmarks(
+                self._map.landmarks["position"][ids[features]],
+                observation.measured[features],
+                observation.weights[features],
+                observation.intrinsics,
+            ),
+            noise=self._config.depth_noise,
+        )
+
+    def _models(
+        self, observation: ImageObservation, last: TrackedPose
+    ) -> tuple[list[DepthSurface], list[Transform]]:
+        """Return the surfaces of the latest keyframes and of the last frame, and their T_camera_world."""
+        keyframes, cells = self._map.keyframes, observation.depth_cells
+        origin = keyframes[last.reference].origin
+        self._keyframes = [
+            k
+            for k in self._map.latest(last.reference)
+            if keyframes[k].origin == origin and _alike(keyframes[k].observation.depth_cells, cells)
+        ]
+        of_stamp = {}
+        models = [(keyframes[k].observation, keyframes[k].T_camera_world) for k in self._keyframes]
+        if all(earlier is not last.observation for earlier, _ in models):
+            models.append((last.observation, last.T_camera_world))
+        for earlier, _ in models:
+            there = earlier.depth_cells
+            if there is not None and _alike(there, cells):
+                of_stamp[earlier.stamp_ns] = self._surfaces.get(earlier.stamp_ns) or surface_of(there)
+        self._surfaces = of_stamp
+        known = [(of_stamp[earlier.stamp_ns], T) for earlier, T in models if earlier.stamp_ns in of_stamp]
+        return [surface for surface, _ in known], [T for _, T in known]
+
+    def _fused(
+        self,
+        observation: ImageObservation,
+        alignment: DepthAlignment,
+        found: TrackedPose | None,
+    ) -> TrackedPose | None:
+        """Return the pose of an alignment that agrees; None if a motion was not observed for long."""
+        if not alignment.unobservable:
+            self._observed_ns = observation.stamp_ns
+        unsure_s = (observation.stamp_ns - self._observed_ns) / NS_PER_S
+        if unsure_s > _MAX_UNOBSERVED_S:
+            return found
+        doubts: tuple[str, ...] = ()
+        if alignment.unobservable:
+            doubts = (f"neither depth nor features show {alignment.unobservable} for {unsure_s:.1f} s",)
+        if found is None:
+            best = self._keyframes[int(np.argmax(alignment.agreeing))]
+            return TrackedPose(
+                observation,
+                alignment.T_camera_world,
+                unmatched(observation),
+                best,
+                alignment.points,
+                0.0,
+                DEPTH_ONLY,
+                depth=alignment,
+                doubts=doubts,
+            )
+        landmark_of_feature = found.landmark_of_feature.copy()
+        features = np.flatnonzero(landmark_of_feature >= 0)
+        landmark_of_feature[features[~alignment.is_landmark_inlier]] = -1
+        return replace(
+            found,
+            T_camera_world=alignment.T_camera_world,
+            landmark_of_feature=landmark_of_feature,
+            method=f"{found.method}+depth",
+            depth=alignment,
+            doubts=doubts,
+        )
+
+
+def _alike(cells: DepthCells | None, others: DepthCells | None) -> bool:
+    """Return whether there are two depth images, of the same camera."""
+    return cells is not None and others is not None and cells.camera == others.camera
+
+
+def _agrees(alignment: DepthAlignment) -> bool:
+    """Return whether enough of the depth image lies on the keyframes' surfaces, and little contradicts."""
+    return (
+        alignment.visible_ratio >= _MIN_VISIBLE_RATIO
+        and alignment.agreeing_ratio >= _MIN_AGREEING_RATIO
+        and alignment.weakest_ratio >= _MIN_WEAKEST_RATIO
+        and alignment.contradicting_ratio <= _MAX_CONTRADICTING_RATIO
+    )
