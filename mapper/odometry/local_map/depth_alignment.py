@@ -7,6 +7,7 @@ that one of them does not observe is decided by the other.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from statistics import mean
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +25,9 @@ _EVERY = (4, 4, 1)
 """One point in so many is used with each of these gates."""
 _ITERATIONS = 8
 _MIN_POINTS = 300
-_MIN_SHARE = 0.015
-"""A motion with a smaller share of its displacements along the normals is not observed: the bow of a plane in
-a Kinect's depth image gives 0.003, its noise at 4 m as much."""
+_MIN_SHARE, _NOISE_SHARES = 0.004, 2.5
+"""A motion is observed by a larger share of its displacements along the normals: a plane's bow in a Kinect's
+depth image gives 0.002, and the normals' noise gives their variance."""
 _FEW = 0.02  # of all surface; a direction that less faces is left to the degeneracy check
 _LEAST_SCALE = 0.5  # of the assumed noise, however well the surfaces fit
 _OBSERVED_SIGMA_M = 0.02
@@ -141,6 +142,7 @@ def align_depth(
     optics = np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, *camera.distortion])
     planes = np.array([surface.planes for surface in surfaces])
     model = planes, np.array(T_surfaces_world), optics, cells.cell_px
+    min_share = _min_share(surfaces)
     kept = np.eye(6)
     while True:
         T_found, is_inlier = descend(
@@ -166,7 +168,7 @@ def align_depth(
         )
         if (verdict == 1).sum() < _MIN_POINTS:
             return None
-        degeneracy = degeneracy_of(unit, points=points[verdict == 1], min_share=_MIN_SHARE)
+        degeneracy = degeneracy_of(unit, points=points[verdict == 1], min_share=min_share)
         if degeneracy.unobservable_count == 0 or kept.trace() < 6.0:
             break
         kept = _observable(degeneracy)
@@ -198,7 +200,11 @@ def observes_all(surface: DepthSurface) -> bool:
     points, normals = points[fitted], normals[fitted]
     rows = np.hstack([np.cross(points, normals), normals])
     information = np.einsum("ni,nj->ij", rows, rows)
-    return degeneracy_of(information, points=points, min_share=_MIN_SHARE).unobservable_count == 0
+    return degeneracy_of(information, points=points, min_share=_min_share([surface])).unobservable_count == 0
+
+
+def _min_share(surfaces: Sequence[DepthSurface]) -> float:
+    return max(_MIN_SHARE, _NOISE_SHARES * mean(surface.normal_variance for surface in surfaces))
 
 
 def _observable(degeneracy: Degeneracy) -> Array:

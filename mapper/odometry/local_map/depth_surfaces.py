@@ -61,10 +61,12 @@ class DepthSurface:
         cells: The depth image.
         planes: (R, C, 4) n and h of the plane n · x = h through each cell, camera frame: the unit normal
             points away from the camera; all 0 where there is none.
+        normal_variance: Mean variance of the normals in one direction, rad².
     """
 
     cells: DepthCells
     planes: Array
+    normal_variance: float
 
     def normals(self) -> Array:
         """Return the (N, 3) normals of the points of the cells, 0 where there is none."""
@@ -91,7 +93,7 @@ def surface_of(cells: DepthCells) -> DepthSurface:
     The inverse depth of a plane is linear in x/z and y/z, and the noise of a triangulating sensor is the same
     everywhere in it (Khoshelham & Elberink 2012, eq. 10), so that least squares weigh every cell alike.
     """
-    planes, variances = np.zeros((*cells.inverse_depth.shape, 4)), np.zeros(cells.inverse_depth.shape)
+    planes, variances = np.zeros((*cells.inverse_depth.shape, 4)), np.zeros((*cells.inverse_depth.shape, 2))
     _fit_planes(
         cells.inverse_depth.astype(np.float64),
         cells.rays,
@@ -101,9 +103,11 @@ def surface_of(cells: DepthCells) -> DepthSurface:
         planes,
         variances,
     )
-    if variances.any():
-        planes[variances > _MAX_VARIANCE_RATIO * np.median(variances[variances > 0.0])] = 0.0
-    return DepthSurface(cells, planes)
+    residual, turning = variances[..., 0], variances[..., 1]
+    if residual.any():
+        planes[residual > _MAX_VARIANCE_RATIO * np.median(residual[residual > 0.0])] = 0.0
+    fitted = planes[..., 3] > 0.0
+    return DepthSurface(cells, planes, float(turning[fitted].mean()) if fitted.any() else 0.0)
 
 
 def point_sigmas(cells: DepthCells, points: Points, noise: DepthNoiseConfig | None) -> Array:
@@ -146,7 +150,7 @@ def _average(depth_m, cell_px, sample_px, max_ratio, inverse_depth):  # type: ig
 def _fit_planes(  # type: ignore[no-untyped-def]
     inverse_depth, rays, reach, min_cells, same_surface, planes, variances
 ):
-    """Fill in the planes 1 / z = a · x/z + b · y/z + c about each cell, and their residual variances."""
+    """Fill in the planes 1 / z = a · x/z + b · y/z + c about each cell, with their variances."""
     rows, columns = inverse_depth.shape
     for row in range(reach, rows - reach):
         for column in range(reach, columns - reach):
@@ -172,8 +176,10 @@ def _fit_planes(  # type: ignore[no-untyped-def]
             if determinant <= 0.05 * suu * svv:
                 continue
             a, b = (sud * svv - svd * suv) / determinant, (svd * suu - sud * suv) / determinant
-            variances[row, column] = (sdd - sd * sd / n - a * sud - b * svd) / (n - 3.0)
+            variance = (sdd - sd * sd / n - a * sud - b * svd) / (n - 3.0)
             c = here + (sd - a * su - b * sv) / n - a * u0 - b * v0
             length = np.sqrt(a * a + b * b + c * c)
             planes[row, column, 0], planes[row, column, 1] = a / length, b / length
             planes[row, column, 2], planes[row, column, 3] = c / length, 1.0 / length
+            variances[row, column, 0] = variance
+            variances[row, column, 1] = 0.5 * variance * (suu + svv) / determinant / (length * length)

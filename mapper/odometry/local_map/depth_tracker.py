@@ -27,7 +27,7 @@ _MIN_WEAKEST_RATIO = 0.5
 _MAX_CONTRADICTING_RATIO = 0.15
 _SPEED_SIGMA = 0.5
 """Metres and radians per second by which a predicted motion may err: one sigma for a camera in a hand."""
-_MAX_UNOBSERVED_S = 1.0
+_MAX_UNOBSERVED_S = 2.0
 """After so long on a prediction in any direction a frame is lost."""
 _LEAST_ELAPSED_S = 0.01
 
