@@ -207,8 +207,8 @@ def compare(T_camera_world, points, sigmas, planes, T_keyframes_world, optics, c
     """Return how a depth image fits keyframes' planes; arguments as for ``descend``.
 
     Returns:
-        (N,) int8 of each point: 1 it agrees with the plane of a keyframe, −1 it lies in front of all that it
-        projects to, −2 behind all or in between, 0 it projects to none.
+        (N,) int8 of each point: −1 it lies in front of a keyframe's plane, else 1 it agrees with one, −2 it
+        lies behind all, 0 it projects to none. What moves can agree with the last keyframe, but not with all.
         (K,) number of points that agree with each keyframe.
         (6, 6) information of unit distances, and of distances in their standard deviations.
         (3, 3) sums of m·mᵀ over the normals m of all pairs, and of those that agree, camera frame.
@@ -235,11 +235,13 @@ def compare(T_camera_world, points, sigmas, planes, T_keyframes_world, optics, c
                     if agrees:
                         facing_agreeing[a, b] += row[3 + a] * row[3 + b]
             if not agrees:
-                if verdict[i] != 1:
-                    before = verdict[i]
-                    verdict[i] = -1 if distance < 0.0 and before != -2 else -2
+                if distance < 0.0:
+                    verdict[i] = -1
+                elif verdict[i] == 0:
+                    verdict[i] = -2
                 continue
-            verdict[i] = 1
+            if verdict[i] != -1:
+                verdict[i] = 1
             agreeing[k] += 1
             squares += distance * distance / (sigma * sigma)
             squares_m += distance * distance

@@ -17,8 +17,9 @@ from mapper.odometry.local_map.depth_alignment import (
 from mapper.odometry.local_map.depth_surfaces import DepthCells, DepthSurface, surface_of
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import LandmarkMap
+from mapper.odometry.local_map.local_search import LocalSearch
 from mapper.odometry.local_map.motion_tracker import predicted
-from mapper.odometry.local_map.pose_tracker import TrackedPose, unmatched
+from mapper.odometry.local_map.pose_tracker import TrackedPose, project, unmatched
 
 _MIN_VISIBLE_RATIO = 0.3
 _MIN_AGREEING_RATIO = 0.7
@@ -30,6 +31,8 @@ _SPEED_SIGMA = 0.5
 _MAX_UNOBSERVED_S = 2.0
 """After so long on a prediction in any direction a frame is lost."""
 _LEAST_ELAPSED_S = 0.01
+_MIN_KEPT_RATIO = 0.5
+"""When fewer of a pose's landmarks agree once the depth image takes part, one of both is wrong."""
 
 
 class DepthTracker:
@@ -38,9 +41,11 @@ class DepthTracker:
     def __init__(self, config: KeyframeOdometryConfig, landmark_map: LandmarkMap) -> None:
         self._config = config
         self._map = landmark_map
+        self._search = LocalSearch(config, landmark_map)
         self._surfaces: dict[int, DepthSurface] = {}  # of the frames last used, by stamp
         self._keyframes: list[int] = []  # those among them
         self._observed_ns = 0  # when every motion was last observed
+        self._is_confirmed = False  # the sub-map, by a frame of many landmarks
 
     def can_start(self, observation: ImageObservation) -> bool:
         """Return whether a map can begin with a frame although it has few features."""
@@ -49,7 +54,7 @@ class DepthTracker:
 
     def began(self, observation: ImageObservation) -> None:
         """Take note of a sub-map's first frame."""
-        self._observed_ns = observation.stamp_ns
+        self._observed_ns, self._is_confirmed = observation.stamp_ns, False
         self._surfaces.clear()
 
     def supported(
@@ -72,17 +77,32 @@ class DepthTracker:
             None if there is no pose.
         """
         if found is not None and found.inliers >= self._config.weak_inliers:
-            self._observed_ns = observation.stamp_ns
+            self._observed_ns, self._is_confirmed = observation.stamp_ns, True
             return found
         T_predicted = predicted(observation.stamp_ns, last, before_last)
         starts = [T_predicted] if found is None else [found.T_camera_world, T_predicted]
         for T_camera_world in starts:
             alignment = self._aligned(observation, T_camera_world, T_predicted, last, found)
             if alignment is not None and _agrees(alignment):
-                return self._fused(observation, alignment, found)
+                break
+        else:
+            if found is not None:
+                self._observed_ns = observation.stamp_ns
+            return found
         if found is not None:
-            self._observed_ns = observation.stamp_ns
-        return found
+            return self._by_both(observation, alignment, found)
+        reference = self._keyframes[int(np.argmax(alignment.agreeing))]
+        found = self._search.refine(
+            observation,
+            alignment.T_camera_world,
+            unmatched(observation),
+            reference=reference,
+            method="depth+map",
+        )
+        if found is None:
+            return self._by_depth(observation, alignment, reference)
+        alignment = self._aligned(observation, found.T_camera_world, T_predicted, last, found) or alignment
+        return self._by_both(observation, alignment, found)
 
     def _aligned(
         self,
@@ -95,7 +115,7 @@ class DepthTracker:
         surfaces, T_surfaces_world = self._models(observation, last)
         if observation.depth_cells is None or not surfaces:
             return None
-        unsure_s = max((observation.stamp_ns - self._observed_ns) / NS_PER_S, _LEAST_ELAPSED_S)
+        unsure_s = max(self._unobserved_s(observation), _LEAST_ELAPSED_S)
         ids = unmatched(observation) if found is None else found.landmark_of_feature
         features = np.flatnonzero(ids >= 0)
         return align_depth(
@@ -138,34 +158,37 @@ class DepthTracker:
         known = [(of_stamp[earlier.stamp_ns], T) for earlier, T in models if earlier.stamp_ns in of_stamp]
         return [surface for surface, _ in known], [T for _, T in known]
 
-    def _fused(
-        self,
-        observation: ImageObservation,
-        alignment: DepthAlignment,
-        found: TrackedPose | None,
+    def _by_depth(
+        self, observation: ImageObservation, alignment: DepthAlignment, reference: int
     ) -> TrackedPose | None:
-        """Return the pose of an alignment that agrees; None if a motion was not observed for long."""
-        if not alignment.unobservable:
-            self._observed_ns = observation.stamp_ns
-        unsure_s = (observation.stamp_ns - self._observed_ns) / NS_PER_S
-        if unsure_s > _MAX_UNOBSERVED_S:
-            return found
-        doubts: tuple[str, ...] = ()
-        if alignment.unobservable:
-            doubts = (f"neither depth nor features show {alignment.unobservable} for {unsure_s:.1f} s",)
-        if found is None:
-            best = self._keyframes[int(np.argmax(alignment.agreeing))]
-            return TrackedPose(
-                observation,
-                alignment.T_camera_world,
-                unmatched(observation),
-                best,
-                alignment.points,
-                0.0,
-                DEPTH_ONLY,
-                depth=alignment,
-                doubts=doubts,
-            )
+        """Return the pose of an alignment without landmarks; None if a motion was not observed for long."""
+        expected = min(self._visible(alignment.T_camera_world, reference, observation), len(observation))
+        doubts = self._doubts(observation, alignment)
+        if not self._is_confirmed and expected >= 2 * self._config.min_inliers:
+            # What moves with the camera, such as a hand before the lens, agrees with itself.
+            doubts = (*doubts, f"{expected} features, but none where the depth image has them")
+        if self._unobserved_s(observation) > _MAX_UNOBSERVED_S:
+            return None
+        return TrackedPose(
+            observation,
+            alignment.T_camera_world,
+            unmatched(observation),
+            reference,
+            alignment.points,
+            0.0,
+            DEPTH_ONLY,
+            depth=alignment,
+            doubts=doubts,
+        )
+
+    def _by_both(
+        self, observation: ImageObservation, alignment: DepthAlignment, found: TrackedPose
+    ) -> TrackedPose:
+        """Return the pose of an alignment with landmarks, unless most of these contradict it."""
+        agree = int(alignment.is_landmark_inlier.sum())
+        if agree < _MIN_KEPT_RATIO * found.inliers:
+            doubt = f"{agree} of {found.inliers} features agree with the depth image"
+            return replace(found, doubts=(*found.doubts, doubt))
         landmark_of_feature = found.landmark_of_feature.copy()
         features = np.flatnonzero(landmark_of_feature >= 0)
         landmark_of_feature[features[~alignment.is_landmark_inlier]] = -1
@@ -173,10 +196,27 @@ class DepthTracker:
             found,
             T_camera_world=alignment.T_camera_world,
             landmark_of_feature=landmark_of_feature,
-            method=f"{found.method}+depth",
+            method=found.method if "depth" in found.method else f"{found.method}+depth",
             depth=alignment,
-            doubts=doubts,
+            doubts=(*found.doubts, *self._doubts(observation, alignment)),
         )
+
+    def _doubts(self, observation: ImageObservation, alignment: DepthAlignment) -> tuple[str, ...]:
+        """Return which motions were not observed and for how long, and take note when all were."""
+        if not alignment.unobservable:
+            self._observed_ns = observation.stamp_ns
+            return ()
+        unobserved_s = self._unobserved_s(observation)
+        return (f"neither depth nor features show {alignment.unobservable} for {unobserved_s:.1f} s",)
+
+    def _unobserved_s(self, observation: ImageObservation) -> float:
+        return (observation.stamp_ns - self._observed_ns) / NS_PER_S
+
+    def _visible(self, T_camera_world: Transform, keyframe: int, observation: ImageObservation) -> int:
+        """Return how many landmarks of a keyframe a pose has in the image."""
+        points_world = self._map.landmarks["position"][self._map.landmarks_of(keyframe)]
+        pixels = project(T_camera_world, points_world, observation.intrinsics)
+        return int(((pixels >= 0.0) & (pixels < observation.size_px)).all(axis=1).sum())
 
 
 def _alike(cells: DepthCells | None, others: DepthCells | None) -> bool:

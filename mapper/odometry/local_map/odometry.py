@@ -158,9 +158,12 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
 
     def _not_found(self, observation: ImageObservation) -> FrameResult:
         """Return a lost frame, or begin a new sub-map with it once enough frames matched no landmarks."""
-        if self._near_features(observation) >= _MIN_START_FEATURES or self._depth.can_start(observation):
+        is_first = self._last is None
+        if self._near_features(observation) >= _MIN_START_FEATURES or (
+            is_first and self._depth.can_start(observation)
+        ):
             self._unknown_frames += 1
-            if self._last is None or 0 < self._config.max_lost_frames < self._unknown_frames:
+            if is_first or 0 < self._config.max_lost_frames < self._unknown_frames:
                 return self._begin_sub_map(observation)
         return self._lost(observation)
 
