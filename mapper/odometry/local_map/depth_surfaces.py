@@ -13,8 +13,8 @@ from mapper.sensing.config import DepthNoiseConfig
 from mapper.sensing.depth_noise import depth_sigma_m
 
 _COLUMNS = 80
-_SAMPLE_PX = 2
-"""Every second row and column of a cell is read: neighbouring pixels of a depth image have the same error."""
+_SAMPLES = 4
+"""Rows and columns that are read of a cell: neighbouring pixels of a large depth image have the same error."""
 _MAX_DEPTH_RANGE = 0.15
 """A cell with a larger range of depth, relative to its least, lies on an edge and has no surface."""
 _REACH_CELLS = 2
@@ -83,7 +83,7 @@ def depth_cells(depth_m: DepthImage, camera: PinholeCamera) -> DepthCells:
     """
     cell_px = max(camera.width_px // _COLUMNS, 1)
     inverse_depth = np.zeros((camera.height_px // cell_px, camera.width_px // cell_px), np.float32)
-    _average(depth_m, cell_px, min(_SAMPLE_PX, cell_px), np.float32(1.0 + _MAX_DEPTH_RANGE), inverse_depth)
+    _average(depth_m, cell_px, max(cell_px // _SAMPLES, 1), np.float32(1.0 + _MAX_DEPTH_RANGE), inverse_depth)
     return DepthCells(inverse_depth, cell_px, camera)
 
 
