@@ -17,8 +17,8 @@ FACING_Y = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0
 STEP_NS = 66_666_667
 
 
-def track(frames, config=LocalMapConfig()):
-    odometry = build_frame_odometry(config)
+def track(frames, *, align_depth=True):
+    odometry = build_frame_odometry(LocalMapConfig(align_depth=align_depth))
     tracks = [odometry.track(odometry.observe(frame)) for frame in frames]
     return tracks, odometry.finish()
 
@@ -81,7 +81,7 @@ def test_it_is_the_same_every_time(white_room):
 
 
 def test_without_the_depth_leg_it_is_lost():
-    tracks, _ = track(walk(swaying()[:4], ROOM), LocalMapConfig(align_depth=False))
+    tracks, _ = track(walk(swaying()[:4], ROOM), align_depth=False)
     assert all(step.node is None for step in tracks)
 
 

@@ -9,6 +9,7 @@ from mapper.odometry.local_map.bundle_adjustment import adjust
 from mapper.registration.reprojection import normal_matrix, refine_pose
 
 INTRINSICS = np.array([525.0, 525.0, 319.5, 239.5, 40.0])
+NO_LINKS = np.empty((0, 2), np.int32), np.empty((0, 4, 4)), np.empty((0, 6, 6))
 
 
 def measure(T_camera_world, points_world, rng, *, noise_px=0.0):
@@ -94,7 +95,17 @@ def test_bundle_moves_poses_and_points_back_to_the_truth():
     start_points = points + rng.normal(0, 0.03, points.shape)
 
     poses, refined, agree = adjust(
-        start, free, start_points, first, edges, measured, np.full((len(edges), 3), 4.0), INTRINSICS, 2, 8
+        start,
+        free,
+        start_points,
+        first,
+        edges,
+        measured,
+        np.full((len(edges), 3), 4.0),
+        INTRINSICS,
+        NO_LINKS,
+        2,
+        8,
     )
 
     assert (poses[0] == truth[0]).all()
@@ -111,8 +122,26 @@ def test_bundle_of_exact_measurements_stays_where_it_is():
     truth, points, first, edges, measured = bundle(rng, noise_px=0.0)
     free = np.array([-1, 0, 1, 2, 3], np.int32)
     poses, refined, agree = adjust(
-        truth, free, points, first, edges, measured, np.ones((len(edges), 3)), INTRINSICS, 2, 5
+        truth, free, points, first, edges, measured, np.ones((len(edges), 3)), INTRINSICS, NO_LINKS, 2, 5
     )
     assert np.allclose(poses, truth, atol=1e-9)
     assert np.allclose(refined, points, atol=1e-9)
     assert agree.all()
+
+
+def test_a_measured_relative_pose_holds_a_camera_that_points_hardly_do():
+    """The last of five cameras sees two points only; it and its neighbour are linked, both free."""
+    rng = np.random.default_rng(3)
+    truth, points, first, edges, measured = bundle(rng, noise_px=0.1)
+    weights = np.full((len(edges), 3), 4.0)
+    weights[(edges[:, 0] == 4) & (edges[:, 1] > 1)] = 1e-12
+    start = truth.copy()
+    start[4] = random_pose(rng, translation_m=0.03, rotation_rad=0.02) @ truth[4]
+    free = np.array([-1, 0, 1, 2, 3], np.int32)
+    for pair in ((3, 4), (4, 3)):
+        T_to_from = truth[pair[1]] @ inverse(truth[pair[0]])
+        links = np.array([pair], np.int32), T_to_from[None], 1e8 * np.eye(6)[None]
+        held, _, _ = adjust(start, free, points, first, edges, measured, weights, INTRINSICS, links, 2, 12)
+        left, _, _ = adjust(start, free, points, first, edges, measured, weights, INTRINSICS, NO_LINKS, 2, 12)
+        assert np.linalg.norm((inverse(truth[4]) @ held[4])[:3, 3]) < 0.002
+        assert np.linalg.norm((inverse(truth[4]) @ left[4])[:3, 3]) > 0.005

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from mapper.core.linear import solve_positive, turned, twist_exp
+from mapper.core.linear import product, solve_positive, turned, twist_exp
 from mapper.registration.reprojection import (
     CHI2_2DOF,
     CHI2_3DOF,
@@ -17,9 +17,65 @@ from mapper.registration.reprojection import (
 
 
 @njit(cache=True, nogil=True)
-def _cost(poses, points, edges, measured, weights, intrinsics, active, robust):
+def _link_error(T_measured, T_to, T_from, e):
+    """Write the (6,) twist by which a relative pose misses its measurement; small-angle in the rotation."""
+    T = np.eye(4)
+    T[:3, :3] = product(T_to, T_from[:3, :3].T.copy())
+    T[:3, 3] = T_to[:3, 3] - turned(T, T_from[:3, 3])
+    R = product(T_measured, T[:3, :3].T.copy())
+    for a in range(3):
+        e[3 + a] = T_measured[a, 3] - R[a, 0] * T[0, 3] - R[a, 1] * T[1, 3] - R[a, 2] * T[2, 3]
+    e[0], e[1], e[2] = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
+    return T
+
+
+@njit(cache=True, nogil=True)
+def _add_links(poses, free, links, Hcc, bc, across):
+    """Add measured relative poses to the cameras' blocks; write the blocks between two free cameras."""
+    pairs, T_measured, information = links
+    e, A = np.empty(6), np.zeros((6, 6))
+    for q in range(len(pairs)):
+        f, g = free[pairs[q, 0]], free[pairs[q, 1]]
+        T = _link_error(T_measured[q], poses[pairs[q, 1]], poses[pairs[q, 0]], e)
+        A[:3, :3] = T[:3, :3]
+        A[3:, 3:] = T[:3, :3]
+        x, y, z = T[0, 3], T[1, 3], T[2, 3]
+        for k in range(3):  # [t]× · R: the adjoint of T
+            A[3, k], A[4, k] = y * T[2, k] - z * T[1, k], z * T[0, k] - x * T[2, k]
+            A[5, k] = x * T[1, k] - y * T[0, k]
+        H = information[q]
+        for a in range(6):
+            for b in range(6):
+                if g >= 0:
+                    bc[g, a] += H[a, b] * e[b]
+                    Hcc[g, a, b] += H[a, b]
+                across[q, a, b] = 0.0
+                for k in range(6):
+                    across[q, a, b] -= H[a, k] * A[k, b]
+        if f >= 0:
+            for a in range(6):
+                for b in range(6):
+                    bc[f, a] += across[q, b, a] * e[b]
+                    for k in range(6):
+                        Hcc[f, a, b] -= A[k, a] * across[q, k, b]
+
+
+@njit(cache=True, nogil=True)
+def _link_cost(poses, links):
+    pairs, T_measured, information = links
+    e, total = np.empty(6), 0.0
+    for q in range(len(pairs)):
+        _link_error(T_measured[q], poses[pairs[q, 1]], poses[pairs[q, 0]], e)
+        for a in range(6):
+            for b in range(6):
+                total += e[a] * information[q, a, b] * e[b]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _cost(poses, points, edges, measured, weights, intrinsics, links, active, robust):
     r = np.empty(3)
-    total = 0.0
+    total = _link_cost(poses, links)
     for e in range(len(edges)):
         if not active[e]:
             continue
@@ -34,13 +90,17 @@ def _cost(poses, points, edges, measured, weights, intrinsics, active, robust):
 
 
 @njit(cache=True, nogil=True)
-def _linearise(poses, free, points, edges, measured, weights, intrinsics, active, robust, blocks):
-    """Write the blocks of the normal equations: cameras (6, 6), points (3, 3), and one (6, 3) per edge."""
-    Hcc, bc, Hpp, bp, W = blocks
+def _linearise(poses, free, points, edges, measured, weights, intrinsics, links, active, robust, blocks):
+    """Write the blocks of the normal equations.
+
+    Cameras (6, 6), points (3, 3), one (6, 3) per edge and one (6, 6) per link.
+    """
+    Hcc, bc, Hpp, bp, W, across = blocks
     Hcc[:] = 0.0
     bc[:] = 0.0
     Hpp[:] = 0.0
     bp[:] = 0.0
+    _add_links(poses, free, links, Hcc, bc, across)
     r = np.empty(3)
     J = np.empty((3, 3))
     J_pose = np.empty((3, 6))
@@ -100,9 +160,9 @@ def _inverse3(M, out):
 
 
 @njit(cache=True, nogil=True)
-def _step(free, first_edge, edges, active, blocks, damping):
+def _step(free, first_edge, edges, links, active, blocks, damping):
     """Return the damped step of cameras (C, 6) and points (P, 3) through the Schur complement."""
-    Hcc, bc, Hpp, bp, W = blocks
+    Hcc, bc, Hpp, bp, W, across = blocks
     cameras, points = len(Hcc), len(Hpp)
     S = np.zeros((6 * cameras, 6 * cameras))
     rhs = np.empty(6 * cameras)
@@ -112,6 +172,15 @@ def _step(free, first_edge, edges, active, blocks, damping):
             for b in range(6):
                 S[6 * f + a, 6 * f + b] = Hcc[f, a, b]
             S[6 * f + a, 6 * f + a] += damping * Hcc[f, a, a] + 1e-6
+    for q in range(len(across)):
+        f, g = free[links[0][q, 0]], free[links[0][q, 1]]
+        if f >= 0 and g >= 0:
+            for a in range(6):
+                for b in range(6):  # the upper triangle is copied to the lower
+                    if f < g:
+                        S[6 * f + b, 6 * g + a] += across[q, a, b]
+                    else:
+                        S[6 * g + a, 6 * f + b] += across[q, a, b]
     inverses = np.empty((points, 3, 3))
     damped = np.empty((3, 3))
     WV = np.empty((6, 3))
@@ -158,7 +227,7 @@ def _step(free, first_edge, edges, active, blocks, damping):
 
 
 @njit(cache=True, nogil=True)
-def adjust(poses, free, points, first_edge, edges, measured, weights, intrinsics, rounds, iterations):
+def adjust(poses, free, points, first_edge, edges, measured, weights, intrinsics, links, rounds, iterations):
     """Return refined poses and points, and which edges pass the last χ² test.
 
     Args:
@@ -170,6 +239,8 @@ def adjust(poses, free, points, first_edge, edges, measured, weights, intrinsics
         measured: (E, 3) u, v, bf/z in pixels; NaN in the third column without depth.
         weights: (E, 3) inverse variances, px⁻².
         intrinsics: (5,) fx, fy, cx, cy, bf.
+        links: Measured relative poses, as by depth: (Q, 2) int32 keyframes i and j, (Q, 4, 4) T_j_i, and the
+            (6, 6) information of each in j's tangent.
         rounds: How often outliers are classified; only the first round is robust.
         iterations: Largest number of steps per round.
     """
@@ -178,28 +249,32 @@ def adjust(poses, free, points, first_edge, edges, measured, weights, intrinsics
     Hcc, bc = np.empty((cameras, 6, 6)), np.empty((cameras, 6))
     Hpp, bp = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
     W = np.zeros((len(edges), 6, 3))
-    blocks = Hcc, bc, Hpp, bp, W
+    blocks = Hcc, bc, Hpp, bp, W, np.zeros((len(links[0]), 6, 6))
     active = np.ones(len(edges), np.bool_)
     r = np.empty(3)
     for k in range(rounds):
         robust = k == 0
         damping = 1e-4
-        cost = _cost(poses, points, edges, measured, weights, intrinsics, active, robust)
-        _linearise(poses, free, points, edges, measured, weights, intrinsics, active, robust, blocks)
+        cost = _cost(poses, points, edges, measured, weights, intrinsics, links, active, robust)
+        _linearise(poses, free, points, edges, measured, weights, intrinsics, links, active, robust, blocks)
         for _ in range(iterations):
-            step_cameras, step_points = _step(free, first_edge, edges, active, blocks, damping)
+            step_cameras, step_points = _step(free, first_edge, edges, links, active, blocks, damping)
             trial_poses = poses.copy()
             for c in range(len(poses)):
                 if free[c] >= 0:
                     trial_poses[c] = twist_exp(step_cameras[free[c]], poses[c])
             trial_points = points + step_points
-            trial = _cost(trial_poses, trial_points, edges, measured, weights, intrinsics, active, robust)
+            trial = _cost(
+                trial_poses, trial_points, edges, measured, weights, intrinsics, links, active, robust
+            )
             if trial <= cost:
                 converged = cost - trial < 1e-4 * cost
                 poses, points, cost, damping = trial_poses, trial_points, trial, damping * 0.2
                 if converged:
                     break
-                _linearise(poses, free, points, edges, measured, weights, intrinsics, active, robust, blocks)
+                _linearise(
+                    poses, free, points, edges, measured, weights, intrinsics, links, active, robust, blocks
+                )
             else:
                 damping *= 10.0
                 if damping > 1e3:
@@ -212,7 +287,9 @@ def adjust(poses, free, points, first_edge, edges, measured, weights, intrinsics
 
 
 @njit(cache=True, nogil=True)
-def common_parameter(poses, free, points, first_edge, edges, measured, weights, intrinsics, active, slopes):
+def common_parameter(
+    poses, free, points, first_edge, edges, measured, weights, intrinsics, links, active, slopes
+):
     """Return the information on a parameter common to all edges, and the gradient of half their χ².
 
     Poses and points are eliminated, so the parameter's Gauss–Newton step is −gradient / information.
@@ -226,6 +303,7 @@ def common_parameter(poses, free, points, first_edge, edges, measured, weights, 
         measured: As for ``adjust``.
         weights: As for ``adjust``.
         intrinsics: As for ``adjust``.
+        links: As for ``adjust``.
         active: (E,) edges that take part.
         slopes: (E, 2) change of the residuals of u and v with the parameter.
     """
@@ -233,8 +311,8 @@ def common_parameter(poses, free, points, first_edge, edges, measured, weights, 
     Hcc, bc = np.empty((cameras, 6, 6)), np.empty((cameras, 6))
     Hpp, bp = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
     W = np.zeros((len(edges), 6, 3))
-    blocks = Hcc, bc, Hpp, bp, W
-    _linearise(poses, free, points, edges, measured, weights, intrinsics, active, False, blocks)
+    blocks = Hcc, bc, Hpp, bp, W, np.zeros((len(links[0]), 6, 6))
+    _linearise(poses, free, points, edges, measured, weights, intrinsics, links, active, False, blocks)
     coupling_c, coupling_p = np.zeros((cameras, 6)), np.zeros((len(points), 3))
     r = np.empty(3)
     J = np.empty((3, 3))
@@ -261,6 +339,6 @@ def common_parameter(poses, free, points, first_edge, edges, measured, weights, 
     for f in range(cameras):  # the residuals' own gradient gives way to that of the coupling
         bc[f] = coupling_c[f]
     bp[:] = coupling_p
-    moved_c, moved_p = _step(free, first_edge, edges, active, blocks, 0.0)
+    moved_c, moved_p = _step(free, first_edge, edges, links, active, blocks, 0.0)
     information -= (coupling_c * moved_c).sum() + (coupling_p * moved_p).sum()
     return information, gradient

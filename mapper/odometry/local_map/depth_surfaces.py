@@ -14,7 +14,7 @@ from mapper.sensing.depth_noise import depth_sigma_m
 
 _COLUMNS = 80
 _SAMPLES = 4
-"""Rows and columns that are read of a cell: neighbouring pixels of a large depth image have the same error."""
+"""Rows and columns read of a cell: neighbouring pixels of a large depth image have the same error."""
 _MAX_DEPTH_RANGE = 0.15
 """A cell with a larger range of depth, relative to its least, lies on an edge and has no surface."""
 _REACH_CELLS = 2

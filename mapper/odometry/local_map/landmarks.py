@@ -26,6 +26,21 @@ _BUNDLE_ROUNDS, _BUNDLE_ITERATIONS = 2, 5
 _NEWEST = 3
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthLink:
+    """Relative pose of two keyframes from their depth images.
+
+    Attributes:
+        reference: The keyframe that the depth image was aligned to.
+        T_camera_reference: (4, 4) from its camera to the camera of the keyframe that has the link.
+        information: (6, 6) of the latter's tangent (rotation, translation).
+    """
+
+    reference: int
+    T_camera_reference: Transform
+    information: Array
+
+
 @dataclass(slots=True, eq=False)
 class Keyframe:
     """A frame that stays in the map.
@@ -36,8 +51,7 @@ class Keyframe:
         landmark_of_feature: (N,) int32 landmark of each feature, −1 for none.
         origin: First keyframe of its sub-map; sub-maps are not connected to each other.
         twist_camera: (6,) velocity of the camera in its own axes, rad/s and m/s; 0 if it is unknown.
-        depth_link: A keyframe whose surfaces the frame's depth image was aligned to, and the (6, 6)
-            information of that alignment, camera tangent; None if its landmarks were many.
+        depth_link: Pose relative to an earlier keyframe by depth; None if the landmarks were many.
     """
 
     observation: ImageObservation
@@ -45,7 +59,7 @@ class Keyframe:
     landmark_of_feature: Ids
     origin: int
     twist_camera: Array
-    depth_link: tuple[int, Array] | None = None
+    depth_link: DepthLink | None = None
 
 
 class LandmarkMap:
@@ -89,7 +103,7 @@ class LandmarkMap:
         new: NDArray[np.bool_],
         neighbour: int | None,
         twist_camera: Array,
-        depth_link: tuple[int, Array] | None = None,
+        depth_information: Array | None = None,
     ) -> int:
         """Add a keyframe that observes known landmarks, and create landmarks from its ``new`` features.
 
@@ -100,7 +114,8 @@ class LandmarkMap:
             new: (N,) features with depth that become landmarks.
             neighbour: A keyframe of the same sub-map; None begins a new one.
             twist_camera: (6,) as in ``Keyframe``.
-            depth_link: As in ``Keyframe``.
+            depth_information: (6, 6) information of its pose relative to the neighbour from depth images,
+                camera tangent; None if these were not aligned.
 
         Returns:
             The keyframe's index.
@@ -123,8 +138,12 @@ class LandmarkMap:
             observers=0,
         )
         origin = index if neighbour is None else self.keyframes[neighbour].origin
+        link = None
+        if neighbour is not None and depth_information is not None:
+            T_camera_reference = T_camera_world @ inverse(self.keyframes[neighbour].T_camera_world)
+            link = DepthLink(neighbour, T_camera_reference, depth_information)
         self.keyframes.append(
-            Keyframe(observation, T_camera_world, landmark_of_feature, origin, twist_camera, depth_link)
+            Keyframe(observation, T_camera_world, landmark_of_feature, origin, twist_camera, link)
         )
         self._link(index)
         return index
@@ -199,20 +218,20 @@ class LandmarkMap:
         """Adjust a keyframe, its most covisible ones and their landmarks; drop observations that disagree.
 
         Keyframes outside the window that observe these landmarks take part but stay fixed, as does the first
-        of a sub-map, and as do those that were placed by their depth image too: their landmarks are few.
+        of a sub-map. Depth links hold keyframes of few landmarks.
         """
         covisible = self.covisible(index, min_shared=MIN_SHARED_LANDMARKS)
         members = [index, *(k for k, _ in covisible[: window - 1])]
-        movable = sorted(
-            k for k in members if k != self.keyframes[k].origin and self.keyframes[k].depth_link is None
-        )
+        movable = sorted(k for k in members if k != self.keyframes[k].origin)
         if not movable:
             return
         landmarks = self.landmarks_of_any(members, except_for=np.empty(0, np.int32))
         first, observations = observations_of(
             landmarks, self.landmarks["newest"], self._observations["older"], self._observations["keyframe"]
         )
-        keyframe_ids, local = np.unique(self._observations["keyframe"][observations], return_inverse=True)
+        linked, T_links, link_information = self._links(movable)
+        keyframe_ids = np.unique([*self._observations["keyframe"][observations], *linked.ravel(), *movable])
+        local = np.searchsorted(keyframe_ids, self._observations["keyframe"][observations])
         free = np.full(len(keyframe_ids), -1, np.int32)
         free[np.searchsorted(keyframe_ids, movable)] = np.arange(len(movable))
         rows = np.repeat(np.arange(len(landmarks)), np.diff(first))
@@ -222,6 +241,7 @@ class LandmarkMap:
             self._observations["weights"][observations],
         )
         intrinsics = self.keyframes[index].observation.intrinsics
+        links = np.searchsorted(keyframe_ids, linked).astype(np.int32), T_links, link_information
         poses, points, agree = adjust(
             np.array([self.keyframes[k].T_camera_world for k in keyframe_ids]),
             free,
@@ -231,6 +251,7 @@ class LandmarkMap:
             measured,
             weights,
             intrinsics,
+            links,
             _BUNDLE_ROUNDS,
             _BUNDLE_ITERATIONS,
         )
@@ -238,7 +259,7 @@ class LandmarkMap:
             slopes = self._observations["slope"][observations]
             self.readout.learn(
                 *common_parameter(
-                    poses, free, points, first, edges, measured, weights, intrinsics, agree, slopes
+                    poses, free, points, first, edges, measured, weights, intrinsics, links, agree, slopes
                 )
             )
         for k, f in zip(keyframe_ids, free, strict=True):
@@ -259,6 +280,16 @@ class LandmarkMap:
             )
         rows = slice(self._observations.size)
         self._observations["measured"][rows, :2] += by_s * self._observations["slope"][rows]
+
+    def _links(self, keyframes: Iterable[int]) -> tuple[Ids, Array, Array]:
+        """Return the depth links of some keyframes, as ``adjust`` takes them."""
+        linked = [(k, self.keyframes[k].depth_link) for k in keyframes]
+        links = [(k, link) for k, link in linked if link is not None]
+        return (
+            np.array([(link.reference, k) for k, link in links], np.int32).reshape(-1, 2),
+            np.array([link.T_camera_reference for _, link in links]).reshape(-1, 4, 4),
+            np.array([link.information for _, link in links]).reshape(-1, 6, 6),
+        )
 
     def _unlink(self, observations: Ids) -> None:
         keyframes, features = self._observations["keyframe"], self._observations["feature"]
@@ -313,8 +344,8 @@ class LandmarkMap:
         Zero if they were not aligned. Tangent of the source's body, (rotation, translation).
         """
         keyframe = self.keyframes[source]
-        if keyframe.depth_link is None or keyframe.depth_link[0] != target:
+        if keyframe.depth_link is None or keyframe.depth_link.reference != target:
             return np.zeros((6, 6))
         to_camera = adjoint(inverse(keyframe.observation.T_body_camera))
-        H_body: Array = to_camera.T @ keyframe.depth_link[1] @ to_camera
+        H_body: Array = to_camera.T @ keyframe.depth_link.information @ to_camera
         return H_body

@@ -141,7 +141,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             earlier = [(k, shared) for k, shared in self._map.covisible(j, min_shared=1) if k < j]
             strong = [k for k, shared in earlier if shared >= MIN_SHARED_LANDMARKS]
             weak = [k for k, _ in earlier[:1]] or [self._map.previous(j)]
-            linked = [keyframe.depth_link[0]] if keyframe.depth_link is not None else []
+            linked = [keyframe.depth_link.reference] if keyframe.depth_link is not None else []
             chosen = strong[:_FACTORS_PER_KEYFRAME] or linked or weak
             factors += [self._factor(i, j) for i in dict.fromkeys([*chosen, *linked])]
         return factors
@@ -237,7 +237,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             new=self._new_landmarks(tracked_pose),
             neighbour=neighbour,
             twist_camera=self._shutter.twist_camera,
-            depth_link=tracked_pose.depth_link,
+            depth_information=None if tracked_pose.depth is None else tracked_pose.depth.information,
         )
         self._relocalizer.add(index)
         self._map.refine(index, window=config.bundle_keyframes)

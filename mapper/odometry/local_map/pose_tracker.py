@@ -50,11 +50,6 @@ class TrackedPose:
         """Number of features that agree with the pose."""
         return int((self.landmark_of_feature >= 0).sum())
 
-    @property
-    def depth_link(self) -> tuple[int, Array] | None:
-        """The reference and the (6, 6) information of the depth image's alignment to it, if there is one."""
-        return None if self.depth is None else (self.reference, self.depth.information)
-
 
 class PoseTracker(Protocol):
     """Method that finds the pose of a frame while the frame before it was tracked."""

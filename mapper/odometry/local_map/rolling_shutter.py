@@ -15,6 +15,8 @@ from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.registration.reprojection import pose_jacobian, projection_jacobian, residual
 
 _ITERATIONS = 2
+_MIN_LANDMARKS = 50
+"""With fewer the pose may be from depth, and the image does not show the motion."""
 _FIRST_SPREAD = np.repeat([0.1, 0.05], 3)
 """Change of velocity (rad/s, m/s) from frame to frame before any is known."""
 _LEAST_SPREAD = np.full(6, 0.01)
@@ -65,7 +67,7 @@ class RollingShutter:
         # much is uncertain.
         self.twist_camera = velocity + 0.5 * change
         readout_s = self._readout.seconds
-        if readout_s == 0.0:
+        if readout_s == 0.0 or len(points_world) < _MIN_LANDMARKS:
             return tracked_pose
         sigma = 0.5 * np.sqrt(self._variance) + _LEAST_SPREAD
         features = np.flatnonzero(tracked_pose.landmark_of_feature >= 0)
