@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.errors import GraphError
 from mapper.core.geometry import Array
@@ -135,7 +136,8 @@ def _recover(supernodes: Sequence[_Supernode]) -> dict[int, Array]:
     return covariances
 
 
-def _scalars(blocks: Sequence[int]) -> Array:
+def _scalars(blocks: Sequence[int]) -> NDArray[np.int64]:
     """Return the indices of the rows of some nodes."""
     first = _DIMENSION * np.asarray(blocks, np.int64)
-    return (first[:, np.newaxis] + np.arange(_DIMENSION)).ravel()
+    scalars: NDArray[np.int64] = (first[:, np.newaxis] + np.arange(_DIMENSION)).ravel()
+    return scalars

@@ -72,9 +72,9 @@ def build(
             level = _level(source, tracking.tracked_trajectory(), config)
         observer.on_levelled(level.T_level_world)
         tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
-        if warning := _height_warning(source, tracking.tracked_trajectory()):
-            progress.note(warning)
-            writer.warn([RunWarning(kind="depth", sentence=warning, weight="doubt")])
+        if implausible := _height_warning(source, tracking.tracked_trajectory()):
+            progress.note(implausible)
+            writer.warn([RunWarning(kind="depth", sentence=implausible, weight="doubt")])
         with writer.clock.stage("solve"):
             save_solved(writer, from_tracking(tracking, source.truth))
         writer.update(

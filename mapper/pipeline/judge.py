@@ -1,8 +1,10 @@
 """Judging a run: its warnings, a short trial of other settings where tracking was poor, and the verdict."""
 
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.config.build import BuildConfig
 from mapper.config.loading import overridden
@@ -36,7 +38,11 @@ _FACTORS: Mapping[str, Mapping[str, float]] = {
     "kiss-icp": {"map_voxel_m": 0.5, "keyframe_distance_m": 0.5},
     "hough-ndt": {"voxel_m": 0.5},
 }
-_OTHERS = {"local-map": PnpConfig(), "gicp": HoughOdometryConfig(), "icp": HoughOdometryConfig()}
+_OTHERS: Mapping[str, PnpConfig | HoughOdometryConfig] = {
+    "local-map": PnpConfig(),
+    "gicp": HoughOdometryConfig(),
+    "icp": HoughOdometryConfig(),
+}
 
 
 def judge(
@@ -88,7 +94,7 @@ def candidates_for(config: BuildConfig) -> Iterator[tuple[str, BuildConfig]]:
     """Yield the settings to try instead of a configuration's own, as ``--set`` takes them."""
     odometry = config.odometry
     for name, factor in _FACTORS.get(odometry.kind, {}).items():
-        value = odometry.model_dump()
+        value: Any = odometry.model_dump()
         for part in name.split("."):
             value = value.get(part) if isinstance(value, dict) else None
         if not isinstance(value, int | float):
@@ -103,7 +109,7 @@ def candidates_for(config: BuildConfig) -> Iterator[tuple[str, BuildConfig]]:
         yield f"odometry.kind={instead.kind}", config.model_copy(update={"odometry": instead})
 
 
-def _worst_stretch(is_unplaced: np.typing.NDArray[np.bool_], length: int) -> np.typing.NDArray[np.intp]:
+def _worst_stretch(is_unplaced: NDArray[np.bool_], length: int) -> NDArray[np.intp]:
     """Return the indices of the frames of a trial."""
     counts = np.concatenate([[0], np.cumsum(is_unplaced)])
     begins = np.arange(max(len(is_unplaced) - length, 0) + 1)

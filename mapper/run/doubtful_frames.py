@@ -7,7 +7,7 @@ import numpy as np
 
 from mapper.core.geometry import Array, Transform, exp, interpolate, inverse, log, transform
 from mapper.core.rotations import rotation_from_quaternion
-from mapper.core.timebase import NS_PER_S
+from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.trajectory import Trajectory
 from mapper.graph.model import PoseGraph
 from mapper.run.frame_outcomes import FrameRecord
@@ -140,6 +140,6 @@ def _middle_variances(tracked: Trajectory, gap_ns: int) -> Array | None:
     return np.repeat(squares, 3)
 
 
-def _line(stamps_ns: Array, poses: Array, begin: int, middle: int, end: int) -> Transform:
+def _line(stamps_ns: Stamps, poses: Array, begin: int, middle: int, end: int) -> Transform:
     fraction = float(stamps_ns[middle] - stamps_ns[begin]) / float(stamps_ns[end] - stamps_ns[begin])
     return interpolate(poses[begin], poses[end], fraction)

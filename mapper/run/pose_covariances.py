@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, GraphError, RunError
 from mapper.core.geometry import Array, adjoint, inverse, transform
@@ -37,7 +38,7 @@ class UncertainPoses:
     """
 
     trajectory: Trajectory
-    is_doubtful: Array
+    is_doubtful: NDArray[np.bool_]
     covariances: Array
 
     @property

@@ -8,8 +8,8 @@ from itertools import groupby
 
 import numpy as np
 
-from mapper.core.geometry import Array, inverse, log
-from mapper.core.timebase import NS_PER_S
+from mapper.core.geometry import inverse, log
+from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.run.frame_outcomes import DISCONNECTED, FrameRecord
 from mapper.run.manifest import Manifest, RunWarning, Weight
 from mapper.run.results import RunResults
@@ -93,7 +93,7 @@ class _TimeLine:
         begins_ns: First stamps of sessions that were appended: what lies before them is a pause, no gap.
     """
 
-    stamps_ns: Array
+    stamps_ns: Stamps
     usual_ns: float
     begins_ns: tuple[int, ...]
 
