@@ -100,7 +100,7 @@ def synth(
     from mapper.simulation.config import CAMERA_SCENES, LIDAR_SCENES, UNCALIBRATED, SynthWheelsConfig
 
     common = {"duration_s": seconds, "seed": seed}
-    carried = {"wheels": SynthWheelsConfig() if wheels else None}
+    carried: dict[str, object] = {"wheels": SynthWheelsConfig() if wheels else None}
     if sensor is SensorKind.RGBD:
         from mapper.simulation import write_tum_log
 
@@ -108,7 +108,9 @@ def synth(
         start = _scene(CAMERA_SCENES, scene or SceneName.FLAT, sensor)
         carried |= {"sensor": start.sensor.model_copy(update=UNCALIBRATED if uncalibrated else {})}
         if plane_at is not None:
-            _refuse({"--path": path}, "--plane-at")
+            _refuse({"--path": path, "--scene": scene}, "--plane-at")
+        if start.scene != "flat":
+            _refuse({"--rooms": rooms}, f"--scene {scene}")
         given = common | {"path": path, "rooms": rooms} | _at_wall(plane_at) | _camera_noise(noise)
         indoors = overridden(start.model_copy(update=carried), merged(assignments(given), set_))
         prepare_libraries()

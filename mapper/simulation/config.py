@@ -287,6 +287,12 @@ class LidarSynthConfig(Config):
 
     sensor: LidarSensorConfig = LidarSensorConfig()
 
+    @model_validator(mode="after")
+    def _wheels_climb_no_stairs(self) -> Self:
+        if self.wheels is not None and self.scene == "staircase":
+            raise ValueError("wheels: do not climb a staircase; choose another scene")
+        return self
+
 
 STREET = LidarSynthConfig()
 """A car's LiDAR on its way round a block."""

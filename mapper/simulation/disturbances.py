@@ -65,7 +65,7 @@ def _behind_hand(rendering: Rendering, config: SynthConfig, time_s: float) -> Re
     is_hand = square < 1.0
     rng = rng_of(config.seed, Stream.HAND)
     skin = tinted(_SKIN, 0.08 * fractal(rng, (height, width), cell_px=(height / 4, width / 4)))
-    shift = np.float32([[1, 0, _SWAY_SHARE * width * math.sin(angle)], [0, 1, 0]])
+    shift = np.array([[1, 0, _SWAY_SHARE * width * math.sin(angle)], [0, 1, 0]], dtype=np.float32)
     skin = np.asarray(cv2.warpAffine(skin, shift, (width, height), borderMode=cv2.BORDER_REFLECT), np.uint8)
     depth_m = np.float32(config.disturbances.hand_distance_m) * (1 + np.float32(_HAND_BULGE) * square)
     return Rendering(

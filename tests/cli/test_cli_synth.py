@@ -91,3 +91,19 @@ def test_a_lidar_goes_into_tunnels_and_up_stairs(tmp_path, scene):
         invoke("synth", str(tmp_path / "log"), "--sensor", "lidar", "--scene", scene, *small).exit_code == 0
     )
     assert json.loads((tmp_path / "log/scene.json").read_text())["config"]["scene"] == scene
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--scene", "hall", "--rooms", "6"), "--rooms 6: has no meaning with --scene hall"),
+        (("--plane-at", "2", "--scene", "hall"), "--scene hall: has no meaning with --plane-at"),
+        (("--sensor", "lidar", "--scene", "staircase", "--wheels"), "do not climb a staircase"),
+        (("--scene", "tunnel"), "want one of flat, corridor, hall, white-room, twin-rooms"),
+    ],
+)
+def test_options_that_a_scene_cannot_follow_are_refused(tmp_path, arguments, message):
+    result = invoke("synth", str(tmp_path / "log"), *arguments)
+    assert result.exit_code == 1
+    assert message in result.stderr
+    assert not (tmp_path / "log").exists()
