@@ -1,16 +1,18 @@
 """Relative-pose factors between keyframes from wheel odometry, and motions that wheels rule out."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import median
 
 import numpy as np
 
 from mapper.core.geometry import Transform, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
+from mapper.graph.components import components
 from mapper.graph.config import WheelFactorsConfig, WheelNoiseConfig
-from mapper.graph.gate import compare
-from mapper.graph.model import BetweenFactor, Origin, PoseSigmas
+from mapper.graph.gate import Comparison, compare
+from mapper.graph.model import BetweenFactor, Origin, PoseGraph, PoseSigmas
 from mapper.sensing.wheel_kinematics import Odometer, pose_at
 
 
@@ -55,9 +57,7 @@ class WheelMeasurements:
         begin, end = self._at(0, begin_ns), self._at(1, end_ns)
         if begin is None or end is None:
             return ""
-        driven = self._factor(begin, end)
-        covariance = np.asarray(np.linalg.inv(driven.information), np.float64)
-        apart = compare(T_begin_end, driven.T_i_j, covariance, slack_m=_SLACK_M, slack_rad=_SLACK_RAD)
+        apart = _apart(T_begin_end, self._factor(begin, end))
         return "" if apart.is_possible else f"{apart}, by the wheels"
 
     def _at(self, node: int, stamp_ns: int) -> WheelNode | None:
@@ -72,19 +72,38 @@ class WheelMeasurements:
         return wheel_factor(i, j, self._odometer, self._config, origin="wheel")
 
 
-def wheel_factors(
-    stamps_ns: Mapping[int, int], wheels: Trajectory | None, config: WheelFactorsConfig
-) -> list[BetweenFactor]:
-    """Return a factor between every two nodes that follow each other in time and whose wheel poses are known.
+def wheel_conflict(graph: PoseGraph, driven: Sequence[BetweenFactor]) -> str:
+    """Return a sentence about wheel factors that contradict the odometry; empty if none does.
 
     Args:
-        stamps_ns: Time of every node, nanoseconds.
-        wheels: T_odom_body; None without wheels.
-        config: Whether they are used, and their noise.
+        graph: Nodes at the odometry's estimates, with its factors.
+        driven: Wheel factors between them; those between parts that the odometry left unconnected are new.
     """
-    measurements = WheelMeasurements(wheels, config)
-    in_time_order = sorted(stamps_ns.items(), key=lambda item: item[1])
-    return [factor for node, stamp_ns in in_time_order for factor in measurements.link(node, stamp_ns)]
+    by_odometry = PoseGraph(
+        graph.T_world_node, graph.stamps_ns, [f for f in graph.factors if f.origin == "odometry"]
+    )
+    part_of = {node: part for part, nodes in enumerate(components(by_odometry)) for node in nodes}
+    both = [factor for factor in driven if part_of[factor.i] == part_of[factor.j]]
+    apart = [
+        _apart(inverse(graph.T_world_node[factor.i]) @ graph.T_world_node[factor.j], factor)
+        for factor in both
+    ]
+    wrong = [of for of in apart if not of.is_possible]
+    if not wrong:
+        return ""
+    miss_m, miss_rad = (
+        median(values) for values in ([of.translation_m for of in wrong], [of.rotation_rad for of in wrong])
+    )
+    return (
+        f"the wheels contradict the odometry in {len(wrong)} of {len(both)} steps between keyframes, by "
+        f"{miss_m:.2f} m and {miss_rad:.2f} rad (median): did they slip, is their mounting or clock wrong, "
+        "or did the odometry jump?"
+    )
+
+
+def _apart(T_i_j: Transform, driven: BetweenFactor) -> Comparison:
+    covariance = np.asarray(np.linalg.inv(driven.information), np.float64)
+    return compare(T_i_j, driven.T_i_j, covariance, slack_m=_SLACK_M, slack_rad=_SLACK_RAD)
 
 
 def wheel_factor(

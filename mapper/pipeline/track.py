@@ -11,7 +11,7 @@ from mapper.core.errors import ConfigError, FrameError, TrackingError
 from mapper.core.frames import Sensor
 from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.graph.model import BetweenFactor, PoseGraph
-from mapper.graph.wheel_factors import WheelMeasurements
+from mapper.graph.wheel_factors import WheelMeasurements, wheel_conflict
 from mapper.loops.closure import LoopClosure
 from mapper.loops.detector import LoopDetector
 from mapper.loops.factory import build_loop_detector
@@ -171,14 +171,16 @@ def track_log(
             graph.add_factors(track.factors)
             tracks.append(track)
             observer.on_frame(Step(entry, track, view, odometry.matches, detector))
+    graph.add_factors(odometry.finish())
+    conflict = wheel_conflict(graph, wheel_factors)
+    conflicts = [*detector.notes(), *([conflict] if conflict else [])]
     warnings = [
         *(RunWarning(kind="frozen", sentence=note, weight="doubt") for note in checks.frozen()),
         *(RunWarning(kind="far returns", sentence=note) for note in checks.far_returns()),
-        *(RunWarning(kind="conflict", sentence=note, weight="doubt") for note in detector.notes()),
+        *(RunWarning(kind="conflict", sentence=note, weight="doubt") for note in conflicts),
     ]
     for warning in warnings:
         progress.note(warning.sentence)
-    graph.add_factors(odometry.finish())
     graph.add_factors(wheel_factors)
     loops = (*start.loops, *detector.closures())
     graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")

@@ -72,7 +72,9 @@ def test_exact_wheels_keep_two_rooms_apart(log):
     assert loops
     assert all(loop.verdict == "rejected" for loop in loops)
     assert any("by wheels and odometry" in loop.reason for loop in loops)
-    assert any("agree with each other but not with the wheels" in note for note in tracking.notes)
+    assert any(
+        "agree with each other but not with the wheels" in found.sentence for found in tracking.warnings
+    )
 
 
 def test_without_wheels_they_are_one(log):

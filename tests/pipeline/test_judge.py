@@ -26,8 +26,8 @@ DOUBTED = dict.fromkeys((13, 14, 15, 17, 18, 19, 20), np.eye(4))
 def only_with_few_features(monkeypatch):
     """Frames are doubted unless there are 2000 features."""
 
-    def built(config, poses=None):
-        odometry = build_odometry(config, poses)
+    def built(config, *rest):
+        odometry = build_odometry(config, *rest)
         many = getattr(config, "detector", None) and config.detector.max_features >= 2000
         return odometry if many else DoubtingOdometry(odometry, DOUBTED)
 

@@ -12,7 +12,8 @@ from mapper.core.errors import SourceError
 from mapper.core.geometry import angle_between, exp, inverse, transform
 from mapper.core.trajectory import Trajectory
 from mapper.graph.config import WheelFactorsConfig
-from mapper.graph.wheel_factors import WheelMeasurements, wheel_factors
+from mapper.graph.model import BetweenFactor, PoseGraph
+from mapper.graph.wheel_factors import WheelMeasurements, wheel_conflict
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log
@@ -35,6 +36,12 @@ def planar(x, y, yaw):
 def on_a_line(n, *, step_m=0.5, turn_rad=0.0):
     T = [np.linalg.matrix_power(planar(step_m, 0.0, turn_rad), k) for k in range(n)]
     return Trajectory(np.arange(n, dtype=np.int64) * S // 10, np.array(T))
+
+
+def wheel_factors(stamps_ns, wheels, config):
+    """The factors of nodes that come in time order."""
+    measurements = WheelMeasurements(wheels, config)
+    return [factor for node, stamp_ns in stamps_ns.items() for factor in measurements.link(node, stamp_ns)]
 
 
 def test_a_held_wheel_drives_an_exact_arc_at_any_rate():
@@ -99,6 +106,20 @@ def test_a_motion_that_the_wheels_did_not_make_is_named():
     assert wheels.contradiction(np.eye(4), 0, 2 * S).startswith("10.00 m and 0.00 rad off, at most 2.")
     assert wheels.contradiction(np.eye(4), 0, 9 * S) == ""  # no readings, so nothing is known
     assert WheelMeasurements(None, WheelFactorsConfig()).contradiction(np.eye(4), 0, 2 * S) == ""
+
+
+def test_wheels_that_slip_are_told():
+    stamps_ns = {k: k * S // 2 for k in range(5)}
+    graph = PoseGraph()
+    for k, stamp_ns in stamps_ns.items():  # the third step has two metres, of which the wheels know nothing
+        graph.add_node(k, stamp_ns, planar(2.5 * k + (2.0 if k > 2 else 0.0), 0.0, 0.0))
+    steps = [BetweenFactor(k, k + 1, np.eye(4), np.eye(6)) for k in range(4)]
+    driven = wheel_factors(stamps_ns, on_a_line(21), WheelFactorsConfig())
+    connected, broken = (PoseGraph(graph.T_world_node, stamps_ns, kept) for kept in (steps, steps[:2]))
+    said = wheel_conflict(connected, driven)
+    assert said.startswith("the wheels contradict the odometry in 1 of 4 steps between keyframes, by 2.00 m")
+    assert wheel_conflict(broken, driven) == ""  # the odometry measured nothing there
+    assert wheel_conflict(connected, []) == ""
 
 
 def test_without_wheels_or_when_switched_off_there_are_no_factors():
