@@ -85,8 +85,8 @@ def test_bundle_shows_the_readout_time(readout_s):
     first = np.arange(0, len(edges) + 1, 5).astype(np.int32)
     weights = np.full((len(edges), 3), 0.3**-2)
     no_links = np.empty((0, 2), np.int32), np.empty((0, 4, 4)), np.empty((0, 6, 6))
-    arrays = np.array(edges, np.int32), np.array(measured), weights, INTRINSICS, no_links
-    poses, points, _ = adjust(poses, free, points, first, *arrays, 1, 10)
+    arrays = np.array(edges, np.int32), np.array(measured), weights, INTRINSICS
+    poses, points, _ = adjust(poses, free, points, first, *arrays, no_links, 1, 10)
     active = np.ones(len(edges), np.bool_)
     information, gradient = common_parameter(poses, free, points, first, *arrays, active, np.array(slopes))
     sigma_s = information**-0.5

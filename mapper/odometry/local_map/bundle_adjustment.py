@@ -73,9 +73,9 @@ def _link_cost(poses, links):
 
 
 @njit(cache=True, nogil=True)
-def _cost(poses, points, edges, measured, weights, intrinsics, links, active, robust):
+def _cost(poses, points, edges, measured, weights, intrinsics, active, robust):
     r = np.empty(3)
-    total = _link_cost(poses, links)
+    total = 0.0
     for e in range(len(edges)):
         if not active[e]:
             continue
@@ -90,17 +90,13 @@ def _cost(poses, points, edges, measured, weights, intrinsics, links, active, ro
 
 
 @njit(cache=True, nogil=True)
-def _linearise(poses, free, points, edges, measured, weights, intrinsics, links, active, robust, blocks):
-    """Write the blocks of the normal equations.
-
-    Cameras (6, 6), points (3, 3), one (6, 3) per edge and one (6, 6) per link.
-    """
-    Hcc, bc, Hpp, bp, W, across = blocks
+def _linearise(poses, free, points, edges, measured, weights, intrinsics, active, robust, blocks):
+    """Write the blocks of the normal equations: cameras (6, 6), points (3, 3), and one (6, 3) per edge."""
+    Hcc, bc, Hpp, bp, W = blocks
     Hcc[:] = 0.0
     bc[:] = 0.0
     Hpp[:] = 0.0
     bp[:] = 0.0
-    _add_links(poses, free, links, Hcc, bc, across)
     r = np.empty(3)
     J = np.empty((3, 3))
     J_pose = np.empty((3, 6))
@@ -160,9 +156,12 @@ def _inverse3(M, out):
 
 
 @njit(cache=True, nogil=True)
-def _step(free, first_edge, edges, links, active, blocks, damping):
-    """Return the damped step of cameras (C, 6) and points (P, 3) through the Schur complement."""
-    Hcc, bc, Hpp, bp, W, across = blocks
+def _step(free, first_edge, edges, active, blocks, damping, pairs=None, across=None):
+    """Return the damped step of cameras (C, 6) and points (P, 3) through the Schur complement.
+
+    ``across`` (Q, 6, 6) are the blocks between linked cameras, ``pairs`` (Q, 2) their keyframes.
+    """
+    Hcc, bc, Hpp, bp, W = blocks
     cameras, points = len(Hcc), len(Hpp)
     S = np.zeros((6 * cameras, 6 * cameras))
     rhs = np.empty(6 * cameras)
@@ -172,15 +171,16 @@ def _step(free, first_edge, edges, links, active, blocks, damping):
             for b in range(6):
                 S[6 * f + a, 6 * f + b] = Hcc[f, a, b]
             S[6 * f + a, 6 * f + a] += damping * Hcc[f, a, a] + 1e-6
-    for q in range(len(across)):
-        f, g = free[links[0][q, 0]], free[links[0][q, 1]]
-        if f >= 0 and g >= 0:
-            for a in range(6):
-                for b in range(6):  # the upper triangle is copied to the lower
-                    if f < g:
-                        S[6 * f + b, 6 * g + a] += across[q, a, b]
-                    else:
-                        S[6 * g + a, 6 * f + b] += across[q, a, b]
+    if across is not None:
+        for q in range(len(across)):
+            f, g = free[pairs[q, 0]], free[pairs[q, 1]]
+            if f >= 0 and g >= 0:
+                for a in range(6):
+                    for b in range(6):  # the upper triangle is copied to the lower
+                        if f < g:
+                            S[6 * f + b, 6 * g + a] += across[q, a, b]
+                        else:
+                            S[6 * g + a, 6 * f + b] += across[q, a, b]
     inverses = np.empty((points, 3, 3))
     damped = np.empty((3, 3))
     WV = np.empty((6, 3))
@@ -249,32 +249,35 @@ def adjust(poses, free, points, first_edge, edges, measured, weights, intrinsics
     Hcc, bc = np.empty((cameras, 6, 6)), np.empty((cameras, 6))
     Hpp, bp = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
     W = np.zeros((len(edges), 6, 3))
-    blocks = Hcc, bc, Hpp, bp, W, np.zeros((len(links[0]), 6, 6))
+    blocks = Hcc, bc, Hpp, bp, W
+    across = np.zeros((len(links[0]), 6, 6))
     active = np.ones(len(edges), np.bool_)
     r = np.empty(3)
     for k in range(rounds):
         robust = k == 0
         damping = 1e-4
-        cost = _cost(poses, points, edges, measured, weights, intrinsics, links, active, robust)
-        _linearise(poses, free, points, edges, measured, weights, intrinsics, links, active, robust, blocks)
+        cost = _cost(poses, points, edges, measured, weights, intrinsics, active, robust)
+        cost += _link_cost(poses, links)
+        _linearise(poses, free, points, edges, measured, weights, intrinsics, active, robust, blocks)
+        _add_links(poses, free, links, Hcc, bc, across)
         for _ in range(iterations):
-            step_cameras, step_points = _step(free, first_edge, edges, links, active, blocks, damping)
+            step_cameras, step_points = _step(
+                free, first_edge, edges, active, blocks, damping, links[0], across
+            )
             trial_poses = poses.copy()
             for c in range(len(poses)):
                 if free[c] >= 0:
                     trial_poses[c] = twist_exp(step_cameras[free[c]], poses[c])
             trial_points = points + step_points
-            trial = _cost(
-                trial_poses, trial_points, edges, measured, weights, intrinsics, links, active, robust
-            )
+            trial = _cost(trial_poses, trial_points, edges, measured, weights, intrinsics, active, robust)
+            trial += _link_cost(trial_poses, links)
             if trial <= cost:
                 converged = cost - trial < 1e-4 * cost
                 poses, points, cost, damping = trial_poses, trial_points, trial, damping * 0.2
                 if converged:
                     break
-                _linearise(
-                    poses, free, points, edges, measured, weights, intrinsics, links, active, robust, blocks
-                )
+                _linearise(poses, free, points, edges, measured, weights, intrinsics, active, robust, blocks)
+                _add_links(poses, free, links, Hcc, bc, across)
             else:
                 damping *= 10.0
                 if damping > 1e3:
@@ -303,7 +306,6 @@ def common_parameter(
         measured: As for ``adjust``.
         weights: As for ``adjust``.
         intrinsics: As for ``adjust``.
-        links: As for ``adjust``.
         active: (E,) edges that take part.
         slopes: (E, 2) change of the residuals of u and v with the parameter.
     """
@@ -311,8 +313,8 @@ def common_parameter(
     Hcc, bc = np.empty((cameras, 6, 6)), np.empty((cameras, 6))
     Hpp, bp = np.empty((len(points), 3, 3)), np.empty((len(points), 3))
     W = np.zeros((len(edges), 6, 3))
-    blocks = Hcc, bc, Hpp, bp, W, np.zeros((len(links[0]), 6, 6))
-    _linearise(poses, free, points, edges, measured, weights, intrinsics, links, active, False, blocks)
+    blocks = Hcc, bc, Hpp, bp, W
+    _linearise(poses, free, points, edges, measured, weights, intrinsics, active, False, blocks)
     coupling_c, coupling_p = np.zeros((cameras, 6)), np.zeros((len(points), 3))
     r = np.empty(3)
     J = np.empty((3, 3))
@@ -339,6 +341,6 @@ def common_parameter(
     for f in range(cameras):  # the residuals' own gradient gives way to that of the coupling
         bc[f] = coupling_c[f]
     bp[:] = coupling_p
-    moved_c, moved_p = _step(free, first_edge, edges, links, active, blocks, 0.0)
+    moved_c, moved_p = _step(free, first_edge, edges, active, blocks, 0.0)
     information -= (coupling_c * moved_c).sum() + (coupling_p * moved_p).sum()
     return information, gradient

@@ -20,6 +20,8 @@ _HUBER = 1.5
 _MARGIN_M = 0.01
 _MARGIN_SIGMAS = 4.0
 _STEP = 1e-5
+_INDEPENDENT = 0.25
+"""Share of the pairs that count: neighbouring cells have planes and errors in common."""
 
 
 @njit(cache=True, nogil=True)
@@ -160,7 +162,7 @@ def descend(  # type: ignore[no-untyped-def]
     T = T_camera_world.copy()
     active = np.ones(len(landmarks), np.bool_)
     row, r = np.empty(6), np.empty(3)
-    shared = 1.0 / (len(planes) + 1.0)
+    shared = _INDEPENDENT / (len(planes) + 1.0)
     for gate_m, stride in zip(gates_m, every):  # noqa: B905 – numba
         for _ in range(iterations):
             H, g = np.zeros((6, 6)), np.zeros(6)
@@ -220,7 +222,7 @@ def compare(T_camera_world, points, sigmas, planes, T_keyframes_world, optics, c
     facing, facing_agreeing = np.zeros((3, 3)), np.zeros((3, 3))
     row = np.empty(6)
     squares = squares_m = 0.0
-    shared = 1.0 / (len(planes) + 1.0)
+    shared = _INDEPENDENT / (len(planes) + 1.0)
     for k in range(len(planes)):
         T_k_c = _between(T_keyframes_world[k], T_camera_world)
         for i in range(len(points)):

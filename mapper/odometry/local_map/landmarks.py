@@ -230,8 +230,9 @@ class LandmarkMap:
             landmarks, self.landmarks["newest"], self._observations["older"], self._observations["keyframe"]
         )
         linked, T_links, link_information = self._links(movable)
-        keyframe_ids = np.unique([*self._observations["keyframe"][observations], *linked.ravel(), *movable])
-        local = np.searchsorted(keyframe_ids, self._observations["keyframe"][observations])
+        observed_in = self._observations["keyframe"][observations]
+        keyframe_ids = np.unique(np.concatenate([observed_in, linked.ravel(), np.array(movable, np.int32)]))
+        local = np.searchsorted(keyframe_ids, observed_in)
         free = np.full(len(keyframe_ids), -1, np.int32)
         free[np.searchsorted(keyframe_ids, movable)] = np.arange(len(movable))
         rows = np.repeat(np.arange(len(landmarks)), np.diff(first))
@@ -255,11 +256,11 @@ class LandmarkMap:
             _BUNDLE_ROUNDS,
             _BUNDLE_ITERATIONS,
         )
-        if self.readout.is_estimated:
+        if self.readout.is_estimated and len(linked) == 0:
             slopes = self._observations["slope"][observations]
             self.readout.learn(
                 *common_parameter(
-                    poses, free, points, first, edges, measured, weights, intrinsics, links, agree, slopes
+                    poses, free, points, first, edges, measured, weights, intrinsics, agree, slopes
                 )
             )
         for k, f in zip(keyframe_ids, free, strict=True):
