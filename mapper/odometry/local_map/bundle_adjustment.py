@@ -290,9 +290,7 @@ def adjust(poses, free, points, first_edge, edges, measured, weights, intrinsics
 
 
 @njit(cache=True, nogil=True)
-def common_parameter(
-    poses, free, points, first_edge, edges, measured, weights, intrinsics, links, active, slopes
-):
+def common_parameter(poses, free, points, first_edge, edges, measured, weights, intrinsics, active, slopes):
     """Return the information on a parameter common to all edges, and the gradient of half their χ².
 
     Poses and points are eliminated, so the parameter's Gauss–Newton step is −gradient / information.
