@@ -64,8 +64,9 @@ class KeyframeOdometryConfig(Config):
     kind: str
     detector: Annotated[OrbConfig | UniformOrbConfig, Field(discriminator="kind")] = UniformOrbConfig()
     """Evenly distributed features keep track in views where plain ORB finds all in one far corner."""
-    max_depth_m: PositiveFloat = 4.0
-    """Deeper features are tracked, but become landmarks only where near ones are few."""
+    max_depth_m: PositiveFloat | None = None
+    """Depth beyond it is not used. None uses all: a depth z counts as a disparity bf / z, whose error is the
+    same near and far, so that far points count by their noise."""
     virtual_baseline_px_m: PositiveFloat = 40.0
     """bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017); a Kinect's is 40 to 43. Set it to
     the focal length times the baseline of another sensor."""
@@ -95,7 +96,7 @@ class KeyframeOdometryConfig(Config):
     """Keyframe when the inliers fall below this share of the most since the last keyframe; raise it for
     more keyframes."""
     mapped_ratio: Ratio = 0.5
-    """Keyframe when the inliers are a smaller share of the near features, as much of the view is new."""
+    """Keyframe when the inliers are a smaller share of the features with depth: much of the view is new."""
     max_keyframe_gap: PositiveInt = 20
     bundle_keyframes: PositiveInt = 10
     """Keyframes in the window of the local bundle adjustment; fewer are faster and less accurate."""

@@ -33,7 +33,7 @@ _BY_POSES = ("wheels", "given")
 """Kinds of odometry without tracking: frames have the poses of wheels, or known ones."""
 
 _HINTS: Mapping[str, str] = {
-    "rgbd": "is there texture, and depth within max_depth_m, in the images?",
+    "rgbd": "is there texture, and depth in the images?",
     "lidar": "do the scans overlap, and are their units metres?",
     "wheels": "do the wheels' readings cover the frames' times, without gaps beyond odometry.max_gap_s?",
     "given": "do the given poses cover the frames' times, without gaps beyond odometry.max_gap_s?",

@@ -6,7 +6,7 @@ import pytest
 from mapper.core.errors import FrameError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
 from mapper.core.geometry import exp, inverse
-from mapper.core.trajectory import trajectory_from
+from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.features.config import OrbConfig
 from mapper.graph.config import GraphConfig
 from mapper.graph.model import PoseGraph
@@ -43,6 +43,26 @@ def test_plain_orb_works_as_well(source, frames):
     _, trajectory = track(frames, LocalMapConfig(detector=OrbConfig()))
     assert len(trajectory) == len(frames)
     assert ate_rmse_m(trajectory, source.truth) < 0.01
+
+
+def test_the_same_walk_four_times_as_large_has_the_same_drift_per_metre(source, frames):
+    """Then most walls are 4 to 12 m away. Drift may not depend on a limit of the depth."""
+    large = [RgbdFrame(f.stamp_ns, f.image, 4.0 * f.depth_m, f.camera, f.T_body_camera) for f in frames]
+    T_world_body = source.truth.T_world_body.copy()
+    T_world_body[:, :3, 3] *= 4.0
+    _, trajectory = track(large)
+    assert len(trajectory) == len(frames)
+    assert ate_rmse_m(trajectory, Trajectory(source.truth.stamps_ns, T_world_body)) < 4.0 * 0.01
+
+
+def test_depth_beyond_the_limit_is_not_used(frames):
+    def depth_m(**settings):
+        config = LocalMapConfig(**settings)
+        return build_frame_odometry(config).observe(frames[0]).points_camera[:, 2]
+
+    every, near = depth_m(), depth_m(max_depth_m=1.4)
+    assert np.nanmax(every) > 1.4
+    assert np.array_equal(near, np.where(every <= 1.4, every, np.nan), equal_nan=True)
 
 
 def test_the_same_frames_give_the_same_bytes(frames):

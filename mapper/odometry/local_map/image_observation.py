@@ -129,6 +129,8 @@ def observe_image(
     order, grid = sort_into_grid(pixels, width_px=camera.width_px, height_px=camera.height_px)
     pixels, octave = pixels[order], features.octave[order]
     depth_m, column, row = feature_depth_m(frame.depth_m, features.pixels[order])
+    if config.max_depth_m is not None:
+        depth_m[depth_m > config.max_depth_m] = np.nan
     intrinsics = np.array(
         [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, config.virtual_baseline_px_m]
     )

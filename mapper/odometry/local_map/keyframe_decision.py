@@ -24,13 +24,8 @@ class KeyframeDecision:
         self._most_inliers = 0
         self._frames = 0
 
-    def is_due(self, tracked_pose: TrackedPose, near_features: int) -> bool:
-        """Return whether the next tracked frame becomes a keyframe.
-
-        Args:
-            tracked_pose: Of the frame.
-            near_features: How many of its features are near enough to become landmarks.
-        """
+    def is_due(self, tracked_pose: TrackedPose) -> bool:
+        """Return whether the next tracked frame becomes a keyframe."""
         config, inliers = self._config, tracked_pose.inliers
         self._frames += 1
         self._most_inliers = max(self._most_inliers, inliers)
@@ -45,5 +40,5 @@ class KeyframeDecision:
         if self._frames < _MIN_GAP and inliers >= config.weak_inliers:
             return kept_ratio < _YOUNG_RATIO
         # Landmarks at one edge of the image constrain the pose badly, however many they are.
-        mapped_ratio = inliers / max(near_features, 1)
+        mapped_ratio = inliers / max(int(tracked_pose.observation.has_depth.sum()), 1)
         return kept_ratio < config.keyframe_ratio or mapped_ratio < config.mapped_ratio

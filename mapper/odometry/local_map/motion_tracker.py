@@ -80,10 +80,9 @@ class MotionPoseTracker:
         observation, ids = tracked_pose.observation, tracked_pose.landmark_of_feature
         landmarks = self._map.landmarks
         is_landmark = (ids >= 0) & (landmarks["observers"][ids] > 0)
-        is_near = observation.points_camera[:, 2] <= self._config.max_depth_m
         points_world = apply(inverse(tracked_pose.T_camera_world), observation.points_camera)
         points_world[is_landmark] = landmarks["position"][ids[is_landmark]]
-        known = np.flatnonzero(is_landmark | is_near)
+        known = np.flatnonzero(is_landmark | observation.has_depth)
         return known, points_world[known], np.where(is_landmark, ids, -1)[known].astype(np.int32)
 
 

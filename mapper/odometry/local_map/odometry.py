@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapper.core.deskew import Twist
 from mapper.core.frames import Frame
@@ -34,10 +33,7 @@ from mapper.odometry.local_map.rolling_shutter import RollingShutter
 from mapper.places.vocabulary import load_vocabulary
 
 _MIN_START_FEATURES = 100
-"""Near features that a sub-map's first frame must have: a few times ``min_inliers``."""
-_MIN_KEYFRAME_LANDMARKS = 200
-"""Keyframes with fewer landmarks take deeper ones in, the nearest first: more than ``weak_inliers``, so that
-the next frame does not begin weak."""
+"""Features with depth that a sub-map's first frame must have: a few times ``min_inliers``."""
 _FACTORS_PER_KEYFRAME = 4
 """Factors of each keyframe, to the earlier ones that share most landmarks with it."""
 
@@ -102,7 +98,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         before_last = None if self._lost_frames else self._last
         self._lost_frames = self._unknown_frames = 0
         reference = tracked_pose.reference
-        is_keyframe = self._decision.is_due(tracked_pose, self._near_features(observation))
+        is_keyframe = self._decision.is_due(tracked_pose)
         if is_keyframe:
             tracked_pose = self._add_keyframe(tracked_pose, neighbour=reference)
         self._before_last, self._last = before_last, tracked_pose
@@ -159,7 +155,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
     def _not_found(self, observation: ImageObservation) -> FrameResult:
         """Return a lost frame, or begin a new sub-map with it once enough frames matched no landmarks."""
         is_first = self._last is None
-        if self._near_features(observation) >= _MIN_START_FEATURES or (
+        if observation.has_depth.sum() >= _MIN_START_FEATURES or (
             is_first and self._depth.can_start(observation)
         ):
             self._unknown_frames += 1
@@ -220,10 +216,6 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         ids = tracked_pose.landmark_of_feature
         return self._shutter.refined(tracked_pose, self._last, self._map.landmarks["position"][ids[ids >= 0]])
 
-    def _near_features(self, observation: ImageObservation) -> int:
-        """Return the number of features near enough to become landmarks."""
-        return int((observation.points_camera[:, 2] <= self._config.max_depth_m).sum())
-
     def _add_keyframe(self, tracked_pose: TrackedPose, *, neighbour: int | None) -> TrackedPose:
         """Turn a tracked frame into a keyframe, refine the map around it, and return its refined pose.
 
@@ -234,7 +226,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             observation,
             tracked_pose.T_camera_world,
             tracked_pose.landmark_of_feature,
-            new=self._new_landmarks(tracked_pose),
+            new=observation.has_depth & (tracked_pose.landmark_of_feature < 0),
             neighbour=neighbour,
             twist_camera=self._shutter.twist_camera,
             depth_information=None if tracked_pose.depth is None else tracked_pose.depth.information,
@@ -252,17 +244,6 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             landmark_of_feature=keyframe.landmark_of_feature,
             reference=index,
         )
-
-    def _new_landmarks(self, tracked_pose: TrackedPose) -> NDArray[np.bool_]:
-        """Return (N,) which features become landmarks: the near ones, and deeper ones if those are few."""
-        depth_m = tracked_pose.observation.points_camera[:, 2]
-        unmapped = tracked_pose.observation.has_depth & (tracked_pose.landmark_of_feature < 0)
-        new = unmapped & (depth_m <= self._config.max_depth_m)
-        missing = _MIN_KEYFRAME_LANDMARKS - tracked_pose.inliers - int(new.sum())
-        if missing > 0:
-            deep = np.flatnonzero(unmapped & ~new)
-            new[deep[np.argsort(depth_m[deep], kind="stable")[:missing]]] = True
-        return new
 
     def _result(
         self, tracked_pose: TrackedPose, *, is_keyframe: bool, links: Sequence[BetweenFactor] = ()
