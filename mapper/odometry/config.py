@@ -84,10 +84,11 @@ class KeyframeOdometryConfig(Config):
     of higher resolution."""
     local_keyframes: NonNegativeInt = 15
     """Number of covisible keyframes whose landmarks are searched; 0 keeps only the first matches."""
-    min_matches: Annotated[int, Field(ge=8)] = 20
+    min_matches: Annotated[int, Field(ge=8)] = 12
     """Fewer matches to the last frame, or to a keyframe, give no pose."""
-    min_inliers: PositiveInt = 30
-    """With fewer landmarks that agree with the pose the frame is lost; raise it where poses jump."""
+    min_inliers: PositiveInt = 15
+    """With fewer landmarks that agree with the pose the frame is lost; where many landmarks are in view, more
+    have to agree, as some do by chance."""
     weak_inliers: PositiveInt = 150
     """With fewer, a pose competes with those from other keyframes and without a prediction."""
     max_lost_frames: NonNegativeInt = 15
@@ -102,8 +103,8 @@ class KeyframeOdometryConfig(Config):
     """Keyframes in the window of the local bundle adjustment; fewer are faster and less accurate."""
     vocabulary: Path | None = None
     """File of the visual words; None is the one that comes with the toolkit, trained on synthetic logs."""
-    ransac_iterations: PositiveInt = 100
-    """M: largest number of samples of four pairs for P3P (Zhao et al. 2020, §1.2)."""
+    ransac_iterations: PositiveInt = 500
+    """M: largest number of samples of four pairs for P3P (Zhao et al. 2020, §1.2, take 100)."""
     ransac_tolerance_px: PositiveFloat = 4.0
     """β: largest distance between a projected point and its pixel for an inlier of P3P."""
     ransac_seed: NonNegativeInt = 0

@@ -10,6 +10,7 @@ from mapper.graph.components import components
 from mapper.graph.model import PoseGraph
 from mapper.odometry.config import LocalMapConfig, PnpConfig
 from mapper.odometry.factory import build_frame_odometry
+from mapper.odometry.local_map.local_search import least_by_chance
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.source import CameraSimulator
 from tests.support.desk_frames import blank
@@ -171,3 +172,21 @@ def test_after_a_gap_of_the_log_looks_do_not_decide_alone(frames, config):
     assert fooled[len(before)].node is not None
     assert fooled[len(before)].diagnostics.method != "start"
     assert any(track.diagnostics.method == "start" for track in warned[len(before) :])
+
+
+@pytest.mark.parametrize("stride", [4, 5])
+def test_images_that_overlap_by_half_are_all_tracked(source, frames, stride):
+    """They are up to 29° or 36° apart, and 63° wide."""
+    tracks = tracked(frames[::stride], build_frame_odometry(LocalMapConfig()))
+    assert all(track.node is not None for track in tracks)
+    assert sum(track.diagnostics.method == "start" for track in tracks) == 1
+    truth = inverse(source.truth.T_world_body[0]) @ source.truth.T_world_body[::stride]
+    misses = [inverse(T) @ track.T_world_body for T, track in zip(truth, tracks, strict=True)]
+    assert max(np.linalg.norm(miss[:3, 3]) for miss in misses) < 0.08
+
+
+def test_more_landmarks_have_to_agree_where_more_are_in_view():
+    counts = [least_by_chance(visible) for visible in (0, 100, 1000)]
+    assert counts == sorted(counts)
+    assert counts[0] == 0
+    assert 20 < counts[2] < 60  # of 1000, of which 20 agree by chance

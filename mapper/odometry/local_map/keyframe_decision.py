@@ -8,8 +8,8 @@ _MIN_GAP = 4
 _DEPTH_OVERLAP = 0.9
 """With less overlap of the surfaces a frame without landmarks becomes a keyframe: what is left may not show
 every motion."""
-_YOUNG_RATIO = 0.5
-"""``keyframe_ratio`` while the last keyframe is young and the inliers are not weak: for fast motion."""
+_YOUNG_SHARE = 2.0 / 3.0
+"""Share of both ratios that counts while the last keyframe is young and the inliers are not weak."""
 
 
 class KeyframeDecision:
@@ -34,11 +34,13 @@ class KeyframeDecision:
         if self._frames >= config.max_keyframe_gap:
             return True
         if tracked_pose.depth is not None and inliers < config.min_inliers:
-            textured = near_features >= config.weak_inliers and self._frames >= _MIN_GAP
+            textured = (
+                tracked_pose.observation.has_depth.sum() >= config.weak_inliers and self._frames >= _MIN_GAP
+            )
             return textured or tracked_pose.depth.overlap < _DEPTH_OVERLAP
         kept_ratio = inliers / self._most_inliers
-        if self._frames < _MIN_GAP and inliers >= config.weak_inliers:
-            return kept_ratio < _YOUNG_RATIO
+        young = self._frames < _MIN_GAP and inliers >= config.weak_inliers
+        share = _YOUNG_SHARE if young else 1.0
         # Landmarks at one edge of the image constrain the pose badly, however many they are.
         mapped_ratio = inliers / max(int(tracked_pose.observation.has_depth.sum()), 1)
-        return kept_ratio < config.keyframe_ratio or mapped_ratio < config.mapped_ratio
+        return kept_ratio < share * config.keyframe_ratio or mapped_ratio < share * config.mapped_ratio

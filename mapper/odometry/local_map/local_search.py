@@ -15,6 +15,15 @@ from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
 from mapper.odometry.local_map.pose_tracker import MAX_HAMMING, TrackedPose, refined, rms_px
 
 _MAX_RATIO = 0.8
+_CHANCE = 0.02
+"""Largest share of the landmarks in view that match and agree with a wrong pose by chance."""
+_CHANCE_SIGMAS = 5.0
+
+
+def least_by_chance(visible: int) -> int:
+    """Return how many inliers a wrong pose hardly has: the binomial's mean and five standard deviations."""
+    mean = _CHANCE * visible
+    return math.ceil(mean + _CHANCE_SIGMAS * math.sqrt(mean * (1.0 - _CHANCE)))
 
 
 class LocalSearch:
@@ -80,7 +89,7 @@ class LocalSearch:
         if len(features) < config.min_inliers:
             return None
         T_camera_world, agree = refined(T_camera_world, landmarks["position"][ids], observation, features)
-        if agree.sum() < config.min_inliers:
+        if agree.sum() < max(config.min_inliers, least_by_chance(len(visible) + len(matched))):
             return None
         landmark_of_feature[features[~agree]] = -1
         landmarks["visible"][visible] += 1

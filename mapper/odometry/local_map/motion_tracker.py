@@ -33,10 +33,23 @@ class MotionPoseTracker:
         if predicted is not None and predicted.inliers >= self._config.weak_inliers:
             return predicted
         # A pose with few inliers may be wrong, so a pose that does not depend on the prediction competes.
-        matched = self._relocalizer.best_among(
-            self._map.latest(last.reference), observation, method="fallback"
+        known, points_world, landmarks = self._known_points(last)
+        by_last = self._relocalizer.match_points(
+            observation,
+            last.observation.bits[known],
+            points_world,
+            landmarks,
+            reference=last.reference,
+            method="matched",
         )
-        found = [tracked_pose for tracked_pose in (predicted, matched) if tracked_pose is not None]
+        found = [tracked_pose for tracked_pose in (predicted, by_last) if tracked_pose is not None]
+        best = max(found, key=lambda tracked_pose: tracked_pose.inliers, default=None)
+        if best is not None and best.inliers >= self._config.weak_inliers:
+            return best
+        by_keyframe = self._relocalizer.best_among(
+            self._map.latest(last.reference), observation, method="fallback", exhaustive=True
+        )
+        found = [tracked_pose for tracked_pose in (best, by_keyframe) if tracked_pose is not None]
         return max(found, key=lambda tracked_pose: tracked_pose.inliers, default=None)
 
     def _by_motion(

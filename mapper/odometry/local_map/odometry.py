@@ -184,7 +184,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
                 return tracked_pose
         candidates = self._relocalizer.candidates(observation, inverse(last.T_camera_world)[:3, 3])
         relocalised = self._relocalizer.best_among(
-            candidates, observation, method="relocalised", is_possible=self._is_possible
+            candidates, observation, method="relocalised", is_possible=self._is_possible, exhaustive=True
         )
         return self._depth.supported(observation, relocalised or last, None, relocalised)
 

@@ -4,7 +4,8 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from mapper.core.geometry import Array
+from mapper.core.geometry import Array, Points
+from mapper.features.hamming import Bits, match_mutual_bits
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
@@ -45,6 +46,7 @@ class Relocalizer:
         *,
         method: str,
         is_possible: Callable[[TrackedPose], bool] = lambda _: True,
+        exhaustive: bool = False,
     ) -> TrackedPose | None:
         """Return the first pose that many landmarks agree with, else that of most inliers; None if not found.
 
@@ -52,7 +54,7 @@ class Relocalizer:
         """
         best: TrackedPose | None = None
         for k in keyframes:
-            tracked_pose = self._match_keyframe(k, observation, method=method)
+            tracked_pose = self._match_keyframe(k, observation, method=method, exhaustive=exhaustive)
             if tracked_pose is None or not is_possible(tracked_pose):
                 continue
             if best is None or tracked_pose.inliers > best.inliers:
@@ -60,6 +62,32 @@ class Relocalizer:
                 if best.inliers >= self._config.weak_inliers:
                     break
         return best
+
+    def match_points(
+        self,
+        observation: ImageObservation,
+        bits: Bits,
+        points_world: Points,
+        landmarks: Ids,
+        *,
+        reference: int,
+        method: str,
+    ) -> TrackedPose | None:
+        """Match every feature with every point, and find the pose by P3P; None if it is not found.
+
+        Args:
+            observation: The frame.
+            bits: (M, 4) uint64 descriptors of the points.
+            points_world: (M, 3) metres.
+            landmarks: (M,) int32 landmark of each point, −1 for none.
+            reference: A keyframe that sees the place.
+            method: Step for ``TrackedPose.method``.
+        """
+        pairs = match_mutual_bits(bits, observation.bits, MAX_HAMMING, _MAX_RATIO)
+        hits = np.flatnonzero(pairs >= 0)
+        return self._pose_of(
+            observation, pairs[hits], points_world[hits], landmarks[hits], reference=reference, method=method
+        )
 
     def candidates(self, observation: ImageObservation, position_world: Array) -> list[int]:
         """Return keyframes to match a frame with: the most similar, best first, then the nearest.
@@ -76,15 +104,43 @@ class Relocalizer:
         nearest = np.argsort(np.linalg.norm(position_camera, axis=1), kind="stable")[:limit]
         return list(dict.fromkeys([*similar, *map(int, nearest)]))
 
-    def _match_keyframe(self, k: int, observation: ImageObservation, *, method: str) -> TrackedPose | None:
+    def _match_keyframe(
+        self, k: int, observation: ImageObservation, *, method: str, exhaustive: bool
+    ) -> TrackedPose | None:
         """Match one keyframe under the vocabulary's nodes, and find the pose by P3P (Zhao et al. 2020, §1.2).
 
         Levenberg–Marquardt then refines the pose over RANSAC's inliers (ibid., eq. 5–8).
         """
         features, ids = self._matches(k, observation)
+        points_world = self._map.landmarks["position"][ids]
+        found = self._pose_of(observation, features, points_world, ids, reference=k, method=method)
+        if found is not None or not exhaustive:
+            return found
+        keyframe = self._map.keyframes[k]
+        mapped = np.flatnonzero(keyframe.landmark_of_feature >= 0)
+        ids = keyframe.landmark_of_feature[mapped]
+        return self.match_points(
+            observation,
+            keyframe.observation.bits[mapped],
+            self._map.landmarks["position"][ids],
+            ids,
+            reference=k,
+            method=method,
+        )
+
+    def _pose_of(
+        self,
+        observation: ImageObservation,
+        features: Ids,
+        points_world: Points,
+        landmarks: Ids,
+        *,
+        reference: int,
+        method: str,
+    ) -> TrackedPose | None:
+        """Return the pose by P3P, refined over RANSAC's inliers and then with the landmarks around."""
         if len(features) < self._config.min_matches:
             return None
-        points_world = self._map.landmarks["position"][ids]
         found = ransac_p3p(
             points_world,
             observation.measured[features, :2],
@@ -99,12 +155,12 @@ class Relocalizer:
         fewest = max(self._config.min_agreement_ratio * len(features), self._config.min_matches // 2)
         if len(agreeing) < fewest:
             return None
-        features, ids = features[agreeing], ids[agreeing]
+        features, landmarks = features[agreeing], landmarks[agreeing]
         T_camera_world, agree = refined(T_camera_world, points_world[agreeing], observation, features)
         landmark_of_feature = unmatched(observation)
-        landmark_of_feature[features[agree]] = ids[agree]
+        landmark_of_feature[features[agree]] = landmarks[agree]
         return self._search.refine(
-            observation, T_camera_world, landmark_of_feature, reference=k, method=method
+            observation, T_camera_world, landmark_of_feature, reference=reference, method=method
         )
 
     def _matches(self, k: int, observation: ImageObservation) -> tuple[Ids, Ids]:
