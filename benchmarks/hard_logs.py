@@ -41,6 +41,12 @@ HARD_LOGS: Mapping[str, HardLog] = {
         "the same with rolling shutter, late depth, lens and depth errors that no calibration mentions",
         "frame_rate_hz=15", "duration_s=16", scene="corridor", more=(*_LARGE, "--uncalibrated"),
     ),
+    "corridor_pale": _camera(
+        "a corridor 6 m wide, pale: hardly any contrast but on far doors and posters, exposures of 10 ms",
+        "hall_width_m=6", "hall_clearance_m=2.7", "room_height_m=3.6", "furniture_per_room=0",
+        "posters_per_room=6", "texture_contrast=0.15", "sensor.exposure_s=0.01", "speed_mps=1.1",
+        "frame_rate_hz=15", "duration_s=14", scene="corridor", more=_LARGE,
+    ),
     "hall": _camera(
         "hall of 15 by 13 m, painted walls 4 to 8 m off, few near things",
         "frame_rate_hz=10", scene="hall", more=_LARGE,
@@ -124,6 +130,11 @@ HARD_LOGS: Mapping[str, HardLog] = {
     "lidar_2hz": _lidar(
         "two scans a second in rooms, looking around fast",
         "sensor.rings=16", "rate_hz=2", "yaw_swing_rad=1.2", "sensor.motion_distortion=false", scene="flat",
+    ),
+    "lidar_2hz_fast": _lidar(
+        "the same, walking faster, looking around by a right angle and tilting",
+        "sensor.rings=16", "rate_hz=2", "yaw_swing_rad=1.57", "tilt_rad=0.35", "speed_mps=1.2", "laps=2",
+        "sensor.motion_distortion=false", scene="flat",
     ),
     "lidar_roll": _lidar(
         "a street, the sensor rolling by 30 degrees", "sensor.rings=32", "tilt_rad=0.52", "duration_s=25",
