@@ -81,6 +81,16 @@ HARD_LOGS: Mapping[str, HardLog] = {
         "between 7 and 10 s a hand 0.45 m before the lens, with depth, covers three quarters of the image",
         "frame_rate_hz=15", "duration_s=20", "disturbances.hand_start_s=7", "disturbances.hand_duration_s=3",
     ),
+    "frozen_lap": _camera(
+        "one frame is repeated for 3 s; the walk goes on round the flat to where it began",
+        "frame_rate_hz=10", "overlap_m=4",
+        "disturbances.freeze_start_s=7", "disturbances.freeze_duration_s=3",
+    ),
+    "hand_lap": _camera(
+        "a hand covers the lens for 3 s; the walk goes on round the flat to where it began",
+        "frame_rate_hz=10", "overlap_m=4",
+        "disturbances.hand_start_s=7", "disturbances.hand_duration_s=3",
+    ),
     "kidnapped": _camera(
         "from 6 to 12 s the lens is covered and the camera is carried to another room; it comes back",
         "frame_rate_hz=10", "blackout_start_s=6", "blackout_duration_s=6", "overlap_m=6",
