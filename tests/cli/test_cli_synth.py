@@ -73,8 +73,8 @@ def test_a_cameras_scene_begins_with_its_own_settings(tmp_path, scene, name, set
 
 
 def test_an_uncalibrated_sensor_has_every_error_but_those_set_by_hand(tmp_path):
-    arguments = ["synth", str(tmp_path / "log"), "--uncalibrated", "--set", "sensor.depth_scale=1.03", *TINY]
-    assert invoke(*arguments).exit_code == 0
+    settings = ["--set", "sensor.depth_scale=1.03", "--set", "texture_px_per_m=8"]
+    assert invoke("synth", str(tmp_path / "log"), "--uncalibrated", *settings, *TINY).exit_code == 0
     sensor = json.loads((tmp_path / "log/scene.json").read_text())["config"]["sensor"]
     assert sensor["depth_scale"] == 1.03
     assert {name: sensor[name] for name in UNCALIBRATED if name != "depth_scale"} == {
