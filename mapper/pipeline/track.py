@@ -171,6 +171,13 @@ def track_log(
             graph.add_factors(track.factors)
             tracks.append(track)
             observer.on_frame(Step(entry, track, view, odometry.matches, detector))
+    doubts = checks.doubts()
+    tracks = [
+        replace(track, doubts=(*track.doubts, *doubts.get(track.stamp_ns, ())))
+        if track.node is not None
+        else track
+        for track in tracks
+    ]
     graph.add_factors(odometry.finish())
     conflict = wheel_conflict(graph, wheel_factors)
     conflicts = [*detector.notes(), *([conflict] if conflict else [])]

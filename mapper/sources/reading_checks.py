@@ -19,6 +19,8 @@ drivers repeat a frame or two when a sensor is late."""
 FROZEN_DEPTHS = 5
 """As ``FROZEN_FRAMES``, of depth images, whose noise is stronger."""
 
+_FEWEST_FRAMES, _LONG_NS = 3, NS_PER_S
+
 
 @dataclass(frozen=True, slots=True)
 class _Reading:
@@ -47,7 +49,7 @@ class ReadingChecks:
             self._readings[index] = _reading_of(frame)
 
     def repeated(self, what: Literal["image", "depth"], *, fewest: int) -> list[range]:
-        """Return the runs of so many frames or more with the same images.
+        """Return the runs of so many frames or more, or of a second and more, with the same images.
 
         A frame that was not loaded, or could not be, counts as those around it.
         """
@@ -58,7 +60,12 @@ class ReadingChecks:
             list(run) for _, run in groupby(loaded, key=lambda index: getattr(self._readings[index], what))
         ]
 
-        return [range(run[0], run[-1] + 1) for run in same if run[-1] + 1 - run[0] >= fewest]
+        runs = [range(run[0], run[-1] + 1) for run in same]
+        return [run for run in runs if len(run) >= fewest or self._lasts(run)]
+
+    def _lasts(self, run: range) -> bool:
+        lasted_ns = int(self._stamps_ns[run[-1]] - self._stamps_ns[run[0]])
+        return len(run) >= _FEWEST_FRAMES and lasted_ns >= _LONG_NS
 
     def notes(self) -> list[str]:
         """Return what is suspicious about the frames loaded so far, a sentence each."""
@@ -76,6 +83,18 @@ class ReadingChecks:
                 for run in self.repeated("depth", fewest=FROZEN_DEPTHS)
             ),
         ]
+
+    def doubts(self) -> dict[int, list[str]]:
+        """Return why frames tell nothing of their own, by stamp: they repeat the images of an earlier one."""
+        doubts: dict[int, list[str]] = {}
+        frozen_images = self.repeated("image", fewest=FROZEN_FRAMES)
+        frozen_depths = self.repeated("depth", fewest=FROZEN_DEPTHS)
+        for named, runs in (("image", frozen_images), ("depth image", frozen_depths)):
+            for run in runs:
+                for index in run[1:]:
+                    said = f"same {named} as {index - run[0]} frames before"
+                    doubts.setdefault(int(self._stamps_ns[index]), []).append(said)
+        return doubts
 
     def _named(self, run: range) -> str:
         begin_s, end_s = ((self._stamps_ns[[run[0], run[-1]]] - self._stamps_ns[0]) / NS_PER_S).tolist()
@@ -122,5 +141,8 @@ def _reading_of(frame: Frame) -> _Reading:
     return _Reading(image=_checksum(frame.image), depth=_checksum(frame.depth_m))
 
 
-def _checksum(image: Image | DepthImage) -> int:
+def _checksum(image: Image | DepthImage) -> int | None:
+    """Return a number by which images differ; None of an image without content: a dark one shows nothing."""
+    if (image == image.flat[0]).all():
+        return None
     return int(isal_zlib.crc32(np.ascontiguousarray(image)))

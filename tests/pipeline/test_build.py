@@ -2,6 +2,7 @@ import json
 import shutil
 from contextlib import contextmanager
 
+import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -217,9 +218,11 @@ def test_bad_frames_are_skipped_counted_and_reported(damaged_log, tmp_path):
     assert observer.reached == {"track": (31, 31), "fuse": (29, 29)}
 
 
-def test_a_log_without_texture_ends_in_an_error_and_leaves_what_there_is(damaged_log, tmp_path):
+def test_a_log_without_texture_and_depth_ends_in_an_error_and_leaves_what_there_is(damaged_log, tmp_path):
     for image in (damaged_log / "rgb").iterdir():
         image.write_bytes(_black_png())
+    for depth in (damaged_log / "depth").iterdir():
+        cv2.imwrite(str(depth), np.zeros_like(cv2.imread(str(depth), cv2.IMREAD_UNCHANGED)))
 
     with pytest.raises(TrackingError, match="only 0 of 31 frames read could be tracked, want at least 10"):
         build_run(damaged_log, tmp_path / "run")
@@ -257,6 +260,4 @@ def test_a_scan_alone_is_the_frame_s(desk_log):
 
 
 def _black_png():
-    import cv2
-
     return cv2.imencode(".png", np.zeros((240, 320, 3), np.uint8))[1].tobytes()

@@ -2,6 +2,7 @@
 
 import shutil
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -48,6 +49,24 @@ def test_a_frozen_camera_is_noted_with_its_frames_and_times():
     assert notes_on(log) == noted
     assert notes_on(log, np.random.default_rng(0).permutation(40).tolist()) == noted
     assert notes_on(log_of(frozen(40, 7, FROZEN_FRAMES - 1), range(100, 140))) == []
+
+
+def test_frames_that_repeat_earlier_ones_are_doubted():
+    log = log_of(frozen(40, 7, FROZEN_FRAMES), frozen(40, 30, FROZEN_DEPTHS))
+    checks = ReadingChecks(log)
+    for entry in checks.log.entries():
+        entry.load()
+    doubts = checks.doubts()
+    assert sorted(doubts) == log.stamps_ns[[*range(8, 17), *range(31, 35)]].tolist()
+    assert doubts[log.stamps_ns[9]] == ["same image as 2 frames before"]
+    assert doubts[log.stamps_ns[31]] == ["same depth image as 1 frames before"]
+
+
+def test_a_second_of_the_same_image_is_long_whatever_the_frame_rate():
+    log = log_of(frozen(6, 2, 3), range(100, 106))
+    slow = replace(log, stamps_ns=log.stamps_ns * 6)
+    assert notes_on(log) == []
+    assert len(notes_on(slow)) == 1
 
 
 def test_depth_that_repeats_is_noted():
