@@ -7,7 +7,7 @@ from mapper.run.manifest import RunWarning, Trial, Verdict
 from mapper.run.results import load_results
 from mapper.run.warnings import find_warnings
 
-TRACKING_KINDS = frozenset({"lost", "doubtful", "left out"})
+TRACKING_KINDS = frozenset({"lost", "doubtful"})
 """Kinds of warnings that other settings of the odometry may mend."""
 
 

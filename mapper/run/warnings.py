@@ -113,10 +113,9 @@ class _TimeLine:
         return float(self.stamps_ns[last] - self.stamps_ns[first]) / NS_PER_S
 
 
-def _runs_of(records: Sequence[FrameRecord], outcomes: set[str]) -> Iterator[tuple[int, int]]:
-    """Yield the first and last index of each run of frames with these outcomes."""
-    marked = enumerate(record.outcome in outcomes for record in records)
-    for is_marked, run in groupby(marked, key=lambda one: one[1]):
+def _runs_of(marked: Sequence[bool]) -> Iterator[tuple[int, int]]:
+    """Yield the first and last index of each run of frames that are marked."""
+    for is_marked, run in groupby(enumerate(marked), key=lambda one: one[1]):
         indices = [index for index, _ in run]
         if is_marked:
             yield indices[0], indices[-1]
@@ -162,13 +161,12 @@ def _lost(records: Sequence[FrameRecord], timeline: _TimeLine) -> Iterator[RunWa
             suggestion="show a known place again after a loss, or record wheel odometry",
             weight="break",
         )
-    lost = sum(record.outcome == "lost" for record in records) - len(left_out)
+    is_lost = [record.outcome == "lost" and record.diagnostics.method != DISCONNECTED for record in records]
+    lost = sum(is_lost)
     if not lost:
         return
     share = lost / len(records)
-    runs = [
-        (max(first - 1, 0), min(last + 1, len(records) - 1)) for first, last in _runs_of(records, {"lost"})
-    ]
+    runs = [(max(first - 1, 0), min(last + 1, len(records) - 1)) for first, last in _runs_of(is_lost)]
     first, last = max(runs, key=lambda run: timeline.duration_s(*run))
     longest_s = timeline.duration_s(first, last)
     is_long = longest_s > _BROKEN_LOST_S and last - first > _BROKEN_LOST_FRAMES
@@ -197,7 +195,9 @@ def _doubtful(records: Sequence[FrameRecord], timeline: _TimeLine) -> Iterator[R
             examples.setdefault(_without_figures(doubt), doubt)
     reasons = Counter(_without_figures(doubt) for record in doubtful for doubt in record.doubts)
     texts = [f"{examples[reason]} ({count})" for reason, count in reasons.most_common(_REASONS)]
-    first, last = max(_runs_of(records, {"doubtful"}), key=lambda run: run[1] - run[0])
+    first, last = max(
+        _runs_of([record.outcome == "doubtful" for record in records]), key=lambda run: run[1] - run[0]
+    )
     too_many = len(doubtful) > _FEW_FRAMES and share > _MAX_DOUBTFUL_SHARE
     yield RunWarning(
         kind="doubtful",

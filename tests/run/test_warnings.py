@@ -68,6 +68,14 @@ def test_where_frames_were_lost():
     assert "for 2.6 s at the longest" in warning.sentence
 
 
+def test_frames_that_are_left_out_do_not_count_as_lost_too():
+    changed = {k: lost() for k in (140, 141)} | {k: lost(DISCONNECTED) for k in range(142, 200)}
+    left_out, few = found(results_of(changed=changed))
+    assert (left_out.kind, few.kind) == ("left out", "lost")
+    assert few.weight == "note"
+    assert few.where == "13.9 … 14.2 s"
+
+
 def test_a_part_that_is_left_out_breaks_a_run():
     changed = {k: lost(DISCONNECTED) for k in range(150, 200)}
     warning = only(results_of(changed=changed))
