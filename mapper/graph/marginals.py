@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import GraphError
-from mapper.core.geometry import Array
+from mapper.core.geometry import Array, adjoint, inverse
 from mapper.graph.batch import problem_of
 from mapper.graph.components import components
-from mapper.graph.model import PoseGraph, PoseSigmas
+from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.graph.terms import anchor, between, values_of
 
 if TYPE_CHECKING:
@@ -24,11 +24,24 @@ _HELD = PoseSigmas(rotation_rad=1e-6, translation_m=1e-6)
 _DIMENSION = 6
 
 
-def node_covariances(graph: PoseGraph) -> dict[int, Array]:
-    """Return the (6, 6) covariance of every node's pose, given all factors and the first node's pose.
+@dataclass(frozen=True, slots=True, eq=False)
+class Marginals:
+    """Covariances of a pose graph, given all of its factors; rad² and m².
 
-    Tangent of the node (rotation, translation), rad² and m². Each connected component is held at its first
-    node, whose covariance is zero. The information is linearised where the nodes are; of its inverse
+    Attributes:
+        nodes: (6, 6) of every node's pose, tangent of the node (rotation, translation), the first node of its
+            component being held, whose covariance is zero.
+        relative: (6, 6) of the pose of j in i, tangent of j, for every factor's (i, j).
+    """
+
+    nodes: dict[int, Array]
+    relative: dict[tuple[int, int], Array]
+
+
+def marginals_of(graph: PoseGraph) -> Marginals:
+    """Return the covariances of a graph's nodes, and of the nodes that factors tie relative to each other.
+
+    The information is linearised where the nodes are; of its inverse
     only the blocks of nodes that share a clique are computed (Takahashi, Fagan & Chin 1973; on cliques as in
     Kaess & Dellaert 2009, §4), since the whole inverse is dense.
 
@@ -38,15 +51,16 @@ def node_covariances(graph: PoseGraph) -> dict[int, Array]:
     import gtsam
 
     covariances = {node: np.zeros((_DIMENSION, _DIMENSION)) for node in graph.T_world_node}
+    relative: dict[tuple[int, int], Array] = {}
     parts = components(graph)
     part_of = {node: number for number, nodes in enumerate(parts) for node in nodes}
-    terms: list[list[gtsam.NonlinearFactor]] = [[] for _ in parts]
+    factors: list[list[BetweenFactor]] = [[] for _ in parts]
     for factor in graph.factors:
-        terms[part_of[factor.i]].append(between(factor))
-    for nodes, known in zip(parts, terms, strict=True):
+        factors[part_of[factor.i]].append(factor)
+    for nodes, known in zip(parts, factors, strict=True):
         if not known:
             continue
-        problem = problem_of([*known, anchor(nodes[0], graph.T_world_node[nodes[0]], _HELD)])
+        problem = problem_of([*map(between, known), anchor(nodes[0], graph.T_world_node[nodes[0]], _HELD)])
         linear = problem.linearize(values_of(graph.T_world_node, nodes))
         try:
             net = linear.eliminateSequential(gtsam.Ordering.ColamdGaussianFactorGraph(linear))
@@ -54,9 +68,15 @@ def node_covariances(graph: PoseGraph) -> dict[int, Array]:
             raise GraphError(
                 f"covariances of {len(nodes)} nodes from node {nodes[0]}: {' '.join(str(error).split())}"
             ) from None
-        covariances |= _recover(_supernodes([net.at(k) for k in range(net.size())]))
-        covariances[nodes[0]] = np.zeros((_DIMENSION, _DIMENSION))
-    return covariances
+        pairs = list(dict.fromkeys((factor.i, factor.j) for factor in known))
+        blocks = _recover(_supernodes([net.at(k) for k in range(net.size())]), pairs)
+        covariances |= {node: blocks[node, node] for node in nodes[1:]}
+        for i, j in pairs:
+            to_j = adjoint(inverse(graph.T_world_node[j]) @ graph.T_world_node[i])
+            across = to_j @ blocks[i, j]
+            of_j_in_i = to_j @ blocks[i, i] @ to_j.T + blocks[j, j] - across - across.T
+            relative[i, j] = 0.5 * (of_j_in_i + of_j_in_i.T)
+    return Marginals(covariances, relative)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,10 +130,19 @@ def _supernodes(conditionals: Sequence[gtsam.GaussianConditional]) -> list[_Supe
     return made
 
 
-def _recover(supernodes: Sequence[_Supernode]) -> dict[int, Array]:
-    """Return the diagonal blocks of (RᵀR)⁻¹, from the last eliminated supernode down."""
+def _recover(
+    supernodes: Sequence[_Supernode], pairs: Sequence[tuple[int, int]]
+) -> dict[tuple[int, int], Array]:
+    """Return the diagonal blocks of (RᵀR)⁻¹ and those of some pairs, from the last eliminated supernode down.
+
+    Nodes that a factor ties share a supernode: that of the one which is eliminated first.
+    """
     known: list[Array] = []
-    covariances = {}
+    blocks = {}
+    beside: dict[int, list[tuple[int, int]]] = {}
+    for pair in pairs:
+        for node in pair:
+            beside.setdefault(node, []).append(pair)
     for supernode in supernodes:
         front, behind = len(supernode.R), supernode.S.shape[1]
         R_inverse = np.linalg.inv(supernode.R)
@@ -129,11 +158,17 @@ def _recover(supernodes: Sequence[_Supernode]) -> dict[int, Array]:
             covariance[:front, front:], covariance[front:, :front] = across, across.T
             covariance[front:, front:] = of_behind
         known.append(covariance)
-        for index, node in enumerate(supernode.nodes[: front // _DIMENSION]):
-            block = slice(_DIMENSION * index, _DIMENSION * (index + 1))
-            own = covariance[block, block]
-            covariances[int(node)] = 0.5 * (own + own.T)
-    return covariances
+        part = {
+            node: slice(_DIMENSION * index, _DIMENSION * (index + 1))
+            for index, node in enumerate(supernode.nodes)
+        }
+        for node in supernode.nodes[: front // _DIMENSION]:
+            own = covariance[part[node], part[node]]
+            blocks[node, node] = 0.5 * (own + own.T)
+            for i, j in beside.get(node, ()):
+                if i in part and j in part:
+                    blocks[i, j] = covariance[part[i], part[j]]
+    return blocks
 
 
 def _scalars(blocks: Sequence[int]) -> NDArray[np.int64]:

@@ -13,7 +13,7 @@ from mapper.core.errors import DataError, GraphError, RunError
 from mapper.core.geometry import Array, adjoint, inverse, transform
 from mapper.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from mapper.core.trajectory import Trajectory, trajectory_from
-from mapper.graph.marginals import node_covariances
+from mapper.graph.marginals import marginals_of
 from mapper.graph.model import PoseGraph
 from mapper.run.doubtful_frames import estimates_of_doubtful
 from mapper.run.frame_outcomes import FrameRecord
@@ -82,7 +82,7 @@ def uncertain_poses(
         records: Outcome of every frame.
     """
     try:
-        of_nodes = node_covariances(graph)
+        of_nodes = marginals_of(graph).nodes
     except GraphError:
         of_nodes = {}
     record_of = {record.stamp_ns: record for record in records}

@@ -8,8 +8,11 @@ from itertools import groupby
 
 import numpy as np
 
+from mapper.core.errors import GraphError
 from mapper.core.geometry import inverse, log
 from mapper.core.timebase import NS_PER_S, Stamps
+from mapper.graph.marginals import marginals_of
+from mapper.graph.model import PoseGraph
 from mapper.run.frame_outcomes import DISCONNECTED, FrameRecord
 from mapper.run.manifest import Manifest, RunWarning, Weight
 from mapper.run.results import RunResults
@@ -25,7 +28,7 @@ _MAX_DOUBTFUL_SHARE, _FEW_FRAMES = 0.02, 2
 _MAX_LOOP_M, _MAX_LOOP_SHARE, _MAX_LOOP_RAD = 0.3, 0.03, np.radians(10.0)
 _LEAST_LOOPS_REFUSED, _MAX_REFUSED_SHARE = 4, 0.5
 _MAX_WHEEL_CHI2, _LEAST_WHEEL_FACTORS = 9.0, 5
-_MAX_SIGMA_M, _MAX_SIGMA_SHARE, _BROKEN_SIGMA_SHARE = 0.1, 0.05, 0.25
+_MAX_SIGMA_M, _MAX_SIGMA_SHARE, _BROKEN_SIGMA_SHARE = 0.1, 0.1, 0.3
 _MAX_STEP_M, _MAX_STEP_RAD = 0.2, np.radians(5.0)
 _LEAST_AGREEMENT, _LEAST_SHARED_VOXELS = 0.15, 1000
 _REASONS = 3
@@ -55,7 +58,8 @@ def find_warnings(results: RunResults, manifest: Manifest) -> list[RunWarning]:
         *_loops(results),
         *_levelling(manifest),
         *_wheels(results),
-        *_uncertainty(results, timeline),
+        *_uncertainty(results),
+        *_wide_steps(results, timeline),
     ]
     order: tuple[Weight, ...] = ("break", "doubt", "note")
     return sorted(found, key=lambda warning: order.index(warning.weight))
@@ -208,12 +212,22 @@ def _doubtful(records: Sequence[FrameRecord], timeline: _TimeLine) -> Iterator[R
     )
 
 
+def _stretches(pairs: Sequence[tuple[int, int]], graph: PoseGraph) -> int:
+    """Return how many stretches of time some pairs of nodes span: pairs that overlap in time are one."""
+    spans = sorted(sorted(graph.stamps_ns[node] for node in pair) for pair in pairs)
+    count, until_ns = 0, -1
+    for begin_ns, end_ns in spans:
+        count += begin_ns >= until_ns
+        until_ns = max(until_ns, end_ns)
+    return count
+
+
 def _counted(number: int, what: str) -> str:
     return f"{number} {what}{'s' if number > 1 else ''}"
 
 
 def _without_figures(text: str) -> str:
-    return re.sub(r"\d+(\.\d+)?", "…", text)
+    return re.sub(r"-?\d+(\.\d+)?", "…", text)
 
 
 def _loops(results: RunResults) -> Iterator[RunWarning]:
@@ -297,7 +311,7 @@ def _wheels(results: RunResults) -> Iterator[RunWarning]:
     )
 
 
-def _uncertainty(results: RunResults, timeline: _TimeLine) -> Iterator[RunWarning]:
+def _uncertainty(results: RunResults) -> Iterator[RunWarning]:
     poses = results.poses
     if poses is None:
         return
@@ -315,21 +329,31 @@ def _uncertainty(results: RunResults, timeline: _TimeLine) -> Iterator[RunWarnin
             suggestion="come back to known places, so that loops hold the path",
             weight="break" if share > _BROKEN_SIGMA_SHARE else "doubt",
         )
-    steps_m, steps_rad = (
-        np.sqrt(np.diff(poses.covariances[known][:, part, part].trace(axis1=1, axis2=2)).clip(0.0))
-        for part in (slice(3, 6), slice(0, 3))
-    )
-    wide = np.flatnonzero((steps_m > _MAX_STEP_M) | (steps_rad > _MAX_STEP_RAD))
-    if not len(wide):
+
+
+def _wide_steps(results: RunResults, timeline: _TimeLine) -> Iterator[RunWarning]:
+    """Yield a warning if two parts of the path hang together by steps that little is known of."""
+    try:
+        relative = marginals_of(results.graph).relative
+    except GraphError:
         return
-    worst = int(wide[steps_m[wide].argmax()])
-    stamps_ns = poses.trajectory.stamps_ns[known[[worst, worst + 1]]]
+    sigmas = {
+        nodes: np.sqrt([covariance[part, part].trace() for part in (slice(3, 6), slice(0, 3))])
+        for nodes, covariance in relative.items()
+    }
+    wide = [nodes for nodes, (m, rad) in sigmas.items() if m > _MAX_STEP_M or rad > _MAX_STEP_RAD]
+    if not wide:
+        return
+    worst = max(wide, key=lambda nodes: float(sigmas[nodes][0]))
+    stamps_ns = sorted(results.graph.stamps_ns[node] for node in worst)
     first, last = (int(index) for index in np.searchsorted(timeline.stamps_ns, stamps_ns))
+    worst_m, worst_rad = sigmas[worst]
+    steps = _counted(_stretches(wide, results.graph), "step")
     yield RunWarning(
         kind="uncertainty",
-        sentence=f"{_counted(len(wide), 'step')} from frame to frame known to {_MAX_STEP_M:g} m or "
-        f"{np.degrees(_MAX_STEP_RAD):.0f}° at best (1 σ), the worst to {steps_m[worst]:.2g} m and "
-        f"{np.degrees(steps_rad[worst]):.2g}°: the parts before and after may not fit",
+        sentence=f"{steps} between keyframes known to {_MAX_STEP_M:g} m or "
+        f"{np.degrees(_MAX_STEP_RAD):.0f}° at best (1 σ), the worst to {worst_m:.2g} m and "
+        f"{np.degrees(worst_rad):.2g}°: the parts before and after may not fit",
         where=timeline.place(first, last),
         suggestion="come back to known places, so that loops hold the path",
         weight="doubt",

@@ -8,7 +8,7 @@ import pytest
 from mapper.core.errors import DataError, RunError
 from mapper.core.geometry import adjoint, exp, inverse
 from mapper.core.trajectory import trajectory_from
-from mapper.graph.marginals import node_covariances
+from mapper.graph.marginals import marginals_of
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.odometry.base import Diagnostics
 from mapper.run.frame_outcomes import FrameRecord
@@ -40,7 +40,7 @@ def run_of(count=6, own=OWN):
 def test_a_frame_adds_its_own_covariance_to_that_of_its_node():
     trajectory, graph, records = run_of()
     poses = uncertain_poses(trajectory, graph, records)
-    of_nodes = node_covariances(graph)
+    of_nodes = marginals_of(graph).nodes
     to_body = adjoint(inverse(T_NODE_BODY))
     for node, covariance in of_nodes.items():
         np.testing.assert_allclose(poses.covariances[2 * node], covariance, atol=1e-15)

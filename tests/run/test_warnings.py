@@ -10,6 +10,7 @@ from mapper.graph.model import BetweenFactor, PoseSigmas
 from mapper.loops.closure import Discrepancy, LoopClosure
 from mapper.run.frame_outcomes import DISCONNECTED
 from mapper.run.manifest import AppendedLog, Levelling, RunWarning, SkippedFrame
+from mapper.run.pose_covariances import uncertain_poses
 from mapper.run.warnings import find_warnings, merge_warnings
 from mapper.sources.config import SourceConfig
 from tests.support.run_results import MANIFEST, STEP_NS, doubted, lost, results_of
@@ -173,26 +174,32 @@ def test_wheels_that_disagree(shift_m, expected):
 
 def test_a_path_that_is_known_ever_less():
     assert found(results_of(sigmas=PoseSigmas(1e-4, 0.05)), kind="uncertainty") == []
-    warning = found(results_of(sigmas=PoseSigmas(0.02, 0.05)), kind="uncertainty")[0]
+    (warning,) = found(results_of(sigmas=PoseSigmas(0.04, 0.05)), kind="uncertainty")
     assert warning.weight == "doubt"
     assert "after 10.0 m of path" in warning.sentence
     assert found(results_of(sigmas=PoseSigmas(0.2, 1.0)), kind="uncertainty")[0].weight == "break"
 
 
+def test_an_uncertain_heading_makes_no_step_uncertain():
+    results = results_of(1000, wide_steps={1: PoseSigmas(0.04, 0.002)})
+    assert results.poses.position_sigmas_m[-1] > 1.5
+    assert found(results, kind="uncertainty") == []
+
+
 def test_a_step_that_nothing_else_holds():
     results = results_of(wide_steps={20: PoseSigmas(0.01, 0.3)})
-    warning = next(w for w in found(results, kind="uncertainty") if "step" in w.sentence)
-    assert warning.where == "9.9 … 10.0 s"
-    assert "1 step from frame to frame" in warning.sentence
-    # A second way around it is as good as none being wide.
+    (warning,) = found(results, kind="uncertainty")
+    assert warning.where == "9.5 … 10.0 s"
+    assert (
+        "1 step between keyframes known to 0.2 m or 5° at best (1 σ), the worst to 0.52 m" in warning.sentence
+    )
+    # With a second way around it, nothing hangs on it.
     T = results.graph.T_world_node
     results.graph.add_factors(
         [BetweenFactor(18, 21, inverse(T[18]) @ T[21], PoseSigmas(0.001, 0.002).information, "loop")]
     )
-    from mapper.run.pose_covariances import uncertain_poses
-
-    held = replace(results, poses=uncertain_poses(results.trajectory, results.graph, results.records))
-    assert found(held, kind="uncertainty") == []
+    poses = uncertain_poses(results.trajectory, results.graph, results.records)
+    assert found(replace(results, poses=poses), kind="uncertainty") == []
 
 
 def test_what_was_found_while_reading_stays_and_old_notes_count():
