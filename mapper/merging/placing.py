@@ -83,6 +83,10 @@ def warnings_about(placed: Sequence[Placed]) -> list[str]:
         found.append(
             "every run's world was taken for the map's; for runs mapped apart see --place and --poses"
         )
+    for item in placed:
+        verdict = item.run.manifest.verdict
+        if verdict is not None and verdict.state != "trusted":
+            found.append(f"{_name(item.run)} is {verdict.state}: {verdict.sentences[0]}")
     used = [_frames_used(item.run) for item in placed]
     for second, item in enumerate(placed):
         for first, other in enumerate(placed[:second]):

@@ -93,11 +93,16 @@ RUN_FILES = (
         "the voxels that each frame updated, so that fusing again along new poses reads only what moved",
         "maps",
     ),
-    RunFiles((FRAMES, FRAME_MS), "the outcome of every frame, and how long it took", "tracking"),
+    RunFiles(
+        (FRAMES, FRAME_MS),
+        "the outcome of every frame, its doubts and standard deviations, and how long it took",
+        "tracking",
+    ),
     RunFiles((CONFIG,), "every setting as it was used; `mapper build --config` takes it back", "maps"),
     RunFiles(
         (MANIFEST,),
-        "versions, the input's fingerprint, counts, seconds, memory, and how the run ended",
+        "the verdict and all warnings, versions, the input's fingerprint, counts, seconds, memory, and how the "
+        "run ended",
         "maps",
     ),
     RunFiles((MESH,), "a coloured surface, once `mapper export --as mesh` was asked", "poses"),

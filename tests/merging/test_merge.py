@@ -1,5 +1,6 @@
 """Many runs become one map: the same bytes whoever does the work, and those of a merge in memory."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from mapper.export.grid import read_grid
 from mapper.merging import jobs as merging_jobs
 from mapper.merging.merge import merge
 from mapper.merging.merged_map import open_map
-from mapper.merging.placing import Placed, as_built, by_poses, by_truth
+from mapper.merging.placing import Placed, as_built, by_poses, by_truth, warnings_about
 from mapper.octree.config import SliceConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
@@ -24,7 +25,7 @@ from mapper.octree.resampling import blocks_reached, resampled
 from mapper.octree.slice import cut_slice
 from mapper.run.files import SUMMARY
 from mapper.run.folder import load_run, write_run
-from mapper.run.manifest import Input, Manifest
+from mapper.run.manifest import Input, Manifest, Verdict
 from mapper.runtime import resumable_jobs
 from mapper.runtime.executor import Workers, run_jobs
 from mapper.sources.trajectory_files import write_tum
@@ -342,6 +343,11 @@ def test_a_path_is_planned_on_a_merged_map(tmp_path, capsys):
 def test_a_user_is_told_what_to_doubt(runs, maps, merged, tmp_path):
     assert merged.manifest.notes[0].startswith("every run's world was taken for the map's")
     again = make_run(tmp_path / "again", maps[0], log="sha256:1")
+    verdict = Verdict(state="doubtful", sentences=("its loops are far off",))
+    doubted = replace(again, manifest=again.manifest.model_copy(update={"verdict": verdict}))
+    assert "again is doubtful: its loops are far off" in warnings_about(
+        [Placed(doubted, np.eye(4), "by hand")]
+    )
     upside_down = Placed(again, exp(np.array([np.pi, 0.0, 0.0]), np.zeros(3)), "by hand")
 
     found = MERGE([as_built(runs[1:2])[0], upside_down], tmp_path / "map").map
