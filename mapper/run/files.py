@@ -101,8 +101,8 @@ RUN_FILES = (
     RunFiles((CONFIG,), "every setting as it was used; `mapper build --config` takes it back", "maps"),
     RunFiles(
         (MANIFEST,),
-        "the verdict and all warnings, versions, the input's fingerprint, counts, seconds, memory, and how the "
-        "run ended",
+        "the verdict and all warnings, versions, the input's fingerprint, counts, seconds, memory, and how "
+        "the run ended",
         "maps",
     ),
     RunFiles((MESH,), "a coloured surface, once `mapper export --as mesh` was asked", "poses"),
