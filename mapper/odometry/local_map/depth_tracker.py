@@ -18,8 +18,7 @@ from mapper.odometry.local_map.depth_surfaces import DepthCells, DepthSurface, s
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
-from mapper.odometry.local_map.motion_tracker import predicted
-from mapper.odometry.local_map.pose_tracker import TrackedPose, project, unmatched
+from mapper.odometry.local_map.pose_tracker import TrackedPose, predicted, project, unmatched
 
 _MIN_VISIBLE_RATIO = 0.3
 _MIN_AGREEING_RATIO = 0.7
@@ -80,6 +79,8 @@ class DepthTracker:
             self._observed_ns, self._is_confirmed = observation.stamp_ns, True
             return found
         T_predicted = predicted(observation.stamp_ns, last, before_last)
+        if T_predicted is None:
+            T_predicted = last.T_camera_world
         starts = [T_predicted] if found is None else [found.T_camera_world, T_predicted]
         for T_camera_world in starts:
             alignment = self._aligned(observation, T_camera_world, T_predicted, last, found)
@@ -97,6 +98,7 @@ class DepthTracker:
             alignment.T_camera_world,
             unmatched(observation),
             reference=reference,
+            agreement=alignment.agreeing_ratio,
             method="depth+map",
         )
         if found is None:
@@ -175,6 +177,8 @@ class DepthTracker:
             unmatched(observation),
             reference,
             alignment.points,
+            alignment.agreeing_ratio,
+            0,
             0.0,
             DEPTH_ONLY,
             depth=alignment,

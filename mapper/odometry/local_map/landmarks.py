@@ -52,6 +52,8 @@ class Keyframe:
         origin: First keyframe of its sub-map; sub-maps are not connected to each other.
         twist_camera: (6,) velocity of the camera in its own axes, rad/s and m/s; 0 if it is unknown.
         depth_link: Pose relative to an earlier keyframe by depth; None if the landmarks were many.
+        doubt_rad: Error of its rotation that speaks against it; 0 if its pose is not doubtful.
+        doubt_m: Error of its translation.
     """
 
     observation: ImageObservation
@@ -60,6 +62,8 @@ class Keyframe:
     origin: int
     twist_camera: Array
     depth_link: DepthLink | None = None
+    doubt_rad: float = 0.0
+    doubt_m: float = 0.0
 
 
 class LandmarkMap:
@@ -316,6 +320,22 @@ class LandmarkMap:
             removed, self.landmarks["newest"], self._observations["older"], self._observations["keyframe"]
         )
         self._unlink(observations)
+
+    def pose_information(
+        self, observation: ImageObservation, T_camera_world: Transform, landmark_of_feature: Ids
+    ) -> Array:
+        """Return the (6, 6) information of a frame's pose from its landmarks, in the body's tangent."""
+        features = np.flatnonzero(landmark_of_feature >= 0)
+        H_camera = normal_matrix(
+            T_camera_world,
+            self.landmarks["position"][landmark_of_feature[features]],
+            observation.measured[features],
+            observation.weights[features],
+            observation.intrinsics,
+        )
+        to_camera = adjoint(inverse(observation.T_body_camera))
+        information: Array = to_camera.T @ H_camera @ to_camera + _WEAK_PRIOR
+        return information
 
     def information(self, target: int, source: int) -> Array:
         """Return the (6, 6) information of the source's pose in the target from shared landmarks.

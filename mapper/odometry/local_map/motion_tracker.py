@@ -3,17 +3,15 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Points, Transform, apply, exp, inverse, log
+from mapper.core.geometry import Points, apply, inverse
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
-from mapper.odometry.local_map.pose_tracker import TrackedPose, project, refined, unmatched
+from mapper.odometry.local_map.pose_tracker import TrackedPose, predicted, project, refined, unmatched
 from mapper.odometry.local_map.relocalizer import Relocalizer
 
 _MAX_RATIO = 0.9
-_MAX_PREDICTED_STEPS = 10.0
-"""Over longer gaps, in frame intervals, constant velocity predicts worse than no motion."""
 
 
 class MotionPoseTracker:
@@ -29,9 +27,9 @@ class MotionPoseTracker:
         self, observation: ImageObservation, last: TrackedPose, before_last: TrackedPose | None
     ) -> TrackedPose | None:
         """Try the predicted motion, then the latest keyframes."""
-        predicted = self._by_motion(observation, last, before_last)
-        if predicted is not None and predicted.inliers >= self._config.weak_inliers:
-            return predicted
+        by_motion = self._by_motion(observation, last, before_last)
+        if by_motion is not None and by_motion.inliers >= self._config.weak_inliers:
+            return by_motion
         # A pose with few inliers may be wrong, so a pose that does not depend on the prediction competes.
         known, points_world, landmarks = self._known_points(last)
         by_last = self._relocalizer.match_points(
@@ -42,7 +40,7 @@ class MotionPoseTracker:
             reference=last.reference,
             method="matched",
         )
-        found = [tracked_pose for tracked_pose in (predicted, by_last) if tracked_pose is not None]
+        found = [tracked_pose for tracked_pose in (by_motion, by_last) if tracked_pose is not None]
         best = max(found, key=lambda tracked_pose: tracked_pose.inliers, default=None)
         if best is not None and best.inliers >= self._config.weak_inliers:
             return best
@@ -56,7 +54,8 @@ class MotionPoseTracker:
         self, observation: ImageObservation, last: TrackedPose, before_last: TrackedPose | None
     ) -> TrackedPose | None:
         """Search the last frame's points near the pixels that constant velocity predicts."""
-        T_camera_world = predicted(observation.stamp_ns, last, before_last)
+        T_predicted = predicted(observation.stamp_ns, last, before_last)
+        T_camera_world = last.T_camera_world if T_predicted is None else T_predicted
         known, points_world, landmark = self._known_points(last)
         pixels = project(T_camera_world, points_world, observation.intrinsics)
         depth_m = apply(T_camera_world, points_world)[:, 2]
@@ -82,7 +81,12 @@ class MotionPoseTracker:
         landmark_of_feature = unmatched(observation)
         landmark_of_feature[feature[hits[agree]]] = landmark[hits[agree]]
         return self._search.refine(
-            observation, T_camera_world, landmark_of_feature, reference=last.reference, method="map"
+            observation,
+            T_camera_world,
+            landmark_of_feature,
+            reference=last.reference,
+            agreement=float(agree.mean()),
+            method="map",
         )
 
     def _known_points(self, tracked_pose: TrackedPose) -> tuple[NDArray[np.intp], Points, Ids]:
@@ -97,16 +101,3 @@ class MotionPoseTracker:
         points_world[is_landmark] = landmarks["position"][ids[is_landmark]]
         known = np.flatnonzero(is_landmark | observation.has_depth)
         return known, points_world[known], np.where(is_landmark, ids, -1)[known].astype(np.int32)
-
-
-def predicted(stamp_ns: int, last: TrackedPose, before_last: TrackedPose | None) -> Transform:
-    """Return T_camera_world under constant velocity, also across dropped frames."""
-    if before_last is None:
-        return last.T_camera_world
-    t0, t1 = before_last.observation.stamp_ns, last.observation.stamp_ns
-    steps = (stamp_ns - t1) / (t1 - t0)
-    if steps > _MAX_PREDICTED_STEPS:
-        return last.T_camera_world
-    rotation_rad, translation_m = log(last.T_camera_world @ inverse(before_last.T_camera_world))
-    T_camera_world: Transform = exp(steps * rotation_rad, steps * translation_m) @ last.T_camera_world
-    return T_camera_world

@@ -7,12 +7,12 @@ import numpy as np
 
 from mapper.core.deskew import Twist
 from mapper.core.frames import Frame
-from mapper.core.geometry import Transform, inverse
+from mapper.core.geometry import Transform, adjoint, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
-from mapper.graph.noise import with_model_error
+from mapper.graph.noise import inflated, with_model_error
 from mapper.odometry.base import (
     Diagnostics,
     FeatureMatches,
@@ -23,10 +23,11 @@ from mapper.odometry.base import (
 )
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.depth_tracker import DepthTracker
+from mapper.odometry.local_map.frame_doubts import NO_DOUBT, Doubt, FrameDoubts
 from mapper.odometry.local_map.image_observation import ImageObservation, observe_image
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
 from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
-from mapper.odometry.local_map.pose_tracker import PoseTracker, TrackedPose, unmatched
+from mapper.odometry.local_map.pose_tracker import PoseTracker, TrackedPose, predicted, unmatched
 from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.odometry.local_map.relocalizer import Relocalizer
 from mapper.odometry.local_map.rolling_shutter import RollingShutter
@@ -34,6 +35,8 @@ from mapper.places.vocabulary import load_vocabulary
 
 _MIN_START_FEATURES = 100
 """Features with depth that a sub-map's first frame must have: a few times ``min_inliers``."""
+_OWN_SHARE = 0.5
+"""Share of a pose's information that is left as its landmarks were measured no better than its features."""
 _FACTORS_PER_KEYFRAME = 4
 """Factors of each keyframe, to the earlier ones that share most landmarks with it."""
 
@@ -76,6 +79,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._before_last: TrackedPose | None = None
         self._depth = DepthTracker(config, self._map)
         self._decision = KeyframeDecision(config)
+        self._doubts = FrameDoubts()
         self._lost_frames = 0  # since the last tracked one
         self._unknown_frames = 0  # those of them with enough features to begin a sub-map
 
@@ -90,20 +94,39 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
     def track(self, observation: ImageObservation) -> FrameResult:
         """Track the next frame, in time order."""
         observation = self._shutter.predicted(observation)
-        tracked_pose = None if self._last is None else self._find_pose(observation, self._last)
-        if tracked_pose is None:
+        last = self._last
+        tracked_pose = None if last is None else self._find_pose(observation, last)
+        if last is None or tracked_pose is None:
             return self._not_found(observation)
         tracked_pose = self._without_row_shifts(tracked_pose)
+        observation = tracked_pose.observation
+        information = self._map.pose_information(
+            observation, tracked_pose.T_camera_world, tracked_pose.landmark_of_feature
+        )
+        if tracked_pose.depth is not None:
+            to_camera = adjoint(inverse(observation.T_body_camera))
+            information += to_camera.T @ tracked_pose.depth.information @ to_camera
+        expected = None if self._lost_frames else predicted(observation.stamp_ns, last, self._before_last)
+        doubt = self._doubts.assess(tracked_pose, np.linalg.inv(information), last, expected)
         # The motion before a gap does not predict the motion after it.
         before_last = None if self._lost_frames else self._last
         self._lost_frames = self._unknown_frames = 0
-        reference = tracked_pose.reference
+        reference, inliers = tracked_pose.reference, tracked_pose.inliers
         is_keyframe = self._decision.is_due(tracked_pose)
+        if doubt.phrases and tracked_pose.inliers >= self._config.weak_inliers:
+            is_keyframe = False  # tracking goes on without it
         if is_keyframe:
-            tracked_pose = self._add_keyframe(tracked_pose, neighbour=reference)
+            tracked_pose = self._add_keyframe(tracked_pose, neighbour=reference, doubt=doubt)
         self._before_last, self._last = before_last, tracked_pose
         links = [self._factor(reference, tracked_pose.reference)] if is_keyframe else []
-        return self._result(tracked_pose, is_keyframe=is_keyframe, links=links)
+        result = self._result(tracked_pose, inliers=inliers, is_keyframe=is_keyframe, links=links)
+        if is_keyframe:
+            information = links[0].information
+        else:
+            information = with_model_error(_OWN_SHARE * information, result.T_node_body)
+            if doubt.phrases:
+                information = inflated(information, sigma_rad=doubt.sigma_rad, sigma_m=doubt.sigma_m)
+        return replace(result, doubts=doubt.phrases, covariance=np.linalg.inv(information))
 
     def view(self, observation: ImageObservation, twist: Twist | None = None, /) -> ImageView:
         """Return the view for place recognition, by the readout time as it is known now."""
@@ -150,7 +173,11 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         )
         T_i_j = inverse(T_world_i) @ T_world_j
         information = self._map.information(i, j) + self._map.depth_information(i, j)
-        return BetweenFactor(i, j, T_i_j, with_model_error(information, T_i_j))
+        information = with_model_error(information, T_i_j)
+        doubtful = self._map.keyframes[j]
+        if doubtful.doubt_m > 0.0:
+            information = inflated(information, sigma_rad=doubtful.doubt_rad, sigma_m=doubtful.doubt_m)
+        return BetweenFactor(i, j, T_i_j, information)
 
     def _not_found(self, observation: ImageObservation) -> FrameResult:
         """Return a lost frame, or begin a new sub-map with it once enough frames matched no landmarks."""
@@ -167,12 +194,12 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         """Make the frame a sub-map's first keyframe, at the world's origin or the last tracked pose."""
         last = self._last
         T_camera_world = inverse(observation.T_body_camera) if last is None else last.T_camera_world
-        start = TrackedPose(observation, T_camera_world, unmatched(observation), 0, 0, 0.0, "start")
+        start = TrackedPose(observation, T_camera_world, unmatched(observation), 0, 0, 1.0, 0, 0.0, "start")
         self._lost_frames = self._unknown_frames = 0
         self._shutter.restart()
         self._before_last, self._last = None, self._add_keyframe(start, neighbour=None)
         self._depth.began(observation)
-        return self._result(self._last, is_keyframe=True)
+        return self._result(self._last, inliers=0, is_keyframe=True)
 
     def _find_pose(self, observation: ImageObservation, last: TrackedPose) -> TrackedPose | None:
         """Track from the last frame; if that fails, or it was lost, relocalise among similar keyframes."""
@@ -216,7 +243,9 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         ids = tracked_pose.landmark_of_feature
         return self._shutter.refined(tracked_pose, self._last, self._map.landmarks["position"][ids[ids >= 0]])
 
-    def _add_keyframe(self, tracked_pose: TrackedPose, *, neighbour: int | None) -> TrackedPose:
+    def _add_keyframe(
+        self, tracked_pose: TrackedPose, *, neighbour: int | None, doubt: Doubt = NO_DOUBT
+    ) -> TrackedPose:
         """Turn a tracked frame into a keyframe, refine the map around it, and return its refined pose.
 
         ``neighbour`` is a keyframe of the sub-map in which it was tracked; None begins a new one.
@@ -237,6 +266,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._map.cull()
         self._decision.restart()
         keyframe = self._map.keyframes[index]
+        keyframe.doubt_rad, keyframe.doubt_m = doubt.sigma_rad, doubt.sigma_m
         return replace(
             tracked_pose,
             observation=keyframe.observation,
@@ -246,15 +276,21 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         )
 
     def _result(
-        self, tracked_pose: TrackedPose, *, is_keyframe: bool, links: Sequence[BetweenFactor] = ()
+        self,
+        tracked_pose: TrackedPose,
+        *,
+        inliers: int,
+        is_keyframe: bool,
+        links: Sequence[BetweenFactor] = (),
     ) -> FrameResult:
+        """Return the result of a frame; a keyframe's landmarks are more than the ``inliers`` that it had."""
         T_world_body = _body_pose(tracked_pose.observation, tracked_pose.T_camera_world)
         node = self._map.keyframes[tracked_pose.reference]
         T_world_node = _body_pose(node.observation, node.T_camera_world)
         diagnostics = Diagnostics(
             features=len(tracked_pose.observation),
             matches=tracked_pose.matches,
-            inliers=tracked_pose.inliers,
+            inliers=inliers,
             residual=tracked_pose.residual_px,
             residual_unit="px",
             method=tracked_pose.method,
@@ -270,7 +306,6 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             diagnostics=diagnostics,
             links=links,
             twist=self._shutter.twist_body(tracked_pose.observation),
-            doubts=tracked_pose.doubts,
         )
 
     def _lost(self, observation: ImageObservation) -> FrameResult:

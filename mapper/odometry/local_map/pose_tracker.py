@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, Points, Transform, apply
+from mapper.core.geometry import Array, Points, Transform, apply, exp, inverse, log
 from mapper.odometry.local_map.depth_alignment import DepthAlignment
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import Ids
@@ -16,6 +16,8 @@ from mapper.registration.reprojection import refine_pose
 MAX_HAMMING = 64
 """Descriptors that differ in more of their 256 bits do not match."""
 
+_MAX_PREDICTED_STEPS = 10.0
+"""Over longer gaps, in frame intervals, constant velocity predicts worse than no motion."""
 _LM_ROUNDS, _LM_ITERATIONS = 3, 8
 
 
@@ -29,6 +31,8 @@ class TrackedPose:
         landmark_of_feature: (N,) int32 landmark of each feature, −1 for none; inliers only.
         reference: Keyframe that observes most of these landmarks.
         matches: Number of proposed pairs.
+        agreement: Share of the first matches, before the local map is searched, that agree with the pose.
+        visible: Number of the map's landmarks that should be in view.
         residual_px: Root mean square image residual of the inliers.
         method: Step that found the pose, e.g. "map", "fallback" or "relocalised".
         depth: Alignment of the depth image that took part in the pose; None if landmarks alone gave it.
@@ -40,6 +44,8 @@ class TrackedPose:
     landmark_of_feature: Ids
     reference: int
     matches: int
+    agreement: float
+    visible: int
     residual_px: float
     method: str
     depth: DepthAlignment | None = None
@@ -64,6 +70,19 @@ class PoseTracker(Protocol):
 def unmatched(observation: ImageObservation) -> Ids:
     """Return (N,) landmark −1, which is none, for every feature."""
     return np.full(len(observation), -1, np.int32)
+
+
+def predicted(stamp_ns: int, last: TrackedPose, before_last: TrackedPose | None) -> Transform | None:
+    """Return T_camera_world under constant velocity, also across dropped frames; None if nothing tells it."""
+    if before_last is None:
+        return None
+    t0, t1 = before_last.observation.stamp_ns, last.observation.stamp_ns
+    steps = (stamp_ns - t1) / (t1 - t0)
+    if steps > _MAX_PREDICTED_STEPS:
+        return None
+    rotation_rad, translation_m = log(last.T_camera_world @ inverse(before_last.T_camera_world))
+    T_camera_world: Transform = exp(steps * rotation_rad, steps * translation_m) @ last.T_camera_world
+    return T_camera_world
 
 
 def project(T_camera_world: Transform, points_world: Points, intrinsics: Array) -> Array:

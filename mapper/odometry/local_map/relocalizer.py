@@ -155,12 +155,18 @@ class Relocalizer:
         fewest = max(self._config.min_agreement_ratio * len(features), self._config.min_matches // 2)
         if len(agreeing) < fewest:
             return None
+        matches = len(features)
         features, landmarks = features[agreeing], landmarks[agreeing]
         T_camera_world, agree = refined(T_camera_world, points_world[agreeing], observation, features)
         landmark_of_feature = unmatched(observation)
         landmark_of_feature[features[agree]] = landmarks[agree]
         return self._search.refine(
-            observation, T_camera_world, landmark_of_feature, reference=reference, method=method
+            observation,
+            T_camera_world,
+            landmark_of_feature,
+            reference=reference,
+            agreement=int(agree.sum()) / matches,
+            method=method,
         )
 
     def _matches(self, k: int, observation: ImageObservation) -> tuple[Ids, Ids]:
