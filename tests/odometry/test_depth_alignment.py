@@ -145,3 +145,32 @@ def test_a_thing_before_the_walls_contradicts_the_keyframe():
 
     assert found.contradicting_ratio == pytest.approx(0.55, abs=0.1)
     assert found.agreeing_ratio < 0.5
+
+
+def test_a_surface_that_is_gone_contradicts_the_keyframe_too():
+    covered = box_depth(CORNER, ROOM)
+    covered[30:, 40:] = 0.5
+
+    found = aligned(depth_cells(covered, CAMERA), CORNER, cells_of(CORNER, ROOM), guess=CORNER)
+
+    assert found.contradicting_ratio > 0.4
+
+
+def test_what_the_keyframe_could_not_see_contradicts_nothing():
+    """The camera moves sideways past a post, and sees what was behind it."""
+    rng = np.random.default_rng(4)
+    truth = CORNER @ exp(np.zeros(3), np.array([0.1, 0.0, 0.0]))
+
+    def with_post(T_world_camera, column):
+        depth_m = box_depth(T_world_camera, ROOM)
+        depth_m += (0.003 * depth_m**2 * rng.standard_normal(depth_m.shape)).astype(np.float32)
+        depth_m[:, column : column + 24] = 0.9
+        return depth_cells(depth_m, CAMERA)
+
+    shift_px = round(0.1 * CAMERA.fx_px / 0.9)
+    found = aligned(with_post(CORNER, 60), CORNER, with_post(truth, 60 - shift_px), guess=truth)
+
+    assert found.contradicting_ratio < 0.05
+    assert found.weakest_ratio > 0.9
+    assert found.visible_ratio < 0.85
+    assert error_m(found, truth) < 0.006

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points, Transform, is_rigid
 from mapper.odometry.base import Diagnostics
-from mapper.odometry.local_map.depth_kernels import compare, descend
-from mapper.odometry.local_map.depth_surfaces import DepthCells, DepthSurface, point_sigmas
+from mapper.odometry.local_map.depth_kernels import compare, descend, seen_through
+from mapper.odometry.local_map.depth_surfaces import KINECT_NOISE, DepthCells, DepthSurface, point_sigmas
 from mapper.registration.degeneracy import Degeneracy, degeneracy_of, projected
 from mapper.registration.reprojection import normal_matrix
 from mapper.sensing.config import DepthNoiseConfig
@@ -64,13 +64,14 @@ class DepthAlignment:
         information: (6, 6) of the camera's tangent (rotation, translation), from planes alone; a motion that
             they do not observe has none to speak of.
         is_landmark_inlier: (L,) which landmarks agree with the pose.
-        points: Number of points of the depth image that project to surfaces of the keyframes.
+        points: Number of points of the depth image that lie on surfaces of the keyframes, or in front.
         agreeing: (K,) how many of them agree with each keyframe.
         overlap: Number of points that agree with a keyframe relative to its planes, of that with most.
         agreeing_ratio: Share of the points that agree with any.
         weakest_ratio: Share that agrees among the surfaces of that main direction in which the least do.
-        contradicting_ratio: Share that stands in space through which the keyframes see.
-        visible_ratio: Share of the depth image's points that project to surfaces.
+        contradicting_ratio: Share that stands where keyframes see through, or of their surfaces where the
+            depth image sees through, whichever is more.
+        visible_ratio: Share of the points that are on or in front of surfaces, not hidden or new.
         rmse_m: Root mean square distance of agreeing points from their planes.
         unobservable: Names of the motions that neither surfaces nor landmarks observe; empty if none.
     """
@@ -175,6 +176,15 @@ def align_depth(
     pairs = int(agreeing.sum())
     scale = max(squares / pairs, _LEAST_SCALE**2)
     seen = int((verdict != 0).sum())
+    sigma_m = noise or KINECT_NOISE
+    through, seen_back = seen_through(
+        T_found,
+        cells.inverse_depth,
+        planes,
+        cells.rays,
+        *model[1:],
+        np.array([sigma_m.constant_m, sigma_m.linear, sigma_m.quadratic_per_m]),
+    )
     return DepthAlignment(
         T_found,
         projected(information / scale, degeneracy),
@@ -184,7 +194,7 @@ def align_depth(
         float((agreeing / np.maximum((planes[..., 3] > 0.0).sum(axis=(1, 2)), 1))[:keyframes].max()),
         float((verdict == 1).sum()) / seen,
         _weakest(facing, facing_agreeing),
-        float((verdict == -1).sum()) / seen,
+        max(float((verdict == -1).sum()) / seen, through / max(seen_back, 1)),
         seen / len(points),
         float(np.sqrt(squares_m / pairs)),
         _unobserved(degeneracy, T_found, landmarks, is_inlier),

@@ -16,6 +16,8 @@ from mapper.registration.reprojection import (
 )
 
 _MIN_DEPTH_M = 0.1
+_WIDEST = 4.0
+"""Squared tangent from the axis beyond which no camera sees, and its distortion is not defined."""
 _HUBER = 1.5
 _MARGIN_M = 0.01
 _MARGIN_SIGMAS = 4.0
@@ -34,6 +36,28 @@ def _between(T_a_w, T_b_w):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _cell_of(T, p, optics, cell_px, shape):  # type: ignore[no-untyped-def]
+    """Return row and column of the cell that a point is seen in, −1 for none, and its depth, metres."""
+    x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+    y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
+    z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
+    if z < _MIN_DEPTH_M:
+        return -1, -1, z
+    u, v = x / z, y / z
+    s = u * u + v * v
+    if s > _WIDEST:
+        return -1, -1, z
+    radial = 1.0 + s * (optics[4] + s * (optics[5] + s * optics[8]))
+    du = u * radial + 2.0 * optics[6] * u * v + optics[7] * (s + 2.0 * u * u)
+    dv = v * radial + optics[6] * (s + 2.0 * v * v) + 2.0 * optics[7] * u * v
+    column = int(np.floor((du * optics[0] + optics[2] + 0.5) / cell_px))
+    line = int(np.floor((dv * optics[1] + optics[3] + 0.5) / cell_px))
+    if 0 <= line < shape[0] and 0 <= column < shape[1]:
+        return line, column, z
+    return -1, -1, z
+
+
+@njit(cache=True, nogil=True)
 def _plane_row(planes, optics, cell_px, T, p, row):  # type: ignore[no-untyped-def]
     """Write the Jacobian of a point's distance from the plane that it projects to, and return that distance.
 
@@ -48,21 +72,8 @@ def _plane_row(planes, optics, cell_px, T, p, row):  # type: ignore[no-untyped-d
     Returns:
         The distance, negative in front of the plane; NaN if there is no plane.
     """
-    x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
-    y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
-    z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
-    if z < _MIN_DEPTH_M:
-        return np.nan
-    u, v = x / z, y / z
-    s = u * u + v * v
-    if s > 4.0:
-        return np.nan
-    radial = 1.0 + s * (optics[4] + s * (optics[5] + s * optics[8]))
-    du = u * radial + 2.0 * optics[6] * u * v + optics[7] * (s + 2.0 * u * u)
-    dv = v * radial + optics[6] * (s + 2.0 * v * v) + 2.0 * optics[7] * u * v
-    column = int(np.floor((du * optics[0] + optics[2] + 0.5) / cell_px))
-    line = int(np.floor((dv * optics[1] + optics[3] + 0.5) / cell_px))
-    if not (0 <= line < planes.shape[0] and 0 <= column < planes.shape[1]):
+    line, column, z = _cell_of(T, p, optics, cell_px, planes.shape)
+    if line < 0:
         return np.nan
     plane = planes[line, column]
     if plane[3] == 0.0:
@@ -73,6 +84,8 @@ def _plane_row(planes, optics, cell_px, T, p, row):  # type: ignore[no-untyped-d
     row[0], row[1], row[2] = mz * p[1] - my * p[2], mx * p[2] - mz * p[0], my * p[0] - mx * p[1]
     row[0], row[1], row[2] = -row[0], -row[1], -row[2]
     row[3], row[4], row[5] = -mx, -my, -mz
+    x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
+    y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
     return plane[0] * x + plane[1] * y + plane[2] * z - plane[3]
 
 
@@ -209,8 +222,8 @@ def compare(T_camera_world, points, sigmas, planes, T_keyframes_world, optics, c
     """Return how a depth image fits keyframes' planes; arguments as for ``descend``.
 
     Returns:
-        (N,) int8 of each point: −1 it lies in front of a keyframe's plane, else 1 it agrees with one, −2 it
-        lies behind all, 0 it projects to none. What moves can agree with the last keyframe, but not with all.
+        (N,) int8 of each point: −1 it lies in front of a keyframe's plane, else 1 it agrees with one, 0 it is
+        hidden from all, or beside them. What moves can agree with the last keyframe, but not with all.
         (K,) number of points that agree with each keyframe.
         (6, 6) information of unit distances, and of distances in their standard deviations.
         (3, 3) sums of m·mᵀ over the normals m of all pairs, and of those that agree, camera frame.
@@ -231,16 +244,15 @@ def compare(T_camera_world, points, sigmas, planes, T_keyframes_world, optics, c
                 continue
             sigma = _sigma_m(row, points[i], sigmas[i])
             agrees = abs(distance) <= _MARGIN_M + _MARGIN_SIGMAS * sigma
+            if distance > 0.0 and not agrees:
+                continue  # hidden from the keyframe
             for a in range(3):
                 for b in range(3):
                     facing[a, b] += row[3 + a] * row[3 + b]
                     if agrees:
                         facing_agreeing[a, b] += row[3 + a] * row[3 + b]
             if not agrees:
-                if distance < 0.0:
-                    verdict[i] = -1
-                elif verdict[i] == 0:
-                    verdict[i] = -2
+                verdict[i] = -1
                 continue
             if verdict[i] != -1:
                 verdict[i] = 1
@@ -257,3 +269,46 @@ def compare(T_camera_world, points, sigmas, planes, T_keyframes_world, optics, c
         for b in range(a):
             U[a, b], H[a, b] = U[b, a], H[b, a]
     return verdict, agreeing, U, H, facing, facing_agreeing, squares, squares_m
+
+
+@njit(cache=True, nogil=True)
+def seen_through(  # type: ignore[no-untyped-def]
+    T_camera_world, inverse_depth, planes, rays, T_keyframes_world, optics, cell_px, noise
+):
+    """Return how many cells of keyframes a depth image sees through, and how many it sees at all.
+
+    Args:
+        T_camera_world: (4, 4) of the depth image.
+        inverse_depth: (R, C) of its cells, 0 where there is none.
+        planes: (K, R, C, 4) of the keyframes.
+        rays: (R, C, 2) of all cells.
+        T_keyframes_world: (K, 4, 4).
+        optics: As for ``descend``.
+        cell_px: Edge of the cells.
+        noise: (3,) a, b, c of σ_z = a + b·z + c·z².
+    """
+    rows, columns = inverse_depth.shape
+    through = seen = 0
+    for k in range(len(planes)):
+        T = _between(T_camera_world, T_keyframes_world[k])
+        for i in range(rows):
+            for j in range(columns):
+                plane = planes[k, i, j]
+                u, v = rays[i, j, 0], rays[i, j, 1]
+                facing = plane[0] * u + plane[1] * v + plane[2]
+                if facing <= 0.0:
+                    continue
+                z = plane[3] / facing
+                line, column, depth_m = _cell_of(T, (u * z, v * z, z), optics, cell_px, inverse_depth.shape)
+                if line < 1 or column < 1 or line >= rows - 1 or column >= columns - 1:
+                    continue
+                nearest = 0.0  # as inverse depth, about the cell
+                for a in range(line - 1, line + 2):
+                    for b in range(column - 1, column + 2):
+                        nearest = max(nearest, inverse_depth[a, b])
+                if inverse_depth[line, column] == 0.0:
+                    continue
+                seen += 1
+                sigma_m = noise[0] + depth_m * (noise[1] + depth_m * noise[2])
+                through += 1.0 / nearest > depth_m + 2.0 * _MARGIN_M + _MARGIN_SIGMAS * sigma_m
+    return through, seen
