@@ -114,6 +114,34 @@ def test_what_a_wall_does_not_show_is_told():
             assert np.linalg.norm(error[:3, 3]) < 0.02
 
 
+def test_a_blind_stretch_leaves_a_factor_that_is_as_uncertain():
+    """From one corner along a bare wall to the other: how far along is a guess, and the graph knows."""
+    turn = [*np.linspace(0.8, 0.0, 9), *[0.0] * 9, *np.linspace(0.0, -0.8, 9), *[-0.8] * 6]
+    poses = []
+    for k, yaw in enumerate(turn):
+        T_world_camera = FACING_Y @ exp(np.array([0.0, yaw, 0.0]), np.zeros(3))
+        T_world_camera[0, 3] = 1.3 - 0.08 * min(k, 32)
+        poses.append(T_world_camera)
+
+    tracks, factors = track(walk(poses, (2.5, 1.5, 0.5)))
+
+    assert any(step.doubts for step in tracks)
+    assert all(step.node is not None and not step.doubts for step in tracks[-4:])
+    nodes = [step.node for step in tracks]
+    sigma_m = {
+        factor.j: float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(factor.information)[3:, 3:])[-1]))
+        for factor in factors
+    }
+    between = [sigma_m[j] for j in range(1, nodes[-1] + 1)]
+    assert max(between) > 0.1
+    assert between[0] < 0.01
+    assert between[-1] < 0.01
+    blind = next(step for step in tracks if step.doubts)
+    assert np.sqrt(np.linalg.eigvalsh(blind.covariance)[-1]) > 0.1
+    sighted = tracks[-1]
+    assert np.sqrt(np.linalg.eigvalsh(sighted.covariance)[-1]) < 0.03
+
+
 def test_black_images_are_bridged_by_depth(source, frames):
     black = [replace(f, image=np.zeros_like(f.image)) if 15 <= k < 25 else f for k, f in enumerate(frames)]
 

@@ -63,6 +63,7 @@ class DepthAlignment:
         T_camera_world: (4, 4).
         information: (6, 6) of the camera's tangent (rotation, translation), from planes alone; a motion that
             they do not observe has none to speak of.
+        landmark_information: (6, 6) likewise from the landmarks; halved, as they were measured no better.
         is_landmark_inlier: (L,) which landmarks agree with the pose.
         points: Number of points of the depth image that lie on surfaces of the keyframes, or in front.
         agreeing: (K,) how many of them agree with each keyframe.
@@ -78,6 +79,7 @@ class DepthAlignment:
 
     T_camera_world: Transform
     information: Array
+    landmark_information: Array
     is_landmark_inlier: NDArray[np.bool_]
     points: int
     agreeing: NDArray[np.int64]
@@ -185,9 +187,17 @@ def align_depth(
         *model[1:],
         np.array([sigma_m.constant_m, sigma_m.linear, sigma_m.quadratic_per_m]),
     )
+    known = 0.5 * normal_matrix(
+        T_found,
+        landmarks.positions[is_inlier],
+        landmarks.measured[is_inlier],
+        landmarks.weights[is_inlier],
+        landmarks.intrinsics,
+    )
     return DepthAlignment(
         T_found,
         projected(information / scale, degeneracy),
+        known,
         is_inlier,
         seen,
         agreeing[:keyframes],
@@ -197,7 +207,7 @@ def align_depth(
         max(float((verdict == -1).sum()) / seen, through / max(seen_back, 1)),
         seen / len(points),
         float(np.sqrt(squares_m / pairs)),
-        _unobserved(degeneracy, T_found, landmarks, is_inlier),
+        _unobserved(degeneracy, known),
     )
 
 
@@ -232,20 +242,10 @@ def _weakest(facing: Array, agreeing: Array) -> float:
     return float(np.where(shares >= _FEW * shares.sum(), agree, np.inf).min())
 
 
-def _unobserved(
-    degeneracy: Degeneracy, T_camera_world: Transform, landmarks: Landmarks, is_inlier: NDArray[np.bool_]
-) -> str:
-    """Return the names of unobservable motions, unless the landmarks observe them all."""
-    count = degeneracy.unobservable_count
-    if count == 0:
+def _unobserved(degeneracy: Degeneracy, known: Array) -> str:
+    """Return the names of unobservable motions, unless the information of landmarks observes them all."""
+    if degeneracy.unobservable_count == 0:
         return ""
-    motions = degeneracy.motions[:count]
-    known = 0.5 * normal_matrix(
-        T_camera_world,
-        landmarks.positions[is_inlier],
-        landmarks.measured[is_inlier],
-        landmarks.weights[is_inlier],
-        landmarks.intrinsics,
-    )
+    motions = degeneracy.motions[: degeneracy.unobservable_count]
     least = float(np.linalg.eigvalsh(motions @ known @ motions.T)[0])
     return "" if least >= _OBSERVED_SIGMA_M**-2 else degeneracy.text

@@ -150,7 +150,7 @@ class DepthTracker:
         ]
         of_stamp = {}
         models = [(keyframes[k].observation, keyframes[k].T_camera_world) for k in self._keyframes]
-        if all(earlier is not last.observation for earlier, _ in models):
+        if not last.doubts and all(earlier is not last.observation for earlier, _ in models):
             models.append((last.observation, last.T_camera_world))
         for earlier, _ in models:
             there = earlier.depth_cells

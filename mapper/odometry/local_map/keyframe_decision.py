@@ -29,7 +29,9 @@ class KeyframeDecision:
         config, inliers = self._config, tracked_pose.inliers
         self._frames += 1
         self._most_inliers = max(self._most_inliers, inliers)
-        if tracked_pose.doubts:
+        # A motion that was not observed is uncertain in the factor too; other doubts have no measure.
+        blind = tracked_pose.depth is not None and bool(tracked_pose.depth.unobservable)
+        if len(tracked_pose.doubts) > blind:
             return False
         if self._frames >= config.max_keyframe_gap:
             return True
