@@ -61,8 +61,7 @@ class DepthAlignment:
 
     Attributes:
         T_camera_world: (4, 4).
-        information: (6, 6) of the camera's tangent (rotation, translation), from planes alone; a motion that
-            they do not observe has none to speak of.
+        information: (6, 6) of the camera's tangent (rotation, translation), from planes and the prediction.
         landmark_information: (6, 6) likewise from the landmarks; halved, as they were measured no better.
         is_landmark_inlier: (L,) which landmarks agree with the pose.
         points: Number of points of the depth image that lie on surfaces of the keyframes, or in front.
@@ -196,7 +195,7 @@ def align_depth(
     )
     return DepthAlignment(
         T_found,
-        projected(information / scale, degeneracy),
+        projected(information / scale, degeneracy) + prior,
         known,
         is_inlier,
         seen,
