@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array, Points, Transform, is_rigid
 from mapper.odometry.base import Diagnostics
 from mapper.odometry.local_map.depth_kernels import compare, descend, seen_through
-from mapper.odometry.local_map.depth_surfaces import KINECT_NOISE, DepthCells, DepthSurface, point_sigmas
+from mapper.odometry.local_map.depth_surfaces import (
+    KINECT_NOISE,
+    DepthCells,
+    DepthSurface,
+    point_sigmas,
+    surface_of,
+)
 from mapper.registration.degeneracy import Degeneracy, degeneracy_of, projected
 from mapper.registration.reprojection import normal_matrix
 from mapper.sensing.config import DepthNoiseConfig
@@ -30,7 +36,7 @@ _MIN_SHARE, _NOISE_SHARES = 0.004, 2.5
 depth image gives 0.002, and the normals' noise gives their variance."""
 _FEW = 0.02  # of all surface; a direction that less faces is left to the degeneracy check
 _LEAST_SCALE = 0.5  # of the assumed noise, however well the surfaces fit
-_OBSERVED_SIGMA_M = 0.02
+_OBSERVED_SIGMA_M = 0.05
 """A motion that landmarks know this well, as a displacement of the points, is observed by them."""
 
 
@@ -74,6 +80,7 @@ class DepthAlignment:
         visible_ratio: Share of the points that are on or in front of surfaces, not hidden or new.
         rmse_m: Root mean square distance of agreeing points from their planes.
         unobservable: Names of the motions that neither surfaces nor landmarks observe; empty if none.
+        observes_next: The depth image alone would observe every motion of a frame that is aligned to it.
     """
 
     T_camera_world: Transform
@@ -89,6 +96,7 @@ class DepthAlignment:
     visible_ratio: float
     rmse_m: float
     unobservable: str
+    observes_next: bool
 
     def diagnostics(self, image: Diagnostics) -> Diagnostics:
         """Return the figures on a frame's tracking; those of its image only if landmarks took part."""
@@ -207,6 +215,7 @@ def align_depth(
         seen / len(points),
         float(np.sqrt(squares_m / pairs)),
         _unobserved(degeneracy, known),
+        observes_all(surface_of(cells)) if degeneracy.unobservable_count else True,
     )
 
 

@@ -27,6 +27,8 @@ _MIN_WEAKEST_RATIO = 0.5
 _MAX_CONTRADICTING_RATIO = 0.15
 _SPEED_SIGMA = 0.5
 """Metres and radians per second by which a predicted motion may err: one sigma for a camera in a hand."""
+_SURE_S = 0.1
+"""So long a prediction is trusted: it errs by 5 cm."""
 _MAX_UNOBSERVED_S = 2.0
 """After so long on a prediction in any direction a frame is lost."""
 _LEAST_ELAPSED_S = 0.01
@@ -150,7 +152,8 @@ class DepthTracker:
         ]
         of_stamp = {}
         models = [(keyframes[k].observation, keyframes[k].T_camera_world) for k in self._keyframes]
-        if not last.doubts and all(earlier is not last.observation for earlier, _ in models):
+        blind = last.doubts or (last.depth is not None and last.depth.unobservable)
+        if not blind and all(earlier is not last.observation for earlier, _ in models):
             models.append((last.observation, last.T_camera_world))
         for earlier, _ in models:
             there = earlier.depth_cells
@@ -211,6 +214,8 @@ class DepthTracker:
             self._observed_ns = observation.stamp_ns
             return ()
         unobserved_s = self._unobserved_s(observation)
+        if unobserved_s <= _SURE_S:
+            return ()
         return (f"neither depth nor features show {alignment.unobservable} for {unobserved_s:.1f} s",)
 
     def _unobserved_s(self, observation: ImageObservation) -> float:

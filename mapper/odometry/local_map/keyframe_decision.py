@@ -33,6 +33,8 @@ class KeyframeDecision:
         blind = tracked_pose.depth is not None and bool(tracked_pose.depth.unobservable)
         if len(tracked_pose.doubts) > blind:
             return False
+        if blind and tracked_pose.depth is not None and tracked_pose.depth.observes_next:
+            return True
         if self._frames >= config.max_keyframe_gap:
             return True
         if tracked_pose.depth is not None and inliers < config.min_inliers:
