@@ -31,6 +31,8 @@ _SURE_S = 0.1
 """So long a prediction is trusted: it errs by 5 cm."""
 _MAX_UNOBSERVED_S = 2.0
 """After so long on a prediction in any direction a frame is lost."""
+_MAX_GAP_S = 0.5
+"""After a longer gap without frames another corner may be in view that looks alike."""
 _LEAST_ELAPSED_S = 0.01
 _MIN_KEPT_RATIO = 0.5
 """When fewer of a pose's landmarks agree once the depth image takes part, one of both is wrong."""
@@ -80,6 +82,8 @@ class DepthTracker:
         if found is not None and found.inliers >= self._config.weak_inliers:
             self._observed_ns, self._is_confirmed = observation.stamp_ns, True
             return found
+        if found is None and self._unobserved_s(observation) > _MAX_UNOBSERVED_S:
+            return None
         T_predicted = predicted(observation.stamp_ns, last, before_last)
         if T_predicted is None:
             T_predicted = last.T_camera_world
@@ -104,9 +108,10 @@ class DepthTracker:
             method="depth+map",
         )
         if found is None:
-            return self._by_depth(observation, alignment, reference)
-        alignment = self._aligned(observation, found.T_camera_world, T_predicted, last, found) or alignment
-        return self._by_both(observation, alignment, found)
+            gap_s = 0.0 if before_last else (observation.stamp_ns - last.observation.stamp_ns) / NS_PER_S
+            return self._by_depth(observation, alignment, reference, gap_s)
+        joint = self._aligned(observation, found.T_camera_world, T_predicted, last, found)
+        return found if joint is None or not _agrees(joint) else self._by_both(observation, joint, found)
 
     def _aligned(
         self,
@@ -164,16 +169,16 @@ class DepthTracker:
         return [surface for surface, _ in known], [T for _, T in known]
 
     def _by_depth(
-        self, observation: ImageObservation, alignment: DepthAlignment, reference: int
-    ) -> TrackedPose | None:
-        """Return the pose of an alignment without landmarks; None if a motion was not observed for long."""
+        self, observation: ImageObservation, alignment: DepthAlignment, reference: int, gap_s: float
+    ) -> TrackedPose:
+        """Return the pose of an alignment without landmarks, ``gap_s`` after the motion was last known."""
         expected = min(self._visible(alignment.T_camera_world, reference, observation), len(observation))
         doubts = self._doubts(observation, alignment)
         if not self._is_confirmed and expected >= 2 * self._config.min_inliers:
             # What moves with the camera, such as a hand before the lens, agrees with itself.
             doubts = (*doubts, f"{expected} features, but none where the depth image has them")
-        if self._unobserved_s(observation) > _MAX_UNOBSERVED_S:
-            return None
+        if gap_s > _MAX_GAP_S:
+            doubts = (*doubts, f"found by depth alone after {gap_s:.1f} s")
         return TrackedPose(
             observation,
             alignment.T_camera_world,
