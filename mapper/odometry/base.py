@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mapper.core.deskew import Twist
 from mapper.core.frames import Frame
 from mapper.core.geometry import Array, Transform
+from mapper.core.timebase import NS_PER_S
 from mapper.features.frame_view import FrameView
 from mapper.graph.model import BetweenFactor
 from mapper.sources.base import FrameRef
@@ -100,8 +101,15 @@ class FeatureMatches:
     previous_px: Array
 
 
+STEADY_NS = NS_PER_S
+"""After a longer gap the frame before says little about where this one was taken."""
+
+
 class MotionCheck(Protocol):
-    """Other measurement of the body's motion, which holds whatever the images show."""
+    """Other measurement of the body's motion, which holds whatever the images show.
+
+    Poses found after a gap of more than ``STEADY_NS``, or in another sub-map, have to pass it.
+    """
 
     def contradiction(self, T_begin_end: Transform, begin_ns: int, end_ns: int) -> str:
         """Return why a motion (4, 4) between two times cannot be; empty if it can, or nothing is known."""

@@ -71,7 +71,7 @@ def build_frame_odometry(
         case IsvdOdometryConfig():
             from mapper.odometry.isvd_odometry import IsvdOdometry
 
-            return IsvdOdometry(config)
+            return IsvdOdometry(config, motion_check=motion_check)
         case LocalMapConfig():
             from mapper.odometry.local_map.motion_tracker import MotionPoseTracker
             from mapper.odometry.local_map.odometry import KeyframeOdometry

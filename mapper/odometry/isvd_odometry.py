@@ -17,7 +17,15 @@ from mapper.features.frame_view import ImageView
 from mapper.features.matching import Pairs, homography_inliers, match_mutual
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
-from mapper.odometry.base import Diagnostics, FeatureMatches, FrameOdometry, FrameResult, lost_frame
+from mapper.odometry.base import (
+    STEADY_NS,
+    Diagnostics,
+    FeatureMatches,
+    FrameOdometry,
+    FrameResult,
+    MotionCheck,
+    lost_frame,
+)
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
 from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 from mapper.registration.base import Alignment
@@ -91,6 +99,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         *,
         detector: Detector | None = None,
         register: RegisterPair | None = None,
+        motion_check: MotionCheck | None = None,
     ) -> None:
         """Start before the first frame.
 
@@ -99,8 +108,10 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
             detector: Replaces the configured one, so that several odometries on the same frames can share
                 the detection.
             register: Replaces ``register_pair``, so that they can share registrations as well.
+            motion_check: Rules out poses after a gap; None if nothing but the images tells of the motion.
         """
         self._config = config
+        self._motion_check = motion_check
         self._detector = detector or build_detector(config.detector)
         self._register_pair = register or partial(register_pair, Isvd(config.registration))
         self._recent: deque[TrackedFrame] = deque(
@@ -190,10 +201,17 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         candidates = []
         for frame in earlier:
             alignment, weight, matches = self._register_pair(frame.observation, observation, match)
-            if alignment.converged:
+            if alignment.converged and self._is_possible(alignment, frame.observation, observation):
                 T_world_body = frame.T_world_body @ alignment.T_target_source
                 candidates.append(PoseCandidate(frame, alignment, weight, matches, T_world_body))
         return candidates
+
+    def _is_possible(self, found: Alignment, earlier: IsvdObservation, now: IsvdObservation) -> bool:
+        """Return whether a motion across a gap is possible, where something else tells it."""
+        check, begin_ns, end_ns = self._motion_check, earlier.stamp_ns, now.stamp_ns
+        if check is None or end_ns - begin_ns <= STEADY_NS:
+            return True
+        return not check.contradiction(found.T_target_source, begin_ns, end_ns)
 
     def _combine(self, candidates: Sequence[PoseCandidate]) -> Transform:
         """Return T_world_body; the nearest earlier frame comes first (alg. 7, lines 21–27)."""

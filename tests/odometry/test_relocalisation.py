@@ -8,7 +8,7 @@ import pytest
 from mapper.core.geometry import angle_between, inverse
 from mapper.graph.components import components
 from mapper.graph.model import PoseGraph
-from mapper.odometry.config import LocalMapConfig, PnpConfig
+from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig, PnpConfig
 from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.local_map.local_search import least_by_chance
 from mapper.simulation.config import SynthConfig
@@ -16,6 +16,7 @@ from mapper.simulation.source import CameraSimulator
 from tests.support.desk_frames import blank
 
 RATE_HZ = 15.0
+ISVD = IsvdOdometryConfig()
 BOTH = pytest.mark.parametrize("config", [LocalMapConfig(), PnpConfig()], ids=lambda config: config.kind)
 
 
@@ -135,14 +136,14 @@ def test_of_two_weak_poses_that_of_more_inliers_counts(frames, order):
     assert best.inliers == max(tracked_pose.inliers for tracked_pose in alone if tracked_pose is not None)
 
 
-class Stands:
-    """A motion check by which the body stood still at first, and then was carried off."""
+class CarriedOff:
+    """A motion check by which the body was carried to another place at some time."""
 
-    def __init__(self, until_ns: int) -> None:
-        self._until_ns = until_ns
+    def __init__(self, when_ns: int) -> None:
+        self._when_ns = when_ns
 
-    def contradiction(self, _T_begin_end, _begin_ns: int, end_ns: int) -> str:
-        return "" if end_ns <= self._until_ns else "carried off"
+    def contradiction(self, _T_begin_end, begin_ns: int, end_ns: int) -> str:
+        return "carried off" if begin_ns <= self._when_ns < end_ns else ""
 
 
 @BOTH
@@ -150,7 +151,7 @@ def test_a_place_that_only_looks_known_begins_a_sub_map(frames, config):
     """After the darkness the very same room is seen, but the wheels say that it is another one."""
     dark = seconds(4.5, 5.5)
     log = [*frames[: dark.start], *map(blank, frames[dark]), *frames[dark.stop :][:8]]
-    odometry = build_frame_odometry(config, Stands(frames[dark.start].stamp_ns))
+    odometry = build_frame_odometry(config, CarriedOff(frames[dark.start].stamp_ns))
 
     tracks = tracked(log, odometry)
 
@@ -167,7 +168,7 @@ def test_after_a_gap_of_the_log_looks_do_not_decide_alone(frames, config):
     after = [replace(frame, stamp_ns=frame.stamp_ns + 2_000_000_000) for frame in frames[seconds(0.5, 1.0)]]
     fooled, warned = (
         tracked([*before, *after], build_frame_odometry(config, check))
-        for check in (None, Stands(before[-1].stamp_ns))
+        for check in (None, CarriedOff(before[-1].stamp_ns))
     )
     assert fooled[len(before)].node is not None
     assert fooled[len(before)].diagnostics.method != "start"
@@ -190,3 +191,26 @@ def test_more_landmarks_have_to_agree_where_more_are_in_view():
     assert counts == sorted(counts)
     assert counts[0] == 0
     assert 20 < counts[2] < 60  # of 1000, of which 20 agree by chance
+
+
+@BOTH
+def test_the_next_room_is_not_tracked_with_the_landmarks_of_one_alike(frames, config):
+    """Once a sub-map has begun, no keyframe of the other room becomes a frame's reference."""
+    before = frames[seconds(0.0, 1.0)]
+    after = [replace(frame, stamp_ns=frame.stamp_ns + 4_000_000_000) for frame in before]
+    odometry = build_frame_odometry(config, CarriedOff(before[-1].stamp_ns))
+    tracks = tracked([*before, *after], odometry)
+    first = next(track.node for track in tracks[len(before) :] if track.node is not None)
+    assert all(track.node >= first for track in tracks[len(before) :] if track.node is not None)
+    assert len(components(graph_of(tracks, odometry))) == 2
+
+
+def test_isvd_stays_lost_rather_than_in_another_room(frames):
+    before = frames[seconds(0.0, 0.5)]
+    after = [replace(frame, stamp_ns=frame.stamp_ns + 4_000_000_000) for frame in before]
+    fooled, warned = (
+        tracked([*before, *after], build_frame_odometry(ISVD, check))
+        for check in (None, CarriedOff(before[-1].stamp_ns))
+    )
+    assert all(track.node is not None for track in fooled)
+    assert all(track.node is None for track in warned[len(before) :])

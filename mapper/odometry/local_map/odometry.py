@@ -8,12 +8,12 @@ import numpy as np
 from mapper.core.deskew import Twist
 from mapper.core.frames import Frame
 from mapper.core.geometry import Transform, adjoint, inverse
-from mapper.core.timebase import NS_PER_S
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import inflated, with_model_error
 from mapper.odometry.base import (
+    STEADY_NS,
     Diagnostics,
     FeatureMatches,
     FrameOdometry,
@@ -39,9 +39,6 @@ _OWN_SHARE = 0.5
 """Share of a pose's information that is left as its landmarks were measured no better than its features."""
 _FACTORS_PER_KEYFRAME = 4
 """Factors of each keyframe, to the earlier ones that share most landmarks with it."""
-
-_STEADY_NS = NS_PER_S
-"""After a longer gap the frame before says little about where this one was taken."""
 
 MakePoseTracker = Callable[[LandmarkMap, Relocalizer], PoseTracker]
 
@@ -206,14 +203,23 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         if self._lost_frames == 0:
             tracked_pose = self._tracker.track(observation, last, self._before_last)
             tracked_pose = self._depth.supported(observation, last, self._before_last, tracked_pose)
-            steadily = observation.stamp_ns - last.observation.stamp_ns <= _STEADY_NS
-            if tracked_pose is not None and (steadily or self._is_possible(tracked_pose)):
+            if tracked_pose is not None and (
+                self._is_steady(tracked_pose, last) or self._is_possible(tracked_pose)
+            ):
                 return tracked_pose
         candidates = self._relocalizer.candidates(observation, inverse(last.T_camera_world)[:3, 3])
         relocalised = self._relocalizer.best_among(
             candidates, observation, method="relocalised", is_possible=self._is_possible, exhaustive=True
         )
-        return self._depth.supported(observation, relocalised or last, None, relocalised)
+        found = self._depth.supported(observation, relocalised or last, None, relocalised)
+        return found if found is not None and self._is_possible(found) else None
+
+    def _is_steady(self, tracked_pose: TrackedPose, last: TrackedPose) -> bool:
+        """Return whether a pose is soon after the last one, and in its sub-map."""
+        keyframes = self._map.keyframes
+        gap_ns = tracked_pose.observation.stamp_ns - last.observation.stamp_ns
+        one_map = keyframes[tracked_pose.reference].origin == keyframes[last.reference].origin
+        return gap_ns <= STEADY_NS and one_map
 
     def _is_possible(self, tracked_pose: TrackedPose) -> bool:
         """Return whether a pose after a gap is possible by the motion since, where something else tells it.
