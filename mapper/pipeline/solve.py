@@ -5,14 +5,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mapper.core.geometry import Transform
 from mapper.graph.components import align_components, components
 from mapper.graph.config import GraphConfig
 from mapper.graph.drift import innovations
-from mapper.graph.model import PoseGraph
+from mapper.graph.model import PoseGraph, Solution
 from mapper.graph.optimize import optimize
 from mapper.loops.closure import LoopClosure, apply_solution
 from mapper.run.manifest import Solve
 
+_ROUNDING = 1e-12
+"""Largest change of an element of a pose, metres or none, that is rounding."""
 MIN_WEIGHT = 0.5
 """A loop with less weight in the solution is rejected, and is no factor of the solved graph."""
 
@@ -66,4 +69,12 @@ def solve(graph: PoseGraph, loops: Sequence[LoopClosure], config: GraphConfig) -
                 "loop_residual_sigma": float(np.median(np.sqrt(innovations(others, factors)))),
             }
         )
-    return Solved(PoseGraph(solution.T_world_node, graph.stamps_ns, [*others, *factors]), loops, report)
+    return Solved(PoseGraph(_moved(graph, solution), graph.stamps_ns, [*others, *factors]), loops, report)
+
+
+def _moved(graph: PoseGraph, solution: Solution) -> dict[int, Transform]:
+    """Return the solved poses; those that only rounding moved stay, and what was made at them holds."""
+    return {
+        node: T if np.allclose(T, after, rtol=0.0, atol=_ROUNDING) else after
+        for (node, T), after in zip(graph.T_world_node.items(), solution.T_world_node.values(), strict=True)
+    }

@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from mapper.core.geometry import inverse
 from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.graph.g2o import write_g2o
@@ -47,11 +49,15 @@ class StoredTracking:
         """
         node_of = {record.stamp_ns: record.node for record in self.records if record.node is not None}
         before, after = self.graph.T_world_node, graph.T_world_node
-        T_after_before = {node: after[node] @ inverse(before[node]) for node in before}
+        T_after_before = {
+            node: after[node] @ inverse(T) for node, T in before.items() if not np.array_equal(after[node], T)
+        }
         moved = [
             (
                 stamp_ns,
-                T_after_before[node_of[stamp_ns]] @ T_world_body if stamp_ns in node_of else T_world_body,
+                T_after_before[node] @ T_world_body
+                if (node := node_of.get(stamp_ns)) in T_after_before
+                else T_world_body,
             )
             for stamp_ns, T_world_body in zip(
                 self.trajectory.stamps_ns.tolist(), self.trajectory.T_world_body, strict=True

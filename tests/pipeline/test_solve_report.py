@@ -84,3 +84,13 @@ def test_without_loops_nothing_is_told_of_them():
     graph, _ = two_laps(np.eye(4), loops=0)
     report = solve(graph, [], GraphConfig()).report
     assert report.loop_residual_m is report.loop_residual_sigma is report.loops_rejected is None
+
+
+def test_a_solve_that_changes_nothing_leaves_every_bit():
+    graph, _ = two_laps(np.eye(4), loops=0)
+    solved = solve(graph, [], GraphConfig()).graph.T_world_node
+    assert all(np.array_equal(solved[node], T) for node, T in graph.T_world_node.items())
+    bent, closures = two_laps(np.eye(4))
+    assert not np.array_equal(
+        solve(bent, closures, GraphConfig()).graph.T_world_node[20], graph.T_world_node[20]
+    )
