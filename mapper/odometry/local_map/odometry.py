@@ -211,6 +211,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         relocalised = self._relocalizer.best_among(
             candidates, observation, method="relocalised", is_possible=self._is_possible, exhaustive=True
         )
+        if relocalised is None and observation.stamp_ns - last.observation.stamp_ns > STEADY_NS:
+            return None  # depth alone needs a guess, and by now the camera may be in another room
         found = self._depth.supported(observation, relocalised or last, None, relocalised)
         return found if found is not None and self._is_possible(found) else None
 
