@@ -9,7 +9,7 @@ _DEPTH_OVERLAP = 0.9
 """With less overlap of the surfaces a frame without landmarks becomes a keyframe: what is left may not show
 every motion."""
 _YOUNG_SHARE = 2.0 / 3.0
-"""Share of both ratios that counts while the last keyframe is young and the inliers are not weak."""
+"""Share of ``keyframe_ratio`` that counts while the last keyframe is young and the inliers are not weak."""
 
 
 class KeyframeDecision:
@@ -47,4 +47,6 @@ class KeyframeDecision:
         share = _YOUNG_SHARE if young else 1.0
         # Landmarks at one edge of the image constrain the pose badly, however many they are.
         mapped_ratio = inliers / max(int(tracked_pose.observation.has_depth.sum()), 1)
-        return kept_ratio < share * config.keyframe_ratio or mapped_ratio < share * config.mapped_ratio
+        # Unless the map is searched, features without a landmark are not new.
+        is_new = mapped_ratio < config.mapped_ratio and (config.local_keyframes > 0 or not young)
+        return is_new or kept_ratio < share * config.keyframe_ratio
