@@ -38,7 +38,7 @@ def assess(
     if not alignment.converged:
         return alignment
     agree = _agreeing(target, source, T_target_source, near_m, surface_m)
-    share, direction = _weakest(source.normals, agree)
+    share, direction = weakest_direction(source.normals, agree)
     if share < config.min_agreeing_ratio:
         reason = (
             f"{share:.0%} of the source's surfaces that face ({', '.join(f'{x:.2f}' for x in direction)}) "
@@ -64,7 +64,7 @@ def _agreeing(
     return agree
 
 
-def _weakest(normals: Array, agree: NDArray[np.bool_]) -> tuple[float, Array]:
+def weakest_direction(normals: Array, agree: NDArray[np.bool_]) -> tuple[float, Array]:
     """Return the share that agrees in the direction where the least does, and that direction."""
     squares = np.einsum("ni,nj->ij", normals, normals)
     facing, directions = np.linalg.eigh(squares / max(np.trace(squares), 1.0))

@@ -22,9 +22,11 @@ class ScanOdometryConfig(Config):
     keyframe_angle_rad: PositiveFloat = 0.2
     """A scan this far from the last keyframe, or turned this much, becomes a keyframe."""
     usual_ratio: Ratio = 0.8
-    """A scan whose overlap with the last keyframe is a smaller share of the usual one is searched again."""
+    """A scan whose overlap with the last keyframe is a smaller share of the usual one, and unusual for this
+    log, is searched again; it is doubtful if more speaks against its pose. 0 believes every pose."""
     lost_ratio: Ratio = 0.5
-    """A scan whose overlap is still less than this share of the usual one is lost."""
+    """A scan whose overlap is still less than this share of the usual one is lost if anything else speaks
+    against its pose, with less than half of it in any case; 0 loses none."""
     max_lost_scans: NonNegativeInt = 10
     """After so many lost scans in a row a new sub-map begins; 0 disables it."""
     rescue: HoughGicpConfig | None = HoughGicpConfig()

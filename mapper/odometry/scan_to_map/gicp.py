@@ -19,6 +19,8 @@ class GicpMatcher:
     standing sensor does not outweigh the rest of the map.
     """
 
+    uses_guess = True
+
     def __init__(self, config: GicpOdometryConfig) -> None:
         self._config = config
         self.clear()

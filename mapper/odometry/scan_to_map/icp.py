@@ -17,6 +17,8 @@ _MAP_KEYFRAMES = 10
 class IcpMatcher:
     """Matcher to one cloud of the last keyframes, in world coordinates."""
 
+    uses_guess = True
+
     def __init__(self, config: IcpOdometryConfig) -> None:
         self._config = config
         self._keyframes: deque[Points] = deque(maxlen=_MAP_KEYFRAMES)

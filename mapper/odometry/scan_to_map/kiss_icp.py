@@ -12,6 +12,8 @@ _MAX_POINTS_PER_VOXEL, _CONVERGENCE = 20, 1e-4  # the library's defaults
 class KissMatcher:
     """Matcher with the library's map, registration and adaptive threshold, but without its motion model."""
 
+    uses_guess = True
+
     def __init__(self, config: KissOdometryConfig) -> None:
         from kiss_icp.config import KISSConfig
         from kiss_icp.registration import get_registration

@@ -25,7 +25,13 @@ class DeskewedScan:
 
 
 class ScanMatcher(Protocol):
-    """Map of earlier scans, and a method that registers a scan to it."""
+    """Map of earlier scans, and a method that registers a scan to it.
+
+    Attributes:
+        uses_guess: Whether another guess can give another pose.
+    """
+
+    uses_guess: bool
 
     def match(self, deskewed: DeskewedScan, T_world_body: Transform, *, reach: Reach) -> Transform | None:
         """Return the refined T_world_body of a scan from a guess; None if the method finds none."""

@@ -10,6 +10,8 @@ from mapper.registration.factory import build_registration
 class ScanToScanMatcher:
     """Matcher to the last scan, which is the whole map."""
 
+    uses_guess = False
+
     def __init__(self, config: HoughOdometryConfig) -> None:
         self._registration = build_registration(config.registration)
         self.clear()

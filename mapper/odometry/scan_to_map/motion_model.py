@@ -1,0 +1,87 @@
+"""Constant-velocity model of the sensor's motion, with the errors that its predictions had in this log."""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.core.deskew import STILL, Twist, twist_between
+from mapper.core.geometry import Transform, angle_between, inverse
+from mapper.core.timebase import NS_PER_S
+
+_MIN_ELAPSED_S = 0.005  # over less, an error of millimetres becomes a large velocity
+_ERRORS, _FEWEST_ERRORS = 50, 5  # of recent predictions: of so many the median is taken, of fewer none
+_MEDIAN_LENGTH = 1.538  # of a vector of three independent normal errors, in standard deviations
+_LEAST_M, _LEAST_RAD, _LEAST_SHARE = 2e-3, 1e-3, 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Standard deviations of a predicted pose, of each axis: rad and m."""
+
+    rotation_rad: float
+    translation_m: float
+
+
+class MotionModel:
+    """Motion of the body in the middle of each sweep.
+
+    Attributes:
+        T_world_last: (4, 4) pose in the middle of the last scan that was placed.
+        twist: Velocity until then.
+    """
+
+    def __init__(self, time_ns: int, T_world_last: Transform) -> None:
+        self.T_world_last = T_world_last
+        self.twist: Twist = STILL
+        self._time_ns = time_ns
+        self._elapsed_s = 0.0
+        self._placed = 0
+        self._median = np.zeros(2)
+        self._errors: deque[tuple[float, float]] = deque(maxlen=_ERRORS)
+
+    def elapsed_s(self, time_ns: int) -> float:
+        """Return the seconds since the last scan that was placed."""
+        return (time_ns - self._time_ns) / NS_PER_S
+
+    def predicted(self, time_ns: int) -> Transform:
+        """Return T_world_body (4, 4) at a time, if the velocity stays."""
+        return self.T_world_last @ self.twist.over(self.elapsed_s(time_ns))
+
+    def spread(self, time_ns: int) -> Spread | None:
+        """Return the spread of a predicted pose; None before enough predictions could be compared.
+
+        Errors are accelerations: they grow with the time since the last scan and since the one before it. A
+        steady log is given two hundredths of the motion, so that its first acceleration is no surprise.
+        """
+        if len(self._errors) < _FEWEST_ERRORS:
+            return None
+        elapsed_s = self.elapsed_s(time_ns)
+        rotation, translation = self._median
+        moved = float(np.linalg.norm(self.twist.translation_mps)) * elapsed_s
+        turned = float(np.linalg.norm(self.twist.rotation_radps)) * elapsed_s
+        time_s2 = _time_s2(elapsed_s, self._elapsed_s)
+        return Spread(
+            float(np.hypot(rotation * time_s2, _LEAST_RAD + _LEAST_SHARE * turned)),
+            float(np.hypot(translation * time_s2, _LEAST_M + _LEAST_SHARE * moved)),
+        )
+
+    def follow(self, time_ns: int, T_world_body: Transform, *, is_certain: bool = True) -> None:
+        """Take over the pose of a scan; an uncertain one says nothing on the errors of predictions."""
+        elapsed_s = self.elapsed_s(time_ns)
+        self._placed += 1
+        if elapsed_s >= _MIN_ELAPSED_S:
+            if is_certain and self._placed > 1:  # the first is predicted without a velocity
+                error = inverse(self.predicted(time_ns)) @ T_world_body
+                lengths = angle_between(np.eye(3), error[:3, :3]), float(np.linalg.norm(error[:3, 3]))
+                time_s2 = _time_s2(elapsed_s, self._elapsed_s)
+                self._errors.append((lengths[0] / time_s2, lengths[1] / time_s2))
+                self._median = np.median(np.array(self._errors), axis=0) / _MEDIAN_LENGTH
+            self.twist = twist_between(self.T_world_last, T_world_body, duration_s=elapsed_s)
+            self._elapsed_s = elapsed_s
+        self.T_world_last, self._time_ns = T_world_body, time_ns
+
+
+def _time_s2(elapsed_s: float, before_s: float) -> float:
+    """Return what an acceleration is multiplied by: from the middle of one interval over the next."""
+    return 0.5 * elapsed_s * (elapsed_s + before_s)

@@ -1,0 +1,274 @@
+"""Search of a scan's pose: by prediction, and where that fits less than usual, by all other ways."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mapper.core.geometry import Array, Transform, exp, inverse
+from mapper.odometry.scan_to_map.config import ScanOdometryConfig
+from mapper.odometry.scan_to_map.motion_model import MotionModel
+from mapper.odometry.scan_to_map.observed_part import observed_part
+from mapper.odometry.scan_to_map.scan_fit import ScanFit, ScanKeyframe, contradiction, described, fit_of
+from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan, ScanMatcher
+from mapper.odometry.scan_to_map.usual_fit import Jump, Shares, UsualFit, jump_between
+from mapper.registration.base import Aligner
+from mapper.registration.factory import build_registration
+from mapper.registration.refining import refined_motion
+
+_TURNS_RAD = (0.0, 0.3, -0.3, 0.6, -0.6, 1.0, -1.0)  # about the vertical, from the predicted pose
+_PAIR_DISTANCES = (4.0, 2.0, 1.0)  # of a scan to the last keyframe or scan, in largest pair distances
+_CONTRADICTION_WEIGHT = 5.0
+_ALIKE = 0.1  # scores nearer than this do not decide
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseCandidate:
+    """A pose of the body in the middle of a scan's sweep.
+
+    Attributes:
+        keyframe: That it was compared with.
+        T_world_middle: (4, 4) the pose.
+        fit: On that keyframe.
+        shares: What of it is compared with the usual.
+        jump: From the predicted pose.
+        open_m: (6,) errors of the motions that were predicted instead of measured.
+        method: Step that found it.
+    """
+
+    keyframe: ScanKeyframe
+    T_world_middle: Transform
+    fit: ScanFit
+    shares: Shares
+    jump: Jump
+    open_m: Array
+    method: str
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether surfaces show all of the motion."""
+        return bool(self.fit.observability.min() >= 1.0)
+
+    @property
+    def score(self) -> float:
+        """Share of the points that fit, less what contradicts, weighted."""
+        return self.shares.overlap - _CONTRADICTION_WEIGHT * self.shares.contradicting
+
+
+class PoseSearch:
+    """Search by a matcher and by registration to the last keyframes."""
+
+    def __init__(self, config: ScanOdometryConfig, matcher: ScanMatcher) -> None:
+        self.usual = UsualFit()
+        self._config = config
+        self._matcher = matcher
+        self._rescue = build_registration(config.rescue) if config.rescue is not None else None
+        self._rescuer: tuple[DeskewedScan, Aligner] | None = None
+
+    def find(
+        self,
+        deskewed: DeskewedScan,
+        keyframes: Sequence[ScanKeyframe],
+        doubtful: ScanKeyframe | None,
+        last: ScanKeyframe | None,
+        motion: MotionModel,
+        time_ns: int,
+    ) -> PoseCandidate | None:
+        """Return the pose that fits best; None if no method finds one.
+
+        Args:
+            deskewed: The scan.
+            keyframes: The last ones, the newest first.
+            doubtful: Keyframe after them whose pose is in doubt.
+            last: The last scan, if it is not a keyframe.
+            motion: For the predicted pose.
+            time_ns: Of the middle of the sweep.
+        """
+        T_world_predicted = motion.predicted(time_ns)
+        spread = motion.spread(time_ns)
+        is_believed = self._config.usual_ratio == 0.0
+
+        def assessed(found: Transform | None, key: ScanKeyframe, method: str) -> PoseCandidate | None:
+            if found is None:
+                return None
+            fit = fit_of(
+                key,
+                deskewed,
+                inverse(key.T_world_middle) @ found,
+                max_pair_distance_m=self._config.max_pair_distance_m,
+            )
+            if fit is None:
+                return None
+            shares = Shares(fit.overlap, fit.agreement, fit.contradicting)
+            T_world_middle, open_m = found, np.zeros(6)
+            if not is_believed:
+                voxel_m = deskewed.prepared.voxel_m
+                T_world_middle, open_m = observed_part(fit, T_world_predicted, found, spread, voxel_m=voxel_m)
+            jump = jump_between(T_world_predicted, T_world_middle, spread)
+            return PoseCandidate(key, T_world_middle, fit, shares, jump, open_m, method)
+
+        T_world_near = self._matcher.match(deskewed, T_world_predicted, reach="near")
+        best: PoseCandidate | None = None
+        for key in keyframes:
+            near = assessed(T_world_near, key, "map")
+            if near is not None and (is_believed or (not self.is_suspect(near) and near.is_measured)):
+                return near
+            best = self._preferred(best, near)
+        if best is not None and not self.is_suspect(best):
+            return best
+        description = described(deskewed)
+
+        def compared(candidate: PoseCandidate) -> PoseCandidate:
+            """Return a candidate with the contradictions of both scans."""
+            T_key_scan = inverse(candidate.keyframe.T_world_middle) @ candidate.T_world_middle
+            share = contradiction(candidate.keyframe, description, T_key_scan)
+            return replace(candidate, shares=replace(candidate.shares, contradicting=share))
+
+        candidates = [] if best is None else [compared(best)]
+        for way in (self._nearby, self._globally):
+            if way == self._globally and candidates and any(map(self.fits, candidates)):
+                break
+            for key in (keyframes[0], doubtful) if doubtful is not None else (keyframes[0],):
+                for T_world_middle, method in way(deskewed, key, last, motion, T_world_predicted):
+                    found = assessed(T_world_middle, key, method)
+                    if found is not None:
+                        candidates.append(compared(found))
+                        if not self.is_suspect(candidates[-1]):
+                            return candidates[-1]
+        return _best(candidates)
+
+    def _preferred(self, one: PoseCandidate | None, other: PoseCandidate | None) -> PoseCandidate | None:
+        """Return the one that is less suspect and whose keyframe shows more of the motion."""
+        if one is None or other is None:
+            return one or other
+
+        def rank(candidate: PoseCandidate) -> tuple[bool, float, float]:
+            fit = candidate.fit
+            shown = float(fit.observability.min()), float(fit.degeneracy.shares[0])
+            return not self.is_suspect(candidate), *shown
+
+        return other if rank(other) > rank(one) else one
+
+    def is_suspect(self, candidate: PoseCandidate) -> bool:
+        """Return whether a pose fits less than usual, or is a surprise, so that others are tried."""
+        return candidate.jump.is_unusual or not self.fits(candidate)
+
+    def fits(self, candidate: PoseCandidate) -> bool:
+        """Return whether a pose fits as usual."""
+        usual, shares = self.usual, candidate.shares
+        return not (
+            usual.has_little_overlap(shares, usual_ratio=self._config.usual_ratio)
+            or usual.contradicts(shares)
+            or usual.disagrees(shares)
+        )
+
+    def is_lost(self, candidate: PoseCandidate) -> bool:
+        """Return whether next to nothing agrees, or too much speaks against the pose."""
+        if self._config.lost_ratio == 0.0:
+            return False
+        usual, shares = self.usual, candidate.shares
+        share = shares.overlap / usual.usual.overlap
+        little = usual.has_little_overlap(shares, usual_ratio=self._config.usual_ratio)
+        if little and usual.excludes(shares):
+            return True
+        speaks_against = usual.contradicts(shares) or usual.disagrees(shares)
+        return share < (self._config.lost_ratio if speaks_against else 0.5 * self._config.lost_ratio)
+
+    def doubts(self, candidate: PoseCandidate) -> tuple[str, ...]:
+        """Return what speaks against a pose, a phrase each; empty if it is believed.
+
+        Little overlap alone is a new room, and a jump alone a sudden turn.
+        """
+        if self._config.usual_ratio == 0.0:
+            return ()
+        usual, shares = self.usual, candidate.shares
+        little = usual.has_little_overlap(shares, usual_ratio=self._config.usual_ratio)
+        contradicts, disagrees = usual.contradicts(shares), usual.disagrees(shares)
+        jumps = candidate.jump.is_unusual
+        is_alone = not contradicts and little + disagrees + jumps < 2
+        if is_alone and not (jumps and candidate.method == "rescued"):
+            return ()
+        phrases = []
+        if little:
+            phrases.append(f"{shares.overlap:.0%} of the points agree, {usual.usual.overlap:.0%} is usual")
+        if contradicts:
+            phrases.append(
+                f"{shares.contradicting:.1%} of the points stand where rays passed, "
+                f"{usual.usual.contradicting:.1%} is usual"
+            )
+        if disagrees:
+            phrases.append(
+                f"{shares.agreement:.0%} agree in the weakest direction, {usual.usual.agreement:.0%} is usual"
+            )
+        if jumps:
+            phrases.append(candidate.jump.text)
+        return tuple(phrases)
+
+    def _nearby(
+        self,
+        deskewed: DeskewedScan,
+        keyframe: ScanKeyframe,
+        last: ScanKeyframe | None,
+        motion: MotionModel,
+        T_world_predicted: Transform,
+    ) -> Iterator[tuple[Transform | None, str]]:
+        """Yield poses that are found from several turns of the predicted one, and from no motion."""
+        yield self._matcher.match(deskewed, T_world_predicted, reach="far"), "far"
+        up = T_world_predicted[2, :3]
+        guesses = [T_world_predicted @ exp(turn * up, np.zeros(3)) for turn in _TURNS_RAD]
+        for T_world_guess in (*guesses, motion.T_world_last):
+            if self._matcher.uses_guess:
+                yield self._matcher.match(deskewed, T_world_guess, reach="near"), "turned"
+            for key in (keyframe, last) if last is not None else (keyframe,):
+                T_key_scan = refined_motion(
+                    key.deskewed.prepared,
+                    deskewed.prepared,
+                    inverse(key.T_world_middle) @ T_world_guess,
+                    kind="plane-icp",
+                    pair_distances_m=[k * self._config.max_pair_distance_m for k in _PAIR_DISTANCES],
+                )
+                if not isinstance(T_key_scan, str):
+                    yield key.T_world_middle @ T_key_scan, "keyframe" if key is keyframe else "scan"
+
+    def _globally(
+        self,
+        deskewed: DeskewedScan,
+        keyframe: ScanKeyframe,
+        last: ScanKeyframe | None,  # noqa: ARG002
+        motion: MotionModel,  # noqa: ARG002
+        T_world_predicted: Transform,  # noqa: ARG002
+    ) -> Iterator[tuple[Transform | None, str]]:
+        """Yield the pose that is found without a guess."""
+        if self._rescue is None:
+            return
+        if self._rescuer is None or self._rescuer[0] is not keyframe.deskewed:
+            self._rescuer = keyframe.deskewed, self._rescue.prepare(keyframe.deskewed.scan)
+        found = self._rescuer[1].align(deskewed.scan, np.eye(4))
+        if found.converged:
+            T_world_found = keyframe.T_world_middle @ found.T_target_source
+            yield self._matcher.match(deskewed, T_world_found, reach="near"), "rescued"
+            yield T_world_found, "rescued"
+
+
+def _best(candidates: Sequence[PoseCandidate]) -> PoseCandidate | None:
+    """Return the best score, of those alike the one nearest to the predicted pose; None without any."""
+    if not candidates:
+        return None
+    highest = max(candidate.score for candidate in candidates)
+    alike = [candidate for candidate in candidates if candidate.score >= highest - _ALIKE]
+    if len(alike) == 1:
+        return alike[0]
+    surprises = [_surprise(candidate) for candidate in alike]
+    least = min(surprises)
+    return max(
+        (c for c, surprise in zip(alike, surprises, strict=True) if surprise <= least + 1.0),
+        key=lambda candidate: candidate.score,
+    )
+
+
+def _surprise(candidate: PoseCandidate) -> float:
+    """Return the jump in units of what would be much, or of 1 m and 1 rad where that is unknown."""
+    jump = candidate.jump
+    if not np.isfinite(jump.limit_m):
+        return jump.translation_m + jump.rotation_rad
+    return max(jump.translation_m / jump.limit_m, jump.rotation_rad / jump.limit_rad)
