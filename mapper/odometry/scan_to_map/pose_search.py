@@ -167,6 +167,8 @@ class PoseSearch:
         if self._config.lost_ratio == 0.0:
             return False
         usual, shares = self.usual, candidate.shares
+        if not usual.is_known:  # in a field half of the points have partners
+            return shares.overlap < 0.5 * self._config.lost_ratio
         share = shares.overlap / usual.usual.overlap
         little = usual.has_little_overlap(shares, usual_ratio=self._config.usual_ratio)
         if little and usual.excludes(shares):
@@ -185,6 +187,8 @@ class PoseSearch:
         little = usual.has_little_overlap(shares, usual_ratio=self._config.usual_ratio)
         contradicts, disagrees = usual.contradicts(shares), usual.disagrees(shares)
         jumps = candidate.jump.is_unusual
+        if not usual.is_known:
+            little = disagrees = False
         is_alone = not contradicts and little + disagrees + jumps < 2
         if is_alone and not (jumps and candidate.method == "rescued"):
             return ()

@@ -100,6 +100,11 @@ class UsualFit:
         self.usual = Shares(overlap=1.0, agreement=1.0, contradicting=0.0)
         self._overlap_spread, self._agreement_spread = _LEAST_OVERLAP_SPREAD, _LEAST_AGREEMENT_SPREAD
 
+    @property
+    def is_known(self) -> bool:
+        """Whether any scan told what is usual; until then poses are searched for, but none is doubted."""
+        return bool(self._recent)
+
     def has_little_overlap(self, shares: Shares, *, usual_ratio: float) -> bool:
         """Return whether the overlap is below the log's spread, and this share of the usual one."""
         least = self.usual.overlap - _SPREADS * self._overlap_spread
