@@ -77,6 +77,27 @@ def degeneracy_of(information: Array, *, points: Points, min_share: float = _MIN
     )
 
 
+def projected(information: Array, degeneracy: Degeneracy) -> Array:
+    """Return the information without that of the unobservable motions: unknown to within the cloud's extent.
+
+    What they had is noise's; the observable motions keep theirs.
+
+    Args:
+        information: (6, 6) that the degeneracy was found in.
+        degeneracy: Its degeneracy.
+
+    Returns:
+        (6, 6) positive definite information.
+    """
+    motions, count = degeneracy.motions, degeneracy.unobservable_count
+    eigenvalues = np.einsum("ki,ij,kj->k", motions, information, motions)
+    eigenvalues[:count] = np.minimum(eigenvalues[:count], degeneracy.extent_m**-2)
+    eigenvalues = np.maximum(eigenvalues, np.finfo(float).eps * eigenvalues.max())
+    columns = np.linalg.inv(motions)
+    result: Array = (columns * eigenvalues) @ columns.T
+    return 0.5 * (result + result.T)
+
+
 def _text(unobservable: Array) -> str:
     """Return the names of (6, K) motions about the centroid; any basis of one space gets the same names."""
     names = []

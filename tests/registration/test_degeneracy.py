@@ -5,7 +5,7 @@ import pytest
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import apply, exp, transform
-from mapper.registration.degeneracy import degeneracy_of
+from mapper.registration.degeneracy import degeneracy_of, projected
 from mapper.registration.refining import measured
 from mapper.registration.surfaces import prepared
 
@@ -97,6 +97,25 @@ def test_unobservable_motions_move_the_cloud_by_a_metre_and_no_surface_notices()
         moved = apply(exp(0.01 * tangent[:3], 0.01 * tangent[3:]), points)
         assert np.sqrt(((moved - points) ** 2).sum(axis=1).mean()) == pytest.approx(0.01, rel=0.02)
         assert np.abs(np.hypot(moved[:, 1] - 1.5, moved[:, 2]) - radius_before).max() < 2e-3
+
+
+@pytest.mark.parametrize("scene", [corridor, plain, tunnel])
+def test_the_noise_grows_along_unobservable_motions_and_only_there(scene):
+    information, degeneracy = registered(scene)
+    without = projected(information, degeneracy)
+
+    assert np.linalg.eigvalsh(without)[0] > 0.0
+    for k, motion in enumerate(degeneracy.motions):
+        before, after = motion @ information @ motion, motion @ without @ motion
+        if k < degeneracy.unobservable_count:
+            assert after <= degeneracy.extent_m**-2 * 1.001 < before
+        else:
+            assert after == pytest.approx(before)
+
+
+def test_a_room_keeps_its_information():
+    information, degeneracy = registered(room)
+    assert np.allclose(projected(information, degeneracy), information)
 
 
 def test_information_of_nothing_is_an_error():
