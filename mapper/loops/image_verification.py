@@ -15,7 +15,7 @@ from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
 from mapper.registration.p3p import ransac_p3p
 from mapper.registration.reprojection import normal_matrix, refine_pose
-from mapper.registration.variance_factor import variance_factor
+from mapper.registration.variance_factor import residual_statistics
 
 VIRTUAL_BASELINE_PX_M = 40.0
 """bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017)."""
@@ -131,7 +131,7 @@ class ImageVerifier:
             seen = T_j_i, points[agree], measured[agree], weights[agree], intrinsics
             # i's points were measured no better than j's pixels, so the information is halved.
             information = 0.5 * normal_matrix(*seen)
-            honest = 1.0 / variance_factor(*seen)
+            honest = 1.0 / residual_statistics(*seen).variance_factor
         assert information is not None  # ISVD converged
         to_camera = adjoint(inverse(j.T_body_camera))
         T_i_j = i.T_body_camera @ T_ci_cj @ inverse(j.T_body_camera)

@@ -107,7 +107,7 @@ def test_darkness_is_no_place(frames):
     odometry = build_frame_odometry(LocalMapConfig(max_lost_frames=2))
     tracks = tracked([*frames[:5], *map(blank, frames[5:9]), *frames[9:12]], odometry)
     assert all(t.node is None for t in tracks[5:9])
-    assert tracks[9].diagnostics.method == "relocalised"
+    assert tracks[9].diagnostics.method.startswith("relocalised")
 
 
 def test_a_second_turn_is_tracked_with_the_first_ones_landmarks(frames):

@@ -13,6 +13,7 @@ from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmark_kernels import count_observers, observations_of
 from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.registration.reprojection import normal_matrix
+from mapper.registration.variance_factor import ResidualStatistics, residual_statistics
 
 Ids = NDArray[np.int32]
 
@@ -358,6 +359,21 @@ class LandmarkMap:
         to_camera = adjoint(inverse(observation.T_body_camera))
         H_body: Array = to_camera.T @ H_camera @ to_camera
         return H_body + _WEAK_PRIOR
+
+    def residual_statistics(self, index: int) -> ResidualStatistics | None:
+        """Return the statistics of a keyframe's residuals; None where few landmarks have another observer."""
+        keyframe = self.keyframes[index]
+        ids = keyframe.landmark_of_feature
+        features = np.flatnonzero((ids >= 0) & (self.landmarks["observers"][ids] > 1))
+        if len(features) < MIN_SHARED_LANDMARKS:
+            return None
+        return residual_statistics(
+            keyframe.T_camera_world,
+            self.landmarks["position"][ids[features]],
+            keyframe.observation.measured[features],
+            keyframe.observation.weights[features],
+            keyframe.observation.intrinsics,
+        )
 
     def depth_information(self, target: int, source: int) -> Array:
         """Return the (6, 6) information of the source's pose in the target from their depth images.

@@ -1,5 +1,6 @@
 """Odometry against a local map of keyframes and landmarks (Mur-Artal & Tardós 2017; Zhao et al. 2020)."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ from mapper.core.geometry import Transform, adjoint, inverse
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
-from mapper.graph.noise import inflated, with_model_error
+from mapper.graph.noise import inflated
 from mapper.odometry.base import (
     STEADY_NS,
     Diagnostics,
@@ -27,6 +28,7 @@ from mapper.odometry.local_map.frame_doubts import NO_DOUBT, Doubt, FrameDoubts
 from mapper.odometry.local_map.image_observation import ImageObservation, observe_image
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
 from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
+from mapper.odometry.local_map.log_residuals import LogResiduals
 from mapper.odometry.local_map.pose_tracker import PoseTracker, TrackedPose, predicted, unmatched
 from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.odometry.local_map.relocalizer import Relocalizer
@@ -77,6 +79,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._depth = DepthTracker(config, self._map)
         self._decision = KeyframeDecision(config)
         self._doubts = FrameDoubts()
+        self._residuals = LogResiduals()
         self._lost_frames = 0  # since the last tracked one
         self._unknown_frames = 0  # those of them with enough features to begin a sub-map
 
@@ -120,7 +123,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         if is_keyframe:
             information = links[0].information
         else:
-            information = with_model_error(_OWN_SHARE * information, result.T_node_body)
+            information = self._residuals.honest(_OWN_SHARE * information, result.T_node_body)
             if doubt.phrases:
                 information = inflated(information, sigma_rad=doubt.sigma_rad, sigma_m=doubt.sigma_m)
         return replace(result, doubts=doubt.phrases, covariance=np.linalg.inv(information))
@@ -158,19 +161,23 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             strong = [k for k, shared in earlier if shared >= MIN_SHARED_LANDMARKS]
             weak = [k for k, _ in earlier[:1]] or [self._map.previous(j)]
             linked = [keyframe.depth_link.reference] if keyframe.depth_link is not None else []
-            chosen = strong[:_FACTORS_PER_KEYFRAME] or linked or weak
-            factors += [self._factor(i, j) for i in dict.fromkeys([*chosen, *linked])]
+            targets = dict.fromkeys([*(strong[:_FACTORS_PER_KEYFRAME] or linked or weak), *linked])
+            factors += [self._factor(i, j, shared_by=len(targets)) for i in targets]
         return factors
 
-    def _factor(self, i: int, j: int) -> BetweenFactor:
-        """Return the relative pose of two keyframes in the current map."""
+    def _factor(self, i: int, j: int, *, shared_by: int = 1) -> BetweenFactor:
+        """Return the relative pose of two keyframes in the current map.
+
+        ``shared_by`` factors of j rest largely on the same features. Were these the same, each factor would
+        have that share of their information, were they others, all: it has the geometric mean.
+        """
         T_world_i, T_world_j = (
             _body_pose(keyframe.observation, keyframe.T_camera_world)
             for keyframe in (self._map.keyframes[i], self._map.keyframes[j])
         )
         T_i_j = inverse(T_world_i) @ T_world_j
         information = self._map.information(i, j) + self._map.depth_information(i, j)
-        information = with_model_error(information, T_i_j)
+        information = self._residuals.honest(information, T_i_j) / math.sqrt(shared_by)
         doubtful = self._map.keyframes[j]
         if doubtful.doubt_m > 0.0:
             information = inflated(information, sigma_rad=doubtful.doubt_rad, sigma_m=doubtful.doubt_m)
@@ -272,6 +279,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._map.refine(index, window=config.bundle_keyframes)
         self._map.follow_readout()
         self._map.cull()
+        if (statistics := self._map.residual_statistics(index)) is not None:
+            self._residuals.add(statistics)
         self._decision.restart()
         keyframe = self._map.keyframes[index]
         keyframe.doubt_rad, keyframe.doubt_m = doubt.sigma_rad, doubt.sigma_m

@@ -1,0 +1,139 @@
+"""Consistency of covariances: normalised estimation error squared (NEES) of relative poses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.core.geometry import Array, Transform, adjoint, interpolate, inverse, log
+from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S
+from mapper.core.trajectory import Trajectory
+from mapper.graph.marginals import marginals_of
+from mapper.graph.model import BetweenFactor, PoseGraph
+from mapper.run.frame_outcomes import FrameRecord
+
+_NEXT_TO_NOTHING = 1e-6 * np.eye(6)
+"""Information of factors that only ask for the covariance of two nodes relative to each other."""
+
+
+@dataclass(frozen=True, slots=True)
+class Nees:
+    """NEES per degree of freedom: 1 if covariances are as large as the errors, more if they are too small.
+
+    Attributes:
+        mean: Over the relative poses; NaN without any.
+        median: Over them; 0.89 if the covariances are right.
+        count: Number of them.
+    """
+
+    mean: float
+    median: float
+    count: int
+
+
+def window_nees(
+    trajectory: Trajectory,
+    graph: PoseGraph,
+    records: Sequence[FrameRecord],
+    truth: Trajectory,
+    *,
+    window_s: float = 1.0,
+    most: int = 300,
+) -> Nees:
+    """Return the NEES of tracked poses relative to those a window before (Bar-Shalom, Li & Kirubarajan 2001).
+
+    Args:
+        trajectory: Solved poses of the body.
+        graph: Solved, with the factors that hold.
+        records: Outcome of every frame; frames without sigmas are left out.
+        truth: True poses of the body, interpolated to the frames' stamps.
+        window_s: Length of a window.
+        most: Windows to compare, spread over the log.
+    """
+    pose_of = dict(zip(trajectory.stamps_ns.tolist(), trajectory.T_world_body, strict=True))
+    known = [
+        (record, T_true)
+        for record in records
+        if record.outcome == "tracked"
+        and (record.sigmas is not None or record.is_keyframe)
+        and record.stamp_ns in pose_of
+        and (T_true := _true_pose(truth, record.stamp_ns)) is not None
+    ]
+    stamps_ns = np.array([record.stamp_ns for record, _ in known], dtype=np.int64)
+    ends = np.searchsorted(stamps_ns, stamps_ns + round(window_s * NS_PER_S))
+    begins = np.flatnonzero(ends < len(known))
+    begins = begins[:: max(1, len(begins) // most)]
+    windows = [(known[a], known[int(ends[a])]) for a in begins]
+    relative = _relative_covariances(graph, [(a.node, b.node) for (a, _), (b, _) in windows])
+    errors = []
+    for (a, T_true_a), (b, T_true_b) in windows:
+        T_a_b = inverse(pose_of[a.stamp_ns]) @ pose_of[b.stamp_ns]
+        assert a.node is not None
+        assert b.node is not None
+        T_b_node = inverse(pose_of[b.stamp_ns]) @ graph.T_world_node[b.node]
+        covariance = _carried(relative[a.node, b.node], T_b_node) if a.node != b.node else np.zeros((6, 6))
+        covariance = covariance + _own(b) + _carried(_own(a), inverse(T_a_b))
+        errors.append(_nees(T_a_b, inverse(T_true_a) @ T_true_b, covariance))
+    return _summary(errors)
+
+
+def factor_nees(factors: Sequence[BetweenFactor], graph: PoseGraph, truth: Trajectory) -> Nees:
+    """Return the NEES of measured relative poses between a graph's nodes."""
+    true = {node: _true_pose(truth, stamp_ns) for node, stamp_ns in graph.stamps_ns.items()}
+    errors = []
+    for factor in factors:
+        T_true_i, T_true_j = true[factor.i], true[factor.j]
+        if T_true_i is not None and T_true_j is not None:
+            covariance = np.asarray(np.linalg.inv(factor.information), np.float64)
+            errors.append(_nees(factor.T_i_j, inverse(T_true_i) @ T_true_j, covariance))
+    return _summary(errors)
+
+
+def _nees(T_measured: Transform, T_true: Transform, covariance: Array) -> float:
+    error = np.concatenate(log(inverse(T_measured) @ T_true))
+    return float(error @ np.linalg.solve(covariance, error)) / len(error)
+
+
+def _summary(errors: Sequence[float]) -> Nees:
+    if not errors:
+        return Nees(np.nan, np.nan, 0)
+    return Nees(float(np.mean(errors)), float(np.median(errors)), len(errors))
+
+
+def _own(record: FrameRecord) -> Array:
+    """Return the (6, 6) covariance of a frame's pose relative to its node."""
+    if record.is_keyframe or record.sigmas is None:
+        return np.zeros((6, 6))
+    return np.diag(np.square(record.sigmas))
+
+
+def _carried(covariance: Array, T_to_from: Transform) -> Array:
+    """Return a covariance in the tangent of another body that is rigidly connected."""
+    carry = adjoint(T_to_from)
+    carried: Array = carry @ covariance @ carry.T
+    return carried
+
+
+def _relative_covariances(
+    graph: PoseGraph, pairs: Sequence[tuple[int | None, int | None]]
+) -> dict[tuple[int, int], Array]:
+    wanted = {(i, j) for i, j in pairs if i is not None and j is not None and i != j}
+    asking = [
+        BetweenFactor(i, j, inverse(graph.T_world_node[i]) @ graph.T_world_node[j], _NEXT_TO_NOTHING)
+        for i, j in sorted(wanted)
+    ]
+    return marginals_of(PoseGraph(graph.T_world_node, graph.stamps_ns, [*graph.factors, *asking])).relative
+
+
+def _true_pose(truth: Trajectory, stamp_ns: int) -> Transform | None:
+    """Return the truth at a time, interpolated; None outside of it and in its gaps."""
+    after = int(np.searchsorted(truth.stamps_ns, stamp_ns))
+    if after < len(truth) and truth.stamps_ns[after] == stamp_ns:
+        return truth.T_world_body[after]
+    if not 0 < after < len(truth):
+        return None
+    begin_ns, end_ns = truth.stamps_ns[after - 1 : after + 1].tolist()
+    if end_ns - begin_ns > 2 * MAX_TRUTH_GAP_NS:
+        return None
+    share = (stamp_ns - begin_ns) / (end_ns - begin_ns)
+    return interpolate(truth.T_world_body[after - 1], truth.T_world_body[after], share)
