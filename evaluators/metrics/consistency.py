@@ -129,7 +129,8 @@ def _true_pose(truth: Trajectory, stamp_ns: int) -> Transform | None:
     """Return the truth at a time, interpolated; None outside of it and in its gaps."""
     after = int(np.searchsorted(truth.stamps_ns, stamp_ns))
     if after < len(truth) and truth.stamps_ns[after] == stamp_ns:
-        return truth.T_world_body[after]
+        exact: Transform = truth.T_world_body[after]
+        return exact
     if not 0 < after < len(truth):
         return None
     begin_ns, end_ns = truth.stamps_ns[after - 1 : after + 1].tolist()

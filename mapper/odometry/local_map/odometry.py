@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.core.deskew import Twist
 from mapper.core.frames import Frame
-from mapper.core.geometry import Transform, adjoint, inverse
+from mapper.core.geometry import Array, Transform, adjoint, inverse
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
@@ -107,7 +107,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             to_camera = adjoint(inverse(observation.T_body_camera))
             information += to_camera.T @ tracked_pose.depth.information @ to_camera
         expected = None if self._lost_frames else predicted(observation.stamp_ns, last, self._before_last)
-        doubt = self._doubts.assess(tracked_pose, np.linalg.inv(information), last, expected)
+        doubt = self._doubts.assess(tracked_pose, _covariance_of(information), last, expected)
         # The motion before a gap does not predict the motion after it.
         before_last = None if self._lost_frames else self._last
         self._lost_frames = self._unknown_frames = 0
@@ -126,7 +126,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             information = self._residuals.honest(_OWN_SHARE * information, result.T_node_body)
             if doubt.phrases:
                 information = inflated(information, sigma_rad=doubt.sigma_rad, sigma_m=doubt.sigma_m)
-        return replace(result, doubts=doubt.phrases, covariance=np.linalg.inv(information))
+        return replace(result, doubts=doubt.phrases, covariance=_covariance_of(information))
 
     def view(self, observation: ImageObservation, twist: Twist | None = None, /) -> ImageView:
         """Return the view for place recognition, by the readout time as it is known now."""
@@ -335,3 +335,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
 def _body_pose(observation: ImageObservation, T_camera_world: Transform) -> Transform:
     """Return T_world_body."""
     return inverse(observation.T_body_camera @ T_camera_world)
+
+
+def _covariance_of(information: Array) -> Array:
+    return np.asarray(np.linalg.inv(information), np.float64)
