@@ -64,6 +64,7 @@ def _map(voxel_m: float) -> fl.ThreeDeePanel:
         "/trajectory/estimate/dots": hidden,
         "/trajectory/truth/dots": hidden,
         "/plan/dots": hidden,
+        "/pose": hidden,
         "/graph/factors/dots": hidden,
     }
     return fl.ThreeDeePanel(

@@ -173,7 +173,7 @@ def track_log(
             observer.on_frame(Step(entry, track, view, odometry.matches, detector))
     doubts = checks.doubts()
     tracks = [
-        replace(track, doubts=(*track.doubts, *doubts.get(track.stamp_ns, ())))
+        replace(track, doubts=track.doubts or tuple(doubts.get(track.stamp_ns, ())))
         if track.node is not None
         else track
         for track in tracks

@@ -80,6 +80,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._decision = KeyframeDecision(config)
         self._doubts = FrameDoubts()
         self._residuals = LogResiduals()
+        self._agreeing = np.zeros(0, np.bool_)  # features by which the last frame was tracked
         self._lost_frames = 0  # since the last tracked one
         self._unknown_frames = 0  # those of them with enough features to begin a sub-map
 
@@ -115,6 +116,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         is_keyframe = self._decision.is_due(tracked_pose)
         if doubt.phrases and tracked_pose.inliers >= self._config.weak_inliers:
             is_keyframe = False  # tracking goes on without it
+        self._agreeing = tracked_pose.landmark_of_feature >= 0
         if is_keyframe:
             tracked_pose = self._add_keyframe(tracked_pose, neighbour=reference, doubt=doubt)
         self._before_last, self._last = before_last, tracked_pose
@@ -146,7 +148,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
                 )
                 now, then = now[common >= 0], then[common >= 0]
                 previous_px[now] = earlier.observation.pixels[then]
-        return FeatureMatches(landmarks >= 0, previous_px)
+        return FeatureMatches(self._agreeing, previous_px)
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return a factor from every keyframe to those earlier ones that share most landmarks with it.
@@ -201,6 +203,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         start = TrackedPose(observation, T_camera_world, unmatched(observation), 0, 0, 1.0, 0, 0.0, "start")
         self._lost_frames = self._unknown_frames = 0
         self._shutter.restart()
+        self._agreeing = np.zeros(len(observation), np.bool_)
         self._before_last, self._last = None, self._add_keyframe(start, neighbour=None)
         self._depth.began(observation)
         return self._result(self._last, inliers=0, is_keyframe=True)
