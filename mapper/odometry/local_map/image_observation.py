@@ -91,7 +91,8 @@ class ImageObservation:
         depth_m = np.maximum(depth_m, _MIN_DEPTH_M)
         sweep_camera = self.sweep_camera if sweep_camera is None else sweep_camera
         phase = row_phase(pixels, self.size_px[1])
-        return phase[:, np.newaxis] * pixel_velocity(pixels, depth_m, self.intrinsics, sweep_camera)
+        shift: Array = phase[:, np.newaxis] * pixel_velocity(pixels, depth_m, self.intrinsics, sweep_camera)
+        return shift
 
     def view(self) -> ImageView:
         """Return the view for place recognition."""
