@@ -179,6 +179,37 @@ def test_a_wrong_pose_contradicts_free_space():
     assert contradiction(key, description, np.eye(4)) > 0.03
 
 
+def field_scan(x_m):
+    """Return rings on flat ground 1.7 m below, and four round bushes, from x metres along."""
+    azimuth = np.linspace(-np.pi, np.pi, 900, endpoint=False)
+    rings = []
+    for angle in np.radians(np.arange(-15.0, 15.1, 2.0)):
+        distances = np.full(900, 1.7 / np.tan(-angle) if angle < 0.0 else 99.0)
+        for bush in ([6.0, 5.0], [-4.0, 8.0], [3.0, -7.0], [-9.0, -6.0]):
+            x, y = bush[0] - x_m, bush[1]
+            along = x * np.cos(azimuth) + y * np.sin(azimuth)
+            depth = 1.2**2 - (x * np.sin(azimuth) - y * np.cos(azimuth)) ** 2
+            is_hit = (depth > 0.0) & (along > 0.0)
+            distances[is_hit] = np.minimum(distances, along - np.sqrt(np.maximum(depth, 0.0)))[is_hit]
+        seen = distances < 40.0
+        flat = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(900, np.tan(angle))], axis=1)
+        rings.append(flat[seen] * distances[seen, None])
+    points = np.concatenate(rings)
+    return Scan(0, (points + np.random.default_rng(0).normal(0.0, 0.01, points.shape)).astype(np.float32))
+
+
+@pytest.mark.parametrize(("moved_m", "is_shown"), [(1.0, True), (0.1, False)])
+def test_a_few_bushes_in_a_field_show_a_motion_of_more_than_a_voxel(moved_m, is_shown):
+    key = keyframe(field_scan(0.0), voxel_m=0.4)
+    scan = keyframe(field_scan(moved_m), voxel_m=0.4).deskewed
+    right = exp(np.zeros(3), np.array([moved_m, 0.0, 0.0]))
+
+    fit = fit_of(key, scan, right, max_pair_distance_m=0.5)
+
+    assert fit.contradicting < 0.005  # of ground between the other scan's rings
+    assert (fit.observability.min() >= 1.0) == is_shown
+
+
 def test_a_prediction_fills_only_what_surfaces_do_not_show():
     key = keyframe(tunnel_scan(0, 30.0, seed=1), voxel_m=0.4)
     scan = keyframe(tunnel_scan(1, 31.0, seed=2), voxel_m=0.4).deskewed

@@ -98,7 +98,8 @@ def test_a_build_tells_which_motions_no_surface_showed(run, tmp_path):
     for number in range(10):
         np.save(folder / f"{number:06}.npy", field.astype(np.float32))
 
-    text = " ".join(summary_text(built(folder, tmp_path / "run", "octree.resolution_m=0.5"), []).split())
+    overrides = "octree.resolution_m=0.5", "min_tracked_frames=1", "min_tracked_ratio=0"
+    text = " ".join(summary_text(built(folder, tmp_path / "run", *overrides), []).split())
 
     assert "left open in 9 frames, mostly translation along x and y, rotation about z: no surface" in text
 

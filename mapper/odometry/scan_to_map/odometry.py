@@ -108,14 +108,14 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         T_key_scan = inverse(keyframe.T_world_middle) @ found.T_world_middle
         noise = self._noise.of(found.fit, found.open_m, T_key_scan, spread, elapsed_s, observation.middle_s)
         doubts = self._search.doubts(found)
-        fits, is_measured = not doubts, found.is_measured
+        fits = not doubts
         covariance = noise.covariance if fits else noise.inflated(found.jump)
         if fits and keyframe is self._doubtful:
             self._matcher.clear()
             self._matcher.add(keyframe.deskewed, keyframe.T_world_middle, is_keyframe=True)
             self._keyframes.clear()
             self._keyframes.appendleft(keyframe)
-        self._motion.follow(time_ns, found.T_world_middle, is_certain=fits and is_measured)
+        self._motion.follow(time_ns, found.T_world_middle, is_certain=fits and found.is_measured)
         T_world_body = found.T_world_middle @ self._motion.twist.over(-observation.middle_s)
         T_key_body = inverse(keyframe.T_world_body) @ T_world_body
         is_keyframe = is_far(
@@ -125,11 +125,10 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         )
         node = keyframe.node
         factors: tuple[BetweenFactor, ...] = ()
-        scan = ScanKeyframe(self._next_node, deskewed, found.T_world_middle, T_world_body, is_measured)
+        scan = ScanKeyframe(self._next_node, deskewed, found.T_world_middle, T_world_body)
         if fits:
             self._doubtful = None
-            if is_measured:
-                self._search.usual.add(found.shares)
+            self._search.usual.add(found.shares)
             self._matcher.add(deskewed, found.T_world_middle, is_keyframe=is_keyframe)
         if is_keyframe:
             node = self._next_node

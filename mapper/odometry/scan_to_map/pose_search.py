@@ -18,7 +18,7 @@ from mapper.registration.refining import refined_motion
 
 _TURNS_RAD = (0.0, 0.3, -0.3, 0.6, -0.6, 1.0, -1.0)  # about the vertical, from the predicted pose
 _PAIR_DISTANCES = (4.0, 2.0, 1.0)  # of a scan to the last keyframe or scan, in largest pair distances
-_CONTRADICTION_WEIGHT = 5.0
+_CONTRADICTION_WEIGHT = 15.0
 _ALIKE = 0.1  # scores nearer than this do not decide
 
 
@@ -51,8 +51,8 @@ class PoseCandidate:
 
     @property
     def score(self) -> float:
-        """Share of the points that fit, less what contradicts, weighted."""
-        return self.shares.overlap - _CONTRADICTION_WEIGHT * self.shares.contradicting
+        """Agreement less what contradicts, weighted; overlap does not tell, as ground lies on any ground."""
+        return self.shares.agreement - _CONTRADICTION_WEIGHT * self.shares.contradicting
 
 
 class PoseSearch:

@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Transform, apply
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan
 from mapper.registration.acceptance import weakest_direction
@@ -17,13 +18,18 @@ _SURFACE_VOXELS = 0.33  # a point this near to a surface agrees with it
 _DIRECTION_RAD = 0.0175  # of the range images: one degree
 _MARGIN_M = 0.2
 _CHECKED_POINTS = 2000
+_GRAZING = 0.01  # least sine of the angle between a ray and a surface
+_PIXELS = 1.5  # a ray that is compared with a point is off by up to so many
 _SMALL_SHARE = 0.03
 """Share of a motion's displacements that goes along normals, below which the pairs that show it are counted.
 Streets and rooms have more."""
-_FACING = 0.15  # share of one point's displacement along its normals, from which on its pair shows the motion
-_OFF_VOXELS, _SMALL_SHARE_NEARBY = 2.0, 0.1
-_FEW_PAIRS, _ENOUGH_PAIRS = 12, 36
-"""Pairs that face a motion and agree. A bare tunnel has some by chance, a field two trees' worth and more."""
+_FACING = 0.3
+"""Share of one point's displacement along its normals, from which on its pair shows the motion: more than
+the errors of normals make."""
+_OFF_VOXELS = 1.0  # nearer to the keyframe rings lie on the same places, and so errors of normals are alike
+_FEW_PAIRS, _ENOUGH_PAIRS = 8, 24
+"""Pairs that face a motion and agree: a bare tunnel has up to 11 by chance, a field with two trees 13 to 60.
+They measure it to σ/√pairs, with the 0.1 m that a point agrees within to 0.02 m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,14 +41,12 @@ class ScanKeyframe:
         deskewed: The scan as taken all at once in the middle of its sweep.
         T_world_middle: (4, 4) pose of the body then.
         T_world_body: (4, 4) pose of the body at the scan's stamp.
-        is_measured: Whether surfaces showed all of its motion.
     """
 
     node: int
     deskewed: DeskewedScan
     T_world_middle: Transform
     T_world_body: Transform
-    is_measured: bool = True
 
     @cached_property
     def description(self) -> ScanDescription:
@@ -81,10 +85,23 @@ class ScanFit:
 
 def described(deskewed: DeskewedScan) -> ScanDescription:
     """Return the points and rays of a scan for the free-space check."""
-    scan, points = deskewed.scan, deskewed.prepared.points.astype(np.float32)
-    chosen = np.ascontiguousarray(points[:: max(1, -(-len(points) // _CHECKED_POINTS))])
+    scan = deskewed.scan
     ranges_m = range_image(scan.points_body, scan.origin_body, _DIRECTION_RAD)
-    return ScanDescription(np.eye(4), chosen, ranges_m, _DIRECTION_RAD, scan.origin_body)
+    return ScanDescription(np.eye(4), _checked(deskewed), ranges_m, _DIRECTION_RAD, scan.origin_body)
+
+
+def _checked(deskewed: DeskewedScan) -> Points32:
+    """Return the points for the free-space check, each where a ray off by some pixels hits its surface.
+
+    Seen at a grazing angle, ground and walls are passed by the neighbouring rays.
+    """
+    prepared, origin = deskewed.prepared, deskewed.scan.origin_body
+    step = max(1, -(-len(prepared.points) // _CHECKED_POINTS))
+    rays = prepared.points[::step] - origin
+    facing = np.abs(np.einsum("ni,ni->n", prepared.normals[::step], rays))
+    sine = np.clip(facing / np.maximum(np.linalg.norm(rays, axis=1), _MARGIN_M), _GRAZING, 1.0)
+    beyond = _PIXELS * _DIRECTION_RAD * np.sqrt(1.0 - sine**2) / sine
+    return np.ascontiguousarray((origin + rays * (1.0 + beyond[:, None])).astype(np.float32))
 
 
 def fit_of(
@@ -126,15 +143,11 @@ def fit_of(
     agree = np.zeros(len(source.points), dtype=bool)
     agree[near] = (np.abs(residuals_m) <= _SURFACE_VOXELS * source.voxel_m) & normals.any(axis=1)
     agreement, _ = weakest_direction(source.normals, agree)
-    checked = np.ascontiguousarray(
-        source.points[:: max(1, -(-len(source.points) // _CHECKED_POINTS))].astype(np.float32)
-    )
-    counts = FreeSpaceCheck(_MARGIN_M).count(keyframe.description, checked, T_key_scan)
+    counts = FreeSpaceCheck(_MARGIN_M).count(keyframe.description, _checked(deskewed), T_key_scan)
     degeneracy = degeneracy_of(0.5 * (shown + shown.T), points=source.points, min_share=_SMALL_SHARE)
     observability = _observability(degeneracy, points, rows, own_rows, agree[near])
     if np.linalg.norm(T_key_scan[:3, 3]) < _OFF_VOXELS * source.voxel_m:
-        limit = _SMALL_SHARE if keyframe.is_measured else _SMALL_SHARE_NEARBY
-        observability[degeneracy.shares < limit] = 0.0
+        observability[: degeneracy.unobservable_count] = 0.0
     unobservable = ""
     if observability.min() < 0.5:
         least = 1.001 * float(degeneracy.shares[observability < 0.5].max())
@@ -161,8 +174,6 @@ def _observability(
     """Return (6,) whether enough pairs show a motion (as Tuna et al. 2024, §III, count contributions).
 
     Shares do not tell: normals off by a few degrees, a thousand times, make as large a share as one tree.
-    Next to the keyframe the errors of the normals are alike too, since rings lie on the same places: there
-    few pairs tell nothing, and beside a keyframe that itself was not fully measured not even more do.
     """
     observability = np.ones(6)
     for k in range(degeneracy.unobservable_count):

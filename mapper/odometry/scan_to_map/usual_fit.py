@@ -14,9 +14,9 @@ _NORMAL = 1.4826  # standard deviations in a median absolute deviation
 _FEWEST = 5
 _LEAST_OVERLAP_SPREAD = 0.04
 _LEAST_AGREEMENT_SPREAD = 0.06
-_MAX_CONTRADICTING, _TIMES_CONTRADICTING = 0.025, 4.0
-"""Share of points in space that rays passed: right poses had up to 0.008, in a yard that is swept strongly
-tilted 0.024; wrong ones 0.03 to 0.2. It may be so many times the usual one where people or traffic move."""
+_MAX_CONTRADICTING, _TIMES_CONTRADICTING = 0.012, 4.0
+"""Share of points in space that rays passed, none of them by a grazing ray: right poses have up to 0.007,
+wrong ones 0.013 to 0.03 and more. It may be so many times the usual one where people or traffic move."""
 _OTHER_PLACE, _HARDLY = 0.1, 0.2
 _JUMP_SPREADS = 8.0
 _LEAST_JUMP_M, _LEAST_JUMP_RAD = 0.15, 0.09
