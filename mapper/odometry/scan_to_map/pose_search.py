@@ -151,7 +151,11 @@ class PoseSearch:
 
     def is_suspect(self, candidate: PoseCandidate) -> bool:
         """Return whether a pose fits less than usual, or is a surprise, so that others are tried."""
-        return candidate.jump.is_unusual or not self.fits(candidate)
+        return (
+            candidate.jump.is_unusual
+            or self.usual.agrees_little(candidate.shares)
+            or not self.fits(candidate)
+        )
 
     def fits(self, candidate: PoseCandidate) -> bool:
         """Return whether a pose fits as usual."""

@@ -10,6 +10,7 @@ from mapper.odometry.scan_to_map.motion_model import Spread
 
 _RECENT = 30  # recent scans whose fits are usual
 _SPREADS = 4.0  # so many standard deviations below its median a share is unusual
+_FEW_SPREADS, _LITTLE = 2.0, 0.75  # and so many, of this part of it, make a search worth its time
 _NORMAL = 1.4826  # standard deviations in a median absolute deviation
 _FEWEST = 5
 _LEAST_OVERLAP_SPREAD = 0.04
@@ -114,6 +115,11 @@ class UsualFit:
         """Return whether a direction agrees less than the log's spread explains, and than half as usual."""
         least = self.usual.agreement - _SPREADS * self._agreement_spread
         return shares.agreement < min(least, 0.5 * self.usual.agreement)
+
+    def agrees_little(self, shares: Shares) -> bool:
+        """Return whether a direction agrees less than most scans' do, so that a search is worth it."""
+        least = self.usual.agreement - _FEW_SPREADS * self._agreement_spread
+        return shares.agreement < min(least, _LITTLE * self.usual.agreement)
 
     def contradicts(self, shares: Shares) -> bool:
         """Return whether too much stands where rays passed."""
