@@ -24,10 +24,15 @@ class LogResiduals:
 
     def __init__(self) -> None:
         self._keyframes: list[ResidualStatistics] = []
+        self._factor = self._scale = 1.0  # of covariances, and of the model error
 
     def add(self, keyframe: ResidualStatistics) -> None:
         """Add a keyframe's."""
         self._keyframes.append(keyframe)
+        if len(self._keyframes) >= _FEWEST:
+            self._factor = float(np.median([known.variance_factor for known in self._keyframes]))
+            effect = float(np.median([known.design_effect for known in self._keyframes]))
+            self._scale = float(np.clip((effect - _NONE) / (_WHOLE - _NONE), _LEAST, 1.0))
 
     def honest(self, information: Array, T_i_j: Transform) -> Array:
         """Return the (6, 6) information of a relative pose by what the residuals show.
@@ -36,9 +41,4 @@ class LogResiduals:
             information: (6, 6) from features whose errors are independent, and as large as their weights say.
             T_i_j: (4, 4) the measurement.
         """
-        if len(self._keyframes) < _FEWEST:
-            return with_model_error(information, T_i_j)
-        factor = float(np.median([keyframe.variance_factor for keyframe in self._keyframes]))
-        effect = float(np.median([keyframe.design_effect for keyframe in self._keyframes]))
-        scale = float(np.clip((effect - _NONE) / (_WHOLE - _NONE), _LEAST, 1.0))
-        return with_model_error(information / factor, T_i_j, scale=scale)
+        return with_model_error(information / self._factor, T_i_j, scale=self._scale)
