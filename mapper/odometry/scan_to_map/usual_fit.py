@@ -119,7 +119,7 @@ class UsualFit:
     def agrees_little(self, shares: Shares) -> bool:
         """Return whether a direction agrees less than most scans' do, so that a search is worth it."""
         least = self.usual.agreement - _FEW_SPREADS * self._agreement_spread
-        return shares.agreement < min(least, _LITTLE * self.usual.agreement)
+        return self.is_known and shares.agreement < min(least, _LITTLE * self.usual.agreement)
 
     def contradicts(self, shares: Shares) -> bool:
         """Return whether too much stands where rays passed."""
