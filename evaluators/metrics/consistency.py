@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.core.geometry import Array, Transform, adjoint, interpolate, inverse, log
+from mapper.core.geometry import Array, Transform, adjoint, inverse, log
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.graph.marginals import marginals_of
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.run.frame_outcomes import FrameRecord
+from mapper.sensing.wheel_kinematics import pose_at
 
 _NEXT_TO_NOTHING = 1e-6 * np.eye(6)
 """Information of factors that only ask for the covariance of two nodes relative to each other."""
@@ -127,14 +128,4 @@ def _relative_covariances(
 
 def _true_pose(truth: Trajectory, stamp_ns: int) -> Transform | None:
     """Return the truth at a time, interpolated; None outside of it and in its gaps."""
-    after = int(np.searchsorted(truth.stamps_ns, stamp_ns))
-    if after < len(truth) and truth.stamps_ns[after] == stamp_ns:
-        exact: Transform = truth.T_world_body[after]
-        return exact
-    if not 0 < after < len(truth):
-        return None
-    begin_ns, end_ns = truth.stamps_ns[after - 1 : after + 1].tolist()
-    if end_ns - begin_ns > 2 * MAX_TRUTH_GAP_NS:
-        return None
-    share = (stamp_ns - begin_ns) / (end_ns - begin_ns)
-    return interpolate(truth.T_world_body[after - 1], truth.T_world_body[after], share)
+    return pose_at(truth, stamp_ns, max_gap_ns=2 * MAX_TRUTH_GAP_NS)

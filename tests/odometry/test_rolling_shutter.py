@@ -1,9 +1,14 @@
 """Rolling shutter: motion of pixels, the readout time of a bundle, and poses without its error."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mapper.core.geometry import apply, exp, inverse
+from mapper.core.timebase import NS_PER_S
+from mapper.odometry.config import LocalMapConfig
+from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameter
 from mapper.odometry.local_map.pixel_motion import depth_velocity, pixel_velocity, row_phase
 from mapper.odometry.local_map.readout_time import ReadoutTime
@@ -109,3 +114,15 @@ def test_given_readout_time_is_kept():
     readout.learn(information=1e9, gradient=1e9)
     assert readout.seconds == -0.01
     assert not readout.is_estimated
+
+
+@pytest.mark.parametrize("gap_s", [0, 2])
+def test_the_motion_before_a_gap_is_not_that_of_the_image_after_it(frames, gap_s):
+    after = [replace(frame, stamp_ns=frame.stamp_ns + gap_s * NS_PER_S) for frame in frames[6:9]]
+    odometry = build_frame_odometry(LocalMapConfig(readout_s=READOUT_S))
+    results = [odometry.track(odometry.observe(frame)) for frame in (*frames[:6], *after)]
+    assert all(result.node is not None for result in results)
+    speeds = [float(np.linalg.norm(result.twist.translation_mps)) for result in results]
+    assert speeds[5] > 0.0
+    assert (speeds[6] == 0.0) is (gap_s > 1)
+    assert speeds[7] > 0.0

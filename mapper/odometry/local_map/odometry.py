@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.core.deskew import Twist
 from mapper.core.frames import Frame
-from mapper.core.geometry import Array, Transform, adjoint, inverse
+from mapper.core.geometry import Array, Points, Transform, adjoint, inverse
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
@@ -94,12 +94,16 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
 
     def track(self, observation: ImageObservation) -> FrameResult:
         """Track the next frame, in time order."""
-        observation = self._shutter.predicted(observation)
         last = self._last
+        follows = last is not None and not self._lost_frames and _gap_ns(last, observation) <= STEADY_NS
+        if not follows:
+            self._shutter.restart()  # the motion before a gap is not that in this image
+        observation = self._shutter.predicted(observation)
         tracked_pose = None if last is None else self._find_pose(observation, last)
         if last is None or tracked_pose is None:
             return self._not_found(observation)
-        tracked_pose = self._without_row_shifts(tracked_pose)
+        if follows:
+            tracked_pose = self._shutter.refined(tracked_pose, last, self._positions_of(tracked_pose))
         observation = tracked_pose.observation
         information = self._map.pose_information(
             observation, tracked_pose.T_camera_world, tracked_pose.landmark_of_feature
@@ -221,7 +225,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         relocalised = self._relocalizer.best_among(
             candidates, observation, method="relocalised", is_possible=self._is_possible, exhaustive=True
         )
-        if relocalised is None and observation.stamp_ns - last.observation.stamp_ns > STEADY_NS:
+        if relocalised is None and _gap_ns(last, observation) > STEADY_NS:
             return None  # depth alone needs a guess, and by now the camera may be in another room
         found = self._depth.supported(observation, relocalised or last, None, relocalised)
         return found if found is not None and self._is_possible(found) else None
@@ -229,9 +233,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
     def _is_steady(self, tracked_pose: TrackedPose, last: TrackedPose) -> bool:
         """Return whether a pose is soon after the last one, and in its sub-map."""
         keyframes = self._map.keyframes
-        gap_ns = tracked_pose.observation.stamp_ns - last.observation.stamp_ns
         one_map = keyframes[tracked_pose.reference].origin == keyframes[last.reference].origin
-        return gap_ns <= STEADY_NS and one_map
+        return _gap_ns(last, tracked_pose.observation) <= STEADY_NS and one_map
 
     def _is_possible(self, tracked_pose: TrackedPose) -> bool:
         """Return whether a pose after a gap is possible by the motion since, where something else tells it.
@@ -253,13 +256,11 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._unknown_frames = self._config.max_lost_frames  # another place, so a sub-map may begin at once
         return False
 
-    def _without_row_shifts(self, tracked_pose: TrackedPose) -> TrackedPose:
-        """Return a pose without the error of a rolling shutter."""
-        if self._lost_frames or self._last is None:
-            self._shutter.restart()
-            return tracked_pose
+    def _positions_of(self, tracked_pose: TrackedPose) -> Points:
+        """Return the (M, 3) landmarks of a pose's inliers, in the order of their features."""
         ids = tracked_pose.landmark_of_feature
-        return self._shutter.refined(tracked_pose, self._last, self._map.landmarks["position"][ids[ids >= 0]])
+        positions_world: Points = self._map.landmarks["position"][ids[ids >= 0]]
+        return positions_world
 
     def _add_keyframe(
         self, tracked_pose: TrackedPose, *, neighbour: int | None, doubt: Doubt = NO_DOUBT
@@ -333,6 +334,11 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         last = self._last
         T_world_body = np.eye(4) if last is None else _body_pose(last.observation, last.T_camera_world)
         return lost_frame(observation.stamp_ns, T_world_body, features=len(observation), residual_unit="px")
+
+
+def _gap_ns(last: TrackedPose, observation: ImageObservation) -> int:
+    """Return the time since a tracked frame."""
+    return observation.stamp_ns - last.observation.stamp_ns
 
 
 def _body_pose(observation: ImageObservation, T_camera_world: Transform) -> Transform:
