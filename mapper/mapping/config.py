@@ -1,6 +1,6 @@
 """Settings of mapping: levelling, the coloured cloud, and the frames in the MCAP log."""
 
-from typing import Annotated, Protocol
+from typing import Annotated, Literal, Protocol
 
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 
@@ -16,6 +16,9 @@ class LevelConfig(Config):
     """Number of frames, spread over the log, in which planes are searched."""
     plane_tolerance_m: PositiveFloat = 0.03
     """Largest standard deviation of a plane's points from it: the noise of the sensor."""
+    heading: Literal["walls", "start"] = "walls"
+    """What x and y lie along: most walls, where these agree, so that a slice shows them straight; or the
+    first pose's heading."""
 
 
 class McapConfig(Config):

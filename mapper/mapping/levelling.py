@@ -8,10 +8,11 @@ import numpy as np
 
 from mapper.core.errors import DataError
 from mapper.core.frames import Scan, Sensor
-from mapper.core.geometry import Array, Points, Transform, apply, transform
+from mapper.core.geometry import Array, Points, Transform, apply, exp, transform
 from mapper.core.timebase import nearest
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.config import LevelConfig
+from mapper.mapping.heading import WallHeading, wall_heading
 from mapper.mapping.planes import (
     Patches,
     Vertical,
@@ -72,9 +73,9 @@ class Level:
 
     Attributes:
         T_level_world: (4, 4). In the level frame z points up and the floor is at z = 0; the first pose is at
-            x = y = 0 and heads along +x.
+            x = y = 0 and heads along +x, or up to 45° from it where x and y lie along walls.
         method: Source of the vertical: "accelerometer", "planes" or "camera".
-        detail: Quality of the vertical and source of the floor; a sentence for the manifest.
+        detail: Quality of the vertical, source of the floor and of x; a sentence for the manifest.
         has_floor: The floor was seen; else its height is a guess.
     """
 
@@ -102,7 +103,7 @@ def find_level(
         scans: Scans, spread over the log, with their T_world_body.
         trajectory: Poses of the body; at least one.
         accelerations: Readings in the accelerometer's own axes, which may be a permutation of the body's.
-        config: Gives the tolerance of planes.
+        config: Gives the tolerance of planes, and what x lies along.
         axes: Rough attitude of the sensor's body.
 
     Raises:
@@ -122,7 +123,13 @@ def find_level(
         floor_m, floor_detail = _floor(patches, heights_m, up_world=up_world, tolerance_m=tolerance_m)
     T_level_world = _frame(trajectory.T_world_body[0], up_world, floor_m, axes)
     has_floor = floor_detail.startswith(_FLOOR_SEEN)
-    return Level(T_level_world, method, f"{up_detail}; {floor_detail}", has_floor)
+    details = [up_detail, floor_detail]
+    if config.heading == "walls":
+        walls = wall_heading(patches, T_level_world[:3, :3])
+        if walls.determined:
+            T_level_world = exp(np.array([0.0, 0.0, -walls.angle_rad]), np.zeros(3)) @ T_level_world
+        details.append(_heading_text(walls))
+    return Level(T_level_world, method, "; ".join(details), has_floor)
 
 
 def _up(
@@ -302,3 +309,10 @@ def _planes_text(vertical: Vertical, count: int) -> str:
         f"{100 * vertical.upright_ratio:.0f} % upright"
     )
     return text if vertical.determined else f"{text}, all facing one way: the tilt along them is the camera's"
+
+
+def _heading_text(walls: WallHeading) -> str:
+    text = f"{100 * walls.agreeing_ratio:.0f} % of {walls.upright} upright patches agree on a heading"
+    if not walls.determined:
+        return f"x is the first pose's heading, since only {text}"
+    return f"x lies along walls, {np.degrees(walls.angle_rad):.1f}° from the first pose's heading: {text}"

@@ -17,6 +17,7 @@ from tests.support.paths import FR1_XYZ
 
 CAMERA = PinholeCamera(width_px=160, height_px=120, fx_px=130.0, fy_px=130.0, cx_px=79.5, cy_px=59.5)
 MS = 1_000_000
+_DEFAULTS = LevelConfig()
 
 
 @dataclass
@@ -86,8 +87,8 @@ def around(*, x=0.0, down_deg=25.0, n=12, height_m=1.4, span_deg=90.0):
     ]
 
 
-def level_of(scans, trajectory, accelerations=None, **body):
-    return find_level(scans, trajectory=trajectory, accelerations=accelerations, config=LevelConfig(), **body)
+def level_of(scans, trajectory, accelerations=None, config=_DEFAULTS, **body):
+    return find_level(scans, trajectory=trajectory, accelerations=accelerations, config=config, **body)
 
 
 def tilt_deg(level, T_world_room):
@@ -113,12 +114,27 @@ def test_a_room_is_levelled_from_any_world(seed, down_deg):
 
 def test_the_first_pose_is_at_the_origin_and_faces_along_x():
     scans, trajectory, _ = log_of(ROOM, around())
-    T_level_first = level_of(scans, trajectory).T_level_world @ trajectory.T_world_body[0]
+    level = level_of(scans, trajectory, config=LevelConfig(heading="start"))
+    T_level_first = level.T_level_world @ trajectory.T_world_body[0]
     np.testing.assert_allclose(T_level_first[:3, 3], [0.0, 0.0, 1.4], atol=0.02)
     heading = T_level_first[:3, :3] @ AXES["rgbd"].forward
     assert heading[0] > 0.8
     assert abs(heading[1]) < 1e-12
     assert (T_level_first[:3, :3] @ AXES["rgbd"].up)[2] > 0.8
+
+
+@pytest.mark.parametrize("yaw_deg", [-40.0, 17.0, 63.0, 130.0])
+def test_x_lies_along_walls(yaw_deg):
+    T_other_room = exp(np.radians([0.0, 0.0, yaw_deg]), np.zeros(3))
+    turned = [T_other_room @ one for one in around()]
+    scans, trajectory, T_world_room = log_of(ROOM, turned)
+    level = level_of(scans, trajectory)
+    R_level_room = level.T_level_world[:3, :3] @ T_world_room[:3, :3]
+    assert np.abs(R_level_room[0, :2]).max() > np.cos(np.radians(0.3))
+    first = level.T_level_world @ trajectory.T_world_body[0]
+    np.testing.assert_allclose(first[:3, 3], [0.0, 0.0, 1.4], atol=0.02)
+    assert (first[:3, :3] @ AXES["rgbd"].forward)[0] > np.cos(np.radians(46.0)) * 0.9
+    assert "x lies along walls" in level.detail
 
 
 def test_a_camera_facing_straight_down_takes_its_heading_from_its_own_up():
