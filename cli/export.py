@@ -7,7 +7,7 @@ import typer
 
 from cli.console import progress_for
 from cli.environment import prepare_libraries
-from cli.options import MovedLogs, Overrides, Quiet
+from cli.options import MovedLogs, Overrides, Quiet, assignments, merged
 from mapper.export.exporters import EXPORTERS
 
 _KINDS = "; ".join(f"{kind}: {exporter.summary}" for kind, exporter in EXPORTERS.items())
@@ -20,6 +20,10 @@ def export(
         Path | None, typer.Option(help="File to write; omit to keep it in RUN under its usual name.")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
+    level: Annotated[
+        int | None,
+        typer.Option(help="With --as octomap: levels of the tree to leave away; each doubles the voxels."),
+    ] = None,
     set_: Overrides = None,
     log: MovedLogs = None,
     quiet: Quiet = False,
@@ -36,7 +40,8 @@ def export(
     built = load_run(run)
     if log:
         built = moved_log(built, *log)
-    config = overridden(built.config, set_) if set_ else None
+    changes = merged(assignments({"octomap.level": level}), set_)
+    config = overridden(built.config, changes) if changes else None
     progress = progress_for(quiet=quiet)
     path = export_run(built, as_, out, config=config, overwrite=overwrite, progress=progress)
     if not quiet:

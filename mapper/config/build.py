@@ -2,7 +2,7 @@
 
 from pydantic import NonNegativeInt, PositiveInt
 
-from mapper.config.export import MeshConfig, RerunConfig
+from mapper.config.export import MeshConfig, OctomapConfig, RerunConfig
 from mapper.core.config import Config, Ratio
 from mapper.graph.config import GraphConfig
 from mapper.loops.config import LoopsConfig, PlaceLoopsConfig
@@ -29,6 +29,7 @@ class BuildConfig(Config):
     rerun: RerunConfig = RerunConfig()
     mesh: MeshConfig = MeshConfig()
     costmap: CostmapConfig = CostmapConfig()
+    octomap: OctomapConfig = OctomapConfig()
     min_tracked_frames: PositiveInt = 10
     """With fewer frames tracked no map is made, and the build ends in an error."""
     min_tracked_ratio: Ratio = 0.2

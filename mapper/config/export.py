@@ -5,6 +5,7 @@ from typing import Annotated
 from pydantic import Field, PositiveFloat, PositiveInt
 
 from mapper.core.config import Config
+from mapper.octree.config import Parent
 
 
 class MeshConfig(Config):
@@ -19,6 +20,16 @@ class MeshConfig(Config):
     """Every n-th tracked frame is fused."""
     min_observations: PositiveInt = 3
     """Surface seen in fewer fused frames is left out."""
+
+
+class OctomapConfig(Config):
+    """The octree of ``mapper export --as octomap``."""
+
+    level: Annotated[int, Field(ge=0, le=12)] = 0
+    """Levels of the tree that are left away: voxels are 2**level times as wide as the map's."""
+    parent: Parent = "mean"
+    """Log-odds of a wider voxel: "mean" of what it holds (Zhao et al. 2020, eq. 14), or "max", by which
+    nothing occupied is overlooked."""
 
 
 class RerunConfig(Config):

@@ -48,7 +48,13 @@ class Exporter:
 _MESH_ENDINGS = (".ply", ".obj", ".glb")
 
 EXPORTERS = {
-    "octomap": Exporter("octree for OctoMap and ROS", "stored_files:octomap", "map.bt", (".bt", ".ot")),
+    "octomap": Exporter(
+        "octree for OctoMap and ROS",
+        "stored_files:octomap",
+        "map.bt",
+        (".bt", ".ot"),
+        settings="octomap",
+    ),
     "native": Exporter("octree with all attributes", "stored_files:native", "map.octree", (".octree",)),
     "ply": Exporter("coloured cloud", "stored_files:cloud", "cloud.ply", (".ply",)),
     "voxels": Exporter("occupied voxels' centres", "voxels:centres", "voxels.ply", (".ply",)),

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from mapper.core.errors import RunError
 from mapper.export.grid import read_grid, write_grid
+from mapper.octree.octomap_file import read_map, write_bt, write_ot
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.runtime.atomic import atomic_file
@@ -13,8 +14,20 @@ from mapper.sources.trajectory_files import write_kitti
 
 
 def octomap(run: Run, path: Path, _progress: Progress) -> None:
-    """Copy the octree: free or occupied as ``.bt``, log-odds as ``.ot``."""
-    _copy(run, files.OCTREE_OT if path.suffix.lower() == ".ot" else files.OCTREE_BT, path)
+    """Write the octree: free or occupied as ``.bt``, log-odds as ``.ot``; with wider voxels if so configured.
+
+    Raises:
+        RunError: Wider voxels are to replace the run's own octree.
+    """
+    level, full = run.config.octomap.level, path.suffix.lower() == ".ot"
+    name = files.OCTREE_OT if full else files.OCTREE_BT
+    if level == 0:
+        _copy(run, name, path)
+        return
+    if _is_same(run.path / name, path):
+        raise RunError(f"{path}: is the run's own octree; name another file to write level {level} to")
+    octree = read_map(run.path / files.OCTREE_MAP).coarser(level, parent=run.config.octomap.parent)
+    (write_ot if full else write_bt)(path, octree)
 
 
 def native(run: Run, path: Path, _progress: Progress) -> None:

@@ -8,6 +8,10 @@ from mapper.core.config import Config
 
 Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
 
+Parent = Literal["max", "mean"]
+"""Log-odds of a node from its known children: the highest, as in OctoMap (Hornung et al. 2013, eq. 7:
+nothing occupied is overlooked), or their mean (Zhao et al. 2020, eq. 14)."""
+
 
 class OctreeConfig(Config):
     """OctoMap's sensor model and geometry (Hornung et al. 2013); its defaults."""

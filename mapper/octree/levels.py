@@ -1,7 +1,5 @@
 """The map at coarser levels: log-odds of the octree's inner nodes."""
 
-from typing import Literal
-
 import numpy as np
 from numba import njit
 from numpy import float32, int64
@@ -10,11 +8,8 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError
 from mapper.core.geometry import Points
 from mapper.octree.blocks import BlockStore
+from mapper.octree.config import Parent
 from mapper.octree.keys import BLOCK_BITS, BLOCK_DEPTH, BLOCK_VOXELS, KEY_BITS, codes_of, gather
-
-Parent = Literal["max", "mean"]
-"""Log-odds of a node from its known children: the highest, as in OctoMap (Hornung et al. 2013, eq. 7:
-nothing occupied is overlooked), or their mean (Zhao et al. 2020, eq. 14)."""
 
 
 def nodes_at(

@@ -13,9 +13,8 @@ from mapper.octree.attributes import NEVER_SEEN, AttributeLayer, ended_blocks
 from mapper.octree.blocks import BlockStore
 from mapper.octree.boxes import BoxCounts, count_boxes
 from mapper.octree.casting import Cast, Caster, origin_key
-from mapper.octree.config import OctreeConfig
-from mapper.octree.keys import KEY_BITS, KEY_ZERO
-from mapper.octree.levels import Parent
+from mapper.octree.config import OctreeConfig, Parent
+from mapper.octree.keys import KEY_BITS, KEY_ZERO, codes_of
 from mapper.octree.nearest import Nearest, nearest_occupied
 from mapper.octree.scan_update import ScanUpdate
 from mapper.octree.seen_through import SeenThrough
@@ -309,6 +308,26 @@ class OctreeMap:
         )
         self._known += added
         return Overlap(*overlap)
+
+    def coarser(self, levels: int, *, parent: Parent = "mean") -> "OctreeMap":
+        """Return the map of the nodes some levels above the voxels, as voxels 2**levels times as wide.
+
+        It has no attributes.
+
+        Args:
+            levels: 0 … 16.
+            parent: See :meth:`query`.
+
+        Raises:
+            DataError: No such level or parent.
+        """
+        nodes = self.leaves(depth=KEY_BITS - levels, parent=parent)
+        update = {"resolution_m": nodes.edge_m, "attributes": False}
+        coarse = OctreeMap(self.config.model_copy(update=update))
+        depths = np.full(len(nodes.log_odds), KEY_BITS, np.uint8)
+        codes = codes_of(nodes.centres_world, nodes.edge_m)
+        coarse.restore(TreeLeaves(codes, depths, nodes.log_odds))
+        return coarse
 
     def clamp(self) -> None:
         """Clip all log-odds to the sensor model's limits."""

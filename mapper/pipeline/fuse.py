@@ -43,7 +43,7 @@ from mapper.runtime.timing import peak_memory_mb
 from mapper.sources.base import Log
 
 _FUSE_CONFIGS = frozenset(
-    {"octree", "slice", "traversable", "cloud", "mcap", "mesh", "costmap", "rerun", "workers"}
+    {"octree", "slice", "traversable", "cloud", "mcap", "mesh", "costmap", "octomap", "rerun", "workers"}
 )
 _TRACKING_STAGES = ("track", "solve", "level")
 

@@ -164,6 +164,27 @@ def out_of(folder, kind):
     return folder / f"taken{EXPORTERS[kind].endings[0]}"
 
 
+@pytest.mark.parametrize("ending", [".bt", ".ot"])
+def test_an_octree_of_wider_voxels_is_one_that_octomap_reads(untouched, tmp_path, ending):
+    config = overridden(untouched.config, ["octomap.level=2"])
+    path = export(untouched, "octomap", tmp_path / f"coarse{ending}", config=config)
+    tree = pyoctomap.OcTree(1.0)
+    if ending == ".bt":
+        assert tree.readBinary(str(path))
+    else:
+        tree = tree.read(str(path))
+    assert tree.getResolution() == pytest.approx(0.4)
+    mean = read_map(untouched.path / "map.octree").leaves(depth=14, parent="mean")
+    for centre, log_odds in zip(mean.centres_world, mean.log_odds, strict=True):
+        assert tree.isNodeOccupied(tree.search(centre)) == (log_odds >= 0.0)
+
+
+def test_an_octree_of_wider_voxels_does_not_replace_the_run_s_own(untouched):
+    config = overridden(untouched.config, ["octomap.level=2"])
+    with pytest.raises(RunError, match="name another file"):
+        export(untouched, "octomap", config=config)
+
+
 def test_what_is_written_is_read_by_others(untouched, kind, tmp_path):
     out = out_of(tmp_path / "new" / "folder", kind)
     assert export(untouched, kind, out) == out

@@ -105,6 +105,9 @@ def test_the_tables_hold_every_run_side_by_side(page, runs):
     )
     assert '<tr class="differs"><th>odometry.kind</th>' in text
     assert "<tr><th>octree.resolution_m</th>" in text
+    size = (runs[0].path / "map.bt").stat().st_size
+    cells = text.partition("Map sizes")[2]
+    assert f">{size / 1e6:.3g} MB, {100 * size / (runs[0].path / 'cloud.ply').stat().st_size:.3g} %" in cells
     for library, version in runs[0].manifest.libraries.items():
         assert f'<th>{library}</th><td data-of="0">{version}</td>' in text
 

@@ -80,6 +80,16 @@ def test_coarse_leaves_agree_with_coarse_queries(octree, depth):
     assert leaves.edge_m == pytest.approx(0.05 * 2 ** (16 - depth))
 
 
+@pytest.mark.parametrize("levels", [0, 1, 3, 6])
+@pytest.mark.parametrize("parent", ["max", "mean"])
+def test_a_coarser_map_answers_as_the_level_does(octree, points, levels, parent):
+    coarse = octree.coarser(levels, parent=parent)
+    assert coarse.resolution_m == pytest.approx(0.05 * 2**levels)
+    assert len(coarse) == len(octree.leaves(depth=16 - levels).log_odds)
+    wanted = octree.query(points, depth=16 - levels, parent=parent)
+    np.testing.assert_array_equal(coarse.query(points), wanted)
+
+
 def test_a_coarse_query_outside_the_key_range_is_unknown(octree):
     outside = np.array([[1e9, 0.0, 0.0], [-1e9, 0.0, 0.0], [np.nan, 0.0, 0.0], [1638.5, 0.0, 0.0]])
 

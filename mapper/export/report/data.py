@@ -16,11 +16,13 @@ from mapper.export.grid import grid_image, read_grid
 from mapper.export.path_band import SIGMAS
 from mapper.loops.closure import LoopClosure
 from mapper.mapping.thumbnails import encode_jpeg
+from mapper.octree.octomap_file import bt_bytes, read_map
 from mapper.octree.slice import OccupancyGrid
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.run.results import RunResults, load_results
 
+_SIZED_LEVELS = 4
 _VIEW_PX = 1600
 _VIEW_QUALITY = 85
 
@@ -91,6 +93,22 @@ def drawn(chapter: Chapter) -> dict[str, Any]:
         "loops": [_loop(loop, results, seconds) for loop in results.loops],
         "slice": _plan(read_grid(chapter.run.path / f"{files.SLICE}.yaml")),
     }
+
+
+def map_sizes(chapter: Chapter) -> dict[str, str]:
+    """Return the sizes of the cloud and of the octree at a few levels (Zhao et al. 2020, Table 5)."""
+    run = chapter.run
+    octree = read_map(run.path / files.OCTREE_MAP)
+    cloud_bytes = (run.path / files.CLOUD).stat().st_size
+    points = run.manifest.counts.cloud_points
+    sizes = {"coloured cloud": f"{cloud_bytes / 1e6:.3g} MB, {points} points"}
+    for level in range(_SIZED_LEVELS):
+        coarse = octree.coarser(level, parent="max")
+        octree_bytes = bt_bytes(coarse)
+        sizes[f"octree, {coarse.resolution_m:g} m"] = (
+            f"{octree_bytes / 1e6:.3g} MB, {100.0 * octree_bytes / cloud_bytes:.3g} % of the cloud"
+        )
+    return sizes
 
 
 def residual_unit(results: RunResults) -> str:

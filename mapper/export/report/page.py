@@ -10,7 +10,7 @@ from typing import Any
 
 from mapper.core.errors import ConfigError
 from mapper.export.html import document, section
-from mapper.export.report.data import Chapter, drawn, residual_unit, views_uri
+from mapper.export.report.data import Chapter, drawn, map_sizes, residual_unit, views_uri
 from mapper.run.verdict import verdict_on
 from mapper.runtime.atomic import write_text
 
@@ -54,6 +54,7 @@ def page_of(chapters: Sequence[Chapter]) -> str:
             section("Over time", _curves(chapters)),
             section("Loops", "".join(starmap(_loops, enumerate(chapters)))),
             section("Views", _columns(starmap(_views, enumerate(chapters)))),
+            section("Map sizes", _table(["", *_names(chapters)], _side_by_side(chapters, map_sizes))),
             section("Timing", _table(["", *_names(chapters)], _side_by_side(chapters, _timing))),
             section("Versions", _table(["", *_names(chapters)], _side_by_side(chapters, _versions))),
             section("Configuration", _settings(chapters)),
