@@ -53,7 +53,7 @@ def register(
     Example: mapper register scan_10.bin scan_00.bin --method hough-gicp --out registered
     """
     from evaluators.register.config import check_method, register_config
-    from evaluators.register.files import registration_text, write_registration
+    from evaluators.register.files import FOLDER, registration_text, write_registration
     from evaluators.register.registration import register as register_frames
     from mapper.config.loading import overridden
     from mapper.core.errors import RegistrationError
@@ -75,7 +75,7 @@ def register(
     if not quiet:
         print(registration_text(registered))
     if out is not None:
-        with atomic_folder(out, overwrite=overwrite) as folder:
+        with atomic_folder(out, FOLDER, overwrite=overwrite) as folder:
             write_registration(
                 folder,
                 registered,

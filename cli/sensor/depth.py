@@ -66,7 +66,7 @@ def depth(
     --config kinect/sensor.toml
     """
     from evaluators.depth_camera.study import depth_text, study_depth
-    from evaluators.pictures.depth_camera import SENSOR, write_depth_study
+    from evaluators.pictures.depth_camera import FOLDER, SENSOR, write_depth_study
     from mapper.config.loading import load_config
     from mapper.runtime.atomic import atomic_folder
     from mapper.sources import open_source
@@ -76,7 +76,7 @@ def depth(
     config = load_config(None, merged(selection(first, last, stride, None), set_)).source
     prepare_libraries()
     sources = [open_source(log, config) for log in logs]
-    with nullcontext() if out is None else atomic_folder(out, overwrite=overwrite) as folder:
+    with nullcontext() if out is None else atomic_folder(out, FOLDER, overwrite=overwrite) as folder:
         study = study_depth(
             sources,
             distances_m,

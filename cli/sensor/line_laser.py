@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from mapper.line_laser.config import StripeConfig
     from mapper.line_laser.ranging import LineScan
 
+_TABLE_2_1 = "table_2.1.csv"
 _SHOWN = 3  # images whose detections are drawn
 
 Knobs = Annotated[
@@ -54,7 +55,7 @@ def line_laser(
     from mapper.config.loading import overridden, read_config
     from mapper.line_laser.config import THESIS, LineLaserCalibration, LineLaserConfig
     from mapper.line_laser.files import find_images
-    from mapper.line_laser.products import write_drive, write_scans
+    from mapper.line_laser.products import FOLDER, write_drive, write_scans
     from mapper.line_laser.survey import drive, scan_images, sensor_poses
     from mapper.runtime.atomic import atomic_folder
 
@@ -68,7 +69,7 @@ def line_laser(
     if wheels is not None:
         T_world_sensor, told = sensor_poses(wheels, known)
         notes += told
-    with atomic_folder(out, overwrite=overwrite) as folder:
+    with atomic_folder(out, FOLDER, overwrite=overwrite) as folder:
         scans, more = scan_images(paths, stamps_ns, known, config, progress=progress)
         notes += more
         if T_world_sensor is not None:
@@ -159,16 +160,22 @@ def accuracy(
     from evaluators.tables.table import csv_text
     from mapper.config.loading import overridden
     from mapper.line_laser.config import LineLaserConfig
-    from mapper.runtime.atomic import MANIFEST_NAME, atomic_folder, write_text
+    from mapper.line_laser.products import DETECTIONS
+    from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text
 
     prepare_libraries()
     config = overridden(LineLaserConfig(), set_ or [])
-    with atomic_folder(out, overwrite=overwrite) if out else nullcontext() as folder:
+    tables = FolderKind(
+        "a line laser's accuracy",
+        manifest_keys=frozenset(LineLaserConfig.model_fields),
+        files=frozenset({DETECTIONS, _TABLE_2_1}),
+    )
+    with atomic_folder(out, tables, overwrite=overwrite) if out else nullcontext() as folder:
         found = study(config, range(seeds), progress=progress_for(quiet=quiet))
         scenes, ranges = detections(found), table_2_1(found)
         if folder is not None:
-            write_text(folder / "detections.csv", csv_text(scenes.records))
-            write_text(folder / "table_2.1.csv", csv_text(ranges.records))
+            write_text(folder / DETECTIONS, csv_text(scenes.records))
+            write_text(folder / _TABLE_2_1, csv_text(ranges.records))
             write_text(folder / MANIFEST_NAME, config.model_dump_json(indent=1) + "\n")
     if not quiet:
         print(f"{scenes.text()}\n\n{ranges.text()}")

@@ -19,7 +19,7 @@ from evaluators.study.engine import CELLS
 from evaluators.tables.table import column, csv_text
 from mapper.core.geometry import Array
 from mapper.run.manifest import library_versions
-from mapper.runtime.atomic import MANIFEST_NAME, atomic_folder, write_text
+from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 from mapper.sources.trajectory_files import write_tum
@@ -29,6 +29,14 @@ ODOMETRY, REGISTRATION, TRIALS = "odometry.csv", "registration.csv", "trials.csv
 PATHS_VIEW, PATH_ERRORS_VIEW, REGISTRATION_VIEW = "paths.png", "path_errors.png", "registration_errors.png"
 MCAP = "compare.mcap"
 TRAJECTORIES = "trajectories"
+_FOLDER = FolderKind(
+    "a comparison",
+    manifest_keys=frozenset({"kind", "log", "mapper_version", "config"}),
+    files=frozenset(
+        {TABLES, REPORT, ODOMETRY, REGISTRATION, TRIALS, PATHS_VIEW, PATH_ERRORS_VIEW, REGISTRATION_VIEW}
+        | {MCAP, TRAJECTORIES, CELLS}
+    ),
+)
 
 
 def compare_into(
@@ -54,7 +62,9 @@ def compare_into(
         DataError: As for ``compare``.
     """
     plan = json.dumps(_manifest(source.path, config), indent=2, ensure_ascii=False) + "\n"
-    with atomic_folder(out, overwrite=overwrite, keeps=lambda partial: _begun_with(partial, plan)) as folder:
+    with atomic_folder(
+        out, _FOLDER, overwrite=overwrite, keeps=lambda partial: _begun_with(partial, plan)
+    ) as folder:
         write_text(folder / MANIFEST_NAME, plan)
         comparison = compare(source, config, folder / CELLS, progress=progress)
         write_comparison(folder, comparison)

@@ -19,6 +19,7 @@ from mapper.core.errors import SourceError
 from mapper.core.geometry import Array
 from mapper.line_laser.config import StripeConfig
 from mapper.line_laser.detection import Method
+from mapper.line_laser.products import DETECTIONS, RANGE_ERRORS
 from mapper.line_laser.ranging import LineScan
 from mapper.runtime.atomic import write_text
 from mapper.sources.images import read_colour
@@ -58,8 +59,8 @@ class LabelScores:
 
     def write(self, folder: Path) -> None:
         """Write both tables as ``detections.csv`` and ``range_errors.csv``."""
-        write_text(folder / "detections.csv", csv_text(self._detections.records))
-        write_text(folder / "range_errors.csv", csv_text(self._ranges.records))
+        write_text(folder / DETECTIONS, csv_text(self._detections.records))
+        write_text(folder / RANGE_ERRORS, csv_text(self._ranges.records))
 
     @property
     def _detections(self) -> Table:

@@ -16,13 +16,18 @@ from evaluators.tables.table import csv_text
 from mapper.export.page import FAINT, INK, LINE, hex_of, save
 from mapper.export.palette import Rgb
 from mapper.export.panels import caption, page, panel
-from mapper.runtime.atomic import MANIFEST_NAME, write_text
+from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, write_text
 from mapper.sensing.depth_noise import depth_sigma_m
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SENSOR, NUMBERS, ACCURACY, RESIDUALS = "sensor.toml", "depth.csv", "accuracy.png", "residuals.png"
+FOLDER = FolderKind(
+    "a depth camera's study",
+    manifest_keys=frozenset({"kind", "noise", "levels"}),
+    files=frozenset({SENSOR, NUMBERS, ACCURACY, RESIDUALS}),
+)
 
 _RAW: Rgb = (38, 145, 87)
 _FILTERED: Rgb = (214, 69, 37)

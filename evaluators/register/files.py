@@ -14,9 +14,14 @@ from mapper.core.frames import Scan, Sensor
 from mapper.core.geometry import apply
 from mapper.export.palette import ESTIMATE
 from mapper.export.ply import write_ply
-from mapper.runtime.atomic import MANIFEST_NAME, write_text
+from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, write_text
 
 ALIGNED, PICTURE, RECORDING = "aligned.ply", "registration.png", "registration.mcap"
+FOLDER = FolderKind(
+    "a registration",
+    manifest_keys=frozenset({"method", "trusted", "T_target_source"}),
+    files=frozenset({ALIGNED, PICTURE, RECORDING}),
+)
 
 
 def registration_text(registered: Registered) -> str:

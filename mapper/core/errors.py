@@ -72,5 +72,13 @@ class RunError(MapperError):
     """A run folder that is missing, unfinished or already exists."""
 
 
+class WriteError(MapperError):
+    """A file or folder that cannot be written, as when the disk is full."""
+
+
+class Terminated(KeyboardInterrupt):
+    """The process was told to end by SIGTERM; work ends as it does at Ctrl-C."""
+
+
 class MapperWarning(UserWarning):
     """A warning that a user should read; ``cli`` prints it as one line."""

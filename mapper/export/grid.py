@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError, MapFileError
 from mapper.export.palette import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, shrunk
-from mapper.runtime.atomic import atomic_file, write_bytes, write_text
+from mapper.runtime.atomic import write_bytes, write_text
 
 FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
 OCCUPIED_THRESHOLD = 0.65
@@ -90,9 +90,10 @@ def _write_picture(path: Path, grid: OccupancyGrid) -> None:
     grid = shrunk(grid, _MOST_PX)
     enlargement = -(-_PICTURE_PX // max(grid.cells.shape))
     image = grid_image(grid)[::-1].repeat(enlargement, axis=0).repeat(enlargement, axis=1)
-    with atomic_file(path) as part:
-        if not cv2.imwrite(str(part), image[:, :, ::-1]):
-            raise DataError(f"{path}: a grid of {grid.cells.shape} cells cannot be written as PNG")
+    encoded, png = cv2.imencode(".png", image[:, :, ::-1])
+    if not encoded:
+        raise DataError(f"{path}: a grid of {grid.cells.shape} cells cannot be written as PNG")
+    write_bytes(path, png.tobytes())
 
 
 def _read_settings(path: Path) -> dict[str, str]:

@@ -11,10 +11,13 @@ from mapper.graph.components import components
 from mapper.graph.config import GraphConfig
 from mapper.graph.g2o import write_g2o
 from mapper.graph.model import PoseGraph, Solution
-from mapper.runtime.atomic import atomic_folder, write_text
+from mapper.runtime.atomic import FolderKind, atomic_folder, write_text
 from mapper.sources.trajectory_files import write_tum
 
 GRAPH, KEYFRAMES, PICTURE, REPORT = "graph.g2o", "keyframes.tum", "graph.png", "solve.json"
+_FOLDER = FolderKind(
+    "a solved graph", manifest_keys=frozenset(), files=frozenset({GRAPH, KEYFRAMES, PICTURE, REPORT})
+)
 BELIEVED = 0.5
 """A factor that weighs less is rejected."""
 
@@ -70,7 +73,7 @@ def write_solved_graph(out: Path, solved: SolvedGraph) -> None:
         return
     if out.exists():
         raise RunError(f"{out}: exists already; choose another --out, or a file that ends in .g2o")
-    with atomic_folder(out) as folder:
+    with atomic_folder(out, _FOLDER) as folder:
         write_g2o(folder / GRAPH, solved.solved)
         by_time = sorted((stamp, node) for node, stamp in solved.graph.stamps_ns.items())
         poses = ((stamp, solved.solution.T_world_node[node]) for stamp, node in by_time)

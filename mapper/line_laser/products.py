@@ -16,11 +16,25 @@ from mapper.line_laser.calibration import calibration_text
 from mapper.line_laser.config import LineLaserCalibration, LineLaserConfig
 from mapper.line_laser.ranging import LineScan, local_grid
 from mapper.line_laser.survey import Drive
-from mapper.runtime.atomic import MANIFEST_NAME, atomic_file, write_bytes, write_text
+from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_file, write_bytes, write_text
 from mapper.sources.trajectory_files import write_tum
 
 RANGES, LOCAL, MAP, MAP_PICTURE = "ranges.csv", "local", "map", "map_and_path.png"
 POINTS, TRAJECTORY, CALIBRATION = "points.ply", "trajectory.txt", "calibration.toml"
+DETECTIONS, RANGE_ERRORS, DETECTION_VIEWS = "detections.csv", "range_errors.csv", "detection_*.png"
+FOLDER = FolderKind(
+    "a line laser's ranges",
+    manifest_keys=frozenset({"images", "config", "notes"}),
+    files=frozenset(
+        {RANGES, LOCAL, MAP_PICTURE, POINTS, TRAJECTORY, CALIBRATION}
+        | {
+            DETECTIONS,
+            RANGE_ERRORS,
+            DETECTION_VIEWS,
+            *(f"{MAP}{ending}" for ending in (".pgm", ".yaml", ".png")),
+        }
+    ),
+)
 
 
 def write_scans(

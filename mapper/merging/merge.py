@@ -13,7 +13,16 @@ from mapper.core.errors import ConfigError, RunError
 from mapper.core.geometry import apply
 from mapper.export.grid import write_grid
 from mapper.merging.jobs import JoinedTile, SlicedColumn, SplitRun, Workspace, join_tile, split_run
-from mapper.merging.merged_map import TILES, MapManifest, MergedMap, RunInMap, Tile, open_map
+from mapper.merging.merged_map import (
+    MERGED_MAP,
+    SCRATCH,
+    TILES,
+    MapManifest,
+    MergedMap,
+    RunInMap,
+    Tile,
+    open_map,
+)
 from mapper.merging.octomap_files import write_whole_bt, write_whole_ot
 from mapper.merging.placing import Placed, warnings_about
 from mapper.merging.slicing import draw, slice_map
@@ -22,7 +31,7 @@ from mapper.merging.tiling import tiling_for
 from mapper.octree.config import OctreeConfig
 from mapper.run import files
 from mapper.run.fingerprint import fingerprint
-from mapper.run.manifest import RunWarning, is_merged_map
+from mapper.run.manifest import RunWarning
 from mapper.run.warnings import merge_warnings
 from mapper.runtime.atomic import MANIFEST_NAME, atomic_folder
 from mapper.runtime.executor import IN_PROCESS, Workers, make_executor
@@ -31,7 +40,6 @@ from mapper.runtime.resumable_jobs import JobRunner
 
 DEFAULT_TILE_M = 50.0
 
-_SCRATCH = "work"
 _MUST_AGREE = (
     "resolution_m",
     "hit_probability",
@@ -85,8 +93,6 @@ def merge(
         ConfigError: The runs do not agree in resolution or sensor model, or the tiles' edge is impossible.
         RunError: OUT is there already, a run comes twice or lacks its map, or a job failed.
     """
-    if overwrite and out.exists() and not is_merged_map(out):
-        raise RunError(f"{out}: is no merged map, so --overwrite will not replace it; choose another --out")
     config = _common_config(placed)
     tiling = tiling_for(config.resolution_m, tile_m)
     manifest = MapManifest(
@@ -100,14 +106,14 @@ def merge(
     with (
         make_executor(workers) as executor,
         atomic_folder(
-            out, overwrite=overwrite, keeps=lambda partial: _begun_alike(partial, manifest)
+            out, MERGED_MAP, overwrite=overwrite, keeps=lambda partial: _begun_alike(partial, manifest)
         ) as folder,
     ):
         manifest.save(folder)
         warnings = warnings_about(placed)
         for note in warnings:
             progress.note(note)
-        workspace = Workspace(folder, folder / _SCRATCH, tiling, config)
+        workspace = Workspace(folder, folder / SCRATCH, tiling, config)
         stages = Stages(JobRunner(workspace.scratch / "done", progress), executor, progress)
         split = _split(workspace, stages, placed)
         joined = _join(workspace, stages, split, follows_ground=manifest.slice.above == "ground")

@@ -14,10 +14,16 @@ from mapper.core.geometry import Array
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import read_map
+from mapper.run import files
 from mapper.run.manifest import is_merged_map
-from mapper.runtime.atomic import MANIFEST_NAME, partial_of, write_text
+from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, partial_of, write_text
 
-TILES = "tiles"
+TILES, SCRATCH = "tiles", "work"
+MERGED_MAP = FolderKind(
+    "a merged map",
+    manifest_keys=frozenset({"kind", "status", "tile_m", "tiles"}),
+    files=files.names_of("maps", "exported maps") | {TILES, SCRATCH},
+)
 
 Corner = tuple[float, float, float]
 

@@ -20,6 +20,7 @@ from mapper.core.errors import MapFileError
 from mapper.core.geometry import Transform, angle_between
 from mapper.octree.config import OctreeConfig
 from mapper.octree.scan_update import ScanUpdate, decompressed
+from mapper.runtime.atomic import writing
 
 _FORMAT = "mapper sights 1"  # the updates' former name: files with it are still read
 _RAY_SETTINGS = {"resolution_m", "max_range_m", "discretize"}
@@ -58,11 +59,13 @@ def cache_update(stamp_ns: int, T_world_body: Transform, update: ScanUpdate) -> 
 
 
 class ScanUpdateWriter:
-    """Writer of a new file, frame by frame; a context manager."""
+    """Writer of a new file, frame by frame; a context manager. A full disk raises WriteError."""
 
     def __init__(self, path: Path, config: OctreeConfig) -> None:
-        self._file = path.open("wb")
-        self._file.write(_first_line(config))
+        self._path = path
+        with writing(path):
+            self._file = path.open("wb")
+            self._file.write(_first_line(config))
 
     def __enter__(self) -> Self:
         return self
@@ -70,13 +73,15 @@ class ScanUpdateWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._file.close()
+        with writing(self._path):
+            self._file.close()
 
     def add(self, frame: CachedUpdate) -> None:
         """Append one frame."""
         head = np.array((frame.stamp_ns, frame.T_world_body, frame.blocks, len(frame.data)), dtype=_HEAD)
-        self._file.write(head.tobytes())
-        self._file.write(frame.data)
+        with writing(self._path):
+            self._file.write(head.tobytes())
+            self._file.write(frame.data)
 
 
 class ScanUpdateFile:

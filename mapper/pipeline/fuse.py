@@ -103,7 +103,7 @@ def fuse_changed(
     refuse_another_log(run, source)
     status: Status = "building"
     manifest = moved_log(run, *paths_of(source)).manifest.model_copy(update={"status": status})
-    with write_run(run.path, manifest, run.config, overwrite=True) as writer:
+    with write_run(run.path, manifest, run.config, overwrite=True, takes_over=True) as writer:
         carry_times(writer, manifest.timing)
         _copy_kept_files(run.path, writer.folder)
         if changed is not None:

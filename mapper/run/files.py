@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from mapper.runtime.atomic import MANIFEST_NAME
+from mapper.runtime.atomic import MANIFEST_NAME, FolderKind
 
 TRAJECTORY = "trajectory.tum"
 KEYFRAMES = "keyframes.tum"
@@ -110,6 +110,13 @@ RUN_FILES = (
     RunFiles(_grid(COSTMAP), "the slice inflated for nav2", "exported maps"),
     RunFiles((FOXGLOVE_LAYOUT,), "an arrangement of `run.mcap` for Foxglove", "exported maps"),
     RunFiles((PLAN, PLAN_VIEW), "the last path that `mapper plan` found", "exported maps"),
+)
+
+
+RUN = FolderKind(
+    "a run folder",
+    manifest_keys=frozenset({"status", "mapper_version", "input"}),
+    files=frozenset({name for files in RUN_FILES for name in files.names} | {FORMER_SCAN_UPDATES}),
 )
 
 

@@ -1,7 +1,7 @@
 """Run folder: reading a finished run, and writing a new one."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -9,7 +9,7 @@ from typing import Any
 
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_run_config
-from mapper.core.errors import MapperError, RunError
+from mapper.core.errors import MapperError, RunError, WriteError
 from mapper.core.trajectory import Trajectory
 from mapper.graph.g2o import read_g2o
 from mapper.graph.model import PoseGraph
@@ -216,15 +216,25 @@ class RunWriter:
 
 
 @contextmanager
-def write_run(out: Path, manifest: Manifest, config: BuildConfig, *, overwrite: bool) -> Iterator[RunWriter]:
+def write_run(
+    out: Path, manifest: Manifest, config: BuildConfig, *, overwrite: bool, takes_over: bool = False
+) -> Iterator[RunWriter]:
     """Yield the writer of a run that becomes OUT on success and stays behind as ``OUT.partial`` otherwise.
 
     A failure or an interruption is written into the manifest; a killed process leaves it at "building".
 
+    Args:
+        out: Run folder to create.
+        manifest: What to begin with.
+        config: Every setting.
+        overwrite: Replace a run that is there; one that holds a user's own files only with ``takes_over``.
+        takes_over: The caller copies a user's own files from the run that is replaced.
+
     Raises:
         RunError: OUT exists and may not be replaced, or is being built by another process.
+        WriteError: A file cannot be written, as when the disk is full.
     """
-    with atomic_folder(out, overwrite=overwrite) as folder:
+    with atomic_folder(out, files.RUN, overwrite=overwrite, takes_over=takes_over) as folder:
         writer = RunWriter(folder, manifest)
         try:
             write_text(folder / files.CONFIG, config.model_dump_json(indent=2) + "\n")
@@ -233,7 +243,8 @@ def write_run(out: Path, manifest: Manifest, config: BuildConfig, *, overwrite: 
             status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
             reason = str(error) if isinstance(error, MapperError) else f"{type(error).__name__}: {error}"
             writer.update(status=status, reason=reason)
-            writer.save()
+            with suppress(WriteError):  # the disk is full; the manifest still says "building"
+                writer.save()
             error.add_note(f"what there is so far stays in {folder}")
             raise
         writer.update(status="complete")

@@ -1,29 +1,116 @@
 """Files and folders that are written whole or not at all."""
 
+import ctypes
+import errno
 import fcntl
+import json
 import os
+import secrets
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 
-from mapper.core.errors import RunError, SourceError
+from mapper.core.errors import RunError, SourceError, WriteError
 
 MANIFEST_NAME = "manifest.json"
-"""File that marks a folder as one of ours, which ``--overwrite`` may replace."""
+"""File that tells what a folder of ours is."""
+
+_TEMPORARY = ".*.part*"
+_NAMED = 5
+_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
+
+
+@dataclass(frozen=True, slots=True)
+class FolderKind:
+    """Kind of folder that a verb writes, by which one that may be replaced is known.
+
+    Attributes:
+        name: What messages call it, as in "a run".
+        manifest_keys: Keys that its ``manifest.json`` has.
+        files: What may be in it: names, or patterns of names.
+    """
+
+    name: str
+    manifest_keys: frozenset[str]
+    files: frozenset[str]
+
+    def wrote(self, folder: Path) -> bool:
+        """Return whether the folder is empty, or has a manifest of this kind."""
+        if not folder.is_dir() or folder.is_symlink():
+            return False
+        if not (folder / MANIFEST_NAME).is_file():
+            return all(fnmatchcase(child.name, _TEMPORARY) for child in folder.iterdir())
+        try:
+            manifest = json.loads((folder / MANIFEST_NAME).read_bytes())
+        except (OSError, ValueError, RecursionError):
+            return False
+        return isinstance(manifest, dict) and self.manifest_keys <= manifest.keys()
+
+    def foreign_files(self, folder: Path) -> list[str]:
+        """Return the names in a folder that no verb gave, sorted."""
+        known = (*self.files, MANIFEST_NAME, _TEMPORARY)
+        names = sorted(child.name for child in folder.iterdir())
+        return [name for name in names if not any(fnmatchcase(name, pattern) for pattern in known)]
+
+
+@contextmanager
+def writing(path: Path, part: Path | None = None) -> Iterator[None]:
+    """Name the file or folder that is being written in what the system says about it.
+
+    Args:
+        path: Its final name, which errors tell.
+        part: Its name while it is not whole, if that is another.
+
+    Raises:
+        WriteError: It cannot be written, as when the disk is full.
+    """
+    try:
+        yield
+    except OSError as error:
+        if (refusal := _write_error(path, part or path, error)) is None:
+            raise
+        raise refusal from None
+
+
+def _write_error(path: Path, part: Path, error: OSError) -> WriteError | None:
+    """Return the error of a write to a path; None for an error of something else.
+
+    Writes to an open file tell no name, and those of NumPy no number either.
+    """
+    named = error.filename2 or error.filename
+    if isinstance(named, str | os.PathLike):
+        if not Path(named).is_relative_to(part) and not path.is_relative_to(named):
+            return None
+    elif error.errno is not None and error.errno not in _DISK_ERRORS:
+        return None
+    if error.errno == errno.EFBIG:
+        return WriteError(f"{path}: cannot be written: {error.strerror}; raise the limit (ulimit -f)")
+    reason = error.strerror or " ".join(str(error).split())
+    return WriteError(f"{path}: cannot be written: {reason}; is there space and permission?")
 
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary sibling to write; on success it takes ``path``'s place, on failure it is removed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Yield a temporary sibling to write; on success it takes ``path``'s place, on failure it is removed.
+
+    Raises:
+        WriteError: It cannot be written, as when the disk is full.
+    """
     # The ending stays last: writers such as OpenCV's choose the format by it.
-    part = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
-    try:
-        yield part
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    part = path.with_name(f".{path.stem[:100]}.{secrets.token_hex(8)}.part{path.suffix}")
+    with writing(path, part):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        flags = os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_WRONLY
+        os.close(os.open(part, flags, 0o666))
+        try:
+            yield part
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -38,6 +125,16 @@ def write_bytes(path: Path, data: bytes) -> None:
         part.write_bytes(data)
 
 
+def flush_to_disk(path: Path) -> None:
+    """Wait until a file or a folder's list of names is on the disk, so that it survives a power cut."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        with writing(path):
+            os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
 def partial_of(out: Path) -> Path:
     """Return where a folder is built before it is whole: a sibling, so that one rename finishes it."""
     return out.with_name(f"{out.name}.partial")
@@ -45,28 +142,36 @@ def partial_of(out: Path) -> Path:
 
 @contextmanager
 def atomic_folder(
-    out: Path, *, overwrite: bool = False, keeps: Callable[[Path], bool] = lambda _: False
+    out: Path,
+    kind: FolderKind,
+    *,
+    overwrite: bool = False,
+    takes_over: bool = False,
+    keeps: Callable[[Path], bool] = lambda _: False,
 ) -> Iterator[Path]:
     """Yield ``OUT.partial`` to fill; on success it takes OUT's place, on failure it stays for inspection.
 
     Args:
         out: Folder to create.
-        overwrite: Replace a folder of ours that is there; it stays untouched until the new one is whole.
+        kind: What it will be; only such a folder is replaced, and only if nothing else is in it.
+        overwrite: Replace a folder that is there; it stays untouched until the new one is whole.
+        takes_over: The caller copies what else is in the folder that is replaced.
         keeps: Returns whether the files that an earlier process left in ``OUT.partial`` can be kept.
 
     Raises:
         RunError: OUT exists and may not be replaced, or another process is filling ``OUT.partial``.
+        WriteError: It cannot be written, as when the disk is full.
     """
     out = out.resolve()
-    _refuse_to_lose(out, overwrite=overwrite)
+    _refuse_to_lose(out, kind, overwrite=overwrite, takes_over=takes_over)
     partial = partial_of(out)
-    if partial.exists() and not _is_ours(partial):
-        raise RunError(f"{partial}: is in the way and no unfinished run; move it or choose another --out")
+    if (partial.exists() or partial.is_symlink()) and not kind.wrote(partial):
+        raise RunError(f"{partial}: is in the way and not {kind.name}; move it or choose another --out")
     try:
         partial.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"{partial}: cannot be created: {error.strerror}") from None
-    with locked(partial):
+    with locked(partial), writing(partial):
         if not keeps(partial):
             _empty(partial)
         yield partial
@@ -91,37 +196,55 @@ def resumable_folder(out: Path, *, mark: str) -> Iterator[Path]:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"{out}: cannot be created: {error.strerror}") from None
-    with locked(out):
+    with locked(out), writing(out):
         yield out
 
 
-def _refuse_to_lose(out: Path, *, overwrite: bool) -> None:
+def _refuse_to_lose(out: Path, kind: FolderKind, *, overwrite: bool, takes_over: bool) -> None:
     if not out.exists():
         return
     if not overwrite:
         raise RunError(f"{out}: exists already; choose another --out, or pass --overwrite to replace it")
-    if not _is_ours(out):
-        raise RunError(f"{out}: is not a run folder (no {MANIFEST_NAME}), so --overwrite will not replace it")
-
-
-def _is_ours(folder: Path) -> bool:
-    return folder.is_dir() and ((folder / MANIFEST_NAME).is_file() or not any(folder.iterdir()))
+    if not kind.wrote(out):
+        raise RunError(f"{out}: is not {kind.name}, so --overwrite will not replace it; choose another --out")
+    if not takes_over and (foreign := kind.foreign_files(out)):
+        names = ", ".join(foreign[:_NAMED]) + (", …" if len(foreign) > _NAMED else "")
+        raise RunError(
+            f"{out}: holds files that are not of {kind.name}: {names}; move them, or choose another --out"
+        )
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock, which the system releases even when the process is killed."""
-    handle = os.open(folder, os.O_RDONLY)
+def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
+    """Hold the folder's lock, which the system releases even when the process is killed.
+
+    Args:
+        folder: An existing folder, no symbolic link.
+        wait: Wait for another process, which holds it for a moment only; else refuse.
+
+    Raises:
+        RunError: Another process holds it, or has put another folder in its place.
+    """
+    busy = RunError(f"{folder}: another process is filling it; wait, or choose another --out")
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError:
-            raise RunError(
-                f"{folder}: another process is filling it; wait, or choose another --out"
-            ) from None
+            raise busy from None
+        if not _is_at(handle, folder):
+            raise busy
         yield
     finally:
         os.close(handle)
+
+
+def _is_at(handle: int, folder: Path) -> bool:
+    try:
+        there = folder.lstat()
+    except FileNotFoundError:
+        return False
+    return os.path.samestat(os.fstat(handle), there)
 
 
 def _empty(folder: Path) -> None:
@@ -133,17 +256,32 @@ def _empty(folder: Path) -> None:
 
 
 def _swap(partial: Path, out: Path) -> None:
+    """Rename a whole folder to its final name, and remove the one that it replaces, if any."""
     if not out.exists():
         partial.rename(out)
+        flush_to_disk(out.parent)
         return
-    old = out.with_name(f".{out.name}.{os.getpid()}.old")
+    with locked(out, wait=True):
+        _exchange(partial, out)
+        flush_to_disk(out.parent)
+        shutil.rmtree(partial)
+
+
+def _exchange(partial: Path, out: Path) -> None:
+    """Exchange two names: at every instant, and after a power cut, OUT is the old folder or the new one."""
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    names = os.fsencode(partial), os.fsencode(out)
+    if rename is not None and not rename(_AT_FDCWD, names[0], _AT_FDCWD, names[1], _RENAME_EXCHANGE):
+        return
+    # Not every file system can: here OUT is missing for an instant.
+    old = out.with_name(f".{out.name}.{secrets.token_hex(8)}.old")
     out.rename(old)
     try:
         partial.rename(out)
     except OSError:
         old.rename(out)
         raise
-    shutil.rmtree(old)
+    old.rename(partial)
 
 
 @contextmanager
@@ -151,19 +289,18 @@ def new_folder(out: Path) -> Iterator[Path]:
     """Yield a folder to fill; it takes ``out``'s place when it is complete, and is gone if it never is.
 
     Raises:
-        SourceError: ``out`` is there and not empty, or cannot be written.
+        SourceError: ``out`` is there and not empty.
+        WriteError: It cannot be written, as when the disk is full.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise SourceError(f"{out}: exists already; give a folder that does not, or remove it")
     out = out.resolve()
-    partial = out.with_name(f"{out.name}.{os.getpid()}.partial")
-    try:
-        partial.mkdir(parents=True, exist_ok=True)
-        yield partial
-        partial.rename(out)
-    except OSError as error:
-        raise SourceError(
-            f"{out}: cannot be written: {error.strerror}; is there space and permission?"
-        ) from None
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    partial = out.with_name(f"{out.name}.{secrets.token_hex(8)}.partial")
+    with writing(out, partial):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        partial.mkdir()
+        try:
+            yield partial
+            partial.rename(out)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)

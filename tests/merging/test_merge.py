@@ -315,7 +315,7 @@ def test_runs_that_do_not_fit_together_are_refused(runs, maps, tmp_path):
     (bare.path / "map.octree").unlink()
     with pytest.raises(RunError, match=r"has no map\.octree; make it with mapper fuse"):
         MERGE(as_built([bare]), tmp_path / "map")
-    with pytest.raises(RunError, match="run0: is no merged map, so --overwrite will not replace it"):
+    with pytest.raises(RunError, match="run0: is not a merged map, so --overwrite will not replace it"):
         MERGE(as_built(runs), runs[0].path, overwrite=True)
     with pytest.raises(ConfigError, match=r"tile edge 0\.1 m"):
         merge(as_built(runs), tmp_path / "map", tile_m=0.1)

@@ -6,6 +6,7 @@ import pytest
 from mapper.config.build import BuildConfig
 from mapper.core.errors import RunError, TrackingError
 from mapper.odometry.base import Diagnostics
+from mapper.run.files import RUN
 from mapper.run.fingerprint import fingerprint
 from mapper.run.folder import load_run, write_run
 from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records, write_frame_ms, write_records
@@ -101,17 +102,17 @@ def test_folders_that_are_not_ours_are_never_replaced(tmp_path, place):
     precious.parent.mkdir()
     precious.write_text("years")
 
-    with pytest.raises(RunError), atomic_folder(tmp_path / "lab", overwrite=True):
+    with pytest.raises(RunError), atomic_folder(tmp_path / "lab", RUN, overwrite=True):
         pytest.fail("the body must not run")
     assert precious.read_text() == "years"
 
 
 def test_two_builds_of_one_run_do_not_mix(tmp_path):
-    with atomic_folder(tmp_path / "lab") as partial:
+    with atomic_folder(tmp_path / "lab", RUN) as partial:
         handle = os.open(partial, os.O_RDONLY)
         with pytest.raises(BlockingIOError):
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        with pytest.raises(RunError, match="another process"), atomic_folder(tmp_path / "lab"):
+        with pytest.raises(RunError, match="another process"), atomic_folder(tmp_path / "lab", RUN):
             pytest.fail("the body must not run")
         os.close(handle)
 

@@ -1,6 +1,21 @@
+import json
+
+import numpy as np
 import pytest
 
-from mapper.runtime.atomic import atomic_file, write_bytes, write_text
+from mapper.core.errors import RunError, SourceError, WriteError
+from mapper.runtime.atomic import (
+    FolderKind,
+    atomic_file,
+    atomic_folder,
+    new_folder,
+    partial_of,
+    write_bytes,
+    write_text,
+)
+from tests.support.full_disk import largest_file
+
+MAP = FolderKind("a map", manifest_keys=frozenset({"voxels"}), files=frozenset({"map.bt", "view_*.png"}))
 
 
 def test_a_file_appears_whole_with_its_folders(tmp_path):
@@ -34,3 +49,109 @@ def test_the_old_file_stays_readable_until_the_new_one_is_whole(tmp_path):
         part.write_text("new")
         assert path.read_text() == "old"
     assert path.read_text() == "new"
+
+
+def test_temporary_names_differ_and_are_made_anew(tmp_path):
+    names = set()
+    for _ in range(3):
+        with atomic_file(tmp_path / "map.bt") as part:
+            assert part.stat().st_size == 0
+            names.add(part.name)
+    assert len(names) == 3
+
+
+def test_a_full_disk_is_told_with_the_final_name(tmp_path):
+    path = tmp_path / "map.bt"
+    path.write_text("old")
+    values = np.zeros(100_000)
+
+    def write_by_numpy():
+        with atomic_file(path) as part, part.open("wb") as file:
+            values.tofile(file)
+
+    writers = (
+        write_by_numpy,
+        lambda: write_bytes(path, values.tobytes()),
+        lambda: write_text(path, "x" * 100_000),
+    )
+    with largest_file(10_000):
+        for write in writers:
+            with pytest.raises(WriteError, match=rf"^{path}: cannot be written: "):
+                write()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_error_of_another_file_keeps_its_name(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"log/1\.png"), atomic_file(tmp_path / "run.mcap"):
+        (tmp_path / "log/1.png").read_bytes()
+    with pytest.raises(BrokenPipeError), atomic_file(tmp_path / "run.mcap"):
+        raise BrokenPipeError(32, "Broken pipe")
+
+
+def test_a_new_folder_on_a_full_disk_is_gone(tmp_path):
+    def make_log():
+        with new_folder(tmp_path / "log") as folder:
+            (folder / "times.txt").write_text("0\n" * 1000)
+
+    with largest_file(1000), pytest.raises(WriteError, match=rf"^{tmp_path / 'log'}: "):
+        make_log()
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "log").mkdir()
+    (tmp_path / "log/mine").touch()
+    with pytest.raises(SourceError, match="exists already"), new_folder(tmp_path / "log"):
+        pytest.fail("the body must not run")
+
+
+def names_in(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def make_map(out, text, **options):
+    with atomic_folder(out, MAP, **options) as folder:
+        (folder / "map.bt").write_text(text)
+        (folder / "manifest.json").write_text('{"voxels": 1}')
+
+
+@pytest.mark.parametrize(
+    "manifest",
+    [{"name": "an app", "icons": []}, {"status": "complete", "input": {}}, [1, 2], "voxels"],
+    ids=["web application", "another kind", "list", "text"],
+)
+def test_a_foreign_manifest_does_not_make_a_folder_ours(tmp_path, manifest):
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site/manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(RunError, match="is not a map"):
+        make_map(tmp_path / "site", "new", overwrite=True)
+    assert names_in(tmp_path / "site") == ["manifest.json"]
+
+
+def test_foreign_files_in_a_folder_of_ours_are_named_and_kept(tmp_path):
+    make_map(tmp_path / "map", "old")
+    (tmp_path / "map/view_2.png").touch()
+    make_map(tmp_path / "map", "newer", overwrite=True)
+    (tmp_path / "map/thesis.tex").touch()
+    (tmp_path / "map/notes").mkdir()
+    with pytest.raises(RunError, match=r"not of a map: notes, thesis.tex; move them"):
+        make_map(tmp_path / "map", "newest", overwrite=True)
+    assert (tmp_path / "map/map.bt").read_text() == "newer"
+
+    make_map(tmp_path / "map", "newest", overwrite=True, takes_over=True)
+    assert names_in(tmp_path / "map") == ["manifest.json", "map.bt"]
+    assert names_in(tmp_path) == ["map"]
+
+
+def test_symbolic_links_are_not_followed(tmp_path):
+    (tmp_path / "theirs").mkdir()
+    partial_of(tmp_path / "map").symlink_to(tmp_path / "theirs", target_is_directory=True)
+    with pytest.raises(RunError, match="is in the way"):
+        make_map(tmp_path / "map", "new")
+    assert not list((tmp_path / "theirs").iterdir())
+
+
+def test_a_folder_is_replaced_where_names_cannot_be_exchanged(tmp_path, monkeypatch):
+    make_map(tmp_path / "map", "old")
+    monkeypatch.setattr("mapper.runtime.atomic.ctypes.CDLL", lambda *_, **__: object())
+    make_map(tmp_path / "map", "new", overwrite=True)
+    assert (tmp_path / "map/map.bt").read_text() == "new"
+    assert names_in(tmp_path) == ["map"]
