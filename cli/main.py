@@ -12,6 +12,7 @@ from cli.build import build
 from cli.compare import compare
 from cli.convert import convert
 from cli.demo import demo
+from cli.diff import diff
 from cli.doctor import doctor
 from cli.environment import prepare_environment
 from cli.evaluate import evaluate
@@ -92,6 +93,7 @@ app.command("loops", cls=WithPairs)(loops)
 app.command("eval")(evaluate)
 app.command("export")(export)
 app.command("merge")(merge)
+app.command("diff")(diff)
 app.command("plan", cls=WithPoints)(plan)
 app.command("solve")(solve)
 app.command("register")(register)

@@ -1,6 +1,5 @@
 """``mapper merge``: many runs as one map."""
 
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,18 +8,10 @@ import typer
 from cli.console import progress_for
 from cli.environment import prepare_libraries
 from cli.options import Quiet, workers_for
+from cli.placing import Place, PosesFile, placed_runs
 
 if TYPE_CHECKING:
     from mapper.merging.merge import Merged
-    from mapper.merging.placing import Placed
-    from mapper.run.folder import Run
-
-
-class Place(StrEnum):
-    """Source of the runs' poses in the map."""
-
-    BUILT = "built"
-    TRUTH = "truth"
 
 
 def merge(
@@ -33,10 +24,7 @@ def merge(
             "truth: the runs' truths share a frame; the first run's world is the map's."
         ),
     ] = Place.BUILT,
-    poses: Annotated[
-        Path | None,
-        typer.Option(help="File of the worlds' poses in the map: a line RUN tx ty tz qx qy qz qw for each."),
-    ] = None,
+    poses: PosesFile = None,
     tile_m: Annotated[
         float, typer.Option(help="About how long a tile's edge is: a power of two in voxels.")
     ] = 50.0,
@@ -57,16 +45,13 @@ def merge(
     Example: mapper merge runs/monday runs/tuesday --out maps/campus --processes 2, or: mapper merge runs/*
     --out maps/city --place truth --scheduler tcp://10.0.0.1:8786
     """
-    from mapper.core.errors import ConfigError
     from mapper.merging.merge import merge as merge_runs
     from mapper.run.folder import load_run
 
     workers = workers_for(processes, scheduler, default=1)
     prepare_libraries()
-    if poses is not None and place is not Place.BUILT:
-        raise ConfigError(f"--place {place} and --poses {poses}: both say where the runs lie; give one")
     merged = merge_runs(
-        _placed([load_run(run) for run in runs], place, poses),
+        placed_runs([load_run(run) for run in runs], place, poses),
         out,
         tile_m=tile_m,
         workers=workers,
@@ -75,14 +60,6 @@ def merge(
     )
     if not quiet:
         print(_summary(merged))
-
-
-def _placed(runs: "list[Run]", place: Place, poses: Path | None) -> "list[Placed]":
-    from mapper.merging.placing import as_built, by_poses, by_truth
-
-    if poses is not None:
-        return by_poses(runs, poses)
-    return by_truth(runs) if place is Place.TRUTH else as_built(runs)
 
 
 def _summary(merged: "Merged") -> str:

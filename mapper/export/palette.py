@@ -17,6 +17,9 @@ FACTORS: dict[Origin, Rgb] = {
     "loop": (196, 40, 140),
     "wheel": (224, 160, 32),
 }
+APPEARED: Rgb = (0, 114, 178)
+VANISHED: Rgb = (213, 94, 0)
+NOT_SEEN_AGAIN: Rgb = (150, 156, 166)
 UNKNOWN_CELL: Rgb = (214, 218, 224)
 FREE_CELL: Rgb = (255, 255, 255)
 OCCUPIED_CELL: Rgb = (35, 41, 54)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.frames import Points32
-from mapper.core.geometry import Array
+from mapper.core.geometry import Array, Points
 from mapper.core.trajectory import Trajectory
 from mapper.export.grid import grid_image
 from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure, save
@@ -167,6 +167,41 @@ def write_merged(
     for index, (name, positions) in enumerate(paths_world.items()):
         label = name if index < _NAMED else None
         axes.plot(*positions[:, :2].T, color=hex_of(color_of(index)), linewidth=1.4, label=label)
+    _finish_map(axes, low, high)
+    save(figure, path)
+
+
+def write_layers(
+    path: Path,
+    *,
+    grid: OccupancyGrid,
+    layers: Mapping[str, tuple[Points, Rgb]],
+    title: str,
+    lines: Sequence[str] = (),
+) -> None:
+    """Draw voxels over the slice, seen from above, one colour for each layer; later ones cover earlier ones.
+
+    Args:
+        path: PNG file to write.
+        grid: The slice, world frame.
+        layers: (N, 3) centres of voxels, metres, world frame, and their colour, by their name in the legend.
+        title: Headline.
+        lines: Figures worth knowing, shown below the headline.
+    """
+    low, high = _extent(grid, [centres for centres, _ in layers.values()])
+    figure, axes = _map_page(title, lines, aspect=float(np.divide(*(high - low)[::-1])))
+    _draw_over(axes, grid_image(grid), grid)
+    for name, (centres, color) in layers.items():
+        cells = np.unique(np.floor(centres[:, :2] / grid.resolution_m).astype(np.int64), axis=0)
+        corners = (cells - cells.min(axis=0, initial=0))[:, ::-1] if len(cells) else cells
+        image = np.zeros((*(corners.max(axis=0, initial=0) + 1), 4), np.uint8)
+        image[tuple(corners.T)] = (*color, 255)
+        lower = cells.min(axis=0, initial=0) * grid.resolution_m
+        upper = lower + np.array(image.shape[1::-1]) * grid.resolution_m
+        axes.imshow(
+            image, origin="lower", interpolation="nearest", extent=(lower[0], upper[0], lower[1], upper[1])
+        )
+        axes.fill([], [], facecolor=hex_of(color), label=name)
     _finish_map(axes, low, high)
     save(figure, path)
 

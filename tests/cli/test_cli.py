@@ -24,6 +24,7 @@ VERBS = [
     "eval",
     "export",
     "merge",
+    "diff",
     "plan",
     "solve",
     "compare",

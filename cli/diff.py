@@ -1,0 +1,79 @@
+"""``mapper diff``: what changed between two runs."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli.environment import prepare_libraries
+from cli.options import Quiet
+from cli.placing import Place, PosesFile, placed_runs
+
+if TYPE_CHECKING:
+    from mapper.merging.differences import Differences
+
+_LISTED = 10
+
+
+def diff(
+    before: Annotated[Path, typer.Argument(metavar="RUN_A", help="Run folder of the earlier session.")],
+    after: Annotated[Path, typer.Argument(metavar="RUN_B", help="Run folder of the later session.")],
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder to create.")],
+    place: Annotated[
+        Place,
+        typer.Option(
+            help="built: both runs have one world, as sessions of a chain have. "
+            "truth: the runs' truths share a frame. The pose is refined in any case."
+        ),
+    ] = Place.BUILT,
+    poses: PosesFile = None,
+    tolerance_m: Annotated[
+        float | None,
+        typer.Option(help="Surfaces this near are the same, metres.  [default: two voxels]"),
+    ] = None,
+    min_voxels: Annotated[int, typer.Option(help="Smaller clusters are counted, not listed.", min=1)] = 8,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace FOLDER.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compare the maps of two runs: what appeared, what vanished, and what was not seen again.
+
+    Only space that both runs looked at is compared. FOLDER gets a list, a picture, and a cloud of each kind.
+
+    Example: mapper diff runs/monday runs/tuesday --out diffs/tuesday
+    """
+    from mapper.merging.difference_files import summary, write_differences
+    from mapper.merging.differences import differences_of
+    from mapper.run.folder import load_run
+
+    prepare_libraries()
+    earlier, later = load_run(before), load_run(after)
+    found = differences_of(
+        *placed_runs([earlier, later], place, poses), tolerance_m=tolerance_m, min_voxels=min_voxels
+    )
+    write_differences(out, found, earlier, later, overwrite=overwrite)
+    if not quiet:
+        print(f"{summary(found)}\n{found.alignment}")
+        print(_table(found, earlier.config.octree.resolution_m))
+        print(out)
+
+
+def _table(found: "Differences", resolution_m: float) -> str:
+    from evaluators.tables.table import Column, Record, text_table
+
+    records: list[Record] = [
+        {
+            "what": what,
+            "centre": ", ".join(f"{value:.2f}" for value in cluster.centre_world),
+            "size": " × ".join(f"{value:.2f}" for value in cluster.size_m(resolution_m)),
+            "voxels": len(cluster.centres_world),
+        }
+        for what, clusters in (("appeared", found.appeared), ("vanished", found.vanished))
+        for cluster in clusters[:_LISTED]
+    ]
+    columns = [
+        Column("what", ""),
+        Column("centre", "centre, m"),
+        Column("size", "size, m"),
+        Column("voxels", "voxels"),
+    ]
+    return text_table(columns, records)

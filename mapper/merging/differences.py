@@ -1,0 +1,181 @@
+"""Differences of two runs' maps: what appeared, what vanished, and what was not looked at again.
+
+Only what both runs looked at is compared: a surface has appeared where the earlier run's rays passed free
+space, and vanished where the later run's did. Weak evidence, one hit or a few misses, is no change.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from mapper.core.errors import ConfigError
+from mapper.core.frames import Scan
+from mapper.core.geometry import Array, Points, Transform, apply, inverse
+from mapper.merging.placing import Placed
+from mapper.octree.map import OctreeMap, log_odds
+from mapper.octree.octomap_file import read_map
+from mapper.registration.config import PlaneIcpConfig
+from mapper.registration.icp import Icp
+from mapper.run import files
+
+_TOLERANCE_VOXELS = 2.0
+_MIN_VOXELS = 8
+_SURE_HITS, _SURE_MISSES = 2, 4
+_NEIGHBOUR_VOXELS = 1.8
+"""Voxels that share a corner belong to one cluster: √3, and the rounding of a turned grid."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cluster:
+    """Connected voxels that have appeared or vanished.
+
+    Attributes:
+        centres_world: (N, 3) centres of its voxels, metres, in the earlier run's world.
+    """
+
+    centres_world: Points
+
+    @property
+    def centre_world(self) -> Array:
+        """(3,) middle of its box, metres."""
+        middle: Array = 0.5 * (self.centres_world.min(axis=0) + self.centres_world.max(axis=0))
+        return middle
+
+    def size_m(self, resolution_m: float) -> Array:
+        """Return the (3,) edges of its box along x, y and z."""
+        size: Array = np.ptp(self.centres_world, axis=0) + resolution_m
+        return size
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Differences:
+    """Differences of a later map from an earlier one, in the earlier one's world.
+
+    Attributes:
+        appeared: What stands in space that was free before, the largest first.
+        vanished: What stood in space that is free now, the largest first.
+        not_seen_again: (N, 3) centres of occupied voxels of the earlier map that the later run did not look
+            at, metres.
+        newly_seen: (N, 3) the same of the later map, where the earlier run did not look.
+        same: Number of occupied voxels of the earlier map that are occupied still.
+        small: Number of voxels in clusters too small to be listed.
+        T_before_after: (4, 4) pose of the later run's world in the earlier one's, as it was compared.
+        alignment: How the pose was refined, in a few words.
+    """
+
+    appeared: Sequence[Cluster]
+    vanished: Sequence[Cluster]
+    not_seen_again: Points
+    newly_seen: Points
+    same: int
+    small: int
+    T_before_after: Transform
+    alignment: str
+
+
+def differences_of(
+    before: Placed, after: Placed, *, tolerance_m: float | None = None, min_voxels: int = _MIN_VOXELS
+) -> Differences:
+    """Compare the maps of two runs.
+
+    The later run's pose is refined by plane ICP (Chen & Medioni 1992) of the occupied voxels, unless they do
+    not fit together.
+
+    Args:
+        before: The earlier run; the answer is in its world.
+        after: The later run.
+        tolerance_m: A surface this near to one of the other map is the same; None is two voxels.
+        min_voxels: Smaller clusters are counted, not listed.
+
+    Raises:
+        ConfigError: The maps have different resolutions.
+    """
+    old, new = (read_map(placed.run.path / files.OCTREE_MAP) for placed in (before, after))
+    if old.resolution_m != new.resolution_m:
+        raise ConfigError(
+            f"{after.run.path}: octree.resolution_m is {new.resolution_m:g}, but {old.resolution_m:g} in "
+            f"{before.run.path}; make its maps again with mapper fuse {after.run.path} "
+            f"--set octree.resolution_m={old.resolution_m:g}"
+        )
+    T_before_after, alignment = _refined(old, new, inverse(before.T_map_world) @ after.T_map_world)
+    tolerance_m = _TOLERANCE_VOXELS * old.resolution_m if tolerance_m is None else tolerance_m
+    found = compare_maps(old, new, T_before_after, tolerance_m=tolerance_m, min_voxels=min_voxels)
+    return replace(found, alignment=alignment)
+
+
+def compare_maps(
+    before: OctreeMap, after: OctreeMap, T_before_after: Transform, *, tolerance_m: float, min_voxels: int
+) -> Differences:
+    """Compare two maps of one resolution; see :func:`differences_of`."""
+    old, new = _surely_occupied(before), apply(T_before_after, _surely_occupied(after))
+    old_is = _compared(old, after, inverse(T_before_after), tolerance_m)
+    new_is = _compared(new, before, np.eye(4), tolerance_m)
+    appeared, few_new = _clusters(new[new_is.free], before.resolution_m, min_voxels)
+    vanished, few_old = _clusters(old[old_is.free], before.resolution_m, min_voxels)
+    return Differences(
+        appeared=appeared,
+        vanished=vanished,
+        not_seen_again=old[old_is.unknown],
+        newly_seen=new[new_is.unknown],
+        same=int(np.count_nonzero(old_is.occupied)),
+        small=few_new + few_old,
+        T_before_after=T_before_after,
+        alignment="as placed",
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Compared:
+    """(N,) masks of surfaces by what the other map says of their place; none of them: weakly free."""
+
+    occupied: NDArray[np.bool_]
+    free: NDArray[np.bool_]
+    unknown: NDArray[np.bool_]
+
+
+def _surely_occupied(octree: OctreeMap) -> Points:
+    leaves = octree.leaves()
+    least = _SURE_HITS * log_odds(octree.config.hit_probability)
+    return leaves.centres_world[leaves.log_odds >= max(least, octree.occupied_log_odds)]
+
+
+def _compared(centres: Points, other: OctreeMap, T_other_centres: Transform, tolerance_m: float) -> _Compared:
+    points = apply(T_other_centres, centres)
+    values = other.query(points)
+    occupied = values >= other.occupied_log_odds
+    nearest = other.nearest_obstacles(points[~occupied], max_range_m=tolerance_m)
+    occupied[~occupied] = np.isfinite(nearest.distances_m)
+    config = other.config
+    most = max(_SURE_MISSES * log_odds(config.miss_probability), log_odds(config.clamp_min_probability))
+    return _Compared(occupied, free=~occupied & (values <= most), unknown=~occupied & np.isnan(values))
+
+
+def _clusters(centres: Points, resolution_m: float, min_voxels: int) -> tuple[list[Cluster], int]:
+    """Return the clusters, the largest first, and how many voxels are in smaller ones."""
+    if not len(centres):
+        return [], 0
+    pairs = cKDTree(centres).query_pairs(_NEIGHBOUR_VOXELS * resolution_m, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs), np.int8), pairs.T), shape=(len(centres),) * 2)
+    _, cluster_of = connected_components(links, directed=False)
+    sizes = np.bincount(cluster_of)
+    large = np.flatnonzero(sizes >= min_voxels)
+    order = large[np.argsort(-sizes[large], kind="stable")]
+    clusters = [Cluster(centres[cluster_of == number]) for number in order]
+    return clusters, int(sizes.sum() - sizes[large].sum())
+
+
+def _refined(before: OctreeMap, after: OctreeMap, T_before_after: Transform) -> tuple[Transform, str]:
+    """Return the pose by which most surfaces coincide, and what was done."""
+    target, source = (Scan(0, _surely_occupied(octree).astype(np.float32)) for octree in (before, after))
+    found = (
+        Icp(PlaneIcpConfig(voxel_m=2.0 * before.resolution_m)).prepare(target).align(source, T_before_after)
+    )
+    if not found.converged:
+        return T_before_after, f"as placed, not refined: {found.reason}"
+    moved = inverse(T_before_after) @ found.T_target_source
+    return found.T_target_source, f"refined by {np.linalg.norm(moved[:3, 3]):.2g} m"
