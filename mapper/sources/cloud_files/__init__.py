@@ -6,7 +6,7 @@ from pathlib import Path
 from mapper.core.errors import FrameError
 from mapper.sources.cloud_files.bare import EMPTY, read_bin, read_npy, read_text, why_no_points
 from mapper.sources.cloud_files.las import read_las
-from mapper.sources.cloud_files.parsing import Columns
+from mapper.sources.cloud_files.parsing import MOST_BYTES, Columns
 from mapper.sources.cloud_files.pcd import read_pcd
 from mapper.sources.cloud_files.ply import read_ply
 from mapper.sources.cloud_files.raw import RawCloud, cloud_from
@@ -42,7 +42,11 @@ def read_cloud(path: Path, *, scale: float | None = None) -> RawCloud:
     if reader is None:
         raise FrameError(f"{path}: not the ending of a cloud; want one of {' '.join(ENDINGS)}")
     try:
-        columns = reader(path)
+        size = path.stat().st_size
+        if size > MOST_BYTES:
+            raise FrameError(f"{path}: {size} bytes, want {MOST_BYTES} at most; split it")
+        return cloud_from(reader(path), path=path, scale=scale)
     except OSError as error:
         raise FrameError(f"{path}: cannot be read: {error.strerror or error}") from None
-    return cloud_from(columns, path=path, scale=scale)
+    except MemoryError:
+        raise FrameError(f"{path}: does not fit into memory; split it") from None

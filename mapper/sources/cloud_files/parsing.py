@@ -16,8 +16,12 @@ Columns = Mapping[str, Column]
 
 MIN_POINTS = 10
 """Fewer points show no surface that anything could be aligned to."""
+MOST_BYTES = 2 << 30
+"""Size of a cloud, in its file and unpacked: what is made of it takes up to twice as much memory again."""
 
 _LONGEST_REASON = 150
+_RUST_PANIC = "PanicException"
+"""What an error in a library written in Rust becomes; Python has it under ``BaseException``."""
 
 
 @contextmanager
@@ -31,7 +35,9 @@ def refusing_damage(path: Path, *, what: str) -> Iterator[None]:
         yield
     except (OSError, FrameError):
         raise
-    except Exception as error:  # parsers of foreign bytes raise whatever the line that met them raises
+    except BaseException as error:  # parsers of foreign bytes raise whatever the line that met them raises
+        if not (isinstance(error, Exception) or type(error).__name__ == _RUST_PANIC):
+            raise
         reason = " ".join(str(error).split()) or type(error).__name__
         raise FrameError(f"{path}: not a sound {what} file: {reason[:_LONGEST_REASON]}") from None
 

@@ -1,16 +1,21 @@
 """PCD: the Point Cloud Library's files (Rusu & Cousins 2011), ascii, binary and compressed."""
 
+import os
+import struct
 from itertools import islice
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
-from mapper.sources.cloud_files.parsing import Columns, parse_rows, refusing_damage
+from mapper.sources.cloud_files.parsing import MOST_BYTES, Columns, parse_rows, refusing_damage
 
 _MOST_LINES = 100
+_MOST_VALUES = 10_000  # of a point: histograms of features have some hundreds
+_MOST_LZF_RATIO = 100  # three bytes of LZF expand to 264, no more
+_SIZES = struct.Struct("<II")  # of compressed points, before they are unpacked and after
 
 
 def read_pcd(path: Path) -> Columns:
@@ -31,10 +36,37 @@ def _read(stream: BinaryIO) -> tuple[NDArray[np.void], int]:
     from pypcd4 import Encoding, MetaData, PointCloud
 
     header = MetaData.parse_header(_header_lines(stream))
+    if sum(header.count) > _MOST_VALUES:  # pypcd4 gives each a name
+        raise ValueError(f"{sum(header.count)} values a point, want {_MOST_VALUES} at most")
     if header.data == Encoding.ASCII and header.points > 0:  # pypcd4 allows one blank between numbers only
         return parse_rows(stream, header.build_dtype()), header.points
+    _check_size(stream, header, is_compressed=header.data == Encoding.BINARY_COMPRESSED)
     stream.seek(0)
     return PointCloud.from_fileobj(stream).pc_data, header.points
+
+
+def _check_size(stream: BinaryIO, header: Any, *, is_compressed: bool) -> None:
+    """Refuse a header that announces more bytes than follow it, before room is made for them.
+
+    Raises:
+        ValueError: It does, or the compressed points cannot be unpacked to as many.
+    """
+    want = header.points * sum(size * count for size, count in zip(header.size, header.count, strict=True))
+    left = os.fstat(stream.fileno()).st_size - stream.tell()
+    if is_compressed and header.points:
+        packed, unpacked = _SIZES.unpack(stream.read(_SIZES.size).ljust(_SIZES.size, b"\0"))
+        left -= _SIZES.size
+        if unpacked != want or packed > left:
+            raise ValueError(
+                f"{left} bytes, of which {packed} unpack to {unpacked}, but the header says {header.points} "
+                f"points of {want} bytes; was it cut?"
+            )
+        if unpacked > min(_MOST_LZF_RATIO * packed, MOST_BYTES):
+            raise ValueError(f"{packed} bytes that unpack to {unpacked}, which they cannot or must not")
+    elif want > left:
+        raise ValueError(
+            f"{left} bytes, but the header says {header.points} points of {want} bytes; was it cut?"
+        )
 
 
 def _header_lines(stream: BinaryIO) -> list[str]:
