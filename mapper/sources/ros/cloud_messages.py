@@ -50,6 +50,8 @@ def structured(
     try:
         point = np.dtype({"names": names, "offsets": offsets, "formats": formats, "itemsize": point_bytes})
         strides = (row_bytes or columns * point_bytes, point_bytes)
+        if point_bytes < 1 or (rows > 1 and strides[0] < columns * point_bytes):
+            raise ValueError(f"rows of {row_bytes} bytes overlap")  # a copy of them could be of any size
         return np.ndarray(shape, point, buffer=data, strides=strides).reshape(-1)
     except (TypeError, ValueError) as error:
         raise DataError(

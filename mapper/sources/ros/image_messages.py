@@ -153,9 +153,12 @@ def _pixels(message: PixelsMessage, kind: str, channels: int, *, where: str) -> 
     """Return a view of an image's rows as (H, W) or (H, W, channels), whatever their padding."""
     pixel = np.dtype(kind)
     shape = (message.height_px, message.width_px, channels)
-    row_bytes = message.row_bytes or message.width_px * channels * pixel.itemsize
+    used_bytes = message.width_px * channels * pixel.itemsize
+    row_bytes = message.row_bytes or used_bytes
     strides = (row_bytes, channels * pixel.itemsize, pixel.itemsize)
     try:
+        if message.height_px > 1 and row_bytes < used_bytes:
+            raise ValueError("rows overlap")  # a copy of them could be of any size
         pixels = np.ndarray(shape, pixel, buffer=message.data, strides=strides)
     except (TypeError, ValueError):
         raise FrameError(

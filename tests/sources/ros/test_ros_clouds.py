@@ -134,6 +134,27 @@ def test_numbers_that_do_not_fit_the_payload_are_refused(numbers):
         structured(memoryview(data), XYZ, **numbers)
 
 
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        {"point_bytes": 12, "shape": (1000, 50), "row_bytes": 0},
+        {"point_bytes": 12, "shape": (40_000, 40), "row_bytes": 1},
+        {"point_bytes": 12, "shape": (2, 50), "row_bytes": 599},
+        {"point_bytes": 0, "shape": (2, 50), "row_bytes": 600},
+    ],
+)
+def test_rows_that_overlap_are_refused(numbers):
+    """A message of 48 kB must not become a cloud of gigabytes."""
+    with pytest.raises(DataError, match=r"a cloud of \d+×\d+ points of \d+ bytes in 48000 bytes: "):
+        structured(memoryview(bytes(48_000)), XYZ if numbers["point_bytes"] else [], **numbers)
+
+
+def test_the_step_of_a_single_row_does_not_matter():
+    data = packed(some_points(), XYZ, point_bytes=12).tobytes()
+    view = structured(memoryview(data), XYZ, point_bytes=12, shape=(1, 50), row_bytes=7)
+    np.testing.assert_array_equal(view["x"], some_points()[:, 0])
+
+
 def test_a_cloud_without_heights_is_refused():
     view = structured(memoryview(bytes(80)), XYZ[:2], point_bytes=8, shape=(1, 10))
     with pytest.raises(FrameError, match="m: points of x, y; want x, y and z"):
