@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 
-from mapper.core.errors import FrameError, SourceError
-from mapper.sources.ros.recording import Place, Recorded, Recording, Topic
+from mapper.core.errors import DataError, FrameError, SourceError
+from mapper.sources.ros.recording import MOST_BLOCK_BYTES, Place, Recorded, Recording, Topic
 
 
 class DatabaseRecording:
@@ -25,10 +25,13 @@ class DatabaseRecording:
         self.notes: list[str] = []
         try:
             with closing(self._connect()) as database:
+                _check_tables(database)
                 rows = database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
-        except (sqlite3.Error, UnicodeDecodeError) as error:  # the text of SQLite's error may be damaged too
+        except (sqlite3.Error, UnicodeDecodeError, DataError) as error:  # SQLite's text may be damaged too
             raise SourceError(f"{path}: not a .db3 file that rosbag2 wrote: {error}") from None
-        self._topics = {number: Topic(name, type_, encoding) for number, name, type_, encoding in rows}
+        self._topics = {
+            number: Topic(*texts) for number, *texts in rows if all(isinstance(text, str) for text in texts)
+        }
 
     def messages(self) -> Iterator[Recorded]:
         """Yield every message that can be read, in the order of the file."""
@@ -67,7 +70,9 @@ class DatabaseRecording:
         # killed, its journal holds the last messages, and SQLite opens such a database with its journal only.
         has_journal = self.path.with_name(f"{self.path.name}-wal").exists()
         how = "mode=ro" if has_journal else "mode=ro&immutable=1"
-        return sqlite3.connect(f"{self.path.resolve().as_uri()}?{how}", uri=True)
+        database = sqlite3.connect(f"{self.path.resolve().as_uri()}?{how}", uri=True)
+        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_BLOCK_BYTES)
+        return database
 
 
 class JoinedRecording:
@@ -107,6 +112,21 @@ class JoinedRecording:
         """
         block, number = divmod(place.block, len(self._parts))
         return self._parts[number].read(place._replace(block=block))
+
+
+def _check_tables(database: sqlite3.Connection) -> None:
+    """Refuse views and columns that are computed: their rows are not in the file, and may never end.
+
+    Raises:
+        DataError: The topics or the messages are no table of stored values.
+    """
+    for name in ("topics", "messages"):
+        kinds = database.execute("SELECT type, sql FROM sqlite_master WHERE name = ?", [name]).fetchall()
+        if [kind for kind, _ in kinds] != ["table"] or not f"{kinds[0][1]}".startswith("CREATE TABLE"):
+            raise DataError(f"{name} is no table")
+        hidden = [row[1] for row in database.execute(f"PRAGMA table_xinfo({name})") if row[6]]
+        if hidden:
+            raise DataError(f"column {hidden[0]} of {name} is computed")
 
 
 def in_sequence(paths: Sequence[Path]) -> list[Path]:

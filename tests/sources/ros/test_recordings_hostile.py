@@ -1,15 +1,17 @@
 """Recordings that announce too much cost what is good about them, and neither memory nor time."""
 
 import bz2
+import sqlite3
 import struct
 import tracemalloc
+from contextlib import closing
 from pathlib import Path
 
 import lz4.frame
 import pytest
 import zstandard
 
-from mapper.core.errors import DataError
+from mapper.core.errors import DataError, SourceError
 from mapper.sources import open_source
 from mapper.sources.ros import mcap_file, recording, ros1_bag
 from mapper.sources.ros.decode import decompressed
@@ -147,3 +149,46 @@ def test_zeros_after_what_was_written_are_no_records(tmp_path, name):
         file.truncate(len(whole) - 50)
         file.truncate(1 << 33)  # a hole of 8 GiB, as a file system leaves it after a power cut
     assert len(open_source(path)) == 6
+
+
+ENDLESS = """
+    ALTER TABLE messages RENAME TO stored;
+    CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n)
+    SELECT id, 1 AS topic_id, id AS timestamp, zeroblob(1000000) AS data FROM n;
+"""
+COMPUTED = """
+    ALTER TABLE messages RENAME COLUMN data TO stored;
+    ALTER TABLE messages ADD COLUMN data BLOB GENERATED ALWAYS AS (zeroblob(1000000000)) VIRTUAL;
+"""
+SEARCHED = "DROP TABLE topics; CREATE VIRTUAL TABLE topics USING fts5(id, name, type, serialization_format);"
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (ENDLESS, "messages is no table"),
+        (COMPUTED, "column data of messages is computed"),
+        (SEARCHED, "topics is no table"),
+    ],
+)
+def test_a_database_whose_rows_are_computed_is_refused(tmp_path, change, why):
+    path = changed_database(tmp_path, change)
+    with pytest.raises(SourceError, match=rf"log\.db3: not a \.db3 file that rosbag2 wrote: {why}"):
+        open_source(path)
+
+
+def test_a_topic_whose_name_is_no_text_is_left_out(tmp_path):
+    odd = """
+        INSERT INTO topics (id, name, type, serialization_format, offered_qos_profiles, type_description_hash)
+        VALUES (99, x'ff', 'x/msg/Y', 'cdr', '', '');
+        INSERT INTO messages (topic_id, timestamp, data) VALUES (99, 1, x'00');
+    """
+    assert len(open_source(changed_database(tmp_path, odd))) == 6
+
+
+def changed_database(tmp_path: Path, change: str) -> Path:
+    path = write(tmp_path / "log", shots(6)) / "log.db3"
+    with closing(sqlite3.connect(path)) as database:
+        database.executescript(change)
+        database.commit()
+    return path
