@@ -134,11 +134,10 @@ def read_records(path: Path) -> list[FrameRecord]:
     """
     try:
         rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
+        return [_record(row) for row in rows]
     except OSError as error:
         raise RunError(f"{path}: cannot be read: {error.strerror}") from None
-    try:
-        return [_record(row) for row in rows]
-    except (KeyError, ValueError, TypeError) as error:
+    except (KeyError, ValueError, TypeError, csv.Error) as error:  # ValueError: of what is no text, too
         raise DataError(f"{path}: not a list of frames with columns {', '.join(_COLUMNS)}: {error}") from None
 
 

@@ -1,5 +1,6 @@
 """Calibration files beside a log: our TOML, and the YAML of ROS, OpenCV and ORB-SLAM."""
 
+import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -9,6 +10,7 @@ from typing import Any
 from mapper.core.errors import DataError, SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
 from mapper.sources.calibration import Calibration
+from mapper.sources.regular_files import read_text
 
 FILE_NAMES = (
     "calibration.toml",
@@ -33,7 +35,10 @@ def read_calibration(path: Path) -> Calibration:
         SourceError: The file cannot be read, lacks a number, or (TOML) has a key of another meaning.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
+    except DataError as error:
+        raise SourceError(str(error)) from None
+    try:
         if path.suffix == ".toml":
             numbers = _toml_numbers(tomllib.loads(text))
             unknown = sorted(set(numbers) - _KEYS)
@@ -42,11 +47,9 @@ def read_calibration(path: Path) -> Calibration:
         else:
             numbers = _yaml_numbers(text)
         return _interpret(numbers, f"{path}")
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # RecursionError: of brackets within brackets
         raise SourceError(f"{path}: not valid {path.suffix[1:].upper()}: {error}") from None
-    except DataError as error:
+    except (DataError, OverflowError) as error:  # an integer that is too large for a float
         raise SourceError(f"{path}: {error}") from None
 
 
@@ -86,7 +89,11 @@ _KEYS = {name for names in _NAMES.values() for name in names}
 
 
 def _interpret(numbers: _Numbers, origin: str) -> Calibration:
+
     found = {meaning: numbers[name] for meaning, names in _NAMES.items() for name in names if name in numbers}
+    for meaning, values in found.items():
+        if not all(map(math.isfinite, values)):
+            raise DataError(f"{meaning}: {', '.join(f'{value:g}' for value in values)} is not finite")
     if len(K := found.get("matrix", ())) == 9:
         found = {"fx": K[0:1], "cx": K[2:3], "fy": K[4:5], "cy": K[5:6], **found}
     one = {meaning: values[0] for meaning, values in found.items() if len(values) == 1}

@@ -4,7 +4,7 @@ import os
 import pytest
 
 from mapper.config.build import BuildConfig
-from mapper.core.errors import RunError, TrackingError
+from mapper.core.errors import DataError, RunError, TrackingError
 from mapper.odometry.base import Diagnostics
 from mapper.run.files import RUN
 from mapper.run.fingerprint import fingerprint
@@ -155,6 +155,20 @@ def test_records_of_older_runs_are_read(tmp_path, column, expected):
     (record,) = read_records(tmp_path / "frames.csv")
 
     assert record.diagnostics.unobservable == expected
+
+
+@pytest.mark.parametrize(
+    "damage", [b"\xff\xfe", b"\x80\n", b'"' + 200_000 * b"a" + b'"\n', b"1,\0\n", b"1,tracked\n"]
+)
+def test_damaged_records_are_named(tmp_path, damage):
+    path = tmp_path / "frames.csv"
+    write_records(path, [])
+    path.write_bytes(path.read_bytes() + damage)
+    with pytest.raises(DataError, match=r"frames\.csv: not a list of frames with columns stamp_ns, "):
+        read_records(path)
+    path.write_bytes(b"stamp_ns,ms\n" + damage)
+    with pytest.raises(DataError, match=r"frames\.csv: not a list of stamp_ns,ms: "):
+        read_frame_ms(path)
 
 
 def test_a_fingerprint_follows_names_sizes_and_lists_but_not_the_place(tmp_path):

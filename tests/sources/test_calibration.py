@@ -113,6 +113,13 @@ def test_what_is_written_reads_back_exactly(tmp_path):
         ("a.toml", OURS.replace("1.16]", "1.16, 0.0, 3.0]"), "7 distortion coefficients"),
         ("a.yaml", ROS.replace("plumb_bob", "equidistant"), "equidistant lens; only Brown–Conrady"),
         ("a.yaml", "name: kinect\n", "no number fx_px"),
+        ("a.toml", OURS.replace("width_px = 640", "width_px = 1e400"), "width: inf is not finite"),
+        ("a.toml", OURS.replace("= 517.3", "= 1" + 400 * "0"), "int too large to convert to float"),
+        ("a.toml", OURS.replace("= 517.3", "= " + 5000 * "1"), "not valid TOML: Exceeds the limit"),
+        ("a.toml", "x = " + 100_000 * "[", "not valid TOML: maximum recursion depth"),
+        ("a.toml", ".".join("x" * 9000) + " = 1", "not valid TOML: maximum recursion depth"),
+        ("a.yaml", ROS.replace("640", "nan"), "width: nan is not finite"),
+        ("a.yaml", ROS + "range: inf\nfar: [1.0, nan]\nfx: .inf\nfx_px: nan\n", "fx: nan is not finite"),
     ],
 )
 def test_a_bad_file_is_named_with_the_reason(tmp_path, name, text, message):
