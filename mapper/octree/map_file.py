@@ -30,6 +30,8 @@ _FORMAT = CheckedFormat(MAGIC, version=1, remedy="update mapper", error=MapFileE
 _LEVEL = 3  # Zstandard's default
 _MASK_BYTES = BLOCK_VOXELS // 8
 _COUNTS = ("blocks", "voxels", "attribute_blocks", "attribute_voxels")
+_ATTRIBUTE_BYTES = BLOCK_VOXELS * 28
+"""Memory of a block's attributes: three sums of colour, their weight, hits and a stamp per voxel."""
 
 
 def write_map(path: Path, octree: OctreeMap) -> None:
@@ -91,8 +93,10 @@ def parse_map(path: Path, data: bytes, config: OctreeConfig | None) -> OctreeMap
         *[(attribute_voxels, "<u4")] * 5,
         (attribute_voxels, "<i8"),
     ]
-    check_memory(blocks * BLOCK_BYTES, f"the map in {path}")
     plain_bytes = sum(count * np.dtype(kind).itemsize for count, kind in sizes)
+    check_memory(
+        blocks * BLOCK_BYTES + attribute_blocks * _ATTRIBUTE_BYTES + plain_bytes, f"the map in {path}"
+    )
     plain = _decompressed(path, body, plain_bytes)
     columns: list[NDArray[Any]] = []
     at = 0
@@ -116,9 +120,15 @@ def _parse_header(path: Path, head: bytes) -> tuple[list[int], OctreeConfig]:
         header = json.loads(head)
         counts = [header[name] for name in _COUNTS]
         config = OctreeConfig.model_validate(header["config"])
-    except (ValueError, KeyError, TypeError, ValidationError):
+    except (ValueError, KeyError, TypeError, ValidationError, RecursionError):
         raise MapFileError(f"{path}: its header does not describe a map; it is damaged") from None
-    if not all(isinstance(count, int) and count >= 0 for count in counts):
+    blocks, voxels, attribute_blocks, attribute_voxels = counts
+    if not (
+        all(isinstance(count, int) and count >= 0 for count in counts)
+        and voxels <= blocks * BLOCK_VOXELS
+        and attribute_voxels <= attribute_blocks * BLOCK_VOXELS
+        and attribute_blocks <= blocks
+    ):
         raise MapFileError(f"{path}: its header has counts {counts}; it is damaged")
     return counts, config
 

@@ -105,6 +105,9 @@ def resealed(data, change):
         (lambda data: resealed(data, lambda header: header.pop("config")), "does not describe a map"),
         (lambda data: resealed(data, lambda header: header.update(voxels=-1)), "has counts"),
         (lambda data: resealed(data, lambda header: header.update(voxels=5)), "its body is not the"),
+        (lambda data: resealed(data, lambda header: header.update(voxels=1 << 33)), "has counts"),
+        (lambda data: resealed(data, lambda header: header.update(attribute_blocks=1 << 20)), "has counts"),
+        (lambda data: resealed(data, lambda header: header.update(attribute_voxels=1 << 33)), "has counts"),
         (lambda data: data[2:], "not an OctoMap file"),
     ],
 )
@@ -121,6 +124,16 @@ def test_a_map_larger_than_memory_is_refused_before_it_is_unpacked(path, monkeyp
     monkeypatch.setattr(blocks.os, "sysconf", lambda _name: 10)
 
     with pytest.raises(MapSizeError, match="GiB"):
+        read_map(path)
+
+
+def test_everything_that_a_header_announces_has_to_fit_into_memory(path, monkeypatch):
+    def announce(header):
+        header.update(blocks=1 << 20, voxels=1 << 29, attribute_blocks=0, attribute_voxels=0)
+
+    path.write_bytes(resealed(path.read_bytes(), announce))
+    monkeypatch.setattr(blocks.os, "sysconf", lambda _name: 1 << 16)  # of 4 GiB; the blocks alone take 2
+    with pytest.raises(MapSizeError, match=r"map\.octree needs 4\.1 GiB and this machine has 4\.0"):
         read_map(path)
 
 
