@@ -38,5 +38,5 @@ def decode(topic: Topic, data: memoryview) -> Message:
         from mapper.sources.ros.decode_foxglove import decode_foxglove
 
         return decode_foxglove(topic, data)
-    except (ValueError, KeyError, IndexError, TypeError, OverflowError) as error:
+    except (ValueError, KeyError, IndexError, TypeError, OverflowError, RecursionError) as error:
         raise DataError(f"a damaged message: {error}") from None

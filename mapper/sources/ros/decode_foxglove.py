@@ -50,7 +50,7 @@ def stamp_of(topic: Topic, data: memoryview) -> int:
             return _ns(_protobuf_timestamp(topic, data))
         if topic.encoding == "json":
             return _ns(_parse_json(data).timestamp)
-    except (DecodeError, AttributeError, ValueError, TypeError, OverflowError) as error:
+    except (DecodeError, AttributeError, ValueError, TypeError, OverflowError, RecursionError) as error:
         raise DataError(f"a damaged timestamp: {error}") from None
     raise DataError(
         f"messages encoded as {topic.encoding!r} are not read; known are cdr, ros1, protobuf and json"

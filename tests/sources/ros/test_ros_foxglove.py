@@ -177,11 +177,17 @@ def test_json_of_another_shape_is_an_error(data):
         ("json", b'{"timestamp": null}'),
         ("json", b'{"timestamp": {"sec": "x", "nsec": 0}}'),
         ("json", b'{"timestamp": {"sec": 1e999, "nsec": 0}}'),
+        ("json", b'{"timestamp": ' + 100_000 * b"["),
     ],
 )
 def test_a_damaged_stamp_is_an_error(encoding, data):
     with pytest.raises(DataError):
         stamp_of(Topic("/t", "foxglove.RawImage", encoding), memoryview(data))
+
+
+def test_brackets_nested_too_deep_are_damage():
+    with pytest.raises(DataError, match="a damaged message: maximum recursion depth"):
+        decode(Topic("/t", "foxglove.RawImage", "json"), memoryview(100_000 * b'{"a":'))
 
 
 def test_what_is_not_read_is_named():
