@@ -128,6 +128,8 @@ def read_map(path: Path, config: OctreeConfig | None = None) -> OctreeMap:
         data = path.read_bytes()
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read: {error.strerror}") from None
+    except MemoryError:
+        raise MapFileError(f"{path}: {path.stat().st_size} bytes do not fit into memory") from None
     if data.startswith(MAGIC):
         return parse_map(path, data, config)
     header, start = _parse_header(path, data)

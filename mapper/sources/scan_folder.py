@@ -145,7 +145,7 @@ def _files(folder: Path) -> list[Path]:
     try:
         with os.scandir(folder) as found:  # tells files from folders without a stat of each
             return [folder / entry.name for entry in found if entry.is_file()]
-    except (FileNotFoundError, NotADirectoryError, PermissionError):
+    except OSError:  # there is none, it may not be read, or is a link to itself
         return []
 
 

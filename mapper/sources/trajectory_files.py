@@ -11,6 +11,7 @@ from mapper.core.rotations import quaternion_from_rotation, rotation_from_quater
 from mapper.core.timebase import Stamps, ns_from_seconds_text, seconds_text_from_ns
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.atomic import write_text
+from mapper.sources.regular_files import read_text
 
 
 def read_tum(path: Path) -> Trajectory:
@@ -96,13 +97,7 @@ def _orthonormal(T: Transform) -> Transform:
 
 
 def _rows(path: Path) -> Iterable[tuple[int, list[str]]]:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise DataError(f"{path}: not a text file; want one pose a line") from None
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(read_text(path, may_be_pipe=True).splitlines(), start=1):
         words = line.replace(",", " ").split()
         if words and not words[0].startswith("#"):
             yield number, words
