@@ -89,7 +89,6 @@ _KEYS = {name for names in _NAMES.values() for name in names}
 
 
 def _interpret(numbers: _Numbers, origin: str) -> Calibration:
-
     found = {meaning: numbers[name] for meaning, names in _NAMES.items() for name in names if name in numbers}
     for meaning, values in found.items():
         if not all(map(math.isfinite, values)):

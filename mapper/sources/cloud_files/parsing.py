@@ -16,7 +16,7 @@ Columns = Mapping[str, Column]
 
 MIN_POINTS = 10
 """Fewer points show no surface that anything could be aligned to."""
-MOST_BYTES = 2 << 30
+MOST_BYTES = 1 << 30
 """Size of a cloud, in its file and unpacked: what is made of it takes up to twice as much memory again."""
 
 _LONGEST_REASON = 150

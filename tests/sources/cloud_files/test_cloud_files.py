@@ -129,8 +129,7 @@ def test_noise_is_refused_in_one_line(tmp_path, ending):
         refusal_of(path)
 
 
-# Not laz: lazrs ends the process if a damaged chunk size asks for more memory than there is.
-@pytest.mark.parametrize("ending", [".pcd", ".ply", ".npy", ".las"])
+@pytest.mark.parametrize("ending", [".pcd", ".ply", ".npy", ".las", ".laz"])
 def test_damaged_bytes_never_raise_anything_else(tmp_path, ending):
     path = tmp_path / f"cloud{ending}"
     WRITERS[ending](path)
