@@ -1,8 +1,9 @@
-"""``mapper doctor``: is this machine fit for the job, and what to do if not."""
+"""``mapper doctor``: is this machine fit for the job, or a run undamaged, and what to do if not."""
 
 import json
 import sys
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -16,18 +17,30 @@ _MARKS = {"well": "ok  ", "warning": "warn", "failed": "FAIL"}
 
 
 def doctor(
+    run: Annotated[
+        Path | None,
+        typer.Argument(metavar="[RUN]", help="Check this run's files instead of the machine."),
+    ] = None,
     json_: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """Check the machine, try every library in a process of its own, and print what to do.
 
-    The exit status is 1 if anything failed.
+    With RUN, compare all its files with the sizes and digests in its manifest instead. The exit status is 1
+    if anything failed.
 
-    Example: mapper doctor --json, or just: mapper doctor
+    Example: mapper doctor --json, or: mapper doctor runs/xyz, or just: mapper doctor
     """
     from cli.console import progress_for
-    from mapper.doctor.examination import examine
 
-    findings = examine(progress=progress_for(quiet=json_ or not sys.stderr.isatty()))
+    progress = progress_for(quiet=json_ or not sys.stderr.isatty())
+    if run is None:
+        from mapper.doctor.examination import examine
+
+        findings = examine(progress=progress)
+    else:
+        from mapper.run.checks import check_run
+
+        findings = check_run(run, progress=progress)
     if json_:
         print(json.dumps([asdict(finding) for finding in findings], indent=2))
     else:

@@ -231,12 +231,10 @@ def _numbers(text: str) -> list[float]:
 
 def _loops_of(run: "Run", truth: "Trajectory") -> "list[Metric]":
     from evaluators.metrics.loops import loop_metrics
-    from mapper.run.files import KEYFRAMES
-    from mapper.sources.trajectory_files import read_tum
 
     loops = run.config.loops
     looked_every_m = loops.min_motion_m if loops.kind == "scans" else 0.0
-    keyframes_ns = read_tum(run.path / KEYFRAMES).stamps_ns
+    keyframes_ns = run.keyframes().stamps_ns
     return loop_metrics(run.loops(), keyframes_ns, truth, looked_every_m=looked_every_m)
 
 

@@ -52,15 +52,13 @@ def _figures(run: "Run") -> "list[Figure]":
     from evaluators.metrics.loops import loop_metrics
     from evaluators.metrics.metric import shown
     from mapper.export.report.data import Figure
-    from mapper.run.files import KEYFRAMES
     from mapper.run.verdict import verdict_on
-    from mapper.sources.trajectory_files import read_tum
 
     counts, truth = run.manifest.counts, run.truth()
     frames_ns = np.array([record.stamp_ns for record in run.records()], dtype=np.int64)
     metrics = list(assess(run.trajectory(), truth, frames_ns=frames_ns).metrics)
     if truth is not None:
-        metrics += loop_metrics(run.loops(), read_tum(run.path / KEYFRAMES).stamps_ns, truth)
+        metrics += loop_metrics(run.loops(), run.keyframes().stamps_ns, truth)
     return [
         Figure("log", run.manifest.input.title),
         Figure("verdict", verdict_on(run).state),

@@ -1,5 +1,6 @@
 """``mapper view``: a finished run in Rerun."""
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -27,6 +28,7 @@ def view(
     """
     from mapper.core.errors import ConfigError, RunError
     from mapper.export.rerun.finished import show_run
+    from mapper.run.digests import changing
     from mapper.run.files import RERUN
     from mapper.run.folder import load_run
 
@@ -39,6 +41,7 @@ def view(
         show_run(built, "spawn" if connect is None else f"connect:{connect}")
         return
     path = rrd or built.path / RERUN
-    show_run(built, str(path))
+    with nullcontext() if rrd else changing(built.path, {RERUN}):
+        show_run(built, str(path))
     if not quiet:
         print(path)

@@ -58,8 +58,8 @@ def map_quality(
             no points to register.
     """
     world = world or ("truth" if reference.in_truth else "map")
-    octree = read_map(run.path / files.OCTREE_MAP)
-    cloud = read_cloud(run.path / files.CLOUD, scale=1.0).points
+    octree = read_map(run.file(files.OCTREE_MAP))
+    cloud = read_cloud(run.file(files.CLOUD), scale=1.0).points
     T_map_reference = _laid_by_truth(run) if world == "truth" else np.eye(4)
     how = "by the truth's poses" if world == "truth" else "in the run's own world"
     if register:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.export.grid import read_grid
+from mapper.export.grid import stored_grid
 from mapper.export.palette import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
 from mapper.navigation.costmap import INSCRIBED, LETHAL, NO_INFORMATION, Costmap, inflate
 from mapper.run import files
@@ -27,7 +27,7 @@ def costmap(run: Run, path: Path, _progress: Progress) -> None:
     """
     config = run.config.costmap
     inflated = inflate(
-        read_grid(run.path / f"{files.SLICE}.yaml"),
+        stored_grid(run, files.SLICE),
         robot_radius_m=config.robot_radius_m,
         inflation_radius_m=config.inflation_radius_m,
         cost_scaling=config.cost_scaling,

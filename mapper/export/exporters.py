@@ -1,6 +1,7 @@
 """Exports of a run: the kinds of file, and the function that writes any of them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -116,8 +117,22 @@ def export(
     else:
         path = out
         _refuse_out(path, exporter, kind=kind, overwrite=overwrite)
-    exporter.write(run, path, progress)
+    with _recording(run, exporter, path):
+        exporter.write(run, path, progress)
     return path
+
+
+@contextmanager
+def _recording(run: "Run", exporter: Exporter, path: Path) -> Iterator[None]:
+    """Record in the manifest what an export writes into the run; files of the build stay as they are."""
+    from mapper.run.digests import changing
+    from mapper.run.files import names_of
+
+    written = {path.name, *(path.with_suffix(ending).name for ending in exporter.beside)}
+    names = written & names_of("poses", "exported maps")
+    inside = path.parent.resolve() == run.path.resolve()
+    with changing(run.path, names) if inside and names else nullcontext():
+        yield
 
 
 def _refuse_idle_settings(run: "Run", config: "BuildConfig", *, kind: str) -> None:

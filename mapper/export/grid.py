@@ -1,6 +1,7 @@
 """The 2D slice as the PGM + YAML pair that ROS map_server and nav2 load, and as a picture."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -10,6 +11,9 @@ from mapper.core.errors import DataError, MapFileError
 from mapper.export.palette import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, shrunk
 from mapper.runtime.atomic import write_bytes, write_text
+
+if TYPE_CHECKING:
+    from mapper.run.folder import Run
 
 FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
 OCCUPIED_THRESHOLD = 0.65
@@ -75,6 +79,17 @@ def read_grid(path: Path) -> OccupancyGrid:
     cells[darkness < free] = FREE
     cells[darkness > occupied] = OCCUPIED
     return OccupancyGrid(cells, np.array(origin[:2]), resolution_m)
+
+
+def stored_grid(run: "Run", stem: str) -> OccupancyGrid:
+    """Return a grid of a run: its slice, or its traversable floor.
+
+    Raises:
+        RunError: A file is not as it was written.
+        MapperError: As for ``read_grid``.
+    """
+    run.file(f"{stem}.pgm")
+    return read_grid(run.file(f"{stem}.yaml"))
 
 
 def grid_image(grid: OccupancyGrid) -> NDArray[np.uint8]:

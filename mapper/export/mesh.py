@@ -192,7 +192,7 @@ def _undistortion(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[n
 def _expected_blocks(run: Run) -> int:
     """Estimate from the octree how many blocks the surface will fill, and refuse what could not fit."""
     config = run.config.mesh
-    octree = read_map(run.path / files.OCTREE_OT, run.config.octree)
+    octree = read_map(run.file(files.OCTREE_OT), run.config.octree)
     occupied = int((octree.leaves().log_odds >= octree.occupied_log_odds).sum())
     block_m = _BLOCK_VOXELS * config.voxel_m
     shell_blocks = 1.0 + 2.0 * config.truncation_voxels / _BLOCK_VOXELS

@@ -13,6 +13,7 @@ from mapper.export.picture import write_path
 from mapper.navigation.planner import Plan, point_text
 from mapper.octree.slice import OccupancyGrid
 from mapper.run import files
+from mapper.run.digests import changing
 from mapper.run.folder import Run
 from mapper.runtime.atomic import write_text
 
@@ -29,13 +30,15 @@ def write_plan(run: Run, plan: Plan, *, grid: OccupancyGrid) -> None:
         RunError: The run has no MCAP log.
         DataError: The log cannot be read; it stays as it is.
     """
-    log_path = run.path / files.MCAP
+    log_path = run.file(files.MCAP)
     if not log_path.is_file():
         raise RunError(f"{log_path}: is missing from the run; make it again with mapper fuse {run.path}")
-    with McapLog(log_path) as log:
-        log.copy(log_path, without=PLAN_TOPICS)
-        log.plan(int(run.trajectory().stamps_ns[0]), _in_space(plan))
-    draw_plan(run.path, plan, grid=grid)
+    stamp_ns = int(run.trajectory().stamps_ns[0])
+    with changing(run.path, {files.PLAN, files.PLAN_VIEW, files.MCAP}):
+        with McapLog(log_path) as log:
+            log.copy(log_path, without=PLAN_TOPICS)
+            log.plan(stamp_ns, _in_space(plan))
+        draw_plan(run.path, plan, grid=grid)
 
 
 def draw_plan(folder: Path, plan: Plan, *, grid: OccupancyGrid) -> None:

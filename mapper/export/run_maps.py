@@ -7,7 +7,7 @@ import numpy as np
 
 from mapper.core.errors import DataError
 from mapper.core.frames import PinholeCamera
-from mapper.export.grid import read_grid
+from mapper.export.grid import stored_grid
 from mapper.export.run_mcap import BODY, CAMERA
 from mapper.mapping.fusion import Maps, Snapshot
 from mapper.octree.octomap_file import read_map
@@ -28,13 +28,13 @@ def maps_of(run: Run) -> Maps:
         FrameError: The cloud cannot be read.
         DataError: A grid cannot be read.
     """
-    cloud = read_ply(run.path / files.CLOUD)
+    cloud = read_ply(run.file(files.CLOUD))
     return Maps(
-        octree=read_map(run.path / files.OCTREE_MAP),
+        octree=read_map(run.file(files.OCTREE_MAP)),
         cloud_points_world=np.column_stack([cloud[axis] for axis in ("x", "y", "z")]),
         cloud_colors=np.column_stack([cloud[channel] for channel in ("red", "green", "blue")]),
-        grid=read_grid(run.path / f"{files.SLICE}.yaml"),
-        traversable=read_grid(run.path / f"{files.TRAVERSABLE}.yaml"),
+        grid=stored_grid(run, files.SLICE),
+        traversable=stored_grid(run, files.TRAVERSABLE),
     )
 
 
@@ -44,7 +44,7 @@ def snapshots_of(run: Run) -> Iterator[Snapshot]:
     Raises:
         DataError: The log cannot be read.
     """
-    yield from read_snapshots(run.path / files.MCAP)
+    yield from read_snapshots(run.file(files.MCAP))
 
 
 def read_snapshots(path: Path) -> Iterator[Snapshot]:

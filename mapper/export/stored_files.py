@@ -4,7 +4,7 @@ import shutil
 from pathlib import Path
 
 from mapper.core.errors import RunError
-from mapper.export.grid import read_grid, write_grid
+from mapper.export.grid import stored_grid, write_grid
 from mapper.octree.octomap_file import read_map, write_bt, write_ot
 from mapper.run import files
 from mapper.run.folder import Run
@@ -26,7 +26,7 @@ def octomap(run: Run, path: Path, _progress: Progress) -> None:
         return
     if _is_same(run.path / name, path):
         raise RunError(f"{path}: is the run's own octree; name another file to write level {level} to")
-    octree = read_map(run.path / files.OCTREE_MAP).coarser(level, parent=run.config.octomap.parent)
+    octree = read_map(run.file(files.OCTREE_MAP)).coarser(level, parent=run.config.octomap.parent)
     (write_ot if full else write_bt)(path, octree)
 
 
@@ -57,14 +57,13 @@ def kitti(run: Run, path: Path, _progress: Progress) -> None:
 
 def grid(run: Run, path: Path, _progress: Progress) -> None:
     """Write the slice's YAML with PGM and PNG beside it; the YAML names the PGM, so this is no copy."""
-    source = run.path / f"{files.SLICE}.yaml"
-    if not _is_same(source, path):
-        slice_world = read_grid(source)
+    slice_world = stored_grid(run, files.SLICE)
+    if not _is_same(run.path / f"{files.SLICE}.yaml", path):
         write_grid(path.parent, path.stem, slice_world)
 
 
 def _copy(run: Run, name: str, path: Path) -> None:
-    source = run.path / name
+    source = run.file(name)
     if not source.is_file():
         raise RunError(f"{source}: is missing from the run; build it again")
     if not _is_same(source, path):

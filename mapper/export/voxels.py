@@ -93,7 +93,7 @@ def _codes(lattice: Corners) -> Corners:
 
 
 def _occupied(run: Run) -> Leaves:
-    octree = read_map(run.path / files.OCTREE_OT, run.config.octree)
+    octree = read_map(run.file(files.OCTREE_OT), run.config.octree)
     leaves = octree.leaves()
     is_occupied = leaves.log_odds >= octree.occupied_log_odds
     if not is_occupied.any():

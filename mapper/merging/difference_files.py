@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.geometry import Points
-from mapper.export.grid import read_grid
+from mapper.export.grid import stored_grid
 from mapper.export.palette import APPEARED, NOT_SEEN_AGAIN, VANISHED, Rgb
 from mapper.export.picture import write_layers
 from mapper.export.ply import write_ply
@@ -53,7 +53,7 @@ def write_differences(
             write_ply(folder / f"{name.replace(' ', '_')}.ply", centres.astype(np.float32), colors)
         write_layers(
             folder / _PICTURE,
-            grid=shrunk(read_grid(before.path / f"{files.SLICE}.yaml"), _MOST_CELLS),
+            grid=shrunk(stored_grid(before, files.SLICE), _MOST_CELLS),
             layers=layers,
             title=f"{before.path.resolve().name} → {after.path.resolve().name}",
             lines=[summary(found), found.alignment],

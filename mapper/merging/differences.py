@@ -95,7 +95,7 @@ def differences_of(
     Raises:
         ConfigError: The maps have different resolutions.
     """
-    old, new = (read_map(placed.run.path / files.OCTREE_MAP) for placed in (before, after))
+    old, new = (read_map(placed.run.file(files.OCTREE_MAP)) for placed in (before, after))
     if old.resolution_m != new.resolution_m:
         raise ConfigError(
             f"{after.run.path}: octree.resolution_m is {new.resolution_m:g}, but {old.resolution_m:g} in "

@@ -166,7 +166,7 @@ def _common_config(placed: Sequence[Placed]) -> OctreeConfig:
 def _described(item: Placed) -> RunInMap:
     return RunInMap(
         path=str(item.run.path.resolve()),
-        fingerprint=fingerprint(item.run.path / files.OCTREE_MAP),
+        fingerprint=fingerprint(item.run.file(files.OCTREE_MAP)),
         T_map_world=tuple(tuple(row) for row in item.T_map_world.tolist()),
         placed=item.how,
     )

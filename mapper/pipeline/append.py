@@ -26,7 +26,6 @@ from mapper.pipeline.track import (
     track_log,
     wheels_beside,
 )
-from mapper.run import files
 from mapper.run.folder import Run, appended_log, load_run, open_log, write_run
 from mapper.run.manifest import Manifest, Timing, library_versions, now_text
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
@@ -92,7 +91,7 @@ def append(
         later = from_tracking(replace(tracking, graph=solved.graph, loops=solved.loops), None)
         save_solved(writer, before.solved(solved.graph, solved.loops).then(later, truth=source.truth))
         writer.update(solve=solved.report)
-        fuse_into(writer, source, joined, progress, before=files.scan_updates_path(run.path))
+        fuse_into(writer, source, joined, progress, before=run.scan_updates())
     return load_run(out)
 
 

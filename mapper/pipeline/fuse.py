@@ -105,14 +105,14 @@ def fuse_changed(
     manifest = moved_log(run, *paths_of(source)).manifest.model_copy(update={"status": status})
     with write_run(run.path, manifest, run.config, overwrite=True, takes_over=True) as writer:
         carry_times(writer, manifest.timing)
-        _copy_kept_files(run.path, writer.folder)
+        _copy_kept_files(run, writer.folder)
         if changed is not None:
             save_solved(writer, changed)
             for name in files.names_of("poses"):
                 (writer.folder / name).unlink(missing_ok=True)
         if solve is not None:
             writer.update(solve=solve)
-        fuse_into(writer, source, run.config, progress, before=files.scan_updates_path(run.path))
+        fuse_into(writer, source, run.config, progress, before=run.scan_updates())
     return load_run(run.path)
 
 
@@ -146,12 +146,15 @@ def _given(record: FrameRecord) -> FrameRecord:
     return replace(record, outcome="tracked", doubts=(), sigmas=None, pose_in_node=None)
 
 
-def _copy_kept_files(folder: Path, new: Path) -> None:
+def _copy_kept_files(run: Run, new: Path) -> None:
     """Copy the results of tracking and a user's own files; what was made from the old maps is left out."""
+    for name in files.names_of("tracking"):
+        run.file(name)
     made_again = files.names_of("maps", "exported maps") | {files.FORMER_SCAN_UPDATES}
-    for child in folder.iterdir():
+    for child in run.path.iterdir():
         if child.name in made_again:
             continue
+        run.file(child.name)
         if child.is_dir() and not child.is_symlink():
             shutil.copytree(child, new / child.name, symlinks=True)
         else:
@@ -175,7 +178,7 @@ def fuse_into(
     with McapLog(writer.folder / files.MCAP) as log:
         with (
             writer.clock.stage("fuse"),
-            open_scan_updates(before) if before is not None and before.exists() else nullcontext() as known,
+            open_scan_updates(before) if before is not None else nullcontext() as known,
             ScanUpdateWriter(writer.folder / files.SCAN_UPDATES, config.octree) as updates,
         ):
             maps = fuse_log(

@@ -10,6 +10,7 @@ TRAJECTORY = "trajectory.tum"
 KEYFRAMES = "keyframes.tum"
 POSES = "poses.csv"
 TRUTH = "truth.tum"
+KITTI = "trajectory.kitti"
 GRAPH = "graph.g2o"
 LOOPS = "loops.jsonl"
 FRAMES = "frames.csv"
@@ -105,6 +106,7 @@ RUN_FILES = (
         "the run ended",
         "maps",
     ),
+    RunFiles((KITTI,), "the trajectory as KITTI text, once `mapper export --as kitti` was asked", "poses"),
     RunFiles((MESH,), "a coloured surface, once `mapper export --as mesh` was asked", "poses"),
     RunFiles((VOXELS, VOXEL_MESH), "the octree's occupied voxels as points and as cubes", "exported maps"),
     RunFiles(_grid(COSTMAP), "the slice inflated for nav2", "exported maps"),
@@ -123,6 +125,27 @@ RUN = FolderKind(
 def names_of(*depends_on: str) -> frozenset[str]:
     """Return the names of all files that depend on any of these."""
     return frozenset(name for files in RUN_FILES if files.depends_on in depends_on for name in files.names)
+
+
+_REMEDIES = {
+    SCAN_UPDATES: "delete it, and mapper fuse RUN casts every frame afresh",
+    CONFIG: "restore it, or build again; settings are changed with mapper fuse RUN --set",
+    KITTI: "make it again with mapper export RUN --as kitti",
+    MESH: "make it again with mapper export RUN --as mesh",
+    VOXELS: "make it again with mapper export RUN --as voxels",
+    VOXEL_MESH: "make it again with mapper export RUN --as voxel-mesh",
+    FOXGLOVE_LAYOUT: "make it again with mapper export RUN --as foxglove-layout",
+    RERUN: "make it again with mapper view RUN",
+    **dict.fromkeys(_grid(COSTMAP), "make it again with mapper export RUN --as costmap"),
+    **dict.fromkeys((PLAN, PLAN_VIEW), "make it again with mapper plan RUN"),
+    **dict.fromkeys(names_of("tracking"), "only mapper build makes it again; restore it, or build again"),
+}
+
+
+def remedy_for(name: str, folder: Path) -> str:
+    """Return how a user gets a file of a run back, for messages."""
+    name = SCAN_UPDATES if name == FORMER_SCAN_UPDATES else name
+    return _REMEDIES.get(name, "make it again with mapper fuse RUN").replace("RUN", str(folder))
 
 
 def scan_updates_path(folder: Path) -> Path:

@@ -15,6 +15,7 @@ from mapper.graph.g2o import read_g2o
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure, read_closures
 from mapper.run import files
+from mapper.run.digests import checked, digests_of
 from mapper.run.doubtful_frames import without_doubtful
 from mapper.run.fingerprint import fingerprint
 from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records
@@ -31,7 +32,7 @@ from mapper.run.manifest import (
     read_manifest,
 )
 from mapper.run.pose_covariances import UncertainPoses, read_poses
-from mapper.runtime.atomic import atomic_folder, partial_of, write_text
+from mapper.runtime.atomic import atomic_folder, flush_to_disk, partial_of, write_text
 from mapper.runtime.timing import Stopwatch
 from mapper.sources import open_source
 from mapper.sources.base import Log, Session
@@ -54,9 +55,20 @@ class Run:
     config: BuildConfig
     manifest: Manifest
 
+    def file(self, name: str) -> Path:
+        """Return the path of one of its files, after comparing it with what the manifest tells of it.
+
+        Raises:
+            RunError: It is missing, or is not as it was written.
+        """
+        if not self.manifest.files:
+            return self.path / name
+        digests = read_manifest(self.path / files.MANIFEST).files  # exports and plans add theirs
+        return checked(self.path, name, digests)
+
     def trajectory(self) -> Trajectory:
         """Return the solved body poses of all placed frames, doubtful ones too, in the levelled world."""
-        return read_tum(self.path / files.TRAJECTORY)
+        return read_tum(self.file(files.TRAJECTORY))
 
     def tracked_trajectory(self) -> Trajectory:
         """Return the poses of the frames that maps are made from: those that are not doubtful."""
@@ -64,29 +76,38 @@ class Run:
 
     def poses(self) -> UncertainPoses | None:
         """Return the same poses with their covariance; None in a run of before 2026-11-22."""
-        path = self.path / files.POSES
+        path = self.file(files.POSES)
         return read_poses(path) if path.exists() else None
 
     def truth(self) -> Trajectory | None:
         """Return the true body poses, in the truth's own frame, if the log has them."""
-        path = self.path / files.TRUTH
+        path = self.file(files.TRUTH)
         return read_tum(path) if path.exists() else None
 
     def graph(self) -> PoseGraph:
         """Return the pose graph with its nodes at the solution, in the levelled world."""
-        return read_g2o(self.path / files.GRAPH)
+        return read_g2o(self.file(files.GRAPH))
 
     def loops(self) -> list[LoopClosure]:
         """Return every loop candidate with its verdict."""
-        return read_closures(self.path / files.LOOPS)
+        return read_closures(self.file(files.LOOPS))
 
     def records(self) -> list[FrameRecord]:
         """Return the outcome of every frame."""
-        return read_records(self.path / files.FRAMES)
+        return read_records(self.file(files.FRAMES))
 
     def frame_ms(self) -> dict[int, float]:
         """Return how many milliseconds each frame took to track, by stamp."""
-        return read_frame_ms(self.path / files.FRAME_MS)
+        return read_frame_ms(self.file(files.FRAME_MS))
+
+    def keyframes(self) -> Trajectory:
+        """Return the poses of the keyframes."""
+        return read_tum(self.file(files.KEYFRAMES))
+
+    def scan_updates(self) -> Path | None:
+        """Return the path of the frames' updates, by its former name too; None where a user deleted it."""
+        path = files.scan_updates_path(self.path)
+        return self.file(path.name) if path.exists() else None
 
     def files(self) -> list[Path]:
         """Return the folder's files, by name."""
@@ -97,7 +118,8 @@ def load_run(path: Path) -> Run:
     """Return a finished run.
 
     Raises:
-        RunError: The folder is missing, is no run, or is not finished; the message says how it ended.
+        RunError: The folder is missing, is no run, or is not finished; the message says how it ended. Or its
+            settings are not as they were written.
     """
     if not path.is_dir():
         partial = partial_of(path)
@@ -114,7 +136,7 @@ def load_run(path: Path) -> Run:
     manifest = read_manifest(path / files.MANIFEST)
     if manifest.status != "complete":
         raise RunError(f"{path}: not finished: {_ending(path)}")
-    return Run(path, load_run_config(path / files.CONFIG), manifest)
+    return Run(path, load_run_config(checked(path, files.CONFIG, manifest.files)), manifest)
 
 
 def moved_log(run: Run, *logs: Path) -> Run:
@@ -191,7 +213,7 @@ class RunWriter:
     def __init__(self, folder: Path, manifest: Manifest) -> None:
         self.folder = folder
         self.clock = Stopwatch()
-        self.manifest = manifest
+        self.manifest = manifest.model_copy(update={"files": {}})
         self.save()
 
     def update(self, **parts: Any) -> None:
@@ -247,8 +269,10 @@ def write_run(
                 writer.save()
             error.add_note(f"what there is so far stays in {folder}")
             raise
-        writer.update(status="complete")
+        writer.update(status="complete", files=digests_of(folder))
         writer.save()
+        flush_to_disk(folder / files.MANIFEST)
+        flush_to_disk(folder)
 
 
 def first_manifest(source: Log) -> Manifest:

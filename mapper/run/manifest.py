@@ -206,6 +206,13 @@ class Timing(Config):
     peak_memory_mb: float = 0.0
 
 
+class FileDigest(Config):
+    """A file as it was written."""
+
+    size_bytes: int
+    sha256: str
+
+
 class Manifest(Config):
     """``manifest.json``."""
 
@@ -228,6 +235,8 @@ class Manifest(Config):
     solve: Solve | None = None
     levelling: Levelling | None = None
     timing: Timing = Timing()
+    files: dict[str, FileDigest] = Field(default_factory=dict)
+    """Every file of the run but this; empty while it is being built, and in runs of before 2026-11-22."""
 
     def save(self, path: Path) -> None:
         """Write the manifest atomically."""

@@ -131,7 +131,9 @@ def test_the_same_log_gives_the_same_bytes(run, desk_log, tmp_path, workers):
     ours, theirs = files_of(again.path), files_of(run.path)
     assert ours.keys() == theirs.keys()
     assert overridden(again.config, ["workers=2"]) == run.config
-    assert again.manifest.model_copy(update={"timing": run.manifest.timing}) == run.manifest
+    elsewhere = {"timing": run.manifest.timing, "files": run.manifest.files}
+    assert again.manifest.model_copy(update=elsewhere) == run.manifest
+    assert again.manifest.files.keys() == run.manifest.files.keys() == ours.keys() - {"manifest.json"}
     for name in ours.keys() - {"config.json", "manifest.json", "frame_ms.csv"}:
         assert ours[name] == theirs[name], name
 

@@ -1,0 +1,91 @@
+"""Checks of all files of a finished run, for ``mapper doctor RUN``."""
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+from mapper.core.errors import MapperError
+from mapper.doctor.finding import Finding
+from mapper.run import files
+from mapper.run.digests import fault_of
+from mapper.run.folder import Run, load_run
+from mapper.run.manifest import FileDigest
+from mapper.runtime.ordered_map import ordered_map
+from mapper.runtime.progress import SILENT, Progress
+
+_THREADS = 4
+_DISPENSABLE = files.names_of("poses", "exported maps") | {files.SCAN_UPDATES}
+
+
+def check_run(folder: Path, *, progress: Progress = SILENT) -> list[Finding]:
+    """Compare every file of a run with the size and the SHA-256 that its manifest tells.
+
+    The files of a run of before 2026-11-22, which has neither, are read and counted instead.
+
+    Args:
+        folder: The run.
+        progress: Receives how many files were checked.
+
+    Raises:
+        RunError: There is no finished run, or its manifest or its settings are damaged.
+    """
+    run = load_run(folder)
+    digests = run.manifest.files
+    findings = []
+    with progress.stage("check") as report:
+        found = _hashed(run, digests) if digests else _counted(run)
+        for done, finding in enumerate(found, start=1):
+            findings.append(finding)
+            report(done, len(digests) or done)
+    return [*findings, *_unrecorded(run)]
+
+
+def _hashed(run: Run, digests: Mapping[str, FileDigest]) -> Iterator[Finding]:
+    def check(name: str) -> Finding:
+        path, wanted = run.path / name, digests[name]
+        if fault := fault_of(path, wanted):
+            verdict = "failed" if path.exists() or name not in _DISPENSABLE else "warning"
+            return Finding(name, verdict, fault, files.remedy_for(name, run.path))
+        return Finding(name, "well", f"{wanted.size_bytes} bytes, SHA-256 {wanted.sha256[:12]}…")
+
+    return ordered_map(check, sorted(digests), workers=_THREADS)
+
+
+def _counted(run: Run) -> Iterator[Finding]:
+    counts = run.manifest.counts
+    readers: tuple[tuple[str, Callable[[], int], int], ...] = (
+        (files.FRAMES, lambda: len(run.records()), counts.listed),
+        (files.TRAJECTORY, lambda: len(run.trajectory()), counts.tracked + counts.doubtful),
+        (files.KEYFRAMES, lambda: len(run.keyframes()), counts.nodes),
+        (files.GRAPH, lambda: len(run.graph().T_world_node), counts.nodes),
+        (f"{files.GRAPH}: factors", lambda: len(run.graph().factors), counts.factors),
+        (files.LOOPS, lambda: len(run.loops()), counts.loop_candidates),
+    )
+    for name, count, wanted in readers:
+        remedy = files.remedy_for(name.split(":")[0], run.path)
+        try:
+            found = count()
+        except MapperError as error:
+            yield Finding(name, "failed", str(error), remedy)
+            continue
+        if found == wanted:
+            yield Finding(name, "well", f"{found}, as the manifest tells")
+        else:
+            yield Finding(name, "failed", f"has {found}, the manifest tells {wanted}", remedy)
+    yield Finding(
+        files.MANIFEST,
+        "warning",
+        "tells no digests: the run is of an older version, and its maps are not checked",
+        f"mapper fuse {run.path} makes the maps again and records digests of all files",
+    )
+
+
+def _unrecorded(run: Run) -> Iterator[Finding]:
+    """Yield what lies in the run without a digest, but for a user's own files."""
+    for path in run.files():
+        if path.name.startswith(".") and ".part" in path.name:
+            yield Finding(path.name, "warning", "left by a process that was killed", f"delete {path}")
+        elif run.manifest.files and path.name in files.RUN.files - {files.MANIFEST, *run.manifest.files}:
+            remedy = files.remedy_for(path.name, run.path)
+            yield Finding(
+                path.name, "warning", "has no digest: its writer was killed, or it is a copy", remedy
+            )

@@ -1,0 +1,163 @@
+import hashlib
+import shutil
+
+import pytest
+
+from mapper.core.errors import RunError
+from mapper.export.exporters import EXPORTERS, export
+from mapper.pipeline.fuse import fuse
+from mapper.run import digests, files
+from mapper.run.checks import check_run
+from mapper.run.digests import changing
+from mapper.run.folder import load_run, open_log
+from mapper.run.manifest import read_manifest
+from mapper.run.results import load_results
+from tests.support.files import files_of
+
+READERS = {
+    "trajectory.tum": lambda run: run.trajectory(),
+    "keyframes.tum": lambda run: run.keyframes(),
+    "poses.csv": lambda run: run.poses(),
+    "truth.tum": lambda run: run.truth(),
+    "graph.g2o": lambda run: run.graph(),
+    "loops.jsonl": lambda run: run.loops(),
+    "frames.csv": lambda run: run.records(),
+    "frame_ms.csv": lambda run: run.frame_ms(),
+    "config.json": lambda run: load_run(run.path),
+}
+
+
+@pytest.fixture
+def run(desk_run, tmp_path):
+    return load_run(shutil.copytree(desk_run.path, tmp_path / "run"))
+
+
+def cut(path):
+    """Leave half of a file; of an empty one, as the desk's loops are, another."""
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2] or b"{")
+
+
+def turn_a_bit(path):
+    data = bytearray(path.read_bytes())
+    data[-2] ^= 1  # the last digit of a text
+    path.write_bytes(data)
+
+
+def verdicts_of(path):
+    return {finding.name: finding.verdict for finding in check_run(path)}
+
+
+def test_the_manifest_tells_size_and_digest_of_every_file(run):
+    written = files_of(run.path)
+    del written["manifest.json"]
+    assert run.manifest.files.keys() == written.keys()
+    for name, data in written.items():
+        assert run.manifest.files[name].size_bytes == len(data)
+        assert run.manifest.files[name].sha256 == hashlib.sha256(data).hexdigest()
+    assert set(verdicts_of(run.path).values()) == {"well"}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_file_that_was_cut_is_not_read(run, name):
+    READERS[name](run)
+    cut(run.path / name)
+    with pytest.raises(RunError, match=rf"{name}: has \d+ bytes, was written with \d+; "):
+        READERS[name](run)
+
+
+@pytest.mark.parametrize("name", ["trajectory.tum", "poses.csv", "frames.csv"])
+def test_a_bit_that_was_turned_is_found(run, name):
+    turn_a_bit(run.path / name)
+    with pytest.raises(RunError, match=rf"{name}: has SHA-256 .*; only mapper build makes it again"):
+        load_results(run)
+
+
+def test_a_file_that_is_gone_is_no_file_that_never_was(run):
+    (run.path / "truth.tum").unlink()
+    with pytest.raises(RunError, match=r"truth.tum: is missing, was written with \d+ bytes"):
+        run.truth()
+
+
+@pytest.mark.parametrize("kind", EXPORTERS)
+def test_no_export_takes_a_damaged_file(run, tmp_path, kind):
+    """Each file of the run is cut, so whichever an export reads is."""
+    for path in run.path.iterdir():
+        if path.name not in ("manifest.json", "config.json"):
+            cut(path)
+    if kind == "foxglove-layout":  # reads nothing
+        return
+    with pytest.raises(RunError, match="was written with"):
+        export(run, kind, tmp_path / f"out{EXPORTERS[kind].endings[0]}")
+    with pytest.raises(RunError, match="was written with"):
+        export(run, kind)
+
+
+@pytest.mark.parametrize("name", ["graph.g2o", "truth.tum", "loops.jsonl", "scan_updates.bin"])
+def test_fusing_does_not_take_over_damage(run, name):
+    cut(run.path / name)
+    before = files_of(run.path)
+    with pytest.raises(RunError, match=rf"{name}: has \d+ bytes"):
+        fuse(open_log(run), run, run.config)
+    assert files_of(run.path) == before
+
+
+def test_a_large_file_is_hashed_by_the_doctor_only(run, monkeypatch):
+    monkeypatch.setattr(digests, "MOST_HASHED_BYTES", 10)
+    turn_a_bit(run.path / "trajectory.tum")
+    run.trajectory()
+    assert verdicts_of(run.path)["trajectory.tum"] == "failed"
+
+
+def test_the_doctor_names_all_that_is_wrong_and_what_helps(run):
+    cut(run.path / "loops.jsonl")
+    turn_a_bit(run.path / "map.octree")
+    (run.path / "slice.png").unlink()
+    (run.path / "scan_updates.bin").unlink()
+    (run.path / ".mesh.0123.part.ply").touch()
+    (run.path / "notes.txt").write_text("a user's own")
+    findings = {finding.name: finding for finding in check_run(run.path) if finding.verdict != "well"}
+
+    assert findings.keys() == {
+        *("loops.jsonl", "map.octree", "slice.png", "scan_updates.bin", ".mesh.0123.part.ply")
+    }
+    assert findings["scan_updates.bin"].verdict == "warning", "a run is whole without it"
+    assert findings["slice.png"].verdict == findings["loops.jsonl"].verdict == "failed"
+    assert findings["map.octree"].remedy == f"make it again with mapper fuse {run.path}"
+
+
+def test_exports_into_the_run_are_recorded(run):
+    export(run, "costmap")
+    assert verdicts_of(run.path)["costmap.pgm"] == "well"
+    cut(run.path / "costmap.pgm")
+    assert verdicts_of(run.path)["costmap.pgm"] == "failed"
+    export(run, "costmap")
+    assert verdicts_of(run.path)["costmap.pgm"] == "well"
+
+    cut(run.path / "trajectory.tum")
+    with pytest.raises(RunError):
+        export(run, "tum")
+    assert verdicts_of(run.path)["trajectory.tum"] == "failed", "an export records what it writes alone"
+
+
+def test_a_process_that_is_killed_leaves_no_digest_of_what_it_was_changing(run):
+    def kill():
+        with changing(run.path, {files.MCAP}):
+            assert files.MCAP not in read_manifest(run.path / "manifest.json").files
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        kill()
+    assert read_manifest(run.path / "manifest.json").files == run.manifest.files
+
+
+def test_a_run_without_digests_is_read_and_counted(run):
+    old = run.manifest.model_copy(update={"files": {}})
+    old.save(run.path / "manifest.json")
+    assert set(verdicts_of(run.path).values()) == {"well", "warning"}
+    export(run, "costmap")
+    assert not read_manifest(run.path / "manifest.json").files
+
+    lines = (run.path / "trajectory.tum").read_text().splitlines(keepends=True)
+    (run.path / "trajectory.tum").write_text("".join(lines[: len(lines) // 2]))
+    assert len(load_run(run.path).trajectory()) < len(lines) - 1
+    assert verdicts_of(run.path)["trajectory.tum"] == "failed"
