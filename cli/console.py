@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from cli.terminal import escaped
 from mapper.runtime.progress import SILENT, Progress, Report
 
 _SECONDS_BETWEEN_LINES = 10.0
@@ -40,7 +41,7 @@ class _Notes:
             self._show("mapper: … and more of these; the manifest lists all")
 
     def _show(self, line: str) -> None:
-        print(line, file=sys.stderr)
+        print(escaped(line, one_line=True), file=sys.stderr)
 
 
 class Bars(_Notes):
@@ -59,7 +60,9 @@ class Bars(_Notes):
             TextColumn("{task.fields[rate]}"),
             TimeRemainingColumn(elapsed_when_finished=True),
         )
-        with Progress(*columns, console=Console(stderr=True)) as bars:
+        # Bars are drawn by escape sequences, which text may not have.
+        terminal = getattr(sys.stderr, "raw", sys.stderr)
+        with Progress(*columns, console=Console(file=terminal)) as bars:
             task = bars.add_task(name, total=None, rate="")
             began = time.monotonic()
 

@@ -1,9 +1,11 @@
 """The command line: its verbs, and the one place that turns an error into a line and an exit status."""
 
 import errno
+import signal
 import sys
 import warnings
-from typing import Annotated, Any, TextIO
+from types import FrameType
+from typing import Annotated, Any, NoReturn, TextIO, cast
 
 import typer
 from typer.core import TyperGroup
@@ -30,13 +32,14 @@ from cli.show_config import show_config
 from cli.solve import solve
 from cli.sweep import sweep
 from cli.synth import synth
+from cli.terminal import EscapingStream, escaped
 from cli.view import view
 from cli.vocabulary import vocabulary
 from mapper import __version__
-from mapper.core.errors import MapperError, MapperWarning
+from mapper.core.errors import MapperError, MapperWarning, Terminated
 
-_INTERRUPTED = 130  # 128 + SIGINT, as shells count
-_USER_CAN_HELP = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS}
+_INTERRUPTED, _TERMINATED = 130, 143  # 128 + SIGINT, 128 + SIGTERM, as shells count
+_USER_CAN_HELP = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EPERM, errno.EROFS}
 
 
 class Guarded(TyperGroup):
@@ -52,15 +55,19 @@ class Guarded(TyperGroup):
         except OSError as error:
             if error.errno not in _USER_CAN_HELP:
                 raise
-            _say(f"{error.filename or 'a file'}: {error.strerror}", error)
+            _say(f"{error.filename2 or error.filename or 'a file'}: {error.strerror}", error)
             raise typer.Exit(1) from None
+        except Terminated as error:
+            _say("ended by SIGTERM", error)
+            raise typer.Exit(_TERMINATED) from None
         except KeyboardInterrupt as error:
             _say("interrupted", error)
             raise typer.Exit(_INTERRUPTED) from None
 
 
 def _say(what: str, error: BaseException) -> None:
-    print("; ".join([f"mapper: {what}", *getattr(error, "__notes__", ())]), file=sys.stderr)
+    line = "; ".join([f"mapper: {what}", *getattr(error, "__notes__", ())])
+    print(escaped(line, one_line=True), file=sys.stderr)
 
 
 def _show_warning(
@@ -72,7 +79,7 @@ def _show_warning(
     line: str | None = None,
 ) -> None:
     if issubclass(category, MapperWarning):
-        print(f"mapper: {message}", file=sys.stderr)
+        print(escaped(f"mapper: {message}", one_line=True), file=sys.stderr)
     else:
         _python_shows_warning(message, category, filename, lineno, file, line)
 
@@ -122,9 +129,15 @@ def version(
         raise typer.Exit
 
 
+def _terminate(_signal: int, _frame: FrameType | None) -> NoReturn:
+    raise Terminated("SIGTERM")
+
+
 def main() -> None:
     """Run the command line."""
     prepare_environment()
+    signal.signal(signal.SIGTERM, _terminate)
+    sys.stdout, sys.stderr = (cast(TextIO, EscapingStream(stream)) for stream in (sys.stdout, sys.stderr))
     warnings.showwarning = _show_warning
     warnings.simplefilter("always", MapperWarning)
     app()

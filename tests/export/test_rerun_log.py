@@ -17,7 +17,7 @@ from mapper.core.frames import Scan
 from mapper.export.rerun.finished import show_run
 from mapper.export.rerun.live import LiveRerun
 from mapper.export.rerun.recording import recorded
-from mapper.export.rerun.target import check_target
+from mapper.export.rerun.target import check_target, streaming
 from mapper.export.run_maps import maps_of, snapshots_of
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.pipeline.build import build
@@ -196,6 +196,36 @@ def test_no_screen_is_one_line(run, monkeypatch):
     monkeypatch.setattr(sys, "platform", "linux")
     with pytest.raises(ViewerError, match="there is no screen"):
         show_run(run, "spawn")
+
+
+_VIEWER = """#!{python}
+import socket, sys
+options = dict(zip(sys.argv[1::2], sys.argv[2::2]))
+open({told!r}, "w").write(options["--bind"])
+with socket.create_server((options["--bind"], int(options["--port"]))) as server:
+    server.settimeout(30)
+    server.accept()
+"""
+
+
+def test_a_viewer_that_is_started_listens_on_this_machine_only(tmp_path, monkeypatch):
+    viewer, told = tmp_path / "rerun", tmp_path / "told"
+    viewer.write_text(_VIEWER.format(python=sys.executable, told=str(told)))
+    viewer.chmod(0o755)
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    connected = []
+
+    class Recording:
+        def connect_grpc(self, url, **_):
+            connected.append(url)
+
+        def flush(self, **_):
+            pass
+
+    with streaming(Recording(), "spawn", None, keeps=lambda: False):
+        assert told.read_text() == "127.0.0.1"
+        assert connected[0].startswith("rerun+http://127.0.0.1:")
 
 
 def test_the_verb_keeps_the_recording_in_the_run(run, tmp_path):

@@ -2,7 +2,9 @@
 
 import os
 import socket
+import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,10 +18,12 @@ if TYPE_CHECKING:
     import rerun as rr
     import rerun.blueprint as rrb
 
-DEFAULT_URL = "rerun+http://127.0.0.1:9876/proxy"
+_HOST, _PORT = "127.0.0.1", 9876
+DEFAULT_URL = f"rerun+http://{_HOST}:{_PORT}/proxy"
 ENDING = ".rrd"
 _SPAWN, _CONNECT = "spawn", "connect"
 _PATIENCE_S = 3.0
+_START_S = 30.0
 _FLUSH_S = 60.0
 
 
@@ -91,17 +95,55 @@ def streaming(
 
 
 def _spawn(recording: "rr.RecordingStream", blueprint: "rrb.Blueprint") -> None:
-    import rerun as rr
-
+    """Start a viewer that listens on this machine only, unlike the one that ``rr.spawn`` starts."""
     viewer = Path(sys.executable).with_name("rerun")  # in an environment that need not be on the PATH
+    port = _free_port()
+    url = f"rerun+http://{_HOST}:{port}/proxy"
+    command = [
+        str(viewer) if viewer.exists() else "rerun",
+        *("--bind", _HOST, "--port", str(port), "--expect-data-soon"),
+    ]
     try:
-        rr.spawn(
-            executable_path=str(viewer) if viewer.exists() else None,
-            default_blueprint=blueprint,
-            recording=recording,
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # the window stays when this process ends
         )
-    except RuntimeError as error:
-        raise ViewerError(f"rerun: the viewer cannot be started: {str(error).splitlines()[0]}") from None
+    except OSError as error:
+        raise ViewerError(f"rerun: the viewer cannot be started: {command[0]}: {error.strerror}") from None
+    deadline = time.monotonic() + _START_S
+    while not _listens(_HOST, port):
+        if process.poll() is not None:
+            status = process.returncode
+            raise ViewerError(f"rerun: the viewer cannot be started: it ended with status {status}")
+        if time.monotonic() > deadline:
+            process.terminate()
+            raise ViewerError(f"rerun: the viewer did not answer at {url} within {_START_S:g} s")
+        time.sleep(0.05)
+    recording.connect_grpc(url, default_blueprint=blueprint)
+
+
+def _free_port() -> int:
+    """Return Rerun's usual port, or another where that is taken, perhaps by a viewer of another user."""
+    for port in (_PORT, 0):
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((_HOST, port))
+            except OSError:
+                continue
+            return int(probe.getsockname()[1])
+    raise ViewerError(f"rerun: no free port for a viewer on {_HOST}")
+
+
+def _listens(host: str, port: int) -> bool:
+    try:
+        socket.create_connection((host, port), timeout=_PATIENCE_S).close()
+    except OSError:
+        return False
+    return True
 
 
 def _refuse_without_screen() -> None:
@@ -116,7 +158,7 @@ def _refuse_without_listener(url: str) -> None:
     """Ask by a plain connection: Rerun itself would wait, log and drop the data at the end."""
     parts = urlsplit(url)
     try:
-        port = parts.port or 9876
+        port = parts.port or _PORT
         socket.create_connection((str(parts.hostname), port), timeout=_PATIENCE_S).close()
     except (OSError, ValueError) as error:
         raise ViewerError(

@@ -1,0 +1,72 @@
+import io
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from cli.terminal import EscapingStream, escaped
+from mapper.run.manifest import read_manifest
+from tests.support.full_disk import largest_file
+
+MAPPER = [sys.executable, "-c", "from cli.main import main; main()"]
+
+
+def test_control_characters_are_shown_not_obeyed():
+    assert escaped("a\x1b[31mb\x07\r\x9b2J") == r"a\x1b[31mb\x07\r\x9b2J"
+    assert escaped("exe\u202egnp.\u2066") == r"exe\u202egnp.\u2066"
+    assert escaped(os.fsdecode(b"caf\xe9")) == r"caf\udce9"
+    assert escaped("Poznań →\ttab\nline") == "Poznań →\ttab\nline"
+    assert escaped("a\nmapper: all is well", one_line=True) == r"a\nmapper: all is well"
+
+
+def test_a_stream_escapes_what_is_printed_to_it():
+    stream = io.StringIO()
+    print("topic \x1b]0;title\x07", file=EscapingStream(stream))
+    EscapingStream(stream).writelines(["\x1b", "\n"])
+    assert stream.getvalue() == "topic \\x1b]0;title\\x07\n\\x1b\n"
+
+
+def test_a_name_of_a_log_cannot_write_to_the_terminal(tmp_path):
+    name = os.fsencode(tmp_path) + b"/log\x1b[2J\xff\nmapper: fine"
+    told = subprocess.run([*MAPPER, "inspect", name], capture_output=True, check=False)
+    assert told.returncode == 1
+    assert told.stderr.count(b"\n") == 1
+    assert rb"log\x1b[2J\udcff\nmapper: fine: no such" in told.stderr
+    assert b"\x1b" not in told.stderr + told.stdout
+
+
+@pytest.mark.parametrize(
+    ("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)], ids=["SIGTERM", "SIGINT"]
+)
+def test_a_build_that_is_told_to_end_says_so_in_its_manifest(desk_log, tmp_path, number, status):
+    out = tmp_path / "run"
+    build = subprocess.Popen([*MAPPER, "build", desk_log, "--out", out, "--quiet"], stderr=subprocess.PIPE)
+    manifest = tmp_path / "run.partial/manifest.json"
+    while not manifest.exists() and build.poll() is None:
+        time.sleep(0.01)
+    time.sleep(0.2)
+    build.send_signal(number)
+    _, told = build.communicate()
+
+    assert build.returncode == status
+    assert told.count(b"\n") == 1, told
+    assert b"what there is so far stays in" in told
+    assert read_manifest(manifest).status == "interrupted"
+    assert not out.exists()
+
+
+def test_a_full_disk_leaves_no_file_and_one_line(desk_log, tmp_path):
+    with largest_file(3000):
+        build = subprocess.run(
+            [*MAPPER, "build", desk_log, "--out", tmp_path / "run", "--quiet"],
+            capture_output=True,
+            check=False,
+        )
+    assert build.returncode == 1
+    assert build.stderr.count(b"\n") == 1, build.stderr
+    assert b"File too large; raise the limit (ulimit -f)" in build.stderr
+    assert not (tmp_path / "run").exists()
+    assert not list((tmp_path / "run.partial").glob(".*"))
