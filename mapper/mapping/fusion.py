@@ -65,7 +65,7 @@ class Maps:
 
     Attributes:
         octree: Occupied, free and unknown space.
-        cloud_points_world: (N, 3) float32 metres, levelled world.
+        cloud_points_world: (N, 3) float32 metres, levelled world, all in occupied voxels of the octree.
         cloud_colors: (N, 3) uint8 RGB.
         grid: The slice through the octree above the floor.
         traversable: The floor that a robot can drive on.
@@ -172,7 +172,7 @@ def fuse_log(
     if before is not None:
         progress.note(f"fused again: {moved} of {len(trajectory)} frames, which had moved or were not known")
     grid, floor = cut_slice(octree, config.slice), traversable(octree, config.traversable)
-    return Maps(octree, *cloud.points_and_colors(), grid, floor)
+    return Maps(octree, *_in_occupied_voxels(octree, *cloud.points_and_colors()), grid, floor)
 
 
 class _Casters(threading.local):
@@ -264,6 +264,12 @@ def _snapshot(frame: Frame, scan: Scan, config: McapConfig) -> Snapshot | ScanSn
         shrunk_camera(frame.camera, width_px=config.image_width_px),
         frame.T_body_camera,
     )
+
+
+def _in_occupied_voxels(octree: OctreeMap, points_world: Points32, colors: Colors) -> tuple[Points32, Colors]:
+    """Return the part of a cloud that the finished octree agrees with."""
+    kept = octree.are_occupied(points_world)
+    return points_world[kept], colors[kept]
 
 
 def _add_to_cloud(cloud: CloudBuilder, scan: Scan, T_world_body: Transform) -> None:

@@ -202,6 +202,11 @@ class OctreeMap:
         found: NDArray[np.float32] = queries.values_at(self.blocks.table, points_world, self.resolution_m)
         return found
 
+    def are_occupied(self, points_world: Points32) -> NDArray[np.bool_]:
+        """Return the (N,) mask of the (N, 3) points, metres, that lie in occupied voxels."""
+        occupied: NDArray[np.bool_] = self.query(points_world) >= self.occupied_log_odds
+        return occupied
+
     def cast_rays(
         self, origins_world: Points, directions_world: Points, *, max_range_m: float, through_unknown: bool
     ) -> RayEnds:

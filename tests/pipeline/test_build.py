@@ -17,6 +17,7 @@ from mapper.pipeline.fuse import fuse
 from mapper.run.folder import load_run
 from mapper.run.manifest import read_manifest
 from mapper.sources import open_source
+from mapper.sources.cloud_files import read_cloud
 from tests.support.desk import REPEATABLE
 from tests.support.files import files_of
 
@@ -104,6 +105,13 @@ def test_the_maps_agree_with_each_other(run):
     heights_m = np.arange(0.1, 1.2, 0.05) + 0.025
     column_log_odds = octree.query(np.array([[x, y, z] for z in heights_m]))
     assert (column_log_odds >= octree.occupied_log_odds).any()
+
+
+def test_every_point_of_the_cloud_lies_in_an_occupied_voxel(run):
+    cloud = read_cloud(run.path / "cloud.ply", scale=1.0).points
+    assert len(cloud) == run.manifest.counts.cloud_points > 1000
+    for name in ("map.ot", "map.octree"):
+        assert read_map(run.path / name).are_occupied(cloud).all()
 
 
 def test_the_log_holds_the_whole_story(run):
