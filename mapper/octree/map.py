@@ -202,9 +202,9 @@ class OctreeMap:
         found: NDArray[np.float32] = queries.values_at(self.blocks.table, points_world, self.resolution_m)
         return found
 
-    def are_occupied(self, points_world: Points32) -> NDArray[np.bool_]:
+    def are_occupied(self, points_world: Points | Points32) -> NDArray[np.bool_]:
         """Return the (N,) mask of the (N, 3) points, metres, that lie in occupied voxels."""
-        occupied: NDArray[np.bool_] = self.query(points_world) >= self.occupied_log_odds
+        occupied: NDArray[np.bool_] = self.query(points_world.astype(np.float64)) >= self.occupied_log_odds
         return occupied
 
     def cast_rays(

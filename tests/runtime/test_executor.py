@@ -88,8 +88,9 @@ def test_leaving_early_ends_the_workers(diary):
     jobs = [Work(diary, "1"), Work(diary, "asleep", "wait"), Work(diary, "awake", "wait")]
     with make_executor(Workers(2)) as executor:
         assert next(run_jobs(jobs, executor)) == (0, 1)
-        until((diary.parent / "asleep.pid").exists)
-        pid = int((diary.parent / "asleep.pid").read_text() or 0)
+        asleep = diary.parent / "asleep.pid"
+        until(lambda: asleep.exists() and asleep.read_text())  # the file is there before its text
+        pid = int(asleep.read_text())
         assert alive(pid)
     assert not alive(pid)
 

@@ -37,7 +37,7 @@ def with_chunks(path, chunks):
 
 
 def with_layer(path, layer_bytes):
-    """Let the first layer have so many bytes; layers' sizes follow the first point, of 36 bytes, and a count."""
+    """Let the first layer have so many bytes; the sizes follow the first point, of 36 bytes, and a count."""
     data = bytearray(path.read_bytes())
     (start,) = struct.unpack_from("<I", data, 96)
     struct.pack_into("<I", data, start + 8 + 36 + 4, layer_bytes)
