@@ -10,6 +10,7 @@ def prepare_environment() -> None:
     from mapper.runtime.threads import one_thread_per_library
 
     one_thread_per_library()
+    os.environ.setdefault("RUST_LOG", "off")  # Rerun would print lines of its own beside our errors
     package = Path(mapper.__file__).parent
     if not os.access(package, os.W_OK):  # numba keeps its code beside ours, and refuses to work if it cannot
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mapper" / "numba"

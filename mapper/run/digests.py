@@ -3,10 +3,10 @@
 import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Set
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from mapper.core.errors import RunError
+from mapper.core.errors import RunError, WriteError
 from mapper.run import files
 from mapper.run.manifest import FileDigest, read_manifest
 from mapper.runtime.atomic import flush_to_disk, locked
@@ -54,8 +54,11 @@ def changing(folder: Path, names: Iterable[str]) -> Iterator[None]:
     _replace_digests(folder, names, dict)
     try:
         yield
-    finally:
-        _replace_digests(folder, names, lambda: digests_of(folder, names))
+    except BaseException:
+        with suppress(WriteError):  # what happened first is told
+            _replace_digests(folder, names, lambda: digests_of(folder, names))
+        raise
+    _replace_digests(folder, names, lambda: digests_of(folder, names))
 
 
 def _replace_digests(folder: Path, names: Set[str], new: Callable[[], Mapping[str, FileDigest]]) -> None:

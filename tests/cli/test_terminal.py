@@ -9,7 +9,6 @@ import pytest
 
 from cli.terminal import EscapingStream, escaped
 from mapper.run.manifest import read_manifest
-from tests.support.full_disk import largest_file
 
 MAPPER = [sys.executable, "-c", "from cli.main import main; main()"]
 
@@ -56,17 +55,3 @@ def test_a_build_that_is_told_to_end_says_so_in_its_manifest(desk_log, tmp_path,
     assert b"what there is so far stays in" in told
     assert read_manifest(manifest).status == "interrupted"
     assert not out.exists()
-
-
-def test_a_full_disk_leaves_no_file_and_one_line(desk_log, tmp_path):
-    with largest_file(3000):
-        build = subprocess.run(
-            [*MAPPER, "build", desk_log, "--out", tmp_path / "run", "--quiet"],
-            capture_output=True,
-            check=False,
-        )
-    assert build.returncode == 1
-    assert build.stderr.count(b"\n") == 1, build.stderr
-    assert b"File too large; raise the limit (ulimit -f)" in build.stderr
-    assert not (tmp_path / "run").exists()
-    assert not list((tmp_path / "run.partial").glob(".*"))

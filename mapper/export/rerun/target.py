@@ -4,6 +4,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,6 +25,7 @@ ENDING = ".rrd"
 _SPAWN, _CONNECT = "spawn", "connect"
 _PATIENCE_S = 3.0
 _START_S = 30.0
+_PIPE_BYTES = 1 << 20
 _FLUSH_S = 60.0
 
 
@@ -66,17 +68,15 @@ def streaming(
     check_target(target)
     if Path(target).suffix == ENDING:
         with atomic_file(Path(target)) as part:
-            recording.save(part, default_blueprint=blueprint)
             failure = None
-            try:
-                yield
-            except BaseException as error:
-                if not keeps():
-                    raise
-                error.add_note(f"what it recorded so far is in {target}")
-                failure = error
-            recording.flush()
-            recording.disconnect()
+            with _piped(recording, part, blueprint):
+                try:
+                    yield
+                except BaseException as error:
+                    if not keeps():
+                        raise
+                    error.add_note(f"what it recorded so far is in {target}")
+                    failure = error
         if failure is not None:
             raise failure
         return
@@ -92,6 +92,41 @@ def streaming(
         recording.flush(timeout_sec=_FLUSH_S)
     except RuntimeError as error:
         raise ViewerError(f"rerun: the viewer went away: {error}; record to a FILE{ENDING} instead") from None
+
+
+@contextmanager
+def _piped(recording: "rr.RecordingStream", path: Path, blueprint: "rrb.Blueprint") -> Iterator[None]:
+    """Save a recording to a file through a pipe.
+
+    Rerun's own writer of files ends when the disk is full, and the program may then wait for it forever. Here
+    the rest is read and dropped, and the error told at the end.
+    """
+    read, write = os.pipe()
+    errors: list[OSError] = []
+    copying = threading.Thread(target=_copy, args=(read, path, errors), name="rerun file", daemon=True)
+    copying.start()
+    try:
+        try:
+            recording.save(f"/dev/fd/{write}", default_blueprint=blueprint)
+        finally:
+            os.close(write)  # Rerun has opened it anew, so the pipe ends when Rerun closes it
+        yield
+        recording.flush()
+    finally:
+        recording.disconnect()
+        copying.join()
+    if errors:
+        raise errors[0]
+
+
+def _copy(read: int, path: Path, errors: list[OSError]) -> None:
+    with os.fdopen(read, "rb", buffering=0) as pipe, path.open("wb", buffering=0) as file:
+        while data := pipe.read(_PIPE_BYTES):
+            try:
+                while data and not errors:
+                    data = data[file.write(data) :]
+            except OSError as error:
+                errors.append(error)
 
 
 def _spawn(recording: "rr.RecordingStream", blueprint: "rrb.Blueprint") -> None:

@@ -1,0 +1,209 @@
+"""Soak test: for a given time, builds and changes of a run that are killed, or meet a full disk or damage.
+
+After every trial it checks that the earlier run is as it was, that nothing under a final name is written by
+half, and that what went wrong was told in one line; now and then a trial is left to its end, and has to give
+the reference's bytes.
+
+Example: python scripts/soak.py --minutes 30 --folder /tmp/soak
+"""
+
+import argparse
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mapper.core.errors import MapperError
+from mapper.run.checks import check_run
+from mapper.run.folder import load_run
+from mapper.runtime.atomic import partial_of
+
+MAPPER = [sys.executable, "-c", "import sys; sys.argv[0] = 'mapper'; from cli.main import main; main()"]
+LOG = [
+    *("--path", "desk", "--seconds", "2", "--set", "frame_rate_hz=15", "--set", "width_px=320"),
+    *("--set", "height_px=240", "--set", "texture_px_per_m=64"),
+]
+REPEATABLE = ["--set", "mcap.frame_times=false"]
+MEASURED = {"manifest.json", "frame_ms.csv"}
+"""Files of a run that hold times, so that they differ from run to run."""
+ENDINGS = {-signal.SIGKILL: "killed", 143: "SIGTERM", 130: "SIGINT", -signal.SIGTERM: "SIGTERM", 0: "done"}
+LONGEST_S = 600.0
+
+
+@dataclass
+class Soak:
+    """A folder with a log, the reference run of it, and the run that is worked on.
+
+    Attributes:
+        folder: Scratch.
+        random: Draws all trials.
+        counts: How the trials ended.
+        faults: What should not be, a line each.
+    """
+
+    folder: Path
+    random: random.Random
+    counts: Counter[str] = field(default_factory=Counter)
+    faults: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.log, self.reference, self.run = (self.folder / name for name in ("log", "reference", "run"))
+        self.duration_s = 0.0
+
+    def prepare(self) -> None:
+        """Make the log, the reference run and a copy of it, unless an earlier soak left them."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if not self.log.exists():
+            self._must("synth", self.log, *LOG)
+        if not self.reference.exists():
+            self._must("build", self.log, "--out", self.reference, *REPEATABLE)
+        began = time.monotonic()
+        self._must("build", self.log, "--out", self.run, "--overwrite", *REPEATABLE)
+        self.duration_s = time.monotonic() - began
+        self._compare("first build")
+
+    def trial(self) -> None:
+        """Draw one trial, run it and check what it left."""
+        kinds: list[Callable[[], None]] = [self._killed, self._killed, self._full_disk, self._damaged_log]
+        self.random.choice(kinds)()
+
+    def _work(self) -> list[object]:
+        """Draw a verb that writes into the run or replaces it by the same."""
+        return self.random.choice(
+            [
+                ["build", self.log, "--out", self.run, "--overwrite", *REPEATABLE],
+                ["fuse", self.run],
+                ["export", self.run, "--as", "costmap"],
+                ["export", self.run, "--as", "voxel-mesh"],
+                ["view", self.run, "--quiet"],
+            ]
+        )
+
+    def _killed(self) -> None:
+        work = self._work()
+        how = self.random.choice([signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+        after_s = self.random.uniform(0.0, 1.2 * self.duration_s)
+        process = subprocess.Popen(
+            [*MAPPER, *map(str, work)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        )
+        try:
+            _, told = process.communicate(timeout=after_s)
+        except subprocess.TimeoutExpired:
+            process.send_signal(how)
+            _, told = process.communicate(timeout=60.0)
+        what = f"{' '.join(map(str, work[:1]))} {how.name} after {after_s:.1f} s"
+        self._count(f"{work[0]} {ENDINGS.get(process.returncode, process.returncode)}")
+        if process.returncode not in ENDINGS or "Traceback" in told:
+            self.faults.append(f"{what}: status {process.returncode}: {told}")
+        self._compare(what)
+
+    def _full_disk(self) -> None:
+        work = self._work()
+        blocks = int(2 ** self.random.uniform(0.0, 12.0))  # of 1 kB
+        told = self._told(["sh", "-c", f'ulimit -f {blocks} && exec "$@"', "sh", *MAPPER, *map(str, work)])
+        what = f"{work[0]} with files of {blocks} kB at most"
+        self._count(f"{work[0]}, full disk: status {told.returncode}")
+        if told.returncode not in (0, 1) or told.stderr.count("mapper: ") > 1 or "Traceback" in told.stderr:
+            self.faults.append(f"{what}: status {told.returncode}: {told.stderr}")
+        self._compare(what)
+
+    def _damaged_log(self) -> None:
+        log, out = self.folder / "damaged", self.folder / "damaged_run"
+        for path in (log, out, partial_of(out)):
+            shutil.rmtree(path, ignore_errors=True)
+        shutil.copytree(self.log, log)
+        damage = [self._damage(log) for _ in range(self.random.randint(1, 4))]
+        told = self._told([*MAPPER, "build", str(log), "--out", str(out), "--quiet"])
+        what = f"build of a log with {', '.join(damage)}"
+        self._count(f"damaged log: status {told.returncode}")
+        if told.returncode not in (0, 1) or "Traceback" in told.stderr:
+            self.faults.append(f"{what}: status {told.returncode}: {told.stderr}")
+        if told.returncode == 0:
+            self._check(out, what)
+        elif out.exists():
+            self.faults.append(f"{what}: failed, but {out} is there")
+
+    def _damage(self, log: Path) -> str:
+        path = self.random.choice(sorted(path for path in log.rglob("*") if path.is_file()))
+        how = self.random.choice(["cut", "bits", "gone", "empty"])
+        data = bytearray(path.read_bytes())
+        if how == "gone":
+            path.unlink()
+        elif how == "cut":
+            path.write_bytes(data[: self.random.randrange(len(data) + 1)])
+        elif how == "empty":
+            path.write_bytes(b"")
+        else:
+            for _ in range(self.random.randint(1, 20) if data else 0):
+                data[self.random.randrange(len(data))] ^= 1 << self.random.randrange(8)
+            path.write_bytes(data)
+        return f"{path.relative_to(log)} {how}"
+
+    def _compare(self, what: str) -> None:
+        """Check the run, and its bytes against the reference."""
+        self._check(self.run, what)
+        for path in sorted(self.reference.iterdir()):
+            ours = self.run / path.name
+            if path.name not in MEASURED and (not ours.is_file() or ours.read_bytes() != path.read_bytes()):
+                self.faults.append(f"{what}: {path.name} is not the reference's")
+
+    def _check(self, run: Path, what: str) -> None:
+        try:
+            load_run(run)
+            findings = check_run(run)
+        except (MapperError, OSError) as error:
+            self.faults.append(f"{what}: {error}")
+            return
+        # A process that was killed may leave a temporary file, which the doctor tells; nothing else.
+        wrong = [finding for finding in findings if finding.verdict == "failed"]
+        self.faults += [f"{what}: {finding.name}: {finding.detail}" for finding in wrong]
+
+    def _count(self, ending: str) -> None:
+        self.counts[ending] += 1
+
+    def _told(self, command: list[str]) -> "subprocess.CompletedProcess[str]":
+        try:
+            return subprocess.run(command, capture_output=True, text=True, check=False, timeout=LONGEST_S)
+        except subprocess.TimeoutExpired:
+            return subprocess.CompletedProcess(command, -1, "", f"hangs: no end after {LONGEST_S:g} s")
+
+    def _must(self, *arguments: object) -> None:
+        told = self._told([*MAPPER, *map(str, arguments)])
+        if told.returncode:
+            raise SystemExit(f"soak: {arguments[0]} failed: {told.stderr}")
+
+
+def main() -> None:
+    """Run trials until the time is over; the exit status is 1 if any left what it should not."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--minutes", type=float, default=30.0, help="how long to go on")
+    parser.add_argument("--folder", type=Path, required=True, help="scratch folder, kept")
+    parser.add_argument("--seed", type=int, default=0, help="draws the trials")
+    options = parser.parse_args()
+    soak = Soak(options.folder.resolve(), random.Random(options.seed))
+    soak.prepare()
+    end = time.monotonic() + 60.0 * options.minutes
+    while time.monotonic() < end:
+        known = len(soak.faults)
+        soak.trial()
+        for fault in soak.faults[known:]:
+            print(f"FAULT {fault}", flush=True)
+        if len(soak.faults) > known:  # so that the next trial begins at a sound run
+            shutil.rmtree(soak.run, ignore_errors=True)
+            shutil.copytree(soak.reference, soak.run)
+    for ending, count in sorted(soak.counts.items()):
+        print(f"{count:5d}  {ending}")
+    print(f"{sum(soak.counts.values())} trials, {len(soak.faults)} faults")
+    sys.exit(bool(soak.faults))
+
+
+if __name__ == "__main__":
+    main()
