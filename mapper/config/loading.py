@@ -16,6 +16,7 @@ from mapper.core.config import Config
 from mapper.core.errors import ConfigError, MapperWarning
 from mapper.core.frames import Sensor
 from mapper.runtime.atomic import MANIFEST_NAME
+from mapper.runtime.regular_files import read_text
 from mapper.sources.config import SourceConfig
 
 AnyConfig = TypeVar("AnyConfig", bound=Config)
@@ -84,12 +85,10 @@ def read_config(path: Path, model: type[AnyConfig]) -> AnyConfig:
 
 def _read(path: Path) -> dict[str, Any]:
     is_json = path.suffix == ".json"
+    text = read_text(path, error=ConfigError, may_be_pipe=True)
     try:
-        text = path.read_text(encoding="utf-8")
         tree: dict[str, Any] = json.loads(text) if is_json else tomllib.loads(text)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:  # what either parser raises, and text that is not UTF-8
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid {'JSON' if is_json else 'TOML'}: {error}") from None
     return tree
 

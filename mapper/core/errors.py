@@ -3,9 +3,21 @@
 Library code raises or warns; only ``cli`` turns them into one line and, for an error, an exit status.
 """
 
+_LONGEST = 800
+
 
 class MapperError(Exception):
-    """Base of all errors: the message names the thing, the value, the limit and the remedy."""
+    """Base of all errors: the message names the thing, the value, the limit and the remedy.
+
+    Values of damaged files may be of any length; the middle of a message that is longer than a few lines on a
+    terminal is left out.
+    """
+
+    def __str__(self) -> str:
+        message = super().__str__()
+        if len(message) <= _LONGEST:
+            return message
+        return f"{message[: _LONGEST // 2]} … {message[-_LONGEST // 4 :]}"
 
 
 class ConfigError(MapperError):

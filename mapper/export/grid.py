@@ -11,6 +11,7 @@ from mapper.core.errors import DataError, MapFileError
 from mapper.export.palette import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, shrunk
 from mapper.runtime.atomic import write_bytes, write_text
+from mapper.runtime.regular_files import read_text
 
 if TYPE_CHECKING:
     from mapper.run.folder import Run
@@ -113,10 +114,7 @@ def _write_picture(path: Path, grid: OccupancyGrid) -> None:
 
 def _read_settings(path: Path) -> dict[str, str]:
     """Parse the flat subset of YAML that map_server writes."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise MapFileError(f"{path}: cannot be read: {error}") from None
+    lines = read_text(path, error=MapFileError).splitlines()
     pairs = (line.split("#")[0].partition(":") for line in lines)
     return {key.strip(): value.strip() for key, colon, value in pairs if colon}
 

@@ -15,6 +15,7 @@ from mapper.graph.information import as_gtsam_takes, lifted, swapped, symmetric
 from mapper.graph.model import BetweenFactor, Origin, PoseGraph
 from mapper.runtime.atomic import write_text
 from mapper.runtime.progress import SILENT, Progress
+from mapper.runtime.regular_files import read_text
 
 _ORIGINS: tuple[Origin, ...] = get_args(Origin)
 _SHORTEST = 1e-9
@@ -147,7 +148,8 @@ _FORMS = _VERTICES | _EDGES
 def _tables(path: Path) -> dict[str, _Table]:
     """Sort the lines by their tags; numbers are checked in bulk afterwards."""
     tables: dict[str, _Table] = {}
-    for line, text in enumerate(_text(path).splitlines(), start=1):
+    lines = read_text(path, error=GraphError, encoding="ascii").splitlines()
+    for line, text in enumerate(lines, start=1):
         body, _, note = text.partition("#")
         tag, *words = body.split() or [""]
         if tag in ("", "FIX"):
@@ -218,15 +220,6 @@ def _informations(path: Path, tables: dict[str, _Table], progress: Progress) -> 
             "taken as GTSAM takes it: by its Cholesky factor as far as that goes"
         )
     return informations
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="ascii")
-    except OSError as error:
-        raise GraphError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise GraphError(f"{path}: byte {error.start} is not ASCII; is this really a g2o file?") from None
 
 
 def _noted(note: str, name: str, missing: str) -> str:

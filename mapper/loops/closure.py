@@ -13,6 +13,7 @@ from mapper.core.geometry import Array, Transform, inverse, rotation_log, transf
 from mapper.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from mapper.graph.model import BetweenFactor, Solution
 from mapper.runtime.atomic import write_text
+from mapper.runtime.regular_files import read_text
 
 ProposedBy = Literal["places", "scans", "nearby", "hand"]
 Verdict = Literal["accepted", "rejected"]
@@ -159,15 +160,12 @@ def read_closures(path: Path) -> list[LoopClosure]:
         RunError: The file cannot be read.
         DataError: A line is not a loop closure; the message names it.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise RunError(f"{path}: cannot be read: {error.strerror}") from None
+    lines = read_text(path, error=RunError).splitlines()
     closures = []
     for number, line in enumerate(lines, start=1):
         try:
             closures.append(_closure(json.loads(line)))
-        except (KeyError, TypeError, ValueError, DataError) as error:
+        except (KeyError, TypeError, ValueError, RecursionError, DataError) as error:
             raise DataError(f"{path}:{number}: not a loop closure: {error!r}") from None
     return closures
 

@@ -12,6 +12,7 @@ from mapper.core.geometry import Array, Transform, fit_rigid, inverse, transform
 from mapper.core.rotations import rotation_from_quaternion
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, nearest
 from mapper.run.folder import Run
+from mapper.runtime.regular_files import read_text
 
 _LEVER_M = 1.0
 """Length of the body's axes in the fit: a straight path alone leaves a turn about itself open."""
@@ -140,12 +141,8 @@ def _with_axes(T_a_body: Array) -> Array:
 
 
 def _read_poses(path: Path) -> dict[str, Transform]:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from None
     poses: dict[str, Transform] = {}
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(read_text(path, may_be_pipe=True).splitlines(), start=1):
         name, *words = line.replace(",", " ").split() or [""]
         if not name or name.startswith("#"):
             continue

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.errors import MapFileError
+from mapper.core.errors import DataError, MapFileError, MapSizeError
 from mapper.octree import tree_reader
 from mapper.octree.attributes import UNSET
+from mapper.octree.blocks import check_memory
 from mapper.octree.color_tree import COLOR_NODE, colored
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import KEY_BITS
@@ -17,6 +18,7 @@ from mapper.octree.map import OctreeMap, log_odds
 from mapper.octree.map_file import MAGIC, parse_map
 from mapper.octree.tree import NODE, children_in, nodes_in_preorder, words_in_preorder
 from mapper.runtime import atomic
+from mapper.runtime.regular_files import read_regular
 
 _FULL = b"# Octomap OcTree file"
 _BINARY = b"# Octomap OcTree binary file"
@@ -125,11 +127,18 @@ def read_map(path: Path, config: OctreeConfig | None = None) -> OctreeMap:
         MapSizeError: Its leaves, expanded to voxels, would not fit into memory.
     """
     try:
-        data = path.read_bytes()
+        size = path.stat().st_size
+        check_memory(size, f"the map in {path}")
+        return _parse(path, read_regular(path, most_bytes=size), config)
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read: {error.strerror}") from None
+    except DataError as error:
+        raise MapFileError(f"{path}: {error}") from None
     except MemoryError:
-        raise MapFileError(f"{path}: {path.stat().st_size} bytes do not fit into memory") from None
+        raise MapSizeError(f"{path}: does not fit into memory") from None
+
+
+def _parse(path: Path, data: bytes, config: OctreeConfig | None) -> OctreeMap:
     if data.startswith(MAGIC):
         return parse_map(path, data, config)
     header, start = _parse_header(path, data)

@@ -13,6 +13,7 @@ from mapper.core.errors import DataError, RunError
 from mapper.core.rotations import quaternion_from_rotation
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.runtime.atomic import write_text
+from mapper.runtime.regular_files import read_text
 from mapper.sources.base import Skipped
 
 Outcome = Literal["tracked", "doubtful", "lost", "skipped"]
@@ -132,12 +133,10 @@ def read_records(path: Path) -> list[FrameRecord]:
         RunError: The file cannot be read.
         DataError: It is not what ``write_records`` writes.
     """
+    text = read_text(path, error=RunError)
     try:
-        rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
-        return [_record(row) for row in rows]
-    except OSError as error:
-        raise RunError(f"{path}: cannot be read: {error.strerror}") from None
-    except (KeyError, ValueError, TypeError, csv.Error) as error:  # ValueError: of what is no text, too
+        return [_record(row) for row in csv.DictReader(io.StringIO(text))]
+    except (KeyError, ValueError, TypeError, csv.Error) as error:
         raise DataError(f"{path}: not a list of frames with columns {', '.join(_COLUMNS)}: {error}") from None
 
 
@@ -154,11 +153,9 @@ def read_frame_ms(path: Path) -> dict[int, float]:
         RunError: The file cannot be read.
         DataError: It is something else.
     """
+    lines = read_text(path, error=RunError).splitlines()[1:]
     try:
-        rows = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()[1:]]
-        return {int(stamp_ns): float(ms) for stamp_ns, ms in rows}
-    except OSError as error:
-        raise RunError(f"{path}: cannot be read: {error.strerror}") from None
+        return {int(stamp_ns): float(ms) for stamp_ns, ms in (line.split(",") for line in lines)}
     except ValueError as error:
         raise DataError(f"{path}: not a list of stamp_ns,ms: {error}") from None
 

@@ -18,6 +18,7 @@ from mapper.graph.model import PoseGraph
 from mapper.run.doubtful_frames import estimates_of_doubtful
 from mapper.run.frame_outcomes import FrameRecord
 from mapper.runtime.atomic import write_text
+from mapper.runtime.regular_files import read_text
 
 _AXES = ("roll", "pitch", "yaw", "x", "y", "z")
 _UPPER = np.triu_indices(6)
@@ -141,12 +142,10 @@ def read_poses(path: Path) -> UncertainPoses:
         RunError: The file cannot be read.
         DataError: It is something else.
     """
+    text = read_text(path, error=RunError)
     try:
-        rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))))
-    except OSError as error:
-        raise RunError(f"{path}: cannot be read: {error.strerror}") from None
-    covariances = np.empty((len(rows), 6, 6))
-    try:
+        rows = list(csv.DictReader(io.StringIO(text)))
+        covariances = np.empty((len(rows), 6, 6))
         poses = [[float(row[name]) for name in _POSE] for row in rows]
         trajectory = trajectory_from(
             (
@@ -159,6 +158,6 @@ def read_poses(path: Path) -> UncertainPoses:
             covariance[_UPPER] = [np.nan if row[name] == "" else float(row[name]) for name in _COVARIANCE]
             covariance.T[_UPPER] = covariance[_UPPER]
         is_doubtful = np.array([row["outcome"] == "doubtful" for row in rows], np.bool_)
-    except (KeyError, ValueError, TypeError, DataError) as error:
+    except (KeyError, ValueError, TypeError, csv.Error, DataError) as error:
         raise DataError(f"{path}: not a list of poses with columns {', '.join(_COLUMNS)}: {error}") from None
     return UncertainPoses(trajectory, is_doubtful, covariances)

@@ -9,8 +9,8 @@ from typing import Any
 
 from mapper.core.errors import DataError, SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
+from mapper.runtime.regular_files import read_text
 from mapper.sources.calibration import Calibration
-from mapper.sources.regular_files import read_text
 
 FILE_NAMES = (
     "calibration.toml",
@@ -34,10 +34,7 @@ def read_calibration(path: Path) -> Calibration:
     Raises:
         SourceError: The file cannot be read, lacks a number, or (TOML) has a key of another meaning.
     """
-    try:
-        text = read_text(path)
-    except DataError as error:
-        raise SourceError(str(error)) from None
+    text = read_text(path, error=SourceError)
     try:
         if path.suffix == ".toml":
             numbers = _toml_numbers(tomllib.loads(text))
@@ -85,6 +82,7 @@ _NAMES = {
     "p2": ("p2",),
     "k3": ("k3",),
 }
+_UNITS_PER_M = (1e-3, 1e7)  # of a depth image: kilometres to tenths of a micrometre
 _KEYS = {name for names in _NAMES.values() for name in names}
 
 
@@ -103,8 +101,9 @@ def _interpret(numbers: _Numbers, origin: str) -> Calibration:
     if any(distortion[5:]):
         raise DataError(f"{len(distortion)} distortion coefficients; only k1, k2, p1, p2, k3 are supported")
     k1, k2, p1, p2, k3 = (*distortion[:5], *NO_DISTORTION)[:5]
-    if one.get("depth_factor", 1.0) <= 0.0:
-        raise DataError(f"depth_factor {one['depth_factor']} must be > 0 image units per metre")
+    low, high = _UNITS_PER_M
+    if not low <= one.get("depth_factor", 1.0) <= high:
+        raise DataError(f"depth_factor {one['depth_factor']:g}, want {low:g} to {high:g} units per metre")
     size = (int(one["width"]), int(one["height"])) if {"width", "height"} <= one.keys() else None
     return Calibration(
         origin,

@@ -16,16 +16,23 @@ from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.calibration import ICL_NUIM
 from mapper.sources.config import SourceConfig
+from mapper.sources.listed_files import present
 from mapper.sources.numbered import RATE_HZ, find_images, stamp_at
-from mapper.sources.regular_files import present
 from mapper.sources.rgbd import FramePair, find_calibration, rgbd_log
-from mapper.sources.text import parse_numbers, pose_from_numbers, rows, table, time_order, truth_from
+from mapper.sources.text import (
+    parse_count,
+    parse_numbers,
+    pose_from_numbers,
+    rows,
+    table,
+    time_order,
+    truth_from,
+)
 
 DEPTH_UNITS_PER_M = 5000.0
 LOOKED_FOR = "associations.txt of N depth/N.png N rgb/N.png (ICL-NUIM)"
 
 _LIST = "associations.txt"
-_LINE = "1 depth/1.png 1 rgb/1.png"
 _TRUTHS = ("*.gt.freiburg", "groundtruth.txt")
 _NUMBER = re.compile(r"\d{1,6}")  # a stamp of the epoch has more digits
 
@@ -96,10 +103,9 @@ def _read_pairs(folder: Path, rate_hz: float) -> tuple[list[FramePair], list[str
 def _read_list(path: Path, rate_hz: float) -> tuple[list[FramePair], list[str]]:
     listed = []
     for where, words in table(path, "number", "depth/number.png", "number", "rgb/number.png"):
-        if not (words[0].isdecimal() and words[2].isdecimal()):
-            raise SourceError(f"{where}: {' '.join(words)!r}, want frame numbers, as in: {_LINE}")
         colour, depth = sorted((words[:2], words[2:]), key=lambda side: "depth" in side[1])
-        stamp_ns, depth_stamp_ns = (stamp_at(int(number), rate_hz=rate_hz) for number, _ in (colour, depth))
+        numbers = (parse_count(number, where=where) for number, _ in (colour, depth))
+        stamp_ns, depth_stamp_ns = (stamp_at(number, rate_hz=rate_hz) for number in numbers)
         listed.append(FramePair(stamp_ns, path.parent / colour[1], depth_stamp_ns, path.parent / depth[1]))
     has_colour = present(pair.colour for pair in listed)
     has_depth = present(pair.depth for pair in listed)
@@ -118,8 +124,6 @@ def _read_truth(folder: Path, rate_hz: float) -> tuple[Trajectory | None, list[s
         return None, []
     poses: list[tuple[int, Transform | None]] = []
     for where, words in table(path, "number", "tx", "ty", "tz", "qx", "qy", "qz", "qw"):
-        number, *pose = parse_numbers(words, where=where)
-        if not number >= 0.0 or number != int(number):
-            raise SourceError(f"{where}: {words[0]} is no frame number")
-        poses.append((stamp_at(int(number), rate_hz=rate_hz), pose_from_numbers(np.array(pose))))
+        number, pose = parse_count(words[0], where=where), parse_numbers(words[1:], where=where)
+        poses.append((stamp_at(number, rate_hz=rate_hz), pose_from_numbers(pose)))
     return truth_from(poses, what=path.name)

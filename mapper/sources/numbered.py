@@ -22,7 +22,7 @@ from mapper.sources.base import Log
 from mapper.sources.calibration import PRIMESENSE, SEVEN_SCENES
 from mapper.sources.config import SourceConfig
 from mapper.sources.rgbd import FramePair, find_calibration, rgbd_log
-from mapper.sources.text import parse_numbers, rows, time_order, truth_from
+from mapper.sources.text import parse_count, parse_numbers, rows, time_order, truth_from
 
 DEPTH_UNITS_PER_M = 1000.0
 RATE_HZ = 30.0
@@ -224,9 +224,9 @@ def _read_redwood(path: Path, pairs: Sequence[FramePair]) -> tuple[Trajectory | 
     poses: list[tuple[int, Transform | None]] = []
     for block in range(0, len(lines), 5):
         number, words = lines[block]
-        if len(words) != 3 or not words[0].isdigit():
+        if len(words) != 3:
             raise SourceError(f"{path}:{number}: {' '.join(words)!r}, want the block's number, as in: 0 0 1")
-        index = int(words[0])
+        index = parse_count(words[0], where=f"{path}:{number}")
         if index >= len(pairs):
             raise SourceError(
                 f"{path}:{number}: pose of image {index}, but there are only {len(pairs)} images"

@@ -20,7 +20,7 @@ from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.numbered import find_images, stamp_at, stamped
 from mapper.sources.rgbd import find_calibration, rgbd_log
-from mapper.sources.text import parse_numbers, read_lines, rows, truth_from
+from mapper.sources.text import parse_count, parse_numbers, read_lines, rows, truth_from
 
 DEPTH_UNITS_PER_M = 1000.0
 RATE_HZ = 10.0  # "every 100 ms", Somlyai (PhD thesis), §5.6
@@ -66,7 +66,7 @@ def _truth_file(folder: Path) -> Path | None:
     for path in sorted(folder.glob("*.txt")):
         if _TRUTH_NAME.search(path.stem):
             first = next((words for _, words in rows(path)), [])
-            if len(first) == 7 and first[0].isdigit():
+            if len(first) == 7 and first[0].isdecimal():
                 return path
     return None
 
@@ -77,9 +77,9 @@ def _read_truth(
     numbers, values = [], []
     for line, words in rows(path):
         where = f"{path}:{line}"
-        if len(words) != 7 or not words[0].isdigit():
+        if len(words) != 7:
             raise SourceError(f"{where}: {' '.join(words)!r}, want: number x y z roll pitch yaw")
-        numbers.append(int(words[0]))
+        numbers.append(parse_count(words[0], where=where))
         values.append(parse_numbers(words[1:], where=where))
     table = np.array(values)
     in_degrees = _in_degrees(path, table[:, 3:])
@@ -88,7 +88,9 @@ def _read_truth(
     for number, row in zip(numbers, table, strict=True):
         stamp_ns = stamps_ns.get(number, stamp_at(number, rate_hz=rate_hz))
         roll, pitch, yaw = np.deg2rad(row[3:]) if in_degrees else row[3:]
-        poses.append((stamp_ns, transform(rotation_from_euler(roll, pitch, yaw), row[:3])))
+        is_pose = np.isfinite(row).all()
+        T = transform(rotation_from_euler(roll, pitch, yaw), row[:3]) if is_pose else None
+        poses.append((stamp_ns, T))
     truth, notes = truth_from(poses, what=path.name)
     return truth, [note, *notes]
 

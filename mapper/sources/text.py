@@ -11,7 +11,9 @@ from mapper.core.geometry import Array, Transform, is_rigid, transform
 from mapper.core.rotations import rotation_from_quaternion
 from mapper.core.timebase import Stamps, ns_from_date_text, ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
-from mapper.sources.regular_files import read_text
+from mapper.runtime.regular_files import read_text
+
+_MOST_DIGITS = 9  # a year of frames at 30 Hz
 
 
 def read_lines(path: Path) -> list[str]:
@@ -20,10 +22,7 @@ def read_lines(path: Path) -> list[str]:
     Raises:
         SourceError: The file is missing, unreadable, no regular file, too large or not text.
     """
-    try:
-        return read_text(path).splitlines()
-    except DataError as error:
-        raise SourceError(str(error)) from None
+    return read_text(path, error=SourceError).splitlines()
 
 
 def rows(path: Path, *, separator: str | None = None) -> Iterator[tuple[int, list[str]]]:
@@ -72,6 +71,17 @@ def parse_date(text: str, *, where: str) -> int:
         return ns_from_date_text(text)
     except DataError as error:
         raise SourceError(f"{where}: {error}") from None
+
+
+def parse_count(text: str, *, where: str) -> int:
+    """Return the whole number of an image or a pose.
+
+    Raises:
+        SourceError: The text is none; the message starts with ``where``.
+    """
+    if not text.isdecimal() or len(text) > _MOST_DIGITS:
+        raise SourceError(f"{where}: {text!r} is no number of a frame")
+    return int(text)
 
 
 def parse_numbers(words: Sequence[str], *, where: str) -> Array:

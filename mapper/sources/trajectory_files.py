@@ -11,7 +11,7 @@ from mapper.core.rotations import quaternion_from_rotation, rotation_from_quater
 from mapper.core.timebase import Stamps, ns_from_seconds_text, seconds_text_from_ns
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.atomic import write_text
-from mapper.sources.regular_files import read_text
+from mapper.runtime.regular_files import read_text
 
 
 def read_tum(path: Path) -> Trajectory:

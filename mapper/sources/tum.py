@@ -13,7 +13,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.calibration import freiburg_camera
 from mapper.sources.config import SourceConfig
-from mapper.sources.regular_files import present, within
+from mapper.sources.listed_files import present, within
 from mapper.sources.rgbd import FramePair, find_calibration, rgbd_log, unpaired_note
 from mapper.sources.text import (
     parse_numbers,

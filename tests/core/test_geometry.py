@@ -154,10 +154,13 @@ def test_is_rigid_refuses_matrices_that_only_resemble_a_motion():
     T = g.exp(np.array([0.3, -0.2, 0.9]), np.array([1.0, 2.0, 3.0]))
     assert g.is_rigid(T)
     assert g.is_rigid(np.stack([T, np.eye(4)]))
-    scaled, mirrored, bent, broken = (T.copy() for _ in range(4))
+    scaled, mirrored, bent, broken, far, huge = (T.copy() for _ in range(6))
     scaled[:3, :3] *= 1.001
     mirrored[:3, 0] *= -1.0
     bent[3, 0] = 0.1
     broken[0, 3] = np.nan
-    for bad in (scaled, mirrored, bent, broken, np.eye(3), np.stack([T, scaled])):
+    far[0, 3] = -1e12
+    huge[0, 0] = 1e200
+    bad_pairs = [np.stack([T, bad]) for bad in (scaled, far, huge)]
+    for bad in (scaled, mirrored, bent, broken, far, huge, np.eye(3), *bad_pairs):
         assert not g.is_rigid(bad)

@@ -5,12 +5,14 @@ import pytest
 
 from mapper.config.build import BuildConfig
 from mapper.core.errors import DataError, RunError, TrackingError
+from mapper.loops.closure import read_closures
 from mapper.odometry.base import Diagnostics
 from mapper.run.files import RUN
 from mapper.run.fingerprint import fingerprint
 from mapper.run.folder import load_run, write_run
 from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records, write_frame_ms, write_records
 from mapper.run.manifest import Input, Manifest, read_manifest
+from mapper.run.pose_covariances import read_poses
 from mapper.runtime.atomic import atomic_folder, partial_of
 
 MANIFEST = Manifest(status="building", input=Input(path="/log", kind="tum", fingerprint="sha256:0"))
@@ -158,7 +160,7 @@ def test_records_of_older_runs_are_read(tmp_path, column, expected):
 
 
 @pytest.mark.parametrize(
-    "damage", [b"\xff\xfe", b"\x80\n", b'"' + 200_000 * b"a" + b'"\n', b"1,\0\n", b"1,tracked\n"]
+    "damage", [b'"' + 200_000 * b"a" + b'"\n', b"1,\0\n", b"1,tracked\n"], ids=["quote", "zero", "short"]
 )
 def test_damaged_records_are_named(tmp_path, damage):
     path = tmp_path / "frames.csv"
@@ -169,6 +171,18 @@ def test_damaged_records_are_named(tmp_path, damage):
     path.write_bytes(b"stamp_ns,ms\n" + damage)
     with pytest.raises(DataError, match=r"frames\.csv: not a list of stamp_ns,ms: "):
         read_frame_ms(path)
+
+
+@pytest.mark.parametrize("read", [read_records, read_frame_ms, read_poses, read_closures])
+def test_a_run_s_file_that_is_no_text_or_endless_is_named(tmp_path, read):
+    path = tmp_path / "file"
+    path.write_bytes(b"stamp_ns\n1\xff\n")
+    with pytest.raises(RunError, match="file: not a text file: byte 10 is not UTF-8"):
+        read(path)
+    path.unlink()
+    path.symlink_to("/dev/zero")
+    with pytest.raises(RunError, match="file: no regular file"):
+        read(path)
 
 
 def test_a_fingerprint_follows_names_sizes_and_lists_but_not_the_place(tmp_path):

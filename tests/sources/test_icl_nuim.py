@@ -118,12 +118,12 @@ def test_associations_by_stamp_are_not_taken_for_frame_numbers(tiny_tum_log):
     ("name", "text", "message"),
     [
         ("livingRoom1.gt.freiburg", "1 2 3\n", r"freiburg:1: 3 columns, want 8: number tx ty tz qx qy qz qw"),
-        ("livingRoom1.gt.freiburg", "1.5 0 0 0 0 0 0 1\n", r"freiburg:1: 1\.5 is no frame number"),
+        ("livingRoom1.gt.freiburg", "1.5 0 0 0 0 0 0 1\n", r"freiburg:1: '1\.5' is no number of a frame"),
         ("associations.txt", "0 depth/0.png 0 rgb/0.png\n1 rgb/1.png\n", r"associations\.txt:2: 2 columns"),
         (
             "associations.txt",
             "0 depth/0.png 0 rgb/0.png\na d b c\n",
-            r"associations\.txt:2: 'a d b c', want frame",
+            r"associations\.txt:2: 'a' is no number of a frame",
         ),
         (
             "associations.txt",

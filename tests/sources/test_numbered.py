@@ -157,7 +157,7 @@ def test_redwood_trajectory_counts_images_from_zero(tmp_path):
         ("0 0 1\n1 0 0 0\n", r"trajectory\.log: 2 lines, want blocks of 5"),
         ("9 9 10\n" + "1 0 0 0\n" * 4, r"trajectory\.log:1: pose of image 9, but there are only 3 images"),
         ("0 0 1\n" + "1 0 0\n" * 4, r"trajectory\.log:2: 3 columns, want 4"),
-        ("a b c\n" + "1 0 0 0\n" * 4, r"trajectory\.log:1: 'a b c', want the block's number"),
+        ("a b c\n" + "1 0 0 0\n" * 4, r"trajectory\.log:1: 'a' is no number of a frame"),
     ],
 )
 def test_a_malformed_trajectory_is_named_with_its_line(tmp_path, text, message):

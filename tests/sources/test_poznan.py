@@ -64,12 +64,23 @@ def test_degrees_or_radians_by_the_documented_rule(tmp_path, header, yaw, want_r
     np.testing.assert_allclose(source.truth.T_world_body[0, :3, :3], want, atol=1e-12)
 
 
-def test_truth_of_some_images_only_and_not_finite(tmp_path):
-    rows = [ROWS[0], (1, "nan", 0, 0, 0, 0, 0)]
+@pytest.mark.parametrize(
+    "row", [(1, "nan", 0, 0, 0, 0, 0), (1, 0, 0, 0, "inf", 0, 0), (1, 0, "-1e308", 0, 0, 0, 0)]
+)
+def test_truth_of_some_images_only_and_not_finite(tmp_path, row):
+    rows = [ROWS[0], row]
     source = open_source(make(tmp_path, rows))
     assert source.truth.stamps_ns.tolist() == [0]
     assert len(source) == 3
     assert "groundtruth.txt: 1 of 2 poses are not finite rigid motions; dropped" in source.notes
+
+
+@pytest.mark.parametrize("number", ["²", 5000 * "1", "-1", "x"])
+def test_what_is_no_number_of_an_image_is_named(tmp_path, number):
+    folder = make(tmp_path, [ROWS[0], (number, *ROWS[1][1:])])
+    with pytest.raises(SourceError, match=r"groundtruth\.txt:2: '.*is no number of a frame$") as caught:
+        open_source(folder)
+    assert len(str(caught.value)) < 1000
 
 
 def test_a_bad_line_is_named(tmp_path):

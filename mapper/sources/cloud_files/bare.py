@@ -90,7 +90,7 @@ def why_no_points(path: Path) -> str | None:
         first = next((line.strip() for line in lines if line.strip()), "")
         return f"{first[:_QUOTED]!r} is not three or more numbers" if first else EMPTY
     rows = [line.split() for line in lines[skipped:] if line.strip()]
-    if wrong := next((row for row in rows if not all(map(_NUMBER.fullmatch, row))), None):
+    if wrong := next((row for row in rows if len(row) < 3 or not all(map(_NUMBER.fullmatch, row))), None):
         return f"{' '.join(wrong)[:_QUOTED]!r} is not three or more numbers"
     if len(rows) < MIN_POINTS and not is_cut:
         return f"{len(rows)} lines, want {MIN_POINTS} points or more"

@@ -1,10 +1,9 @@
 """Choice of the topics that a map is made from: the user's, or a guess that a note reports."""
 
+import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.sources.config import TopicsConfig
@@ -212,7 +211,7 @@ def frame_of(message: Message | None) -> str:
 
 def _feels_gravity(message: Message | None) -> bool:
     low, high = _GRAVITY_MPS2
-    return isinstance(message, ImuMessage) and low < float(np.linalg.norm(message.acceleration_mps2)) < high
+    return isinstance(message, ImuMessage) and low < math.hypot(*message.acceleration_mps2) < high
 
 
 def _what_there_is(color: Series | None, depth: Series | None, series: Iterable[Series]) -> str:

@@ -9,7 +9,7 @@ from pypcd4 import Encoding, PointCloud
 
 from mapper.core.errors import FrameError
 from mapper.sources import cloud_files
-from mapper.sources.cloud_files import read_cloud
+from mapper.sources.cloud_files import read_cloud, why_no_points
 from mapper.sources.cloud_files.las import read_las
 from mapper.sources.cloud_files.parsing import refusing_damage
 
@@ -37,7 +37,7 @@ def with_chunks(path, chunks):
 
 
 def with_layer(path, layer_bytes):
-    """Let the first layer have so many bytes; the sizes follow the first point, of 36 bytes, and a count."""
+    """Let the first layer have so many bytes; their sizes follow a point of 36 bytes and a count."""
     data = bytearray(path.read_bytes())
     (start,) = struct.unpack_from("<I", data, 96)
     struct.pack_into("<I", data, start + 8 + 36 + 4, layer_bytes)
@@ -121,3 +121,9 @@ def test_a_file_beyond_the_limit_is_not_read(tmp_path, monkeypatch):
     monkeypatch.setattr(cloud_files, "MOST_BYTES", 1000)
     with pytest.raises(FrameError, match=rf"{path}: 12128 bytes, want 1000 at most; split it"):
         read_cloud(path)
+
+
+def test_a_text_file_of_lines_of_several_lengths_is_no_cloud(tmp_path):
+    path = tmp_path / "1.csv"
+    path.write_text("1.5,2,3\n4,5\n" + 10 * "6,7,8\n")
+    assert why_no_points(path) == "'4 5' is not three or more numbers"

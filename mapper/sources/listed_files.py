@@ -1,59 +1,10 @@
-"""Files of a log: regular ones within its folder, and of a bounded size."""
+"""Files that a log lists: regular ones, within its folder."""
 
 import os
-import stat
 from collections.abc import Iterable
 from pathlib import Path, PurePath
 
-from mapper.core.errors import DataError, SourceError
-
-MOST_TEXT_BYTES = 256 << 20
-"""Size of a log's text files, beyond which they are taken for something else: the true poses of ten hours at
-100 Hz fill it, and as lines it takes a few gigabytes of memory."""
-
-
-def read_regular(path: Path, *, most_bytes: int, may_be_pipe: bool = False) -> bytes:
-    """Return a file's bytes.
-
-    Args:
-        path: A regular file, or a link to one; devices and pipes may never end, or never begin.
-        most_bytes: Size of the largest file that is read.
-        may_be_pipe: Read a pipe too: the user named it, and not a log.
-
-    Raises:
-        OSError: It cannot be read.
-        DataError: It is no regular file, or larger; the message does not name it.
-    """
-    wait = 0 if may_be_pipe else os.O_NONBLOCK  # opening a pipe waits for its writer
-    descriptor = os.open(path, os.O_RDONLY | wait)
-    with os.fdopen(descriptor, "rb") as file:
-        status = os.fstat(descriptor)
-        if not (stat.S_ISREG(status.st_mode) or may_be_pipe):
-            raise DataError("no regular file")
-        if status.st_size > most_bytes:
-            raise DataError(f"{status.st_size} bytes, want {most_bytes} at most")
-        return file.read()
-
-
-def read_text(path: Path, *, may_be_pipe: bool = False) -> str:
-    """Return the text of a file, which is UTF-8.
-
-    Args:
-        path: As of :func:`read_regular`.
-        may_be_pipe: As of :func:`read_regular`.
-
-    Raises:
-        DataError: It cannot be read, is no regular file, too large or no text; the message says which file.
-    """
-    try:
-        data = read_regular(path, most_bytes=MOST_TEXT_BYTES, may_be_pipe=may_be_pipe)
-        return data.decode("utf-8")
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise DataError(f"{path}: not a text file") from None
-    except DataError as error:
-        raise DataError(f"{path}: {error}") from None
+from mapper.core.errors import SourceError
 
 
 def within(folder: Path, name: str, *, where: str) -> Path:

@@ -7,7 +7,8 @@ import signal
 import pytest
 
 from mapper.core.errors import FrameError, SourceError
-from mapper.sources import open_source, regular_files
+from mapper.runtime import regular_files
+from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.inspection import inspect_log
 from mapper.sources.writers import write_log

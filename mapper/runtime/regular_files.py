@@ -1,0 +1,67 @@
+"""Regular files of a bounded size, as bytes and as text; devices and pipes may never end, or never begin."""
+
+import os
+import stat
+from pathlib import Path
+
+from mapper.core.errors import DataError, MapperError
+
+MOST_TEXT_BYTES = 256 << 20
+"""Size of a text file, beyond which it is taken for something else: the true poses of ten hours at 100 Hz
+fill it, and as lines it takes a few gigabytes of memory."""
+
+
+def read_regular(path: Path, *, most_bytes: int, may_be_pipe: bool = False) -> bytes:
+    """Return a file's bytes.
+
+    Args:
+        path: A regular file, or a link to one.
+        most_bytes: Size of the largest file that is read.
+        may_be_pipe: Read a pipe too: the user named it, and not a log.
+
+    Raises:
+        OSError: It cannot be read.
+        DataError: It is no regular file, or larger; the message does not name it.
+    """
+    wait = 0 if may_be_pipe else os.O_NONBLOCK  # opening a pipe waits for its writer
+    with os.fdopen(os.open(path, os.O_RDONLY | wait), "rb") as file:
+        status = os.fstat(file.fileno())
+        if stat.S_ISREG(status.st_mode):
+            if status.st_size > most_bytes:
+                raise DataError(f"{status.st_size} bytes, want {most_bytes} at most")
+            return file.read()
+        if not (may_be_pipe and stat.S_ISFIFO(status.st_mode)):
+            raise DataError("no regular file")
+        data = file.read(most_bytes + 1)
+        if len(data) > most_bytes:
+            raise DataError(f"more than {most_bytes} bytes")
+        return data
+
+
+def read_text(
+    path: Path,
+    *,
+    error: type[MapperError] = DataError,
+    encoding: str = "utf-8",
+    may_be_pipe: bool = False,
+) -> str:
+    """Return the text of a file.
+
+    Args:
+        path: As of :func:`read_regular`.
+        error: What is raised.
+        encoding: Of the text.
+        may_be_pipe: As of :func:`read_regular`.
+
+    Raises:
+        MapperError: ``error``: it cannot be read, is no regular file, too large or no text; the message says
+            which file.
+    """
+    try:
+        return read_regular(path, most_bytes=MOST_TEXT_BYTES, may_be_pipe=may_be_pipe).decode(encoding)
+    except OSError as why:
+        raise error(f"{path}: cannot be read: {why.strerror}") from None
+    except UnicodeDecodeError as why:
+        raise error(f"{path}: not a text file: byte {why.start} is not {encoding.upper()}") from None
+    except (DataError, MemoryError) as why:
+        raise error(f"{path}: {why or 'does not fit into memory'}") from None
