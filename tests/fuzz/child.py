@@ -1,0 +1,110 @@
+"""Child process that reads inputs: ``python -m tests.fuzz.child MEMORY_BYTES``.
+
+It takes a line of JSON for each input: the words of a command, which is a verb of ``mapper``, "all" or a
+peer. It answers with another: the outcome and the message, or the traceback of an error not of mapper's own.
+"""
+
+import json
+import os
+import resource
+import sys
+import traceback
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+from mapper.core.errors import FrameError, MapperError
+from tests.fuzz.peers import PEERS
+
+LONGEST_MESSAGE = 1000
+_EXIT_REFUSED = 1
+
+
+class NotOneLineError(Exception):
+    """A message to the user that is no line."""
+
+
+def read_all(path: Path) -> str:
+    """Read a map, or all of a log, and return what its reader noted.
+
+    Raises:
+        MapperError: It is damaged, or a frame of it is.
+    """
+    if path.suffix in (".octree", ".ot", ".bt"):
+        from mapper.octree.octomap_file import read_map
+
+        read_map(path).leaves()
+        return ""
+    from mapper.sources import open_source
+    from mapper.sources.config import SourceConfig
+    from mapper.sources.inspection import inspect_log
+
+    inspect_log(path, SourceConfig())
+    log = open_source(path)
+    reason: FrameError | None = None
+    for entry in log.entries():
+        for read in (entry.load, entry.scan):
+            try:
+                read()
+            except FrameError as error:
+                reason = error
+    if reason is not None:
+        raise reason
+    return "; ".join(log.notes)
+
+
+def run_verb(words: Sequence[str]) -> str:
+    """Run ``mapper`` with some words, and return its warnings.
+
+    Raises:
+        MapperError: It refused the input.
+    """
+    from typer.testing import CliRunner
+
+    from cli.main import app
+
+    result = CliRunner().invoke(app, list(words), catch_exceptions=False)
+    if result.exit_code == _EXIT_REFUSED:  # inspect says on its standard output what is wrong
+        raise MapperError((result.stderr or result.output).rstrip().rpartition("\n")[2])
+    if result.exit_code:
+        raise NotOneLineError(f"exit status {result.exit_code}: {result.output}")
+    said: str = result.stderr.strip()
+    return said
+
+
+def run(words: Sequence[str]) -> str:
+    """Run a command and return notes or warnings."""
+    what = words[0]
+    if what == "all":
+        return read_all(Path(words[1]))
+    return PEERS[what](words[1]) if what in PEERS else run_verb(words)
+
+
+def answer(words: Sequence[str]) -> dict[str, str]:
+    """Return the outcome: "read", "noted" with the notes, "refused" and why, or "error" with a traceback."""
+    try:
+        notes = run(words)
+    except MapperError as error:
+        message = str(error)
+        if not message or "\n" in message or len(message) > LONGEST_MESSAGE:
+            return {"outcome": "error", "detail": f"not one line: {message[:3000]!r}"}
+        return {"outcome": "refused", "detail": message}
+    except BaseException as error:  # also what Rust's libraries raise
+        if words[0] in PEERS:
+            return {"outcome": "refused", "detail": f"{type(error).__name__}: {error}"}
+        return {"outcome": "error", "detail": traceback.format_exc()}
+    return {"outcome": "noted" if notes else "read", "detail": notes}
+
+
+def main() -> None:
+    """Answer until the input ends."""
+    resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[1]),) * 2)
+    warnings.simplefilter("error", RuntimeWarning)
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)  # what a library prints is no answer
+    for line in sys.stdin:
+        print(json.dumps(answer(json.loads(line))), file=answers)
+
+
+if __name__ == "__main__":
+    main()
