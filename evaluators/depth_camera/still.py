@@ -15,13 +15,13 @@ from evaluators.depth_camera.accuracy import (
     seen_plane,
     typical_of,
 )
-from evaluators.depth_camera.planes import MAX_NOISE_RATIO, fit_planes
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import RgbdFrame, ray_table
 from mapper.core.geometry import Array
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.depth_filter import dif
+from mapper.sensing.planes import MAX_NOISE_RATIO, fit_planes
 from mapper.sources.base import FrameRef, Log
 
 _MIN_MEASURED_RATIO = 0.5

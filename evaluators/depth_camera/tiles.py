@@ -16,13 +16,13 @@ from evaluators.depth_camera.accuracy import (
     seen_plane,
     typical_of,
 )
-from evaluators.depth_camera.planes import MAX_NOISE_RATIO, Planes, fit_planes
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import RgbdFrame, ray_table
 from mapper.core.geometry import Array
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.depth_filter import dif
+from mapper.sensing.planes import MAX_NOISE_RATIO, Planes, cut_tiles, fit_planes
 from mapper.sources.base import FrameRef, Log
 
 _TILES_ACROSS = 16
@@ -109,9 +109,9 @@ def depth_of_planes(
 
 def _planes(frame: RgbdFrame, where: Patch, side: int, *, number: int) -> tuple[list[SeenPlane], ResidualMap]:
     """Return the planes that tiles of a frame show, and a picture of them."""
-    depth_m = _cut(frame.depth_m[where.slices], side)
-    rays = _cut(ray_table(frame.camera)[where.slices], side)
-    filtered_m = _cut(dif(frame.depth_m)[where.slices], side)
+    depth_m = cut_tiles(frame.depth_m[where.slices], side)
+    rays = cut_tiles(ray_table(frame.camera)[where.slices], side)
+    filtered_m = cut_tiles(dif(frame.depth_m)[where.slices], side)
     whole = np.flatnonzero((depth_m > 0.0).mean(axis=1) >= _MIN_MEASURED_RATIO)
     planes = fit_planes(depth_m[whole], rays[whole])
     steps_m = [quantisation_step_m(tile) for tile in depth_m[whole]]
@@ -133,14 +133,6 @@ def _planes(frame: RgbdFrame, where: Patch, side: int, *, number: int) -> tuple[
     together = _joined(tiles_m, side, across=where.width // side)
     error_m[where.slices][: together.shape[0], : together.shape[1]] = together
     return seen, ResidualMap(frame.gray, error_m, f"frame {number}: {len(seen)} tiles show a plane")
-
-
-def _cut(image: NDArray[np.floating], side: int) -> Array:
-    """Return (T, side², …) tiles of an (H, W, …) image, row by row; what is left at its ends is dropped."""
-    rows, columns = image.shape[0] // side, image.shape[1] // side
-    rest = image.shape[2:]
-    whole = image[: rows * side, : columns * side].reshape(rows, side, columns, side, *rest)
-    return whole.swapaxes(1, 2).reshape(rows * columns, side * side, *rest).astype(np.float64)
 
 
 def _joined(tiles: Array, side: int, *, across: int) -> Array:

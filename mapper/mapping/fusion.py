@@ -16,7 +16,7 @@ from mapper.mapping.cloud import CloudBuilder, Colors, height_colors
 from mapper.mapping.config import FuseSettings, McapConfig
 from mapper.mapping.thumbnails import encode_jpeg, shrunk_camera
 from mapper.navigation.traversable import traversable
-from mapper.octree.casting import Caster, reach_m
+from mapper.octree.casting import Caster, depth_limit_of, reach_m
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.scan_update import ScanUpdate, pack
@@ -139,7 +139,7 @@ def fuse_log(
         after: Receives the frames' updates.
     """
     octree, cloud = OctreeMap(config.octree), CloudBuilder(config.cloud.voxel_m)
-    casters, moved, unreached = _Casters(config.octree), 0, 0
+    casters, depth_limit, moved, unreached = _Casters(config.octree), depth_limit_of(config.octree), 0, 0
 
     def prepare(job: _Job) -> _Fused:
         return _prepared(job, config, casters.caster)
@@ -161,7 +161,8 @@ def fuse_log(
             moved += fused.job.cached is None
             unreached += fused.unreached
             if fused.scan is not None and fused.job.feeds_cloud:
-                _add_to_cloud(cloud, fused.scan, fused.job.T_world_body)
+                scan = fused.scan if depth_limit is None else depth_limit.split(fused.scan)[0]
+                _add_to_cloud(cloud, scan, fused.job.T_world_body)
             if fused.snapshot is not None:
                 on_snapshot(fused.snapshot)
     if unreached:

@@ -151,7 +151,7 @@ class AttributeLayer:
             np.ascontiguousarray(T_world_body),
             np.asarray(origin_world, dtype=np.float32),
             self._resolution_m,
-            config.max_range_m,
+            config.range_limit_m,
             config.discretize,
             stamp_ns,
             self._blocks.table,

@@ -12,6 +12,9 @@ from mapper.octree import kernels
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import KEY_COUNT, KEY_ZERO
 from mapper.octree.window import Window, WindowBuffer, block_codes, take_touched
+from mapper.sensing.depth_limit import DepthLimit
+
+_NO_POINTS: Points32 = np.empty((0, 3), np.float32)
 
 
 class Cast(NamedTuple):
@@ -33,6 +36,7 @@ class Caster:
 
     def __init__(self, config: OctreeConfig) -> None:
         self.config = config
+        self._depth_limit = depth_limit_of(config)
         self._buffer = WindowBuffer()
 
     @property
@@ -47,15 +51,19 @@ class Caster:
     def cast(self, scan: Scan, T_world_body: Transform) -> Cast:
         """Rasterise a scan: free along every ray, occupied at its end; occupied wins.
 
+        Returns of a depth camera that are noisier than a voxel is large only free space.
+
         Raises:
             DataError: A point or the origin has no key.
             MapSizeError: The scan is too large for its resolution.
         """
         origin_world = apply(T_world_body, scan.origin_body[np.newaxis])[0]
-        points_body, T = np.ascontiguousarray(scan.points_body), np.ascontiguousarray(T_world_body)
-        if self.config.discretize:
-            return self._discretized(points_body, T, origin_world)
-        return self._rays(kernels.to_world(points_body, T), origin_world)
+        T = np.ascontiguousarray(T_world_body)
+        if self._depth_limit is None:
+            return self._rays(self._ends(np.ascontiguousarray(scan.points_body), T), origin_world)
+        counting, free_body = self._depth_limit.split(scan)
+        ends_world = self._ends(np.ascontiguousarray(counting.points_body), T)
+        return self._rays(ends_world, origin_world, free_world=self._ends(free_body, T))
 
     def cast_points(self, points_world: Points32, origin_world: Array) -> Cast:
         """Rasterise rays from a (3,) origin to (N, 3) world points, metres.
@@ -67,23 +75,31 @@ class Caster:
         if points_world.ndim != 2 or points_world.shape[1] != 3:
             raise DataError(f"octree: points {points_world.shape}, want (N, 3)")
         points_world = np.ascontiguousarray(points_world, dtype=np.float32)
-        if self.config.discretize:
-            return self._discretized(points_world, np.eye(4), origin_world)
-        return self._rays(points_world, origin_world)
+        return self._rays(self._ends(points_world, np.eye(4)), origin_world)
 
-    def _discretized(self, points_body: Points32, T_world_body: Transform, origin_world: Array) -> Cast:
+    def _ends(self, points_body: Points32, T_world_body: Transform) -> Points32:
+        """Return the world points where rays end: one per end voxel, its centre, or one per point."""
+        if not self.config.discretize:
+            ends_world: Points32 = kernels.to_world(points_body, T_world_body)
+            return ends_world
+        centres_world: Points32
         centres_world, outside = kernels.end_voxels(points_body, T_world_body, self.config.resolution_m)
         self._refuse(outside, len(points_body))
-        return self._rays(centres_world, origin_world)
+        return centres_world
 
-    def _rays(self, ends_world: Points32, origin_world: Array) -> Cast:
+    def _rays(self, ends_world: Points32, origin_world: Array, *, free_world: Points32 = _NO_POINTS) -> Cast:
+        """Rasterise rays to obstacles, and rays to points where there is none."""
+        obstacles = len(ends_world)
+        if len(free_world):
+            ends_world = np.concatenate([ends_world, free_world])
         resolution_m = self.config.resolution_m
         origin = np.asarray(origin_world, dtype=np.float32)
         base = origin_key(origin, resolution_m)
         stops, hits, lowest, highest, outside = kernels.clip_rays(
-            ends_world, origin, resolution_m, self.config.max_range_m
+            ends_world, origin, resolution_m, self.config.range_limit_m
         )
         self._refuse(outside, len(ends_world))
+        hits[obstacles:] = False
         window = self._buffer.window(lowest, highest, origin=base)
         kernels.cast_rays(stops, hits, origin, resolution_m, window)
         positions = take_touched(window)
@@ -97,6 +113,13 @@ class Caster:
                 f"±{reach_m(resolution_m):g} m, the reach of {resolution_m:g} m voxels; "
                 "drop them or raise resolution_m"
             )
+
+
+def depth_limit_of(config: OctreeConfig) -> DepthLimit | None:
+    """Return which returns of a depth camera count; None where its noise does not limit them."""
+    if config.depth_noise is None or config.max_range_m is not None:
+        return None
+    return DepthLimit(config.depth_noise, max_sigma_m=config.resolution_m)
 
 
 def origin_key(origin: NDArray[np.float32], resolution_m: float) -> NDArray[np.int64]:

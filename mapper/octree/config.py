@@ -1,10 +1,12 @@
 """Settings of the occupancy octree and of the 2D slice."""
 
+import math
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 from mapper.core.config import Config
+from mapper.sensing.config import DepthNoiseConfig
 
 Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
 
@@ -22,8 +24,12 @@ class OctreeConfig(Config):
     clamp_min_probability: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.1192
     clamp_max_probability: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.971
     occupied_probability: Probability = 0.5
-    max_range_m: Annotated[float, Field(gt=0.0, allow_inf_nan=True)] = 4.0
-    """Beyond it a ray only frees space, up to this range. Kinect depth is poor past 4 m."""
+    max_range_m: Annotated[float, Field(gt=0.0, allow_inf_nan=True)] | None = None
+    """Beyond it a ray only frees space, up to this range. None is as far as ``depth_noise`` allows."""
+    depth_noise: DepthNoiseConfig | None = None
+    """Noise of a depth camera, with which a return counts while its standard deviation is at most a voxel.
+    None: ``odometry.depth_noise``, else a build measures it on the planes that the log shows. Without effect
+    where ``max_range_m`` is a number."""
     discretize: bool = True
     """Cast one ray per end voxel (fast), not one per point; both are OctoMap's own modes."""
     attributes: bool = False
@@ -36,6 +42,11 @@ class OctreeConfig(Config):
     seen_through_scans: Annotated[int, Field(ge=1, le=255)] = 3
     """After so many consecutive scans with an occupied voxel free, its log-odds are those of these misses
     alone: the object has left. Only with ``dynamic = "seen-through"``."""
+
+    @property
+    def range_limit_m(self) -> float:
+        """Length of the longest ray with an occupied end."""
+        return math.inf if self.max_range_m is None else self.max_range_m
 
 
 class SliceConfig(Config):

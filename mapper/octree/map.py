@@ -12,7 +12,7 @@ from mapper.octree import kernels, levels, queries
 from mapper.octree.attributes import NEVER_SEEN, AttributeLayer, ended_blocks
 from mapper.octree.blocks import BlockStore
 from mapper.octree.boxes import BoxCounts, count_boxes
-from mapper.octree.casting import Cast, Caster, origin_key
+from mapper.octree.casting import Cast, Caster, depth_limit_of, origin_key
 from mapper.octree.config import OctreeConfig, Parent
 from mapper.octree.keys import KEY_BITS, KEY_ZERO, codes_of
 from mapper.octree.nearest import Nearest, nearest_occupied
@@ -112,6 +112,8 @@ class OctreeMap:
         """
         self._merge(self._caster.cast(scan, T_world_body))
         if self.attributes is not None:
+            if (limit := depth_limit_of(self.config)) is not None:
+                scan, _ = limit.split(scan)
             self.attributes.add(
                 scan.points_body,
                 T_world_body,

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import MapFileError
 from mapper.core.geometry import Transform, angle_between
+from mapper.octree.casting import depth_limit_of
 from mapper.octree.config import OctreeConfig
 from mapper.octree.scan_update import ScanUpdate, decompressed
 from mapper.runtime.atomic import writing
 
 _FORMAT = "mapper sights 1"  # the updates' former name: files with it are still read
-_RAY_SETTINGS = {"resolution_m", "max_range_m", "discretize"}
+_RAY_SETTINGS = {"resolution_m", "max_range_m", "depth_noise", "discretize"}
 """Settings that casting depends on; probabilities only matter when updates are merged."""
 _HEAD = np.dtype([("stamp_ns", "<i8"), ("T_world_body", "<f8", (4, 4)), ("blocks", "<u4"), ("size", "<u4")])
 
@@ -128,9 +129,8 @@ class ScanUpdateFile:
         if stamp_ns not in self._heads:
             return False
         head, _ = self._heads[stamp_ns]
-        return displacement_m(head["T_world_body"], T_world_body, range_m=config.max_range_m) <= (
-            config.stays_within_m
-        )
+        moved_m = displacement_m(head["T_world_body"], T_world_body, range_m=_longest_ray_m(config))
+        return moved_m <= config.stays_within_m
 
 
 def displacement_m(T_a_body: Transform, T_b_body: Transform, *, range_m: float) -> float:
@@ -138,8 +138,15 @@ def displacement_m(T_a_body: Transform, T_b_body: Transform, *, range_m: float) 
     if np.array_equal(T_a_body, T_b_body):
         return 0.0
     shift_m = float(np.linalg.norm(T_a_body[:3, 3] - T_b_body[:3, 3]))
-    bound_m = shift_m + range_m * angle_between(T_a_body[:3, :3], T_b_body[:3, :3])
+    angle_rad = angle_between(T_a_body[:3, :3], T_b_body[:3, :3])
+    bound_m = shift_m + (range_m * angle_rad if angle_rad > 0.0 else 0.0)
     return max(bound_m, float(np.finfo(np.float64).tiny))
+
+
+def _longest_ray_m(config: OctreeConfig) -> float:
+    """Return a bound on the length of rays: no pixel of a depth camera is more than 60° off its axis."""
+    limit = depth_limit_of(config)
+    return config.range_limit_m if limit is None else 2.0 * limit.depth_m
 
 
 def open_scan_updates(path: Path) -> ScanUpdateFile:

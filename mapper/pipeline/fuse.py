@@ -19,6 +19,7 @@ from mapper.export.ply import write_ply
 from mapper.export.run_mcap import log_maps, log_results, log_snapshot
 from mapper.graph.model import PoseGraph
 from mapper.mapping.fusion import Maps, fuse_log
+from mapper.mapping.measured_noise import measure_noise
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.scan_update_file import ScanUpdateWriter, open_scan_updates
@@ -34,12 +35,13 @@ from mapper.run.folder import (
     write_run,
 )
 from mapper.run.frame_outcomes import FrameRecord
-from mapper.run.manifest import Solve, Status, Timing
+from mapper.run.manifest import DepthReach, Solve, Status, Timing
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.results import RunResults, load_results
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
 from mapper.runtime.progress import SILENT, Progress
 from mapper.runtime.timing import peak_memory_mb
+from mapper.sensing.depth_limit import DepthLimit
 from mapper.sources.base import Log
 
 _FUSE_CONFIGS = frozenset(
@@ -175,16 +177,18 @@ def fuse_into(
     if not config.mcap.frame_times:
         results = replace(results, frame_ms={})
     trajectory = results.trajectory
+    with writer.clock.stage("fuse"):
+        settings = _with_depth_noise(writer, source, config, progress)
     with McapLog(writer.folder / files.MCAP) as log:
         with (
             writer.clock.stage("fuse"),
             open_scan_updates(before) if before is not None else nullcontext() as known,
-            ScanUpdateWriter(writer.folder / files.SCAN_UPDATES, config.octree) as updates,
+            ScanUpdateWriter(writer.folder / files.SCAN_UPDATES, settings.octree) as updates,
         ):
             maps = fuse_log(
                 source,
                 results.tracked,
-                config,
+                settings,
                 progress=progress,
                 on_snapshot=lambda snapshot: log_snapshot(log, snapshot),
                 before=known,
@@ -201,6 +205,27 @@ def fuse_into(
     )
     writer.update(counts=counts, timing=_timing(writer, trajectory, counts.read))
     observer.on_mapped(Run(writer.folder, config, writer.manifest), results, maps)
+
+
+def _with_depth_noise(writer: RunWriter, source: Log, config: BuildConfig, progress: Progress) -> BuildConfig:
+    """Return the settings with the noise of the log's camera, which limits the depth that counts."""
+    octree = config.octree
+    if source.sensor != "rgbd" or octree.max_range_m is not None:
+        writer.update(depth=None)
+        return config
+    given = octree.depth_noise or getattr(config.odometry, "depth_noise", None)
+    measured = measure_noise(source, given=given, workers=config.workers)
+    settings = octree.model_copy(update={"depth_noise": measured.noise})
+    limit_m = DepthLimit(measured.noise, max_sigma_m=octree.resolution_m).depth_m
+    reach = DepthReach(
+        noise=measured.noise,
+        detail=measured.detail,
+        limit_m=limit_m,
+        counted_ratio=measured.share_within(limit_m),
+    )
+    progress.note(reach.sentence)
+    writer.update(depth=reach)
+    return config.model_copy(update={"octree": settings})
 
 
 def _write_maps(folder: Path, maps: Maps) -> None:

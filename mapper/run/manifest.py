@@ -13,6 +13,7 @@ import mapper
 from mapper.core.config import Config
 from mapper.core.errors import RunError
 from mapper.runtime.atomic import MANIFEST_NAME, write_text
+from mapper.sensing.config import DepthNoiseConfig
 from mapper.sources.config import SourceConfig
 
 Status = Literal["building", "complete", "failed", "interrupted"]
@@ -189,6 +190,26 @@ class Levelling(Config):
     """The floor was seen; else its height is a guess."""
 
 
+class DepthReach(Config):
+    """How far the depth of a camera counts in the maps."""
+
+    noise: DepthNoiseConfig
+    detail: str
+    """Where the noise comes from; part of a sentence."""
+    limit_m: float
+    """Where its standard deviation is a voxel's edge: farther returns only tell that space is free."""
+    counted_ratio: float
+    """Share of the measured depths within this limit."""
+
+    @property
+    def sentence(self) -> str:
+        """A sentence for the user."""
+        return (
+            f"depth counts up to {self.limit_m:.1f} m, {self.counted_ratio:.0%} of all returns: there its "
+            f"noise of {self.noise.text} m, {self.detail}, is as large as a voxel"
+        )
+
+
 class Timing(Config):
     """All that differs between two runs on the same input."""
 
@@ -234,6 +255,8 @@ class Manifest(Config):
     """None in runs of before 2026-11-22."""
     solve: Solve | None = None
     levelling: Levelling | None = None
+    depth: DepthReach | None = None
+    """None where the range of octree and cloud is a setting."""
     timing: Timing = Timing()
     files: dict[str, FileDigest] = Field(default_factory=dict)
     """Every file of the run but this; empty while it is being built, and in runs of before 2026-11-22."""

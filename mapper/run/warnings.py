@@ -29,6 +29,7 @@ _MAX_LOOP_M, _MAX_LOOP_SHARE, _MAX_LOOP_RAD = 0.3, 0.03, np.radians(10.0)
 _LEAST_LOOPS_REFUSED, _MAX_REFUSED_SHARE = 4, 0.5
 _MAX_WHEEL_CHI2, _LEAST_WHEEL_FACTORS = 9.0, 5
 _MAX_SIGMA_M, _MAX_SIGMA_SHARE, _BROKEN_SIGMA_SHARE = 0.1, 0.1, 0.3
+_MIN_COUNTED_DEPTH = 0.5
 _MAX_STEP_M, _MAX_STEP_RAD = 0.2, np.radians(5.0)
 _LEAST_AGREEMENT, _LEAST_SHARED_VOXELS = 0.15, 1000
 _REASONS = 3
@@ -57,6 +58,7 @@ def find_warnings(results: RunResults, manifest: Manifest) -> list[RunWarning]:
         *_doubtful(results.records, timeline),
         *_loops(results),
         *_levelling(manifest),
+        *_depth_reach(manifest),
         *_wheels(results),
         *_uncertainty(results),
         *_wide_steps(results, timeline),
@@ -282,6 +284,16 @@ def _levelling(manifest: Manifest) -> Iterator[RunWarning]:
             kind="levelling",
             sentence=f"the height of the floor is a guess: {levelling.detail}",
             suggestion="show the floor",
+        )
+
+
+def _depth_reach(manifest: Manifest) -> Iterator[RunWarning]:
+    reach = manifest.depth
+    if reach is not None and reach.counted_ratio < _MIN_COUNTED_DEPTH:
+        yield RunWarning(
+            kind="reach",
+            sentence=reach.sentence,
+            suggestion="raise octree.resolution_m, or set octree.max_range_m if noise in the map is no harm",
         )
 
 

@@ -35,3 +35,7 @@ class DepthNoiseConfig(Config):
         terms = {"": self.constant_m, "·z": self.linear, "·z²": self.quadratic_per_m}
         signed = [f"{'−' if value < 0.0 else '+'} {abs(value):.3g}{z}" for z, value in terms.items() if value]
         return " ".join(signed).removeprefix("+ ") or "0"
+
+
+KINECT_NOISE = DepthNoiseConfig(constant_m=0.0015, linear=-0.0015, quadratic_per_m=0.0019)
+"""σ_z = 1.2 mm + 1.9 mm/m² · (z − 0.4 m)² (Nguyen, Izadi & Lovell 2012, eq. 3)."""

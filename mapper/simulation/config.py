@@ -13,6 +13,9 @@ class SensorConfig(Config):
 
     axial_noise_ratio: NonNegativeFloat = 1.0
     """Multiplies σ_z = 1.2 mm + 1.9 mm/m² · (z − 0.4 m)² (Nguyen et al. 2012, eq. 3); 0 is exact depth."""
+    disparity_noise_px: NonNegativeFloat = 0.0
+    """Standard deviation of the disparity, in pixels at 640 px: σ_z is z² times this over 43.5 m px, as of a
+    stereo camera, for which ``axial_noise_ratio`` is 0."""
     lateral_noise_px: NonNegativeFloat = 0.4
     """Standard deviation of where in the image a depth really was measured."""
     disparity_step_px: NonNegativeFloat = 0.125

@@ -95,12 +95,15 @@ def _warped(depth_m: DepthImage, warp_px: Field32) -> DepthImage:
 
 
 def _noisy_depth(depth_m: DepthImage, sensor: SensorConfig, rng: np.random.Generator) -> DepthImage:
-    """Displace, add axial noise (half of its variance in patches), then round to whole disparity steps."""
+    """Displace, add axial and disparity noise, then round to whole disparity steps."""
     measured: DepthImage = _displaced(depth_m, sensor.lateral_noise_px, rng)
     if sensor.axial_noise_ratio > 0.0:
-        noise = rng.standard_normal(depth_m.shape, dtype=np.float32) + _patches(depth_m.shape, rng)
+        noise = _in_pixels_and_patches(depth_m.shape, rng)
         noise *= np.float32(math.sqrt(0.5) * sensor.axial_noise_ratio) * axial_sigma_m(measured)
         measured = measured + noise
+    if sensor.disparity_noise_px > 0.0:
+        noise = _in_pixels_and_patches(depth_m.shape, rng)
+        measured = _warped(measured, np.float32(math.sqrt(0.5) * sensor.disparity_noise_px) * noise)
     if sensor.disparity_step_px > 0.0:
         one_step_m = np.float32(BASELINE_M * DISPARITY_FOCAL_PX / sensor.disparity_step_px)
         steps = np.maximum(np.rint(one_step_m / np.maximum(measured, _TINY_M)), _ONE)
@@ -118,6 +121,11 @@ def _displaced(depth_m: DepthImage, sigma_px: float, rng: np.random.Generator) -
     columns = np.clip(np.arange(width, dtype=np.int32) + shift[1], 0, width - 1)
     displaced: DepthImage = np.take(depth_m, rows * width + columns)
     return displaced
+
+
+def _in_pixels_and_patches(shape: tuple[int, ...], rng: np.random.Generator) -> Field32:
+    """Return (H, W) noise of variance 2, half of it from pixel to pixel and half in patches."""
+    return rng.standard_normal(shape, dtype=np.float32) + _patches(shape, rng)
 
 
 def _patches(shape: tuple[int, ...], rng: np.random.Generator) -> Field32:

@@ -110,7 +110,7 @@ def test_a_scan_is_its_points_at_the_pose(discretize):
     rng = np.random.default_rng(5)
     T_world_body = exp(np.array([0.3, -0.2, 1.1]), np.array([4.0, -2.0, 1.0]))
     scan = Scan(0, rng.normal(0.0, 2.0, (500, 3)).astype(np.float32), origin_body=np.array([0.1, 0.2, 0.3]))
-    octree = OctreeMap(OctreeConfig(discretize=discretize))
+    octree = OctreeMap(OctreeConfig(discretize=discretize, max_range_m=4.0))
 
     octree.insert(scan, T_world_body)
 

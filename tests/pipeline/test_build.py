@@ -16,6 +16,7 @@ from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse
 from mapper.run.folder import load_run
 from mapper.run.manifest import read_manifest
+from mapper.sensing.depth_noise import depth_sigma_m
 from mapper.sources import open_source
 from mapper.sources.cloud_files import read_cloud
 from tests.support.desk import REPEATABLE
@@ -112,6 +113,21 @@ def test_every_point_of_the_cloud_lies_in_an_occupied_voxel(run):
     assert len(cloud) == run.manifest.counts.cloud_points > 1000
     for name in ("map.ot", "map.octree"):
         assert read_map(run.path / name).are_occupied(cloud).all()
+
+
+def test_depth_counts_as_far_as_its_noise_is_below_a_voxel(run, desk_log, tmp_path):
+    reach = run.manifest.depth
+    sigma_m = depth_sigma_m(reach.noise, np.array([reach.limit_m]))[0]
+    assert sigma_m == pytest.approx(run.config.octree.resolution_m)
+    assert reach.detail.startswith("measured on planes")
+    assert 3.0 < reach.limit_m < 8.0, "the camera is simulated after a Kinect"
+
+    copy = load_run(shutil.copytree(run.path, tmp_path / "run"))
+    again = fuse(
+        open_source(desk_log, run.config.source), copy, overridden(run.config, ["octree.max_range_m=1"])
+    )
+    assert again.manifest.depth is None
+    assert again.manifest.counts.leaves < run.manifest.counts.leaves
 
 
 def test_the_log_holds_the_whole_story(run):

@@ -56,6 +56,16 @@ def test_depth_noise_follows_nguyen(depth_m):
     assert 0.3 < neighbours < 0.55, "half of the variance comes in patches"
 
 
+@pytest.mark.parametrize("depth_m", [2.0, 5.0])
+def test_noise_of_the_disparity_grows_with_the_square_of_the_depth(depth_m):
+    sensor = changed(IDEAL_SENSOR, disparity_noise_px=0.2)
+    seen = [
+        observe(flat(depth_m), focal_px=262, sensor=sensor, rng=np.random.default_rng(i)) for i in range(5)
+    ]
+    errors_m = np.array([depth for _, depth in seen]) - depth_m
+    assert errors_m.std() == pytest.approx(0.2 * depth_m**2 / 43.5, rel=0.05)
+
+
 def test_depth_comes_in_eighths_of_a_pixel_of_disparity():
     sensor = SensorConfig(dropout_ratio=0.0)
     _, depth_m = observe(flat(2.5), focal_px=262, sensor=sensor, rng=np.random.default_rng(0))

@@ -16,7 +16,6 @@ from mapper.core.geometry import Array, Points, Transform, is_rigid
 from mapper.odometry.base import Diagnostics
 from mapper.odometry.local_map.depth_kernels import compare, descend, seen_through
 from mapper.odometry.local_map.depth_surfaces import (
-    KINECT_NOISE,
     DepthCells,
     DepthSurface,
     point_sigmas,
@@ -24,7 +23,7 @@ from mapper.odometry.local_map.depth_surfaces import (
 )
 from mapper.registration.degeneracy import Degeneracy, degeneracy_of, projected
 from mapper.registration.reprojection import normal_matrix
-from mapper.sensing.config import DepthNoiseConfig
+from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
 
 _GATES_M = (0.3, 0.1, 0.04)
 _EVERY = (4, 4, 1)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import DepthImage, PinholeCamera
 from mapper.core.geometry import Array, Points
-from mapper.sensing.config import DepthNoiseConfig
+from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
 from mapper.sensing.depth_noise import depth_sigma_m
 
 _COLUMNS = 80
@@ -23,8 +23,6 @@ _SAME_SURFACE = 0.08
 _MAX_VARIANCE_RATIO = 6.0
 """Residual variance of a fit, relative to the image's median, from which the cells are on no one plane."""
 _LATERAL_SIGMA_PX = 0.8
-KINECT_NOISE = DepthNoiseConfig(constant_m=0.0015, linear=-0.0015, quadratic_per_m=0.0019)
-"""σ_z = 1.2 mm + 1.9 mm/m² · (z − 0.4 m)² (Nguyen, Izadi & Lovell 2012, eq. 3)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -48,6 +48,14 @@ class Planes:
         return tilt
 
 
+def cut_tiles(image: NDArray[np.floating], side: int) -> Array:
+    """Return (T, side², …) tiles of an (H, W, …) image, row by row; what is left at its ends is dropped."""
+    rows, columns = image.shape[0] // side, image.shape[1] // side
+    rest = image.shape[2:]
+    whole = image[: rows * side, : columns * side].reshape(rows, side, columns, side, *rest)
+    return whole.swapaxes(1, 2).reshape(rows * columns, side * side, *rest).astype(np.float64)
+
+
 def fit_planes(depth_m: Array, rays: Array) -> Planes:
     """Fit a plane to every patch by least squares of the depths, without those more than 4 σ off.
 

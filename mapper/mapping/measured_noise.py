@@ -1,0 +1,122 @@
+"""Depth noise of a log's camera, measured on the planes that a few of its frames show."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.core.errors import FrameError
+from mapper.core.frames import RgbdFrame, ray_table
+from mapper.core.geometry import Array
+from mapper.runtime.ordered_map import ordered_map
+from mapper.sensing.config import KINECT_NOISE, DepthNoiseConfig
+from mapper.sensing.planes import cut_tiles, fit_planes
+from mapper.sources.base import FrameRef, Log
+
+_FRAMES = 24
+_TILES_ACROSS = 16
+_STRIDE_PX = 2
+_MIN_MEASURED_RATIO = 0.9
+_MIN_PLANE_RATIO = 0.98
+_MAX_TILT_RAD = np.radians(60.0)
+"""Up to here a Kinect's axial noise does not depend on the angle (Nguyen et al. 2012, §4)."""
+_MAX_NOISE_RATIO = 0.1
+_BIN_RATIO = 1.1
+_MIN_TILES, _MIN_FRAMES = 30, 3
+_FLATTEST_PERCENT = 25.0
+"""Relief only adds to the noise, so that of the flatter tiles is the sensor's."""
+_LEAST_QUADRATIC_PER_M = 1e-6
+"""Noise of exact depth images, which is not 0 only by rounding."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredNoise:
+    """Depth noise of a camera.
+
+    Attributes:
+        noise: Standard deviation of a depth, by depth.
+        detail: Where it comes from; part of a sentence.
+        depths_m: (N,) depths of some pixels, to tell how many a limit leaves out.
+    """
+
+    noise: DepthNoiseConfig
+    detail: str
+    depths_m: Array
+
+    def share_within(self, depth_m: float) -> float:
+        """Return the share of depths up to a limit."""
+        return float((self.depths_m <= depth_m).mean()) if len(self.depths_m) else 1.0
+
+
+def measure_noise(source: Log, *, given: DepthNoiseConfig | None = None, workers: int) -> MeasuredNoise:
+    """Measure a camera's depth noise; that of a Kinect is assumed where too few planes are seen.
+
+    Frames spread over the log are cut into tiles, and a plane is fitted to each. The tiles are sorted by
+    distance, in steps of 10 %; the noise at a distance is the lower quartile of the standard deviations
+    from the planes. It is taken to be σ_z = c·z² (Khoshelham & Elberink 2012, eq. 10), with the median of
+    σ_z / z² over the farther half of the distances: a curve with more terms fits better where planes are
+    seen, but is worth nothing beyond, and sensors whose noise grows more slowly are trusted less than they
+    might be, not more.
+
+    Args:
+        source: RGB-D log.
+        given: The noise, where the user knows it; then only depths are collected.
+        workers: Threads that decode frames.
+    """
+    chosen = np.unique(np.linspace(0, len(source) - 1, min(_FRAMES, len(source))).round().astype(int))
+    entries = (source.entry_at(int(index)) for index in chosen)
+    seen = [one for one in ordered_map(_seen, entries, workers=workers) if one is not None]
+    depths_m = np.concatenate([np.empty(0), *(depths for depths, _, _ in seen)])
+    if given is not None:
+        return MeasuredNoise(given, "as set", depths_m)
+    distance_m = np.concatenate([np.empty(0), *(z for _, z, _ in seen)])
+    sigma_m = np.concatenate([np.empty(0), *(sigmas for _, _, sigmas in seen)])
+    frame_of = np.repeat(np.arange(len(seen)), [len(z) for _, z, _ in seen])
+    distances_m, sigmas_m = _levels(distance_m, sigma_m, frame_of)
+    if not len(distances_m):
+        return MeasuredNoise(KINECT_NOISE, "that of a Kinect, as the log shows too few planes", depths_m)
+    far = len(distances_m) // 2
+    quadratic_per_m = float(f"{np.median(sigmas_m[far:] / distances_m[far:] ** 2):.3g}")
+    return MeasuredNoise(
+        DepthNoiseConfig(quadratic_per_m=max(quadratic_per_m, _LEAST_QUADRATIC_PER_M)),
+        f"measured on planes {distances_m[0]:.1f} to {distances_m[-1]:.1f} m away",
+        depths_m,
+    )
+
+
+def _seen(entry: FrameRef) -> tuple[Array, Array, Array] | None:
+    """Return some depths of a frame, and the distances and standard deviations of tiles that are planes."""
+    try:
+        frame = entry.load(colour=False)
+    except FrameError:
+        return None
+    if not isinstance(frame, RgbdFrame):
+        return None
+    depth_m = frame.depth_m[::_STRIDE_PX, ::_STRIDE_PX]
+    some_m = depth_m[::4, ::4][depth_m[::4, ::4] > 0.0].astype(np.float64)
+    side = max(depth_m.shape[1] // _TILES_ACROSS, 3)
+    tiles_m = cut_tiles(depth_m, side)
+    measured = (tiles_m > 0.0).mean(axis=1) >= _MIN_MEASURED_RATIO
+    if not measured.any():
+        return some_m, np.empty(0), np.empty(0)
+    tiles_m = tiles_m[measured]
+    rays = cut_tiles(ray_table(frame.camera)[::_STRIDE_PX, ::_STRIDE_PX], side)[measured]
+    planes = fit_planes(tiles_m, rays)
+    distance_m = np.median(planes.depth_m, axis=1)
+    flat = (
+        (planes.used.sum(axis=1) >= _MIN_PLANE_RATIO * (tiles_m > 0.0).sum(axis=1))
+        & (planes.tilt_rad <= _MAX_TILT_RAD)
+        & (planes.sigma_m <= _MAX_NOISE_RATIO * distance_m)
+    )
+    return some_m, distance_m[flat], planes.sigma_m[flat]
+
+
+def _levels(distance_m: Array, sigma_m: Array, frame_of: Array) -> tuple[Array, Array]:
+    """Return the distances at which enough frames show enough planes, and the noise there."""
+    steps = np.floor(np.log(distance_m) / np.log(_BIN_RATIO))
+    depths, sigmas = [], []
+    for step in np.unique(steps):
+        inside = steps == step
+        if inside.sum() >= _MIN_TILES and len(np.unique(frame_of[inside])) >= _MIN_FRAMES:
+            depths.append(float(np.median(distance_m[inside])))
+            sigmas.append(float(np.percentile(sigma_m[inside], _FLATTEST_PERCENT)))
+    return np.array(depths), np.array(sigmas)
