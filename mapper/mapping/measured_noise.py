@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import RgbdFrame, ray_table
@@ -70,7 +71,7 @@ def measure_noise(source: Log, *, given: DepthNoiseConfig | None = None, workers
         return MeasuredNoise(given, "as set", depths_m)
     distance_m = np.concatenate([np.empty(0), *(z for _, z, _ in seen)])
     sigma_m = np.concatenate([np.empty(0), *(sigmas for _, _, sigmas in seen)])
-    frame_of = np.repeat(np.arange(len(seen)), [len(z) for _, z, _ in seen])
+    frame_of = np.repeat(np.arange(len(seen), dtype=np.intp), [len(z) for _, z, _ in seen])
     distances_m, sigmas_m = _levels(distance_m, sigma_m, frame_of)
     if not len(distances_m):
         return MeasuredNoise(KINECT_NOISE, "that of a Kinect, as the log shows too few planes", depths_m)
@@ -110,7 +111,7 @@ def _seen(entry: FrameRef) -> tuple[Array, Array, Array] | None:
     return some_m, distance_m[flat], planes.sigma_m[flat]
 
 
-def _levels(distance_m: Array, sigma_m: Array, frame_of: Array) -> tuple[Array, Array]:
+def _levels(distance_m: Array, sigma_m: Array, frame_of: NDArray[np.intp]) -> tuple[Array, Array]:
     """Return the distances at which enough frames show enough planes, and the noise there."""
     steps = np.floor(np.log(distance_m) / np.log(_BIN_RATIO))
     depths, sigmas = [], []

@@ -65,6 +65,33 @@ class WheelsConfig(Config):
     is what tf tells, or else its origin, looking forward."""
 
 
+class BodyConfig(Config):
+    """The sensor's own vehicle, whose returns no part of mapper gets to see: neither tracking nor maps.
+
+    ``mapper inspect`` proposes the box, from returns that stand still while the sensor moves.
+    """
+
+    box: tuple[float, float, float, float, float, float] | None = None
+    """Least x y z, then largest x y z, metres, body frame: returns inside are the vehicle's, or its driver's."""
+    min_range_m: NonNegativeFloat = 0.0
+    """Nearer returns are left out."""
+    max_range_m: PositiveFloat | None = None
+    """Farther returns are left out, and free no space either; see ``octree.max_range_m`` for those that do."""
+
+    @property
+    def clears(self) -> bool:
+        """Whether any return may be left out."""
+        return self.box is not None or self.min_range_m > 0.0 or self.max_range_m is not None
+
+    @model_validator(mode="after")
+    def _is_not_empty(self) -> Self:
+        if self.box is not None and not all(a < b for a, b in zip(self.box[:3], self.box[3:], strict=True)):
+            raise ValueError(f"box {self.box}: want the least x y z, then the largest x y z")
+        if self.max_range_m is not None and self.max_range_m <= self.min_range_m:
+            raise ValueError(f"max_range_m {self.max_range_m} must be above min_range_m {self.min_range_m}")
+        return self
+
+
 class SourceConfig(Config):
     """The selection every kind of log understands."""
 
@@ -84,6 +111,7 @@ class SourceConfig(Config):
     camera: CameraConfig | None = None
     topics: TopicsConfig = TopicsConfig()
     wheels: WheelsConfig = WheelsConfig()
+    body: BodyConfig = BodyConfig()
     body_frame: str | None = None
     """Frame in a recording's tf that is a LiDAR's body, e.g. base_link; None is the cloud's own frame.
     The body of RGB-D frames is the camera."""

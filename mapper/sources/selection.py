@@ -1,4 +1,4 @@
-"""The part of a log that is used: a range of frames, a stride, and frames with truth only."""
+"""The part of a log that is used: a range of frames, a stride, frames with truth only, no own vehicle."""
 
 from dataclasses import replace
 
@@ -9,14 +9,19 @@ from mapper.core.errors import SourceError
 from mapper.core.timebase import NS_PER_S, nearest
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
+from mapper.sources.vehicle import without_vehicle
 
 
 def selected(log: Log, config: SourceConfig) -> Log:
     """Return the frames ``first_frame`` … ``last_frame`` by ``stride``, with truth where it is required.
 
+    Returns of the sensor's own vehicle are left out of them.
+
     Raises:
         SourceError: Nothing is left, or truth is required of a log that has none.
     """
+    if config.body.clears:
+        log = without_vehicle(log, config.body)
     total = len(log)
     stop = total if config.last_frame is None else config.last_frame + 1
     is_used = np.zeros(total, dtype=bool)
