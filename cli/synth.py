@@ -60,6 +60,12 @@ def synth(
     wheels: Annotated[
         bool, typer.Option("--wheels", help="Wheels carry the sensor; wheels.txt holds their odometry.")
     ] = False,
+    moving: Annotated[
+        bool,
+        typer.Option(
+            "--moving", help="rgbd: people and boxes cross the view; lidar: cars, cyclists and pedestrians."
+        ),
+    ] = False,
     noise: Annotated[float | None, typer.Option(help="Times the sensor's noise; 0 is exact.")] = None,
     uncalibrated: Annotated[
         bool,
@@ -89,6 +95,7 @@ def synth(
                 "--scene": scene,
                 "--rings": rings,
                 "--wheels": wheels or None,
+                "--moving": moving or None,
                 "--uncalibrated": uncalibrated or None,
             },
             f"--sensor {sensor}",
@@ -97,7 +104,15 @@ def synth(
         return
 
     from mapper.config.loading import overridden
-    from mapper.simulation.config import CAMERA_SCENES, LIDAR_SCENES, UNCALIBRATED, SynthWheelsConfig
+    from mapper.simulation.config import (
+        CAMERA_SCENES,
+        LIDAR_SCENES,
+        MOVING_INDOORS,
+        MOVING_OUTDOORS,
+        PEDESTRIANS,
+        UNCALIBRATED,
+        SynthWheelsConfig,
+    )
 
     common = {"duration_s": seconds, "seed": seed}
     carried: dict[str, object] = {"wheels": SynthWheelsConfig() if wheels else None}
@@ -111,7 +126,13 @@ def synth(
             _refuse({"--path": path, "--scene": scene}, "--plane-at")
         if start.scene != "flat":
             _refuse({"--rooms": rooms}, f"--scene {scene}")
-        given = common | {"path": path, "rooms": rooms} | _at_wall(plane_at) | _camera_noise(noise)
+        given = (
+            common
+            | {"path": path, "rooms": rooms}
+            | (MOVING_INDOORS if moving else {})
+            | _at_wall(plane_at)
+            | _camera_noise(noise)
+        )
         indoors = overridden(start.model_copy(update=carried), merged(assignments(given), set_))
         prepare_libraries()
         with progress_for(quiet=quiet).stage("render") as report:
@@ -129,6 +150,8 @@ def synth(
             f"--sensor {sensor}",
         )
         given = common | {"sensor.rings": rings} | _lidar_noise(noise)
+        if moving:
+            given |= MOVING_OUTDOORS if scene in (None, SceneName.STREET) else PEDESTRIANS
         outdoors = _scene(LIDAR_SCENES, scene or SceneName.STREET, sensor).model_copy(update=carried)
         outdoors = overridden(outdoors, merged(assignments(given), set_))
         prepare_libraries()

@@ -163,28 +163,6 @@ class SynthConfig(Config):
         return self
 
 
-_LATER = {
-    SynthConfig: {
-        *("moving_boxes", "wheels", "scene", "hall_length_m", "hall_width_m", "hall_clearance_m"),
-        *("people", "texture_contrast", "disturbances"),
-    },
-    SensorConfig: {
-        *("readout_s", "depth_delay_s", "radial_k1", "radial_k2", "depth_scale", "disparity_warp_px"),
-    },
-}
-"""Settings that came after the first logs."""
-
-
-def set_or_first(config: SynthConfig, *, exclude: set[str]) -> dict[str, Any]:
-    """Return the settings, without later ones at their defaults: so older logs' files keep their bytes."""
-    settings = config.model_dump(mode="json", exclude=exclude)
-    for part, into in ((config, settings), (config.sensor, settings["sensor"])):
-        for name in _LATER[type(part)]:
-            if getattr(part, name) == type(part).model_fields[name].default:
-                into.pop(name, None)
-    return settings
-
-
 CAMERA_SCENES: Mapping[str, SynthConfig] = {
     "flat": SynthConfig(),
     "corridor": SynthConfig(
@@ -201,6 +179,11 @@ CAMERA_SCENES: Mapping[str, SynthConfig] = {
     "twin-rooms": SynthConfig(scene="twin-rooms"),
 }
 """Where ``mapper synth`` begins with a camera."""
+
+MOVING_INDOORS: Mapping[str, int] = {"people": 4, "moving_boxes": 1}
+MOVING_OUTDOORS: Mapping[str, int] = {"cars": 10, "cyclists": 6, "pedestrians": 16}
+PEDESTRIANS: Mapping[str, int] = {"pedestrians": 6}
+"""Settings of what moves; pedestrians where there is no road."""
 
 UNCALIBRATED: Mapping[str, float] = {
     "exposure_s": 0.012,
@@ -271,6 +254,12 @@ class LidarSynthConfig(Config):
     undulation_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
     """Largest height of the ground's waves above its mean slope."""
 
+    cars: NonNegativeInt = 0
+    """Cars that drive along the route: some ahead of the sensor, the others towards it."""
+    cyclists: NonNegativeInt = 0
+    pedestrians: NonNegativeInt = 0
+    """People who walk along the route beside it, and stand still now and then."""
+
     laps: PositiveFloat = 1.0
     overlap_m: NonNegativeFloat = 15.0
     """How far the way goes on past its start, so that its ends see the same."""
@@ -295,6 +284,40 @@ class LidarSynthConfig(Config):
         if self.wheels is not None and self.scene == "staircase":
             raise ValueError("wheels: do not climb a staircase; choose another scene")
         return self
+
+    @model_validator(mode="after")
+    def _traffic_has_room(self) -> Self:
+        road, roaming = self.cars + self.cyclists, self.pedestrians
+        if (road and self.scene != "street") or (roaming and self.scene in ("tunnel", "staircase", "flat")):
+            raise ValueError(
+                f"scene {self.scene}: has no room for what moves; want cars and cyclists in street alone, "
+                "pedestrians in street, courtyard or field"
+            )
+        return self
+
+
+_LATER = {
+    SynthConfig: {
+        *("moving_boxes", "wheels", "scene", "hall_length_m", "hall_width_m", "hall_clearance_m"),
+        *("people", "texture_contrast", "disturbances"),
+    },
+    SensorConfig: {
+        *("readout_s", "depth_delay_s", "radial_k1", "radial_k2", "depth_scale", "disparity_warp_px"),
+    },
+    LidarSynthConfig: {"wheels", "cars", "cyclists", "pedestrians"},
+    LidarSensorConfig: set(),
+}
+"""Settings that came after the first logs."""
+
+
+def set_or_first(config: SynthConfig | LidarSynthConfig, *, exclude: set[str]) -> dict[str, Any]:
+    """Return the settings, without later ones at their defaults: so older logs' files keep their bytes."""
+    settings = config.model_dump(mode="json", exclude=exclude)
+    for part, into in ((config, settings), (config.sensor, settings["sensor"])):
+        for name in _LATER[type(part)]:
+            if getattr(part, name) == type(part).model_fields[name].default:
+                into.pop(name, None)
+    return settings
 
 
 STREET = LidarSynthConfig()

@@ -4,14 +4,16 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.frames import Frame, PinholeCamera, RgbdFrame, Scan, Sensor
+from mapper.core.frames import DepthImage, Frame, PinholeCamera, RgbdFrame, Scan, Sensor
 from mapper.core.geometry import Array
 from mapper.core.trajectory import Trajectory
+from mapper.simulation.builder import FACES
 from mapper.simulation.config import LidarSynthConfig, SynthConfig
 from mapper.simulation.disturbances import between, disturbed, shown_frames
 from mapper.simulation.movers import Movers, make_movers
@@ -144,6 +146,28 @@ class CameraSimulator:
         time_s = float(self._times_s[index])
         exact = self._shutter.take(time_s, self.truth.T_world_body[index])
         return disturbed(exact, self.config, time_s)
+
+    def moving_pixels(self, index: int, depth_m: DepthImage) -> NDArray[np.bool_]:
+        """Return (H, W) whether each pixel of a frame's measured depth lies on what moves.
+
+        The sensor measures a fraction of a pixel beside a pixel, so near an outline the surface is that of
+        the neighbouring pixel whose exact depth is nearest to the measured one.
+
+        Args:
+            index: The frame.
+            depth_m: (H, W) its depth as ``observe`` returned it.
+        """
+        exact = self.render(int(self._shown[index]))
+        moving = exact.surface >= FACES * len(self.scene.boxes)
+        padded_m, padded = np.pad(exact.depth_m, 1, mode="edge"), np.pad(moving, 1, mode="edge")
+        height, width = depth_m.shape
+        nearest_m, found = np.full(depth_m.shape, np.inf, np.float32), np.zeros(depth_m.shape, np.bool_)
+        for row, column in product((1, 0, 2), repeat=2):
+            around = slice(row, row + height), slice(column, column + width)
+            miss_m = np.abs(padded_m[around] - depth_m)
+            better = miss_m < nearest_m
+            nearest_m[better], found[better] = miss_m[better], padded[around][better]
+        return found
 
     def observe(self, index: int, colour: bool = True) -> RgbdFrame:
         """Return a frame as the sensor reports it, in grey where ``colour`` is false."""

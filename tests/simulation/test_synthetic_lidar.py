@@ -250,3 +250,36 @@ def test_a_log_is_not_written_over_another_and_leaves_nothing_half_done(tmp_path
     with pytest.raises(KeyboardInterrupt):
         write_lidar_log(tmp_path / "other", exact(COURTYARD), on_progress=give_up)
     assert [path.name for path in tmp_path.iterdir()] == ["log"]
+
+
+BUSY = STREET.model_copy(update={"duration_s": 1.0, "cars": 8, "cyclists": 3, "pedestrians": 6})
+
+
+def test_traffic_is_labelled_and_changes_no_other_return():
+    quiet, busy = (LidarSimulator(config) for config in (STREET.model_copy(update={"duration_s": 1.0}), BUSY))
+
+    for index in (0, 9):
+        scan, moving = busy.observe_labelled(index)
+        still = quiet.observe(index)
+        unlabelled = {tuple(row) for row in scan.points_body[~moving].tolist()}
+        assert moving.shape == (len(scan.points_body),)
+        assert 0.001 < moving.mean() < 0.5
+        assert unlabelled <= {tuple(row) for row in still.points_body.tolist()}
+
+
+def test_traffic_moves_and_stands_on_the_ground():
+    traffic = LidarSimulator(BUSY).traffic
+    times_s = np.arange(0.0, 30.0, 0.1)
+
+    for mover in traffic.movers:
+        steps_m = np.abs(np.diff(mover.along_m(times_s)))
+        assert steps_m.sum() > 5.0
+        assert steps_m.max() < 1.0
+        low, _ = mover.solids.bounds_world()
+        assert -0.01 < low[:, 2].min() < 0.3
+
+
+@pytest.mark.parametrize("update", [{"scene": "tunnel", "pedestrians": 1}, {"scene": "courtyard", "cars": 1}])
+def test_scenes_without_room_refuse_traffic(update):
+    with pytest.raises(ValueError, match="has no room for what moves"):
+        LidarSynthConfig.model_validate(update)

@@ -70,7 +70,7 @@ def sort_into_cells(solids: Solids, ground: Ground) -> World:
 
 
 @njit(cache=True, nogil=True)
-def cast(world: World, origins: Array, directions: Array, max_range_m: float) -> Array:
+def cast(world: World, origins: Array, directions: Array, max_range_m: float, meets_ground: bool) -> Array:
     """Return (A, E) float64 ranges in metres along unit rays; inf where nothing is met in range.
 
     A ray that starts inside a solid does not see it.
@@ -80,6 +80,7 @@ def cast(world: World, origins: Array, directions: Array, max_range_m: float) ->
         origins: (A, 3) world frame, metres.
         directions: (A, E, 3) unit vectors, world frame.
         max_range_m: Length of the rays.
+        meets_ground: Whether rays end on the ground; otherwise they end on solids alone.
     """
     # Unpacked here, because compiled code counts references to every array of a tuple at every call.
     solids, starts, members, tops = world.solids, world.starts, world.members, world.tops
@@ -94,8 +95,10 @@ def cast(world: World, origins: Array, directions: Array, max_range_m: float) ->
             nearest = _solid_range_m(
                 solids, corner, starts, members, tops, origin, direction, max_range_m, tested, ray
             )
-            touched = ground_range_m(slope, waves, origin, direction, min(nearest, max_range_m))
-            ranges[a, e] = min(nearest, touched)
+            if meets_ground:
+                limit_m = min(nearest, max_range_m)
+                nearest = min(nearest, ground_range_m(slope, waves, origin, direction, limit_m))
+            ranges[a, e] = nearest
             ray += 1
     return ranges
 

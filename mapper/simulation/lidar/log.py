@@ -7,7 +7,7 @@ from pathlib import Path
 from mapper.core.timebase import seconds_text_from_ns
 from mapper.runtime.atomic import new_folder
 from mapper.runtime.ordered_map import ordered_map
-from mapper.simulation.config import LidarSynthConfig
+from mapper.simulation.config import LidarSynthConfig, set_or_first
 from mapper.simulation.lidar.source import LidarSimulator
 from mapper.sources.kitti_writing import save_scan
 from mapper.sources.trajectory_files import write_kitti
@@ -50,9 +50,8 @@ def write_lidar_log(
         write_kitti(folder / "poses.txt", simulator.truth)
         if log.wheels is not None:
             write_wheels(folder, log.wheels, sensor=log.sensor)
-        unset = {"wheels"} if config.wheels is None else set()  # so that older logs' files keep their bytes
         scene = {
-            "config": config.model_dump(mode="json", exclude=unset),
+            "config": set_or_first(config, exclude=set()),
             "ground": simulator.scene.ground.as_json(),
             "solids": simulator.scene.solids.as_json(),
         }

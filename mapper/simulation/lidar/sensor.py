@@ -13,6 +13,7 @@ from mapper.core.geometry import Array, Transform
 from mapper.simulation.config import LidarSensorConfig
 from mapper.simulation.lidar.cast import cast
 from mapper.simulation.lidar.scene import OutdoorScene
+from mapper.simulation.lidar.traffic import Traffic
 
 
 def firing_times_s(sensor: LidarSensorConfig) -> Array:
@@ -54,10 +55,8 @@ def render_sweep(
         raise DataError(
             f"sweep: poses {T_world_lidar.shape}, want one a column: ({sensor.azimuth_steps}, 4, 4)"
         )
-    points_lidar, returned = _measure(scene, sensor, T_world_lidar, rng)
-    columns = np.nonzero(returned)[0]
-    times_s = firing_times_s(sensor)[columns].astype(np.float32)
-    return Scan(stamp_ns, points_lidar, times_s=times_s)
+    points_lidar, columns, _ = measure(scene, sensor, T_world_lidar, rng)
+    return Scan(stamp_ns, points_lidar, times_s=column_times_s(sensor, columns))
 
 
 def render_scan(
@@ -70,20 +69,51 @@ def render_scan(
 ) -> Scan:
     """Return the scan of a sensor that stands still at a (4, 4) pose; its points have no times."""
     poses = np.broadcast_to(T_world_lidar, (sensor.azimuth_steps, 4, 4))
-    return Scan(stamp_ns, _measure(scene, sensor, poses, rng)[0])
+    return Scan(stamp_ns, measure(scene, sensor, poses, rng)[0])
 
 
-def _measure(
-    scene: OutdoorScene, sensor: LidarSensorConfig, T_world_lidar: Array, rng: np.random.Generator
-) -> tuple[Points32, NDArray[np.bool_]]:
-    """Return the points (N, 3) of all returns, and which of (A, E) rays returned."""
+def column_times_s(sensor: LidarSensorConfig, columns: NDArray[np.intp]) -> NDArray[np.float32]:
+    """Return (N,) seconds after the stamp of points of a sweep, given the column of each."""
+    return firing_times_s(sensor)[columns].astype(np.float32)
+
+
+def measure(
+    scene: OutdoorScene,
+    sensor: LidarSensorConfig,
+    T_world_lidar: Array,
+    rng: np.random.Generator,
+    *,
+    traffic: Traffic | None = None,
+    start_s: float = 0.0,
+) -> tuple[Points32, NDArray[np.intp], NDArray[np.bool_]]:
+    """Return the points of a sweep, the column of each, and whether each lies on what moves.
+
+    Args:
+        scene: The world, without what moves in it.
+        sensor: The LiDAR.
+        T_world_lidar: (A, 4, 4) its pose when each column is fired.
+        rng: This scan's own noise.
+        traffic: What moves; None is nothing.
+        start_s: When the sweep begins, seconds after the log does.
+
+    Returns:
+        (N, 3) float32 metres in the lidar frame, (N,) columns, (N,) bool.
+    """
     rays_lidar = ray_directions(sensor)
     rays_world = np.ascontiguousarray(rays_lidar @ T_world_lidar[:, :3, :3].transpose(0, 2, 1))
     origins_world = np.ascontiguousarray(T_world_lidar[:, :3, 3])
-    ranges_m = cast(scene.world, origins_world, rays_world, sensor.max_range_m)
+    ranges_m = cast(scene.world, origins_world, rays_world, sensor.max_range_m, True)
+    moving = np.zeros(ranges_m.shape, np.bool_)
+    if traffic is not None and len(traffic):
+        fired_s = firing_times_s(sensor) if sensor.motion_distortion else np.zeros(len(origins_world))
+        near_m = traffic.ranges_m(
+            origins_world, rays_world, sensor.max_range_m, start_s=start_s, fired_s=fired_s
+        )
+        moving = near_m < ranges_m
+        ranges_m = np.minimum(ranges_m, near_m)
     # Every ray has its own noise, so that what one ray meets does not change another's.
     noise_m = sensor.range_noise_m * rng.standard_normal(ranges_m.shape)
     kept = rng.random(ranges_m.shape) >= sensor.dropout_ratio
     returned = np.isfinite(ranges_m) & (ranges_m >= sensor.min_range_m) & kept
     points = rays_lidar[returned] * (ranges_m + noise_m)[returned, None]
-    return points.astype(np.float32), returned
+    return points.astype(np.float32), np.nonzero(returned)[0], moving[returned]
