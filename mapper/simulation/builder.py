@@ -14,8 +14,24 @@ FACES = 6
 """−x, +x, −y, +y, −z, +z in the box's own axes; face 2·axis + side."""
 
 _SHADE_BELOW, _SHADE_UPRIGHT, _SHADE_ABOVE = 0.78, 0.86, 1.0
-_SHADE_SWING, _LIGHT_YAW_RAD = 0.10, 0.9
-"""Light comes from above and a little from one side."""
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """Light from above and a little from one side.
+
+    Attributes:
+        yaw_rad: From which side.
+        swing: How much brighter that side of things is than the mean of both.
+        gain: Brightness of all.
+    """
+
+    yaw_rad: float = 0.9
+    swing: float = 0.10
+    gain: float = 1.0
+
+
+DAYLIGHT = Light()
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +138,7 @@ class Builder:
         table = np.array(self.rows, dtype=np.float64).reshape(-1, 7)
         return Boxes(tuple(self.names), table[:, :3].copy(), table[:, 3:6].copy(), table[:, 6].copy())
 
-    def faces(self) -> Faces:
+    def faces(self, light: Light = DAYLIGHT) -> Faces:
         """Return the texture maps, in the order of the solids."""
         n = len(self.names)
         textures = np.zeros((n, FACES), dtype=np.int64)
@@ -137,7 +153,7 @@ class Builder:
                 else:
                     scales[i, face] = skin.px_per_m
                     offsets[i, face] = skin.px_per_m * np.array(skin.offset_m)
-        return Faces(textures, scales, offsets, _shades(np.array(self.rows)[:, 6]))
+        return Faces(textures, scales, offsets, _shades(np.array(self.rows)[:, 6], light))
 
 
 def face_halves(halves: Array, face: int) -> tuple[float, float]:
@@ -146,9 +162,9 @@ def face_halves(halves: Array, face: int) -> tuple[float, float]:
     return (halves[1] if axis == 0 else halves[0]), (halves[1] if axis == 2 else halves[2])
 
 
-def _shades(yaws_rad: Array) -> Array:
+def _shades(yaws_rad: Array, light: Light) -> Array:
     shades = np.empty((len(yaws_rad), FACES))
     for face, normal_rad in enumerate((np.pi, 0.0, -np.pi / 2, np.pi / 2)):
-        shades[:, face] = _SHADE_UPRIGHT + _SHADE_SWING * np.cos(yaws_rad + normal_rad - _LIGHT_YAW_RAD)
+        shades[:, face] = _SHADE_UPRIGHT + light.swing * np.cos(yaws_rad + normal_rad - light.yaw_rad)
     shades[:, 4], shades[:, 5] = _SHADE_BELOW, _SHADE_ABOVE
-    return shades
+    return light.gain * shades

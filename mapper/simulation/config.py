@@ -83,6 +83,9 @@ class SynthConfig(Config):
     """One synthetic log: the same configuration gives the same bytes."""
 
     seed: NonNegativeInt = 0
+    day: NonNegativeInt = 0
+    """Another day in the same rooms: other light, chairs, tables and cartons stand elsewhere, and the walker
+    looks elsewhere on the way."""
 
     scene: Literal["flat", "hall", "twin-rooms"] = "flat"
     """"flat": a ring of rooms; "hall": one hall or corridor with closed doors; "twin-rooms": two rooms that
@@ -242,6 +245,9 @@ class LidarSynthConfig(Config):
     """One synthetic LiDAR log: the same configuration gives the same points."""
 
     seed: NonNegativeInt = 0
+    day: NonNegativeInt = 0
+    """Another day in the same place: most parked cars, bicycles and bins are gone or stand elsewhere, and the
+    sensor keeps to another line of its lane."""
 
     scene: Literal["street", "courtyard", "field", "tunnel", "staircase", "flat"] = "street"
     """"street": round a block between facades; "courtyard": a yard with few things in it; "field": open
@@ -299,12 +305,12 @@ class LidarSynthConfig(Config):
 _LATER = {
     SynthConfig: {
         *("moving_boxes", "wheels", "scene", "hall_length_m", "hall_width_m", "hall_clearance_m"),
-        *("people", "texture_contrast", "disturbances"),
+        *("people", "texture_contrast", "disturbances", "day"),
     },
     SensorConfig: {
         *("readout_s", "depth_delay_s", "radial_k1", "radial_k2", "depth_scale", "disparity_warp_px"),
     },
-    LidarSynthConfig: {"wheels", "cars", "cyclists", "pedestrians"},
+    LidarSynthConfig: {"wheels", "cars", "cyclists", "pedestrians", "day"},
     LidarSensorConfig: set(),
 }
 """Settings that came after the first logs."""

@@ -18,11 +18,19 @@ _BOARD_M = 0.03
 
 @dataclass(frozen=True, slots=True)
 class Studio:
-    """Materials, random numbers and the builder, which every piece needs."""
+    """Materials, random numbers and the builder, which every piece needs.
+
+    Attributes:
+        builder: Takes the boxes.
+        shop: Materials.
+        rng: Decides what a piece looks like, and where it stands.
+        another_day: Decides where loose pieces stand instead; None leaves them where they are.
+    """
 
     builder: Builder
     shop: Workshop
     rng: np.random.Generator
+    another_day: np.random.Generator | None = None
 
 
 Size = tuple[float, float, float]

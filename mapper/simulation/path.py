@@ -50,7 +50,7 @@ class Motion:
 
 def make_motion(config: SynthConfig, scene: Scene) -> Motion:
     """Return the motion of a configuration; it keeps at least 0.3 m from every solid of its scene."""
-    rng = rng_of(config.seed, Stream.PATH)
+    rng = rng_of(config.seed, Stream.PATH, config.day)
     if config.path == "loop":
         duration_s, steady = _loop(config, scene.plan, rng)
     elif config.path == "desk":

@@ -1,5 +1,6 @@
 """The scene of a camera: walls, floors, ceilings, doors, furniture and pictures."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import assert_never
 
@@ -10,7 +11,7 @@ from mapper.core.geometry import Array
 from mapper.simulation import surfaces
 from mapper.simulation.atlas import Atlas, build_atlas
 from mapper.simulation.boxes import Boxes
-from mapper.simulation.builder import ORIGIN, Builder, Faces, Place, Skin
+from mapper.simulation.builder import DAYLIGHT, ORIGIN, Builder, Faces, Light, Place, Skin
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.furniture import PIECES, Studio, desk
 from mapper.simulation.plan import (
@@ -74,7 +75,8 @@ def make_scene(config: SynthConfig) -> Scene:
     plan = make_plan(config, rng_of(config.seed, Stream.PLAN))
     builder = Builder()
     rng = rng_of(config.seed, Stream.FURNITURE)
-    studio = Studio(builder, Workshop(builder, rng, px_per_m=config.texture_px_per_m), rng)
+    another_day = rng_of(config.seed, Stream.DAY, config.day) if config.day > 0 else None
+    studio = Studio(builder, Workshop(builder, rng, px_per_m=config.texture_px_per_m), rng, another_day)
     match config.scene:
         case "flat":
             _flat(config, studio, plan)
@@ -84,12 +86,21 @@ def make_scene(config: SynthConfig) -> Scene:
             _twin_rooms(config, studio, plan)
         case _:
             assert_never(config.scene)
-    faces, textures = builder.faces(), builder.textures
+    faces, textures = builder.faces(_light(config)), builder.textures
     if config.texture_contrast < 1.0:
         textures = [_whitened(texture, config.texture_contrast) for texture in textures]
         shades = 1.0 - config.texture_contrast * (1.0 - faces.shades)
         faces = replace(faces, shades=shades)
     return Scene(builder.boxes(), faces, build_atlas(textures), plan)
+
+
+def _light(config: SynthConfig) -> Light:
+    """Return the light of a day."""
+    if config.day == 0:
+        return DAYLIGHT
+    rng = rng_of(config.seed, Stream.DAY, config.day)
+    yaw_rad, swing, gain = rng.uniform((-np.pi, 0.05, 0.6), (np.pi, 0.14, 1.0)).tolist()
+    return Light(yaw_rad, swing, gain)
 
 
 def _whitened(texture: Image, contrast: float) -> Image:
@@ -266,8 +277,31 @@ def _furnish(
             if in_the_way or any(map(footprint.overlaps, footprints)):
                 continue
             footprints.append(footprint)
+            if studio.another_day is not None and not piece.at_wall:
+                place = _moved(
+                    studio.another_day, room, size, place, keep_free=keep_free, footprints=footprints
+                )
             piece.build(studio, place, size)
             break
+
+
+def _moved(
+    rng: np.random.Generator,
+    room: Room,
+    size: tuple[float, float, float],
+    place: Place,
+    *,
+    keep_free: Array,
+    footprints: Sequence[_Footprint],
+) -> Place:
+    """Return where a piece stands on another day: at a free spot of the room, or where it was."""
+    for _ in range(_TRIES):
+        other = _anywhere(rng, room, size)
+        footprint = _footprint(other, size)
+        free = not any(map(footprint.overlaps, footprints))
+        if free and footprint.distance_m(keep_free) >= _ROUTE_CLEARANCE_M:
+            return other
+    return place
 
 
 def _at_a_wall(rng: np.random.Generator, room: Room, size: tuple[float, float, float]) -> Place:

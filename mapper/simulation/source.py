@@ -22,7 +22,7 @@ from mapper.simulation.raycast import Rendering
 from mapper.simulation.scene import Scene, make_scene
 from mapper.simulation.sensor import observe, warp_of
 from mapper.simulation.shutter import Shutter
-from mapper.simulation.streams import Stream, rng_of
+from mapper.simulation.streams import Stream, noise_index, rng_of
 from mapper.simulation.wheel_readings import counted
 from mapper.sources.base import ImageFiles, Log
 
@@ -180,7 +180,7 @@ class CameraSimulator:
                 self.render(shown),
                 focal_px=self.camera.fx_px,
                 sensor=self.config.sensor,
-                rng=rng_of(self.config.seed, Stream.SENSOR, shown),
+                rng=rng_of(self.config.seed, Stream.SENSOR, noise_index(self.config.day, shown)),
                 warp_px=self._warp_px,
             )
         frame = RgbdFrame(int(self.truth.stamps_ns[index]), image, depth_m, self.camera)

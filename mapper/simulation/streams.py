@@ -21,8 +21,14 @@ class Stream(IntEnum):
     HAND = 10
     GAINS = 11
     WARP = 12
+    DAY = 13
 
 
 def rng_of(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
     """Return the generator of a stream's index-th part, e.g. of one frame's noise."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(stream), index)))
+
+
+def noise_index(day: int, frame: int) -> int:
+    """Return which part of the sensor's stream a frame has: another day's noise is another."""
+    return (day << 32) + frame

@@ -21,6 +21,8 @@ _SAMPLES_PER_STEP = 40
 _LARGEST_CORNER_M = 8.0
 _CORNER_SHARE = 0.35
 _SWAY_M = 0.4
+_ASIDE_M = 0.5
+"""Largest distance of another day's line from the first day's."""
 _TUNNEL_TURN_M = 1.0
 _TUNNEL_START_SHARE = 0.77
 """Of the way from the middle of the lower side: just after the turn at the left end."""
@@ -96,7 +98,7 @@ def make_route(config: LidarSynthConfig) -> Route:
 
 def flat_of(config: LidarSynthConfig) -> SynthConfig:
     """Return the flat in which a LiDAR moves."""
-    return SynthConfig(seed=config.seed, texture_px_per_m=16)
+    return SynthConfig(seed=config.seed, day=config.day, texture_px_per_m=16)
 
 
 def _round_a_block(config: LidarSynthConfig) -> Route:
@@ -154,19 +156,23 @@ class Drive:
         route: Along which way.
         ground: Over which ground.
         phases_rad: (3,) of its swings.
+        aside_m: How far to the left of the way it keeps.
     """
 
     config: LidarSynthConfig
     route: Route
     ground: Ground
     phases_rad: Array
+    aside_m: float = 0.0
 
     def poses(self, times_s: Array) -> Array:
         """Return (N, 4, 4) T_world_lidar (x forward, y left, z up) at (N,) seconds after the start."""
         config = self.config
         along_m = config.speed_mps * self._eased_s(times_s)
+        heading = self.route.headings_rad(along_m)
         points = self.route.points(along_m)
-        yaw = self.route.headings_rad(along_m) + config.yaw_swing_rad * self._sine(times_s, 0.17, 0)
+        points = points + self.aside_m * np.column_stack([-np.sin(heading), np.cos(heading)])
+        yaw = heading + config.yaw_swing_rad * self._sine(times_s, 0.17, 0)
         up = self.ground.normals(points)
         forward = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))])
         left = np.cross(up, forward)
@@ -196,7 +202,10 @@ class Drive:
 
 def make_drive(config: LidarSynthConfig, route: Route, ground: Ground) -> Drive:
     """Return the motion of a configuration."""
-    return Drive(config, route, ground, rng_of(config.seed, Stream.PATH).uniform(0.0, 2.0 * np.pi, 3))
+    rng = rng_of(config.seed, Stream.PATH, config.day)
+    phases_rad = rng.uniform(0.0, 2.0 * np.pi, 3)
+    aside_m = float(rng.uniform(-_ASIDE_M, _ASIDE_M)) if config.day > 0 and config.scene == "street" else 0.0
+    return Drive(config, route, ground, phases_rad, aside_m)
 
 
 def scan_stamps(config: LidarSynthConfig, route: Route) -> Stamps:

@@ -29,6 +29,8 @@ _YARD_MARGIN_M = 5.0
 _FIELD_MARGIN_M = 25.0
 _TUNNEL_END_M, _TUNNEL_SIDE_M, _TUNNEL_HEIGHT_M = 3.0, 2.5, 4.5
 _TRIES = 40
+_STAYING_SHARE = 0.4
+"""Of the movable things, those that are there on another day too, if at another spot."""
 
 Count = tuple[Callable[[Site, Place, np.random.Generator], None], int, int]
 """A thing, and how many of it there are at least and at most."""
@@ -71,7 +73,7 @@ def make_outdoor_scene(config: LidarSynthConfig) -> OutdoorScene:
     rng = rng_of(config.seed, Stream.FURNITURE)
     match config.scene:
         case "street":
-            _street(site, route, rng)
+            _street(site, route, rng, rng_of(config.seed, Stream.DAY, config.day) if config.day else None)
         case "courtyard":
             _courtyard(site, route, rng)
         case "field":
@@ -88,7 +90,9 @@ def make_outdoor_scene(config: LidarSynthConfig) -> OutdoorScene:
     return OutdoorScene(site.solids(), ground, route)
 
 
-def _street(site: Site, route: Route, rng: np.random.Generator) -> None:
+def _street(
+    site: Site, route: Route, rng: np.random.Generator, another_day: np.random.Generator | None
+) -> None:
     """Houses on both sides of a rectangle of streets, and what stands before them."""
     width, depth = route.size_m
     for side in _sides(width + 2 * _FACADE_M, depth + 2 * _FACADE_M):
@@ -100,7 +104,7 @@ def _street(site: Site, route: Route, rng: np.random.Generator) -> None:
     free = _free_points(route)
     for side in _sides(width, depth):
         for line in (side.start, side.outwards()):
-            _kerb(site, line, side.length_m, free=free, rng=rng.spawn(1)[0])
+            _kerb(site, line, side.length_m, free=free, rng=rng.spawn(1)[0], another_day=another_day)
 
 
 def _block(site: Site, size_m: tuple[float, float], rng: np.random.Generator) -> None:
@@ -152,7 +156,15 @@ def _tunnel(site: Site, route: Route) -> None:
     site.add("roof", ORIGIN, center=(0.0, 0.0, high + thick / 2), size=(length, width, thick))
 
 
-def _kerb(site: Site, line: Place, length_m: float, *, free: Array, rng: np.random.Generator) -> None:
+def _kerb(
+    site: Site,
+    line: Place,
+    length_m: float,
+    *,
+    free: Array,
+    rng: np.random.Generator,
+    another_day: np.random.Generator | None,
+) -> None:
     """Set things along one side of a street, whose middle is x of ``line`` and whose houses lie at +y."""
     shares = np.array([kind.share for kind in things.KINDS])
     at_m = float(rng.uniform(0.0, 4.0))
@@ -161,7 +173,12 @@ def _kerb(site: Site, line: Place, length_m: float, *, free: Array, rng: np.rand
         offset_m, turn_rad = float(rng.uniform(*kind.offset_m)), float(rng.normal(0.0, 0.02))
         spots = [line.world(at_m + share * kind.along_m, offset_m) for share in (0.0, 0.5, 1.0)]
         if min(_distance_m(np.array(spot), free) for spot in spots) > _CLEARANCE_M + kind.across_m:
-            kind.build(site, Place(*spots[1], line.yaw_rad + turn_rad), rng)
+            into, spot = site, spots[1]
+            if another_day is not None and kind.is_movable:
+                stays, shift_m = another_day.random() < _STAYING_SHARE, float(another_day.uniform(-2.0, 2.0))
+                into = site if stays else Site(site.ground)  # built there, it draws the same and is gone
+                spot = line.world(at_m + 0.5 * kind.along_m + shift_m, offset_m)
+            kind.build(into, Place(*spot, line.yaw_rad + turn_rad), rng)
         at_m += kind.along_m + float(rng.exponential(2.5))
 
 

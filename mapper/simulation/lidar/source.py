@@ -12,7 +12,7 @@ from mapper.simulation.lidar.sensor import column_times_s, firing_times_s, measu
 from mapper.simulation.lidar.traffic import Traffic, make_traffic
 from mapper.simulation.path import seconds_of
 from mapper.simulation.source import synthetic_log
-from mapper.simulation.streams import Stream, rng_of
+from mapper.simulation.streams import Stream, noise_index, rng_of
 from mapper.sources.base import Log
 
 
@@ -62,7 +62,7 @@ class LidarSimulator:
             self.scene,
             sensor,
             poses,
-            rng_of(self.config.seed, Stream.SENSOR, index),
+            rng_of(self.config.seed, Stream.SENSOR, noise_index(self.config.day, index)),
             traffic=self.traffic,
             start_s=float(start_s[0]),
         )

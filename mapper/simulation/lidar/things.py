@@ -101,6 +101,7 @@ class Kind:
         along_m: Space it needs along the kerb.
         across_m: Half its width.
         share: How often it comes, relative to others.
+        is_movable: On another day it may be gone or elsewhere.
     """
 
     build: Callable[[Site, Place, np.random.Generator], None]
@@ -108,15 +109,16 @@ class Kind:
     along_m: float
     across_m: float
     share: float
+    is_movable: bool = False
 
 
 KINDS: tuple[Kind, ...] = (
-    Kind(car, (3.5, 3.8), 5.8, 0.95, 5.0),
+    Kind(car, (3.5, 3.8), 5.8, 0.95, 5.0, is_movable=True),
     Kind(tree, (5.2, 5.8), 3.0, 0.4, 2.5),
     Kind(pole, (5.0, 5.4), 1.0, 0.3, 1.5),
     Kind(sign, (5.0, 5.6), 1.0, 0.5, 1.2),
     Kind(bench, (6.2, 6.8), 2.6, 0.4, 0.8),
-    Kind(bicycle, (6.0, 6.9), 1.8, 0.4, 1.0),
-    Kind(bin_, (5.2, 6.8), 0.8, 0.3, 0.8),
+    Kind(bicycle, (6.0, 6.9), 1.8, 0.4, 1.0, is_movable=True),
+    Kind(bin_, (5.2, 6.8), 0.8, 0.3, 0.8, is_movable=True),
     Kind(bush, (6.0, 6.6), 2.2, 0.6, 0.8),
 )
