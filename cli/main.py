@@ -21,6 +21,7 @@ from cli.evaluate import evaluate
 from cli.export import export
 from cli.fuse import fuse
 from cli.inspect import inspect
+from cli.localise import localise
 from cli.loops import WithPairs, loops
 from cli.merge import merge
 from cli.plan import WithPoints, plan
@@ -99,6 +100,7 @@ app.command("fuse")(fuse)
 app.command("loops", cls=WithPairs)(loops)
 app.command("eval")(evaluate)
 app.command("export")(export)
+app.command("localise")(localise)
 app.command("merge")(merge)
 app.command("diff")(diff)
 app.command("plan", cls=WithPoints)(plan)

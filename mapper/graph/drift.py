@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,13 +29,13 @@ def innovations(known: Sequence[BetweenFactor], loops: Sequence[BetweenFactor]) 
         loops: Factors that may be outliers.
 
     Returns:
-        (len(loops),) χ² of six degrees of freedom; 0 of a loop that connects two parts, or leads to a node
-        without known factors.
+        (len(loops),) χ² of six degrees of freedom; 0 of a loop that connects two parts.
     """
-    tree = _spanning_tree(known)
+    nodes = [node for loop in loops for node in (loop.i, loop.j)]
+    tree = _spanning_tree(known, nodes)
     while between := tree.between_first_parts(loops):
         tried = between[:: -(-len(between) // _MOST_TRIED)]
-        trees = [_spanning_tree([*known, connection]) for connection in tried]
+        trees = [_spanning_tree([*known, connection], nodes) for connection in tried]
         best = min(range(len(tried)), key=lambda k: float(np.median([*map(trees[k].innovation, between)])))
         known, tree = [*known, tried[best]], trees[best]
     return np.array([tree.innovation(loop) for loop in loops])
@@ -93,11 +93,16 @@ class _Tree:
         return a
 
 
-def _spanning_tree(factors: Sequence[BetweenFactor]) -> _Tree:
-    """Return the tree of the surest factors, grown from the first node of each component."""
-    places: dict[int, _Place] = {}
+def _spanning_tree(factors: Sequence[BetweenFactor], others: Iterable[int]) -> _Tree:
+    """Return the tree of the surest factors, grown from the first node of each component.
+
+    Other nodes, without factors, are trees of their own.
+    """
+    places = {node: _root(node) for node in others}
     if not factors:
         return _Tree(places)
+    for node in {node for factor in factors for node in (factor.i, factor.j)}:
+        places.pop(node, None)
     spreads = np.linalg.inv(np.array([factor.information for factor in factors]))
     nodes = list(dict.fromkeys(node for factor in factors for node in (factor.i, factor.j)))
     index_of = {node: index for index, node in enumerate(nodes)}
@@ -110,7 +115,7 @@ def _spanning_tree(factors: Sequence[BetweenFactor]) -> _Tree:
     for root, node in enumerate(nodes):
         if node in places:
             continue
-        places[node] = _Place(node, node, 0, np.eye(4), np.zeros((6, 6)))
+        places[node] = _root(node)
         reached, before = breadth_first_order(tree, root, directed=False)
         for index in reached[1:].tolist():
             parent = int(before[index])
@@ -119,6 +124,10 @@ def _spanning_tree(factors: Sequence[BetweenFactor]) -> _Tree:
                 places[nodes[parent]], nodes[parent], nodes[index], factors[k], spreads[k]
             )
     return _Tree(places)
+
+
+def _root(node: int) -> _Place:
+    return _Place(node, node, 0, np.eye(4), np.zeros((6, 6)))
 
 
 def _grown(before: _Place, parent: int, node: int, factor: BetweenFactor, spread: Array) -> _Place:

@@ -20,12 +20,14 @@ from mapper.loops.consistency_check import ConsistencyCheck
 from mapper.loops.drift_gate import MIN_CONFLICTS, DriftGate
 from mapper.loops.odometry_chain import OdometryChain
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
+from mapper.loops.place_file import AnyPlace
 from mapper.loops.proposers import PoseProposer
 from mapper.odometry.base import FrameResult
 
 ViewOf = Callable[[], FrameView]
 
-_ALONE = "alone: no loop found from nearby tells the same"
+ALONE = "alone: no loop found from nearby tells the same"
+"""Reason of a measured loop that waits for another to confirm it."""
 
 
 class LoopDetector(Protocol):
@@ -45,6 +47,10 @@ class LoopDetector(Protocol):
 
     def notes(self) -> Sequence[str]:
         """Return what is suspicious about the loops so far, a sentence each."""
+        ...
+
+    def places(self) -> Mapping[int, AnyPlace]:
+        """Return the places that were kept, by node."""
         ...
 
 
@@ -69,6 +75,10 @@ class NoLoopDetector:
     def notes(self) -> Sequence[str]:
         """Return nothing."""
         return ()
+
+    def places(self) -> Mapping[int, AnyPlace]:
+        """Return nothing."""
+        return {}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,6 +194,10 @@ class KeyframeLoopDetector(Generic[Place]):
         """Return a sentence about loops that agree with each other, but not with odometry or wheels."""
         return self._gate.notes()
 
+    def places(self) -> Mapping[int, Place]:
+        """Return the places that were kept, those of an earlier session too, by node."""
+        return self._places
+
     def _search_from(self, track: FrameResult) -> _Search | None:
         """Return the search to make from here; None where too little has changed since the last."""
         if not track.is_sharp:
@@ -218,7 +232,7 @@ class KeyframeLoopDetector(Generic[Place]):
 
     def _hold_back(self, closure: LoopClosure) -> None:
         """Keep a measured loop as a hypothesis, and accept all that are confirmed now."""
-        self._closures[closure.i, closure.j] = replace(closure, verdict="rejected", reason=_ALONE)
+        self._closures[closure.i, closure.j] = replace(closure, verdict="rejected", reason=ALONE)
         for confirmed in self._consistency.add(closure):
             self._closures[confirmed.i, confirmed.j] = confirmed
             self._estimator.close(confirmed)

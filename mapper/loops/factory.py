@@ -1,8 +1,10 @@
 """Factory of the loop detectors and of their verifiers."""
 
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, assert_never
 
+from mapper.core.frames import Sensor
 from mapper.loops.base import Verifier
 from mapper.loops.config import (
     AnyLoops,
@@ -16,6 +18,12 @@ from mapper.loops.config import (
 from mapper.loops.detector import KeyframeLoopDetector, LoopDetector, NoLoopDetector
 from mapper.loops.odometry_chain import OdometryChain
 from mapper.loops.online_pose_estimator import Correction, build_pose_estimator
+
+LOOPS_OF: Mapping[Sensor, PlaceLoopsConfig | ScanLoopsConfig] = {
+    "rgbd": PlaceLoopsConfig(),
+    "lidar": ScanLoopsConfig(),
+}
+"""How keyframes are compared where a run was built without loops."""
 
 
 def build_loop_detector(config: AnyLoops, correction: Correction) -> LoopDetector:

@@ -1,14 +1,21 @@
 """Proposer of places that are near by the current estimate of the poses, and two proposers combined."""
 
 from collections.abc import Callable
-from typing import Generic
+from typing import Generic, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform
 from mapper.loops.base import Place, Proposal, Proposer
-from mapper.loops.online_pose_estimator import OnlinePoseEstimator
+
+
+class NodePoses(Protocol):
+    """Source of the current estimates of nodes' poses."""
+
+    def pose_of(self, node: int) -> Transform:
+        """Return the (4, 4) current estimate of a node's pose."""
+        ...
 
 
 class PoseProposer(Generic[Place]):
@@ -16,7 +23,7 @@ class PoseProposer(Generic[Place]):
 
     def __init__(
         self,
-        estimator: OnlinePoseEstimator,
+        estimator: NodePoses,
         pose_of_sensor: Callable[[Place], Transform],
         *,
         max_distance_m: float,

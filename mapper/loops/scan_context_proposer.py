@@ -1,9 +1,11 @@
 """Proposer of similar scans among those that may be near, by Scan Context (Kim & Kim 2018)."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.frames import Points32
 from mapper.core.geometry import Transform, apply
@@ -11,7 +13,7 @@ from mapper.loops.base import Proposal, Proposer
 from mapper.loops.config import ScanLoopsConfig
 from mapper.loops.odometry_chain import OdometryChain
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
-from mapper.loops.proposers import CombinedProposer, PoseProposer
+from mapper.loops.proposers import CombinedProposer, NodePoses, PoseProposer
 from mapper.places.config import ScanContextConfig
 from mapper.places.scan_context import ScanContext, ScanContexts, scan_context
 
@@ -34,34 +36,29 @@ class ScanPlace:
     T_level_body: Transform
 
 
+Among = Callable[[int, ScanPlace, Sequence[int]], NDArray[np.bool_]]
+"""Returns which of some nodes' places the scan of a node may be of, (N,)."""
+
+
 class ScanContextProposer:
-    """Scan context proposer: similar scans, in any heading, among those that may be near.
+    """Scan context proposer: similar scans, in any heading, among those that may be one."""
 
-    Where a path leads to a place, the odometry's drift on it bounds its distance; streets far apart are
-    similar more often than they are one. Disconnected places may be anywhere.
-    """
-
-    def __init__(
-        self, config: ScanContextConfig, by_pose: PoseProposer[ScanPlace], chain: OdometryChain
-    ) -> None:
+    def __init__(self, config: ScanContextConfig, among: Among) -> None:
         """Start without places.
 
         Args:
             config: Scan contexts, and their least similarity.
-            by_pose: Gives the distance at which places count as near; the same places have to be added to it.
-            chain: Factors between the nodes.
+            among: Excludes places.
         """
         self._config = config
-        self._by_pose = by_pose
-        self._chain = chain
+        self._among = among
         self._index = ScanContexts(config)
         self._nodes: list[int] = []
         self._context = lru_cache(1)(self._context_of)  # a place is queried and then added
 
     def propose(self, node: int, seen: ScanPlace, /, *, before: int, limit: int) -> list[Proposal]:
         """Return the most similar places, the most similar first."""
-        disconnected = ~self._chain.connected(node, self._nodes[:before])
-        among = disconnected | self._by_pose.within_reach(node, seen, before=before)
+        among = self._among(node, seen, self._nodes[:before])
         if not among.any():
             return []
         found = self._index.query(self._context(seen), among, limit=min(limit, MAX_SIMILAR))
@@ -80,12 +77,25 @@ class ScanContextProposer:
 def scan_proposer(
     config: ScanLoopsConfig, estimator: OnlinePoseEstimator, chain: OdometryChain
 ) -> Proposer[ScanPlace]:
-    """Return the proposer of scans: by similarity and by pose."""
-    by_pose: PoseProposer[ScanPlace] = PoseProposer(
-        estimator,
+    """Return the proposer of scans: by similarity and by pose.
+
+    Where a path leads to a place, the odometry's drift on it bounds its distance; streets far apart are
+    similar more often than they are one. Disconnected places may be anywhere.
+    """
+    by_pose = nearby_scans(config, estimator)
+
+    def among(node: int, seen: ScanPlace, nodes: Sequence[int]) -> NDArray[np.bool_]:
+        return ~chain.connected(node, nodes) | by_pose.within_reach(node, seen, before=len(nodes))
+
+    return CombinedProposer(ScanContextProposer(config.context, among), by_pose)
+
+
+def nearby_scans(config: ScanLoopsConfig, poses: NodePoses) -> PoseProposer[ScanPlace]:
+    """Return the proposer of scans by pose."""
+    return PoseProposer(
+        poses,
         lambda _: np.eye(4),  # a scanner sees all around: its upright axis stands for a viewing direction
         max_distance_m=config.max_distance_m,
         max_angle_rad=config.max_tilt_rad,
         drift_ratio=config.gate.drift_ratio,
     )
-    return CombinedProposer(ScanContextProposer(config.context, by_pose, chain), by_pose)

@@ -2,7 +2,7 @@
 
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from statistics import median
 
 from mapper.core.geometry import Transform
@@ -65,6 +65,10 @@ class ThesisLoopDetector:
     def notes(self) -> Sequence[str]:
         """Return nothing: no loop is held against the odometry."""
         return ()
+
+    def places(self) -> Mapping[int, ImageView]:
+        """Return the keyframes so far."""
+        return self._views
 
     def _search(self, node: int, seen: ImageView) -> None:
         min_gap_ns = round(self._config.min_gap_s * NS_PER_S)

@@ -6,7 +6,7 @@ from mapper.features.frame_view import ImageView
 from mapper.loops.base import Proposal, Proposer
 from mapper.loops.config import PlaceLoopsConfig
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
-from mapper.loops.proposers import CombinedProposer, PoseProposer
+from mapper.loops.proposers import CombinedProposer, NodePoses, PoseProposer
 from mapper.places.config import PlacesConfig
 from mapper.places.index import PlaceIndex
 from mapper.places.vocabulary import WordVector, load_vocabulary
@@ -49,14 +49,19 @@ def image_proposer(
     config: PlaceLoopsConfig, estimator: OnlinePoseEstimator, first: ImageView
 ) -> Proposer[ImageView]:
     """Return the proposer that fits a log's first keyframe: only ORB's descriptors have words."""
-    by_pose: PoseProposer[ImageView] = PoseProposer(
-        estimator,
+    by_pose = nearby_images(config, estimator)
+    if config.propose == "nearby" or (config.propose == "auto" and not first.is_orb):
+        return by_pose
+    by_words = VisualWordProposer(config.places)
+    return by_words if config.propose == "places" else CombinedProposer(by_words, by_pose)
+
+
+def nearby_images(config: PlaceLoopsConfig, poses: NodePoses) -> PoseProposer[ImageView]:
+    """Return the proposer of images by pose."""
+    return PoseProposer(
+        poses,
         lambda view: view.T_body_camera,
         max_distance_m=config.max_distance_m,
         max_angle_rad=config.max_angle_rad,
         drift_ratio=config.gate.drift_ratio,
     )
-    if config.propose == "nearby" or (config.propose == "auto" and not first.is_orb):
-        return by_pose
-    by_words = VisualWordProposer(config.places)
-    return by_words if config.propose == "places" else CombinedProposer(by_words, by_pose)

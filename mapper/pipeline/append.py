@@ -23,6 +23,7 @@ from mapper.pipeline.track import (
     depth_cautions,
     from_tracking,
     refuse_a_fragment,
+    save_places,
     track_log,
     wheels_beside,
 )
@@ -89,6 +90,7 @@ def append(
             solved = solve(tracking.graph, tracking.loops, config.graph)
         _refuse_unconnected(second, run, solved.loops, known)
         later = from_tracking(replace(tracking, graph=solved.graph, loops=solved.loops), None)
+        save_places(writer, tracking)
         save_solved(writer, before.solved(solved.graph, solved.loops).then(later, truth=source.truth))
         writer.update(solve=solved.report)
         fuse_into(writer, source, joined, progress, before=run.scan_updates())

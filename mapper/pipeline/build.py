@@ -13,7 +13,13 @@ from mapper.mapping.levelling import AXES, Level, find_level
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.fuse import fuse_into
 from mapper.pipeline.solve import solve
-from mapper.pipeline.track import depth_cautions, from_tracking, refuse_a_fragment, track_log
+from mapper.pipeline.track import (
+    depth_cautions,
+    from_tracking,
+    refuse_a_fragment,
+    save_places,
+    track_log,
+)
 from mapper.run.folder import (
     Run,
     first_manifest,
@@ -77,6 +83,7 @@ def build(
             writer.warn([RunWarning(kind="depth", sentence=implausible, weight="doubt")])
         with writer.clock.stage("solve"):
             save_solved(writer, from_tracking(tracking, source.truth))
+            save_places(writer, tracking)
         writer.update(
             solve=solved.report,
             levelling=Levelling(method=level.method, detail=level.detail, has_floor=level.has_floor),

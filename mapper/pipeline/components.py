@@ -42,7 +42,10 @@ def component_of(tracking: TrackingResult, node: int, *, progress: Progress) -> 
     graph = tracking.graph
     return replace(
         tracking,
-        tracks=tuple(_lost_unless(track, kept) for track in tracking.tracks),
+        tracks=tuple(
+            track if track.node is None or track.node in kept else disconnected(track)
+            for track in tracking.tracks
+        ),
         graph=PoseGraph(
             {node: T for node, T in graph.T_world_node.items() if node in kept},
             {node: stamp_ns for node, stamp_ns in graph.stamps_ns.items() if node in kept},
@@ -52,9 +55,8 @@ def component_of(tracking: TrackingResult, node: int, *, progress: Progress) -> 
     )
 
 
-def _lost_unless(track: FrameResult, kept: Set[int]) -> FrameResult:
-    if track.node is None or track.node in kept:
-        return track
+def disconnected(track: FrameResult) -> FrameResult:
+    """Return the result of a frame without the pose, which nothing connects to the rest."""
     nothing = Diagnostics(
         track.diagnostics.features, 0, 0, 0.0, track.diagnostics.residual_unit, DISCONNECTED
     )

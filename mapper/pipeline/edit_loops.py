@@ -1,6 +1,6 @@
 """Loops that a user adds to a finished run or takes from it: solved and fused again, but not tracked."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,8 +12,8 @@ from mapper.graph.model import PoseGraph
 from mapper.graph.odometry_poses import by_odometry
 from mapper.loops.base import Proposal, Verifier, verify_proposal
 from mapper.loops.closure import LoopClosure
-from mapper.loops.config import NoLoopsConfig, PlaceLoopsConfig, ScanLoopsConfig
-from mapper.loops.factory import build_verifier
+from mapper.loops.config import NoLoopsConfig
+from mapper.loops.factory import LOOPS_OF, build_verifier
 from mapper.pipeline.fuse import fuse_changed
 from mapper.pipeline.reobserve import reobserve
 from mapper.pipeline.solve import solve
@@ -26,11 +26,6 @@ Pair = tuple[int, int]
 """Two nodes."""
 
 _REMOVED = "hand: removed"
-_LOOPS: Mapping[Sensor, PlaceLoopsConfig | ScanLoopsConfig] = {
-    "rgbd": PlaceLoopsConfig(),
-    "lidar": ScanLoopsConfig(),
-}
-"""How frames are compared in a run that was built without loops."""
 
 
 def edit_loops(
@@ -123,7 +118,7 @@ def _measured(
 
 
 def _verifier(config: BuildConfig, sensor: Sensor) -> Verifier[Any]:
-    loops = _LOOPS[sensor] if isinstance(config.loops, NoLoopsConfig) else config.loops
+    loops = LOOPS_OF[sensor] if isinstance(config.loops, NoLoopsConfig) else config.loops
     return build_verifier(loops.verification)
 
 

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -15,10 +15,13 @@ from mapper.graph.wheel_factors import WheelMeasurements, wheel_conflict
 from mapper.loops.closure import LoopClosure
 from mapper.loops.detector import LoopDetector
 from mapper.loops.factory import build_loop_detector
+from mapper.loops.place_file import AnyPlace, write_places
 from mapper.odometry.base import FrameResult, Odometry
 from mapper.odometry.factory import build_odometry
 from mapper.odometry.given_poses import poses_for
+from mapper.run import files
 from mapper.run.doubtful_frames import placed_by_neighbours
+from mapper.run.folder import RunWriter
 from mapper.run.frame_outcomes import records_of
 from mapper.run.manifest import RunWarning
 from mapper.run.observers import NULL_OBSERVER, Observer, Step
@@ -51,6 +54,7 @@ class TrackingResult:
         loops: Every loop candidate with its verdict.
         frame_ms: Wall milliseconds that each frame took to read, detect and track, by stamp.
         warnings: What is suspicious about the frames that were read.
+        places: What the nodes are recognised by, of those that were searched for loops.
     """
 
     tracks: tuple[FrameResult, ...]
@@ -59,6 +63,7 @@ class TrackingResult:
     loops: tuple[LoopClosure, ...]
     frame_ms: Mapping[int, float]
     warnings: Sequence[RunWarning] = ()
+    places: Mapping[int, AnyPlace] = field(default_factory=dict)
 
     @property
     def placed(self) -> list[FrameResult]:
@@ -191,7 +196,7 @@ def track_log(
     graph.add_factors(wheel_factors)
     loops = (*start.loops, *detector.closures())
     graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")
-    return TrackingResult(tuple(tracks), tuple(skipped), graph, loops, frame_ms, warnings)
+    return TrackingResult(tuple(tracks), tuple(skipped), graph, loops, frame_ms, warnings, detector.places())
 
 
 def wheels_beside(source: Log, config: BuildConfig) -> WheelMeasurements:
@@ -223,6 +228,13 @@ def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: 
         f"{found}, want at least {enough:.0f}; {hint} "
         "(min_tracked_frames and min_tracked_ratio set the limit)"
     )
+
+
+def save_places(writer: RunWriter, tracking: TrackingResult) -> None:
+    """Write the places of the nodes that are in the graph; none, if no loops were searched."""
+    places = {node: place for node, place in tracking.places.items() if node in tracking.graph.T_world_node}
+    if places:
+        write_places(writer.folder / files.PLACES, places)
 
 
 def depth_cautions(source: Log) -> list[RunWarning]:

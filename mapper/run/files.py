@@ -13,6 +13,7 @@ TRUTH = "truth.tum"
 KITTI = "trajectory.kitti"
 GRAPH = "graph.g2o"
 LOOPS = "loops.jsonl"
+PLACES = "places.bin"
 FRAMES = "frames.csv"
 FRAME_MS = "frame_ms.csv"
 OCTREE_BT = "map.bt"
@@ -93,6 +94,11 @@ RUN_FILES = (
         (SCAN_UPDATES,),
         "the voxels that each frame updated, so that fusing again along new poses reads only what moved",
         "maps",
+    ),
+    RunFiles(
+        (PLACES,),
+        "the features or points by which keyframes are recognised: `mapper localise` needs no log of the map",
+        "tracking",
     ),
     RunFiles(
         (FRAMES, FRAME_MS),

@@ -20,6 +20,7 @@ from mapper.run.results import RunResults
 INPUT_KINDS = frozenset({"log", "depth", "frozen", "far returns", "conflict"})
 """Kinds that are found while the log is read; a finished run has them in its manifest alone."""
 
+_ORDER: tuple[Weight, ...] = ("break", "doubt", "note")
 _GAP_INTERVALS, _LEAST_GAP_S = 3.0, 0.5
 _MAX_SKIPPED_SHARE = 0.1
 _MAX_LOST_SHARE, _BROKEN_LOST_SHARE = 0.02, 0.25
@@ -63,8 +64,7 @@ def find_warnings(results: RunResults, manifest: Manifest) -> list[RunWarning]:
         *_uncertainty(results),
         *_wide_steps(results, timeline),
     ]
-    order: tuple[Weight, ...] = ("break", "doubt", "note")
-    return sorted(found, key=lambda warning: order.index(warning.weight))
+    return sorted(found, key=lambda warning: _ORDER.index(warning.weight))
 
 
 def merge_warnings(name: str, *, agreement: float | None, shared_voxels: int) -> list[RunWarning]:
@@ -87,6 +87,41 @@ def merge_warnings(name: str, *, agreement: float | None, shared_voxels: int) ->
             weight="doubt",
         )
     ]
+
+
+def localisation_warnings(results: RunResults, manifest: Manifest) -> list[RunWarning]:
+    """Return all that is suspicious about a log that was localised in a map, what weighs most first.
+
+    Args:
+        results: Of the localised log; a frame without a known pose in the map is lost.
+        manifest: With the input's notes and the skipped frames.
+    """
+    timeline, records = _TimeLine.of(results, manifest), results.records
+    found = [
+        *(warning for warning in manifest.warnings if warning.kind in INPUT_KINDS),
+        *_skipped(records, manifest),
+        *_gaps(timeline),
+        *_not_localised(records, timeline),
+        *_doubtful(records, timeline),
+    ]
+    return sorted(found, key=lambda warning: _ORDER.index(warning.weight))
+
+
+def _not_localised(records: Sequence[FrameRecord], timeline: "_TimeLine") -> Iterator[RunWarning]:
+    is_lost = [record.outcome == "lost" for record in records]
+    if not any(is_lost):
+        return
+    share = sum(is_lost) / len(records)
+    first, last = max(_runs_of(is_lost), key=lambda run: timeline.duration_s(*run))
+    yield RunWarning(
+        kind="not localised",
+        sentence=f"{sum(is_lost)} of {len(records)} frames are not localised, {share:.1%}, for "
+        f"{timeline.duration_s(first, last):.1f} s at the longest: lost, or in a part of the path in which "
+        f"too little of the map was recognised (at most {_MAX_LOST_SHARE:.0%} is harmless)",
+        suggestion="come by places that the map shows, seen from where it was recorded",
+        where=timeline.place(first, last),
+        weight="break" if share > _BROKEN_LOST_SHARE else "doubt" if share > _MAX_LOST_SHARE else "note",
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,86 @@
+"""``mapper localise``: where a new log lies in a finished map."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli.console import progress_for
+from cli.environment import prepare_libraries
+from cli.options import First, Last, Overrides, Quiet, Stride, merged, selection
+
+if TYPE_CHECKING:
+    from mapper.run.localised import LocalisedManifest
+
+
+def localise(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Recorded log, of the map's kind of sensor.")],
+    in_: Annotated[
+        Path, typer.Option("--in", metavar="RUN", help="Finished run, or merged map; it stays as it is.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder to create.")],
+    set_: Overrides = None,
+    first: First = None,
+    last: Last = None,
+    stride: Stride = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace OUT, once the new folder is whole.")
+    ] = False,
+    strict: Annotated[
+        bool,
+        typer.Option(
+            "--strict", help="Exit with status 1 if the result is not trusted; it is written whole."
+        ),
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Place a new log in a finished map: its trajectory in the map's frame, and which of it is trusted.
+
+    A log of another place is refused, with exit status 1.
+
+    Example: mapper localise logs/tuesday --in runs/flat --out runs/tuesday
+    """
+    from mapper.config.loading import overridden
+    from mapper.core.errors import UntrustedError
+    from mapper.pipeline.known_map import load_known_map
+    from mapper.pipeline.localise import localise as localise_log
+    from mapper.sources import open_source
+    from mapper.sources.config import SourceConfig
+
+    prepare_libraries()
+    progress = progress_for(quiet=quiet)
+    known = load_known_map(in_, progress=progress)
+    overrides = merged(selection(first, last, stride, None), set_)
+    config = overridden(known.config.model_copy(update={"source": SourceConfig()}), overrides)
+    source = open_source(log, config.source)
+    for note in source.notes:
+        progress.note(note)
+    manifest = localise_log(source, known, config, out, progress=progress, overwrite=overwrite)
+    if not quiet:
+        print(_text(manifest, out))
+    verdict = manifest.verdict
+    if strict and verdict is not None and verdict.state != "trusted":
+        raise UntrustedError(f"{out}: {verdict.state}: {verdict.sentences[0]}")
+
+
+def _text(manifest: "LocalisedManifest", out: Path) -> str:
+    counts, verdict = manifest.counts, manifest.verdict
+    rows = [
+        ("frames", counts.frames_text),
+        ("localised", f"{manifest.localised_share:.1%} of the frames, in {manifest.map}"),
+        ("constraints", f"{counts.loops} of {counts.loop_candidates} comparisons with the map's places hold"),
+    ]
+    for stretch in manifest.stretches:
+        known = f", known to {stretch.sigma_m:.2g} m (1 σ)" if stretch.sigma_m is not None else ""
+        rows.append(
+            (
+                f"{stretch.begin_s:.1f} … {stretch.end_s:.1f} s",
+                f"{stretch.state}, {stretch.frames} frames, {stretch.constraints} constraints{known}",
+            )
+        )
+    rows.append(("seconds", f"{manifest.timing.total_s:.1f}"))
+    rows.append(("in", str(out)))
+    if verdict is not None:
+        rows += [("verdict", verdict.state), *(("", sentence) for sentence in verdict.sentences)]
+    width = 2 + max(len(name) for name, _ in rows)
+    return "\n".join(f"{name:<{width}}{text}" for name, text in rows)

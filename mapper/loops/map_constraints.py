@@ -1,0 +1,206 @@
+"""Loop detector against a finished map: a new log's keyframes compared with places that do not move."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Generic, assert_never
+
+import numpy as np
+
+from mapper.core.errors import ConfigError, FrameError
+from mapper.core.geometry import Transform
+from mapper.features.frame_view import ImageView
+from mapper.graph.model import PoseGraph
+from mapper.loops.base import Place, Proposal, Proposer, Verifier, verify_proposal
+from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy, exceeds
+from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
+from mapper.loops.consistency_check import ConsistencyCheck
+from mapper.loops.detector import ALONE, ViewOf
+from mapper.loops.factory import build_verifier
+from mapper.loops.odometry_chain import OdometryChain
+from mapper.loops.online_pose_estimator import IncrementalPoseEstimator, OnlinePoseEstimator
+from mapper.loops.place_file import AnyPlace
+from mapper.loops.proposers import NodePoses, PoseProposer
+from mapper.odometry.base import FrameResult
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownPlaces:
+    """Places of a finished map, at poses that are not changed.
+
+    Attributes:
+        places: Views of its keyframes, by node.
+        T_map_node: (4, 4) poses of these nodes.
+    """
+
+    places: Mapping[int, AnyPlace]
+    T_map_node: Mapping[int, Transform]
+
+    @property
+    def map_node(self) -> int:
+        """Number of the node that stands for the map's frame: all of the map's own come before it."""
+        return 1 + max(self.places)
+
+
+class _InMap:
+    """Poses of the known places beside the estimates of the new nodes; see ``NodePoses``."""
+
+    def __init__(self, known: KnownPlaces, estimator: OnlinePoseEstimator) -> None:
+        self._known = known
+        self._estimator = estimator
+
+    def pose_of(self, node: int) -> Transform:
+        """Return the (4, 4) pose of a known place, or the current estimate of a new node's."""
+        T_map_node = self._known.T_map_node.get(node)
+        return self._estimator.pose_of(node) if T_map_node is None else T_map_node
+
+
+class MapConstraintDetector(Generic[Place]):
+    """Loop detector that compares the keyframes of a new log with the known places of a map.
+
+    What is measured against a place at a fixed pose is a pose in the map. So every constraint leads from one
+    node, that of the map's frame, and the consistency check compares constraints found at any two places.
+
+    Until a part of the path is localised, its keyframes are compared with similar places anywhere in the map;
+    then with the places next to the current estimate first. No drift gate holds: constraints that contradict
+    the odometry may show that the sensor was carried elsewhere.
+    """
+
+    def __init__(
+        self,
+        config: PlaceLoopsConfig | ScanLoopsConfig,
+        known: KnownPlaces,
+        verifier: Verifier[Place],
+        similar: Proposer[Place],
+        nearby_for: Callable[[NodePoses], PoseProposer[Place]],
+    ) -> None:
+        """Add all known places.
+
+        Args:
+            config: Settings.
+            known: Of the finished map.
+            verifier: Compares two places.
+            similar: Empty; proposes similar places.
+            nearby_for: Returns an empty proposer of the places near an estimate.
+        """
+        self._config = config
+        self._known = known
+        self._verifier = verifier
+        self._similar = similar
+        self._map = known.map_node
+        self._estimator = IncrementalPoseEstimator()
+        self._estimator.preload(PoseGraph({self._map: np.eye(4)}, {self._map: 0}))
+        self._nearby = nearby_for(_InMap(known, self._estimator))
+        for node, place in known.places.items():
+            self._similar.add(node, place)
+            self._nearby.add(node, place)
+        self._chain = OdometryChain()
+        self._consistency = ConsistencyCheck(
+            self._chain,
+            self._estimator,
+            config.gate,
+            min_agreeing=max(config.min_agreeing, 1),
+            within_m=config.agreement_path_m,
+        )
+        self._localised: list[int] = []
+        self._last: Transform | None = None
+        self._place_of: dict[int, int] = {}
+        self._closures: dict[tuple[int, int], LoopClosure] = {}
+
+    def add(self, node: int, track: FrameResult, view: ViewOf, /) -> None:
+        """Search the map from a new node."""
+        self._estimator.add(node, track)
+        self._chain.add(track.links)
+        is_localised = bool(self._localised) and bool(self._chain.connected(node, self._localised).any())
+        if not track.is_sharp or (is_localised and not self._has_moved(track)):
+            return
+        try:
+            place = self._verifier.describe(view())
+        except FrameError:
+            return  # a damaged frame that wheel odometry did not read
+        self._last = track.T_world_body
+        for proposal in self._proposals(node, place, is_localised=is_localised):
+            measured = verify_proposal(
+                proposal, node, self._known.places[proposal.node], place, self._verifier
+            )
+            closure = self._in_map(measured)
+            self._closures[proposal.node, node] = closure
+            if closure.verdict == "accepted":
+                self._hold_back(proposal.node, closure)
+                break
+
+    def closures(self) -> Sequence[LoopClosure]:
+        """Return every candidate so far; i is the node of the map's frame, ``stamp_i_ns`` names the place."""
+        return tuple(self._closures.values())
+
+    def current_estimate(self, node: int) -> Transform:
+        """Return the (4, 4) current estimate of a node's pose, in the map once its part is localised."""
+        return self._estimator.pose_of(node)
+
+    def notes(self) -> Sequence[str]:
+        """Return nothing."""
+        return ()
+
+    def places(self) -> Mapping[int, AnyPlace]:
+        """Return nothing: the map stays as it is."""
+        return {}
+
+    def _has_moved(self, track: FrameResult) -> bool:
+        if self._last is None:
+            return True
+        moved = discrepancy(np.eye(4), self._last, track.T_world_body)
+        return exceeds(moved, Discrepancy(self._config.min_motion_m, self._config.min_motion_rad))
+
+    def _proposals(self, node: int, place: Place, *, is_localised: bool) -> list[Proposal]:
+        limit, count = self._config.max_candidates, len(self._known.places)
+        proposals: dict[int, Proposal] = {}
+        for proposer in (self._nearby, self._similar) if is_localised else (self._similar,):
+            for proposal in proposer.propose(node, place, before=count, limit=limit):
+                proposals.setdefault(proposal.node, proposal)
+        return list(proposals.values())[:limit]
+
+    def _in_map(self, measured: LoopClosure) -> LoopClosure:
+        """Return the closure with the map's frame instead of the place's."""
+        T_map_j = None if measured.T_i_j is None else self._known.T_map_node[measured.i] @ measured.T_i_j
+        return replace(measured, i=self._map, T_i_j=T_map_j)
+
+    def _hold_back(self, place: int, closure: LoopClosure) -> None:
+        """Keep a measured constraint as a hypothesis, and accept all that are confirmed now."""
+        self._closures[place, closure.j] = replace(closure, verdict="rejected", reason=ALONE)
+        self._place_of[closure.j] = place
+        for confirmed in self._consistency.add(closure):
+            self._closures[self._place_of[confirmed.j], confirmed.j] = confirmed
+            self._estimator.close(confirmed)
+            self._localised.append(confirmed.j)
+
+
+def build_map_constraint_detector(
+    config: PlaceLoopsConfig | ScanLoopsConfig, known: KnownPlaces
+) -> MapConstraintDetector[Any]:
+    """Return the detector that compares a new log with a map.
+
+    Raises:
+        ConfigError: The places cannot be recognised by similarity.
+    """
+    verifier = build_verifier(config.verification)
+    match config:
+        case PlaceLoopsConfig():
+            from mapper.loops.visual_word_proposer import VisualWordProposer, nearby_images
+
+            first = next(iter(known.places.values()))
+            if not (isinstance(first, ImageView) and first.is_orb) or config.propose == "nearby":
+                raise ConfigError(
+                    "places of a map are recognised by visual words; want images, an ORB detector, and "
+                    "loops.propose=auto or places"
+                )
+            words = VisualWordProposer(config.places)
+            return MapConstraintDetector(config, known, verifier, words, partial(nearby_images, config))
+        case ScanLoopsConfig():
+            from mapper.loops.scan_context_proposer import ScanContextProposer, nearby_scans
+
+            contexts = ScanContextProposer(
+                config.context, lambda _node, _seen, nodes: np.ones(len(nodes), bool)
+            )
+            return MapConstraintDetector(config, known, verifier, contexts, partial(nearby_scans, config))
+        case _:
+            assert_never(config)

@@ -1,0 +1,96 @@
+"""Finished maps in which a new log can be localised: runs, and merged maps of runs."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mapper.config.build import BuildConfig
+from mapper.core.errors import RunError
+from mapper.core.geometry import Transform
+from mapper.features.frame_view import ImageView
+from mapper.loops.config import KeyframeLoopsConfig
+from mapper.loops.factory import LOOPS_OF, build_verifier
+from mapper.loops.map_constraints import KnownPlaces
+from mapper.loops.place_file import AnyPlace, read_places
+from mapper.merging.merged_map import open_map
+from mapper.pipeline.reobserve import reobserve
+from mapper.run import files
+from mapper.run.fingerprint import fingerprint
+from mapper.run.folder import Run, load_run, open_log
+from mapper.run.manifest import is_merged_map
+from mapper.runtime.progress import SILENT, Progress
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownMap:
+    """A finished map with what its places are recognised by.
+
+    Attributes:
+        path: Folder of the run or of the merged map.
+        config: Settings by which its places were observed: those of its first run.
+        places: Of all of its runs, in the map's frame.
+    """
+
+    path: Path
+    config: BuildConfig
+    places: KnownPlaces
+
+    @property
+    def sensor(self) -> str:
+        """What its places were seen by."""
+        is_image = isinstance(next(iter(self.places.places.values())), ImageView)
+        return "rgbd" if is_image else "lidar"
+
+
+def load_known_map(path: Path, *, progress: Progress = SILENT) -> KnownMap:
+    """Return a run, or a merged map whose runs are still there, with its places.
+
+    A run of before places were stored has them observed again from its log.
+
+    Raises:
+        RunError: There is no such map, it has no places, its runs have changed or were observed by other
+            settings, or the log of an old run is no longer there.
+    """
+    if not is_merged_map(path):
+        run = load_run(path)
+        members = [(run, np.eye(4))]
+    else:
+        members = []
+        for member in open_map(path).manifest.runs:
+            run = load_run(Path(member.path))
+            if fingerprint(run.path / files.OCTREE_MAP) != member.fingerprint:
+                raise RunError(f"{run.path}: changed since it was merged into {path}; merge again")
+            members.append((run, np.array(member.T_map_world)))
+    first, _ = members[0]
+    places: dict[int, AnyPlace] = {}
+    T_map_node: dict[int, Transform] = {}
+    for run, T_map_world in members:
+        if run.config.odometry != first.config.odometry:
+            raise RunError(
+                f"{run.path}: observed by other settings of odometry than {first.path}; localise in "
+                "one of them"
+            )
+        T_world_node = run.graph().T_world_node
+        for node, place in places_of(run, progress=progress).items():
+            if node in T_world_node:
+                number = len(places)
+                places[number], T_map_node[number] = place, T_map_world @ T_world_node[node]
+    if not places:
+        raise RunError(
+            f"{path}: no keyframe of it can be recognised; build it with loops.kind=places or scans"
+        )
+    return KnownMap(path, first.config, KnownPlaces(places, T_map_node))
+
+
+def places_of(run: Run, *, progress: Progress = SILENT) -> Mapping[int, AnyPlace]:
+    """Return the stored places of a run; those of an old run are observed again from its log."""
+    stored = run.path / files.PLACES
+    if stored.exists():
+        return read_places(stored)
+    log = open_log(run)
+    loops = run.config.loops if isinstance(run.config.loops, KeyframeLoopsConfig) else LOOPS_OF[log.sensor]
+    verifier, graph = build_verifier(loops.verification), run.graph()
+    views = reobserve(log, run.trajectory(), set(graph.stamps_ns.values()), run.config, progress=progress)
+    return {node: verifier.describe(views[stamp_ns]) for node, stamp_ns in graph.stamps_ns.items()}

@@ -1,0 +1,270 @@
+"""Localising: a new log placed in a finished map, which stays as it is."""
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mapper.config.build import BuildConfig
+from mapper.core.errors import ConfigError, LoopError
+from mapper.export.grid import read_grid
+from mapper.export.picture import write_summary
+from mapper.graph.components import components
+from mapper.graph.config import GraphConfig
+from mapper.graph.model import BetweenFactor, PoseGraph
+from mapper.graph.optimize import optimize
+from mapper.loops.closure import write_closures
+from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
+from mapper.loops.factory import LOOPS_OF
+from mapper.loops.map_constraints import build_map_constraint_detector
+from mapper.loops.odometry_chain import OdometryChain
+from mapper.odometry.factory import build_odometry
+from mapper.odometry.given_poses import poses_for
+from mapper.odometry.node_offset import NodeOffset
+from mapper.pipeline.components import component_of
+from mapper.pipeline.kidnapping import without_jumps
+from mapper.pipeline.known_map import KnownMap
+from mapper.pipeline.solve import solve
+from mapper.pipeline.track import (
+    Start,
+    TrackingResult,
+    depth_cautions,
+    from_tracking,
+    track_log,
+    wheels_beside,
+)
+from mapper.run import files
+from mapper.run.folder import RunWriter, first_manifest, write_run
+from mapper.run.frame_outcomes import write_frame_ms, write_records
+from mapper.run.localised import LocalisedManifest, find_stretches
+from mapper.run.manifest import SkippedFrame
+from mapper.run.pose_covariances import uncertain_poses, write_poses
+from mapper.run.results import RunResults
+from mapper.run.verdict import verdict_of
+from mapper.run.warnings import localisation_warnings
+from mapper.runtime.progress import SILENT, Progress
+from mapper.runtime.timing import peak_memory_mb
+from mapper.sources.base import Log
+from mapper.sources.trajectory_files import write_tum
+
+_LEAST_CONSTRAINTS = 3
+"""A part of the path that fewer constraints tie to the map is not localised."""
+_FAR = 3.0
+"""Times ``loops.agreement_path_m``: the path from the nearest constraint beyond which frames are doubtful."""
+_MEDIAN_CHI2 = 5.348
+"""Median of χ² with six degrees of freedom."""
+
+
+def localise(
+    source: Log,
+    known: KnownMap,
+    config: BuildConfig,
+    out: Path,
+    *,
+    progress: Progress = SILENT,
+    overwrite: bool = False,
+) -> LocalisedManifest:
+    """Place a log in a finished map: its poses in the map's frame, with their covariance given the map.
+
+    The log is tracked as in a build. Its keyframes are compared with the map's places, and what holds becomes
+    a constraint to the map's frame, one node that is fixed; odometry and constraints are solved together, so
+    between constraints the odometry carries on. A part of the path without constraints is not localised.
+
+    Args:
+        source: The log.
+        known: The finished map.
+        config: The map's own but for ``source``; loops, graph and workers may have other settings.
+        out: Folder to create.
+        progress: Receives stages, counts and notes.
+        overwrite: Replace a folder that is there, once the new one is whole.
+
+    Raises:
+        ConfigError: The log is of another sensor than the map, or the settings differ in what places were
+            observed by.
+        LoopError: Nothing of the log can be placed; the message says why.
+        RunError: OUT is there already.
+    """
+    _refuse_unfit(source, known, config)
+    warnings = depth_cautions(source)
+    for warning in warnings:
+        progress.note(warning.sentence)
+    start = first_manifest(source)
+    manifest = LocalisedManifest(map=str(known.path.resolve()), **dict(start))
+    with write_run(out, manifest, config, overwrite=overwrite) as writer:
+        writer.warn(warnings)
+        map_node = known.places.map_node
+        with writer.clock.stage("track"):
+            tracking = track_log(source, config, progress=progress, start=_start(source, known, config))
+        writer.warn(tracking.warnings)
+        with writer.clock.stage("solve"):
+            tracking = without_jumps(tracking, map_node, _loops(source, config).gate, progress=progress)
+            _refuse_unplaced(source, known, tracking)
+            tracking = _supported(tracking)
+            solved = solve(tracking.graph, tracking.loops, config.graph)
+            tracking = _supported(replace(tracking, graph=solved.graph, loops=solved.loops))
+            _refuse_unplaced(source, known, tracking)
+            tracking = component_of(tracking, map_node, progress=progress)
+            tracking = replace(tracking, graph=_with_honest_constraints(tracking.graph, config.graph))
+        tracking = _doubtful_if_far(tracking, _FAR * _loops(source, config).agreement_path_m)
+        writer.update(solve=solved.report)
+        with writer.clock.stage("write"):
+            _write(writer, source, known, tracking)
+        return writer.manifest  # type: ignore[return-value]
+
+
+def _loops(source: Log, config: BuildConfig) -> PlaceLoopsConfig | ScanLoopsConfig:
+    loops = config.loops
+    return loops if isinstance(loops, PlaceLoopsConfig | ScanLoopsConfig) else LOOPS_OF[source.sensor]
+
+
+def _refuse_unfit(source: Log, known: KnownMap, config: BuildConfig) -> None:
+    if source.sensor != known.sensor:
+        raise ConfigError(
+            f"{source.path}: a log of kind {source.sensor}, but {known.path} was made by {known.sensor}; "
+            "a log is localised by what the map's places were seen by"
+        )
+    if config.odometry != known.config.odometry:
+        raise ConfigError(f"odometry: fixed by {known.path}; its places were observed with these settings")
+    if config.graph.solve != "batch":
+        raise ConfigError(f"graph.solve={config.graph.solve}: cannot join a log to a map; want batch")
+
+
+def _start(source: Log, known: KnownMap, config: BuildConfig) -> Start:
+    map_node = known.places.map_node
+    odometry = build_odometry(
+        config.odometry, poses_for(config.odometry, source), wheels_beside(source, config)
+    )
+    detector = build_map_constraint_detector(_loops(source, config), known.places)
+    graph = PoseGraph({map_node: np.eye(4)}, {map_node: 0})
+    return Start(NodeOffset(odometry, first_node=map_node + 1), detector, graph)
+
+
+def _refuse_unplaced(source: Log, known: KnownMap, tracking: TrackingResult) -> None:
+    """Refuse a log of which nothing is tied to the map."""
+    if any(loop.verdict == "accepted" for loop in tracking.loops):
+        return
+    if not tracking.loops:
+        why = "nothing in it looks like a place of the map (min_similarity of loops.places or loops.context)"
+    else:
+        refused = Counter(loop.reason.split(":")[0] for loop in tracking.loops).most_common()
+        why = (
+            f"{len(tracking.loops)} pairs compared, none held: {', '.join(f'{by} {n}' for by, n in refused)}"
+        )
+    raise LoopError(f"{source.path}: cannot be placed in {known.path}; {why}; is it the same place?")
+
+
+def _supported(tracking: TrackingResult) -> TrackingResult:
+    """Return the result without the constraints of parts that too few tie to the map."""
+    graph = tracking.graph
+    odometry = [factor for factor in graph.factors if factor.origin != "loop"]
+    parts = components(PoseGraph(graph.T_world_node, graph.stamps_ns, odometry))
+    part_of = {node: number for number, nodes in enumerate(parts) for node in nodes}
+    tied = Counter(part_of[loop.j] for loop in tracking.loops if loop.verdict == "accepted")
+    weak = {part for part, count in tied.items() if count < _LEAST_CONSTRAINTS}
+    if not weak:
+        return tracking
+    loops = tuple(
+        replace(
+            loop,
+            verdict="rejected",
+            reason=f"few: {tied[part_of[loop.j]]} constraints tie its part of the path, want "
+            f"{_LEAST_CONSTRAINTS}",
+        )
+        if loop.verdict == "accepted" and part_of[loop.j] in weak
+        else loop
+        for loop in tracking.loops
+    )
+    factors = [*odometry, *(loop.factor for loop in loops if loop.verdict == "accepted")]
+    return replace(tracking, graph=PoseGraph(graph.T_world_node, graph.stamps_ns, factors), loops=loops)
+
+
+def _with_honest_constraints(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
+    """Return the graph solved again, with the constraints' information scaled to how well they agree.
+
+    Their information is that of the pixels or points and knows nothing of the errors that the map's own poses
+    have. Divided by their median χ², over that of consistent measurements, it does.
+    """
+    constraints = [factor for factor in graph.factors if factor.origin == "loop"]
+    known = [factor for factor in graph.factors if factor.origin != "loop"]
+    exact = config.model_copy(update={"robust": "none"})
+    solution = optimize(graph, exact)
+    chi2 = 2.0 * np.array(solution.factor_errors)[[f.origin == "loop" for f in graph.factors]]
+    scale = 1.0 / max(1.0, float(np.median(chi2)) / _MEDIAN_CHI2)
+    scaled = [BetweenFactor(f.i, f.j, f.T_i_j, scale * f.information, f.origin) for f in constraints]
+    graph = PoseGraph(solution.T_world_node, graph.stamps_ns, [*known, *scaled])
+    return PoseGraph(optimize(graph, exact).T_world_node, graph.stamps_ns, graph.factors)
+
+
+def _doubtful_if_far(tracking: TrackingResult, limit_m: float) -> TrackingResult:
+    """Return the result with the frames doubtful that lie far along the path from every constraint."""
+    chain = OdometryChain()
+    chain.add(factor for factor in tracking.graph.factors if factor.origin != "loop")
+    near: set[int] = set()
+    for node in {loop.j for loop in tracking.loops if loop.verdict == "accepted"}:
+        near |= chain.around(node, within_m=limit_m).keys()
+    far = f"more than {limit_m:g} m of path from the nearest place that was recognised"
+    tracks = tuple(
+        replace(track, doubts=(*track.doubts, far))
+        if track.node is not None and track.node not in near
+        else track
+        for track in tracking.tracks
+    )
+    return replace(tracking, tracks=tracks)
+
+
+def _write(writer: RunWriter, source: Log, known: KnownMap, tracking: TrackingResult) -> None:
+    folder, held = writer.folder, [loop for loop in tracking.loops if loop.verdict == "accepted"]
+    stored = from_tracking(tracking, source.truth)
+    poses = uncertain_poses(stored.trajectory, stored.graph, stored.records)
+    write_tum(folder / files.TRAJECTORY, stored.trajectory)
+    write_poses(folder / files.POSES, poses)
+    write_records(folder / files.FRAMES, stored.records)
+    write_frame_ms(folder / files.FRAME_MS, stored.frame_ms)
+    write_closures(folder / files.LOOPS, stored.loops)
+    if source.truth is not None:
+        write_tum(folder / files.TRUTH, source.truth)
+    outcomes = [record.outcome for record in stored.records]
+    counts = writer.manifest.counts.model_copy(
+        update={
+            "listed": len(outcomes),
+            "read": len(outcomes) - outcomes.count("skipped"),
+            **{name: outcomes.count(name) for name in ("skipped", "lost", "doubtful", "tracked")},  # type: ignore[arg-type]
+            "nodes": len(stored.graph.T_world_node) - 1,
+            "factors": len(stored.graph.factors),
+            "loops": len(held),
+            "loop_candidates": len(stored.loops),
+        }
+    )
+    writer.update(
+        counts=counts,
+        skipped=tuple(SkippedFrame(stamp_ns=s.stamp_ns, reason=s.reason) for s in stored.skipped),
+        stretches=tuple(find_stretches(stored.records, poses, [loop.stamp_j_ns for loop in held])),
+    )
+    results = RunResults(stored.trajectory, stored.graph, stored.records, held, stored.frame_ms, None, poses)
+    warnings = localisation_warnings(results, writer.manifest)
+    writer.update(warnings=tuple(warnings), verdict=verdict_of(warnings))
+    grid = read_grid(known.path / f"{files.SLICE}.yaml")
+    write_summary(
+        folder / files.SUMMARY,
+        grid=grid,
+        trajectory=stored.trajectory,
+        truth=None,
+        loops_world=np.array([[stored.graph.T_world_node[loop.j][:3, 3]] * 2 for loop in held]),
+        title=f"{source.path.name} in {known.path.name}",
+        lines=[counts.frames_text, f"recognised in {len(held)} keyframes"],
+        poses=poses,
+    )
+    seconds = {stage: round(value, 3) for stage, value in writer.clock.seconds.items()}
+    total_s = sum(seconds.values())
+    writer.update(
+        timing=writer.manifest.timing.model_copy(
+            update={
+                "stage_s": seconds,
+                "total_s": round(total_s, 3),
+                "log_s": float(np.ptp(source.stamps_ns)) / 1e9,
+                "frames_per_s": round(counts.read / max(total_s, 1e-9), 2),
+                "peak_memory_mb": round(peak_memory_mb(), 1),
+            }
+        )
+    )
