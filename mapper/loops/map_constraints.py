@@ -42,6 +42,10 @@ class KnownPlaces:
         return 1 + max(self.places)
 
 
+_MAX_FAILED = 2
+"""Searches in a row that fail next to the estimate before the whole map is searched."""
+
+
 class _InMap:
     """Poses of the known places beside the estimates of the new nodes; see ``NodePoses``."""
 
@@ -61,9 +65,10 @@ class MapConstraintDetector(Generic[Place]):
     What is measured against a place at a fixed pose is a pose in the map. So every constraint leads from one
     node, that of the map's frame, and the consistency check compares constraints found at any two places.
 
-    Until a part of the path is localised, its keyframes are compared with similar places anywhere in the map;
-    then with the places next to the current estimate first. No drift gate holds: constraints that contradict
-    the odometry may show that the sensor was carried elsewhere.
+    Until a part of the path is localised, and when the places next to the current estimate are not recognised
+    several times in a row, keyframes are compared with similar places anywhere in the map; else with those
+    next to the estimate. No drift gate holds: constraints that contradict the odometry may show that the
+    sensor was carried elsewhere.
     """
 
     def __init__(
@@ -104,6 +109,7 @@ class MapConstraintDetector(Generic[Place]):
         )
         self._localised: list[int] = []
         self._last: Transform | None = None
+        self._failed = 0
         self._place_of: dict[int, int] = {}
         self._closures: dict[tuple[int, int], LoopClosure] = {}
 
@@ -119,7 +125,9 @@ class MapConstraintDetector(Generic[Place]):
         except FrameError:
             return  # a damaged frame that wheel odometry did not read
         self._last = track.T_world_body
-        for proposal in self._proposals(node, place, is_localised=is_localised):
+        is_near = is_localised and self._failed < _MAX_FAILED
+        self._failed += 1
+        for proposal in self._proposals(node, place, is_near=is_near):
             measured = verify_proposal(
                 proposal, node, self._known.places[proposal.node], place, self._verifier
             )
@@ -151,13 +159,11 @@ class MapConstraintDetector(Generic[Place]):
         moved = discrepancy(np.eye(4), self._last, track.T_world_body)
         return exceeds(moved, Discrepancy(self._config.min_motion_m, self._config.min_motion_rad))
 
-    def _proposals(self, node: int, place: Place, *, is_localised: bool) -> list[Proposal]:
-        limit, count = self._config.max_candidates, len(self._known.places)
-        proposals: dict[int, Proposal] = {}
-        for proposer in (self._nearby, self._similar) if is_localised else (self._similar,):
-            for proposal in proposer.propose(node, place, before=count, limit=limit):
-                proposals.setdefault(proposal.node, proposal)
-        return list(proposals.values())[:limit]
+    def _proposals(self, node: int, place: Place, *, is_near: bool) -> list[Proposal]:
+        proposer = self._nearby if is_near else self._similar
+        return proposer.propose(
+            node, place, before=len(self._known.places), limit=self._config.max_candidates
+        )
 
     def _in_map(self, measured: LoopClosure) -> LoopClosure:
         """Return the closure with the map's frame instead of the place's."""
@@ -169,6 +175,7 @@ class MapConstraintDetector(Generic[Place]):
         self._closures[place, closure.j] = replace(closure, verdict="rejected", reason=ALONE)
         self._place_of[closure.j] = place
         for confirmed in self._consistency.add(closure):
+            self._failed = 0
             self._closures[self._place_of[confirmed.j], confirmed.j] = confirmed
             self._estimator.close(confirmed)
             self._localised.append(confirmed.j)

@@ -18,7 +18,6 @@ from mapper.loops.closure import write_closures
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.factory import LOOPS_OF
 from mapper.loops.map_constraints import build_map_constraint_detector
-from mapper.loops.odometry_chain import OdometryChain
 from mapper.odometry.factory import build_odometry
 from mapper.odometry.given_poses import poses_for
 from mapper.odometry.node_offset import NodeOffset
@@ -50,8 +49,11 @@ from mapper.sources.trajectory_files import write_tum
 
 _LEAST_CONSTRAINTS = 3
 """A part of the path that fewer constraints tie to the map is not localised."""
-_FAR = 3.0
-"""Times ``loops.agreement_path_m``: the path from the nearest constraint beyond which frames are doubtful."""
+_FAR, _FAR_BEYOND = 3.0, 0.2
+"""Times ``loops.agreement_path_m``: the path from the nearest constraint from which on frames are doubtful,
+between two constraints, and where there is one on one side only: there nothing would show a jump."""
+_MAX_MOVED_RATIO = 0.14
+"""Least ``max_moved_ratio`` of scans: the map was made on another day."""
 _MEDIAN_CHI2 = 5.348
 """Median of χ² with six degrees of freedom."""
 
@@ -106,7 +108,7 @@ def localise(
             _refuse_unplaced(source, known, tracking)
             tracking = component_of(tracking, map_node, progress=progress)
             tracking = replace(tracking, graph=_with_honest_constraints(tracking.graph, config.graph))
-        tracking = _doubtful_if_far(tracking, _FAR * _loops(source, config).agreement_path_m)
+        tracking = _doubtful_if_far(tracking, _loops(source, config).agreement_path_m)
         writer.update(solve=solved.report)
         with writer.clock.stage("write"):
             _write(writer, source, known, tracking)
@@ -114,8 +116,16 @@ def localise(
 
 
 def _loops(source: Log, config: BuildConfig) -> PlaceLoopsConfig | ScanLoopsConfig:
+    """Return how keyframes are compared with the map."""
     loops = config.loops
-    return loops if isinstance(loops, PlaceLoopsConfig | ScanLoopsConfig) else LOOPS_OF[source.sensor]
+    if not isinstance(loops, PlaceLoopsConfig | ScanLoopsConfig):
+        loops = LOOPS_OF[source.sensor]
+    if isinstance(loops, PlaceLoopsConfig):
+        return loops
+    moved = max(loops.verification.max_moved_ratio, _MAX_MOVED_RATIO)
+    return loops.model_copy(
+        update={"verification": loops.verification.model_copy(update={"max_moved_ratio": moved})}
+    )
 
 
 def _refuse_unfit(source: Log, known: KnownMap, config: BuildConfig) -> None:
@@ -196,18 +206,31 @@ def _with_honest_constraints(graph: PoseGraph, config: GraphConfig) -> PoseGraph
     return PoseGraph(optimize(graph, exact).T_world_node, graph.stamps_ns, graph.factors)
 
 
-def _doubtful_if_far(tracking: TrackingResult, limit_m: float) -> TrackingResult:
-    """Return the result with the frames doubtful that lie far along the path from every constraint."""
-    chain = OdometryChain()
-    chain.add(factor for factor in tracking.graph.factors if factor.origin != "loop")
-    near: set[int] = set()
-    for node in {loop.j for loop in tracking.loops if loop.verdict == "accepted"}:
-        near |= chain.around(node, within_m=limit_m).keys()
-    far = f"more than {limit_m:g} m of path from the nearest place that was recognised"
+def _doubtful_if_far(tracking: TrackingResult, agreement_path_m: float) -> TrackingResult:
+    """Return the result with the frames doubtful whose pose no constraint nearby confirms.
+
+    Between two constraints that the odometry agrees with, it has neither drifted far nor jumped. Before the
+    first and after the last of a part of the path nothing tells, and where the map contradicted a constraint
+    the part around it may be the wrong one.
+    """
+    graph, doubts = tracking.graph, dict[int, str]()
+    held = {loop.j for loop in tracking.loops if loop.verdict == "accepted"}
+    contradicting = {loop.j for loop in tracking.loops if loop.reason.startswith("solver")} - held
+    odometry = [factor for factor in graph.factors if factor.origin != "loop"]
+    for nodes in components(PoseGraph(graph.T_world_node, graph.stamps_ns, odometry)):
+        in_order = sorted(nodes)
+        positions = np.array([graph.T_world_node[node][:3, 3] for node in in_order])
+        path_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
+        known_m = path_m[[node in held for node in in_order]]
+        for node, at_m in zip(in_order, path_m.tolist(), strict=True):
+            before, after = known_m[known_m <= at_m], known_m[known_m >= at_m]
+            limit_m = agreement_path_m * (_FAR if len(before) and len(after) else _FAR_BEYOND)
+            if np.abs(known_m - at_m).min(initial=np.inf) > limit_m:
+                doubts[node] = f"more than {limit_m:g} m of path from the nearest place that was recognised"
+            elif node in contradicting:
+                doubts[node] = "the place that was recognised here contradicts the others"
     tracks = tuple(
-        replace(track, doubts=(*track.doubts, far))
-        if track.node is not None and track.node not in near
-        else track
+        replace(track, doubts=(*track.doubts, doubts[track.node])) if track.node in doubts else track
         for track in tracking.tracks
     )
     return replace(tracking, tracks=tracks)
