@@ -105,7 +105,7 @@ def _built(out: Path, log: Log) -> tuple[Run, float]:
     """Return the map of a log and the CPU seconds that it took; NaN if it was there."""
     if out.exists():
         return load_run(out), float("nan")
-    config: BuildConfig = load_config(None, [], sensor=log.sensor)
+    config: BuildConfig = load_config(None, ["min_tracked_frames=5"], sensor=log.sensor)
     began = time.process_time()
     run = build(log, config, out)
     return run, time.process_time() - began

@@ -107,6 +107,44 @@ def _draw_loops(axes: "Axes", loops_world: Array) -> None:
         label = ""
 
 
+def write_localised(
+    path: Path,
+    *,
+    grid: OccupancyGrid,
+    poses: UncertainPoses,
+    begins_ns: Sequence[int],
+    recognised_world: Array,
+    title: str,
+    lines: Sequence[str] = (),
+) -> None:
+    """Draw where a log lies in a map, over the map's slice.
+
+    Args:
+        path: PNG file to write.
+        grid: The map's slice.
+        poses: Of the frames that were placed, in the map's frame; at least one.
+        begins_ns: Stamps from which the path is drawn anew: what lies before each is not connected to it.
+        recognised_world: (K, 3) where the map was recognised, metres.
+        title: Headline.
+        lines: Figures worth knowing, shown below the headline.
+    """
+    positions = poses.trajectory.positions_world
+    low, high = _extent(grid, [positions])
+    figure, axes = _map_page(title, lines, aspect=float(np.divide(*(high - low)[::-1])))
+    _draw_over(axes, grid_image(grid), grid)
+    parts = np.split(positions, np.searchsorted(poses.trajectory.stamps_ns, sorted(begins_ns)))
+    for number, part in enumerate(part for part in parts if len(part)):
+        label = "" if number else "estimate"
+        axes.plot(*part[:, :2].T, color=hex_of(ESTIMATE), linewidth=1.3, label=label)
+    _draw_doubtful(axes, poses)
+    label = f"recognised in {len(recognised_world)} keyframes"
+    axes.plot(*recognised_world[:, :2].T, ".", color=hex_of(FACTORS["loop"]), markersize=3.0, label=label)
+    _mark(axes, positions[0], color=START, marker="o", label="start")
+    _mark(axes, positions[-1], color=END, marker="s", label="end")
+    _finish_map(axes, low, high)
+    save(figure, path)
+
+
 def write_path(
     path: Path,
     *,

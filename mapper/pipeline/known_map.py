@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from mapper.config.build import BuildConfig
+from mapper.core.config import Config
 from mapper.core.errors import RunError
 from mapper.core.geometry import Transform
 from mapper.features.frame_view import ImageView
@@ -67,10 +68,10 @@ def load_known_map(path: Path, *, progress: Progress = SILENT) -> KnownMap:
     places: dict[int, AnyPlace] = {}
     T_map_node: dict[int, Transform] = {}
     for run, T_map_world in members:
-        if run.config.odometry != first.config.odometry:
+        if detector_of(run.config) != detector_of(first.config):
             raise RunError(
-                f"{run.path}: observed by other settings of odometry than {first.path}; localise in "
-                "one of them"
+                f"{run.path}: its features are by another odometry.detector than those of {first.path}; "
+                "localise in one of them"
             )
         T_world_node = run.graph().T_world_node
         for node, place in places_of(run, progress=progress).items():
@@ -82,6 +83,12 @@ def load_known_map(path: Path, *, progress: Progress = SILENT) -> KnownMap:
             f"{path}: no keyframe of it can be recognised; build it with loops.kind=places or scans"
         )
     return KnownMap(path, first.config, KnownPlaces(places, T_map_node))
+
+
+def detector_of(config: BuildConfig) -> Config | None:
+    """Return the settings of the features by which places are recognised; None of scans."""
+    detector: Config | None = getattr(config.odometry, "detector", None)
+    return detector
 
 
 def places_of(run: Run, *, progress: Progress = SILENT) -> Mapping[int, AnyPlace]:

@@ -9,7 +9,7 @@ import numpy as np
 from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, LoopError
 from mapper.export.grid import read_grid
-from mapper.export.picture import write_summary
+from mapper.export.picture import write_localised
 from mapper.graph.components import components
 from mapper.graph.config import GraphConfig
 from mapper.graph.model import BetweenFactor, PoseGraph
@@ -23,7 +23,7 @@ from mapper.odometry.given_poses import poses_for
 from mapper.odometry.node_offset import NodeOffset
 from mapper.pipeline.components import component_of
 from mapper.pipeline.kidnapping import without_jumps
-from mapper.pipeline.known_map import KnownMap
+from mapper.pipeline.known_map import KnownMap, detector_of
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import (
     Start,
@@ -76,7 +76,7 @@ def localise(
     Args:
         source: The log.
         known: The finished map.
-        config: The map's own but for ``source``; loops, graph and workers may have other settings.
+        config: The map's own; all but the detector of features may have other settings.
         out: Folder to create.
         progress: Receives stages, counts and notes.
         overwrite: Replace a folder that is there, once the new one is whole.
@@ -108,7 +108,7 @@ def localise(
             _refuse_unplaced(source, known, tracking)
             tracking = component_of(tracking, map_node, progress=progress)
             tracking = replace(tracking, graph=_with_honest_constraints(tracking.graph, config.graph))
-        tracking = _doubtful_if_far(tracking, _loops(source, config).agreement_path_m)
+        tracking = _doubtful_unless_confirmed(tracking, _loops(source, config).agreement_path_m)
         writer.update(solve=solved.report)
         with writer.clock.stage("write"):
             _write(writer, source, known, tracking)
@@ -131,11 +131,13 @@ def _loops(source: Log, config: BuildConfig) -> PlaceLoopsConfig | ScanLoopsConf
 def _refuse_unfit(source: Log, known: KnownMap, config: BuildConfig) -> None:
     if source.sensor != known.sensor:
         raise ConfigError(
-            f"{source.path}: a log of kind {source.sensor}, but {known.path} was made by {known.sensor}; "
-            "a log is localised by what the map's places were seen by"
+            f"{source.path}: is of sensor {source.sensor}, and the places of {known.path} were seen by "
+            f"{known.sensor}; want a log of the map's sensor"
         )
-    if config.odometry != known.config.odometry:
-        raise ConfigError(f"odometry: fixed by {known.path}; its places were observed with these settings")
+    if detector_of(config) != detector_of(known.config):
+        raise ConfigError(
+            f"odometry.detector: fixed by {known.path}; its places have the features of that detector"
+        )
     if config.graph.solve != "batch":
         raise ConfigError(f"graph.solve={config.graph.solve}: cannot join a log to a map; want batch")
 
@@ -206,29 +208,36 @@ def _with_honest_constraints(graph: PoseGraph, config: GraphConfig) -> PoseGraph
     return PoseGraph(optimize(graph, exact).T_world_node, graph.stamps_ns, graph.factors)
 
 
-def _doubtful_if_far(tracking: TrackingResult, agreement_path_m: float) -> TrackingResult:
+def _doubtful_unless_confirmed(tracking: TrackingResult, agreement_path_m: float) -> TrackingResult:
     """Return the result with the frames doubtful whose pose no constraint nearby confirms.
 
     Between two constraints that the odometry agrees with, it has neither drifted far nor jumped. Before the
-    first and after the last of a part of the path nothing tells, and where the map contradicted a constraint
-    the part around it may be the wrong one.
+    first and after the last of a part of the path nothing tells, least of all where the map was searched in
+    vain.
     """
     graph, doubts = tracking.graph, dict[int, str]()
     held = {loop.j for loop in tracking.loops if loop.verdict == "accepted"}
-    contradicting = {loop.j for loop in tracking.loops if loop.reason.startswith("solver")} - held
+    failed = {loop.j for loop in tracking.loops} - held
     odometry = [factor for factor in graph.factors if factor.origin != "loop"]
     for nodes in components(PoseGraph(graph.T_world_node, graph.stamps_ns, odometry)):
+        if held.isdisjoint(nodes):
+            continue
         in_order = sorted(nodes)
         positions = np.array([graph.T_world_node[node][:3, 3] for node in in_order])
         path_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
-        known_m = path_m[[node in held for node in in_order]]
+        known = sorted(held.intersection(nodes))
+        known_m = path_m[np.searchsorted(in_order, known)]
+        begin = max((node for node in failed.intersection(nodes) if node < known[0]), default=-1)
+        end = min((node for node in failed.intersection(nodes) if node > known[-1]), default=in_order[-1] + 1)
         for node, at_m in zip(in_order, path_m.tolist(), strict=True):
-            before, after = known_m[known_m <= at_m], known_m[known_m >= at_m]
-            limit_m = agreement_path_m * (_FAR if len(before) and len(after) else _FAR_BEYOND)
-            if np.abs(known_m - at_m).min(initial=np.inf) > limit_m:
+            is_between = known[0] <= node <= known[-1]
+            limit_m = agreement_path_m * (_FAR if is_between else _FAR_BEYOND)
+            if not begin < node < end:
+                doubts[node] = "the map was searched in vain here, at the end of what was recognised"
+            elif np.abs(known_m - at_m).min() > limit_m:
                 doubts[node] = f"more than {limit_m:g} m of path from the nearest place that was recognised"
-            elif node in contradicting:
-                doubts[node] = "the place that was recognised here contradicts the others"
+    contradicting = {loop.j for loop in tracking.loops if loop.reason.startswith("solver")} - held
+    doubts |= dict.fromkeys(contradicting, "the place that was recognised here contradicts the others")
     tracks = tuple(
         replace(track, doubts=(*track.doubts, doubts[track.node])) if track.node in doubts else track
         for track in tracking.tracks
@@ -267,16 +276,14 @@ def _write(writer: RunWriter, source: Log, known: KnownMap, tracking: TrackingRe
     results = RunResults(stored.trajectory, stored.graph, stored.records, held, stored.frame_ms, None, poses)
     warnings = localisation_warnings(results, writer.manifest)
     writer.update(warnings=tuple(warnings), verdict=verdict_of(warnings))
-    grid = read_grid(known.path / f"{files.SLICE}.yaml")
-    write_summary(
+    write_localised(
         folder / files.SUMMARY,
-        grid=grid,
-        trajectory=stored.trajectory,
-        truth=None,
-        loops_world=np.array([[stored.graph.T_world_node[loop.j][:3, 3]] * 2 for loop in held]),
-        title=f"{source.path.name} in {known.path.name}",
-        lines=[counts.frames_text, f"recognised in {len(held)} keyframes"],
+        grid=read_grid(known.path / f"{files.SLICE}.yaml"),
         poses=poses,
+        begins_ns=[record.stamp_ns for record in stored.records if record.node is None],
+        recognised_world=np.array([stored.graph.T_world_node[loop.j][:3, 3] for loop in held]),
+        title=f"{source.path.name} in {known.path.name}",
+        lines=[counts.frames_text],
     )
     seconds = {stage: round(value, 3) for stage, value in writer.clock.seconds.items()}
     total_s = sum(seconds.values())

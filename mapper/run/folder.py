@@ -26,6 +26,7 @@ from mapper.run.manifest import (
     Manifest,
     RunWarning,
     Timing,
+    is_localised_log,
     is_merged_map,
     library_versions,
     now_text,
@@ -132,6 +133,10 @@ def load_run(path: Path) -> Run:
         raise RunError(
             f"{path}: is a merged map, not a run; its {files.OCTREE_BT}, {files.OCTREE_OT} and slice "
             "are in it"
+        )
+    if is_localised_log(path):
+        raise RunError(
+            f"{path}: is a localised log, not a run; the map that it lies in is told in its manifest"
         )
     manifest = read_manifest(path / files.MANIFEST)
     if manifest.status != "complete":

@@ -298,3 +298,11 @@ def is_merged_map(folder: Path) -> bool:
         return '"kind": "merged map"' in (folder / MANIFEST_NAME).read_text(encoding="utf-8")[:200]
     except (OSError, UnicodeDecodeError):
         return False
+
+
+def is_localised_log(folder: Path) -> bool:
+    """Return whether a folder holds a log that was localised in a map, not a run."""
+    try:
+        return '"kind": "localised log"' in (folder / MANIFEST_NAME).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return False
