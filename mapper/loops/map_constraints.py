@@ -25,7 +25,7 @@ from mapper.odometry.base import FrameResult
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class KnownPlaces:
+class KnownPlaces(Generic[Place]):
     """Places of a finished map, at poses that are not changed.
 
     Attributes:
@@ -33,7 +33,7 @@ class KnownPlaces:
         T_map_node: (4, 4) poses of these nodes.
     """
 
-    places: Mapping[int, AnyPlace]
+    places: Mapping[int, Place]
     T_map_node: Mapping[int, Transform]
 
     @property
@@ -49,7 +49,7 @@ _MAX_FAILED = 2
 class _InMap:
     """Poses of the known places beside the estimates of the new nodes; see ``NodePoses``."""
 
-    def __init__(self, known: KnownPlaces, estimator: OnlinePoseEstimator) -> None:
+    def __init__(self, known: KnownPlaces[Any], estimator: OnlinePoseEstimator) -> None:
         self._known = known
         self._estimator = estimator
 
@@ -74,7 +74,7 @@ class MapConstraintDetector(Generic[Place]):
     def __init__(
         self,
         config: PlaceLoopsConfig | ScanLoopsConfig,
-        known: KnownPlaces,
+        known: KnownPlaces[Place],
         verifier: Verifier[Place],
         similar: Proposer[Place],
         nearby_for: Callable[[NodePoses], PoseProposer[Place]],
@@ -182,7 +182,7 @@ class MapConstraintDetector(Generic[Place]):
 
 
 def build_map_constraint_detector(
-    config: PlaceLoopsConfig | ScanLoopsConfig, known: KnownPlaces
+    config: PlaceLoopsConfig | ScanLoopsConfig, known: KnownPlaces[Any]
 ) -> MapConstraintDetector[Any]:
     """Return the detector that compares a new log with a map.
 

@@ -4,11 +4,12 @@ import io
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.errors import RunError
-from mapper.core.geometry import Array
 from mapper.features.frame_view import ImageView
 from mapper.loops.scan_context_proposer import ScanPlace
 from mapper.runtime.checked_file import CheckedFormat
@@ -57,7 +58,7 @@ def read_places(path: Path) -> dict[int, AnyPlace]:
         raise RunError(f"{path}: no file of places: {error}") from None
 
 
-def _of_images(places: Mapping[int, ImageView]) -> dict[str, Array]:
+def _of_images(places: Mapping[int, ImageView]) -> dict[str, NDArray[Any]]:
     views = list(places.values())
     return {
         "count": np.array([len(view) for view in views], np.int64),
@@ -70,7 +71,7 @@ def _of_images(places: Mapping[int, ImageView]) -> dict[str, Array]:
     }
 
 
-def _images(table: Mapping[str, Array]) -> list[ImageView]:
+def _images(table: Mapping[str, NDArray[Any]]) -> list[ImageView]:
     ends = np.cumsum(table["count"]).tolist()
     views = []
     for k, (begin, end) in enumerate(zip([0, *ends], ends, strict=False)):
@@ -92,7 +93,7 @@ def _images(table: Mapping[str, Array]) -> list[ImageView]:
     return views
 
 
-def _of_scans(places: Mapping[int, ScanPlace]) -> dict[str, Array]:
+def _of_scans(places: Mapping[int, ScanPlace]) -> dict[str, NDArray[Any]]:
     scans = list(places.values())
     return {
         "count": np.array([len(scan.points_body) for scan in scans], np.int64),
@@ -101,7 +102,7 @@ def _of_scans(places: Mapping[int, ScanPlace]) -> dict[str, Array]:
     }
 
 
-def _scans(table: Mapping[str, Array]) -> list[ScanPlace]:
+def _scans(table: Mapping[str, NDArray[Any]]) -> list[ScanPlace]:
     ends = np.cumsum(table["count"]).tolist()
     return [
         ScanPlace(int(stamp_ns), table["points_body"][begin:end], T_level_body)

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,7 @@ class KnownMap:
 
     path: Path
     config: BuildConfig
-    places: KnownPlaces
+    places: KnownPlaces[Any]
 
     @property
     def sensor(self) -> str:

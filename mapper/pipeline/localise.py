@@ -112,7 +112,9 @@ def localise(
         writer.update(solve=solved.report)
         with writer.clock.stage("write"):
             _write(writer, source, known, tracking)
-        return writer.manifest  # type: ignore[return-value]
+    finished = writer.manifest
+    assert isinstance(finished, LocalisedManifest)  # as it began
+    return finished
 
 
 def _loops(source: Log, config: BuildConfig) -> PlaceLoopsConfig | ScanLoopsConfig:
@@ -261,7 +263,7 @@ def _write(writer: RunWriter, source: Log, known: KnownMap, tracking: TrackingRe
         update={
             "listed": len(outcomes),
             "read": len(outcomes) - outcomes.count("skipped"),
-            **{name: outcomes.count(name) for name in ("skipped", "lost", "doubtful", "tracked")},  # type: ignore[arg-type]
+            **{name: outcomes.count(name) for name in ("skipped", "lost", "doubtful", "tracked")},
             "nodes": len(stored.graph.T_world_node) - 1,
             "factors": len(stored.graph.factors),
             "loops": len(held),

@@ -75,3 +75,15 @@ def test_where_nothing_leads_nothing_is_said():
     far = transform(np.eye(3), [9.0, 0.0, 0.0])
     assert innovations(steps, [factor(0, 6, far, "loop"), factor(0, 9, far, "loop")]).tolist() == [0.0, 0.0]
     assert innovations([], [factor(0, 1, far, "loop")]).tolist() == [0.0]
+
+
+def test_a_node_without_known_factors_is_reached_by_its_loops():
+    """As the frame of a map, to which constraints alone lead: a false one is far from what the others say."""
+    rng = np.random.default_rng(3)
+    truth, steps = chain(20, rng)
+    far = transform(np.eye(3), np.array([4.0, -3.0, 1.0]))
+    loops = [factor(99, k, far @ noisy([np.eye(4), *truth], 0, k + 1, rng), "loop") for k in range(0, 20, 2)]
+    loops[4] = factor(99, 8, far @ truth[8] @ exp(np.zeros(3), np.array([2.0, 0.0, 0.0])), "loop")
+    apart = innovations(steps, loops)
+    assert apart[4] > 10.0 * np.median(apart)
+    assert np.delete(apart, 4).max() < 30.0
