@@ -84,11 +84,12 @@ def plan(
     )
     config = overridden(PlanConfig(), assignments({"radius_m": radius, "unknown": unknown, "layer": layer}))
     built = open_map(run) if is_merged_map(run) else load_run(run)
-    of_run = isinstance(built, Run)
-    grid = stored_grid(built, config.layer) if of_run else read_grid(run / f"{config.layer}.yaml")
+    if isinstance(built, Run):
+        grid, octree_path = stored_grid(built, config.layer), built.file(files.OCTREE_OT)
+    else:
+        grid, octree_path = read_grid(run / f"{config.layer}.yaml"), run / files.OCTREE_OT
     if in_3d:
-        octree = read_map(built.file(files.OCTREE_OT) if of_run else run / files.OCTREE_OT)
-        found = plan_3d(octree, start, goal, config=config)
+        found = plan_3d(read_map(octree_path), start, goal, config=config)
     else:
         found = plan_2d(grid, start, goal, config=config)
     if isinstance(built, Run):

@@ -129,7 +129,7 @@ def synth(
         given = (
             common
             | {"path": path, "rooms": rooms}
-            | (MOVING_INDOORS if moving else {})
+            | (dict(MOVING_INDOORS) if moving else {})
             | _at_wall(plane_at)
             | _camera_noise(noise)
         )

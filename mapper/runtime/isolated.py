@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO, TypeVar
+from typing import Any, BinaryIO, TypeVar, cast
 
 from mapper.core.errors import DataError
 
@@ -46,8 +46,7 @@ def call_isolated(job: Callable[[], R], *, memory_bytes: int) -> R:
     _idle.append(child)
     if error is not None:
         raise error
-    answer: R = result
-    return answer
+    return cast("R", result)
 
 
 class _Child:
@@ -107,6 +106,7 @@ def _serve(jobs: BinaryIO, answers: BinaryIO) -> None:
             job, memory_bytes = pickle.load(jobs)
         except EOFError:  # the parent ended
             return
+        answer: tuple[Any, Exception | None]
         try:
             with _memory_limited(memory_bytes):
                 answer = job(), None

@@ -72,11 +72,11 @@ class BodyConfig(Config):
     """
 
     box: tuple[float, float, float, float, float, float] | None = None
-    """Least x y z, then largest x y z, metres, body frame: returns inside are the vehicle's, or its driver's."""
+    """Least x y z, then largest x y z, metres, body frame: returns inside are the vehicle's or driver's."""
     min_range_m: NonNegativeFloat = 0.0
     """Nearer returns are left out."""
     max_range_m: PositiveFloat | None = None
-    """Farther returns are left out, and free no space either; see ``octree.max_range_m`` for those that do."""
+    """Farther returns are left out, and free no space either: see ``octree.max_range_m`` for that."""
 
     @property
     def clears(self) -> bool:
