@@ -12,9 +12,10 @@ from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, RunError
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
+from mapper.export.cloud_picture import write_cloud_views
 from mapper.export.grid import write_grid
 from mapper.export.mcap_log import McapLog
-from mapper.export.picture import write_cloud_views, write_summary
+from mapper.export.picture import write_summary
 from mapper.export.ply import write_ply
 from mapper.export.run_mcap import log_maps, log_results, log_snapshot
 from mapper.graph.model import PoseGraph

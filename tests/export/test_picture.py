@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from mapper.core.trajectory import Trajectory
+from mapper.export.cloud_picture import splat, write_cloud_views
 from mapper.export.palette import DOUBTFUL, ESTIMATE, FACTORS, TRUTH
 from mapper.export.path_band import band_image, stretches
-from mapper.export.picture import splat, write_cloud_views, write_summary
+from mapper.export.picture import write_summary
 from mapper.mapping.cloud import height_colors
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.run.pose_covariances import UncertainPoses
