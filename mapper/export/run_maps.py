@@ -1,6 +1,7 @@
 """A finished run's maps and pictures, read back from its files."""
 
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from mapper.export.grid import stored_grid
 from mapper.export.run_mcap import BODY, CAMERA
 from mapper.mapping.fusion import Maps, Snapshot
 from mapper.octree.octomap_file import read_map
+from mapper.octree.slice import OccupancyGrid
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.sources.cloud_files.ply import read_ply
@@ -35,7 +37,15 @@ def maps_of(run: Run) -> Maps:
         cloud_colors=np.column_stack([cloud[channel] for channel in ("red", "green", "blue")]),
         grid=stored_grid(run, files.SLICE),
         traversable=stored_grid(run, files.TRAVERSABLE),
+        storeys=tuple(_storeys(run)),
     )
+
+
+def _storeys(run: Run) -> Iterator[OccupancyGrid]:
+    for stem in map(files.storey, count()):
+        if not (run.path / f"{stem}.yaml").exists():
+            return
+        yield stored_grid(run, stem)
 
 
 def snapshots_of(run: Run) -> Iterator[Snapshot]:

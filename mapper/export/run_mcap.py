@@ -67,6 +67,8 @@ def log_maps(log: McapLog, maps: Maps, *, stamp_ns: int) -> None:
     log.cloud(stamp_ns, maps.cloud_points_world, colors=maps.cloud_colors, name="cloud")
     log.grid(stamp_ns, maps.grid)
     log.grid(stamp_ns, maps.traversable, name="traversable")
+    for number, storey in enumerate(maps.storeys):
+        log.grid(stamp_ns, storey, name=f"traversable_{number}")
 
 
 def _loop_fields(loop: LoopClosure) -> dict[str, int | float | str]:

@@ -15,6 +15,7 @@ from mapper.core.voxel_grid import thin
 from mapper.mapping.cloud import CloudBuilder, Colors, height_colors
 from mapper.mapping.config import FuseSettings, McapConfig
 from mapper.mapping.thumbnails import encode_jpeg, shrunk_camera
+from mapper.navigation.floor import driven_ground, reachable_floor
 from mapper.navigation.traversable import traversable
 from mapper.octree.casting import Caster, depth_limit_of, reach_m
 from mapper.octree.config import OctreeConfig
@@ -68,7 +69,9 @@ class Maps:
         cloud_points_world: (N, 3) float32 metres, levelled world, all in occupied voxels of the octree.
         cloud_colors: (N, 3) uint8 RGB.
         grid: The slice through the octree above the floor.
-        traversable: The floor that a robot can drive on.
+        traversable: The floor that a robot can drive on, of the storey on which the path begins.
+        storeys: The same of every storey, the lowest first, where floors lie over each other.
+        has_path: Whether the path tells the height of the floor.
     """
 
     octree: OctreeMap
@@ -76,6 +79,8 @@ class Maps:
     cloud_colors: Colors
     grid: OccupancyGrid
     traversable: OccupancyGrid
+    storeys: tuple[OccupancyGrid, ...] = ()
+    has_path: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,8 +177,13 @@ def fuse_log(
         )
     if before is not None:
         progress.note(f"fused again: {moved} of {len(trajectory)} frames, which had moved or were not known")
-    grid, floor = cut_slice(octree, config.slice), traversable(octree, config.traversable)
-    return Maps(octree, *_in_occupied_voxels(octree, *cloud.points_and_colors()), grid, floor)
+    floor = reachable_floor(octree, config.traversable, positions_world=trajectory.positions_world)
+    grid = cut_slice(octree, config.slice, driven=driven_ground(floor))
+    storeys = traversable(floor, config.traversable)
+    home = next(storey.grid for storey in storeys if storey.is_home)
+    several = tuple(storey.grid for storey in storeys) if len(storeys) > 1 else ()
+    points = _in_occupied_voxels(octree, *cloud.points_and_colors())
+    return Maps(octree, *points, grid, home, several, has_path=len(floor.path) > 0)
 
 
 class _Casters(threading.local):

@@ -17,13 +17,14 @@ from mapper.merging.merged_map import TILES
 from mapper.merging.tiling import Tiling
 from mapper.octree.attributes import UNSET
 from mapper.octree.color_tree import colored
+from mapper.octree.columns import block_extent
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.ground_height import GroundHeights, lowest_occupied
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import read_map
 from mapper.octree.resampling import blocks_reached, resampled
-from mapper.octree.slice import block_extent, see_band
+from mapper.octree.slice import see_band
 from mapper.octree.summing import Overlap
 from mapper.octree.tree import children_in, nodes_in_preorder, words_in_preorder
 from mapper.runtime.atomic import atomic_file, write_bytes
@@ -205,11 +206,11 @@ def slice_column(
         floor_z_m: Height of the floor in the map.
     """
     first, shape = workspace.window(tiles[0])
-    followed = None if ground is None else load_ground(ground)
+    ground_m = None if ground is None else load_ground(ground).under(first=first, shape=shape)
     seen, known = np.zeros(shape, np.uint8), np.zeros(shape, np.bool_)
     for tile in tiles:
         octree = read_map(workspace.tile(tile))
-        seen |= see_band(octree, config, first=first, shape=shape, ground=followed, floor_z_m=floor_z_m)
+        seen |= see_band(octree, config, first=first, shape=shape, ground_m=ground_m, floor_z_m=floor_z_m)
         x, y = (octree.leaves().keys[:, :2] - first).T
         known[y, x] = True
     _save(workspace.piece(tiles[0], "band"), seen)

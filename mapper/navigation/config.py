@@ -20,6 +20,8 @@ class TraversableConfig(Config):
     """A floor with something occupied less than this above it is an obstacle: the robot's height."""
     robot_radius_m: NonNegativeFloat = 0.0
     """Floor nearer than this to an obstacle is not traversable; 0 leaves that to the planner."""
+    footprint_m: NonNegativeFloat = 0.3
+    """Half the width of what carried the sensor: the floor that it swept is free where nothing was seen."""
     max_gap_m: NonNegativeFloat = 0.1
     """Unknown gaps in the floor up to this wide, as rays along the floor leave them, are closed."""
 

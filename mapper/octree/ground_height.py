@@ -4,11 +4,13 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Protocol
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array
+from mapper.octree.columns import NOWHERE
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, gather
 from mapper.octree.map import OctreeMap
 
@@ -17,6 +19,7 @@ _MAX_SLOPE = 0.3
 _LOW_PERCENT = 20.0  # below it are reflections
 _START_M = 0.5
 _MIN_COLUMNS = 4
+_BESIDE_M = 1.0
 NOTHING = np.iinfo(np.int32).max
 """Value of ``lowest_occupied`` for a column without an occupied voxel."""
 
@@ -65,24 +68,64 @@ def _between(values: Array, positions: Array) -> Array:
     return found
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class DrivenGround:
+    """Floor that is connected to the ground under a path.
+
+    Attributes:
+        heights: (H, W) int32 heights of the lowest such floor in voxels above z = 0; NOWHERE where there is
+            none. The columns are those of all blocks of the map.
+        swept: (H, W) mask of what the footprint passed over.
+    """
+
+    heights: NDArray[np.int32]
+    swept: NDArray[np.bool_]
+
+
 def ground_heights(
-    octree: OctreeMap, *, first: NDArray[np.int64], shape: tuple[int, int], floor_z_m: float
+    octree: OctreeMap,
+    *,
+    first: NDArray[np.int64],
+    shape: tuple[int, int],
+    floor_z_m: float,
+    driven: DrivenGround | None = None,
 ) -> Array:
     """Return the (H, W) height of the ground in the world, metres, under each column of a grid.
 
-    In each cell of a few metres the ground is a low percentile of the lowest occupied voxels. It is followed
-    from the floor outwards, no steeper than a street: at a larger step (a roof, a wall) the height of the
-    neighbour is kept.
+    Where floor is connected to the path, it is the ground, and within a metre of it the nearest of it is.
+    Farther away, in each cell of a few metres, the ground is a low percentile of the lowest occupied voxels.
+    It is followed from the floor outwards, no steeper than a street: at a larger step (a roof, a wall, a
+    lower yard) the height of the neighbour is kept.
 
     Args:
         octree: The map in a world with z up.
         first: (2,) x and y keys of the column of row 0 and column 0.
         shape: H, W.
-        floor_z_m: Height of the floor near x = y = 0, from which the ground is followed.
+        floor_z_m: Height of the floor near x = y = 0, from which the ground is followed if no driven ground
+            is known.
+        driven: Floor that was driven on, in the same columns.
     """
-    lowest = lowest_occupied(octree, first=first, shape=shape)
-    ground = ground_from_lowest(lowest, first=first, resolution_m=octree.resolution_m, floor_z_m=floor_z_m)
-    return ground.under(first=first, shape=shape)
+    lowest, cell_m = lowest_occupied(octree, first=first, shape=shape), octree.resolution_m
+    known = None if driven is None or not (driven.heights > NOWHERE).any() else driven.heights
+    ground = ground_from_lowest(lowest, first=first, resolution_m=cell_m, floor_z_m=floor_z_m, floor=known)
+    heights_m = ground.under(first=first, shape=shape)
+    if known is not None:
+        level, distances = nearest_heights(known)
+        beside = distances * cell_m <= _BESIDE_M
+        heights_m[beside] = level[beside] * cell_m
+    return heights_m
+
+
+def nearest_heights(heights: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Return the (H, W) height of the nearest column that has one, and its distance in columns."""
+    missing = heights == NOWHERE
+    distances, labels = cv2.distanceTransformWithLabels(
+        missing.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    height_of = np.empty(int(labels.max()) + 1, np.int32)
+    height_of[labels[~missing]] = heights[~missing]
+    level: NDArray[np.int32] = height_of[labels]
+    return level, np.asarray(distances, np.float32)
 
 
 def lowest_occupied(
@@ -100,13 +143,30 @@ def lowest_occupied(
 
 
 def ground_from_lowest(
-    lowest: Rows, *, first: NDArray[np.int64], resolution_m: float, floor_z_m: float
+    lowest: Rows,
+    *,
+    first: NDArray[np.int64],
+    resolution_m: float,
+    floor_z_m: float,
+    floor: NDArray[np.int32] | None = None,
 ) -> GroundHeights:
-    """Return the ground from the result of ``lowest_occupied``; see ``ground_heights``."""
+    """Return the ground in cells from the result of ``lowest_occupied``; see ``ground_heights``.
+
+    ``floor`` are the (H, W) heights of floor that is known, in voxels.
+    """
     columns = max(1, round(_CELL_M / resolution_m))
-    low_m = _cells(lowest, columns) * resolution_m
-    origin = (KEY_ZERO - first[::-1]) // columns
-    heights_m = _followed(low_m, origin, floor_z_m, max_step_m=_MAX_SLOPE * columns * resolution_m)
+    low_m = _cells(lowest, columns, _LOW_PERCENT, NOTHING) * resolution_m
+    if floor is not None:
+        heights_m = _cells(floor, columns, 50.0, NOWHERE) * resolution_m
+    else:
+        heights_m = np.full(low_m.shape, np.nan)
+        floors = np.argwhere(np.abs(low_m - floor_z_m) <= _START_M)
+        if not len(floors):
+            return GroundHeights(np.full(low_m.shape, floor_z_m), first, columns)
+        origin = (KEY_ZERO - first[::-1]) // columns
+        start = tuple(floors[np.argmin(((floors - origin) ** 2).sum(axis=1))].tolist())
+        heights_m[start] = low_m[start]
+    _follow(low_m, heights_m, max_step_m=_MAX_SLOPE * columns * resolution_m)
     return GroundHeights(heights_m, first, columns)
 
 
@@ -123,29 +183,23 @@ def _lowest_occupied(codes, slots, values, threshold, first, lowest):
                     lowest[row, column] = min(lowest[row, column], top)
 
 
-def _cells(lowest: Rows, columns: int) -> Array:
-    """Return a low percentile of the lowest voxels in squares of so many columns; NaN where they are few."""
-    rows_of, columns_of = (-(-size // columns) for size in lowest.shape)
+def _cells(tops: Rows, columns: int, percent: float, nothing: int) -> Array:
+    """Return a percentile of the heights in squares of so many columns; NaN where they are few."""
+    rows_of, columns_of = (-(-size // columns) for size in tops.shape)
     cells = np.full((rows_of, columns_of), np.nan)
     for row in range(rows_of):
-        band = lowest[row * columns : (row + 1) * columns]
+        band = tops[row * columns : (row + 1) * columns]
         for column in range(columns_of):
-            tops = band[:, column * columns : (column + 1) * columns]
-            tops = tops[tops != NOTHING]
-            if len(tops) >= _MIN_COLUMNS:
-                cells[row, column] = np.percentile(tops, _LOW_PERCENT)
+            found = band[:, column * columns : (column + 1) * columns]
+            found = found[found != nothing]
+            if len(found) >= _MIN_COLUMNS:
+                cells[row, column] = np.percentile(found, percent)
     return cells
 
 
-def _followed(low_m: Array, origin: NDArray[np.int64], floor_z_m: float, *, max_step_m: float) -> Array:
-    """Return the ground in every cell, breadth first from the cell nearest to the origin with the floor."""
-    heights_m = np.full(low_m.shape, np.nan)
-    floors = np.argwhere(np.abs(low_m - floor_z_m) <= _START_M)
-    if not len(floors):
-        return np.full(low_m.shape, floor_z_m)
-    start = tuple(floors[np.argmin(((floors - origin) ** 2).sum(axis=1))].tolist())
-    heights_m[start] = low_m[start]
-    queue = deque([start])
+def _follow(low_m: Array, heights_m: Array, *, max_step_m: float) -> None:
+    """Write the ground in every cell, breadth first from those whose height is known."""
+    queue = deque(map(tuple, np.argwhere(~np.isnan(heights_m)).tolist()))
     while queue:
         row, column = queue.popleft()
         here_m = heights_m[row, column]
@@ -155,4 +209,3 @@ def _followed(low_m: Array, origin: NDArray[np.int64], floor_z_m: float, *, max_
             if np.isnan(heights_m[beside]):
                 heights_m[beside] = low_m[beside] if abs(low_m[beside] - here_m) <= max_step_m else here_m
                 queue.append(beside)
-    return heights_m

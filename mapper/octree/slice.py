@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array
+from mapper.octree.columns import block_extent
 from mapper.octree.config import SliceConfig
-from mapper.octree.ground_height import GroundHeights, ground_from_lowest, lowest_occupied
+from mapper.octree.ground_height import DrivenGround, ground_heights
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap
 
@@ -61,38 +62,36 @@ def shrunk(grid: OccupancyGrid, most_cells: int) -> OccupancyGrid:
     return OccupancyGrid(cells, grid.origin_world_m, factor * grid.resolution_m)
 
 
-def cut_slice(octree: OctreeMap, config: SliceConfig, *, floor_z_m: float = 0.0) -> OccupancyGrid:
+def cut_slice(
+    octree: OctreeMap, config: SliceConfig, *, floor_z_m: float = 0.0, driven: DrivenGround | None = None
+) -> OccupancyGrid:
     """Return the band between two heights above the floor as a grid just large enough for it.
 
     A voxel belongs to the band if its centre does. A cell is occupied if any voxel of its column is, else
-    free if any is, else unknown. In too small a group of occupied cells, occupied voxels do not count.
+    free if any is, else unknown. In too small a group of occupied cells, occupied voxels do not count. Where
+    what carried the sensor passed, the cell is free: obstacles lower than the sensor are left out of that.
 
     Args:
         octree: The map in a world with z up.
         config: Heights and the smallest group.
         floor_z_m: Height of the floor in the world.
+        driven: The ground that was driven on, of the same map; None if none is known.
 
     Raises:
         DataError: The band has no voxels, or none that is known.
     """
     first, last = block_extent(octree)
     shape = int(last[1] - first[1]), int(last[0] - first[0])
-    ground = None
+    ground_m = None
     if config.above == "ground":
-        lowest = lowest_occupied(octree, first=first, shape=shape)
-        ground = ground_from_lowest(
-            lowest, first=first, resolution_m=octree.resolution_m, floor_z_m=floor_z_m
-        )
-    seen = see_band(octree, config, first=first, shape=shape, ground=ground, floor_z_m=floor_z_m)
+        ground_m = ground_heights(octree, first=first, shape=shape, floor_z_m=floor_z_m, driven=driven)
+    seen = see_band(octree, config, first=first, shape=shape, ground_m=ground_m, floor_z_m=floor_z_m)
+    if driven is not None:
+        swept = driven.swept
+        if ground_m is None:  # a level band shows one storey
+            swept = swept & (np.abs(driven.heights * octree.resolution_m - floor_z_m) <= config.min_height_m)
+        seen[swept] = _SEEN_FREE
     return grid_of(seen, config, first=first, resolution_m=octree.resolution_m, floor_z_m=floor_z_m)
-
-
-def block_extent(octree: OctreeMap) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the (2,) x and y keys of the first column of any block, and those after the last column."""
-    keys = block_keys(octree.blocks.codes)[:, :2]
-    if not len(keys):
-        return np.full(2, KEY_ZERO), np.full(2, KEY_ZERO)
-    return keys.min(axis=0), keys.max(axis=0) + (1 << BLOCK_BITS)
 
 
 def see_band(
@@ -101,7 +100,7 @@ def see_band(
     *,
     first: NDArray[np.int64],
     shape: tuple[int, int],
-    ground: GroundHeights | None,
+    ground_m: Array | None,
     floor_z_m: float,
 ) -> NDArray[np.uint8]:
     """Return (H, W) uint8 flags of the states of the band's voxels in each column; ``or`` joins several maps.
@@ -111,7 +110,7 @@ def see_band(
         config: Heights.
         first: (2,) x and y keys of the column of row 0 and column 0.
         shape: H, W.
-        ground: Ground that the band follows; None if it is level.
+        ground_m: (H, W) height of the ground that the band follows; None if it is level.
         floor_z_m: Height of the floor in the world.
 
     Raises:
@@ -121,13 +120,12 @@ def see_band(
     slots = octree.blocks.sorted_slots()
     codes = octree.blocks.codes[slots]
     bases = np.zeros(shape, dtype=np.int64)
-    if ground is None:
+    if ground_m is None:
         z = block_keys(codes)[:, 2]
         inside = (z + (1 << BLOCK_BITS) > lowest) & (z <= highest)
         codes, slots = codes[inside], slots[inside]
     else:
-        heights_m = ground.under(first=first, shape=shape) - floor_z_m
-        bases += np.rint(heights_m / octree.resolution_m).astype(np.int64)
+        bases += np.rint((ground_m - floor_z_m) / octree.resolution_m).astype(np.int64)
     seen = np.zeros(shape, dtype=np.uint8)
     values, threshold = octree.blocks.table.values, octree.occupied_log_odds
     _flatten(codes, slots, values, threshold, first, lowest, highest, bases, seen)

@@ -40,6 +40,7 @@ from mapper.run.manifest import DepthReach, Solve, Status, Timing
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.results import RunResults, load_results
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
+from mapper.run.warnings import FLOOR, floor_warnings
 from mapper.runtime.progress import SILENT, Progress
 from mapper.runtime.timing import peak_memory_mb
 from mapper.sensing.depth_limit import DepthLimit
@@ -200,6 +201,9 @@ def fuse_into(
             log_maps(log, maps, stamp_ns=int(trajectory.stamps_ns[0]))
             _write_maps(writer.folder, maps)
             _write_pictures(writer, maps, results)
+    others = [warning for warning in writer.manifest.warnings if warning.kind != FLOOR]
+    found = floor_warnings(config.traversable, config.octree.resolution_m, has_path=maps.has_path)
+    writer.update(warnings=(*others, *found))
     judge(writer, source, config, results, progress=progress)
     counts = writer.manifest.counts.model_copy(
         update={"leaves": len(maps.octree), "cloud_points": len(maps.cloud_points_world)}
@@ -236,6 +240,8 @@ def _write_maps(folder: Path, maps: Maps) -> None:
     write_ply(folder / files.CLOUD, maps.cloud_points_world, maps.cloud_colors)
     write_grid(folder, files.SLICE, maps.grid)
     write_grid(folder, files.TRAVERSABLE, maps.traversable)
+    for number, storey in enumerate(maps.storeys[: files.MOST_STOREYS]):
+        write_grid(folder, files.storey(number), storey)
 
 
 def _write_pictures(writer: RunWriter, maps: Maps, results: RunResults) -> None:

@@ -85,7 +85,12 @@ RUN_FILES = (
         "maps",
     ),
     RunFiles(_grid(SLICE), "the 2D map for ROS map_server and nav2, and a picture of it", "maps"),
-    RunFiles(_grid(TRAVERSABLE), "the floor that a robot can drive on, in the same form", "maps"),
+    RunFiles(
+        _grid(TRAVERSABLE),
+        "the floor that a robot can drive on, in the same form; where floors lie over each other, that on "
+        "which the log begins, and `traversable_0.pgm` and so on, from below, for each",
+        "maps",
+    ),
     RunFiles((CLOUD, CLOUD_VIEWS), "the coloured cloud, and two views of it", "maps"),
     RunFiles((MCAP,), "all of it over time, for Foxglove and Rerun", "maps"),
     RunFiles((RERUN,), "the same arranged in Rerun, once `mapper view` was asked", "exported maps"),
@@ -121,16 +126,29 @@ RUN_FILES = (
 )
 
 
+MOST_STOREYS = 32
+
+
+def storey(number: int) -> str:
+    """Return the stem of the traversable floor of a storey; the lowest is 0."""
+    return f"{TRAVERSABLE}_{number}"
+
+
+_STOREY_FILES = frozenset(name for number in range(MOST_STOREYS) for name in _grid(storey(number)))
+
 RUN = FolderKind(
     "a run folder",
     manifest_keys=frozenset({"status", "mapper_version", "input"}),
-    files=frozenset({name for files in RUN_FILES for name in files.names} | {FORMER_SCAN_UPDATES}),
+    files=frozenset(name for files in RUN_FILES for name in files.names)
+    | _STOREY_FILES
+    | {FORMER_SCAN_UPDATES},
 )
 
 
 def names_of(*depends_on: str) -> frozenset[str]:
     """Return the names of all files that depend on any of these."""
-    return frozenset(name for files in RUN_FILES if files.depends_on in depends_on for name in files.names)
+    names = frozenset(name for files in RUN_FILES if files.depends_on in depends_on for name in files.names)
+    return names | _STOREY_FILES if "maps" in depends_on else names
 
 
 _REMEDIES = {

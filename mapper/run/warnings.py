@@ -13,12 +13,14 @@ from mapper.core.geometry import inverse, log
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.graph.marginals import marginals_of
 from mapper.graph.model import PoseGraph
+from mapper.navigation.config import TraversableConfig
 from mapper.run.frame_outcomes import DISCONNECTED, FrameRecord
 from mapper.run.manifest import Manifest, RunWarning, Weight
 from mapper.run.results import RunResults
 
-INPUT_KINDS = frozenset({"log", "depth", "frozen", "far returns", "conflict"})
-"""Kinds that are found while the log is read; a finished run has them in its manifest alone."""
+FLOOR = "floor"
+INPUT_KINDS = frozenset({"log", "depth", "frozen", "far returns", "conflict", FLOOR})
+"""Kinds that are found while the log is read or fused; a finished run has them in its manifest alone."""
 
 _ORDER: tuple[Weight, ...] = ("break", "doubt", "note")
 _GAP_INTERVALS, _LEAST_GAP_S = 3.0, 0.5
@@ -122,6 +124,36 @@ def _not_localised(records: Sequence[FrameRecord], timeline: "_TimeLine") -> Ite
         where=timeline.place(first, last),
         weight="break" if share > _BROKEN_LOST_SHARE else "doubt" if share > _MAX_LOST_SHARE else "note",
     )
+
+
+def floor_warnings(config: TraversableConfig, resolution_m: float, *, has_path: bool) -> list[RunWarning]:
+    """Return what is doubtful about the traversable floor.
+
+    Args:
+        config: Limits of the robot.
+        resolution_m: Edge of a voxel.
+        has_path: Whether the path tells the height of the floor.
+    """
+    found = []
+    if config.max_step_m < resolution_m * (1.0 - 1e-6):
+        found.append(
+            RunWarning(
+                kind=FLOOR,
+                sentence=f"traversable.max_step_m = {config.max_step_m:g} m is less than a voxel of "
+                f"{resolution_m:g} m; steps of {resolution_m:g} m count as floor",
+                suggestion=f"--set octree.resolution_m={config.max_step_m:g}, or less",
+            )
+        )
+    if not has_path:
+        found.append(
+            RunWarning(
+                kind=FLOOR,
+                sentence="no floor was found below the path; the traversable floor is what lies at the "
+                "height of the floor, wherever that was seen",
+                suggestion="show the floor that the sensor is carried over",
+            )
+        )
+    return found
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ import pytest
 from mapper.export.grid import read_grid, write_grid
 from mapper.navigation.config import PlanConfig, TraversableConfig
 from mapper.navigation.distance import distance_3d
+from mapper.navigation.floor import reachable_floor
 from mapper.navigation.planner import plan_2d, plan_3d
 from mapper.navigation.traversable import traversable
 from mapper.navigation.voxels import known_box
@@ -118,7 +119,10 @@ def test_distances_agree_with_the_true_solids(source, octree):
 
 def test_the_traversable_floor_is_free_in_the_true_flat(source, octree):
     config = TraversableConfig()
-    floor = traversable(octree, config)
+    (storey,) = traversable(
+        reachable_floor(octree, config, positions_world=source.truth.positions_world), config
+    )
+    floor = storey.grid
     heights_m = np.arange(config.max_step_m + CELL / 2, config.head_room_m, CELL)
     free = centres(floor, FREE)
     assert len(free) > 3000

@@ -3,6 +3,7 @@ import pytest
 
 from mapper.core.errors import DataError
 from mapper.navigation.config import TraversableConfig
+from mapper.navigation.floor import reachable_floor
 from mapper.navigation.traversable import traversable
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
@@ -23,6 +24,16 @@ def octree_of(*solids):
     return octree
 
 
+NO_PATH = np.empty((0, 3))
+
+
+def traversable_grid(octree, config, *, path=NO_PATH, floor_z_m=0.0):
+    """Return the grid of the only storey; without a path it begins at all floor at the floor's height."""
+    floor = reachable_floor(octree, config, positions_world=np.asarray(path), floor_z_m=floor_z_m)
+    (storey,) = traversable(floor, config)
+    return storey.grid
+
+
 def floor(x0=0.0, x1=2.0, *, z=0.0, y1=1.0):
     return (x0, 0.0, z - CELL), (x1, y1, z)
 
@@ -38,7 +49,7 @@ def row_codes(grid, xs, y=0.5):
 
 
 def test_a_bare_floor_is_free_and_the_grid_is_just_large_enough():
-    grid = traversable(octree_of(floor()), TraversableConfig())
+    grid = traversable_grid(octree_of(floor()), TraversableConfig())
     assert grid.cells.shape == (20, 40)
     assert (grid.cells == FREE).all()
     np.testing.assert_allclose(grid.origin_world_m, [0.0, 0.0], atol=1e-9)
@@ -49,30 +60,30 @@ def test_a_table_blocks_by_its_height_and_a_lamp_does_not():
     lamp = (1.2, 0.0, 1.5), (1.5, 1.0, 1.55)
     octree = octree_of(floor(), table, lamp)
 
-    assert row_codes(traversable(octree, TraversableConfig()), [0.2, 0.65, 1.35, 1.8]) == [
+    assert row_codes(traversable_grid(octree, TraversableConfig()), [0.2, 0.65, 1.35, 1.8]) == [
         FREE,
         OCCUPIED,
         FREE,
         FREE,
     ]
     low = TraversableConfig(head_room_m=0.5)
-    assert row_codes(traversable(octree, low), [0.2, 0.65, 1.35, 1.8]) == [FREE] * 4
+    assert row_codes(traversable_grid(octree, low), [0.2, 0.65, 1.35, 1.8]) == [FREE] * 4
     tall = TraversableConfig(head_room_m=1.6)
-    assert row_codes(traversable(octree, tall), [0.65, 1.35, 1.8]) == [OCCUPIED, OCCUPIED, FREE]
+    assert row_codes(traversable_grid(octree, tall), [0.65, 1.35, 1.8]) == [OCCUPIED, OCCUPIED, FREE]
 
 
 def test_head_room_is_measured_from_the_floor_to_the_lowest_obstacle():
     octree = octree_of(floor(), ((0.5, 0.0, 0.6), (1.0, 1.0, 0.65)))
-    assert row_codes(traversable(octree, TraversableConfig(head_room_m=0.6)), [0.7]) == [FREE]
-    assert row_codes(traversable(octree, TraversableConfig(head_room_m=0.65)), [0.7]) == [OCCUPIED]
+    assert row_codes(traversable_grid(octree, TraversableConfig(head_room_m=0.6)), [0.7]) == [FREE]
+    assert row_codes(traversable_grid(octree, TraversableConfig(head_room_m=0.65)), [0.7]) == [OCCUPIED]
 
 
 @pytest.mark.parametrize(("height_m", "code"), [(0.05, FREE), (0.1, FREE), (0.15, OCCUPIED)])
 def test_steps_up_and_down_are_climbed_to_a_limit(height_m, code):
     up = octree_of(floor(0.0, 1.0), floor(1.0, 2.0, z=height_m))
-    assert row_codes(traversable(up, TraversableConfig()), [0.5, 1.5]) == [FREE, code]
+    assert row_codes(traversable_grid(up, TraversableConfig()), [0.5, 1.5]) == [FREE, code]
     down = octree_of(floor(0.0, 1.0), floor(1.0, 2.0, z=-height_m))
-    assert row_codes(traversable(down, TraversableConfig()), [0.5, 1.5]) == [FREE, code]
+    assert row_codes(traversable_grid(down, TraversableConfig()), [0.5, 1.5]) == [FREE, code]
 
 
 def ramp(rise_per_cell, *, first_x=1.0, cells=20):
@@ -86,45 +97,54 @@ def ramp(rise_per_cell, *, first_x=1.0, cells=20):
 
 def test_a_gentle_ramp_is_free_and_a_steep_one_is_not():
     gentle, steep = ramp(0.2), ramp(0.6)  # 11° and 31°
-    assert row_codes(traversable(gentle, TraversableConfig()), [0.5, 1.5, 1.9]) == [FREE] * 3
-    assert row_codes(traversable(steep, TraversableConfig()), [0.5, 1.5, 1.9]) == [FREE, OCCUPIED, OCCUPIED]
-    assert row_codes(traversable(steep, TraversableConfig(max_slope_rad=0.6)), [1.5]) == [FREE]
+    assert row_codes(traversable_grid(gentle, TraversableConfig()), [0.5, 1.5, 1.9]) == [FREE] * 3
+    assert row_codes(traversable_grid(steep, TraversableConfig()), [0.5, 1.5, 1.9]) == [
+        FREE,
+        OCCUPIED,
+        OCCUPIED,
+    ]
+    assert row_codes(traversable_grid(steep, TraversableConfig(max_slope_rad=0.6)), [1.5]) == [FREE]
 
 
 def test_what_only_a_steep_side_leads_to_is_no_floor():
     solids = [floor(0.0, 1.0)]
     solids += [((1.0 + n * CELL, 0.0, 0.0), (1.05 + n * CELL, 1.0, (n + 1) * 2 * CELL)) for n in range(10)]
     solids.append(((1.5, 0.0, 0.9), (3.0, 1.0, 1.0)))  # a platform that a 63° bank leads to
-    grid = traversable(octree_of(*solids), TraversableConfig())
+    grid = traversable_grid(octree_of(*solids), TraversableConfig())
     assert row_codes(grid, [0.3, 1.25, 2.8]) == [FREE, OCCUPIED, OCCUPIED]
 
 
 def test_small_gaps_are_closed_and_large_ones_stay_unknown():
     octree = octree_of(floor(0.0, 1.0), floor(1.1, 2.0), floor(2.4, 3.0))
-    grid = traversable(octree, TraversableConfig())
+    grid = traversable_grid(octree, TraversableConfig())
     assert row_codes(grid, [1.025, 1.075]) == [FREE, FREE]
     assert row_codes(grid, [2.1, 2.2, 2.3]) == [UNKNOWN] * 3
-    assert row_codes(traversable(octree, TraversableConfig(max_gap_m=0.0)), [1.025, 1.075]) == [UNKNOWN] * 2
+    assert (
+        row_codes(traversable_grid(octree, TraversableConfig(max_gap_m=0.0)), [1.025, 1.075]) == [UNKNOWN] * 2
+    )
 
 
 def test_the_robot_s_radius_widens_what_blocks():
     octree = octree_of(floor(), ((1.0, 0.0, 0.0), (1.05, 1.0, 0.5)))
-    grid = traversable(octree, TraversableConfig(robot_radius_m=0.2))
+    grid = traversable_grid(octree, TraversableConfig(robot_radius_m=0.2))
     assert row_codes(grid, [0.775, 0.825, 0.975, 1.225, 1.275]) == [FREE, OCCUPIED, OCCUPIED, OCCUPIED, FREE]
 
 
 def test_the_floor_may_lie_anywhere():
     octree = octree_of(floor(z=-1.0), ((0.5, 0.0, -0.5), (0.8, 1.0, -0.45)))
-    assert row_codes(traversable(octree, TraversableConfig(), floor_z_m=-1.0), [0.2, 0.6]) == [FREE, OCCUPIED]
-    assert (traversable(octree, TraversableConfig()).cells == UNKNOWN).all()
+    assert row_codes(traversable_grid(octree, TraversableConfig(), floor_z_m=-1.0), [0.2, 0.6]) == [
+        FREE,
+        OCCUPIED,
+    ]
+    assert (traversable_grid(octree, TraversableConfig()).cells == UNKNOWN).all()
 
 
 def test_the_grid_does_not_depend_on_the_order_of_the_blocks(tmp_path):
     octree = octree_of(floor(), ((0.5, 0.0, 0.0), (0.8, 0.4, 0.3)), ((1.5, 0.5, 0.3), (1.6, 1.0, 0.4)))
     write_ot(tmp_path / "map.ot", octree)
     ours, theirs = (
-        traversable(octree, TraversableConfig()),
-        traversable(read_map(tmp_path / "map.ot"), TraversableConfig()),
+        traversable_grid(octree, TraversableConfig()),
+        traversable_grid(read_map(tmp_path / "map.ot"), TraversableConfig()),
     )
     np.testing.assert_array_equal(ours.cells, theirs.cells)
     np.testing.assert_array_equal(ours.origin_world_m, theirs.origin_world_m)
@@ -132,4 +152,4 @@ def test_the_grid_does_not_depend_on_the_order_of_the_blocks(tmp_path):
 
 def test_an_empty_map_has_no_floor():
     with pytest.raises(DataError, match="the map is empty"):
-        traversable(OctreeMap(OctreeConfig()), TraversableConfig())
+        traversable_grid(OctreeMap(OctreeConfig()), TraversableConfig())

@@ -45,6 +45,8 @@ def log_run(log: RerunLog, results: RunResults, maps: Maps) -> None:
     log.cloud(maps.cloud_points_world, maps.cloud_colors)
     log.grid("slice", maps.grid)
     log.grid("traversable", maps.traversable)
+    for number, storey in enumerate(maps.storeys):
+        log.grid(f"traversable_{number}", storey)
     log.plan(maps.grid, paths)
 
 

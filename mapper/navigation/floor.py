@@ -1,0 +1,122 @@
+"""Floor that a robot can reach from where it was driven, on every storey: steps, slopes and head room."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.core.errors import DataError
+from mapper.core.geometry import Points
+from mapper.navigation.config import TraversableConfig
+from mapper.navigation.flood import (
+    OFF_PLANE,
+    Indices,
+    Limits,
+    Mask,
+    flood,
+    limits_of,
+    mark_plane,
+    mark_steep,
+    mark_surfaces,
+)
+from mapper.navigation.footprint import with_footprint
+from mapper.navigation.path_ground import PathGround, path_ground
+from mapper.octree.columns import NOWHERE, Columns, occupied_columns
+from mapper.octree.ground_height import DrivenGround
+from mapper.octree.map import OctreeMap
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Floor:
+    """Surfaces of the map, and those that were reached.
+
+    Attributes:
+        columns: The map's occupied voxels, and one for each place of the path whose ground was not seen.
+        reached: (N,) mask of the voxels whose tops are floor.
+        steep: (N,) mask of those that steps alone would reach.
+        driven: (N,) mask of the floor under the path.
+        path: The path's ground.
+        limits: Limits of the robot.
+    """
+
+    columns: Columns
+    reached: Mask
+    steep: Mask
+    driven: Mask
+    path: PathGround
+    limits: Limits
+
+
+def reachable_floor(
+    octree: OctreeMap, config: TraversableConfig, *, positions_world: Points, floor_z_m: float = 0.0
+) -> Floor:
+    """Return the floor that a robot can reach from the ground under a path.
+
+    A surface is the top of an occupied voxel with head room above it, where unknown voxels count as free.
+    From the ground under the path, steps lead from surface to surface, over gaps in which nothing is known.
+    Surfaces on which the plane through the floor around is too steep are not entered, unless the path led
+    over them. Without a path that tells the ground, all surfaces at the floor's height are where it begins.
+
+    Args:
+        octree: The map in a world with z up.
+        config: Limits of the robot.
+        positions_world: (N, 3) of the sensor, in the order in which it passed.
+        floor_z_m: Height of the floor in the world.
+
+    Raises:
+        DataError: The map is empty.
+    """
+    if not len(octree):
+        raise DataError("traversable floor: the map is empty; fuse scans into it first")
+    columns, limits = occupied_columns(octree), limits_of(config, octree.resolution_m)
+    path = path_ground(
+        columns,
+        positions_world,
+        radius_m=config.footprint_m,
+        room_m=config.head_room_m,
+        floor_z_m=floor_z_m,
+    )
+    columns, driven = with_footprint(columns, path, limits, radius_m=config.footprint_m)
+    is_surface = np.zeros(len(columns.tops), np.bool_)
+    mark_surfaces(columns.starts, columns.tops, limits.room, is_surface)
+    is_surface |= driven
+    seeds = np.flatnonzero(driven)
+    if not len(seeds):
+        floor = floor_z_m / octree.resolution_m
+        # A floor at z = 0 lies in the voxel above or in that below.
+        seeds = np.flatnonzero(is_surface & (np.abs(columns.tops - floor) <= limits.step))
+    column_of = np.repeat(np.arange(len(columns.starts) - 1, dtype=np.int32), np.diff(columns.starts))
+    by_steps = _flooded(columns, column_of, limits, seeds, is_surface)
+    steep, plain = np.zeros_like(by_steps), np.zeros_like(by_steps)
+    mark_steep(columns.starts, columns.tops, columns.shape, column_of, limits, by_steps, steep)
+    steep &= ~driven
+    reached = _flooded(columns, column_of, limits, seeds[~steep[seeds]], by_steps & ~steep)
+    # Where floor meets a steep bank, the plane through both is too steep for what still is floor. And a slope
+    # that the path led over, such as stairs, is one that can be taken across its width.
+    candidates = by_steps & ~reached
+    place = (columns.starts, columns.tops, columns.shape, column_of, limits, candidates)
+    mark_plane(*place, reached, (0.0, limits.slope), OFF_PLANE, plain)
+    mark_plane(*place, driven, (limits.slope, np.inf), OFF_PLANE + limits.step / 2.0, plain)
+    reached = _flooded(columns, column_of, limits, seeds[~steep[seeds]], reached | plain)
+    return Floor(columns, reached, by_steps & ~reached, driven, path, limits)
+
+
+def driven_ground(floor: Floor) -> DrivenGround:
+    """Return the lowest floor of every column, and what the footprint passed over."""
+    columns = floor.columns
+    column_of = np.repeat(np.arange(len(columns.starts) - 1), np.diff(columns.starts))
+    heights = np.full(columns.shape, NOWHERE, np.int32)
+    at = column_of[floor.reached][::-1]  # the lowest of a column comes last
+    heights.ravel()[at] = columns.tops[floor.reached][::-1]
+    swept = np.zeros(columns.shape, np.bool_)
+    swept.ravel()[column_of[floor.driven & floor.reached]] = True
+    return DrivenGround(heights, swept)
+
+
+def _flooded(
+    columns: Columns, column_of: NDArray[np.int32], limits: Limits, seeds: Indices, open_: Mask
+) -> Mask:
+    """Return a mask of the open surfaces that steps connect to the seeds."""
+    reached = np.zeros(len(columns.tops), np.bool_)
+    flood(columns.starts, columns.tops, columns.shape, column_of, limits, seeds, open_, reached)
+    return reached

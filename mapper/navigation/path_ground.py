@@ -1,0 +1,207 @@
+"""Ground under a trajectory: where what carried the sensor stood or rolled."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mapper.core.geometry import Array, Points
+from mapper.octree.columns import Columns, Tops
+from mapper.octree.keys import KEY_ZERO
+
+_MAX_HEIGHT_M = 4.0
+"""Sensors are carried no higher than this above the ground."""
+_CHANGE_PER_M = 10.0
+"""A change of the sensor's height by a metre costs as much as so many samples without ground below."""
+_LONGEST_STEPS, _LEAST_BREAK_M = 5.0, 2.0
+_STEADY_M = 0.3
+_DRIVEN_M = 2.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathGround:
+    """Ground along a path.
+
+    Attributes:
+        points_world: (N, 3) metres: x and y of the sensor, z of the ground below it; a voxel apart at most.
+        sensor_m: (N,) height of the sensor above it.
+        share_seen: Of these points, those with a surface of the map at them.
+    """
+
+    points_world: Points
+    sensor_m: Array
+    share_seen: float
+
+    def __len__(self) -> int:
+        return len(self.points_world)
+
+
+NO_PATH = PathGround(np.empty((0, 3)), np.empty(0), 0.0)
+
+
+def path_ground(
+    columns: Columns, positions_world: Points, *, radius_m: float, room_m: float, floor_z_m: float
+) -> PathGround:
+    """Return the ground along a path, as far as it is the ground that was driven or walked on.
+
+    Below each point of the path the map's surfaces within a radius vote for heights of the sensor above the
+    ground; the sequence of heights with the most votes and the least change is found by dynamic programming
+    (Viterbi 1967). So a surface that is seen now and then gives the height where none is seen, and a table
+    that a camera is held over does not raise the ground of a walk. A stretch is left out if its height is not
+    that of the others and its ground, away from the floor's height, was not travelled along: a camera that
+    never leaves a desk tells nothing of the floor.
+
+    Args:
+        columns: The map's occupied voxels.
+        positions_world: (N, 3) of the sensor, in the order in which it passed.
+        radius_m: Half the width of what carried it.
+        room_m: Free height that a surface needs above it, unless the sensor is lower.
+        floor_z_m: Height of the floor in the world.
+    """
+    cell_m = columns.resolution_m
+    points, breaks = _sampled(positions_world, cell_m)
+    if not len(points):
+        return NO_PATH
+    highest = int(np.ceil(_MAX_HEIGHT_M / cell_m))
+    low = (points[:, :2] / cell_m - (columns.first - KEY_ZERO)).astype(np.float64)
+    votes = np.zeros((len(points), highest + 1), np.float32)
+    _vote(
+        columns.starts, columns.tops, columns.shape, low, points[:, 2] / cell_m,
+        radius_m / cell_m, room_m / cell_m, votes,
+    )  # fmt: skip
+    height = _steadiest(votes, _CHANGE_PER_M * cell_m)
+    seen = votes[np.arange(len(points)), height] > 0.0
+    ground = points - np.column_stack([np.zeros((len(points), 2)), height * cell_m])
+    kept = _driven(ground, height * cell_m, seen, breaks, floor_z_m)
+    if not kept.any():
+        return NO_PATH
+    return PathGround(ground[kept], height[kept] * cell_m, float(seen[kept].mean()))
+
+
+def _sampled(positions_world: Points, spacing_m: float) -> tuple[Points, NDArray[np.int64]]:
+    """Return points along the path, a spacing apart at most, and the first point after each break of it."""
+    if len(positions_world) < 2:
+        return positions_world.copy(), np.empty(0, np.int64)
+    steps_m = np.linalg.norm(np.diff(positions_world, axis=0), axis=1)
+    moving = steps_m[steps_m > 1e-3]
+    longest_m = max(_LEAST_BREAK_M, _LONGEST_STEPS * float(np.median(moving))) if len(moving) else 0.0
+    pieces, breaks, count = [positions_world[:1]], [], 1
+    last = positions_world[0]
+    for position, step_m in zip(positions_world[1:], steps_m, strict=True):
+        if step_m > longest_m:
+            breaks.append(count)
+            parts = 1
+        else:
+            away_m = float(np.linalg.norm(position - last))
+            if away_m < 0.5 * spacing_m:
+                continue
+            parts = int(np.ceil(away_m / spacing_m))
+        shares = np.arange(1, parts + 1)[:, np.newaxis] / parts
+        pieces.append(last + shares * (position - last) if parts > 1 else position[np.newaxis])
+        last, count = position, count + parts
+    return np.concatenate(pieces), np.array(breaks, np.int64)
+
+
+def _driven(
+    ground: Points, sensor_m: Array, seen: NDArray[np.bool_], breaks: NDArray[np.int64], floor_z_m: float
+) -> NDArray[np.bool_]:
+    """Return a mask of the points whose stretch of the path was driven or walked along."""
+    jumps = np.flatnonzero(np.abs(np.diff(sensor_m)) > _STEADY_M) + 1
+    bounds = np.unique(np.concatenate([[0], jumps, breaks, [len(ground)]]))
+    kept = np.zeros(len(ground), np.bool_)
+    usual: list[float] = []
+    stretches = sorted(pairwise(bounds.tolist()), key=lambda one: one[0] - one[1])
+    for first, last in stretches:  # the longest first: it tells the usual height
+        extent_m = float(np.linalg.norm(np.ptp(ground[first:last], axis=0)))
+        on_floor = np.abs(ground[first:last, 2] - floor_z_m)[seen[first:last]] < _STEADY_M
+        height_m = float(np.median(sensor_m[first:last]))
+        is_usual = any(abs(height_m - one) <= _STEADY_M for one in usual)
+        if not seen[first:last].any() and not is_usual:
+            continue
+        if is_usual or on_floor.mean() > 0.5 or (not usual and extent_m >= _DRIVEN_M):
+            kept[first:last] = True
+            usual.append(height_m)
+    return kept
+
+
+@njit(cache=True, nogil=True)
+def _vote(
+    starts: NDArray[np.int64],
+    tops: Tops,
+    shape: tuple[int, int],
+    places: Array,
+    sensor_z: Array,
+    radius: float,
+    room: float,
+    votes: NDArray[np.float32],
+) -> None:
+    """Write, for each height of the sensor, the share of the columns around with a surface so far below.
+
+    Args:
+        starts: As in ``Columns``.
+        tops: As in ``Columns``.
+        shape: H, W.
+        places: (N, 2) x and y in columns.
+        sensor_z: (N,) heights in voxels.
+        radius: Around each place, in columns.
+        room: Free voxels above a surface, at most up to the sensor.
+        votes: (N, highest + 1) result.
+    """
+    height, width = shape
+    highest = votes.shape[1] - 1
+    for i in range(len(places)):
+        x, y = places[i]
+        count = 0
+        for row in range(int(np.floor(y - radius)), int(np.floor(y + radius)) + 1):
+            for column in range(int(np.floor(x - radius)), int(np.floor(x + radius)) + 1):
+                if (row + 0.5 - y) ** 2 + (column + 0.5 - x) ** 2 > radius * radius and not (
+                    row == int(np.floor(y)) and column == int(np.floor(x))
+                ):
+                    continue
+                count += 1
+                if not (0 <= row < height and 0 <= column < width):
+                    continue
+                at = row * width + column
+                for n in range(starts[at], starts[at + 1]):
+                    below = sensor_z[i] - tops[n]
+                    if below < 1.0 or below > highest:
+                        continue
+                    if n + 1 < starts[at + 1] and tops[n + 1] - tops[n] <= min(room, below):
+                        continue
+                    votes[i, int(np.rint(below))] += 1.0
+        for k in range(highest + 1):
+            votes[i, k] /= count
+
+
+@njit(cache=True, nogil=True)
+def _steadiest(votes: NDArray[np.float32], change_cost: float) -> NDArray[np.int64]:
+    """Return the (N,) heights of least cost: 1 less the votes for a height and beside it, plus changes."""
+    count, states = votes.shape
+    came_from = np.empty((count, states), np.int16)
+    cost = np.zeros(states)
+    best, source = np.empty(states), np.empty(states, np.int16)
+    for i in range(count):
+        for k in range(states):  # the distance transform of the costs so far: least cost plus change
+            best[k], source[k] = cost[k], k
+        for k in range(1, states):
+            if best[k - 1] + change_cost < best[k]:
+                best[k], source[k] = best[k - 1] + change_cost, source[k - 1]
+        for k in range(states - 2, -1, -1):
+            if best[k + 1] + change_cost < best[k]:
+                best[k], source[k] = best[k + 1] + change_cost, source[k + 1]
+        for k in range(states):
+            share = votes[i, k]
+            if k > 0:
+                share += 0.5 * votes[i, k - 1]
+            if k + 1 < states:
+                share += 0.5 * votes[i, k + 1]
+            cost[k] = best[k] + 1.0 - min(1.0, share)
+            came_from[i, k] = source[k]
+    heights = np.empty(count, np.int64)
+    state = int(np.argmin(cost))
+    for i in range(count - 1, -1, -1):
+        heights[i] = state
+        state = came_from[i, state]
+    return heights

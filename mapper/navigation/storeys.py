@@ -1,0 +1,159 @@
+"""Storeys of a floor, each with one height a column; ramps and stairs belong to both that they join."""
+
+from heapq import heappop, heappush
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mapper.navigation.flood import Indices, Mask
+from mapper.navigation.floor import Floor
+from mapper.octree.columns import NOWHERE, Tops
+
+Heights = NDArray[np.int32]
+
+_LEAST_AREA_M2 = 1.0
+_OVERLAP_M = 3.0
+_NONE = -1
+
+
+def storeys_of(floor: Floor) -> list[Heights]:
+    """Return the (H, W) heights, in voxels above z = 0, of the floor of every storey, the lowest first.
+
+    Where floors lie over each other, each is a storey; every other surface belongs to the storey to which one
+    climbs or descends least. A storey goes on for some metres over the ramps and stairs that lead from it, so
+    that neighbours share these surfaces. One that is neither as large as a square metre nor under the path is
+    left out. A floor without any other above is a single storey.
+    """
+    columns, reached = floor.columns, floor.reached
+    heights = np.full(columns.shape, NOWHERE, np.int32)
+    column_of = np.repeat(np.arange(len(columns.starts) - 1), np.diff(columns.starts))[reached]
+    tops = columns.tops[reached]
+    if not (np.diff(column_of) == 0).any():
+        heights.ravel()[column_of] = tops
+        return [heights]
+    starts = np.searchsorted(column_of, np.arange(len(columns.starts)))
+    limits, driven = floor.limits, floor.driven[reached]
+    storey = np.full(len(tops), _NONE, np.int32)
+    sources = np.zeros(len(tops), np.bool_)
+    sources[np.argmin(np.where(driven, tops, tops.max())) if driven.any() else np.argmin(tops)] = True
+    _climb(starts, tops, columns.shape, column_of, limits.step, limits.gap, sources, storey)
+    # Floors over each other are told apart; all else goes to the nearer of them.
+    shared = np.diff(starts)[column_of] > 1
+    storey[~shared] = _NONE
+    _climb(starts, tops, columns.shape, column_of, limits.step, limits.gap, shared, storey)
+    cell_m = columns.resolution_m
+    kept = [
+        number
+        for number in np.unique(storey).tolist()
+        if (storey == number).sum() * cell_m**2 >= _LEAST_AREA_M2 or (driven & (storey == number)).any()
+    ]
+    kept.sort(key=lambda number: float(np.median(tops[storey == number])))
+    result = []
+    for number in kept:
+        own = storey == number
+        _extend(starts, tops, columns.shape, column_of, limits.step, round(_OVERLAP_M / cell_m), own)
+        heights = np.full(columns.shape, NOWHERE, np.int32)
+        heights.ravel()[column_of[own]] = tops[own]
+        result.append(heights)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _climb(
+    starts: Indices,
+    tops: Tops,
+    shape: tuple[int, int],
+    column_of: Indices,
+    step: int,
+    gap: int,
+    sources: Mask,
+    storey: NDArray[np.int32],
+) -> None:
+    """Give every surface the storey of the source from which one climbs least, or the next free one above.
+
+    Sources without a storey are of storey 0, as are surfaces that neither steps nor gaps lead to.
+    """
+    height, width = shape
+    cost = np.full(len(tops), 1 << 30, np.int64)
+    heap = [(np.int64(0), np.int64(0), np.int64(0))]  # climb so far, surface, storey of the one before
+    heap.clear()
+    for n in range(len(tops)):
+        if sources[n]:
+            cost[n] = 0
+            heappush(heap, (np.int64(0), np.int64(n), np.int64(max(storey[n], 0))))
+    is_done = np.zeros(len(tops), np.bool_)
+    rest = 0
+    while True:
+        while heap:
+            so_far, n, wanted = heappop(heap)
+            if is_done[n]:
+                continue
+            is_done[n] = True
+            if storey[n] == _NONE:
+                storey[n] = _free_storey(starts, column_of[n], n, storey, wanted)
+            row, column = column_of[n] // width, column_of[n] % width
+            for reach in (1, gap + 1):
+                beside = 0
+                for y in range(max(row - reach, 0), min(row + reach + 1, height)):
+                    for x in range(max(column - reach, 0), min(column + reach + 1, width)):
+                        for m in range(starts[y * width + x], starts[y * width + x + 1]):
+                            climb = abs(tops[m] - tops[n])
+                            beside += climb <= step
+                            if climb <= step and so_far + climb < cost[m]:
+                                cost[m] = so_far + climb
+                                heappush(heap, (cost[m], np.int64(m), np.int64(storey[n])))
+                if beside == 9:  # floor all around, itself included
+                    break
+        while rest < len(tops) and is_done[rest]:
+            rest += 1
+        if rest == len(tops):
+            return
+        heappush(heap, (np.int64(0), np.int64(rest), np.int64(0)))
+
+
+@njit(cache=True, nogil=True)
+def _free_storey(starts: Indices, column: int, surface: int, storey: NDArray[np.int32], wanted: int) -> int:
+    """Return the wanted storey, or the next that no other surface of the column has."""
+    taken = True
+    while taken:
+        taken = False
+        for m in range(starts[column], starts[column + 1]):
+            if m != surface and storey[m] == wanted:
+                taken = True
+        wanted += taken
+    return wanted
+
+
+@njit(cache=True, nogil=True)
+def _extend(
+    starts: Indices, tops: Tops, shape: tuple[int, int], column_of: Indices, step: int, reach: int, own: Mask
+) -> None:
+    """Add the surfaces that up to so many steps lead to, in columns where the storey has none."""
+    height, width = shape
+    taken = np.zeros(height * width, np.bool_)
+    queue = np.empty(len(tops), np.int64)
+    count = done = 0
+    for n in range(len(tops)):
+        if own[n]:
+            taken[column_of[n]] = True
+            queue[count] = n
+            count += 1
+    end = count
+    for _ in range(reach):
+        while done < end:
+            n = queue[done]
+            done += 1
+            row, column = column_of[n] // width, column_of[n] % width
+            for y in range(max(row - 1, 0), min(row + 2, height)):
+                for x in range(max(column - 1, 0), min(column + 2, width)):
+                    at = y * width + x
+                    if taken[at]:
+                        continue
+                    for m in range(starts[at], starts[at + 1]):
+                        if not own[m] and abs(tops[m] - tops[n]) <= step:
+                            own[m] = taken[at] = True
+                            queue[count] = m
+                            count += 1
+                            break
+        end = count

@@ -1,0 +1,91 @@
+"""Occupied voxels of an octree by column, in order of height, for ground plans and surfaces."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_MASK, KEY_ZERO, block_keys, gather
+from mapper.octree.map import OctreeMap
+
+Tops = NDArray[np.int32]
+
+NOWHERE = -(1 << 30)
+"""Height of the floor in a column without any, in voxels."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Columns:
+    """Occupied voxels of every column, in order of height.
+
+    Attributes:
+        starts: (H·W + 1,) start of each column's voxels; columns run along x first.
+        tops: (N,) upper face of each voxel, in voxels above z = 0.
+        shape: H, W.
+        first: (2,) x and y keys of the column of row 0 and column 0.
+        resolution_m: Edge of a voxel.
+    """
+
+    starts: NDArray[np.int64]
+    tops: Tops
+    shape: tuple[int, int]
+    first: NDArray[np.int64]
+    resolution_m: float
+
+    def with_tops(self, columns: NDArray[np.int64], tops: Tops) -> "Columns":
+        """Return these columns and further voxels, given by their (M,) column numbers and tops."""
+        # Voxels of a column are in order, so the key below orders all of them.
+        keys = _keys(np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts)), self.tops)
+        added = np.setdiff1d(_keys(columns, tops), keys)
+        places = np.searchsorted(keys, added)
+        counts = np.bincount(added >> 17, minlength=len(self.starts) - 1)
+        starts = self.starts + np.concatenate([[0], np.cumsum(counts)])
+        tops = np.insert(self.tops, places, (added & (1 << 17) - 1) - KEY_ZERO)
+        return Columns(starts, tops, self.shape, self.first, self.resolution_m)
+
+
+def _keys(columns: NDArray[np.int64], tops: Tops) -> NDArray[np.int64]:
+    """Return column · 2¹⁷ + top: a top lies one above the highest key at most."""
+    keys: NDArray[np.int64] = (columns << 17) | (tops.astype(np.int64) + KEY_ZERO)
+    return keys
+
+
+def block_extent(octree: OctreeMap) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the (2,) x and y keys of the first column of any block, and those after the last column."""
+    keys = block_keys(octree.blocks.codes)[:, :2]
+    if not len(keys):
+        return np.full(2, KEY_ZERO), np.full(2, KEY_ZERO)
+    return keys.min(axis=0), keys.max(axis=0) + (1 << BLOCK_BITS)
+
+
+def occupied_columns(octree: OctreeMap) -> Columns:
+    """Return the occupied voxels of a map by column."""
+    first, last = block_extent(octree)
+    width, height = (int(n) for n in last - first)
+    codes, values = octree.blocks.codes, octree.blocks.table.values
+    packed = np.sort(_occupied(codes, values, octree.occupied_log_odds))  # by y, then x, then z
+    columns = ((packed >> 32) - first[1]) * width + (packed >> 16 & KEY_MASK) - first[0]
+    starts = np.searchsorted(columns, np.arange(height * width + 1))
+    tops = ((packed & KEY_MASK) + 1 - KEY_ZERO).astype(np.int32)
+    return Columns(starts, tops, (height, width), first, octree.resolution_m)
+
+
+@njit(cache=True, nogil=True)
+def _occupied(
+    codes: NDArray[np.int64], values: NDArray[np.float32], threshold: np.float32
+) -> NDArray[np.int64]:
+    """Return the keys of all occupied voxels as y · 2³² + x · 2¹⁶ + z."""
+    count = 0
+    for b in range(len(codes)):
+        for voxel in range(BLOCK_VOXELS):
+            count += values[b, voxel] >= threshold
+    packed = np.empty(count, np.int64)
+    count = 0
+    for b in range(len(codes)):
+        for voxel in range(BLOCK_VOXELS):
+            if values[b, voxel] >= threshold:
+                code = (codes[b] << (3 * BLOCK_BITS)) | voxel
+                packed[count] = (gather(code >> 1) << 32) | (gather(code) << 16) | gather(code >> 2)
+                count += 1
+    return packed
