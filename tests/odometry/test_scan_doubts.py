@@ -10,6 +10,7 @@ from mapper.odometry.scan_to_map.gicp import GicpMatcher
 from mapper.odometry.scan_to_map.motion_model import MotionModel, Spread
 from mapper.odometry.scan_to_map.observed_part import observed_part
 from mapper.odometry.scan_to_map.odometry import ScanOdometry
+from mapper.odometry.scan_to_map.pose_search import Answers
 from mapper.odometry.scan_to_map.scan_fit import ScanKeyframe, contradiction, described, fit_of
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan
 from mapper.odometry.scan_to_map.scan_noise import surface_covariance
@@ -86,6 +87,41 @@ def test_a_wrong_pose_of_the_matcher_is_replaced_by_one_that_fits():
     assert track.doubts == ()
     assert np.linalg.norm(miss[:3, 3]) < 0.05
     assert angle_between(np.eye(3), miss[:3, :3]) < 0.02
+
+
+class CountingMatcher(GicpMatcher):
+    """GICP that counts the guesses it is given."""
+
+    count = 0
+
+    def match(self, deskewed, T_world_body, *, reach):
+        self.count += 1
+        return super().match(deskewed, T_world_body, reach=reach)
+
+
+def test_a_search_ends_when_several_guesses_lead_to_one_pose(monkeypatch):
+    matcher = CountingMatcher(INDOOR)
+    odometry = ScanOdometry(INDOOR, matcher)
+    for k in range(8):
+        odometry.track(odometry.observe(room_scan(k * 500_000_000, seed=k)))
+    monkeypatch.setattr(UsualFit, "agrees_little", lambda *_: True)
+    matcher.count = 0
+    track = odometry.track(odometry.observe(room_scan(4_000_000_000, seed=8)))
+
+    assert 3 <= matcher.count <= 10  # of 8 guesses, each to the map and to two scans
+    assert np.linalg.norm(track.T_world_body[:3, 3]) < 0.02
+
+
+def test_answers_count_the_guesses_that_led_to_them():
+    answers = Answers(0.2, [np.eye(4)])
+    close, far = (exp(np.zeros(3), np.array([x_m, 0.0, 0.0])) for x_m in (0.02, 0.2))
+    turned = exp(np.array([0.0, 0.0, 0.05]), np.zeros(3))
+
+    assert not answers.add(close, 1)
+    assert answers.add(far, 1)
+    assert answers.add(turned, 2)
+    assert not answers.add(close, 1)
+    assert [answers.guesses_of(pose) for pose in (np.eye(4), far, turned)] == [2, 1, 1]
 
 
 def test_scans_that_fit_are_not_doubted_and_all_have_a_covariance():

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapper.core.geometry import Array, Transform, exp, inverse
+from mapper.core.geometry import Array, Transform, angle_between, exp, inverse
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.odometry.scan_to_map.motion_model import MotionModel
 from mapper.odometry.scan_to_map.observed_part import observed_part
@@ -16,10 +16,13 @@ from mapper.registration.base import Aligner
 from mapper.registration.factory import build_registration
 from mapper.registration.refining import refined_motion
 
-_TURNS_RAD = (0.0, 0.3, -0.3, 0.6, -0.6, 1.0, -1.0)  # about the vertical, from the predicted pose
+_TURNS_RAD = (0.3, -0.3, 0.6, -0.6, 1.0, -1.0)  # about the vertical, from the predicted pose
 _PAIR_DISTANCES = (4.0, 2.0, 1.0)  # of a scan to the last keyframe or scan, in largest pair distances
 _CONTRADICTION_WEIGHT = 15.0
 _ALIKE = 0.1  # scores nearer than this do not decide
+_GOOD = 0.75  # a score of this part of the usual one ends the search
+_FAIR, _GUESSES = 0.5, 3  # and so does one of this part to which so many guesses lead
+_SAME_VOXELS, _SAME_RAD = 0.25, 0.01  # two answers of a registration that differ less are one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +55,7 @@ class PoseCandidate:
     @property
     def score(self) -> float:
         """Agreement less what contradicts, weighted; overlap does not tell, as ground lies on any ground."""
-        return self.shares.agreement - _CONTRADICTION_WEIGHT * self.shares.contradicting
+        return _score(self.shares)
 
 
 class PoseSearch:
@@ -125,16 +128,21 @@ class PoseSearch:
             return replace(candidate, shares=replace(candidate.shares, contradicting=share))
 
         candidates = [] if best is None else [compared(best)]
+        answers = Answers(deskewed.prepared.voxel_m, [c.T_world_middle for c in candidates])
         for way in (self._nearby, self._globally):
-            if way == self._globally and candidates and any(map(self.fits, candidates)):
+            if way == self._globally and any(map(self.fits, candidates)):
                 break
             for key in (keyframes[0], doubtful) if doubtful is not None else (keyframes[0],):
-                for T_world_middle, method in way(deskewed, key, last, motion, T_world_predicted):
-                    found = assessed(T_world_middle, key, method)
-                    if found is not None:
-                        candidates.append(compared(found))
-                        if not self.is_suspect(candidates[-1]):
-                            return candidates[-1]
+                for guess, T_world_middle, method in way(deskewed, key, last, motion, T_world_predicted):
+                    if T_world_middle is None:
+                        continue
+                    if answers.add(T_world_middle, guess):
+                        found = assessed(T_world_middle, key, method)
+                        if found is not None:
+                            candidates.append(compared(found))
+                    best = _best(candidates)
+                    if best is not None and self._is_enough(best, answers):
+                        return best
         return _best(candidates)
 
     def _preferred(self, one: PoseCandidate | None, other: PoseCandidate | None) -> PoseCandidate | None:
@@ -156,6 +164,13 @@ class PoseSearch:
             or self.usual.agrees_little(candidate.shares)
             or not self.fits(candidate)
         )
+
+    def _is_enough(self, best: PoseCandidate, answers: "Answers") -> bool:
+        """Return whether no other pose has to be tried: it fits well, or several guesses lead to it."""
+        usual = _score(self.usual.usual)
+        if best.score >= _GOOD * usual and not self.is_suspect(best):
+            return True
+        return best.score >= _FAIR * usual and answers.guesses_of(best.T_world_middle) >= _GUESSES
 
     def fits(self, candidate: PoseCandidate) -> bool:
         """Return whether a pose fits as usual."""
@@ -219,14 +234,17 @@ class PoseSearch:
         last: ScanKeyframe | None,
         motion: MotionModel,
         T_world_predicted: Transform,
-    ) -> Iterator[tuple[Transform | None, str]]:
-        """Yield poses that are found from several turns of the predicted one, and from no motion."""
-        yield self._matcher.match(deskewed, T_world_predicted, reach="far"), "far"
+    ) -> Iterator[tuple[int, Transform | None, str]]:
+        """Yield poses that are found from the predicted one, from no motion, and from turns of both.
+
+        Each comes with the number of its guess; that of the predicted pose is 0.
+        """
+        yield 0, self._matcher.match(deskewed, T_world_predicted, reach="far"), "far"
         up = T_world_predicted[2, :3]
-        guesses = [T_world_predicted @ exp(turn * up, np.zeros(3)) for turn in _TURNS_RAD]
-        for T_world_guess in (*guesses, motion.T_world_last):
-            if self._matcher.uses_guess:
-                yield self._matcher.match(deskewed, T_world_guess, reach="near"), "turned"
+        turned = [T_world_predicted @ exp(turn * up, np.zeros(3)) for turn in _TURNS_RAD]
+        for guess, T_world_guess in enumerate((T_world_predicted, *turned, motion.T_world_last)):
+            if self._matcher.uses_guess and guess > 0:  # from the predicted pose it was the first try
+                yield guess, self._matcher.match(deskewed, T_world_guess, reach="near"), "turned"
             for key in (keyframe, last) if last is not None else (keyframe,):
                 T_key_scan = refined_motion(
                     key.deskewed.prepared,
@@ -236,7 +254,10 @@ class PoseSearch:
                     pair_distances_m=[k * self._config.max_pair_distance_m for k in _PAIR_DISTANCES],
                 )
                 if not isinstance(T_key_scan, str):
-                    yield key.T_world_middle @ T_key_scan, "keyframe" if key is keyframe else "scan"
+                    T_world_found = key.T_world_middle @ T_key_scan
+                    method = "keyframe" if key is keyframe else "scan"
+                    yield guess, self._matcher.match(deskewed, T_world_found, reach="near"), method
+                    yield guess, T_world_found, method
 
     def _globally(
         self,
@@ -245,7 +266,7 @@ class PoseSearch:
         last: ScanKeyframe | None,  # noqa: ARG002
         motion: MotionModel,  # noqa: ARG002
         T_world_predicted: Transform,  # noqa: ARG002
-    ) -> Iterator[tuple[Transform | None, str]]:
+    ) -> Iterator[tuple[int, Transform | None, str]]:
         """Yield the pose that is found without a guess."""
         if self._rescue is None:
             return
@@ -254,8 +275,43 @@ class PoseSearch:
         found = self._rescuer[1].align(deskewed.scan, np.eye(4))
         if found.converged:
             T_world_found = keyframe.T_world_middle @ found.T_target_source
-            yield self._matcher.match(deskewed, T_world_found, reach="near"), "rescued"
-            yield T_world_found, "rescued"
+            yield len(_TURNS_RAD) + 2, self._matcher.match(deskewed, T_world_found, reach="near"), "rescued"
+            yield len(_TURNS_RAD) + 2, T_world_found, "rescued"
+
+
+class Answers:
+    """Poses that registrations found, each with the guesses that led to it."""
+
+    def __init__(self, voxel_m: float, first: Sequence[Transform]) -> None:
+        """Begin with poses that guess 0 led to."""
+        self._near_m = _SAME_VOXELS * voxel_m
+        self._poses = [(T_world_body, {0}) for T_world_body in first]
+
+    def add(self, T_world_body: Transform, guess: int) -> bool:
+        """Add a pose; return whether it is a new one."""
+        if (guesses := self._of(T_world_body)) is not None:
+            guesses.add(guess)
+            return False
+        self._poses.append((T_world_body, {guess}))
+        return True
+
+    def guesses_of(self, T_world_body: Transform) -> int:
+        """Return how many guesses led to a pose."""
+        return len(self._of(T_world_body) or ())
+
+    def _of(self, T_world_body: Transform) -> set[int] | None:
+        for other, guesses in self._poses:
+            difference = inverse(other) @ T_world_body
+            if (
+                np.linalg.norm(difference[:3, 3]) < self._near_m
+                and angle_between(np.eye(3), difference[:3, :3]) < _SAME_RAD
+            ):
+                return guesses
+        return None
+
+
+def _score(shares: Shares) -> float:
+    return shares.agreement - _CONTRADICTION_WEIGHT * shares.contradicting
 
 
 def _best(candidates: Sequence[PoseCandidate]) -> PoseCandidate | None:
