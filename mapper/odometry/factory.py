@@ -25,6 +25,22 @@ from mapper.odometry.scan_to_map.config import (
 
 if TYPE_CHECKING:
     from mapper.odometry.scan_to_map.scan_matcher import ScanMatcher
+    from mapper.sources.base import Log
+
+
+def odometry_for(
+    config: OdometryConfig, log: "Log", motion_check: MotionCheck | None = None
+) -> Odometry[Any]:
+    """Return the odometry that the settings choose for a log: with its poses, adapted to its surroundings.
+
+    Raises:
+        ConfigError: Wheel odometry or known poses are chosen, and the log has none.
+        DataError: The file of known poses is malformed.
+    """
+    from mapper.odometry.given_poses import poses_for
+    from mapper.odometry.scan_to_map.surroundings import adapted_to
+
+    return build_odometry(adapted_to(config, log), poses_for(config, log), motion_check)
 
 
 def build_odometry(

@@ -11,8 +11,7 @@ from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure
 from mapper.loops.config import KeyframeLoopsConfig
 from mapper.loops.factory import build_keyframe_loop_detector
-from mapper.odometry.factory import build_odometry
-from mapper.odometry.given_poses import poses_for
+from mapper.odometry.factory import odometry_for
 from mapper.odometry.node_offset import NodeOffset
 from mapper.pipeline.components import component_of
 from mapper.pipeline.fuse import carry_times, fuse_into
@@ -136,8 +135,7 @@ def _after(
     detector = build_keyframe_loop_detector(config.loops, config.graph.solve)
     views = reobserve(first, before.trajectory, set(graph.stamps_ns.values()), config, progress=progress)
     detector.preload(graph, {node: views[stamp_ns] for node, stamp_ns in graph.stamps_ns.items()})
-    poses, wheels = poses_for(config.odometry, session), wheels_beside(session, config)
-    odometry = build_odometry(config.odometry, poses, wheels)
+    odometry = odometry_for(config.odometry, session, wheels_beside(session, config))
     offset_odometry = NodeOffset(odometry, first_node=max(graph.T_world_node) + 1)
     known = [factor for factor in graph.factors if factor.origin != "loop"]
     return Start(

@@ -18,8 +18,7 @@ from mapper.loops.closure import write_closures
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.factory import LOOPS_OF
 from mapper.loops.map_constraints import build_map_constraint_detector
-from mapper.odometry.factory import build_odometry
-from mapper.odometry.given_poses import poses_for
+from mapper.odometry.factory import odometry_for
 from mapper.odometry.node_offset import NodeOffset
 from mapper.pipeline.components import component_of
 from mapper.pipeline.kidnapping import without_jumps
@@ -146,9 +145,7 @@ def _refuse_unfit(source: Log, known: KnownMap, config: BuildConfig) -> None:
 
 def _start(source: Log, known: KnownMap, config: BuildConfig) -> Start:
     map_node = known.places.map_node
-    odometry = build_odometry(
-        config.odometry, poses_for(config.odometry, source), wheels_beside(source, config)
-    )
+    odometry = odometry_for(config.odometry, source, wheels_beside(source, config))
     detector = build_map_constraint_detector(_loops(source, config), known.places)
     graph = PoseGraph({map_node: np.eye(4)}, {map_node: 0})
     return Start(NodeOffset(odometry, first_node=map_node + 1), detector, graph)

@@ -6,8 +6,7 @@ from mapper.config.build import BuildConfig
 from mapper.core.deskew import twist_at
 from mapper.core.trajectory import Trajectory
 from mapper.features.frame_view import FrameView
-from mapper.odometry.factory import build_odometry
-from mapper.odometry.given_poses import poses_for
+from mapper.odometry.factory import odometry_for
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import FrameRef, Log
@@ -33,7 +32,7 @@ def reobserve(
     Raises:
         FrameError: A frame cannot be read.
     """
-    odometry = build_odometry(config.odometry, poses_for(config.odometry, source))
+    odometry = odometry_for(config.odometry, source)
     index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
 
     def view(entry: FrameRef) -> tuple[int, FrameView]:

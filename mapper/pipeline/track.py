@@ -17,8 +17,7 @@ from mapper.loops.detector import LoopDetector
 from mapper.loops.factory import build_loop_detector
 from mapper.loops.place_file import AnyPlace, write_places
 from mapper.odometry.base import FrameResult, Odometry
-from mapper.odometry.factory import build_odometry
-from mapper.odometry.given_poses import poses_for
+from mapper.odometry.factory import odometry_for
 from mapper.run import files
 from mapper.run.doubtful_frames import placed_by_neighbours
 from mapper.run.folder import RunWriter
@@ -119,9 +118,7 @@ def first_session(source: Log, config: BuildConfig) -> Start:
             "loops.kind=thesis looks from frames with many features, and "
             f"odometry.kind={config.odometry.kind} counts none; want loops.kind=places, scans or none"
         )
-    odometry = build_odometry(
-        config.odometry, poses_for(config.odometry, source), wheels_beside(source, config)
-    )
+    odometry = odometry_for(config.odometry, source, wheels_beside(source, config))
     return Start(odometry, build_loop_detector(config.loops, config.graph.solve), PoseGraph())
 
 

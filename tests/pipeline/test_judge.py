@@ -8,7 +8,7 @@ import pytest
 
 from evaluators.metrics.evaluate import evaluate
 from mapper.config.loading import load_config
-from mapper.odometry.factory import build_odometry
+from mapper.odometry.factory import odometry_for
 from mapper.pipeline import judge, track
 from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse
@@ -27,11 +27,11 @@ def only_with_few_features(monkeypatch):
     """Frames are doubted unless there are 2000 features."""
 
     def built(config, *rest):
-        odometry = build_odometry(config, *rest)
+        odometry = odometry_for(config, *rest)
         many = getattr(config, "detector", None) and config.detector.max_features >= 2000
         return odometry if many else DoubtingOdometry(odometry, DOUBTED)
 
-    monkeypatch.setattr(track, "build_odometry", built)
+    monkeypatch.setattr(track, "odometry_for", built)
 
 
 def test_a_build_tells_what_helped_in_a_trial(desk_log, tmp_path, monkeypatch):
