@@ -58,6 +58,9 @@ class Guarded(TyperGroup):
                 raise
             _say(f"{error.filename2 or error.filename or 'a file'}: {error.strerror}", error)
             raise typer.Exit(1) from None
+        except MemoryError as error:
+            _say("the memory does not suffice; close other programs, or read less of the log", error)
+            raise typer.Exit(1) from None
         except Terminated as error:
             _say("ended by SIGTERM", error)
             raise typer.Exit(_TERMINATED) from None

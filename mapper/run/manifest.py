@@ -11,8 +11,9 @@ from pydantic import Field, ValidationError
 
 import mapper
 from mapper.core.config import Config
-from mapper.core.errors import RunError
+from mapper.core.errors import DataError, RunError
 from mapper.runtime.atomic import MANIFEST_NAME, write_text
+from mapper.runtime.regular_files import MOST_TEXT_BYTES, read_regular, read_text
 from mapper.sensing.config import DepthNoiseConfig
 from mapper.sources.config import SourceConfig
 
@@ -273,9 +274,11 @@ def read_manifest(path: Path) -> Manifest:
         RunError: There is none, or it is not one that this version wrote.
     """
     try:
-        return Manifest.model_validate_json(path.read_bytes())
+        return Manifest.model_validate_json(read_regular(path, most_bytes=MOST_TEXT_BYTES))
     except OSError as error:
         raise RunError(f"{path}: cannot be read: {error.strerror}; is {path.parent} a run folder?") from None
+    except DataError as error:
+        raise RunError(f"{path}: {error}") from None
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
@@ -295,14 +298,14 @@ def now_text() -> str:
 def is_merged_map(folder: Path) -> bool:
     """Return whether a folder holds a merged map, not a run."""
     try:
-        return '"kind": "merged map"' in (folder / MANIFEST_NAME).read_text(encoding="utf-8")[:200]
-    except (OSError, UnicodeDecodeError):
+        return '"kind": "merged map"' in read_text(folder / MANIFEST_NAME)[:200]
+    except DataError:
         return False
 
 
 def is_localised_log(folder: Path) -> bool:
     """Return whether a folder holds a log that was localised in a map, not a run."""
     try:
-        return '"kind": "localised log"' in (folder / MANIFEST_NAME).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
+        return '"kind": "localised log"' in read_text(folder / MANIFEST_NAME)
+    except DataError:
         return False

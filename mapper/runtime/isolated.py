@@ -85,7 +85,8 @@ def _kill_idle() -> None:
 
 
 @contextmanager
-def _memory_limited(more_bytes: int) -> Iterator[None]:
+def memory_limited(more_bytes: int) -> Iterator[None]:
+    """Let this process allocate so much more while inside (Linux)."""
     statm = Path("/proc/self/statm")
     if not statm.exists():
         yield
@@ -108,7 +109,7 @@ def _serve(jobs: BinaryIO, answers: BinaryIO) -> None:
             return
         answer: tuple[Any, Exception | None]
         try:
-            with _memory_limited(memory_bytes):
+            with memory_limited(memory_bytes):
                 answer = job(), None
         except Exception as error:
             answer = None, error

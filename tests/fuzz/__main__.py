@@ -11,6 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from tests.fuzz.corpus import FORMATS
+from tests.fuzz.damage import BYTES
 from tests.fuzz.peers import PEER_OF
 from tests.fuzz.runner import Case, Runner, cases, for_each_case
 
@@ -69,7 +70,7 @@ def compare(runner: Runner, count: int, seed: int) -> None:
         if ours.outcome == "read" and theirs.outcome != "read":
             reasons[case.format, peer][f"{theirs.outcome}: {theirs.detail[:100]} ← {file}"] += 1
 
-    for_each_case(cases(PEER_OF), count, seed, run)
+    for_each_case(cases(PEER_OF, BYTES), count, seed, run)  # peers wait for pipes, and read devices
     print(
         "| format | peer | both read | only we read, with a note | without | only we refuse | both refuse |"
     )

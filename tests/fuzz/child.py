@@ -6,7 +6,6 @@ peer. It answers with another: the outcome and the message, or the traceback of 
 
 import json
 import os
-import resource
 import sys
 import traceback
 import warnings
@@ -14,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mapper.core.errors import FrameError, MapperError
+from mapper.runtime.isolated import memory_limited
 from tests.fuzz.peers import PEERS
 
 LONGEST_MESSAGE = 1000
@@ -98,12 +98,14 @@ def answer(words: Sequence[str]) -> dict[str, str]:
 
 def main() -> None:
     """Answer until the input ends."""
-    resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[1]),) * 2)
+    memory_bytes = int(sys.argv[1])
     warnings.simplefilter("error", RuntimeWarning)
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # what a library prints is no answer
     for line in sys.stdin:
-        print(json.dumps(answer(json.loads(line))), file=answers)
+        with memory_limited(memory_bytes):  # for each input: threads of libraries keep address space
+            found = answer(json.loads(line))
+        print(json.dumps(found), file=answers)
 
 
 if __name__ == "__main__":

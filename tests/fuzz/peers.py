@@ -3,6 +3,8 @@
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from mapper.sources.ros.typestore import typestore
+
 
 class RefusedError(Exception):
     """A peer that reports no error has read nothing."""
@@ -28,9 +30,8 @@ def _mcap(path: str) -> str:
 
 def _rosbags(path: str) -> str:
     from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
 
-    with AnyReader([Path(path)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+    with AnyReader([Path(path)], default_typestore=typestore("cdr")) as reader:
         for connection, _, data in reader.messages():
             reader.deserialize(data, connection.msgtype)
     return ""
@@ -43,13 +44,6 @@ def _each(ending: str, read: Callable[[Path], object]) -> Callable[[str], str]:
         return ""
 
     return read_all
-
-
-def _open3d(path: Path) -> None:
-    import open3d
-
-    if not open3d.io.read_point_cloud(str(path)).has_points():
-        raise RefusedError
 
 
 def _plyfile(path: Path) -> None:
@@ -68,7 +62,6 @@ PEERS: Mapping[str, Callable[[str], str]] = {
     "OctoMap": _octomap,
     "mcap": _mcap,
     "rosbags": _rosbags,
-    "Open3D": _each(".pcd", _open3d),
     "plyfile": _each(".ply", _plyfile),
     "laspy": _each(".la?", _laspy),
 }
@@ -84,7 +77,6 @@ PEER_OF: Mapping[str, str] = {
     "bag": "rosbags",
     "bag, bz2": "rosbags",
     "rosbag2": "rosbags",
-    "clouds, pcd": "Open3D",
     "clouds, ply": "plyfile",
     "clouds, las": "laspy",
     "clouds, laz": "laspy",
