@@ -69,7 +69,7 @@ def plan(
     Example: mapper plan runs/xyz --from 2.1 -0.3 --to 1.9 1.4 --radius 0.15
     """
     from mapper.config.loading import overridden
-    from mapper.export.grid import read_grid, stored_grid
+    from mapper.export.grid import stored_grid
     from mapper.export.plan import draw_plan, write_plan
     from mapper.merging.merged_map import open_map
     from mapper.navigation.config import PlanConfig
@@ -84,12 +84,9 @@ def plan(
     )
     config = overridden(PlanConfig(), assignments({"radius_m": radius, "unknown": unknown, "layer": layer}))
     built = open_map(run) if is_merged_map(run) else load_run(run)
-    if isinstance(built, Run):
-        grid, octree_path = stored_grid(built, config.layer), built.file(files.OCTREE_OT)
-    else:
-        grid, octree_path = read_grid(run / f"{config.layer}.yaml"), run / files.OCTREE_OT
+    grid = stored_grid(built, config.layer)
     if in_3d:
-        found = plan_3d(read_map(octree_path), start, goal, config=config)
+        found = plan_3d(read_map(built.file(files.OCTREE_OT)), start, goal, config=config)
     else:
         found = plan_2d(grid, start, goal, config=config)
     if isinstance(built, Run):

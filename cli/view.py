@@ -28,7 +28,6 @@ def view(
     """
     from mapper.core.errors import ConfigError, RunError
     from mapper.export.rerun.finished import show_run
-    from mapper.run.digests import changing
     from mapper.run.files import RERUN
     from mapper.run.folder import load_run
 
@@ -41,7 +40,7 @@ def view(
         show_run(built, "spawn" if connect is None else f"connect:{connect}")
         return
     path = rrd or built.path / RERUN
-    with nullcontext() if rrd else changing(built.path, {RERUN}):
+    with nullcontext() if rrd else built.changing({RERUN}):
         show_run(built, str(path))
     if not quiet:
         print(path)

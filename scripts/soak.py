@@ -45,12 +45,14 @@ class Soak:
         random: Draws all trials.
         counts: How the trials ended.
         faults: What should not be, a line each.
+        seconds: How long a verb took that was left to its end.
     """
 
     folder: Path
     random: random.Random
     counts: Counter[str] = field(default_factory=Counter)
     faults: list[str] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.log, self.reference, self.run = (self.folder / name for name in ("log", "reference", "run"))
@@ -75,25 +77,25 @@ class Soak:
 
     def _work(self) -> list[object]:
         """Draw a verb that writes into the run or replaces it by the same."""
-        return self.random.choice(
-            [
-                ["build", self.log, "--out", self.run, "--overwrite", *REPEATABLE],
-                ["fuse", self.run],
-                ["export", self.run, "--as", "costmap"],
-                ["export", self.run, "--as", "voxel-mesh"],
-                ["view", self.run, "--quiet"],
-            ]
-        )
+        works: list[list[object]] = [
+            ["build", self.log, "--out", self.run, "--overwrite", *REPEATABLE],
+            ["fuse", self.run],
+            ["export", self.run, "--as", "costmap"],
+            ["view", self.run, "--quiet"],
+        ]
+        return self.random.choices(works, weights=[4, 4, 1, 1])[0]
 
     def _killed(self) -> None:
         work = self._work()
         how = self.random.choice([signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-        after_s = self.random.uniform(0.0, 1.2 * self.duration_s)
+        after_s = self.random.uniform(0.0, 1.2) * self.seconds.get(str(work[0]), self.duration_s)
+        began = time.monotonic()
         process = subprocess.Popen(
             [*MAPPER, *map(str, work)], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
         )
         try:
             _, told = process.communicate(timeout=after_s)
+            self.seconds[str(work[0])] = time.monotonic() - began
         except subprocess.TimeoutExpired:
             process.send_signal(how)
             _, told = process.communicate(timeout=60.0)

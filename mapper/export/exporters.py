@@ -125,13 +125,12 @@ def export(
 @contextmanager
 def _recording(run: "Run", exporter: Exporter, path: Path) -> Iterator[None]:
     """Record in the manifest what an export writes into the run; files of the build stay as they are."""
-    from mapper.run.digests import changing
     from mapper.run.files import names_of
 
     written = {path.name, *(path.with_suffix(ending).name for ending in exporter.beside)}
     names = written & names_of("poses", "exported maps")
     inside = path.parent.resolve() == run.path.resolve()
-    with changing(run.path, names) if inside and names else nullcontext():
+    with run.changing(names) if inside and names else nullcontext():
         yield
 
 

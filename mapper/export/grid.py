@@ -1,7 +1,7 @@
 """The 2D slice as the PGM + YAML pair that ROS map_server and nav2 load, and as a picture."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -12,9 +12,6 @@ from mapper.export.palette import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, shrunk
 from mapper.runtime.atomic import write_bytes, write_text
 from mapper.runtime.regular_files import read_text
-
-if TYPE_CHECKING:
-    from mapper.run.folder import Run
 
 FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205
 OCCUPIED_THRESHOLD = 0.65
@@ -82,15 +79,21 @@ def read_grid(path: Path) -> OccupancyGrid:
     return OccupancyGrid(cells, np.array(origin[:2]), resolution_m)
 
 
-def stored_grid(run: "Run", stem: str) -> OccupancyGrid:
-    """Return a grid of a run: its slice, or its traversable floor.
+class _Folder(Protocol):
+    """A run or a merged map."""
+
+    def file(self, name: str, /) -> Path: ...
+
+
+def stored_grid(folder: _Folder, stem: str) -> OccupancyGrid:
+    """Return a grid of a run or of a merged map: its slice, or its traversable floor.
 
     Raises:
         RunError: A file is not as it was written.
         MapperError: As for ``read_grid``.
     """
-    run.file(f"{stem}.pgm")
-    return read_grid(run.file(f"{stem}.yaml"))
+    folder.file(f"{stem}.pgm")
+    return read_grid(folder.file(f"{stem}.yaml"))
 
 
 def grid_image(grid: OccupancyGrid) -> NDArray[np.uint8]:

@@ -13,7 +13,6 @@ from mapper.export.picture import write_path
 from mapper.navigation.planner import Plan, point_text
 from mapper.octree.slice import OccupancyGrid
 from mapper.run import files
-from mapper.run.digests import changing
 from mapper.run.folder import Run
 from mapper.runtime.atomic import write_text
 
@@ -34,7 +33,7 @@ def write_plan(run: Run, plan: Plan, *, grid: OccupancyGrid) -> None:
     if not log_path.is_file():
         raise RunError(f"{log_path}: is missing from the run; make it again with mapper fuse {run.path}")
     stamp_ns = int(run.trajectory().stamps_ns[0])
-    with changing(run.path, {files.PLAN, files.PLAN_VIEW, files.MCAP}):
+    with run.changing({files.PLAN, files.PLAN_VIEW, files.MCAP}):
         with McapLog(log_path) as log:
             log.copy(log_path, without=PLAN_TOPICS)
             log.plan(stamp_ns, _in_space(plan))

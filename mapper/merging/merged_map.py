@@ -102,6 +102,10 @@ class MergedMap:
     path: Path
     manifest: MapManifest
 
+    def file(self, name: str) -> Path:
+        """Return the path of one of its files."""
+        return self.path / name
+
     def tile_path(self, tile: Tile) -> Path:
         """Return the file of a tile."""
         return self.path / TILES / f"{tile.name}.octree"

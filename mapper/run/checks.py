@@ -43,8 +43,8 @@ def _hashed(run: Run, digests: Mapping[str, FileDigest]) -> Iterator[Finding]:
     def check(name: str) -> Finding:
         path, wanted = run.path / name, digests[name]
         if fault := fault_of(path, wanted):
-            heavy = path.exists() or name not in _DISPENSABLE
-            return Finding(name, "failed" if heavy else "warning", fault, files.remedy_for(name, run.path))
+            is_gone = name in _DISPENSABLE and not path.exists()  # a run is whole without it
+            return Finding(name, "warning" if is_gone else "failed", fault, files.remedy_for(name, run.path))
         return Finding(name, "well", f"{wanted.size_bytes} bytes, SHA-256 {wanted.sha256[:12]}…")
 
     return ordered_map(check, sorted(digests), workers=_THREADS)

@@ -47,8 +47,7 @@ def digests_of(folder: Path, names: Iterable[str] | None = None) -> dict[str, Fi
 def changing(folder: Path, names: Iterable[str]) -> Iterator[None]:
     """Let a verb write files into a finished run while inside, and put their digests into its manifest.
 
-    They have none meanwhile, so that a process that is killed leaves no digest of a file that is gone. A run
-    without digests, as older versions made it, stays without.
+    They have none meanwhile, so that a process that is killed leaves no digest of a file that is gone.
     """
     names = set(names)
     _replace_digests(folder, names, dict)

@@ -1,7 +1,7 @@
 """Run folder: reading a finished run, and writing a new one."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -15,7 +15,7 @@ from mapper.graph.g2o import read_g2o
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure, read_closures
 from mapper.run import files
-from mapper.run.digests import checked, digests_of
+from mapper.run.digests import changing, checked, digests_of
 from mapper.run.doubtful_frames import without_doubtful
 from mapper.run.fingerprint import fingerprint
 from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records
@@ -66,6 +66,10 @@ class Run:
             return self.path / name
         digests = read_manifest(self.path / files.MANIFEST).files  # exports and plans add theirs
         return checked(self.path, name, digests)
+
+    def changing(self, names: Iterable[str]) -> AbstractContextManager[None]:
+        """Return a context in which files of the run may be written; their digests are recorded at its end."""
+        return changing(self.path, names) if self.manifest.files else nullcontext()
 
     def trajectory(self) -> Trajectory:
         """Return the solved body poses of all placed frames, doubtful ones too, in the levelled world."""

@@ -154,7 +154,7 @@ def test_a_run_without_digests_is_read_and_counted(run):
     old = run.manifest.model_copy(update={"files": {}})
     old.save(run.path / "manifest.json")
     assert set(verdicts_of(run.path).values()) == {"well", "warning"}
-    export(run, "costmap")
+    export(load_run(run.path), "costmap")
     assert not read_manifest(run.path / "manifest.json").files
 
     lines = (run.path / "trajectory.tum").read_text().splitlines(keepends=True)
