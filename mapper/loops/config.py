@@ -112,8 +112,9 @@ class ScanVerificationConfig(Config):
     """A larger share of the visible obstacles in the other scan's free space is no loop. More, where much of
     what stands moves: parked cars leave."""
     max_moved_ratio: Ratio = 0.0
-    """A further share that may contradict where most of what stands agrees: between two days cars leave and
-    things are moved. ``mapper localise`` allows 0.14 unless more is set; more, where yards are rearranged."""
+    """A further share that may contradict where three quarters of what stands agree, less down to a half:
+    between two days cars leave and things are moved. ``mapper localise`` allows 0.14 unless more is set;
+    more, where yards are rearranged."""
     min_compared: PositiveInt = 100
     """Fewer points that agree or contradict prove nothing: bare yards are all alike."""
     min_lead: NonNegativeFloat = 0.07

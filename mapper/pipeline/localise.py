@@ -100,8 +100,8 @@ def localise(
         writer.warn(tracking.warnings)
         with writer.clock.stage("solve"):
             tracking = without_jumps(tracking, map_node, _loops(source, config).gate, progress=progress)
-            _refuse_unplaced(source, known, tracking)
             tracking = _supported(tracking)
+            _refuse_unplaced(source, known, tracking)
             solved = solve(tracking.graph, tracking.loops, config.graph)
             tracking = _supported(replace(tracking, graph=solved.graph, loops=solved.loops))
             _refuse_unplaced(source, known, tracking)

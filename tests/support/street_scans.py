@@ -14,9 +14,9 @@ SENSOR = LidarSensorConfig(rings=32, azimuth_steps=360)
 
 
 @cache
-def street(seed: int, *, loop_m: float = 150.0) -> OutdoorScene:
+def street(seed: int, *, loop_m: float = 150.0, day: int = 0) -> OutdoorScene:
     """Return a block of streets."""
-    return make_outdoor_scene(STREET.model_copy(update={"seed": seed, "loop_m": loop_m}))
+    return make_outdoor_scene(STREET.model_copy(update={"seed": seed, "loop_m": loop_m, "day": day}))
 
 
 def on_street(scene: OutdoorScene, along_m: float, *, yaw_rad: float = 0.0, left_m: float = 0.0) -> Transform:
