@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.errors import DataError
-from mapper.core.frames import PinholeCamera
+from mapper.core.frames import PinholeCamera, Points32
 from mapper.export.grid import stored_grid
 from mapper.export.run_mcap import BODY, CAMERA
+from mapper.mapping.cloud import Colors
 from mapper.mapping.fusion import Maps, Snapshot
 from mapper.octree.octomap_file import read_map
 from mapper.octree.slice import OccupancyGrid
@@ -30,11 +31,16 @@ def maps_of(run: Run) -> Maps:
         FrameError: The cloud cannot be read.
         DataError: A grid cannot be read.
     """
-    cloud = read_ply(run.file(files.CLOUD))
+    points_world, colors = _coloured_cloud(run.file(files.CLOUD))
+    dynamic_world, dynamic_colors = np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8)
+    if (run.path / files.DYNAMIC).exists():  # runs of before 2026-11-22 have none
+        dynamic_world, dynamic_colors = _coloured_cloud(run.file(files.DYNAMIC))
     return Maps(
         octree=read_map(run.file(files.OCTREE_MAP)),
-        cloud_points_world=np.column_stack([cloud[axis] for axis in ("x", "y", "z")]),
-        cloud_colors=np.column_stack([cloud[channel] for channel in ("red", "green", "blue")]),
+        cloud_points_world=points_world,
+        cloud_colors=colors,
+        dynamic_points_world=dynamic_world,
+        dynamic_colors=dynamic_colors,
         grid=stored_grid(run, files.SLICE),
         traversable=stored_grid(run, files.TRAVERSABLE),
         storeys=tuple(_storeys(run)),
@@ -46,6 +52,12 @@ def _storeys(run: Run) -> Iterator[OccupancyGrid]:
         if not (run.path / f"{stem}.yaml").exists():
             return
         yield stored_grid(run, stem)
+
+
+def _coloured_cloud(path: Path) -> tuple[Points32, Colors]:
+    cloud = read_ply(path)
+    points_world = np.column_stack([cloud[axis] for axis in ("x", "y", "z")])
+    return points_world, np.column_stack([cloud[channel] for channel in ("red", "green", "blue")])
 
 
 def snapshots_of(run: Run) -> Iterator[Snapshot]:

@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from mapper.navigation.traversable import traversable
 from mapper.octree.casting import Caster, depth_limit_of, reach_m
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
+from mapper.octree.moving_things import remove_moving_things
 from mapper.octree.scan_update import ScanUpdate, pack
 from mapper.octree.scan_update_file import CachedUpdate, ScanUpdateFile, ScanUpdateWriter, cache_update
 from mapper.octree.slice import OccupancyGrid, cut_slice
@@ -68,6 +70,8 @@ class Maps:
         octree: Occupied, free and unknown space.
         cloud_points_world: (N, 3) float32 metres, levelled world, all in occupied voxels of the octree.
         cloud_colors: (N, 3) uint8 RGB.
+        dynamic_points_world: (M, 3) float32 metres, the points of what moved, which is in no map.
+        dynamic_colors: (M, 3) uint8 RGB.
         grid: The slice through the octree above the floor.
         traversable: The floor that a robot can drive on, of the storey on which the path begins.
         storeys: The same of every storey, the lowest first, where floors lie over each other.
@@ -77,6 +81,8 @@ class Maps:
     octree: OctreeMap
     cloud_points_world: Points32
     cloud_colors: Colors
+    dynamic_points_world: Points32
+    dynamic_colors: Colors
     grid: OccupancyGrid
     traversable: OccupancyGrid
     storeys: tuple[OccupancyGrid, ...] = ()
@@ -132,7 +138,8 @@ def fuse_log(
 ) -> Maps:
     """Fuse every frame of the trajectory, in time order; decoding and casting run ahead in threads.
 
-    The cached update of a frame that has not moved is merged without reading the frame, to the same bits.
+    Then what moved is removed, unless ``octree.moving`` keeps it. The cached update of a frame whose pose is
+    the same is merged without reading the frame, to the same bits.
 
     Args:
         source: The log that was tracked.
@@ -177,13 +184,31 @@ def fuse_log(
         )
     if before is not None:
         progress.note(f"fused again: {moved} of {len(trajectory)} frames, which had moved or were not known")
+    points_world, colors = cloud.points_and_colors()
+    moving = np.zeros(len(points_world), np.bool_)
+    if config.octree.moving == "removed":
+        with after.reopened() as written:
+            things = remove_moving_things(octree, partial(_updates, written, config.workers))
+        moving = things.contain(points_world)
+        progress.note(f"moving things: {moving.sum()} of {len(moving)} points of the cloud")
+    kept = octree.are_occupied(points_world)
     floor = reachable_floor(octree, config.traversable, positions_world=trajectory.positions_world)
-    grid = cut_slice(octree, config.slice, driven=driven_ground(floor))
     storeys = traversable(floor, config.traversable)
-    home = next(storey.grid for storey in storeys if storey.is_home)
-    several = tuple(storey.grid for storey in storeys) if len(storeys) > 1 else ()
-    points = _in_occupied_voxels(octree, *cloud.points_and_colors())
-    return Maps(octree, *points, grid, home, several, has_path=len(floor.path) > 0)
+    return Maps(
+        octree=octree,
+        cloud_points_world=points_world[kept],
+        cloud_colors=colors[kept],
+        dynamic_points_world=points_world[moving],
+        dynamic_colors=colors[moving],
+        grid=cut_slice(octree, config.slice, driven=driven_ground(floor)),
+        traversable=next(storey.grid for storey in storeys if storey.is_home),
+        storeys=tuple(storey.grid for storey in storeys) if len(storeys) > 1 else (),
+        has_path=len(floor.path) > 0,
+    )
+
+
+def _updates(written: ScanUpdateFile, workers: int) -> Iterator[ScanUpdate]:
+    return ordered_map(CachedUpdate.update, written.entries(), workers=workers)
 
 
 class _Casters(threading.local):
@@ -275,12 +300,6 @@ def _snapshot(frame: Frame, scan: Scan, config: McapConfig) -> Snapshot | ScanSn
         shrunk_camera(frame.camera, width_px=config.image_width_px),
         frame.T_body_camera,
     )
-
-
-def _in_occupied_voxels(octree: OctreeMap, points_world: Points32, colors: Colors) -> tuple[Points32, Colors]:
-    """Return the part of a cloud that the finished octree agrees with."""
-    kept = octree.are_occupied(points_world)
-    return points_world[kept], colors[kept]
 
 
 def _add_to_cloud(cloud: CloudBuilder, scan: Scan, T_world_body: Transform) -> None:

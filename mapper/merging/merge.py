@@ -160,7 +160,7 @@ def _common_config(placed: Sequence[Placed]) -> OctreeConfig:
                     f"again with mapper fuse {run.path} --set octree.{name}={wanted:g}"
                 )
     attributes = all(item.run.config.octree.attributes for item in placed)
-    return first.config.octree.model_copy(update={"attributes": attributes, "dynamic": "none"})
+    return first.config.octree.model_copy(update={"attributes": attributes})
 
 
 def _described(item: Placed) -> RunInMap:

@@ -37,11 +37,9 @@ class OctreeConfig(Config):
     stays_within_m: NonNegativeFloat = 1e-9
     """Fusing again along another trajectory keeps a frame's cached update if no end of a ray moves further;
     the default tolerates the rounding of poses that were text."""
-    dynamic: Literal["none", "seen-through"] = "none"
-    """"none" is OctoMap. "seen-through": see ``seen_through_scans``."""
-    seen_through_scans: Annotated[int, Field(ge=1, le=255)] = 3
-    """After so many consecutive scans with an occupied voxel free, its log-odds are those of these misses
-    alone: the object has left. Only with ``dynamic = "seen-through"``."""
+    moving: Literal["removed", "kept"] = "removed"
+    """Whether fusing frees the voxels in which something moved, and keeps surfaces that rays only grazed; see
+    ``mapper.octree.moving_things``. "kept" is OctoMap's map."""
 
     @property
     def range_limit_m(self) -> float:

@@ -17,7 +17,6 @@ from mapper.octree.config import OctreeConfig, Parent
 from mapper.octree.keys import KEY_BITS, KEY_ZERO, codes_of
 from mapper.octree.nearest import Nearest, nearest_occupied
 from mapper.octree.scan_update import ScanUpdate
-from mapper.octree.seen_through import SeenThrough
 from mapper.octree.summing import Overlap, add_blocks
 from mapper.octree.tree_reader import TreeLeaves, fill
 
@@ -77,11 +76,6 @@ class OctreeMap:
         self.blocks = BlockStore()
         self.attributes = AttributeLayer(self.blocks, config.resolution_m) if config.attributes else None
         self._caster = Caster(config)
-        self._seen_through = None
-        if config.dynamic == "seen-through":
-            self._seen_through = SeenThrough(
-                config.seen_through_scans, occupied_log_odds=self.occupied_log_odds
-            )
         self._known = 0
 
     @property
@@ -165,10 +159,11 @@ class OctreeMap:
         self._add(cast.window.cells, cast.positions, slots)
 
     def _add(self, cells: NDArray[np.uint8], positions: NDArray[np.int64], slots: NDArray[np.int64]) -> None:
-        merge = kernels.merge if self._seen_through is None else self._seen_through.merge
-        self._known += merge(cells, positions, slots, self.blocks.table.values, self._sensor())
+        self._known += kernels.merge(cells, positions, slots, self.blocks.table.values, self.sensor)
 
-    def _sensor(self) -> kernels.SensorModel:
+    @property
+    def sensor(self) -> kernels.SensorModel:
+        """The sensor model in log-odds."""
         config = self.config
         return kernels.SensorModel(
             hit=log_odds(config.hit_probability),
@@ -336,9 +331,13 @@ class OctreeMap:
         coarse.restore(TreeLeaves(codes, depths, nodes.log_odds))
         return coarse
 
+    def forget(self, voxels: int) -> None:
+        """Count so many voxels less as known, after their log-odds were set to NaN."""
+        self._known -= voxels
+
     def clamp(self) -> None:
         """Clip all log-odds to the sensor model's limits."""
-        sensor = self._sensor()
+        sensor = self.sensor
         values = self.blocks.table.values[: len(self.blocks)]
         np.clip(values, sensor.lowest, sensor.highest, out=values)
 

@@ -8,6 +8,7 @@ scratch.
 
 import json
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -84,6 +85,12 @@ class ScanUpdateWriter:
             self._file.write(head.tobytes())
             self._file.write(frame.data)
 
+    def reopened(self) -> "ScanUpdateFile":
+        """Return a reader of what was written so far."""
+        with writing(self._path):
+            self._file.flush()
+        return open_scan_updates(self._path)
+
 
 class ScanUpdateFile:
     """Reader with access by stamp, from any thread; a context manager. Only heads are kept in memory."""
@@ -106,6 +113,11 @@ class ScanUpdateFile:
         """Return the number of frames."""
         return len(self._heads)
 
+    def entries(self) -> Iterator[CachedUpdate]:
+        """Yield every frame's update, in the order of the file."""
+        for stamp_ns, (head, start) in self._heads.items():
+            yield self._read(stamp_ns, head, start)
+
     def holds_for(self, config: OctreeConfig) -> bool:
         """Return whether the updates were cast with the same settings."""
         return self._first_line == _first_line(config)
@@ -120,7 +132,9 @@ class ScanUpdateFile:
         """
         if not self.holds(stamp_ns, T_world_body, config=config):
             return None
-        head, start = self._heads[stamp_ns]
+        return self._read(stamp_ns, *self._heads[stamp_ns])
+
+    def _read(self, stamp_ns: int, head: NDArray[np.void], start: int) -> CachedUpdate:
         data = os.pread(self._descriptor, int(head["size"]), start)
         return CachedUpdate(stamp_ns, head["T_world_body"], int(head["blocks"]), data)
 

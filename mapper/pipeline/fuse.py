@@ -206,7 +206,11 @@ def fuse_into(
     writer.update(warnings=(*others, *found))
     judge(writer, source, config, results, progress=progress)
     counts = writer.manifest.counts.model_copy(
-        update={"leaves": len(maps.octree), "cloud_points": len(maps.cloud_points_world)}
+        update={
+            "leaves": len(maps.octree),
+            "cloud_points": len(maps.cloud_points_world),
+            "dynamic_points": len(maps.dynamic_points_world),
+        }
     )
     writer.update(counts=counts, timing=_timing(writer, trajectory, counts.read))
     observer.on_mapped(Run(writer.folder, config, writer.manifest), results, maps)
@@ -238,6 +242,7 @@ def _write_maps(folder: Path, maps: Maps) -> None:
     write_ot(folder / files.OCTREE_OT, maps.octree)
     write_map(folder / files.OCTREE_MAP, maps.octree)
     write_ply(folder / files.CLOUD, maps.cloud_points_world, maps.cloud_colors)
+    write_ply(folder / files.DYNAMIC, maps.dynamic_points_world, maps.dynamic_colors)
     write_grid(folder, files.SLICE, maps.grid)
     write_grid(folder, files.TRAVERSABLE, maps.traversable)
     for number, storey in enumerate(maps.storeys[: files.MOST_STOREYS]):

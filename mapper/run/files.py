@@ -23,6 +23,7 @@ SLICE = "slice"
 TRAVERSABLE = "traversable"
 CLOUD = "cloud.ply"
 CLOUD_VIEWS = "cloud.png"
+DYNAMIC = "dynamic.ply"
 MCAP = "run.mcap"
 SUMMARY = "summary.png"
 SCAN_UPDATES = "scan_updates.bin"
@@ -92,6 +93,7 @@ RUN_FILES = (
         "maps",
     ),
     RunFiles((CLOUD, CLOUD_VIEWS), "the coloured cloud, and two views of it", "maps"),
+    RunFiles((DYNAMIC,), "the coloured points of what moved, which are in no map", "maps"),
     RunFiles((MCAP,), "all of it over time, for Foxglove and Rerun", "maps"),
     RunFiles((RERUN,), "the same arranged in Rerun, once `mapper view` was asked", "exported maps"),
     RunFiles((SUMMARY,), "the trajectory over the slice, with the truth", "maps"),

@@ -93,6 +93,7 @@ class Counts(Config):
     leaves: int = 0
     """Known leaves of the octree."""
     cloud_points: int = 0
+    dynamic_points: int = 0
 
     @property
     def frames_text(self) -> str:

@@ -94,16 +94,16 @@ def assert_same_bits(ours, theirs):
     np.testing.assert_array_equal(a.log_odds.view(np.int32), b.log_odds.view(np.int32))
 
 
-@pytest.mark.parametrize("dynamic", ["none", "seen-through"])
+@pytest.mark.parametrize("moving", ["removed", "kept"])
 @pytest.mark.parametrize(
     "indices",
     [[], [7], range(FRAMES - 4, FRAMES), range(FRAMES)],
     ids=["none", "one", "tail", "all"],
 )
 def test_only_frames_that_moved_are_read_and_the_bits_are_those_of_fusing_from_scratch(
-    source, first, tmp_path, indices, dynamic
+    source, first, tmp_path, indices, moving
 ):
-    config = overridden(CONFIG, [f"octree.dynamic={dynamic}"])
+    config = overridden(CONFIG, [f"octree.moving={moving}"])
     trajectory, counted = moved(source.truth, indices), Counted(source)
 
     with open_scan_updates(first) as before:

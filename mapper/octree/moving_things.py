@@ -1,0 +1,259 @@
+"""Removal of what moved: voxels that held something in some scans and were seen empty in others.
+
+OctoMap lets the majority of scans decide, and every ray frees whatever voxels it crosses. So a thing that
+stood for long stays, and ground that is seen at a slant is erased by the rays that pass low above it. Here
+the evidence of a ray is weighed by what the same scan saw around it:
+
+- A miss is *void* if all 26 voxels around were observed in the same scan (Duberg et al. 2024, DUFOMap).
+  Nothing is observed below the ground or behind a wall, so rays that graze a surface do not erase it. The
+  margin of a voxel covers errors of the pose (their d_p = 1).
+- A miss *passes* if none of these 26 voxels was hit in the same scan: noise of the range and errors of the
+  pose move a hit by no more (their d_s). A voxel is *seen through* by a miss that is void and passes.
+
+A voxel with h hits held something that moved if no surface is beside it and it was seen through at least 3
+times and in more than h/2 scans. A sparse sensor seldom observes all voxels around in one scan; for it, 8
+passes and more than 2h are enough. A surface is a voxel that was hit and has a voxel beside it that no
+scan observed: the ground, a wall. Feet and wheels touch the ground: a voxel that was hit beside a voxel of
+a moving thing that was hit too, in 9 of 10 of its hits, belongs to the thing; this is repeated once.
+
+What remains of the voxels that were ever hit is occupied, unless its void misses alone outweigh its hits.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy import float32, int64, uint64
+from numpy.typing import NDArray
+
+from mapper.core.geometry import Points
+from mapper.octree.bit_planes import (
+    ALL_SET,
+    NONE_SET,
+    WORD_BITS,
+    WORDS,
+    Words,
+    dilated,
+    neighbours_of,
+    words_of,
+)
+from mapper.octree.blocks import BlockStore, find_slots
+from mapper.octree.keys import BLOCK_BITS, codes_of
+from mapper.octree.map import OctreeMap
+from mapper.octree.scan_update import ScanUpdate
+
+_LEAST_SEEN_THROUGH, _SEEN_THROUGH_RATIO = 3, 0.5
+_LEAST_PASSES, _PASSES_RATIO = 8, 2.0
+_ATTACHED_RATIO = 0.9
+_ATTACHING_ROUNDS = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MovingThings:
+    """Voxels that held something that moved.
+
+    Attributes:
+        blocks: The blocks of the map.
+        removed: The plane of these voxels, by the blocks' slots.
+        resolution_m: Edge of a voxel.
+    """
+
+    blocks: BlockStore
+    removed: Words
+    resolution_m: float
+
+    def contain(self, points_world: Points) -> NDArray[np.bool_]:
+        """Return for each of (N, 3) points, metres, whether it lies in such a voxel."""
+        codes = codes_of(np.ascontiguousarray(points_world, np.float64), self.resolution_m)
+        slots = np.empty(len(codes), np.int64)
+        find_slots(self.blocks.table, codes >> (3 * BLOCK_BITS), slots)
+        inside: NDArray[np.bool_] = _set_at(self.removed, slots, codes)
+        return inside & (codes >= 0)
+
+    def __len__(self) -> int:
+        """Return the number of voxels."""
+        return int(np.unpackbits(self.removed.view(np.uint8)).sum())
+
+
+def remove_moving_things(octree: OctreeMap, scans: Callable[[], Iterable[ScanUpdate]]) -> MovingThings:
+    """Free the voxels of an octree in which something moved, and keep those of grazed surfaces.
+
+    A voxel that was never passed becomes unknown. Memory: about 24 bytes a voxel that was ever hit, and a few
+    bits for every other.
+
+    Args:
+        octree: The map of all scans; changed in place.
+        scans: Returns the map's scans, in any order; it is called four times.
+    """
+    blocks = octree.blocks
+    ever = np.zeros((len(blocks), WORDS), np.uint64)
+    for scan in scans():
+        _mark(words_of(scan.occupied), _slots_of(blocks, scan), ever)
+    starts, count = _number(ever)
+    counts = np.zeros((count, 4), np.int32)  # hits, voids, passes, seen through
+    for scan in scans():
+        _count(*_evidence(scan), _slots_of(blocks, scan), ever, starts, counts)
+    hits, _, passes, seen_through = counts.T
+    often = (seen_through >= _LEAST_SEEN_THROUGH) & (seen_through > _SEEN_THROUGH_RATIO * hits)
+    often |= (passes >= _LEAST_PASSES) & (passes > _PASSES_RATIO * hits)
+    moved = often & _gathered(_clear_of_surfaces(octree, ever), ever, count)
+    for _ in range(_ATTACHING_ROUNDS):
+        removed, beside = _scattered(moved, ever), np.zeros(count, np.int32)
+        for scan in scans():
+            hit, slots = words_of(scan.occupied), _slots_of(blocks, scan)
+            near = dilated(hit & removed[slots], neighbours_of(scan.codes), absent=NONE_SET)
+            _count_one(hit & near, slots, ever, starts, beside)
+        moved |= beside >= _ATTACHED_RATIO * hits
+    octree.forget(_decide(blocks.table.values, ever, moved, counts, octree.sensor, octree.occupied_log_odds))
+    return MovingThings(blocks, _scattered(moved, ever), octree.resolution_m)
+
+
+def _evidence(scan: ScanUpdate) -> tuple[Words, Words, Words]:
+    """Return where a scan hit, where it is void, and where it passes."""
+    free, hit = words_of(scan.free), words_of(scan.occupied)
+    neighbours = neighbours_of(scan.codes)
+    void = free & ~dilated(~(free | hit), neighbours, absent=ALL_SET)
+    return hit, void, free & ~dilated(hit, neighbours, absent=NONE_SET)
+
+
+def _slots_of(blocks: BlockStore, scan: ScanUpdate) -> NDArray[np.int64]:
+    slots = np.empty(len(scan), np.int64)
+    find_slots(blocks.table, scan.codes, slots)
+    return slots
+
+
+def _clear_of_surfaces(octree: OctreeMap, ever: Words) -> Words:
+    """Return the voxels with nothing unknown and no surface among the voxels around."""
+    neighbours = neighbours_of(octree.blocks.codes)
+    known: Words = _known(octree.blocks.table.values, len(octree.blocks))
+    inside = known & ~dilated(~known, neighbours, absent=ALL_SET)
+    clear: Words = inside & ~dilated(ever & ~inside, neighbours, absent=NONE_SET)
+    return clear
+
+
+@njit(cache=True, nogil=True)
+def _known(values, blocks):  # type: ignore[no-untyped-def]
+    words = np.zeros((blocks, WORDS), uint64)
+    for i in range(blocks):
+        for j in range(WORDS * WORD_BITS):
+            if values[i, j] == values[i, j]:
+                words[i, j // WORD_BITS] |= uint64(1) << uint64(j % WORD_BITS)
+    return words
+
+
+@njit(cache=True, nogil=True)
+def _mark(words, slots, plane):  # type: ignore[no-untyped-def]
+    for i in range(len(slots)):
+        for k in range(WORDS):
+            plane[slots[i], k] |= words[i, k]
+
+
+@njit(cache=True, nogil=True)
+def _number(ever):  # type: ignore[no-untyped-def]
+    """Number the set bits of a plane; return the first number in each word, and how many there are."""
+    starts, count = np.empty(ever.shape, int64), int64(0)
+    for i in range(len(ever)):
+        for k in range(WORDS):
+            starts[i, k] = count
+            word = ever[i, k]
+            while word:
+                word &= word - uint64(1)
+                count += 1
+    return starts, count
+
+
+@njit(cache=True, nogil=True)
+def _count(hit, void, passed, slots, ever, starts, counts):  # type: ignore[no-untyped-def]
+    """Add one scan to the counts of the voxels that were ever hit."""
+    for i in range(len(slots)):
+        for k in range(WORDS):
+            own = ever[slots[i], k]
+            if not own & (hit[i, k] | void[i, k] | passed[i, k]):
+                continue
+            row = starts[slots[i], k]
+            for bit in range(WORD_BITS):
+                if (own >> uint64(bit)) & uint64(1):
+                    is_void = int64((void[i, k] >> uint64(bit)) & uint64(1))
+                    is_passed = int64((passed[i, k] >> uint64(bit)) & uint64(1))
+                    counts[row, 0] += int64((hit[i, k] >> uint64(bit)) & uint64(1))
+                    counts[row, 1] += is_void
+                    counts[row, 2] += is_passed
+                    counts[row, 3] += is_void & is_passed
+                    row += 1
+
+
+@njit(cache=True, nogil=True)
+def _count_one(words, slots, ever, starts, counts):  # type: ignore[no-untyped-def]
+    """Add one plane of a scan to the counts of the voxels that were ever hit."""
+    for i in range(len(slots)):
+        for k in range(WORDS):
+            if not words[i, k]:
+                continue
+            row = starts[slots[i], k]
+            for bit in range(WORD_BITS):
+                if (ever[slots[i], k] >> uint64(bit)) & uint64(1):
+                    counts[row] += int64((words[i, k] >> uint64(bit)) & uint64(1))
+                    row += 1
+
+
+@njit(cache=True, nogil=True)
+def _gathered(plane, ever, count):  # type: ignore[no-untyped-def]
+    """Return (count,) bool: a plane at the voxels that were ever hit."""
+    flags, row = np.empty(count, np.bool_), 0
+    for i in range(len(ever)):
+        for k in range(WORDS):
+            for bit in range(WORD_BITS):
+                if (ever[i, k] >> uint64(bit)) & uint64(1):
+                    flags[row] = (plane[i, k] >> uint64(bit)) & uint64(1) != uint64(0)
+                    row += 1
+    return flags
+
+
+@njit(cache=True, nogil=True)
+def _scattered(flags, ever):  # type: ignore[no-untyped-def]
+    """Return the plane of flagged voxels: the inverse of ``_gathered``."""
+    plane, row = np.zeros_like(ever), 0
+    for i in range(len(ever)):
+        for k in range(WORDS):
+            for bit in range(WORD_BITS):
+                if (ever[i, k] >> uint64(bit)) & uint64(1):
+                    plane[i, k] |= uint64(flags[row]) << uint64(bit)
+                    row += 1
+    return plane
+
+
+@njit(cache=True, nogil=True)
+def _decide(values, ever, moved, counts, sensor, occupied_log_odds):  # type: ignore[no-untyped-def]
+    """Write the log-odds of all voxels that were ever hit; return how many became unknown."""
+    row, forgotten = 0, 0
+    for i in range(len(ever)):
+        for k in range(WORDS):
+            for bit in range(WORD_BITS):
+                if not (ever[i, k] >> uint64(bit)) & uint64(1):
+                    continue
+                voxel = k * WORD_BITS + bit
+                if moved[row] and counts[row, 2] > 0:
+                    values[i, voxel] = sensor.lowest
+                elif moved[row]:
+                    values[i, voxel] = np.nan
+                    forgotten += 1
+                elif values[i, voxel] < occupied_log_odds:
+                    weighed = float32(counts[row, 0]) * sensor.hit + float32(counts[row, 1]) * sensor.miss
+                    if weighed >= occupied_log_odds:
+                        values[i, voxel] = min(weighed, sensor.highest)
+                row += 1
+    return forgotten
+
+
+@njit(cache=True, nogil=True)
+def _set_at(plane, slots, codes):  # type: ignore[no-untyped-def]
+    """Return (N,) bool: a plane's bits at the voxels of codes whose blocks have these slots."""
+    flags = np.zeros(len(codes), np.bool_)
+    for i in range(len(codes)):
+        if slots[i] >= 0:
+            voxel = codes[i] & (WORDS * WORD_BITS - 1)
+            flags[i] = (plane[slots[i], voxel // WORD_BITS] >> uint64(voxel % WORD_BITS)) & uint64(
+                1
+            ) != uint64(0)
+    return flags

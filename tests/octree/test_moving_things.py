@@ -1,0 +1,148 @@
+"""Moving things: what was seen through is freed, what was grazed stays, and feet go with the body."""
+
+import numpy as np
+import pytest
+
+from mapper.core.frames import Scan
+from mapper.octree.casting import Caster
+from mapper.octree.config import OctreeConfig
+from mapper.octree.map import OctreeMap
+from mapper.octree.moving_things import remove_moving_things
+from mapper.octree.scan_update import pack
+
+CONFIG = OctreeConfig(resolution_m=0.2, max_range_m=30.0)
+EYE_M = 1.62
+GROUND_M = 0.05
+"""The ground lies low in the voxels 0 … 0.2 m."""
+
+
+def rays(ring_step_rad=0.01, azimuth_step_rad=0.01):
+    elevation, azimuth = np.meshgrid(
+        np.arange(-1.2, 0.2, ring_step_rad), np.arange(-np.pi, np.pi, azimuth_step_rad), indexing="ij"
+    )
+    flat = np.cos(elevation)
+    return np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)], -1).reshape(-1, 3)
+
+
+def box_range_m(origin, directions, low, high):
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = (low - origin) / directions, (high - origin) / directions
+    enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+    return np.where((enter <= leave) & (enter > 0.0), enter, np.inf)
+
+
+DENSE = rays()
+
+
+def scan_of(boxes, *, x_m=0.0, directions=DENSE, reach_m=12.0):
+    """Return points, in the world, on flat ground, a wall at x = 9 m, and boxes (low, high)."""
+    origin = np.array([x_m, 0.03, EYE_M])
+    with np.errstate(divide="ignore"):
+        ground_m = np.where(directions[:, 2] < 0, (GROUND_M - EYE_M) / directions[:, 2], np.inf)
+        wall_m = np.where(directions[:, 0] > 0, (9.05 - x_m) / directions[:, 0], np.inf)
+    ranges_m = np.minimum(ground_m, wall_m)
+    owner = np.zeros(len(directions), np.int64)
+    for number, (low, high) in enumerate(boxes, start=1):
+        found_m = box_range_m(origin, directions, np.array(low), np.array(high))
+        owner[found_m < ranges_m] = number
+        ranges_m = np.minimum(ranges_m, found_m)
+    seen = ranges_m < reach_m
+    return (origin + directions[seen] * ranges_m[seen, None]).astype(np.float32), owner[seen], origin
+
+
+def fused(scans):
+    octree, caster = OctreeMap(CONFIG), Caster(CONFIG)
+    updates = []
+    for points, _, origin in scans:
+        T_world_body = np.eye(4)
+        T_world_body[:3, 3] = origin
+        update = pack(caster.cast(Scan(0, (points - origin).astype(np.float32)), T_world_body))
+        octree.merge(update)
+        updates.append(update)
+    return octree, updates
+
+
+def person(y_m):
+    return (4.3, y_m - 0.25, GROUND_M), (4.6, y_m + 0.25, 1.8)
+
+
+POLE = (3.33, 1.3, GROUND_M), (3.41, 1.38, 2.4)
+
+
+@pytest.fixture(scope="module")
+def street():
+    """A sensor backs away from a pole; a person stands for 8 scans, and has walked away after 4 more."""
+    ways_m = [-2.0] * 8 + [-1.2, -0.4, 0.4, 1.2] + [None] * 4
+    return [
+        scan_of([POLE] if y_m is None else [POLE, person(y_m)], x_m=-0.05 * i) for i, y_m in enumerate(ways_m)
+    ]
+
+
+def test_people_leave_and_ground_walls_and_poles_stay(street):
+    octree, updates = fused(street)
+
+    things = remove_moving_things(octree, lambda: updates)
+
+    points = np.concatenate([points for points, _, _ in street]).astype(np.float64)
+    owner = np.concatenate([owner for _, owner, _ in street])
+    moving, kept = things.contain(points), octree.are_occupied(points)
+    body = (owner == 2) & (points[:, 2] > 0.2)
+    assert moving[body].mean() > 0.98
+    assert kept[body].mean() < 0.01
+    assert moving[owner == 2].mean() > 0.9, "feet in the ground's voxels alone stay"
+    assert moving[owner == 1].mean() < 0.01
+    assert kept[owner == 1].mean() > 0.95
+    assert moving[owner == 0].mean() < 0.001
+    assert kept[owner == 0].mean() > 0.98
+
+
+def test_space_where_a_thing_stood_is_free_and_the_floor_below_it_stays(street):
+    octree, updates = fused(street)
+    assert octree.query(np.array([[4.3, -2.0, 1.1]]))[0] > 0.0
+
+    remove_moving_things(octree, lambda: updates)
+
+    chest, floor = octree.query(np.array([[4.3, -2.0, 1.1], [4.3, -2.0, 0.1]]))
+    assert chest < 0.0 < floor
+
+
+def test_ground_that_octomap_erases_at_a_slant_is_kept():
+    sparse = rays(ring_step_rad=0.03)
+    scans = [scan_of([], x_m=-0.61 * i, directions=sparse, reach_m=25.0) for i in range(12)]
+    octree, updates = fused(scans)
+    points = np.concatenate([points for points, _, _ in scans]).astype(np.float64)
+    ground = points[points[:, 2] < 0.1]
+    lost = 1.0 - octree.are_occupied(ground).mean()
+
+    things = remove_moving_things(octree, lambda: updates)
+
+    assert lost > 0.05
+    assert 1.0 - octree.are_occupied(ground).mean() < 0.2 * lost
+    assert things.contain(ground).mean() < 0.001
+
+
+def test_a_scene_without_motion_loses_nothing_and_the_order_of_scans_does_not_matter(street):
+    still = [scan_of([POLE], x_m=-0.05 * i) for i in range(10)]
+    octree, updates = fused(still)
+    assert len(remove_moving_things(octree, lambda: updates)) == 0
+
+    (one, updates), (other, _) = fused(street), fused(street)
+    remove_moving_things(one, lambda: updates)
+    remove_moving_things(other, lambda: reversed(updates))
+    np.testing.assert_array_equal(one.leaves().log_odds, other.leaves().log_odds)
+
+
+def test_the_number_of_known_voxels_stays_right(street):
+    octree, updates = fused(street)
+
+    remove_moving_things(octree, lambda: updates)
+
+    assert len(octree) == np.isfinite(octree.blocks.table.values[: len(octree.blocks)]).sum()
+
+
+def test_points_without_a_voxel_are_in_no_moving_thing(street):
+    octree, updates = fused(street)
+    things = remove_moving_things(octree, lambda: updates)
+
+    far = np.array([[1e9, 0.0, 0.0], [np.nan, 0.0, 0.0], [500.0, 500.0, 500.0]])
+    assert not things.contain(far).any()
