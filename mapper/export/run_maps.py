@@ -56,8 +56,9 @@ def _storeys(run: Run) -> Iterator[OccupancyGrid]:
 
 def _coloured_cloud(path: Path) -> tuple[Points32, Colors]:
     cloud = read_ply(path)
-    points_world = np.column_stack([cloud[axis] for axis in ("x", "y", "z")])
-    return points_world, np.column_stack([cloud[channel] for channel in ("red", "green", "blue")])
+    points_world: Points32 = np.column_stack([cloud[axis] for axis in ("x", "y", "z")])
+    colors: Colors = np.column_stack([cloud[channel] for channel in ("red", "green", "blue")])
+    return points_world, colors
 
 
 def snapshots_of(run: Run) -> Iterator[Snapshot]:

@@ -78,10 +78,9 @@ def _climb(
     cost = np.full(len(tops), 1 << 30, np.int64)
     heap = [(np.int64(0), np.int64(0), np.int64(0))]  # climb so far, surface, storey of the one before
     heap.clear()
-    for n in range(len(tops)):
-        if sources[n]:
-            cost[n] = 0
-            heappush(heap, (np.int64(0), np.int64(n), np.int64(max(storey[n], 0))))
+    for source in np.flatnonzero(sources):
+        cost[source] = 0
+        heappush(heap, (np.int64(0), np.int64(source), np.int64(max(storey[source], 0))))
     is_done = np.zeros(len(tops), np.bool_)
     rest = 0
     while True:

@@ -64,7 +64,7 @@ def dilated(words: Words, neighbours: NDArray[np.int64], *, absent: np.uint64) -
 
 
 @njit(cache=True, nogil=True)
-def _neighbours(codes, index):  # type: ignore[no-untyped-def]
+def _neighbours(codes, index):
     rows = np.empty((len(codes), 3, 2), int64)
     for i in range(len(codes)):
         for axis in range(3):
@@ -77,7 +77,7 @@ def _neighbours(codes, index):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _dilated(words, neighbours, layers, absent):  # type: ignore[no-untyped-def]
+def _dilated(words, neighbours, layers, absent):
     before = words
     for axis in range(3):
         after = np.empty_like(words)

@@ -27,6 +27,7 @@ from numba import njit
 from numpy import float32, int64, uint64
 from numpy.typing import NDArray
 
+from mapper.core.frames import Points32
 from mapper.core.geometry import Points
 from mapper.octree.bit_planes import (
     ALL_SET,
@@ -63,13 +64,13 @@ class MovingThings:
     removed: Words
     resolution_m: float
 
-    def contain(self, points_world: Points) -> NDArray[np.bool_]:
+    def contain(self, points_world: Points | Points32) -> NDArray[np.bool_]:
         """Return for each of (N, 3) points, metres, whether it lies in such a voxel."""
         codes = codes_of(np.ascontiguousarray(points_world, np.float64), self.resolution_m)
         slots = np.empty(len(codes), np.int64)
         find_slots(self.blocks.table, codes >> (3 * BLOCK_BITS), slots)
-        inside: NDArray[np.bool_] = _set_at(self.removed, slots, codes)
-        return inside & (codes >= 0)
+        inside: NDArray[np.bool_] = _set_at(self.removed, slots, codes) & (codes >= 0)
+        return inside
 
     def __len__(self) -> int:
         """Return the number of voxels."""
@@ -133,7 +134,7 @@ def _clear_of_surfaces(octree: OctreeMap, ever: Words) -> Words:
 
 
 @njit(cache=True, nogil=True)
-def _known(values, blocks):  # type: ignore[no-untyped-def]
+def _known(values, blocks):
     words = np.zeros((blocks, WORDS), uint64)
     for i in range(blocks):
         for j in range(WORDS * WORD_BITS):
@@ -143,14 +144,14 @@ def _known(values, blocks):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _mark(words, slots, plane):  # type: ignore[no-untyped-def]
+def _mark(words, slots, plane):
     for i in range(len(slots)):
         for k in range(WORDS):
             plane[slots[i], k] |= words[i, k]
 
 
 @njit(cache=True, nogil=True)
-def _number(ever):  # type: ignore[no-untyped-def]
+def _number(ever):
     """Number the set bits of a plane; return the first number in each word, and how many there are."""
     starts, count = np.empty(ever.shape, int64), int64(0)
     for i in range(len(ever)):
@@ -164,7 +165,7 @@ def _number(ever):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _count(hit, void, passed, slots, ever, starts, counts):  # type: ignore[no-untyped-def]
+def _count(hit, void, passed, slots, ever, starts, counts):
     """Add one scan to the counts of the voxels that were ever hit."""
     for i in range(len(slots)):
         for k in range(WORDS):
@@ -184,7 +185,7 @@ def _count(hit, void, passed, slots, ever, starts, counts):  # type: ignore[no-u
 
 
 @njit(cache=True, nogil=True)
-def _count_one(words, slots, ever, starts, counts):  # type: ignore[no-untyped-def]
+def _count_one(words, slots, ever, starts, counts):
     """Add one plane of a scan to the counts of the voxels that were ever hit."""
     for i in range(len(slots)):
         for k in range(WORDS):
@@ -198,7 +199,7 @@ def _count_one(words, slots, ever, starts, counts):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True)
-def _gathered(plane, ever, count):  # type: ignore[no-untyped-def]
+def _gathered(plane, ever, count):
     """Return (count,) bool: a plane at the voxels that were ever hit."""
     flags, row = np.empty(count, np.bool_), 0
     for i in range(len(ever)):
@@ -211,7 +212,7 @@ def _gathered(plane, ever, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _scattered(flags, ever):  # type: ignore[no-untyped-def]
+def _scattered(flags, ever):
     """Return the plane of flagged voxels: the inverse of ``_gathered``."""
     plane, row = np.zeros_like(ever), 0
     for i in range(len(ever)):
@@ -224,7 +225,7 @@ def _scattered(flags, ever):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _decide(values, ever, moved, counts, sensor, occupied_log_odds):  # type: ignore[no-untyped-def]
+def _decide(values, ever, moved, counts, sensor, occupied_log_odds):
     """Write the log-odds of all voxels that were ever hit; return how many became unknown."""
     row, forgotten = 0, 0
     for i in range(len(ever)):
@@ -247,7 +248,7 @@ def _decide(values, ever, moved, counts, sensor, occupied_log_odds):  # type: ig
 
 
 @njit(cache=True, nogil=True)
-def _set_at(plane, slots, codes):  # type: ignore[no-untyped-def]
+def _set_at(plane, slots, codes):
     """Return (N,) bool: a plane's bits at the voxels of codes whose blocks have these slots."""
     flags = np.zeros(len(codes), np.bool_)
     for i in range(len(codes)):

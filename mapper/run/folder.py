@@ -68,7 +68,7 @@ class Run:
         return checked(self.path, name, digests)
 
     def changing(self, names: Iterable[str]) -> AbstractContextManager[None]:
-        """Return a context in which files of the run may be written; at its end their digests are recorded."""
+        """Return a context in which files of the run may be written; it records their digests at its end."""
         return changing(self.path, names) if self.manifest.files else nullcontext()
 
     def trajectory(self) -> Trajectory:
