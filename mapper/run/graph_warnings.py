@@ -1,0 +1,143 @@
+"""What is suspicious about a run's pose graph: its loops, its wheel factors, its uncertainty."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from mapper.core.errors import GraphError
+from mapper.core.geometry import inverse, log
+from mapper.graph.marginals import marginals_of
+from mapper.graph.model import PoseGraph
+from mapper.run.manifest import RunWarning
+from mapper.run.results import RunResults
+from mapper.run.timeline import TimeLine, counted
+
+_MAX_LOOP_M, _MAX_LOOP_SHARE, _MAX_LOOP_RAD = 0.3, 0.03, np.radians(10.0)
+_LEAST_LOOPS_REFUSED, _MAX_REFUSED_SHARE = 4, 0.5
+_MAX_WHEEL_CHI2, _LEAST_WHEEL_FACTORS = 9.0, 5
+_MAX_SIGMA_M, _MAX_SIGMA_SHARE, _BROKEN_SIGMA_SHARE = 0.1, 0.1, 0.3
+_MAX_STEP_M, _MAX_STEP_RAD = 0.2, np.radians(5.0)
+
+
+def loop_warnings(results: RunResults) -> Iterator[RunWarning]:
+    """Yield what is suspicious about loops: far from the odometry, or against the rest of the graph."""
+    held = [loop for loop in results.loops if loop.verdict == "accepted" and loop.before is not None]
+    contradicting = [loop for loop in results.loops if loop.reason.startswith("solver")]
+    tried = len(held) + len(contradicting)
+    if len(contradicting) >= _LEAST_LOOPS_REFUSED and len(contradicting) > _MAX_REFUSED_SHARE * tried:
+        yield RunWarning(
+            kind="loops",
+            sentence=f"{len(contradicting)} of {tried} loops contradict the rest of the graph "
+            f"(at most {_MAX_REFUSED_SHARE:.0%} is usual)",
+            suggestion="mapper loops RUN lists them; mapper loops RUN --remove I J takes a wrong one back",
+            weight="doubt",
+        )
+    if not held:
+        return
+    before = [loop.before for loop in held if loop.before is not None]
+    miss_m = float(np.median([miss.translation_m for miss in before]))
+    miss_rad = float(np.median([miss.rotation_rad for miss in before]))
+    stamps_ns = results.trajectory.stamps_ns
+    steps_m = np.linalg.norm(np.diff(results.trajectory.positions_world, axis=0), axis=1)
+    travelled_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    ends = np.searchsorted(stamps_ns, [[loop.stamp_i_ns, loop.stamp_j_ns] for loop in held])
+    ends = np.minimum(ends, len(stamps_ns) - 1)
+    path_m = float(np.median(np.abs(np.diff(travelled_m[ends], axis=1))))
+    limit_m = max(_MAX_LOOP_M, _MAX_LOOP_SHARE * path_m)
+    if miss_m <= limit_m and miss_rad <= _MAX_LOOP_RAD:
+        return
+    yield RunWarning(
+        kind="loops",
+        sentence=f"before the solve the median loop was {miss_m:.2f} m and {np.degrees(miss_rad):.1f}° "
+        f"from the odometry, over {path_m:.1f} m of path (at most {limit_m:.2f} m and "
+        f"{np.degrees(_MAX_LOOP_RAD):.0f}° are usual): either the odometry is wrong or the loops are",
+        suggestion="mapper loops RUN lists them; mapper loops RUN --remove I J takes a wrong one back",
+        weight="doubt",
+    )
+
+
+def wheel_warnings(results: RunResults) -> Iterator[RunWarning]:
+    """Yield a warning if wheel factors are farther from the solution than their noise explains."""
+    T_world_node = results.graph.T_world_node
+    factors = [factor for factor in results.graph.factors if factor.origin == "wheel"]
+    if len(factors) < _LEAST_WHEEL_FACTORS:
+        return
+    misses = [
+        np.concatenate(log(inverse(factor.T_i_j) @ inverse(T_world_node[factor.i]) @ T_world_node[factor.j]))
+        for factor in factors
+    ]
+    chi2 = [
+        float(miss @ factor.information @ miss) / 6.0 for miss, factor in zip(misses, factors, strict=True)
+    ]
+    if np.median(chi2) <= _MAX_WHEEL_CHI2:
+        return
+    miss_m = float(np.median([np.linalg.norm(miss[3:]) for miss in misses]))
+    moved_m = float(np.median([np.linalg.norm(factor.T_i_j[:3, 3]) for factor in factors]))
+    yield RunWarning(
+        kind="wheels",
+        sentence=f"wheels and odometry disagree: in the median by {miss_m:.2f} m where keyframes are "
+        f"{moved_m:.2f} m apart, {np.sqrt(np.median(chi2)):.0f} times what their noise explains "
+        f"(at most {np.sqrt(_MAX_WHEEL_CHI2):.0f} is usual)",
+        suggestion="check the wheels' calibration and clock, and the mounting of the sensor",
+        weight="doubt",
+    )
+
+
+def uncertainty_warnings(results: RunResults) -> Iterator[RunWarning]:
+    """Yield a warning if little is known of where the path ends."""
+    poses = results.poses
+    if poses is None:
+        return
+    known = np.flatnonzero(np.isfinite(poses.position_sigmas_m) & ~poses.is_doubtful)
+    if len(known) < 2:
+        return
+    path_m = results.trajectory.path_length_m
+    sigma_m = float(poses.position_sigmas_m[known[-1]])
+    share = sigma_m / max(path_m, 1e-9)
+    if sigma_m > _MAX_SIGMA_M and share > _MAX_SIGMA_SHARE:
+        yield RunWarning(
+            kind="uncertainty",
+            sentence=f"the last pose is known to {sigma_m:.2g} m (1 σ) after {path_m:.1f} m of path "
+            f"({share:.0%}, at most {_MAX_SIGMA_SHARE:.0%} is usual)",
+            suggestion="come back to known places, so that loops hold the path",
+            weight="break" if share > _BROKEN_SIGMA_SHARE else "doubt",
+        )
+
+
+def step_warnings(results: RunResults, timeline: TimeLine) -> Iterator[RunWarning]:
+    """Yield a warning if two parts of the path hang together by steps that little is known of."""
+    try:
+        relative = marginals_of(results.graph).relative
+    except GraphError:
+        return
+    sigmas = {
+        nodes: np.sqrt([covariance[part, part].trace() for part in (slice(3, 6), slice(0, 3))])
+        for nodes, covariance in relative.items()
+    }
+    wide = [nodes for nodes, (m, rad) in sigmas.items() if m > _MAX_STEP_M or rad > _MAX_STEP_RAD]
+    if not wide:
+        return
+    worst = max(wide, key=lambda nodes: float(sigmas[nodes][0]))
+    stamps_ns = sorted(results.graph.stamps_ns[node] for node in worst)
+    first, last = (int(index) for index in np.searchsorted(timeline.stamps_ns, stamps_ns))
+    worst_m, worst_rad = sigmas[worst]
+    steps = counted(_stretches(wide, results.graph), "step")
+    yield RunWarning(
+        kind="uncertainty",
+        sentence=f"{steps} between keyframes known to {_MAX_STEP_M:g} m or "
+        f"{np.degrees(_MAX_STEP_RAD):.0f}° at best (1 σ), the worst to {worst_m:.2g} m and "
+        f"{np.degrees(worst_rad):.2g}°: the parts before and after may not fit",
+        where=timeline.place(first, last),
+        suggestion="come back to known places, so that loops hold the path",
+        weight="doubt",
+    )
+
+
+def _stretches(pairs: Sequence[tuple[int, int]], graph: PoseGraph) -> int:
+    """Return how many stretches of time some pairs of nodes span: pairs that overlap in time are one."""
+    spans = sorted(sorted(graph.stamps_ns[node] for node in pair) for pair in pairs)
+    count, until_ns = 0, -1
+    for begin_ns, end_ns in spans:
+        count += begin_ns >= until_ns
+        until_ns = max(until_ns, end_ns)
+    return count

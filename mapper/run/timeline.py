@@ -1,0 +1,55 @@
+"""A log's frames in time, as warnings tell of them."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+
+from mapper.core.timebase import NS_PER_S, Stamps
+from mapper.run.manifest import Manifest
+from mapper.run.results import RunResults
+
+
+@dataclass(frozen=True, slots=True)
+class TimeLine:
+    """Stamps of a log's frames.
+
+    Attributes:
+        stamps_ns: (N,) of all frames, in time order.
+        usual_ns: Median interval.
+        begins_ns: First stamps of sessions that were appended: what lies before them is a pause, no gap.
+    """
+
+    stamps_ns: Stamps
+    usual_ns: float
+    begins_ns: tuple[int, ...]
+
+    @classmethod
+    def of(cls, results: RunResults, manifest: Manifest) -> "TimeLine":
+        """Return the stamps of a run's frames."""
+        stamps_ns = np.array([record.stamp_ns for record in results.records], np.int64)
+        usual_ns = float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0.0
+        return cls(stamps_ns, usual_ns, tuple(log.begins_ns for log in manifest.input.appended))
+
+    def place(self, first: int, last: int) -> str:
+        """Return between which seconds of the log two frames lie."""
+        begin_s, end_s = (self.stamps_ns[[first, last]] - self.stamps_ns[0]) / NS_PER_S
+        return f"{begin_s:.1f} … {end_s:.1f} s"
+
+    def duration_s(self, first: int, last: int) -> float:
+        """Return the seconds between two frames."""
+        return float(self.stamps_ns[last] - self.stamps_ns[first]) / NS_PER_S
+
+
+def runs_of(marked: Sequence[bool]) -> Iterator[tuple[int, int]]:
+    """Yield the first and last index of each run of frames that are marked."""
+    for is_marked, run in groupby(enumerate(marked), key=lambda one: one[1]):
+        indices = [index for index, _ in run]
+        if is_marked:
+            yield indices[0], indices[-1]
+
+
+def counted(number: int, what: str) -> str:
+    """Return a number and what it counts, in the plural if need be."""
+    return f"{number} {what}{'s' if number > 1 else ''}"
