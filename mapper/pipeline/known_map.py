@@ -62,7 +62,7 @@ def load_known_map(path: Path, *, progress: Progress = SILENT) -> KnownMap:
         members = []
         for member in open_map(path).manifest.runs:
             run = load_run(Path(member.path))
-            if fingerprint(run.path / files.OCTREE_MAP) != member.fingerprint:
+            if fingerprint(run.file(files.OCTREE_MAP)) != member.fingerprint:
                 raise RunError(f"{run.path}: changed since it was merged into {path}; merge again")
             members.append((run, np.array(member.T_map_world)))
     first, _ = members[0]
@@ -94,9 +94,8 @@ def detector_of(config: BuildConfig) -> Config | None:
 
 def places_of(run: Run, *, progress: Progress = SILENT) -> Mapping[int, AnyPlace]:
     """Return the stored places of a run; those of an old run are observed again from its log."""
-    stored = run.path / files.PLACES
-    if stored.exists():
-        return read_places(stored)
+    if (run.path / files.PLACES).exists():
+        return read_places(run.file(files.PLACES))
     log = open_log(run)
     loops = run.config.loops if isinstance(run.config.loops, KeyframeLoopsConfig) else LOOPS_OF[log.sensor]
     verifier, graph = build_verifier(loops.verification), run.graph()
