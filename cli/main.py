@@ -5,7 +5,7 @@ import signal
 import sys
 import warnings
 from types import FrameType
-from typing import Annotated, Any, NoReturn, TextIO, cast
+from typing import Annotated, Any, NoReturn, TextIO
 
 import typer
 from typer.core import TyperGroup
@@ -142,7 +142,9 @@ def main() -> None:
     """Run the command line."""
     prepare_environment()
     signal.signal(signal.SIGTERM, _terminate)
-    sys.stdout, sys.stderr = (cast(TextIO, EscapingStream(stream)) for stream in (sys.stdout, sys.stderr))
+    for name in ("stdout", "stderr"):
+        if stream := getattr(sys, name):  # None where the shell has closed it
+            setattr(sys, name, EscapingStream(stream))
     warnings.showwarning = _show_warning
     warnings.simplefilter("always", MapperWarning)
     app()

@@ -41,6 +41,7 @@ from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.results import RunResults, load_results
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
 from mapper.run.warnings import FLOOR, floor_warnings
+from mapper.runtime.atomic import is_temporary
 from mapper.runtime.progress import SILENT, Progress
 from mapper.runtime.timing import peak_memory_mb
 from mapper.sensing.depth_limit import DepthLimit
@@ -156,7 +157,7 @@ def _copy_kept_files(run: Run, new: Path) -> None:
         run.file(name)
     made_again = files.names_of("maps", "exported maps") | {files.FORMER_SCAN_UPDATES}
     for child in run.path.iterdir():
-        if child.name in made_again:
+        if child.name in made_again or is_temporary(child.name):
             continue
         run.file(child.name)
         if child.is_dir() and not child.is_symlink():

@@ -9,6 +9,7 @@ from mapper.run import files
 from mapper.run.digests import fault_of
 from mapper.run.folder import Run, load_run
 from mapper.run.manifest import FileDigest
+from mapper.runtime.atomic import is_temporary
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 
@@ -82,7 +83,7 @@ def _counted(run: Run) -> Iterator[Finding]:
 def _unrecorded(run: Run) -> Iterator[Finding]:
     """Yield what lies in the run without a digest, but for a user's own files."""
     for path in run.files():
-        if path.name.startswith(".") and ".part" in path.name:
+        if is_temporary(path.name):
             yield Finding(path.name, "warning", "left by a process that was killed", f"delete {path}")
         elif run.manifest.files and path.name in files.RUN.files - {files.MANIFEST, *run.manifest.files}:
             remedy = files.remedy_for(path.name, run.path)

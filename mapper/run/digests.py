@@ -61,6 +61,7 @@ def changing(folder: Path, names: Iterable[str]) -> Iterator[None]:
 
 
 def _replace_digests(folder: Path, names: Set[str], new: Callable[[], Mapping[str, FileDigest]]) -> None:
+    folder = folder.resolve()
     with locked(folder, wait=True):
         path = folder / files.MANIFEST
         manifest = read_manifest(path)

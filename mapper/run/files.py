@@ -115,8 +115,8 @@ RUN_FILES = (
     RunFiles((CONFIG,), "every setting as it was used; `mapper build --config` takes it back", "maps"),
     RunFiles(
         (MANIFEST,),
-        "the verdict and all warnings, versions, the input's fingerprint, counts, seconds, memory, and how "
-        "the run ended",
+        "the verdict and all warnings, versions, the input's fingerprint, counts, seconds, memory, how the "
+        "run ended, and size and SHA-256 of every other file",
         "maps",
     ),
     RunFiles((KITTI,), "the trajectory as KITTI text, once `mapper export --as kitti` was asked", "poses"),

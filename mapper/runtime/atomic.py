@@ -43,7 +43,7 @@ class FolderKind:
         if not folder.is_dir() or folder.is_symlink():
             return False
         if not (folder / MANIFEST_NAME).is_file():
-            return all(fnmatchcase(child.name, _TEMPORARY) for child in folder.iterdir())
+            return all(is_temporary(child.name) for child in folder.iterdir())
         try:
             manifest = json.loads((folder / MANIFEST_NAME).read_bytes())
         except (OSError, ValueError, RecursionError):
@@ -55,6 +55,11 @@ class FolderKind:
         known = (*self.files, MANIFEST_NAME, _TEMPORARY)
         names = sorted(child.name for child in folder.iterdir())
         return [name for name in names if not any(fnmatchcase(name, pattern) for pattern in known)]
+
+
+def is_temporary(name: str) -> bool:
+    """Return whether a file's name is one of ``atomic_file``'s, which a process that is killed leaves."""
+    return fnmatchcase(name, _TEMPORARY)
 
 
 @contextmanager

@@ -55,3 +55,10 @@ def test_a_build_that_is_told_to_end_says_so_in_its_manifest(desk_log, tmp_path,
     assert b"what there is so far stays in" in told
     assert read_manifest(manifest).status == "interrupted"
     assert not out.exists()
+
+
+def test_a_closed_standard_output_is_no_error():
+    told = subprocess.run(
+        ["sh", "-c", '"$@" >&-', "sh", *MAPPER, "--version"], capture_output=True, check=False
+    )
+    assert (told.returncode, told.stderr) == (0, b"")

@@ -139,6 +139,13 @@ def test_exports_into_the_run_are_recorded(run):
     assert verdicts_of(run.path)["trajectory.tum"] == "failed", "an export records what it writes alone"
 
 
+def test_a_run_may_be_named_by_a_link(run):
+    link = run.path.with_name("link")
+    link.symlink_to(run.path, target_is_directory=True)
+    export(load_run(link), "costmap")
+    assert verdicts_of(link)["costmap.pgm"] == "well"
+
+
 def test_a_process_that_is_killed_leaves_no_digest_of_what_it_was_changing(run):
     def kill():
         with changing(run.path, {files.MCAP}):
