@@ -78,8 +78,8 @@ class Soak:
     def _work(self) -> list[object]:
         """Draw a verb that writes into the run or replaces it by the same."""
         works: list[list[object]] = [
-            ["build", self.log, "--out", self.run, "--overwrite", *REPEATABLE],
-            ["fuse", self.run],
+            ["build", self.log, "--out", self.run, "--overwrite", "--quiet", *REPEATABLE],
+            ["fuse", self.run, "--quiet"],
             ["export", self.run, "--as", "costmap"],
             ["view", self.run, "--quiet"],
         ]
