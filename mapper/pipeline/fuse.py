@@ -153,7 +153,7 @@ def _given(record: FrameRecord) -> FrameRecord:
 
 def _copy_kept_files(run: Run, new: Path) -> None:
     """Copy the results of tracking and a user's own files; what was made from the old maps is left out."""
-    for name in files.names_of("tracking"):
+    for name in files.names_of("tracking") - files.DISPENSABLE:
         run.file(name)
     made_again = files.names_of("maps", "exported maps") | {files.FORMER_SCAN_UPDATES}
     for child in run.path.iterdir():

@@ -14,7 +14,6 @@ from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 
 _THREADS = 4
-_DISPENSABLE = files.names_of("poses", "exported maps") | {files.SCAN_UPDATES}
 
 
 def check_run(folder: Path, *, progress: Progress = SILENT) -> list[Finding]:
@@ -44,7 +43,7 @@ def _hashed(run: Run, digests: Mapping[str, FileDigest]) -> Iterator[Finding]:
     def check(name: str) -> Finding:
         path, wanted = run.path / name, digests[name]
         if fault := fault_of(path, wanted):
-            is_gone = name in _DISPENSABLE and not path.exists()  # a run is whole without it
+            is_gone = name in files.DISPENSABLE and not path.exists()  # a run is whole without it
             return Finding(name, "warning" if is_gone else "failed", fault, files.remedy_for(name, run.path))
         return Finding(name, "well", f"{wanted.size_bytes} bytes, SHA-256 {wanted.sha256[:12]}…")
 

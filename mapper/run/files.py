@@ -153,6 +153,10 @@ def names_of(*depends_on: str) -> frozenset[str]:
     return names | _STOREY_FILES if "maps" in depends_on else names
 
 
+DISPENSABLE = names_of("poses", "exported maps") | {SCAN_UPDATES, PLACES}
+"""Files that a user may delete: a run is whole without them."""
+
+
 _REMEDIES = {
     SCAN_UPDATES: "delete it, and mapper fuse RUN casts every frame afresh",
     CONFIG: "restore it, or build again; settings are changed with mapper fuse RUN --set",
