@@ -20,6 +20,7 @@ from mapper.sources.ros.index import Series
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.source import recording_log
 from mapper.sources.selection import selected
+from mapper.sources.vehicle_box import Box, vehicle_box
 
 _GAP_PERIODS = 3.0
 """Median periods that a pause must exceed to be a gap."""
@@ -75,6 +76,8 @@ class LogFacts:
         readings: How many accelerations there are.
         notes: What opening it had to leave out or assume.
         warnings: What is implausible about its depth.
+        vehicle: Box around the sensor's own vehicle, least x y z and largest, metres, body frame; None where
+            none is seen.
     """
 
     name: str
@@ -89,6 +92,7 @@ class LogFacts:
     readings: int
     notes: Sequence[str]
     warnings: Sequence[str]
+    vehicle: Box | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,6 +166,7 @@ def _inspected(path: Path, topics: Sequence[TopicFacts], source: Log) -> Inspect
         readings=0 if source.accelerations is None else len(source.accelerations.stamps_ns),
         notes=[*source.notes, *damage, *checks.notes()],
         warnings=depth_warnings(source),
+        vehicle=vehicle_box(source),
     )
     return Inspection(path, topics, log, problem or None)
 

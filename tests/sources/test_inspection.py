@@ -1,4 +1,5 @@
 import json
+import re
 
 import numpy as np
 import pytest
@@ -114,3 +115,18 @@ def test_what_is_no_log_is_refused(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(SourceError, match=r"not a log of a known format; .*\.mcap, \.bag"):
         inspect_log(tmp_path / "empty", SourceConfig())
+
+
+def test_the_box_of_the_vehicle_is_printed_as_the_setting_that_clears_it(tmp_path):
+    rng = np.random.default_rng(0)
+    for k in range(10):
+        vehicle = rng.uniform((-1.0, -0.5, -0.4), (-0.6, 0.5, -0.3), (300, 3))
+        world = rng.uniform((-12.0, -12.0, 0.0), (12.0, 12.0, 3.0), (400, 3))
+        ground = np.column_stack([rng.uniform(-12.0, 12.0, (400, 2)), np.full(400, -1.7)])
+        cloud = np.concatenate([vehicle, world, ground]).astype(np.float32)
+        np.save(tmp_path / f"{k:06d}.npy", cloud)
+
+    told = invoke("inspect", tmp_path).stdout
+    setting = re.search(r"--set (source\.body\.box=\[[-0-9.,]+\])", told).group(1)
+    assert "own vehicle" not in invoke("inspect", tmp_path, "--set", setting).stdout
+    assert len(json.loads(invoke("inspect", tmp_path, "--json").stdout)["log"]["vehicle"]) == 6

@@ -16,7 +16,7 @@ class ScanOdometryConfig(Config):
     """Factor on all lengths but the ranges. None takes it from the log: 1 outdoors; where walls are near, as
     much less as makes the voxel 0.06 of the median distance, or 0.15 m. 1 keeps the lengths as they are."""
     min_range_m: PositiveFloat = 1.0
-    """Nearer returns are the vehicle's own."""
+    """Nearer returns are the vehicle's own; ``source.body`` keeps them out of the maps, too."""
     max_range_m: PositiveFloat = 100.0
     """Farther returns are too sparse for registration."""
     voxel_m: PositiveFloat = 0.4

@@ -1,0 +1,127 @@
+"""Proposal of the box of a sensor's own vehicle: from returns that stand still while the sensor moves."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from mapper.core.errors import FrameError
+from mapper.core.frames import Sensor
+from mapper.core.geometry import Array, Points
+from mapper.sources.base import Log
+
+Box = tuple[float, float, float, float, float, float]
+"""Least x y z, then largest x y z, metres, body frame."""
+
+_FRAMES, _MIN_FRAMES = 24, 8
+_MIN_STANDING_RATIO, _SURE_RATIO, _MIN_SURE_CELLS = 0.6, 0.95, 2
+"""Shares of the frames in which a cell of the vehicle has returns: at the edge of a driver who walks along,
+and in the middle. With fewer of the latter a group is a wall that the sensor happens to keep beside."""
+_MAX_STILL_WORLD_RATIO = 0.5
+"""If more of the far cells stand still, so does the sensor, or it moves along a tunnel."""
+_STEP_M = 0.05
+_POINTS = 60_000
+
+
+@dataclass(frozen=True, slots=True)
+class _Scale:
+    """Size of a vehicle around a kind of sensor.
+
+    Attributes:
+        cell_m: Edge of the cells that returns are counted in.
+        vehicle_m: The vehicle is within this distance.
+        around_m: The world around it is looked at up to here, to tell walls that stand beside it.
+        ground_m: Returns up to so far above the ground are the ground's; None where up is not known.
+    """
+
+    cell_m: float
+    vehicle_m: float
+    around_m: float
+    ground_m: float | None
+
+
+_SCALES: Mapping[Sensor, _Scale] = {
+    "lidar": _Scale(cell_m=0.25, vehicle_m=4.0, around_m=12.0, ground_m=0.3),
+    "rgbd": _Scale(cell_m=0.05, vehicle_m=1.0, around_m=3.0, ground_m=None),
+}
+
+
+def vehicle_box(log: Log) -> Box | None:
+    """Return a box around the vehicle that carries a log's sensor, and a driver beside it; None without.
+
+    Returns near the sensor are counted in cells of the body frame, over frames spread over the log. Cells
+    that have returns in most of them are the vehicle, unless they join others that lie farther off, as
+    those of walls along the way do. Ground below a LiDAR stands still too, and is left out by its height.
+    """
+    scale = _SCALES[log.sensor]
+    clouds = _clouds(log, scale)
+    if len(clouds) < _MIN_FRAMES:
+        return None
+    cells, standing = _counted(clouds, scale.cell_m)
+    range_m = np.linalg.norm((cells + 0.5) * scale.cell_m, axis=1)
+    still = standing >= _MIN_STANDING_RATIO
+    far = range_m > scale.vehicle_m
+    world = still[far & (standing >= 2.0 / len(clouds))]
+    if not far.any() or (len(world) and world.mean() > _MAX_STILL_WORLD_RATIO):
+        return None
+    joined = _joined(cells[still])
+    still_range_m = range_m[still]
+    own = np.array(
+        [
+            (standing[still][members := joined == label] >= _SURE_RATIO).sum() >= _MIN_SURE_CELLS
+            and still_range_m[members].max() <= scale.vehicle_m
+            for label in range(joined.max(initial=-1) + 1)
+        ],
+        np.bool_,
+    )
+    own_cells = cells[still][own[joined]] if len(own) else cells[:0]
+    if not len(own_cells):
+        return None
+    lower = np.floor(own_cells.min(axis=0) * scale.cell_m / _STEP_M + 1e-6) * _STEP_M - _STEP_M
+    upper = np.ceil((own_cells.max(axis=0) + 1) * scale.cell_m / _STEP_M - 1e-6) * _STEP_M + _STEP_M
+    x_low, y_low, z_low, x_high, y_high, z_high = (round(float(v), 3) for v in (*lower, *upper))
+    return x_low, y_low, z_low, x_high, y_high, z_high
+
+
+def _clouds(log: Log, scale: _Scale) -> list[Points]:
+    """Return the points around the sensor of some frames, without the ground."""
+    clouds: list[Points] = []
+    for index in np.unique(np.linspace(0, len(log) - 1, min(_FRAMES, len(log))).round().astype(int)):
+        try:
+            points = log.entry_at(int(index)).scan().points_body
+        except FrameError:
+            continue
+        points = points[:: max(1, len(points) // _POINTS)].astype(np.float64)
+        clouds.append(points[np.linalg.norm(points, axis=1) <= scale.around_m])
+    if scale.ground_m is not None and clouds:
+        limit_m = _ground_m(np.concatenate([points[:, 2] for points in clouds])) + scale.ground_m
+        clouds = [points[points[:, 2] > limit_m] for points in clouds]
+    return clouds
+
+
+def _ground_m(heights_m: Array) -> float:
+    """Return the height below the sensor at which most returns lie."""
+    below_m = heights_m[heights_m < 0.0]
+    if not len(below_m):
+        return -np.inf
+    counts, edges_m = np.histogram(below_m, bins=np.arange(np.floor(below_m.min()), 0.15, 0.1))
+    return float(edges_m[int(counts.argmax())]) + 0.05
+
+
+def _counted(clouds: list[Points], cell_m: float) -> tuple[NDArray[np.int64], Array]:
+    """Return the (C, 3) cells with returns, and the share of the clouds that have some in each."""
+    of_each = [np.unique(np.floor(points / cell_m).astype(np.int64), axis=0) for points in clouds]
+    cells, counts = np.unique(np.concatenate(of_each), axis=0, return_counts=True)
+    return cells, counts / len(clouds)
+
+
+def _joined(cells: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Return the (C,) number of the group of each cell; at most one empty cell lies between its members."""
+    pairs = cKDTree(cells).query_pairs(2.0, p=np.inf, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs), np.bool_), pairs.T), shape=(len(cells), len(cells)))
+    _, labels = connected_components(graph, directed=False)
+    return np.asarray(labels, dtype=np.intp)

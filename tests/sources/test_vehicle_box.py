@@ -1,0 +1,83 @@
+"""Box of the sensor's own vehicle, proposed from returns that stand still in the body frame."""
+
+import numpy as np
+import pytest
+
+from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
+from mapper.sources.config import BodyConfig, SourceConfig
+from mapper.sources.selection import selected
+from mapper.sources.vehicle_box import vehicle_box
+from tests.support.logs import MemoryEntry, log_in_memory
+from tests.support.street_scans import on_street, street, view
+
+FRAMES = 12
+CAMERA = PinholeCamera(width_px=80, height_px=60, fx_px=70.0, fy_px=70.0, cx_px=39.5, cy_px=29.5)
+
+
+def bonnet_and_driver(rng):
+    """Return points of a bonnet before the sensor, and of a person who walks behind it and sways."""
+    bonnet = rng.uniform((0.8, -0.7, -0.85), (1.9, 0.7, -0.8), (400, 3))
+    angle = rng.uniform(0.0, 2.0 * np.pi, 500)
+    driver = np.column_stack([0.25 * np.cos(angle), 0.25 * np.sin(angle), rng.uniform(-1.1, 0.1, 500)])
+    driver += [-1.4 + rng.normal(0.0, 0.05), rng.normal(0.0, 0.08), 0.0]
+    return np.concatenate([bonnet, driver])
+
+
+def street_log(*, vehicle, parked=False):
+    """Return a drive along a synthetic street, and the points that belong to the vehicle and its driver."""
+    scene, rng, entries, own = street(1), np.random.default_rng(4), [], []
+    for k in range(FRAMES):
+        points = view(scene, on_street(scene, 5.0 + (0.0 if parked else 2.5 * k)), seed=k).points_body
+        own.append(bonnet_and_driver(rng))
+        if vehicle:
+            points = np.concatenate([points, own[-1].astype(np.float32)])
+        entries.append(MemoryEntry(k, Scan(k, points.astype(np.float32))))
+    return log_in_memory(entries, sensor="lidar"), np.concatenate(own)
+
+
+def test_the_box_holds_vehicle_and_driver_and_little_else():
+    log, own = street_log(vehicle=True)
+    box = vehicle_box(log)
+    lower, upper = np.array(box).reshape(2, 3)
+    inside = ((own >= lower) & (own <= upper)).all(axis=1)
+    assert inside.mean() > 0.97
+    assert (lower >= own.min(axis=0) - 0.4).all()
+    assert (upper <= own.max(axis=0) + 0.4).all()
+
+    left = selected(log, SourceConfig(body=BodyConfig(box=box)))
+    assert vehicle_box(left) is None
+    kept = sum(len(entry.scan().points_body) for entry in left.entries())
+    total = sum(len(entry.scan().points_body) for entry in log.entries())
+    assert total - kept == pytest.approx(len(own), rel=0.03)
+
+
+def test_a_street_alone_has_no_vehicle():
+    assert vehicle_box(street_log(vehicle=False)[0]) is None
+
+
+def test_while_the_sensor_stands_nothing_can_be_told():
+    assert vehicle_box(street_log(vehicle=True, parked=True)[0]) is None
+
+
+def test_few_frames_tell_nothing():
+    log, _ = street_log(vehicle=True)
+    assert vehicle_box(log.subset(np.arange(5))) is None
+
+
+@pytest.mark.parametrize("bumper", [True, False])
+def test_a_bumper_below_a_camera_is_found(bumper):
+    entries = []
+    for k in range(FRAMES):
+        depth_m = np.full((60, 80), 1.3 + 0.12 * k, np.float32)
+        if bumper:
+            depth_m[48:, 20:60] = 0.4
+        frame = RgbdFrame(k, np.zeros((60, 80), np.uint8), depth_m, CAMERA)
+        entries.append(MemoryEntry(k, frame))
+    box = vehicle_box(log_in_memory(entries))
+    if not bumper:
+        assert box is None
+        return
+    lower, upper = np.array(box).reshape(2, 3)
+    assert (lower <= (-0.11, 0.11, 0.4)).all()
+    assert (upper >= (0.11, 0.16, 0.4)).all()
+    assert (upper - lower < 0.5).all()
