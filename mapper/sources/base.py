@@ -41,12 +41,14 @@ class ImageFiles:
         depth: 16-bit depth image.
         depth_stamp_ns: Time of the depth image, nanoseconds.
         depth_units_per_m: Depth image units per metre.
+        recorded_units_per_m: Those of the recording that it is encoded from; None if they are the same.
     """
 
     colour: ImageFile
     depth: ImageFile
     depth_stamp_ns: int
     depth_units_per_m: float
+    recorded_units_per_m: float | None = None
 
 
 class FrameRef(Protocol):

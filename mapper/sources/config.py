@@ -18,7 +18,7 @@ class CameraConfig(Config):
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2, k3 (OpenCV's order)."""
     depth_factor: PositiveFloat | None = None
-    """Depth image units per metre; None keeps the log's own (5000 for TUM)."""
+    """Depth image units per metre; None keeps the log's own (TUM's 5000, 1 of 32-bit depth in recordings)."""
 
     @property
     def intrinsics_px(self) -> tuple[float, float, float, float] | None:

@@ -200,7 +200,7 @@ def _read(log: Log, index: int) -> RgbdFrame | None:
 
 def _units_per_m(log: Log) -> float | None:
     files = log.entry_at(0).files
-    return None if files is None else files.depth_units_per_m
+    return None if files is None else files.recorded_units_per_m or files.depth_units_per_m
 
 
 def _rounded(units_per_m: float) -> float:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from mapper.core.errors import DataError, FrameError
-from mapper.core.frames import PinholeCamera, Scan
+from mapper.core.frames import DepthImage, PinholeCamera, Scan
 from mapper.core.geometry import Transform
 from mapper.sources.base import ImageFiles
 from mapper.sources.images import encode_colour, encode_depth
@@ -52,7 +52,13 @@ class Located:
 
 
 def rgbd_entry(
-    colour: Located, depth: Located, camera: PinholeCamera, *, units_per_m: float, colour_suffix: str
+    colour: Located,
+    depth: Located,
+    camera: PinholeCamera,
+    *,
+    units_per_m: float,
+    float_units_per_m: float | None,
+    colour_suffix: str,
 ) -> RgbdEntry:
     """Return the entry of a colour and a depth message; the body is the camera.
 
@@ -63,16 +69,18 @@ def rgbd_entry(
         depth: Depth image, registered to it.
         camera: Camera of both.
         units_per_m: 16-bit depth units per metre.
+        float_units_per_m: Those of depth that is recorded as 32-bit numbers; None if it is not.
         colour_suffix: Ending of a colour image's file.
     """
+    depth_file = _DepthFile(depth, units_per_m, float_units_per_m or 1.0)
     return RgbdEntry(
         colour.stamp_ns,
         ImageFiles(
-            _ColourFile(colour, colour_suffix), _DepthFile(depth, units_per_m), depth.stamp_ns, units_per_m
+            _ColourFile(colour, colour_suffix), depth_file, depth.stamp_ns, units_per_m, float_units_per_m
         ),
         camera,
         read_image=lambda in_colour: image_of(colour.image(), colour=in_colour, where=f"{colour}"),
-        read_depth_m=lambda: depth_m_of(depth.image(), units_per_m=units_per_m, where=f"{depth}"),
+        read_depth_m=lambda: depth_file.depth_m_of(depth.image()),
     )
 
 
@@ -132,6 +140,7 @@ class _DepthFile:
 
     message: Located
     units_per_m: float
+    float_units_per_m: float
     suffix: str = ".png"
 
     def __str__(self) -> str:
@@ -142,5 +151,13 @@ class _DepthFile:
         file = depth_file_of(message)
         if file is not None:
             return file
-        depth_m = depth_m_of(message, units_per_m=self.units_per_m, where=f"{self.message}")
-        return encode_depth(depth_m, self.units_per_m)
+        return encode_depth(self.depth_m_of(message), self.units_per_m)
+
+    def depth_m_of(self, message: ImageMessage) -> DepthImage:
+        """Return (H, W) depth in metres of the message."""
+        return depth_m_of(
+            message,
+            units_per_m=self.units_per_m,
+            float_units_per_m=self.float_units_per_m,
+            where=f"{self.message}",
+        )

@@ -90,26 +90,31 @@ def image_of(message: ImageMessage, *, colour: bool, where: str) -> Image:
     return image
 
 
-def depth_m_of(message: ImageMessage, *, units_per_m: float, where: str) -> DepthImage:
+def depth_m_of(
+    message: ImageMessage, *, units_per_m: float, float_units_per_m: float = 1.0, where: str
+) -> DepthImage:
     """Return (H, W) float32 depth in metres; 0 is no measurement.
 
     Args:
-        message: 16-bit units, 32-bit metres, or a file of 16-bit units.
+        message: 16-bit units, 32-bit numbers, or a file of either.
         units_per_m: 16-bit units of a metre; ROS says 1000.
+        float_units_per_m: The same of 32-bit numbers; ROS says 1.
         where: What to name in an error.
 
     Raises:
         FrameError: The image is damaged, or in an encoding that is not read.
     """
     if isinstance(message, FileMessage):
-        return _depth_m_of_file(message, units_per_m=units_per_m, where=where)
+        return _depth_m_of_file(
+            message, units_per_m=units_per_m, float_units_per_m=float_units_per_m, where=where
+        )
     kind = _DEPTH.get(message.encoding)
     if kind is None:
         raise FrameError(f"{where}: depth encoded as {message.encoding}; known are {', '.join(_DEPTH)}")
     order = ">" if message.is_big_endian else "<"
     pixels = _pixels(message, order + kind, 1, where=where)
     if kind == "f4":
-        return _valid_depth(pixels)
+        return _valid_depth(pixels, float_units_per_m)
     return depth_m_from(np.ascontiguousarray(pixels, dtype=np.uint16), units_per_m)
 
 
@@ -121,7 +126,16 @@ def depth_file_of(message: ImageMessage) -> bytes | None:
     return data[_DEPTH_HEADER.size :] if "compressedDepth" in message.format else data
 
 
-def _depth_m_of_file(message: FileMessage, *, units_per_m: float, where: str) -> DepthImage:
+def has_float_depth(message: ImageMessage) -> bool:
+    """Return whether depth is stored as 32-bit numbers, or was before it was compressed."""
+    if isinstance(message, PixelsMessage):
+        return message.encoding == "32FC1"
+    return message.format.startswith("32FC1")
+
+
+def _depth_m_of_file(
+    message: FileMessage, *, units_per_m: float, float_units_per_m: float, where: str
+) -> DepthImage:
     """Decode a PNG, which in compressedDepth follows a header.
 
     Its 32-bit depth is stored as A / depth + B in 16 bits, with A and B in the header.
@@ -139,12 +153,13 @@ def _depth_m_of_file(message: FileMessage, *, units_per_m: float, where: str) ->
         return depth_m_from(units, units_per_m)
     with np.errstate(divide="ignore"):
         depth_m = np.float32(a) / (units.astype(np.float32) - np.float32(b))
-    return _valid_depth(np.where(units > 0, depth_m, np.float32(0.0)))
+    return _valid_depth(np.where(units > 0, depth_m, np.float32(0.0)), float_units_per_m)
 
 
-def _valid_depth(depth_m: DepthImage) -> DepthImage:
-    """Return depth with 0 where it is not finite, negative, or beyond the reach of every depth camera."""
-    valid: DepthImage = np.array(depth_m, dtype=np.float32)  # aligned, which a message need not be
+def _valid_depth(depth: DepthImage, units_per_m: float) -> DepthImage:
+    """Return metres, 0 where depth is not finite, negative, or beyond the reach of every depth camera."""
+    valid: DepthImage = np.array(depth, dtype=np.float32)  # aligned, which a message need not be
+    valid /= np.float32(units_per_m)
     np.copyto(valid, 0.0, where=~((valid >= 0.0) & (valid < _FARTHEST_M)))
     return valid
 

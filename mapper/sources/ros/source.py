@@ -11,9 +11,9 @@ from mapper.sources.calibration import Calibration, configured
 from mapper.sources.config import SourceConfig
 from mapper.sources.images import FINE_UNITS_PER_M
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry
-from mapper.sources.ros.image_messages import MILLIMETRES_PER_M, size_of
+from mapper.sources.ros.image_messages import MILLIMETRES_PER_M, has_float_depth, size_of
 from mapper.sources.ros.index import Series
-from mapper.sources.ros.messages import CameraMessage, FileMessage, ImageMessage, PixelsMessage
+from mapper.sources.ros.messages import CameraMessage, FileMessage, ImageMessage
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.time_line import ordered, paired
 from mapper.sources.ros.topics import CameraTopics, choose, frame_of
@@ -84,10 +84,9 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
     frame, depth_frame = frame_of(first_color), frame_of(first_depth)
     if frame != depth_frame:
         notes.append(f"depth in frame {depth_frame} is taken to be registered to colour in {frame}")
-    stored_in_metres = isinstance(first_depth, PixelsMessage) and first_depth.encoding == "32FC1"
-    units_per_m = FINE_UNITS_PER_M if stored_in_metres else MILLIMETRES_PER_M
-    if config.camera is not None and config.camera.depth_factor is not None:
-        units_per_m = config.camera.depth_factor
+    factor = None if config.camera is None else config.camera.depth_factor
+    float_units_per_m = (factor or 1.0) if has_float_depth(first_depth) else None
+    units_per_m = (factor or MILLIMETRES_PER_M) if float_units_per_m is None else FINE_UNITS_PER_M
     is_jpeg = isinstance(first_color, FileMessage) and bytes(first_color.data[:2]) == _JPEG_START
 
     def entry_at(index: int) -> FrameRef:
@@ -96,6 +95,7 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
             reader.located(depth, int(j[index])),
             camera,
             units_per_m=units_per_m,
+            float_units_per_m=float_units_per_m,
             colour_suffix=".jpg" if is_jpeg else ".png",
         )
 

@@ -10,6 +10,7 @@ from mapper.core.geometry import exp
 from mapper.core.rotations import quaternion_from_rotation
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig, TopicsConfig
+from mapper.sources.images import decode_depth_units
 from mapper.sources.ros.encode_ros import SerializedMessage, cloud_message, imu_message, odometry_message
 from mapper.sources.writers import write_log
 from tests.support.recordings import CAMERA, COLOR, DEPTH, camera_info, image, shots, write
@@ -158,6 +159,20 @@ def test_depth_units_can_be_set(tmp_path):
     camera = CameraConfig(fx_px=60, fy_px=60, cx_px=32, cy_px=24, depth_factor=5000)
     frame = next(opened(tmp_path / "a.mcap", shots(1), camera=camera).entries()).load()
     np.testing.assert_array_equal(frame.depth_m, picture(0)[1].astype(np.float32) / np.float32(5000))
+
+
+@pytest.mark.parametrize("factor", [None, 1.0, 1000.0])
+def test_units_of_depth_of_32_bits_can_be_set(tmp_path, factor):
+    depth_m = np.linspace(0.5, 4.0, 48 * 64, dtype=np.float32).reshape(48, 64)
+    stored = depth_m * np.float32(factor or 1.0)
+    messages = [image(FIRST_NS, DEPTH, stored, "32FC1") if m.topic == DEPTH else m for m in shots(1)]
+    camera = CameraConfig(fx_px=60, fy_px=60, cx_px=32, cy_px=24, depth_factor=factor)
+    entry = next(opened(tmp_path / "a.mcap", messages, camera=camera).entries())
+
+    np.testing.assert_allclose(entry.load().depth_m, depth_m, rtol=1e-6)
+    assert entry.files.recorded_units_per_m == (factor or 1.0)
+    written_m = decode_depth_units(entry.files.depth.read_bytes(), "png") / entry.files.depth_units_per_m
+    np.testing.assert_allclose(written_m, depth_m, atol=1.1e-4)
 
 
 @pytest.mark.parametrize("name", ["a.mcap", "a.bag", "a"])
