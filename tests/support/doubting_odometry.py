@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import Transform
-from mapper.odometry.factory import build_odometry
+from mapper.odometry.factory import odometry_for
 from mapper.pipeline import append, track
 
 DOUBT = "jump of 0.50 m where 0.02 m was predicted"
@@ -60,6 +60,6 @@ def doubt_frames(
     for module in (track, append):
         patch.setattr(
             module,
-            "build_odometry",
-            lambda *arguments: DoubtingOdometry(build_odometry(*arguments), moved, doubted_keyframes),
+            "odometry_for",
+            lambda *arguments: DoubtingOdometry(odometry_for(*arguments), moved, doubted_keyframes),
         )
