@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.export.grid import stored_grid
+from mapper.export.grid import stored_grid, write_values
 from mapper.export.palette import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
 from mapper.navigation.costmap import INSCRIBED, LETHAL, NO_INFORMATION, Costmap, inflate
 from mapper.run import files
 from mapper.run.folder import Run
-from mapper.runtime.atomic import write_bytes, write_text
+from mapper.runtime.atomic import write_bytes
 from mapper.runtime.progress import Progress
 
 _MOST_INFLATED = 98
@@ -33,16 +33,8 @@ def costmap(run: Run, path: Path, _progress: Progress) -> None:
         cost_scaling=config.cost_scaling,
     )
     values = occupancy_values(inflated)
-    height, width = values.shape
-    header = f"P5\n# CREATOR: mapper {inflated.resolution_m:.3f} m/pix\n{width} {height}\n255\n"
-    write_bytes(path.with_suffix(".pgm"), header.encode("ascii") + values[::-1].tobytes())
     write_bytes(path.with_suffix(".png"), _picture(values))
-    x, y = (float(value) for value in inflated.origin_world_m)
-    write_text(
-        path,
-        f"image: {path.stem}.pgm\nmode: raw\nresolution: {float(inflated.resolution_m)!r}\n"
-        f"origin: [{x!r}, {y!r}, 0.0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n",
-    )
+    write_values(path.parent, path.stem, values, inflated)
 
 
 def occupancy_values(costmap: Costmap) -> NDArray[np.uint8]:

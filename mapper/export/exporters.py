@@ -25,7 +25,8 @@ class Exporter:
     Attributes:
         summary: What it is, in a few words.
         function: ``module:name`` of the ``Write``, below :mod:`mapper.export`; imported at the first use.
-        file_name: Its name inside the run; some are there since the build.
+        file_name: Its name inside the run; some are there since the build. Empty for a folder, which is
+            never in the run.
         endings: What another name may end with.
         beside: Endings of the files that come with it.
         settings: The part of the configuration that it reads, if any.
@@ -72,6 +73,7 @@ EXPORTERS = {
         beside=(".pgm", ".png"),
         settings="costmap",
     ),
+    "nav2": Exporter("folder for nav2: map, masks, parameters", "nav2:nav2", "", (), settings="costmap"),
     "tum": Exporter("trajectory as TUM text", "stored_files:tum", "trajectory.tum", (".tum", ".txt")),
     "kitti": Exporter(
         "trajectory as KITTI text", "stored_files:kitti", "trajectory.kitti", (".kitti", ".txt")
@@ -113,6 +115,8 @@ def export(
         _refuse_idle_settings(run, config, kind=kind)
         run = replace(run, config=config)
     if out is None:
+        if not exporter.file_name:
+            raise ConfigError(f"{kind}: is a folder beside the run; name it with --out")
         path = run.path / exporter.file_name
     else:
         path = out
@@ -143,6 +147,10 @@ def _refuse_idle_settings(run: "Run", config: "BuildConfig", *, kind: str) -> No
 
 
 def _refuse_out(path: Path, exporter: Exporter, *, kind: str, overwrite: bool) -> None:
+    if not exporter.file_name:
+        if path.exists() and not overwrite:
+            raise RunError(f"{path}: exists already; choose another --out, or pass --overwrite to replace it")
+        return
     if path.suffix.lower() not in exporter.endings:
         raise ConfigError(
             f"{path}: {kind} files end with {' or '.join(exporter.endings)}; choose such a name"

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, MapFileError
+from mapper.core.geometry import Array
 from mapper.export.palette import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, shrunk
 from mapper.runtime.atomic import write_bytes, write_text
@@ -29,18 +30,36 @@ def write_grid(folder: Path, stem: str, grid: OccupancyGrid) -> None:
         stem: Name of the files without ending.
         grid: The slice; the world frame becomes the ROS map frame.
     """
-    height, width = grid.cells.shape
-    header = f"P5\n# CREATOR: mapper {grid.resolution_m:.3f} m/pix\n{width} {height}\n255\n"
     pixels = np.full(grid.cells.shape, UNKNOWN_PIXEL, np.uint8)
     pixels[grid.cells == FREE] = FREE_PIXEL
     pixels[grid.cells == OCCUPIED] = OCCUPIED_PIXEL
-    write_bytes(folder / f"{stem}.pgm", header.encode("ascii") + pixels[::-1].tobytes())
     _write_picture(folder / f"{stem}.png", grid)
-    x, y = (float(value) for value in grid.origin_world_m)
+    _write_image(folder, stem, pixels, grid, mode="trinary")
+
+
+def write_values(folder: Path, stem: str, values: NDArray[np.uint8], geometry: "_Geometry") -> None:
+    """Write ``stem.pgm`` and ``stem.yaml`` in map_server's mode "raw", each atomically.
+
+    Args:
+        folder: Where; made if missing.
+        stem: Name of the files without ending.
+        values: (H, W) what the cells are published as: 0 … 100, or 255 for unknown.
+        geometry: A grid or costmap of these cells.
+    """
+    _write_image(folder, stem, values, geometry, mode="raw")
+
+
+def _write_image(
+    folder: Path, stem: str, pixels: NDArray[np.uint8], geometry: "_Geometry", *, mode: str
+) -> None:
+    height, width = pixels.shape
+    header = f"P5\n# CREATOR: mapper {geometry.resolution_m:.3f} m/pix\n{width} {height}\n255\n"
+    write_bytes(folder / f"{stem}.pgm", header.encode("ascii") + pixels[::-1].tobytes())
+    x, y = (float(value) for value in geometry.origin_world_m)
     settings = {
         "image": f"{stem}.pgm",
-        "mode": "trinary",
-        "resolution": repr(float(grid.resolution_m)),
+        "mode": mode,
+        "resolution": repr(float(geometry.resolution_m)),
         "origin": f"[{x!r}, {y!r}, 0.0]",
         "negate": "0",
         "occupied_thresh": str(OCCUPIED_THRESHOLD),
@@ -77,6 +96,16 @@ def read_grid(path: Path) -> OccupancyGrid:
     cells[darkness < free] = FREE
     cells[darkness > occupied] = OCCUPIED
     return OccupancyGrid(cells, np.array(origin[:2]), resolution_m)
+
+
+class _Geometry(Protocol):
+    """Where the cells of a grid or a costmap lie."""
+
+    @property
+    def resolution_m(self) -> float: ...
+
+    @property
+    def origin_world_m(self) -> Array: ...
 
 
 class _Folder(Protocol):

@@ -1,0 +1,188 @@
+"""A folder from which ROS 2's nav2 starts: the map, two filter masks, parameters and a launch file."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.core.errors import DataError
+from mapper.export.grid import stored_grid, write_grid, write_values
+from mapper.navigation.config import CostmapConfig
+from mapper.navigation.distance_transform import NONE, squares_to_centres
+from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from mapper.run import files
+from mapper.run.folder import Run
+from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text
+from mapper.runtime.progress import Progress
+
+MAP, KEEPOUT, SPEED = "map", "keepout_mask", "speed_mask"
+PARAMETERS, LAUNCH = "nav2_params.yaml", "map.launch.yaml"
+FOLDER = FolderKind(
+    "a nav2 export",
+    manifest_keys=frozenset({"nav2", "run"}),
+    files=frozenset({PARAMETERS, LAUNCH, *(f"{stem}.*" for stem in (MAP, KEEPOUT, SPEED))}),
+)
+
+_SLOWEST_PERCENT = 30.0
+"""Speed allowed where the robot all but touches an obstacle, of its full speed."""
+
+
+def nav2(run: Run, path: Path, _progress: Progress) -> None:
+    """Write the folder; it replaces an earlier one.
+
+    Raises:
+        DataError: The slice and the traversable floor do not cover the same cells.
+        RunError: PATH holds something else.
+    """
+    grid, floor = stored_grid(run, files.SLICE), stored_grid(run, files.TRAVERSABLE)
+    keepout = keepout_mask(grid, floor)
+    slowed = slowed_percent(grid, keepout, run.config.costmap)
+    with atomic_folder(path, FOLDER, overwrite=True) as folder:
+        write_text(folder / MANIFEST_NAME, json.dumps({"nav2": 1, "run": str(run.path.resolve())}) + "\n")
+        write_grid(folder, MAP, grid)
+        write_grid(folder, KEEPOUT, keepout)
+        write_values(folder, SPEED, slowed, grid)
+        write_text(folder / PARAMETERS, _parameters(run.config.costmap, grid.resolution_m))
+        write_text(folder / LAUNCH, _LAUNCH)
+
+
+def keepout_mask(grid: OccupancyGrid, floor: OccupancyGrid) -> OccupancyGrid:
+    """Return where a robot must not go although the map shows no obstacle: steps, slopes, drops, low heads.
+
+    Args:
+        grid: The slice.
+        floor: The traversable floor, of the same voxels.
+
+    Returns:
+        A grid as large as the slice: occupied is kept out of, the rest is free.
+
+    Raises:
+        DataError: The cells of the two differ in size.
+    """
+    if grid.resolution_m != floor.resolution_m:
+        raise DataError(f"nav2: cells of {grid.resolution_m:g} m and {floor.resolution_m:g} m; fuse again")
+    offset = np.rint((floor.origin_world_m - grid.origin_world_m) / grid.resolution_m).astype(int)[::-1]
+    blocked = np.zeros(grid.cells.shape, np.bool_)
+    low = np.clip(offset, 0, grid.cells.shape)
+    high = np.clip(offset + floor.cells.shape, 0, grid.cells.shape)
+    inside = tuple(slice(*ends) for ends in zip(low, high, strict=True))
+    own = tuple(slice(*ends) for ends in zip(low - offset, high - offset, strict=True))
+    blocked[inside] = floor.cells[own] == OCCUPIED
+    cells = np.where(blocked & (grid.cells != OCCUPIED), OCCUPIED, FREE).astype(np.int8)
+    return OccupancyGrid(cells, grid.origin_world_m, grid.resolution_m)
+
+
+def slowed_percent(grid: OccupancyGrid, keepout: OccupancyGrid, config: CostmapConfig) -> NDArray[np.uint8]:
+    """Return (H, W) by how many percent of its full speed a robot is slowed: 0 far from obstacles.
+
+    The speed falls linearly from full, at the inflation radius, to 30 % at the robot's own radius.
+    """
+    obstacles = (grid.cells == OCCUPIED) | (keepout.cells == OCCUPIED)
+    squares = squares_to_centres(obstacles[np.newaxis])[0]
+    distances_m = np.where(squares == NONE, np.inf, np.sqrt(squares)) * grid.resolution_m
+    span_m = max(config.inflation_radius_m - config.robot_radius_m, grid.resolution_m)
+    nearness = np.clip((config.inflation_radius_m - distances_m) / span_m, 0.0, 1.0)
+    slowed = np.rint((100.0 - _SLOWEST_PERCENT) * nearness).astype(np.uint8)
+    slowed[grid.cells == UNKNOWN] = 0
+    return slowed
+
+
+def _parameters(config: CostmapConfig, resolution_m: float) -> str:
+    layers = f"""\
+      global_frame: map
+      robot_base_frame: base_link
+      robot_radius: {config.robot_radius_m!r}
+      resolution: {resolution_m!r}
+      filters: ["keepout_filter", "speed_filter"]
+      keepout_filter:
+        plugin: "nav2_costmap_2d::KeepoutFilter"
+        enabled: true
+        filter_info_topic: "keepout_filter_info"
+      speed_filter:
+        plugin: "nav2_costmap_2d::SpeedFilter"
+        enabled: true
+        filter_info_topic: "speed_filter_info"
+        speed_limit_topic: "speed_limit"
+      inflation_layer:
+        plugin: "nav2_costmap_2d::InflationLayer"
+        inflation_radius: {config.inflation_radius_m!r}
+        cost_scaling_factor: {config.cost_scaling!r}
+"""
+    return f"""\
+# Parameters of nav2 for this map; {LAUNCH} gives the servers their files. Merge the costmaps into your own.
+map_server:
+  ros__parameters:
+    frame_id: map
+    topic_name: map
+keepout_mask_server:
+  ros__parameters:
+    frame_id: map
+    topic_name: keepout_mask
+keepout_filter_info_server:
+  ros__parameters:
+    type: 0 # keep out
+    filter_info_topic: keepout_filter_info
+    mask_topic: keepout_mask
+    base: 0.0
+    multiplier: 1.0
+speed_mask_server:
+  ros__parameters:
+    frame_id: map
+    topic_name: speed_mask
+speed_filter_info_server:
+  ros__parameters:
+    type: 1 # speed limit, percent of the full speed: base + multiplier * mask
+    filter_info_topic: speed_filter_info
+    mask_topic: speed_mask
+    base: 100.0
+    multiplier: -1.0
+global_costmap:
+  global_costmap:
+    ros__parameters:
+      plugins: ["static_layer", "inflation_layer"]
+      static_layer:
+        plugin: "nav2_costmap_2d::StaticLayer"
+        map_topic: map
+{layers}local_costmap:
+  local_costmap:
+    ros__parameters:
+      rolling_window: true
+      plugins: ["inflation_layer"] # and the layer of your own sensor
+{layers}"""
+
+
+def _server(package_node: str, name: str, mask: str = "") -> str:
+    file = f'\n      - {{name: yaml_filename, value: "$(dirname)/{mask}.yaml"}}' if mask else ""
+    return f"""\
+- node:
+    pkg: nav2_map_server
+    exec: {package_node}
+    name: {name}
+    output: screen
+    param:
+      - {{from: "$(dirname)/{PARAMETERS}"}}{file}
+"""
+
+
+_SERVERS = {
+    "map_server": ("map_server", MAP),
+    "keepout_mask_server": ("map_server", KEEPOUT),
+    "keepout_filter_info_server": ("costmap_filter_info_server", ""),
+    "speed_mask_server": ("map_server", SPEED),
+    "speed_filter_info_server": ("costmap_filter_info_server", ""),
+}
+_LAUNCH = (
+    f"# ros2 launch {LAUNCH}: the map and its filter masks; your bringup goes on from there.\nlaunch:\n"
+    + "".join(_server(node, name, mask) for name, (node, mask) in _SERVERS.items())
+    + f"""\
+- node:
+    pkg: nav2_lifecycle_manager
+    exec: lifecycle_manager
+    name: lifecycle_manager_map
+    output: screen
+    param:
+      - {{name: autostart, value: true}}
+      - {{name: node_names, value: [{", ".join(_SERVERS)}]}}
+"""
+)
