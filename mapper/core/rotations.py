@@ -12,10 +12,11 @@ def rotation_from_quaternion(xyzw: Array) -> Array:
     """Return the (3, 3) rotation of an xyzw quaternion of any positive length, or (N, 3, 3) of (N, 4).
 
     Raises:
-        DataError: A quaternion is zero or not finite.
+        DataError: A quaternion is zero, not finite, or so large that its length is not.
     """
     xyzw = np.asarray(xyzw)
-    norm = np.sqrt((xyzw * xyzw).sum(axis=-1, keepdims=True))
+    with np.errstate(over="ignore"):
+        norm = np.sqrt((xyzw * xyzw).sum(axis=-1, keepdims=True))
     usable = np.isfinite(norm) & (norm >= 1e-9)
     if not usable.all():
         bad = np.atleast_2d(xyzw)[int(np.argmin(usable.ravel()))]

@@ -1,5 +1,6 @@
 """Line-by-line text files of a log, with errors that name the line, and rows put in time order."""
 
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from mapper.core.timebase import Stamps, ns_from_date_text, ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.regular_files import read_text
 
+_LONGEST_QUATERNION = 1e150  # whose square is finite
 _MOST_DIGITS = 9  # a year of frames at 30 Hz
 
 
@@ -112,7 +114,7 @@ def time_order(stamps_ns: Stamps, *, what: str) -> tuple[NDArray[np.intp], list[
 
 def pose_from_numbers(numbers: Array) -> Transform | None:
     """Return the pose of x y z qx qy qz qw; None where motion capture wrote no pose (NaN, or no rotation)."""
-    if not np.isfinite(numbers).all() or np.linalg.norm(numbers[3:]) < 1e-9:
+    if not np.isfinite(numbers).all() or not 1e-9 <= math.hypot(*numbers[3:]) < _LONGEST_QUATERNION:
         return None
     return transform(rotation_from_quaternion(numbers[3:]), numbers[:3])
 

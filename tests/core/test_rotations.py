@@ -99,3 +99,8 @@ def test_many_turns_are_converted_as_one_would_be():
     q[7] = 0.0
     with pytest.raises(DataError, match=r"\(0.0, 0.0, 0.0, 0.0\) has no direction"):
         rotation_from_quaternion(q)
+
+
+def test_a_quaternion_whose_length_overflows_is_refused():
+    with pytest.raises(DataError, match="has no direction"):
+        rotation_from_quaternion(np.array([0.0, -1e308, 0.0, 1.0]))

@@ -13,7 +13,7 @@ class RefusedError(Exception):
 def _octomap(path: str) -> str:
     import pyoctomap
 
-    tree = pyoctomap.ColorOcTree.read(path) if path.endswith(".ot") else pyoctomap.OcTree(0.1)
+    tree = pyoctomap.ColorOcTree(0.1).read(path) if path.endswith(".ot") else pyoctomap.OcTree(0.1)
     if tree is None or (path.endswith(".bt") and not tree.readBinary(path)):
         raise RefusedError
     return ""
