@@ -23,7 +23,7 @@ _JUMP_RATIO = 8.0
 right poses is 3 to 6."""
 _SUPPORT_AGREEMENT, _SUPPORT_RATIO = 0.85, 2.0
 """A jump is believed if the agreement is at least this share of the usual, and the uncertainty at most this
-multiple: fast motions are real."""
+multiple, and nothing in view moves by itself: fast motions are real."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,9 @@ class FrameDoubts:
         if agreement < _LOW_AGREEMENT * usual_agreement:
             phrases.append(f"{agreement:.0%} of the matches agree, {usual_agreement:.0%} is usual")
         is_supported = (
-            agreement >= _SUPPORT_AGREEMENT * usual_agreement and sigma_m <= _SUPPORT_RATIO * usual_m
+            agreement >= _SUPPORT_AGREEMENT * usual_agreement
+            and sigma_m <= _SUPPORT_RATIO * usual_m
+            and not len(tracked_pose.moving)
         )
         if not is_supported:
             phrases += self._jumps(jump, elapsed_s)

@@ -9,10 +9,11 @@ from mapper.core.geometry import Array, Transform, apply
 from mapper.features.hamming import Bits
 from mapper.features.window_matching import match_windows
 from mapper.odometry.config import KeyframeOdometryConfig
+from mapper.odometry.local_map.camera_motion import refined_by_established
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmark_kernels import project_visible
 from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
-from mapper.odometry.local_map.pose_tracker import MAX_HAMMING, TrackedPose, refined, rms_px
+from mapper.odometry.local_map.pose_tracker import MAX_HAMMING, TrackedPose, rms_px
 
 _MAX_RATIO = 0.8
 _CHANCE = 0.02
@@ -90,7 +91,9 @@ class LocalSearch:
         ids = landmark_of_feature[features]
         if len(features) < config.min_inliers:
             return None
-        T_camera_world, agree = refined(T_camera_world, landmarks["position"][ids], observation, features)
+        T_camera_world, agree = refined_by_established(
+            T_camera_world, landmarks["position"][ids], observation, features, landmarks["observers"][ids]
+        )
         if agree.sum() < max(config.min_inliers, least_by_chance(len(visible) + len(matched))):
             return None
         landmark_of_feature[features[~agree]] = -1

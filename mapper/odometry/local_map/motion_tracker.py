@@ -1,17 +1,24 @@
 """Pose tracker by constant velocity: the last frame's points are searched near their predicted pixels."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Points, apply, inverse
 from mapper.odometry.config import LocalMapConfig
+from mapper.odometry.local_map.camera_motion import agreeing, camera_motion
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
-from mapper.odometry.local_map.pose_tracker import TrackedPose, predicted, project, refined, unmatched
+from mapper.odometry.local_map.pose_tracker import TrackedPose, predicted, project, unmatched
 from mapper.odometry.local_map.relocalizer import Relocalizer
 
 _MAX_RATIO = 0.9
+_RIVAL_RATIO = 0.5
+"""A pose of fewer inliers, relative to the better one, does not cast doubt on it."""
+_SAME_RATIO = 0.5
+"""Of two poses that are the same, each has more of the other's inliers."""
 
 
 class MotionPoseTracker:
@@ -40,15 +47,26 @@ class MotionPoseTracker:
             reference=last.reference,
             method="matched",
         )
-        found = [tracked_pose for tracked_pose in (by_motion, by_last) if tracked_pose is not None]
-        best = max(found, key=lambda tracked_pose: tracked_pose.inliers, default=None)
+        best = self._better(by_motion, by_last)
         if best is not None and best.inliers >= self._config.weak_inliers:
             return best
         by_keyframe = self._relocalizer.best_among(
             self._map.latest(last.reference), observation, method="fallback", exhaustive=True
         )
-        found = [tracked_pose for tracked_pose in (best, by_keyframe) if tracked_pose is not None]
-        return max(found, key=lambda tracked_pose: tracked_pose.inliers, default=None)
+        return self._better(best, by_keyframe)
+
+    def _better(self, a: TrackedPose | None, b: TrackedPose | None) -> TrackedPose | None:
+        """Return the pose of more inliers, which is doubtful if those of the other one contradict it."""
+        if a is None or b is None:
+            return a or b
+        best, other = (a, b) if a.inliers >= b.inliers else (b, a)
+        features = np.flatnonzero(other.landmark_of_feature >= 0)
+        positions_world = self._map.landmarks["position"][other.landmark_of_feature[features]]
+        agree = agreeing(best.T_camera_world, positions_world, best.observation, features)
+        if len(features) < _RIVAL_RATIO * best.inliers or agree.mean() >= _SAME_RATIO:
+            return best
+        doubt = f"{len(features)} features show another pose than these {best.inliers}"
+        return replace(best, doubts=(*best.doubts, doubt))
 
     def _by_motion(
         self, observation: ImageObservation, last: TrackedPose, before_last: TrackedPose | None
@@ -75,19 +93,29 @@ class MotionPoseTracker:
                 break
         else:
             return None
-        T_camera_world, agree = refined(T_camera_world, points_world[hits], observation, feature[hits])
+        motion = camera_motion(
+            T_camera_world,
+            points_world[hits],
+            observation,
+            feature[hits],
+            np.where(landmark[hits] >= 0, self._map.landmarks["observers"][landmark[hits]], 0),
+        )
+        agree = motion.agree
         if agree.sum() < self._config.min_matches // 2:
             return None
         landmark_of_feature = unmatched(observation)
         landmark_of_feature[feature[hits[agree]]] = landmark[hits[agree]]
-        return self._search.refine(
+        found = self._search.refine(
             observation,
-            T_camera_world,
+            motion.T_camera_world,
             landmark_of_feature,
             reference=last.reference,
             agreement=float(agree.mean()),
             method="map",
         )
+        if found is None:
+            return None
+        return replace(found, doubts=motion.doubts, moving=feature[hits[motion.moving]])
 
     def _known_points(self, tracked_pose: TrackedPose) -> tuple[NDArray[np.intp], Points, Ids]:
         """Return the features with a known 3D point: indices, (M, 3) world points, landmark or −1.

@@ -270,11 +270,13 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         ``neighbour`` is a keyframe of the sub-map in which it was tracked; None begins a new one.
         """
         config, observation = self._config, tracked_pose.observation
+        is_new = observation.has_depth & (tracked_pose.landmark_of_feature < 0)
+        is_new[tracked_pose.moving] = False
         index = self._map.add_keyframe(
             observation,
             tracked_pose.T_camera_world,
             tracked_pose.landmark_of_feature,
-            new=observation.has_depth & (tracked_pose.landmark_of_feature < 0),
+            new=is_new,
             neighbour=neighbour,
             twist_camera=self._shutter.twist_camera,
             depth_information=None if tracked_pose.depth is None else tracked_pose.depth.information,

@@ -1,7 +1,7 @@
 """Interface of the pose trackers: the pose of a frame in the local map, and the methods that find it."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -37,6 +37,7 @@ class TrackedPose:
         method: Step that found the pose, e.g. "map", "fallback" or "relocalised".
         depth: Alignment of the depth image that took part in the pose; None if landmarks alone gave it.
         doubts: Why the pose may be wrong, a phrase each.
+        moving: (M,) int32 features that contradict the pose while something else moves in view.
     """
 
     observation: ImageObservation
@@ -50,6 +51,7 @@ class TrackedPose:
     method: str
     depth: DepthAlignment | None = None
     doubts: tuple[str, ...] = ()
+    moving: Ids = field(default_factory=lambda: np.empty(0, np.int32))
 
     @property
     def inliers(self) -> int:
