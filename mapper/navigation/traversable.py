@@ -135,7 +135,9 @@ def _closed(reached: Mask, gap: int) -> Mask:
     """Return the floor with gaps of up to ``gap`` columns closed."""
     square = np.ones((gap + 1, gap + 1), np.uint8)
     around = cv2.copyMakeBorder(reached.astype(np.uint8), gap, gap, gap, gap, cv2.BORDER_CONSTANT, value=0)
-    closed = cv2.morphologyEx(around, cv2.MORPH_CLOSE, square)
+    # The anchors mirror each other: those of cv2.MORPH_CLOSE would shift the floor if the edge is even.
+    low, high = gap // 2, gap - gap // 2
+    closed = cv2.erode(cv2.dilate(around, square, anchor=(low, low)), square, anchor=(high, high))
     filled: Mask = closed[gap : gap + reached.shape[0], gap : gap + reached.shape[1]].astype(np.bool_)
     return filled
 

@@ -124,6 +124,14 @@ def test_small_gaps_are_closed_and_large_ones_stay_unknown():
     )
 
 
+@pytest.mark.parametrize("gap_m", [0.0, 0.05, 0.1, 0.15, 0.25])
+def test_closing_gaps_moves_no_floor(gap_m):
+    grid = traversable_grid(octree_of(floor(0.0, 1.0)), TraversableConfig(max_gap_m=gap_m))
+    assert grid.cells.shape == (20, 20)
+    np.testing.assert_allclose(grid.origin_world_m, [0.0, 0.0], atol=1e-9)
+    assert (grid.cells == FREE).all()
+
+
 def test_the_robot_s_radius_widens_what_blocks():
     octree = octree_of(floor(), ((1.0, 0.0, 0.0), (1.05, 1.0, 0.5)))
     grid = traversable_grid(octree, TraversableConfig(robot_radius_m=0.2))
