@@ -64,29 +64,34 @@ def plan(
 ) -> None:
     """Plan the shortest collision-free path, and draw it into the run: plan.json, plan.png, run.mcap.
 
-    A merged map has no run.mcap to draw it into.
+    Where floors lie over each other (--layer traversable), a third number tells the storey of a point. A
+    merged map has no run.mcap to draw it into.
 
     Example: mapper plan runs/xyz --from 2.1 -0.3 --to 1.9 1.4 --radius 0.15
     """
     from mapper.config.loading import overridden
     from mapper.export.grid import stored_grid
     from mapper.export.plan import draw_plan, write_plan
+    from mapper.export.run_maps import storeys_of_run
     from mapper.merging.merged_map import open_map
     from mapper.navigation.config import PlanConfig
     from mapper.navigation.planner import plan_2d, plan_3d
+    from mapper.navigation.storey_planner import plan_storeys
     from mapper.octree.octomap_file import read_map
     from mapper.run import files
     from mapper.run.folder import Run, load_run
     from mapper.run.manifest import is_merged_map
 
-    start, goal = (
-        _point(text, name, in_3d=in_3d) for text, name in zip((from_, to), _POINT_OPTIONS, strict=True)
-    )
+    has_storeys = not in_3d and layer == Layer.TRAVERSABLE and (run / f"{files.storey(0)}.yaml").exists()
+    counts = (3,) if in_3d else (2, 3) if has_storeys else (2,)
+    start, goal = (_point(text, name, counts) for text, name in zip((from_, to), _POINT_OPTIONS, strict=True))
     config = overridden(PlanConfig(), assignments({"radius_m": radius, "unknown": unknown, "layer": layer}))
     built = open_map(run) if is_merged_map(run) else load_run(run)
     grid = stored_grid(built, config.layer)
     if in_3d:
         found = plan_3d(read_map(built.file(files.OCTREE_OT)), start, goal, config=config)
+    elif has_storeys and isinstance(built, Run):
+        found = plan_storeys(storeys_of_run(built), start, goal, config=config)
     else:
         found = plan_2d(grid, start, goal, config=config)
     if isinstance(built, Run):
@@ -100,16 +105,16 @@ def plan(
         print(run / files.PLAN_VIEW)
 
 
-def _point(text: str, name: str, *, in_3d: bool) -> "Array":
+def _point(text: str, name: str, counts: tuple[int, ...]) -> "Array":
     import numpy as np
 
     from mapper.core.errors import ConfigError
 
     words = text.replace(",", " ").split()
-    wanted = 3 if in_3d else 2
-    if len(words) != wanted or not all(_is_number(word) and isfinite(float(word)) for word in words):
-        hint = "; a height needs --3d" if len(words) == 3 and not in_3d else ""
-        raise ConfigError(f"{name} {text}: want {'x y z' if in_3d else 'x y'} in metres{hint}")
+    if len(words) not in counts or not all(_is_number(word) and isfinite(float(word)) for word in words):
+        wanted = {(2,): "x y", (3,): "x y z"}.get(counts, "x y or x y z")
+        hint = "; a height needs --3d" if len(words) == 3 and 3 not in counts else ""
+        raise ConfigError(f"{name} {text}: want {wanted} in metres{hint}")
     return np.array([float(word) for word in words])
 
 

@@ -62,11 +62,12 @@ def draw_plan(folder: Path, plan: Plan, *, grid: OccupancyGrid) -> None:
 def plan_json(plan: Plan) -> str:
     """Return what ``plan.json`` holds."""
     record = {
-        "map": "octree" if plan.dimensions == 3 else plan.config.layer,
+        "map": plan.map_name,
         "radius_m": plan.config.radius_m,
         "unknown": plan.config.unknown,
         "length_m": plan.length_m,
         "min_clearance_m": plan.min_clearance_m if isfinite(plan.min_clearance_m) else None,
+        "storeys": list(plan.storeys),
         "waypoints_world_m": plan.waypoints_world.tolist(),
     }
     return json.dumps(record, indent=1) + "\n"

@@ -12,10 +12,13 @@ from mapper.export.grid import stored_grid
 from mapper.export.run_mcap import BODY, CAMERA
 from mapper.mapping.cloud import Colors
 from mapper.mapping.fusion import Maps, Snapshot
+from mapper.navigation.floor import reachable_floor
+from mapper.navigation.traversable import Storey, traversable
 from mapper.octree.octomap_file import read_map
 from mapper.octree.slice import OccupancyGrid
 from mapper.run import files
 from mapper.run.folder import Run
+from mapper.run.results import load_results
 from mapper.sources.cloud_files.ply import read_ply
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.frame_tree import FrameTree
@@ -45,6 +48,17 @@ def maps_of(run: Run) -> Maps:
         traversable=stored_grid(run, files.TRAVERSABLE),
         storeys=tuple(_storeys(run)),
     )
+
+
+def storeys_of_run(run: Run) -> tuple[Storey, ...]:
+    """Return the storeys of a run's floor, found again from its octree and its path.
+
+    Raises:
+        MapFileError: The octree cannot be read.
+    """
+    config, path = run.config.traversable, load_results(run).tracked
+    octree = read_map(run.file(files.OCTREE_MAP))
+    return traversable(reachable_floor(octree, config, positions_world=path.positions_world), config)
 
 
 def _storeys(run: Run) -> Iterator[OccupancyGrid]:

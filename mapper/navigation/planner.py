@@ -30,12 +30,14 @@ class Plan:
         length_m: Length of the straight lines between them.
         min_clearance_m: Least distance of the path to blocked space; +inf if there is none.
         config: Settings of the plan.
+        storeys: Numbers of the storeys that it leads over, in order, if the floor has several.
     """
 
     waypoints_world: Array
     length_m: float
     min_clearance_m: float
     config: PlanConfig
+    storeys: tuple[int, ...] = ()
 
     @property
     def dimensions(self) -> int:
@@ -43,10 +45,17 @@ class Plan:
         return int(self.waypoints_world.shape[1])
 
     @property
+    def map_name(self) -> str:
+        """What it was planned on: "octree", "slice" or "traversable"."""
+        return "octree" if self.dimensions == 3 and not self.storeys else self.config.layer
+
+    @property
     def summary(self) -> str:
         """The path in one line of text."""
         config = self.config
-        where = "the octree" if self.dimensions == 3 else f"the {config.layer}"
+        where = f"the {self.map_name}"
+        if self.storeys:
+            where += f" of {' to '.join(f'storey {number}' for number in self.storeys)}"
         return (
             f"{self.length_m:.2f} m in {where}, {len(self.waypoints_world)} waypoints, "
             f"{self.min_clearance_m:.2f} m clear at the narrowest; radius {config.radius_m:g} m, "
@@ -100,7 +109,7 @@ def plan_3d(
 
 
 def _planned(voxels: VoxelGrid, start_world: Array, goal_world: Array, config: PlanConfig) -> Plan:
-    space = _space(voxels, config)
+    space = space_of(voxels, config)
     start, goal = space.cell(start_world, "start"), space.cell(goal_world, "goal")
     found = shortest_path(space.free, start, goal)
     if not found.reached:
@@ -117,13 +126,13 @@ def _planned(voxels: VoxelGrid, start_world: Array, goal_world: Array, config: P
     return Plan(
         waypoints_world[:, : space.dimensions],
         path_length(waypoints_world),
-        _clearance(space.field, waypoints_world),
+        clearance_of(space.field, waypoints_world),
         config,
     )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Space:
+class Space:
     """Space for the centre of a robot.
 
     Attributes:
@@ -140,6 +149,7 @@ class _Space:
 
     @property
     def dimensions(self) -> int:
+        """2 or 3."""
         return 2 if len(self.free) == 1 else 3
 
     @property
@@ -227,16 +237,17 @@ def point_text(point_world: Array) -> str:
     return f"({', '.join(f'{value:.3f}' for value in point_world)})"
 
 
-def _space(voxels: VoxelGrid, config: PlanConfig) -> _Space:
+def space_of(voxels: VoxelGrid, config: PlanConfig) -> Space:
+    """Return the space that a map leaves to a robot's centre."""
     field = distance_field(voxels, unknown_blocks=config.unknown == "blocked")
-    return _Space(voxels, field, field.distances_m >= config.radius_m - _ROUNDING_M, config)
+    return Space(voxels, field, field.distances_m >= config.radius_m - _ROUNDING_M, config)
 
 
 def _or_unknown(config: PlanConfig) -> str:
     return ", or let unknown space count as free" if config.unknown == "blocked" else ""
 
 
-def _clearance(field: DistanceField, path_world: Array) -> float:
+def clearance_of(field: DistanceField, path_world: Array) -> float:
     """Return the least distance to blocked space along a path, at four points per cell."""
     spacing_m = field.resolution_m / _SAMPLES_PER_CELL
     lowest_m = np.inf

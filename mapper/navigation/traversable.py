@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mapper.navigation.config import TraversableConfig
 from mapper.navigation.distance_transform import NONE, squares_to_boxes
 from mapper.navigation.flood import Indices, Limits, Mask
-from mapper.navigation.floor import Floor, driven_ground
+from mapper.navigation.floor import Floor
 from mapper.navigation.storeys import Heights, storeys_of
 from mapper.octree.columns import NOWHERE, Tops
 from mapper.octree.ground_height import nearest_heights
@@ -19,6 +19,7 @@ from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 _ALLOWANCE = 1e-6
 _NEAR_M = 1.0
+_FAR = 1e6  # voxels: the key range is smaller
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,8 +76,10 @@ def _storey(floor: Floor, heights: Heights, config: TraversableConfig, is_home: 
         blocked = np.zeros(columns.shape, np.bool_)
         is_near = distances * columns.resolution_m <= _NEAR_M
         _add_obstacles(columns.starts, columns.tops, floor.steep, level, reached, is_near, limits, blocked)
-        _add_edges(heights, driven_ground(floor).swept, limits.step, blocked)
-        cells[_closed(reached, limits.gap)] = FREE
+        _add_edges(heights, _driven(floor, heights), limits.step, blocked)
+        closed = _closed(reached, limits.gap)
+        cells[closed] = FREE
+        blocked |= closed & ~reached & _is_edge(heights, limits)
         cells[blocked] = OCCUPIED
         cells[(cells == FREE) & _within(blocked, config.robot_radius_m / columns.resolution_m)] = OCCUPIED
     rows, across = (_known(cells, axis) for axis in (1, 0))  # without unknown margins
@@ -116,19 +119,36 @@ def _add_obstacles(
                     blocked[row, column] = True
 
 
+def _driven(floor: Floor, heights: Heights) -> Mask:
+    """Return the (H, W) mask of the columns in which the floor of a storey is ground under the path."""
+    nodes = np.flatnonzero(floor.driven)
+    columns = np.searchsorted(floor.columns.starts, nodes, side="right") - 1
+    of_storey = heights.ravel()[columns] == floor.columns.tops[nodes]
+    driven = np.zeros(heights.shape, np.bool_)
+    driven.ravel()[columns[of_storey]] = True
+    return driven
+
+
 @njit(cache=True, nogil=True)
 def _add_edges(heights: Heights, driven: Mask, step: int, blocked: Mask) -> None:
-    """Mark floor beside floor that lies more than a step lower, unless the path led over it."""
+    """Mark floor beside floor that lies more than a step lower; the lower one if the path led over this one.
+
+    Where the path led over both, it is the path that joins them.
+    """
     height, width = heights.shape
     for row in range(height):
         for column in range(width):
             here = heights[row, column]
-            if here == NOWHERE or driven[row, column]:
+            if here == NOWHERE:
                 continue
             for y in range(max(row - 1, 0), min(row + 2, height)):
                 for x in range(max(column - 1, 0), min(column + 2, width)):
-                    if heights[y, x] != NOWHERE and here - heights[y, x] > step:
+                    if heights[y, x] == NOWHERE or here - heights[y, x] <= step:
+                        continue
+                    if not driven[row, column]:
                         blocked[row, column] = True
+                    elif not driven[y, x]:
+                        blocked[y, x] = True
 
 
 def _closed(reached: Mask, gap: int) -> Mask:
@@ -140,6 +160,18 @@ def _closed(reached: Mask, gap: int) -> Mask:
     closed = cv2.erode(cv2.dilate(around, square, anchor=(low, low)), square, anchor=(high, high))
     filled: Mask = closed[gap : gap + reached.shape[0], gap : gap + reached.shape[1]].astype(np.bool_)
     return filled
+
+
+def _is_edge(heights: Heights, limits: Limits) -> Mask:
+    """Return the mask of the columns within a gap of which floor lies that no slope joins."""
+    square = np.ones((2 * limits.gap + 1, 2 * limits.gap + 1), np.uint8)
+    reached = heights > NOWHERE
+    highest, lowest = (np.where(reached, heights, sign * _FAR).astype(np.float32) for sign in (-1.0, 1.0))
+    highest, lowest = cv2.dilate(highest, square), cv2.erode(lowest, square)
+    edge: Mask = np.maximum(highest, -_FAR) - np.minimum(lowest, _FAR) > limits.step + limits.slope * len(
+        square
+    )
+    return edge
 
 
 def _within(obstacles: Mask, radius: float) -> Mask:

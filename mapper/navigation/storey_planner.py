@@ -1,0 +1,146 @@
+"""Paths over several storeys of a floor, from one to the next where they share ramps and stairs."""
+
+from collections import deque
+from itertools import pairwise
+
+import numpy as np
+
+from mapper.core.errors import PlanError
+from mapper.core.geometry import Array
+from mapper.navigation.config import PlanConfig
+from mapper.navigation.line_of_sight import shortened
+from mapper.navigation.planner import Plan, Space, clearance_of, point_text, space_of
+from mapper.navigation.search import shortest_path
+from mapper.navigation.traversable import Storey
+from mapper.navigation.voxels import layer
+from mapper.octree.columns import NOWHERE
+from mapper.octree.slice import UNKNOWN, OccupancyGrid
+
+
+def plan_storeys(
+    storeys: tuple[Storey, ...], start_world: Array, goal_world: Array, *, config: PlanConfig
+) -> Plan:
+    """Return a shortest path for a disc over the storeys of a floor; see ``plan_2d``.
+
+    The path changes storeys, the fewest that join the two, where both have the same floor. An end without a
+    height is on the storey where the log begins, or else on the lowest with floor there.
+
+    Args:
+        storeys: From :func:`mapper.navigation.traversable.traversable`.
+        start_world: (2,) or (3,) metres.
+        goal_world: (2,) or (3,) metres.
+        config: Radius, and whether unknown cells are blocked.
+
+    Returns:
+        A plan whose waypoints have the height of the floor.
+
+    Raises:
+        PlanError: An end is outside, unknown or too close to an obstacle, or no path joins the two.
+    """
+    joined, heights = _aligned(storeys)
+    spaces = [space_of(layer(grid), config) for grid in joined]
+    ends = [np.append(point[:2], 0.0) for point in (start_world, goal_world)]
+    numbers = [_storey_at(storeys, point) for point in (start_world, goal_world)]
+    chain = _chain(spaces, heights, *numbers)
+    if not chain:
+        raise PlanError(
+            f"no ramp or stairs lead from the storey of {point_text(start_world)} to that of "
+            f"{point_text(goal_world)} for a radius of {config.radius_m:g} m; plan with a smaller radius"
+        )
+    first, last = spaces[chain[0]], spaces[chain[-1]]
+    start, goal = first.cell(ends[0], "start"), last.cell(ends[1], "goal")
+    planes = [spaces[chain[0]].free[0]]
+    for below, above in pairwise(chain):  # between storeys a plane of what they share
+        planes += [_shared(spaces, heights, below, above), spaces[above].free[0]]
+    found = shortest_path(np.array(planes), start, (2 * (len(chain) - 1), *goal[1:]))
+    if not found.reached:
+        raise PlanError(
+            f"no path from {point_text(start_world)} to {point_text(goal_world)} over {len(chain)} storeys "
+            f"for a radius of {config.radius_m:g} m; plan with a smaller radius"
+        )
+    waypoints, clearance_m = [], np.inf
+    for place, number in enumerate(chain):
+        space = spaces[number]
+        cells = found.cells[found.cells[:, 0] == 2 * place] + 0.5
+        cells[:, 0] = 0.5
+        if place == 0:
+            cells = np.vstack([space.in_cells(ends[0]), cells])
+        if place == len(chain) - 1:
+            cells = np.vstack([cells, space.in_cells(ends[1])])
+        part_world = space.world(shortened(space.field, cells, radius_m=space.least_m))
+        clearance_m = min(clearance_m, clearance_of(space.field, part_world))
+        at = np.floor(np.array([space.in_cells(point) for point in part_world])[:, 1:]).astype(np.int64)
+        tops = heights[number][at[:, 0], at[:, 1]]
+        part_world[:, 2] = np.where(tops == NOWHERE, np.nan, tops * storeys[0].grid.resolution_m)
+        waypoints.append(part_world)
+    waypoints_world = np.concatenate(waypoints)
+    known = np.flatnonzero(~np.isnan(waypoints_world[:, 2]))
+    if len(known):  # a gap in the floor that was closed has the height of the floor before and after it
+        every = np.arange(len(waypoints_world))
+        waypoints_world[:, 2] = np.interp(every, known, waypoints_world[known, 2])
+    length_m = float(np.linalg.norm(np.diff(waypoints_world, axis=0), axis=1).sum())
+    return Plan(waypoints_world, length_m, clearance_m, config, storeys=tuple(chain))
+
+
+def _aligned(storeys: tuple[Storey, ...]) -> tuple[list[OccupancyGrid], list[Array]]:
+    """Return the grids and heights of all storeys in one raster; heights with a ring like ``layer``."""
+    cell_m = storeys[0].grid.resolution_m
+    firsts = np.array([np.rint(storey.grid.origin_world_m / cell_m) for storey in storeys], np.int64)
+    sizes = np.array([storey.grid.cells.shape[::-1] for storey in storeys])
+    low, high = firsts.min(axis=0), (firsts + sizes).max(axis=0)
+    grids, heights = [], []
+    for storey, first in zip(storeys, firsts, strict=True):
+        x, y = first - low
+        rows, columns = storey.grid.cells.shape
+        cells = np.full((high - low)[::-1], UNKNOWN, np.int8)
+        cells[y : y + rows, x : x + columns] = storey.grid.cells
+        tops = np.full((high - low)[::-1] + 2, NOWHERE, np.int32)
+        tops[y + 1 : y + 1 + rows, x + 1 : x + 1 + columns] = storey.heights
+        grids.append(OccupancyGrid(cells, low * cell_m, cell_m))
+        heights.append(tops)
+    return grids, heights
+
+
+def _storey_at(storeys: tuple[Storey, ...], point_world: Array) -> int:
+    """Return the storey of a point: that whose floor is nearest to its height, if it has one."""
+    tops = [_top_at(storey, point_world) for storey in storeys]
+    home = next(number for number, storey in enumerate(storeys) if storey.is_home)
+    if len(point_world) == 2:
+        order = sorted(range(len(storeys)), key=lambda number: number != home)
+        return next((number for number in order if tops[number] is not None), home)
+    away = [np.inf if top is None else abs(top - float(point_world[2])) for top in tops]
+    return int(np.argmin(away)) if np.isfinite(away).any() else home
+
+
+def _top_at(storey: Storey, point_world: Array) -> float | None:
+    """Return the height of a storey's floor at a point, metres; None if it has none there."""
+    grid = storey.grid
+    column, row = np.floor((point_world[:2] - grid.origin_world_m) / grid.resolution_m).astype(int)
+    inside = 0 <= row < grid.cells.shape[0] and 0 <= column < grid.cells.shape[1]
+    if not inside or storey.heights[row, column] == NOWHERE:
+        return None
+    return float(storey.heights[row, column]) * grid.resolution_m
+
+
+def _shared(spaces: list[Space], heights: list[Array], one: int, other: int) -> Array:
+    """Return the mask of the cells whose floor belongs to both of two storeys, with room for the robot."""
+    same = (heights[one] == heights[other]) & (heights[one] != NOWHERE)
+    mask: Array = same & spaces[one].free[0] & spaces[other].free[0]
+    return mask
+
+
+def _chain(spaces: list[Space], heights: list[Array], start: int, goal: int) -> list[int]:
+    """Return the fewest storeys that lead from one to another; none if they are not joined."""
+    before, queue = {start: start}, deque([start])
+    while queue and goal not in before:
+        here = queue.popleft()
+        for other in range(len(spaces)):
+            if other not in before and _shared(spaces, heights, here, other).any():
+                before[other] = here
+                queue.append(other)
+    if goal not in before:
+        return []
+    chain = [goal]
+    while chain[-1] != start:
+        chain.append(before[chain[-1]])
+    return chain[::-1]

@@ -1,0 +1,59 @@
+"""Paths over storeys that ramps and stairs join."""
+
+import numpy as np
+import pytest
+
+from mapper.core.errors import PlanError
+from mapper.navigation.config import PlanConfig, TraversableConfig
+from mapper.navigation.floor import reachable_floor
+from mapper.navigation.storey_planner import plan_storeys
+from mapper.navigation.traversable import traversable
+from tests.support.floor_scenes import bridge, two_storeys
+
+ROBOT = TraversableConfig(max_step_m=0.2, head_room_m=1.8, max_gap_m=0.2)
+PLAN = PlanConfig(layer="traversable", radius_m=0.15)
+
+
+def storeys_of(world):
+    floor = reachable_floor(world.octree(0.1), ROBOT, positions_world=world.positions())
+    return traversable(floor, ROBOT)
+
+
+def test_a_path_leads_up_the_stairs_and_its_waypoints_have_heights():
+    storeys = storeys_of(two_storeys())
+    plan = plan_storeys(storeys, np.array([8.0, 6.0]), np.array([2.0, 5.0, 3.06]), config=PLAN)
+    assert plan.storeys == (0, 1)
+    np.testing.assert_allclose(plan.waypoints_world[[0, -1]], [[8.0, 6.0, 0.0], [2.0, 5.0, 3.1]], atol=0.11)
+    climbing = plan.waypoints_world[(plan.waypoints_world[:, 2] > 0.3) & (plan.waypoints_world[:, 2] < 2.8)]
+    assert (climbing[:, 1] < 1.5).all()  # on the stairs
+    assert len(climbing)
+    assert 15.0 < plan.length_m < 35.0
+    assert plan.min_clearance_m >= 0.15 - 1e-6
+
+
+def test_any_two_places_of_the_path_are_joined():
+    for world in (two_storeys(), bridge()):
+        storeys = storeys_of(world)
+        for start in world.path[::2]:
+            for goal in world.path[1::3]:
+                plan = plan_storeys(storeys, np.array(start), np.array(goal), config=PLAN)
+                np.testing.assert_allclose(
+                    plan.waypoints_world[[0, -1], :2], [start[:2], goal[:2]], atol=0.11
+                )
+
+
+def test_a_point_without_a_height_is_on_the_storey_where_the_log_begins():
+    storeys = storeys_of(two_storeys())
+    plan = plan_storeys(storeys, np.array([8.0, 6.0]), np.array([2.0, 5.0]), config=PLAN)
+    assert plan.storeys == (0,)
+    assert plan.waypoints_world[:, 2].max() <= 0.1
+
+
+def test_storeys_that_only_a_narrower_robot_can_change_are_named():
+    with pytest.raises(PlanError, match="plan with a smaller radius"):
+        plan_storeys(
+            storeys_of(two_storeys()),
+            np.array([8.0, 6.0]),
+            np.array([2.0, 5.0, 3.06]),
+            config=PlanConfig(layer="traversable", radius_m=0.8),
+        )
