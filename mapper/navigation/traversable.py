@@ -19,6 +19,7 @@ from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 _ALLOWANCE = 1e-6
 _NEAR_M = 1.0
+_RISER_M = 0.4
 _FAR = 1e6  # voxels: the key range is smaller
 
 
@@ -76,7 +77,8 @@ def _storey(floor: Floor, heights: Heights, config: TraversableConfig, is_home: 
         blocked = np.zeros(columns.shape, np.bool_)
         is_near = distances * columns.resolution_m <= _NEAR_M
         _add_obstacles(columns.starts, columns.tops, floor.steep, level, reached, is_near, limits, blocked)
-        _add_edges(heights, _driven(floor, heights), limits.step, blocked)
+        riser = max(limits.step, round(_RISER_M / columns.resolution_m))
+        _add_edges(heights, _driven(floor, heights), limits.step, riser, blocked)
         closed = _closed(reached, limits.gap)
         cells[closed] = FREE
         blocked |= closed & ~reached & _is_edge(heights, limits)
@@ -130,10 +132,10 @@ def _driven(floor: Floor, heights: Heights) -> Mask:
 
 
 @njit(cache=True, nogil=True)
-def _add_edges(heights: Heights, driven: Mask, step: int, blocked: Mask) -> None:
+def _add_edges(heights: Heights, driven: Mask, step: int, riser: int, blocked: Mask) -> None:
     """Mark floor beside floor that lies more than a step lower; the lower one if the path led over this one.
 
-    Where the path led over both, it is the path that joins them.
+    Where the path led over both, as over a riser, it joins them.
     """
     height, width = heights.shape
     for row in range(height):
@@ -145,7 +147,8 @@ def _add_edges(heights: Heights, driven: Mask, step: int, blocked: Mask) -> None
                 for x in range(max(column - 1, 0), min(column + 2, width)):
                     if heights[y, x] == NOWHERE or here - heights[y, x] <= step:
                         continue
-                    if not driven[row, column]:
+                    is_turn = here - heights[y, x] > riser  # of a spiral: the path did not step there
+                    if not driven[row, column] or (driven[y, x] and is_turn):
                         blocked[row, column] = True
                     elif not driven[y, x]:
                         blocked[y, x] = True
