@@ -107,3 +107,17 @@ def test_options_that_a_scene_cannot_follow_are_refused(tmp_path, arguments, mes
     assert result.exit_code == 1
     assert message in result.stderr
     assert not (tmp_path / "log").exists()
+
+
+def test_moving_sets_what_the_scene_has_room_for(tmp_path):
+    yard = ["synth", str(tmp_path / "yard"), *YARD, "--rings", "4", "--moving", "--quiet"]
+    flat = ["synth", str(tmp_path / "flat"), *TINY, "--moving"]
+    for arguments in (yard, flat):
+        assert invoke(*arguments).exit_code == 0
+
+    outdoors, indoors = (
+        json.loads((tmp_path / name / "scene.json").read_text())["config"] for name in ("yard", "flat")
+    )
+    assert outdoors["pedestrians"] == 6
+    assert "cars" not in outdoors
+    assert (indoors["people"], indoors["moving_boxes"]) == (4, 1)

@@ -130,6 +130,13 @@ def test_depth_counts_as_far_as_its_noise_is_below_a_voxel(run, desk_log, tmp_pa
     assert again.manifest.counts.leaves < run.manifest.counts.leaves
 
 
+def test_what_moved_is_kept_apart_from_the_maps(run):
+    moved = read_cloud(run.path / "dynamic.ply", scale=1.0).points
+
+    assert len(moved) == run.manifest.counts.dynamic_points
+    assert not read_map(run.path / "map.octree").are_occupied(moved).any()
+
+
 def test_the_log_holds_the_whole_story(run):
     with (run.path / "run.mcap").open("rb") as file:
         summary = make_reader(file).get_summary()
