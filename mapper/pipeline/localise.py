@@ -14,7 +14,7 @@ from mapper.graph.components import components
 from mapper.graph.config import GraphConfig
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.graph.optimize import optimize
-from mapper.loops.closure import write_closures
+from mapper.loops.closure import Discrepancy, exceeds, write_closures
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.factory import LOOPS_OF
 from mapper.loops.map_constraints import build_map_constraint_detector
@@ -107,7 +107,7 @@ def localise(
             _refuse_unplaced(source, known, tracking)
             tracking = component_of(tracking, map_node, progress=progress)
             tracking = replace(tracking, graph=_with_honest_constraints(tracking.graph, config.graph))
-        tracking = _doubtful_unless_confirmed(tracking, _loops(source, config).agreement_path_m)
+        tracking = _doubtful_unless_confirmed(tracking, _loops(source, config))
         writer.update(solve=solved.report)
         with writer.clock.stage("write"):
             _write(writer, source, known, tracking)
@@ -207,7 +207,9 @@ def _with_honest_constraints(graph: PoseGraph, config: GraphConfig) -> PoseGraph
     return PoseGraph(optimize(graph, exact).T_world_node, graph.stamps_ns, graph.factors)
 
 
-def _doubtful_unless_confirmed(tracking: TrackingResult, agreement_path_m: float) -> TrackingResult:
+def _doubtful_unless_confirmed(
+    tracking: TrackingResult, loops: PlaceLoopsConfig | ScanLoopsConfig
+) -> TrackingResult:
     """Return the result with the frames doubtful whose pose no constraint nearby confirms.
 
     Between two constraints that the odometry agrees with, it has neither drifted far nor jumped. Before the
@@ -230,12 +232,17 @@ def _doubtful_unless_confirmed(tracking: TrackingResult, agreement_path_m: float
         end = min((node for node in failed.intersection(nodes) if node > known[-1]), default=in_order[-1] + 1)
         for node, at_m in zip(in_order, path_m.tolist(), strict=True):
             is_between = known[0] <= node <= known[-1]
-            limit_m = agreement_path_m * (_FAR if is_between else _FAR_BEYOND)
+            limit_m = loops.agreement_path_m * (_FAR if is_between else _FAR_BEYOND)
             if not begin < node < end:
                 doubts[node] = "the map was searched in vain here, at the end of what was recognised"
             elif np.abs(known_m - at_m).min() > limit_m:
                 doubts[node] = f"more than {limit_m:g} m of path from the nearest place that was recognised"
-    contradicting = {loop.j for loop in tracking.loops if loop.reason.startswith("solver")} - held
+    slack = Discrepancy(loops.gate.slack_m, loops.gate.slack_rad)
+    contradicting = {
+        loop.j
+        for loop in tracking.loops
+        if loop.reason.startswith("solver") and loop.after is not None and exceeds(loop.after, slack)
+    } - held
     doubts |= dict.fromkeys(contradicting, "the place that was recognised here contradicts the others")
     tracks = tuple(
         replace(track, doubts=(*track.doubts, doubts[track.node])) if track.node in doubts else track
