@@ -112,7 +112,7 @@ def _point(text: str, name: str, counts: tuple[int, ...]) -> "Array":
 
     words = text.replace(",", " ").split()
     if len(words) not in counts or not all(_is_number(word) and isfinite(float(word)) for word in words):
-        wanted = {(2,): "x y", (3,): "x y z"}.get(counts, "x y or x y z")
+        wanted = " or ".join("x y z"[: 2 * count - 1] for count in counts)
         hint = "; a height needs --3d" if len(words) == 3 and 3 not in counts else ""
         raise ConfigError(f"{name} {text}: want {wanted} in metres{hint}")
     return np.array([float(word) for word in words])
