@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from mapper.run.folder import Run
 
 
+_DIGITS = 3
+
+
 def report(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders that builds left.")],
     out: Annotated[Path, typer.Option(help="HTML file to write.")] = Path("report.html"),
@@ -70,5 +73,8 @@ def _figures(run: "Run") -> "list[Figure]":
         Figure("factors", str(counts.factors)),
         Figure("loops that hold", f"{counts.loops} of {counts.loop_candidates}"),
         Figure("octree leaves", f"{counts.leaves} of {run.config.octree.resolution_m:g} m"),
-        *(Figure(name, f"{value} {unit}") for name, value, unit in map(shown, metrics)),
+        *(
+            Figure(name, f"{value} {unit}")
+            for name, value, unit in (shown(metric, digits=_DIGITS) for metric in metrics)
+        ),
     ]

@@ -53,10 +53,10 @@ def json_text(metrics: Sequence[Metric]) -> str:
     return json.dumps([asdict(metric) for metric in metrics], indent=2, ensure_ascii=False)
 
 
-def shown(metric: Metric) -> tuple[str, str, str]:
+def shown(metric: Metric, *, digits: int = 6) -> tuple[str, str, str]:
     """Return a metric's name, value and unit as they are shown; angles in degrees, here alone."""
     if metric.unit in _DEGREES:
-        return metric.name, f"{math.degrees(metric.value):.6g}", _DEGREES[metric.unit]
+        return metric.name, f"{math.degrees(metric.value):.{digits}g}", _DEGREES[metric.unit]
     if isinstance(metric.value, int):
         return metric.name, str(metric.value), metric.unit
-    return metric.name, f"{metric.value:.6g}", metric.unit
+    return metric.name, f"{metric.value:.{digits}g}", metric.unit

@@ -53,6 +53,9 @@ def _map(voxel_m: float) -> fl.ThreeDeePanel:
         "/map/cloud": fl.BaseRendererPointCloudTopicSettings(
             visible=False, point_size=2.0, color_mode="rgba-fields"
         ),
+        "/map/dynamic": fl.BaseRendererPointCloudTopicSettings(
+            visible=False, point_size=2.0, color_mode="rgba-fields"
+        ),
         "/map/slice": fl.BaseRendererRosOccupancyGridTopicSettings(visible=True, color_mode="map", alpha=0.8),
         "/map/traversable": fl.BaseRendererRosOccupancyGridTopicSettings(visible=False, color_mode="costmap"),
         "/trajectory/estimate": _line(ESTIMATE),

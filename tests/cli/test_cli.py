@@ -21,6 +21,7 @@ VERBS = [
     "build",
     "fuse",
     "loops",
+    "localise",
     "eval",
     "export",
     "merge",

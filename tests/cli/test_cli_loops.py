@@ -137,7 +137,8 @@ def test_a_loop_that_is_there_already_is_not_added_again(run):
 def test_a_loop_that_is_not_believed_is_refused(run, knob, value, reason):
     config = (run / "config.json").read_text()
     assert knob in config
-    (run / "config.json").write_text(config.replace(knob, value))
+    with load_run(run).changing(["config.json"]):
+        (run / "config.json").write_text(config.replace(knob, value))
     before = files_of(run)
     i, j = untied(run)
     result = mapper("loops", run, "--add", i, j, status=1)

@@ -351,7 +351,11 @@ _OF_A_RUN = (
     "solve {}/graph.g2o --out {}/../o.g2o",
     "view {} --rrd {}/../o.rrd",
     # Open3D, which makes meshes, takes more address space than the child has.
-    *(f"export {{}} --as {kind} --overwrite" for kind in EXPORTERS if kind != "mesh"),
+    *(
+        f"export {{}} --as {kind} --overwrite"
+        for kind, exporter in EXPORTERS.items()
+        if exporter.file_name and kind != "mesh"
+    ),
 )
 _VERBS: Mapping[str, tuple[str, ...]] = {
     "built log": ("inspect {}", "convert {} --as mcap --out {}/../o.mcap", "build {} --out {}/../o --quiet"),

@@ -144,8 +144,8 @@ def test_the_slice_is_that_of_the_whole(maps, tmp_path, above):
 def test_leaves_larger_than_a_tile_are_pruned_across_tiles(tmp_path, config):
     octree = OctreeMap(config)
     codes = np.concatenate([np.arange(64) + (1 << 30), np.arange(8) + (1 << 31), [3]])
-    values = np.full((len(codes), 512), octree._sensor().lowest)
-    values[-2, 7] = octree._sensor().highest
+    values = np.full((len(codes), 512), octree.sensor.lowest)
+    values[-2, 7] = octree.sensor.highest
     octree.restore_blocks(codes, np.ones(values.shape, bool), values[np.ones(values.shape, bool)])
     if octree.attributes is not None:
         arrays = octree.attributes.arrays._replace()
@@ -256,8 +256,9 @@ def test_a_straight_path_tells_how_a_run_is_turned_about_it(maps, tmp_path):
     poses[:, 0, 3] = np.arange(9)
     straight = Trajectory(np.arange(9) + 1, poses)
     T_truth_world = exp(np.array([1.0, 0.4, -2.0]), np.array([3.0, 2.0, 1.0]))
-    write_tum(run.path / "trajectory.tum", straight)
-    write_tum(run.path / "truth.tum", straight.moved(T_truth_world))
+    with run.changing(["trajectory.tum", "truth.tum"]):
+        write_tum(run.path / "trajectory.tum", straight)
+        write_tum(run.path / "truth.tum", straight.moved(T_truth_world))
     still = make_run(tmp_path / "still", maps[0], T_truth_world=np.eye(4))
 
     placed = by_truth([still, run])

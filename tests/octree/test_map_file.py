@@ -5,7 +5,7 @@ import zlib
 import numpy as np
 import pytest
 
-from mapper.core.errors import MapFileError, MapSizeError
+from mapper.core.errors import MapFileError, MapSizeError, WriteError
 from mapper.core.frames import Scan
 from mapper.octree import blocks
 from mapper.octree.config import OctreeConfig
@@ -141,7 +141,7 @@ def test_a_failed_write_leaves_the_old_file(path, monkeypatch):
     before = path.read_bytes()
     monkeypatch.setattr("pathlib.Path.replace", lambda *_: (_ for _ in ()).throw(OSError("full")))
 
-    with pytest.raises(OSError, match="full"):
+    with pytest.raises(WriteError, match="full"):
         write_map(path, mapped(attributes=False))
     assert path.read_bytes() == before
     assert [file.name for file in path.parent.iterdir()] == ["map.octree"]

@@ -25,7 +25,7 @@ def test_five_maps_add_up_as_in_octomap_to_the_last_bit():
         leaves = other.leaves()
         for centre, value in zip(leaves.centres_world, leaves.log_odds, strict=True):
             tree.updateNode(centre, float(value))
-    lowest, highest = octree._sensor().lowest, octree._sensor().highest
+    lowest, highest = octree.sensor.lowest, octree.sensor.highest
     theirs = voxels(tree, resolution_m=CONFIG.resolution_m)
     assert as_dict(octree) == {key: min(max(value, lowest), highest) for key, value in theirs.items()}
     assert len(octree) == len(theirs)

@@ -86,10 +86,12 @@ def test_no_export_takes_a_damaged_file(run, tmp_path, kind):
             cut(path)
     if kind == "foxglove-layout":  # reads nothing
         return
+    exporter = EXPORTERS[kind]
     with pytest.raises(RunError, match="was written with"):
-        export(run, kind, tmp_path / f"out{EXPORTERS[kind].endings[0]}")
-    with pytest.raises(RunError, match="was written with"):
-        export(run, kind)
+        export(run, kind, tmp_path / f"out{''.join(exporter.endings[:1])}")
+    if exporter.file_name:
+        with pytest.raises(RunError, match="was written with"):
+            export(run, kind)
 
 
 @pytest.mark.parametrize("name", ["graph.g2o", "truth.tum", "loops.jsonl", "scan_updates.bin"])

@@ -118,9 +118,9 @@ def residual_unit(results: RunResults) -> str:
 
 def views_uri(run: Run) -> str | None:
     """Return the run's picture of its cloud from two sides as a data URI; None if it has none."""
-    path = run.file(files.CLOUD_VIEWS)
-    if not path.is_file():
+    if not (run.path / files.CLOUD_VIEWS).is_file():
         return None
+    path = run.file(files.CLOUD_VIEWS)
     image = cv2.imread(str(path))
     if image is None:
         raise DataError(f"{path}: cannot be read as an image; make it again with mapper fuse")
