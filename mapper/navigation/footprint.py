@@ -39,6 +39,8 @@ def with_footprint(
         limits.step,
         near,
     )
+    if not len(column):  # obstacles everywhere below the path
+        return columns, np.zeros(len(columns.tops), np.bool_)
     keys = np.unique((column << 17) | (top + KEY_ZERO))
     column, top = keys >> 17, (keys & (1 << 17) - 1) - KEY_ZERO
     # A column comes at several heights where the path climbs; of those of a storey the middle one counts.
@@ -85,9 +87,9 @@ def _swept(
                     continue
                 aside_x = max(column - x, 0.0, x - column - 1)
                 aside_y = max(row - y, 0.0, y - row - 1)
-                if aside_x * aside_x + aside_y * aside_y >= radius * radius:
-                    continue
                 is_own = aside_x == 0.0 and aside_y == 0.0
+                if not is_own and aside_x * aside_x + aside_y * aside_y >= radius * radius:
+                    continue
                 top = _ground_in(
                     starts[row * shape[1] + column],
                     starts[row * shape[1] + column + 1],

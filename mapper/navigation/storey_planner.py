@@ -14,6 +14,7 @@ from mapper.navigation.search import shortest_path
 from mapper.navigation.traversable import Storey
 from mapper.navigation.voxels import layer
 from mapper.octree.columns import NOWHERE
+from mapper.octree.ground_height import nearest_heights
 from mapper.octree.slice import UNKNOWN, OccupancyGrid
 
 
@@ -70,14 +71,10 @@ def plan_storeys(
         part_world = space.world(shortened(space.field, cells, radius_m=space.least_m))
         clearance_m = min(clearance_m, clearance_of(space.field, part_world))
         at = np.floor(np.array([space.in_cells(point) for point in part_world])[:, 1:]).astype(np.int64)
-        tops = heights[number][at[:, 0], at[:, 1]]
-        part_world[:, 2] = np.where(tops == NOWHERE, np.nan, tops * storeys[0].grid.resolution_m)
+        tops, _ = nearest_heights(heights[number])  # a gap that was closed has the height of floor beside it
+        part_world[:, 2] = tops[at[:, 0], at[:, 1]] * storeys[0].grid.resolution_m
         waypoints.append(part_world)
     waypoints_world = np.concatenate(waypoints)
-    known = np.flatnonzero(~np.isnan(waypoints_world[:, 2]))
-    if len(known):  # a gap in the floor that was closed has the height of the floor before and after it
-        every = np.arange(len(waypoints_world))
-        waypoints_world[:, 2] = np.interp(every, known, waypoints_world[known, 2])
     length_m = float(np.linalg.norm(np.diff(waypoints_world, axis=0), axis=1).sum())
     return Plan(waypoints_world, length_m, clearance_m, config, storeys=tuple(chain))
 

@@ -23,7 +23,7 @@ def storeys_of(floor: Floor) -> list[Heights]:
     Where floors lie over each other, each is a storey; every other surface belongs to the storey to which one
     climbs or descends least. A storey goes on for some metres over the ramps and stairs that lead from it, so
     that neighbours share these surfaces. One that is neither as large as a square metre nor under the path is
-    left out. A floor without any other above is a single storey.
+    left out, unless all are. A floor without any other above is a single storey.
     """
     columns, reached = floor.columns, floor.reached
     heights = np.full(columns.shape, NOWHERE, np.int32)
@@ -43,11 +43,12 @@ def storeys_of(floor: Floor) -> list[Heights]:
     storey[~shared] = _NONE
     _climb(starts, tops, columns.shape, column_of, limits.step, limits.gap, shared, storey)
     cell_m = columns.resolution_m
+    sizes = np.bincount(storey)
     kept = [
         number
-        for number in np.unique(storey).tolist()
-        if (storey == number).sum() * cell_m**2 >= _LEAST_AREA_M2 or (driven & (storey == number)).any()
-    ]
+        for number in np.flatnonzero(sizes).tolist()
+        if sizes[number] * cell_m**2 >= _LEAST_AREA_M2 or (driven & (storey == number)).any()
+    ] or [int(np.argmax(sizes))]
     kept.sort(key=lambda number: float(np.median(tops[storey == number])))
     result = []
     for number in kept:

@@ -56,16 +56,18 @@ def traversable(floor: Floor, config: TraversableConfig) -> tuple[Storey, ...]:
 
 
 def _home(floor: Floor, storeys: list[Heights]) -> int:
-    """Return the number of the storey that is nearest to the ground under the beginning of the path."""
-    if not len(floor.path):
-        return 0
+    """Return the number of the storey nearest to the path's ground, where the path first has floor below."""
     columns = floor.columns
-    x, y, z = floor.path.points_world[0] / columns.resolution_m
-    column, row = (
-        int(np.floor(x)) - columns.first[0] + KEY_ZERO,
-        int(np.floor(y)) - columns.first[1] + KEY_ZERO,
-    )
-    return int(np.argmin([abs(float(heights[row, column]) - z) for heights in storeys]))
+    points = floor.path.points_world / columns.resolution_m
+    places = np.floor(points[:, :2]).astype(np.int64)[:, ::-1] - (columns.first[::-1] - KEY_ZERO)
+    inside = ((places >= 0) & (places < columns.shape)).all(axis=1)  # a frame without points may lie outside
+    tops = np.array([heights[tuple(places[inside].T)] for heights in storeys])
+    has_floor = tops > NOWHERE
+    first = np.flatnonzero(has_floor.any(axis=0))[:1]
+    if not len(first):
+        return 0
+    away = np.where(has_floor, np.abs(tops - points[inside, 2]), np.inf)
+    return int(np.argmin(away[:, first[0]]))
 
 
 def _storey(floor: Floor, heights: Heights, config: TraversableConfig, is_home: bool) -> Storey:

@@ -156,10 +156,10 @@ def ground_from_lowest(
     """
     columns = max(1, round(_CELL_M / resolution_m))
     low_m = _cells(lowest, columns, _LOW_PERCENT, NOTHING) * resolution_m
+    heights_m = np.full(low_m.shape, np.nan)
     if floor is not None:
         heights_m = _cells(floor, columns, 50.0, NOWHERE) * resolution_m
-    else:
-        heights_m = np.full(low_m.shape, np.nan)
+    if np.isnan(heights_m).all():  # no floor is known, or too little for any cell
         floors = np.argwhere(np.abs(low_m - floor_z_m) <= _START_M)
         if not len(floors):
             return GroundHeights(np.full(low_m.shape, floor_z_m), first, columns)

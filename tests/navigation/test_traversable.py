@@ -161,3 +161,26 @@ def test_the_grid_does_not_depend_on_the_order_of_the_blocks(tmp_path):
 def test_an_empty_map_has_no_floor():
     with pytest.raises(DataError, match="the map is empty"):
         traversable_grid(OctreeMap(OctreeConfig()), TraversableConfig())
+
+
+def test_a_path_without_a_width_begins_at_the_ground_below_it():
+    world = octree_of(floor(x1=4.0, z=1.0))
+    path = [(x, 0.5, 1.3) for x in np.arange(0.2, 3.8, 0.1)]
+    grid = traversable_grid(world, TraversableConfig(footprint_m=0.0), path=path)
+    assert code_at(grid, 1.5, 0.2) == FREE
+
+
+def test_a_path_may_begin_outside_the_map():
+    """Frames without points are part of the path."""
+    path = [(x, 0.5, 0.3) for x in np.arange(9.0, 0.5, -0.3)]
+    assert code_at(traversable_grid(octree_of(floor()), TraversableConfig(), path=path), 1.5, 0.5) == FREE
+
+
+def test_one_storey_is_left_where_all_are_small():
+    rng = np.random.default_rng(0)
+    config = TraversableConfig(max_step_m=0.3, max_slope_rad=1.4, max_gap_m=0.3, head_room_m=0.1)
+    for _ in range(30):
+        octree = OctreeMap(OctreeConfig(resolution_m=0.05))
+        octree.insert_points(rng.uniform(-0.4, 0.4, (300, 3)).astype(np.float32), np.zeros(3))
+        storeys = traversable(reachable_floor(octree, config, positions_world=NO_PATH), config)
+        assert sum(storey.is_home for storey in storeys) == 1

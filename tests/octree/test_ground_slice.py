@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from mapper.core.frames import Scan
+from mapper.octree.columns import NOWHERE
 from mapper.octree.config import OctreeConfig, SliceConfig
-from mapper.octree.ground_height import ground_heights
+from mapper.octree.ground_height import DrivenGround, ground_heights
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import FREE, OCCUPIED, cut_slice
@@ -65,3 +66,16 @@ def test_where_no_floor_is_seen_the_band_is_level(hill):
     ground_m = ground_heights(hill, first=np.array([KEY_ZERO + 500, KEY_ZERO]), shape=(20, 20), floor_z_m=0.7)
 
     np.testing.assert_array_equal(ground_m, np.full((20, 20), 0.7))
+
+
+def test_floor_of_a_few_columns_alone_is_no_ground_to_follow_from(hill):
+    first, shape = np.array([KEY_ZERO - 100, KEY_ZERO - 40]), (80, 200)
+    heights = np.full(shape, NOWHERE, np.int32)
+    heights[40, 100] = 0
+    driven = DrivenGround(heights, np.zeros(shape, np.bool_))
+
+    ground_m = ground_heights(hill, first=first, shape=shape, floor_z_m=0.0, driven=driven)
+
+    expected_m = ground_heights(hill, first=first, shape=shape, floor_z_m=0.0)
+    assert ground_m[40, 100] == 0.0
+    np.testing.assert_array_equal(ground_m[:, 120:], expected_m[:, 120:])
