@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from mapper.config.build import BuildConfig
 from mapper.config.refusals import refusal
 from mapper.config.sensors import DEFAULTS
-from mapper.core.config import Config
+from mapper.core.config import Config, drop_unknown
 from mapper.core.errors import ConfigError, MapperWarning
 from mapper.core.frames import Sensor
 from mapper.runtime.atomic import MANIFEST_NAME
@@ -99,30 +99,14 @@ def _is_of_a_run(path: Path) -> bool:
 
 def _drop_former_settings(tree: dict[str, Any], path: Path) -> None:
     """Delete the names that are no settings; a run's file was complete when it was written."""
-    try:
-        BuildConfig.model_validate(tree)
-    except ValidationError as error:
-        unknown = [one["loc"] for one in error.errors() if one["type"] == "extra_forbidden"]
-        names = [_delete(tree, loc) for loc in unknown]
-        if names:
-            warnings.warn(
-                f"{path}: settings of an older version, which this one does not have, are ignored: "
-                f"{', '.join(names)}",
-                MapperWarning,
-                stacklevel=3,
-            )
-
-
-def _delete(tree: dict[str, Any], loc: Sequence[int | str]) -> str:
-    """Delete a setting and return its dotted name; a location also names the kind of each union's member."""
-    node, names = tree, []
-    for part in loc:
-        if not isinstance(node, dict) or part not in node:
-            continue
-        names.append(str(part))
-        parent, node = node, node[str(part)]
-    del parent[names[-1]]
-    return ".".join(names)
+    names = drop_unknown(BuildConfig, tree)
+    if names:
+        warnings.warn(
+            f"{path}: settings of an older version, which this one does not have, are ignored: "
+            f"{', '.join(names)}",
+            MapperWarning,
+            stacklevel=3,
+        )
 
 
 def _over(defaults: Mapping[str, Any], tree: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,9 +2,10 @@
 
 import json
 import re
+from collections.abc import Sequence
 from typing import Annotated, Any, get_args, get_origin
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 Ratio = Annotated[float, Field(ge=0.0, le=1.0)]
 """A ratio from 0 to 1."""
@@ -53,3 +54,33 @@ def _elements(text: str) -> Any:
         return json.loads(text.translate(_SQUARE))
     except ValueError:
         return text
+
+
+def drop_unknown(model: type[Config], tree: Any) -> list[str]:
+    """Delete the names that a model does not have from what an older version wrote; return them, dotted.
+
+    Args:
+        model: What the tree is to be.
+        tree: Parsed JSON; changed in place. What else is wrong with it is left to the model.
+    """
+    try:
+        model.model_validate(tree)
+    except ValidationError as error:
+        return [_delete(tree, one["loc"]) for one in error.errors() if one["type"] == "extra_forbidden"]
+    return []
+
+
+def _delete(tree: Any, loc: Sequence[int | str]) -> str:
+    """Delete a setting and return its dotted name.
+
+    A location also names, after a union, the kind of its member, by which a setting may be called as well.
+    """
+    node, parent, names, is_kind_told = tree, tree, [], False
+    for part in loc:
+        if isinstance(node, dict) and part == node.get("kind") and not is_kind_told:
+            is_kind_told = True
+        elif isinstance(node, list) or part in node:
+            names.append(part)
+            parent, node, is_kind_told = node, node[part], False
+    del parent[names[-1]]
+    return ".".join(str(name) for name in names)

@@ -1,5 +1,6 @@
 """Merged map on disk: its manifest, and the opening of a part of it."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -8,7 +9,7 @@ import numpy as np
 from pydantic import ValidationError
 
 import mapper
-from mapper.core.config import Config
+from mapper.core.config import Config, drop_unknown
 from mapper.core.errors import RunError
 from mapper.core.geometry import Array
 from mapper.octree.config import OctreeConfig, SliceConfig
@@ -139,10 +140,14 @@ def open_map(folder: Path) -> MergedMap:
             raise RunError(f"{folder}: not finished; the command that began it goes on where it stopped")
         raise RunError(f"{folder}: no merged map; make one with mapper merge RUN… --out {folder}")
     try:
-        manifest = MapManifest.model_validate_json((folder / MANIFEST_NAME).read_bytes())
+        tree = json.loads((folder / MANIFEST_NAME).read_bytes())
+        drop_unknown(MapManifest, tree)
+        manifest = MapManifest.model_validate(tree)
     except ValidationError as error:
         first = error.errors()[0]
         raise RunError(
             f"{folder / MANIFEST_NAME}: {first['loc']}: {first['msg']}; by another version?"
         ) from None
+    except (ValueError, RecursionError) as error:
+        raise RunError(f"{folder / MANIFEST_NAME}: not valid JSON: {error}; it is damaged") from None
     return MergedMap(folder, manifest)

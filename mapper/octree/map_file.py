@@ -16,6 +16,7 @@ import zstandard
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from mapper.core.config import drop_unknown
 from mapper.core.errors import MapFileError
 from mapper.octree.attributes import AttributeLayer
 from mapper.octree.blocks import BLOCK_BYTES, check_memory, find_slots
@@ -119,6 +120,7 @@ def _parse_header(path: Path, head: bytes) -> tuple[list[int], OctreeConfig]:
     try:
         header = json.loads(head)
         counts = [header[name] for name in _COUNTS]
+        drop_unknown(OctreeConfig, header["config"])
         config = OctreeConfig.model_validate(header["config"])
     except (ValueError, KeyError, TypeError, ValidationError, RecursionError):
         raise MapFileError(f"{path}: its header does not describe a map; it is damaged") from None

@@ -126,11 +126,13 @@ def test_values_that_would_fail_late_are_refused_early(override, message):
 def test_a_run_of_an_older_version_loses_the_settings_that_are_no_more(tmp_path):
     tree = BuildConfig().model_dump(mode="json")
     tree["odometry"]["former"], tree["odometry"]["detector"]["gone"] = 1, 2
+    assert tree["loops"]["kind"] in tree["loops"]  # a setting is named as the union's member
+    tree["loops"]["verification"]["gone"] = 3
     tree["octree"]["resolution_m"], tree["old_part"] = 0.1, {"a": 1}
     path = tmp_path / "config.json"
     path.write_text(json.dumps(tree))
     (tmp_path / "manifest.json").write_text("{}")
-    names = r"odometry\.detector\.gone, odometry\.former, old_part$"
+    names = r"odometry\.detector\.gone, odometry\.former, loops\.verification\.gone, old_part$"
 
     with pytest.warns(MapperWarning, match=names):
         loaded = load_run_config(path)

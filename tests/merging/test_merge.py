@@ -1,5 +1,6 @@
 """Many runs become one map: the same bytes whoever does the work, and those of a merge in memory."""
 
+import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -338,6 +339,21 @@ def test_a_path_is_planned_on_a_merged_map(tmp_path, capsys):
     assert capsys.readouterr().out.startswith("2.06 m in the slice")
     assert (tmp_path / "map/plan.png").stat().st_size > 10_000
     assert '"map": "slice"' in (tmp_path / "map/plan.json").read_text()
+
+
+def test_a_map_of_an_older_version_is_opened_and_a_damaged_one_refused(merged):
+    path = merged.path / "manifest.json"
+    before = path.read_text()
+    tree = json.loads(before)
+    tree["octree"]["seen_through_scans"] = 3
+    try:
+        path.write_text(json.dumps(tree, indent=2))
+        assert open_map(merged.path).manifest == merged.manifest
+        path.write_text(before[:-20])
+        with pytest.raises(RunError, match="not valid JSON"):
+            open_map(merged.path)
+    finally:
+        path.write_text(before)
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -84,6 +84,17 @@ def test_another_sensor_model_replaces_the_file_s_but_not_its_resolution(path):
     assert again.attributes is not None
 
 
+def test_settings_that_were_dropped_since_the_file_was_written_do_not_matter(path):
+    before = read_map(path)
+    dropped = {"dynamic": "none", "seen_through_scans": 3}
+    path.write_bytes(resealed(path.read_bytes(), lambda header: header["config"].update(dropped)))
+
+    again = read_map(path)
+
+    assert again.config == before.config
+    assert len(again) == len(before)
+
+
 def resealed(data, change):
     """The file with its header changed and its checksum right."""
     version, length, _ = struct.unpack_from("<III", data, len(MAGIC))
