@@ -14,8 +14,8 @@ class MeshConfig(Config):
     voxel_m: PositiveFloat = 0.01
     truncation_voxels: Annotated[float, Field(ge=1.0)] = 4.0
     """How far from the surface distances count; thinner than the depth noise tears holes."""
-    max_depth_m: PositiveFloat = 4.0
-    """Deeper measurements are left out."""
+    max_depth_m: PositiveFloat | None = None
+    """Deeper measurements are left out; None is where those that count in the octree end."""
     frame_stride: PositiveInt = 5
     """Every n-th tracked frame is fused."""
     min_observations: PositiveInt = 3

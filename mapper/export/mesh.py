@@ -1,8 +1,12 @@
-"""A coloured surface from depth images at their final poses, fused by Open3D (Zhou, Park & Koltun 2018)."""
+"""A coloured surface from depth images at their final poses, fused by Open3D (Zhou, Park & Koltun 2018).
 
+Depth counts as in the octree: up to the same limit, and not where something moved, which the octree lacks.
+"""
+
+import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,12 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.config.export import MeshConfig
+from mapper.core.back_projection import back_project
 from mapper.core.errors import DependencyError, FrameError, RunError
-from mapper.core.frames import NO_DISTORTION, DepthImage, PinholeCamera, Points32, RgbdFrame
+from mapper.core.frames import NO_DISTORTION, DepthImage, PinholeCamera, Points32, RgbdFrame, ray_table
 from mapper.core.geometry import Transform, inverse
 from mapper.export.mesh_files import Triangles, write_mesh
 from mapper.mapping.cloud import Colors
 from mapper.octree.blocks import check_memory
+from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import read_map
 from mapper.run import files
 from mapper.run.folder import Run, open_log
@@ -28,6 +34,8 @@ from mapper.sources.base import FrameRef
 _BLOCK_VOXELS = 8
 """Edge of a block. Of Open3D's usual 16 two thirds would lie beyond the truncation, and be computed."""
 _VOXEL_BYTES = 4 + 4 + 12  # distance, weight and colour, all float32: integers would round at every frame
+_NEAR_VOXELS = math.sqrt(3.0)
+"""Noise scatters depth over voxels beside the octree's occupied ones: those that share a corner with one."""
 _LIBRARIES = "libgl1 libegl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0 libgomp1"
 
 
@@ -59,6 +67,7 @@ class _View:
 def surface(run: Run, path: Path, progress: Progress) -> None:
     """Fuse every ``mesh.frame_stride``-th tracked frame of the log and write the surface.
 
+    Depth far from all that is occupied in the run's octree is left out: it is of what moved.
     Memory grows with the surface seen, not with the log.
 
     Raises:
@@ -68,13 +77,14 @@ def surface(run: Run, path: Path, progress: Progress) -> None:
     """
     o3d = _open3d()
     config = run.config.mesh
-    volume = _Volume(o3d, config, blocks=_expected_blocks(run))
-    for view in _views(run, progress):
+    octree, max_depth_m = read_map(run.file(files.OCTREE_MAP)), _max_depth_m(run)
+    volume = _Volume(o3d, config, max_depth_m=max_depth_m, blocks=_expected_blocks(octree, config))
+    for view in _views(run, octree, progress):
         volume.add(view)
     found = volume.surface()
     if not len(found.triangles):
         raise RunError(
-            f"{run.path}: no surface within {config.max_depth_m:g} m was seen in {config.min_observations} "
+            f"{run.path}: no surface within {max_depth_m:g} m was seen in {config.min_observations} "
             "fused frames; lower mesh.min_observations or mesh.frame_stride"
         )
     write_mesh(path, found.points_world, found.colors, found.triangles)
@@ -83,9 +93,10 @@ def surface(run: Run, path: Path, progress: Progress) -> None:
 class _Volume:
     """Open3D's hash of voxel blocks."""
 
-    def __init__(self, o3d: Any, config: MeshConfig, *, blocks: int) -> None:
+    def __init__(self, o3d: Any, config: MeshConfig, *, max_depth_m: float, blocks: int) -> None:
         self._o3d = o3d
         self._config = config
+        self._max_depth_m = max_depth_m
         number = o3d.core.float32
         self._grid = o3d.t.geometry.VoxelBlockGrid(
             attr_names=("tsdf", "weight", "color"),
@@ -102,7 +113,7 @@ class _Volume:
         depth, color = image(tensor(view.depth_m)), image(tensor(view.colors))
         intrinsic, extrinsic = tensor(view.camera.matrix), tensor(inverse(view.T_world_camera))
         # Depth is in metres already, so Open3D's scale is 1.
-        reach = (1.0, self._config.max_depth_m, self._config.truncation_voxels)
+        reach = (1.0, self._max_depth_m, self._config.truncation_voxels)
         blocks = self._grid.compute_unique_block_coordinates(depth, intrinsic, extrinsic, *reach)
         self._grid.integrate(blocks, depth, color, intrinsic, extrinsic, *reach)
 
@@ -132,7 +143,15 @@ def _in_order(points: Points32, colors: Colors, triangles: Triangles) -> Surface
     return Surface(points[is_new], colors[is_new], triangles[np.lexsort(triangles.T[::-1])])
 
 
-def _views(run: Run, progress: Progress) -> Iterator[_View]:
+def _max_depth_m(run: Run) -> float:
+    """Return the depth up to which measurements count."""
+    if run.config.mesh.max_depth_m is not None:
+        return run.config.mesh.max_depth_m
+    depth = run.manifest.depth
+    return run.config.octree.range_limit_m if depth is None else depth.limit_m
+
+
+def _views(run: Run, octree: OctreeMap, progress: Progress) -> Iterator[_View]:
     """Yield the frames to fuse, read and rectified ahead in threads."""
     trajectory = run.tracked_trajectory()
     stride = run.config.mesh.frame_stride
@@ -149,7 +168,8 @@ def _views(run: Run, progress: Progress) -> Iterator[_View]:
             return str(error)
         if not isinstance(frame, RgbdFrame):
             raise RunError(f"{source.path}: a mesh needs depth images, and this log has none")
-        return _rectified(frame, T_world_body[entry.stamp_ns])
+        T = T_world_body[entry.stamp_ns]
+        return _rectified(_without_moved(frame, T, octree), T)
 
     with progress.stage("mesh") as report:
         for done, view in enumerate(ordered_map(prepare, entries, workers=run.config.workers), start=1):
@@ -175,6 +195,16 @@ def _rectified(frame: RgbdFrame, T_world_body: Transform) -> _View:
     )
 
 
+def _without_moved(frame: RgbdFrame, T_world_body: Transform, octree: OctreeMap) -> RgbdFrame:
+    """Return a frame without the depth that is far from all that is occupied in the octree."""
+    measured = (frame.depth_m > 0.0) & np.isfinite(frame.depth_m)
+    depth_m = np.where(measured, frame.depth_m, np.float32(0.0))
+    points_world = back_project(depth_m, ray_table(frame.camera), T_world_body @ frame.T_body_camera)
+    max_distance_m = _NEAR_VOXELS * octree.resolution_m
+    depth_m[measured] *= octree.are_near_occupied(points_world, max_distance_m=max_distance_m)
+    return replace(frame, depth_m=depth_m)
+
+
 @lru_cache(maxsize=8)
 def _undistortion(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return where every pixel of the ideal image lies in the real one."""
@@ -189,10 +219,8 @@ def _undistortion(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[n
     return columns, rows
 
 
-def _expected_blocks(run: Run) -> int:
+def _expected_blocks(octree: OctreeMap, config: MeshConfig) -> int:
     """Estimate from the octree how many blocks the surface will fill, and refuse what could not fit."""
-    config = run.config.mesh
-    octree = read_map(run.file(files.OCTREE_OT), run.config.octree)
     occupied = int((octree.leaves().log_odds >= octree.occupied_log_odds).sum())
     block_m = _BLOCK_VOXELS * config.voxel_m
     shell_blocks = 1.0 + 2.0 * config.truncation_voxels / _BLOCK_VOXELS

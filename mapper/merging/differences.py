@@ -147,9 +147,7 @@ def _surely_occupied(octree: OctreeMap) -> Points:
 def _compared(centres: Points, other: OctreeMap, T_other_centres: Transform, tolerance_m: float) -> _Compared:
     points = apply(T_other_centres, centres)
     values = other.query(points)
-    occupied = values >= other.occupied_log_odds
-    nearest = other.nearest_obstacles(points[~occupied], max_range_m=tolerance_m)
-    occupied[~occupied] = np.isfinite(nearest.distances_m)
+    occupied = other.are_near_occupied(points, max_distance_m=tolerance_m)
     config = other.config
     most = max(_SURE_MISSES * log_odds(config.miss_probability), log_odds(config.clamp_min_probability))
     return _Compared(occupied, free=~occupied & (values <= most), unknown=~occupied & np.isnan(values))

@@ -204,6 +204,15 @@ class OctreeMap:
         occupied: NDArray[np.bool_] = self.query(points_world.astype(np.float64)) >= self.occupied_log_odds
         return occupied
 
+    def are_near_occupied(
+        self, points_world: Points | Points32, *, max_distance_m: float
+    ) -> NDArray[np.bool_]:
+        """Return the (N,) mask of (N, 3) points, metres, in occupied voxels or so near to one's centre."""
+        near = self.are_occupied(points_world)
+        nearest = self.nearest_obstacles(points_world[~near].astype(np.float64), max_range_m=max_distance_m)
+        near[~near] = np.isfinite(nearest.distances_m)
+        return near
+
     def cast_rays(
         self, origins_world: Points, directions_world: Points, *, max_range_m: float, through_unknown: bool
     ) -> RayEnds:

@@ -2,10 +2,12 @@ import numpy as np
 import pytest
 
 from mapper.config.export import MeshConfig
-from mapper.core.frames import PinholeCamera, RgbdFrame, ray_table
+from mapper.core.frames import PinholeCamera, RgbdFrame, Scan, ray_table
 from mapper.core.geometry import apply, inverse, transform
 from mapper.core.rotations import rotation_from_euler
-from mapper.export.mesh import _in_order, _rectified, _Volume
+from mapper.export.mesh import _in_order, _rectified, _Volume, _without_moved
+from mapper.octree.config import OctreeConfig
+from mapper.octree.map import OctreeMap
 
 FR1 = (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)
 NORMAL_WORLD, OFFSET_M = np.array([0.28, 0.0, 0.96]), 1.0
@@ -30,7 +32,7 @@ def frame_of_a_plane(T_world_camera, *, distortion):
 @pytest.mark.parametrize("distortion", [(0.0, 0.0, 0.0, 0.0, 0.0), FR1], ids=["ideal", "fr1"])
 def test_the_surface_of_a_plane_is_the_plane(distortion):
     o3d = pytest.importorskip("open3d", reason="the mesh extra is not installed", exc_type=ImportError)
-    volume = _Volume(o3d, MeshConfig(voxel_m=0.02, min_observations=1), blocks=100)
+    volume = _Volume(o3d, MeshConfig(voxel_m=0.02, min_observations=1), max_depth_m=4.0, blocks=100)
     for T_world_camera in POSES:
         volume.add(_rectified(frame_of_a_plane(T_world_camera, distortion=distortion), T_world_camera))
 
@@ -100,3 +102,20 @@ def test_the_pose_of_the_camera_on_the_body_counts():
     view = _rectified(mounted, inverse(T_body_camera))
 
     np.testing.assert_allclose(view.T_world_camera, np.eye(4), atol=1e-12)
+
+
+def test_depth_of_what_the_octree_does_not_have_is_left_out():
+    T_world_camera = POSES[1]
+    wall = frame_of_a_plane(T_world_camera, distortion=FR1)
+    octree = OctreeMap(OctreeConfig(resolution_m=0.05))
+    octree.insert(Scan(0, wall.scan().points_body), T_world_camera)
+    depth_m = wall.depth_m.copy()
+    depth_m[80:120, 100:200] *= 0.6  # who passes before the wall
+    depth_m[:20] = np.nan
+    passed = RgbdFrame(0, wall.image, depth_m, wall.camera)
+
+    kept_m = _without_moved(passed, T_world_camera, octree).depth_m
+
+    expected_m = wall.depth_m.copy()
+    expected_m[80:120, 100:200] = expected_m[:20] = 0.0
+    np.testing.assert_array_equal(kept_m, expected_m)
