@@ -68,7 +68,9 @@ def reachable_floor(
     """
     if not len(octree):
         raise DataError("traversable floor: the map is empty; fuse scans into it first")
-    columns, limits = occupied_columns(octree), limits_of(config, octree.resolution_m)
+    limits = limits_of(config, octree.resolution_m)
+    # What carried a sensor that looks forward began beside the map.
+    columns = occupied_columns(octree, margin=int(np.ceil(config.footprint_m / octree.resolution_m)))
     path = path_ground(
         columns,
         positions_world,
@@ -110,7 +112,7 @@ def driven_ground(floor: Floor) -> DrivenGround:
     heights.ravel()[at] = columns.tops[floor.reached][::-1]
     swept = np.zeros(columns.shape, np.bool_)
     swept.ravel()[column_of[floor.driven & floor.reached]] = True
-    return DrivenGround(heights, swept)
+    return DrivenGround(heights, swept, columns.first)
 
 
 def _flooded(

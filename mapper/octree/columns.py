@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_MASK, KEY_ZERO, block_keys, gather
+from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_COUNT, KEY_MASK, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap
 
 Tops = NDArray[np.int32]
@@ -59,9 +59,10 @@ def block_extent(octree: OctreeMap) -> tuple[NDArray[np.int64], NDArray[np.int64
     return keys.min(axis=0), keys.max(axis=0) + (1 << BLOCK_BITS)
 
 
-def occupied_columns(octree: OctreeMap) -> Columns:
-    """Return the occupied voxels of a map by column."""
+def occupied_columns(octree: OctreeMap, *, margin: int = 0) -> Columns:
+    """Return the occupied voxels of a map by column, with a margin of so many columns around its blocks."""
     first, last = block_extent(octree)
+    first, last = np.maximum(first - margin, 0), np.minimum(last + margin, KEY_COUNT)
     width, height = (int(n) for n in last - first)
     codes, values = octree.blocks.codes, octree.blocks.table.values
     packed = np.sort(_occupied(codes, values, octree.occupied_log_odds))  # by y, then x, then z

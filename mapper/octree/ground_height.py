@@ -74,12 +74,14 @@ class DrivenGround:
 
     Attributes:
         heights: (H, W) int32 heights of the lowest such floor in voxels above z = 0; NOWHERE where there is
-            none. The columns are those of all blocks of the map.
+            none. The columns are those of all blocks of the map and what the footprint passed over beside.
         swept: (H, W) mask of what the footprint passed over.
+        first: (2,) x and y keys of the column of row 0 and column 0.
     """
 
     heights: NDArray[np.int32]
     swept: NDArray[np.bool_]
+    first: NDArray[np.int64]
 
 
 def ground_heights(

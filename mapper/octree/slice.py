@@ -80,8 +80,11 @@ def cut_slice(
     Raises:
         DataError: The band has no voxels, or none that is known.
     """
-    first, last = block_extent(octree)
-    shape = int(last[1] - first[1]), int(last[0] - first[0])
+    if driven is None:
+        first, last = block_extent(octree)
+        shape = int(last[1] - first[1]), int(last[0] - first[0])
+    else:
+        first, shape = driven.first, driven.swept.shape
     ground_m = None
     if config.above == "ground":
         ground_m = ground_heights(octree, first=first, shape=shape, floor_z_m=floor_z_m, driven=driven)

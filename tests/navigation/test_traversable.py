@@ -3,12 +3,12 @@ import pytest
 
 from mapper.core.errors import DataError
 from mapper.navigation.config import TraversableConfig
-from mapper.navigation.floor import reachable_floor
+from mapper.navigation.floor import driven_ground, reachable_floor
 from mapper.navigation.traversable import traversable
-from mapper.octree.config import OctreeConfig
+from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import read_map, write_ot
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN
+from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, cut_slice
 
 CELL = 0.05
 
@@ -174,6 +174,18 @@ def test_a_path_may_begin_outside_the_map():
     """Frames without points are part of the path."""
     path = [(x, 0.5, 0.3) for x in np.arange(9.0, 0.5, -0.3)]
     assert code_at(traversable_grid(octree_of(floor()), TraversableConfig(), path=path), 1.5, 0.5) == FREE
+
+
+def test_the_footprint_is_free_beside_the_map_too():
+    """A sensor that looks forward begins where the map does."""
+    octree = octree_of(floor(x1=4.0))
+    path = [(x, 0.5, 0.3) for x in np.arange(0.02, 3.0, 0.1)]
+    reached = reachable_floor(octree, TraversableConfig(footprint_m=0.3), positions_world=np.array(path))
+    (storey,) = traversable(reached, TraversableConfig())
+    level = cut_slice(octree, SliceConfig(), driven=driven_ground(reached))
+    for grid in (storey.grid, level):
+        assert code_at(grid, -0.2, 0.5) == FREE
+        assert code_at(grid, -0.35, 0.5) == UNKNOWN
 
 
 def test_one_storey_is_left_where_all_are_small():

@@ -72,7 +72,7 @@ def test_floor_of_a_few_columns_alone_is_no_ground_to_follow_from(hill):
     first, shape = np.array([KEY_ZERO - 100, KEY_ZERO - 40]), (80, 200)
     heights = np.full(shape, NOWHERE, np.int32)
     heights[40, 100] = 0
-    driven = DrivenGround(heights, np.zeros(shape, np.bool_))
+    driven = DrivenGround(heights, np.zeros(shape, np.bool_), first)
 
     ground_m = ground_heights(hill, first=first, shape=shape, floor_z_m=0.0, driven=driven)
 
