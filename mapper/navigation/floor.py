@@ -87,7 +87,7 @@ def reachable_floor(
         floor = floor_z_m / octree.resolution_m
         # A floor at z = 0 lies in the voxel above or in that below.
         seeds = np.flatnonzero(is_surface & (np.abs(columns.tops - floor) <= limits.step))
-    column_of = np.repeat(np.arange(len(columns.starts) - 1, dtype=np.int32), np.diff(columns.starts))
+    column_of = columns.column_of.astype(np.int32)
     by_steps = _flooded(columns, column_of, limits, seeds, is_surface)
     steep, plain = np.zeros_like(by_steps), np.zeros_like(by_steps)
     mark_steep(columns.starts, columns.tops, columns.shape, column_of, limits, by_steps, steep)
@@ -105,8 +105,7 @@ def reachable_floor(
 
 def driven_ground(floor: Floor) -> DrivenGround:
     """Return the lowest floor of every column, and what the footprint passed over."""
-    columns = floor.columns
-    column_of = np.repeat(np.arange(len(columns.starts) - 1), np.diff(columns.starts))
+    columns, column_of = floor.columns, floor.columns.column_of
     heights = np.full(columns.shape, NOWHERE, np.int32)
     at = column_of[floor.reached][::-1]  # the lowest of a column comes last
     heights.ravel()[at] = columns.tops[floor.reached][::-1]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mapper.navigation.flood import Indices, Mask
 from mapper.navigation.floor import Floor
-from mapper.octree.columns import NOWHERE, Tops
+from mapper.octree.columns import NOWHERE, Tops, starts_of
 
 Heights = NDArray[np.int32]
 
@@ -27,12 +27,11 @@ def storeys_of(floor: Floor) -> list[Heights]:
     """
     columns, reached = floor.columns, floor.reached
     heights = np.full(columns.shape, NOWHERE, np.int32)
-    column_of = np.repeat(np.arange(len(columns.starts) - 1), np.diff(columns.starts))[reached]
-    tops = columns.tops[reached]
+    column_of, tops = columns.column_of[reached], columns.tops[reached]
     if not (np.diff(column_of) == 0).any():
         heights.ravel()[column_of] = tops
         return [heights]
-    starts = np.searchsorted(column_of, np.arange(len(columns.starts)))
+    starts = starts_of(column_of, len(columns.starts) - 1)
     limits, driven = floor.limits, floor.driven[reached]
     storey = np.full(len(tops), _NONE, np.int32)
     sources = np.zeros(len(tops), np.bool_)

@@ -125,9 +125,8 @@ def _add_obstacles(
 
 def _driven(floor: Floor, heights: Heights) -> Mask:
     """Return the (H, W) mask of the columns in which the floor of a storey is ground under the path."""
-    nodes = np.flatnonzero(floor.driven)
-    columns = np.searchsorted(floor.columns.starts, nodes, side="right") - 1
-    of_storey = heights.ravel()[columns] == floor.columns.tops[nodes]
+    columns = floor.columns.column_of[floor.driven]
+    of_storey = heights.ravel()[columns] == floor.columns.tops[floor.driven]
     driven = np.zeros(heights.shape, np.bool_)
     driven.ravel()[columns[of_storey]] = True
     return driven

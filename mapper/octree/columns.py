@@ -33,16 +33,32 @@ class Columns:
     first: NDArray[np.int64]
     resolution_m: float
 
+    @property
+    def column_of(self) -> NDArray[np.int64]:
+        """(N,) number of each voxel's column."""
+        column_of: NDArray[np.int64] = np.searchsorted(self.starts, np.arange(len(self.tops)), "right") - 1
+        return column_of
+
     def with_tops(self, columns: NDArray[np.int64], tops: Tops) -> "Columns":
         """Return these columns and further voxels, given by their (M,) column numbers and tops."""
-        # Voxels of a column are in order, so the key below orders all of them.
-        keys = _keys(np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts)), self.tops)
+        keys = _keys(self.column_of, self.tops)  # voxels of a column are in order, so it orders all of them
         added = np.setdiff1d(_keys(columns, tops), keys)
         places = np.searchsorted(keys, added)
-        counts = np.bincount(added >> 17, minlength=len(self.starts) - 1)
-        starts = self.starts + np.concatenate([[0], np.cumsum(counts)])
+        starts = starts_of(added >> 17, len(self.starts) - 1)
+        starts += self.starts
         tops = np.insert(self.tops, places, (added & (1 << 17) - 1) - KEY_ZERO)
         return Columns(starts, tops, self.shape, self.first, self.resolution_m)
+
+
+def starts_of(columns: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Return the (count + 1,) start of each column's voxels, given the columns of all voxels in order.
+
+    The columns may be far more than the voxels, so this allocates nothing else of their number.
+    """
+    starts = np.zeros(count + 1, np.int64)
+    np.add.at(starts, columns + 1, 1)
+    np.cumsum(starts, out=starts)
+    return starts
 
 
 def _keys(columns: NDArray[np.int64], tops: Tops) -> NDArray[np.int64]:
@@ -67,7 +83,7 @@ def occupied_columns(octree: OctreeMap, *, margin: int = 0) -> Columns:
     codes, values = octree.blocks.codes, octree.blocks.table.values
     packed = np.sort(_occupied(codes, values, octree.occupied_log_odds))  # by y, then x, then z
     columns = ((packed >> 32) - first[1]) * width + (packed >> 16 & KEY_MASK) - first[0]
-    starts = np.searchsorted(columns, np.arange(height * width + 1))
+    starts = starts_of(columns, height * width)
     tops = ((packed & KEY_MASK) + 1 - KEY_ZERO).astype(np.int32)
     return Columns(starts, tops, (height, width), first, octree.resolution_m)
 
