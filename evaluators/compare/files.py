@@ -31,11 +31,12 @@ MCAP = "compare.mcap"
 TRAJECTORIES = "trajectories"
 _FOLDER = FolderKind(
     "a comparison",
-    manifest_keys=frozenset({"kind", "log", "mapper_version", "config"}),
+    manifest_keys=frozenset({"log", "mapper_version", "config"}),
     files=frozenset(
         {TABLES, REPORT, ODOMETRY, REGISTRATION, TRIALS, PATHS_VIEW, PATH_ERRORS_VIEW, REGISTRATION_VIEW}
         | {MCAP, TRAJECTORIES, CELLS}
     ),
+    kind="comparison",
 )
 
 

@@ -25,8 +25,9 @@ if TYPE_CHECKING:
 SENSOR, NUMBERS, ACCURACY, RESIDUALS = "sensor.toml", "depth.csv", "accuracy.png", "residuals.png"
 FOLDER = FolderKind(
     "a depth camera's study",
-    manifest_keys=frozenset({"kind", "noise", "levels"}),
+    manifest_keys=frozenset({"noise", "levels"}),
     files=frozenset({SENSOR, NUMBERS, ACCURACY, RESIDUALS}),
+    kind="depth accuracy",
 )
 
 _RAW: Rgb = (38, 145, 87)

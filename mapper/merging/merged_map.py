@@ -22,8 +22,9 @@ from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, partial_of, write_t
 TILES, SCRATCH = "tiles", "work"
 MERGED_MAP = FolderKind(
     "a merged map",
-    manifest_keys=frozenset({"kind", "status", "tile_m", "tiles"}),
+    manifest_keys=frozenset({"status", "tile_m", "tiles"}),
     files=files.names_of("maps", "exported maps") | {TILES, SCRATCH},
+    kind="merged map",
 )
 
 Corner = tuple[float, float, float]

@@ -92,7 +92,7 @@ def localise(
         progress.note(warning.sentence)
     start = first_manifest(source)
     manifest = LocalisedManifest(map=str(known.path.resolve()), **dict(start))
-    with write_run(out, manifest, config, overwrite=overwrite) as writer:
+    with write_run(out, manifest, config, overwrite=overwrite, kind=files.LOCALISED_LOG) as writer:
         writer.warn(warnings)
         map_node = known.places.map_node
         with writer.clock.stage("track"):

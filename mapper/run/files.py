@@ -145,6 +145,12 @@ RUN = FolderKind(
     | _STOREY_FILES
     | {FORMER_SCAN_UPDATES},
 )
+LOCALISED_LOG = FolderKind(
+    "a localised log",
+    manifest_keys=frozenset({"status", "mapper_version", "input", "map"}),
+    files=frozenset({TRAJECTORY, POSES, TRUTH, LOOPS, FRAMES, FRAME_MS, SUMMARY, CONFIG}),
+    kind="localised log",
+)
 
 
 def names_of(*depends_on: str) -> frozenset[str]:

@@ -33,7 +33,7 @@ from mapper.run.manifest import (
     read_manifest,
 )
 from mapper.run.pose_covariances import UncertainPoses, read_poses
-from mapper.runtime.atomic import atomic_folder, flush_to_disk, partial_of, write_text
+from mapper.runtime.atomic import FolderKind, atomic_folder, flush_to_disk, partial_of, write_text
 from mapper.runtime.timing import Stopwatch
 from mapper.sources import open_source
 from mapper.sources.base import Log, Session
@@ -248,7 +248,13 @@ class RunWriter:
 
 @contextmanager
 def write_run(
-    out: Path, manifest: Manifest, config: BuildConfig, *, overwrite: bool, takes_over: bool = False
+    out: Path,
+    manifest: Manifest,
+    config: BuildConfig,
+    *,
+    overwrite: bool,
+    takes_over: bool = False,
+    kind: FolderKind = files.RUN,
 ) -> Iterator[RunWriter]:
     """Yield the writer of a run that becomes OUT on success and stays behind as ``OUT.partial`` otherwise.
 
@@ -260,12 +266,13 @@ def write_run(
         config: Every setting.
         overwrite: Replace a run that is there; one that holds a user's own files only with ``takes_over``.
         takes_over: The caller copies a user's own files from the run that is replaced.
+        kind: Of the folder; only one of the same kind is replaced.
 
     Raises:
         RunError: OUT exists and may not be replaced, or is being built by another process.
         WriteError: A file cannot be written, as when the disk is full.
     """
-    with atomic_folder(out, files.RUN, overwrite=overwrite, takes_over=takes_over) as folder:
+    with atomic_folder(out, kind, overwrite=overwrite, takes_over=takes_over) as folder:
         writer = RunWriter(folder, manifest)
         try:
             write_text(folder / files.CONFIG, config.model_dump_json(indent=2) + "\n")

@@ -32,11 +32,13 @@ class FolderKind:
         name: What messages call it, as in "a run".
         manifest_keys: Keys that its ``manifest.json`` has.
         files: What may be in it: names, or patterns of names.
+        kind: Value of the manifest's ``kind``; None if it has none.
     """
 
     name: str
     manifest_keys: frozenset[str]
     files: frozenset[str]
+    kind: str | None = None
 
     def wrote(self, folder: Path) -> bool:
         """Return whether the folder is empty, or has a manifest of this kind."""
@@ -48,7 +50,9 @@ class FolderKind:
             manifest = json.loads((folder / MANIFEST_NAME).read_bytes())
         except (OSError, ValueError, RecursionError):
             return False
-        return isinstance(manifest, dict) and self.manifest_keys <= manifest.keys()
+        if not isinstance(manifest, dict) or manifest.get("kind") != self.kind:
+            return False
+        return self.manifest_keys <= manifest.keys()
 
     def foreign_files(self, folder: Path) -> list[str]:
         """Return the names in a folder that no verb gave, sorted."""

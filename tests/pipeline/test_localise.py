@@ -92,6 +92,14 @@ def test_the_manifest_tells_the_map_the_stretches_and_a_verdict(first, localised
         load_run(localised)
 
 
+def test_a_map_is_not_replaced_by_a_log_localised_in_it(first, desk_log, localised):
+    known = load_known_map(first.path)
+    with pytest.raises(RunError, match="is not a localised log"):
+        localise(open_source(desk_log), known, known.config, first.path, overwrite=True)
+    with pytest.raises(RunError, match="is not a run folder"):
+        build(open_source(desk_log), known.config, localised, overwrite=True)
+
+
 def test_covariances_are_given_the_map(localised):
     poses = read_poses(localised / "poses.csv")
     assert np.isfinite(poses.covariances).all()
