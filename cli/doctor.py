@@ -19,7 +19,17 @@ _MARKS = {"well": "ok  ", "warning": "warn", "failed": "FAIL"}
 def doctor(
     run: Annotated[
         Path | None,
-        typer.Argument(metavar="[RUN]", help="Check this run's files instead of the machine."),
+        typer.Argument(
+            metavar="[RUN]", help="Check the files of this run or localised log instead of the machine."
+        ),
+    ] = None,
+    accept: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FILE",
+            help="Record a map that you edited, such as slice.pgm, as it is now; fusing makes it anew. "
+            "Repeatable.",
+        ),
     ] = None,
     json_: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
@@ -32,6 +42,8 @@ def doctor(
     """
     from cli.console import progress_for
 
+    if accept:
+        _accept(run, accept)
     progress = progress_for(quiet=json_ or not sys.stderr.isatty())
     if run is None:
         from mapper.doctor.examination import examine
@@ -51,6 +63,25 @@ def doctor(
             f"mapper: doctor: {len(failed)} of {len(findings)} failed: {', '.join(failed)}", file=sys.stderr
         )
         raise typer.Exit(1)
+
+
+def _accept(run: Path | None, names: "Sequence[str]") -> None:
+    from mapper.core.errors import ConfigError
+    from mapper.export.grid import read_grid
+    from mapper.run import files
+    from mapper.run.folder import load_run
+
+    if run is None:
+        raise ConfigError(f"--accept {names[0]}: want the run that it is a file of: mapper doctor RUN")
+    for name in names:
+        if name not in files.EDITABLE:
+            known = ", ".join(
+                f"{stem}{end}" for stem in (files.SLICE, files.TRAVERSABLE) for end in (".pgm", ".yaml")
+            )
+            raise ConfigError(f"--accept {name}: is no map that can be edited; want one of {known}")
+        read_grid((run / name).with_suffix(".yaml"))
+    with load_run(run).changing(names):
+        pass
 
 
 def _table(findings: "Sequence[Finding]") -> str:

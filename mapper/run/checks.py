@@ -1,6 +1,7 @@
-"""Checks of all files of a finished run, for ``mapper doctor RUN``."""
+"""Checks of all files of a finished run or localised log, for ``mapper doctor RUN``."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 from mapper.core.errors import MapperError
@@ -8,7 +9,8 @@ from mapper.doctor.finding import Finding
 from mapper.run import files
 from mapper.run.digests import fault_of
 from mapper.run.folder import Run, load_run
-from mapper.run.manifest import FileDigest
+from mapper.run.localised import LocalisedManifest
+from mapper.run.manifest import FileDigest, is_localised_log, read_manifest_of
 from mapper.runtime.atomic import is_temporary
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
@@ -17,34 +19,43 @@ _THREADS = 4
 
 
 def check_run(folder: Path, *, progress: Progress = SILENT) -> list[Finding]:
-    """Compare every file of a run with the size and the SHA-256 that its manifest tells.
+    """Compare every file of a run or a localised log with the size and the SHA-256 that its manifest tells.
 
     The files of a run of before 2026-11-22, which has neither, are read and counted instead.
 
     Args:
-        folder: The run.
+        folder: The run, or the localised log.
         progress: Receives how many files were checked.
 
     Raises:
         RunError: There is no finished run, or its manifest or its settings are damaged.
     """
-    run = load_run(folder)
-    digests = run.manifest.files
+    others: Iterable[Finding] = ()
+    if is_localised_log(folder):
+        localised = read_manifest_of(folder / files.MANIFEST, LocalisedManifest)
+        digests = localised.files
+        found = _hashed(folder, digests, lambda _: f"restore it, or localise again in {localised.map}")
+    else:
+        run = load_run(folder)
+        digests, others = run.manifest.files, _unrecorded(run)
+        remedy = partial(files.remedy_for, folder=folder)
+        found = _hashed(folder, digests, remedy) if digests else _counted(run)
     findings = []
     with progress.stage("check") as report:
-        found = _hashed(run, digests) if digests else _counted(run)
         for done, finding in enumerate(found, start=1):
             findings.append(finding)
             report(done, len(digests) or done)
-    return [*findings, *_unrecorded(run)]
+    return [*findings, *others]
 
 
-def _hashed(run: Run, digests: Mapping[str, FileDigest]) -> Iterator[Finding]:
+def _hashed(
+    folder: Path, digests: Mapping[str, FileDigest], remedy: Callable[[str], str]
+) -> Iterator[Finding]:
     def check(name: str) -> Finding:
-        path, wanted = run.path / name, digests[name]
+        path, wanted = folder / name, digests[name]
         if fault := fault_of(path, wanted):
             is_gone = name in files.DISPENSABLE and not path.exists()  # a run is whole without it
-            return Finding(name, "warning" if is_gone else "failed", fault, files.remedy_for(name, run.path))
+            return Finding(name, "warning" if is_gone else "failed", fault, remedy(name))
         return Finding(name, "well", f"{wanted.size_bytes} bytes, SHA-256 {wanted.sha256[:12]}…")
 
     return ordered_map(check, sorted(digests), workers=_THREADS)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Literal
 
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind
@@ -163,6 +164,13 @@ DISPENSABLE = names_of("poses", "exported maps") | {SCAN_UPDATES, PLACES}
 """Files that a user may delete: a run is whole without them."""
 
 
+EDITABLE = frozenset(
+    f"{stem}{ending}"
+    for stem in (SLICE, TRAVERSABLE, *map(storey, range(MOST_STOREYS)))
+    for ending in (".pgm", ".yaml")
+)
+"""Files that a user may edit by hand: maps for map_server and nav2."""
+
 _REMEDIES = {
     SCAN_UPDATES: "delete it, and mapper fuse RUN casts every frame afresh",
     CONFIG: "restore it, or build again; settings are changed with mapper fuse RUN --set",
@@ -179,9 +187,12 @@ _REMEDIES = {
 
 
 def remedy_for(name: str, folder: Path) -> str:
-    """Return how a user gets a file of a run back, for messages."""
+    """Return how a user gets a file of a run back, or keeps it as it is, for messages."""
     name = SCAN_UPDATES if name == FORMER_SCAN_UPDATES else name
-    return _REMEDIES.get(name, "make it again with mapper fuse RUN").replace("RUN", str(folder))
+    remedy = _REMEDIES.get(name, "make it again with mapper fuse RUN")
+    if name in EDITABLE:
+        remedy = f"{remedy}; if you edited it, mapper doctor RUN --accept {name}"
+    return remedy.replace("RUN", quote(str(folder)))
 
 
 def scan_updates_path(folder: Path) -> Path:

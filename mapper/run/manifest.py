@@ -5,7 +5,7 @@ import sys
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 from pydantic import Field, ValidationError
 
@@ -268,14 +268,22 @@ class Manifest(Config):
         write_text(path, self.model_dump_json(indent=2) + "\n")
 
 
+AnyManifest = TypeVar("AnyManifest", bound=Manifest)
+
+
 def read_manifest(path: Path) -> Manifest:
-    """Return a folder's manifest.
+    """Return a run's manifest; errors as of ``read_manifest_of``."""
+    return read_manifest_of(path, Manifest)
+
+
+def read_manifest_of(path: Path, kind: type[AnyManifest]) -> AnyManifest:
+    """Return a folder's manifest, of that kind.
 
     Raises:
         RunError: There is none, or it is not one that this version wrote.
     """
     try:
-        return Manifest.model_validate_json(read_regular(path, most_bytes=MOST_TEXT_BYTES))
+        return kind.model_validate_json(read_regular(path, most_bytes=MOST_TEXT_BYTES))
     except OSError as error:
         raise RunError(f"{path}: cannot be read: {error.strerror}; is {path.parent} a run folder?") from None
     except DataError as error:

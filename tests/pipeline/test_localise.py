@@ -15,6 +15,7 @@ from mapper.pipeline import known_map
 from mapper.pipeline.build import build
 from mapper.pipeline.known_map import load_known_map
 from mapper.pipeline.localise import localise
+from mapper.run.checks import check_run
 from mapper.run.folder import load_run
 from mapper.run.frame_outcomes import read_records
 from mapper.run.pose_covariances import read_poses
@@ -98,6 +99,15 @@ def test_a_map_is_not_replaced_by_a_log_localised_in_it(first, desk_log, localis
         localise(open_source(desk_log), known, known.config, first.path, overwrite=True)
     with pytest.raises(RunError, match="is not a run folder"):
         build(open_source(desk_log), known.config, localised, overwrite=True)
+
+
+def test_the_files_of_a_localised_log_are_checked(localised, tmp_path):
+    copy = shutil.copytree(localised, tmp_path / "copy")
+    assert {finding.verdict for finding in check_run(copy)} == {"well"}
+    (copy / "trajectory.tum").write_text("")
+    (damaged,) = [finding for finding in check_run(copy) if finding.verdict != "well"]
+    assert damaged.name == "trajectory.tum"
+    assert "localise again in" in damaged.remedy
 
 
 def test_covariances_are_given_the_map(localised):

@@ -12,6 +12,7 @@ from mapper.run.digests import changing
 from mapper.run.folder import load_run, open_log
 from mapper.run.manifest import read_manifest
 from mapper.run.results import load_results
+from tests.support.command_line import mapper
 from tests.support.files import files_of
 
 READERS = {
@@ -125,6 +126,25 @@ def test_the_doctor_names_all_that_is_wrong_and_what_helps(run):
     assert findings["scan_updates.bin"].verdict == "warning", "a run is whole without it"
     assert findings["slice.png"].verdict == findings["loops.jsonl"].verdict == "failed"
     assert findings["map.octree"].remedy == f"make it again with mapper fuse {run.path}"
+
+
+def test_a_map_that_was_edited_is_kept_once_accepted(run):
+    path = run.path / "slice.pgm"
+    original = path.read_bytes()
+    path.write_bytes(original[:-40] + bytes(40))
+    with pytest.raises(
+        RunError, match=r"mapper fuse .*; if you edited it, mapper doctor .* --accept slice.pgm"
+    ):
+        export(run, "costmap")
+    assert "no map that can be edited" in mapper("doctor", run.path, "--accept", "map.bt", status=1).output
+    path.write_bytes(b"P5 no image")
+    refused = mapper("doctor", run.path, "--accept", "slice.pgm", status=1)
+    assert "not a grey 8-bit image" in refused.output
+    path.write_bytes(original[:-40] + bytes(40))
+    mapper("doctor", run.path, "--accept", "slice.pgm")
+    export(load_run(run.path), "costmap")
+    cut(run.path / "map.octree")
+    assert verdicts_of(run.path)["map.octree"] == "failed", "no other file is accepted"
 
 
 def test_exports_into_the_run_are_recorded(run):
