@@ -174,6 +174,21 @@ class AttributeLayer:
         held[held] = rows[slots[held]] >= 0
         _add_rows(self.claim(own[held]), self._arrays, rows[slots[held]], other.arrays)
 
+    def clear_unknown(self) -> None:
+        """Remove the attributes of voxels that the map does not know any more."""
+        slots = self.slots
+        which, voxels = np.nonzero(np.isnan(self._blocks.table.values[slots]))
+        index = self._arrays.rows[slots][which], voxels
+        self._arrays.color_sums[index] = 0
+        self._arrays.color_weights[index] = 0
+        self._arrays.hits[index] = 0
+        self._arrays.last_seen_ns[index] = NEVER_SEEN
+
+    def renumber(self, kept: NDArray[np.int64]) -> None:
+        """Follow the map's blocks to the slots 0 … K − 1, given the (K,) slots that they had."""
+        rows = np.append(self._arrays.rows, np.full(kept.max(initial=-1) + 1, -1, np.int32))[kept]
+        self._arrays = self._arrays._replace(rows=rows)
+
     def block_colors(self, slots: NDArray[np.int64]) -> NDArray[np.uint8]:
         """Return the (B, 512, 3) uint8 mean RGB of blocks with attributes, white where there is none."""
         rows = np.repeat(self._arrays.rows[slots], BLOCK_VOXELS)

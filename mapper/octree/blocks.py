@@ -37,7 +37,7 @@ class BlockTable(NamedTuple):
 
 
 class BlockStore:
-    """Store of blocks, which are never removed; slots number them in the order in which they were added."""
+    """Store of blocks; slots number them in the order in which they were added."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -73,6 +73,18 @@ class BlockStore:
             self._reserve(self._count + missing)
             self._count = _add_missing(self.table, codes, slots, self._codes, self._count)
         return slots
+
+    def drop_unknown(self) -> NDArray[np.int64]:
+        """Remove the blocks without a known voxel; return the (K,) former slots of those that are left.
+
+        Their new slots are 0 … K − 1.
+        """
+        kept: NDArray[np.int64] = _move_known(self.table.values, self._codes, self._count)
+        if len(kept) < self._count:
+            self._count = len(kept)
+            self.table = _table(max(self._count, _FIRST_BLOCKS), values=self.table.values)
+            _index(self.table, self.codes)
+        return kept
 
     def _reserve(self, count: int) -> None:
         capacity = len(self._codes)
@@ -155,3 +167,19 @@ def _index(table, codes_by_slot):
     for slot in range(len(codes_by_slot)):
         entry = _probe(table.entries, codes_by_slot[slot])
         table.entries[entry, 0], table.entries[entry, 1] = codes_by_slot[slot], slot
+
+
+@njit(cache=True, nogil=True)
+def _move_known(values, codes_by_slot, count):
+    """Move the blocks with a known voxel to the first slots, in their order; return their former slots."""
+    kept = np.empty(count, np.int64)
+    known = 0
+    for slot in range(count):
+        for voxel in range(BLOCK_VOXELS):
+            if values[slot, voxel] == values[slot, voxel]:
+                if slot != known:
+                    values[known], codes_by_slot[known] = values[slot], codes_by_slot[slot]
+                kept[known] = slot
+                known += 1
+                break
+    return kept[:known]

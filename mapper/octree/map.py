@@ -344,6 +344,40 @@ class OctreeMap:
         """Count so many voxels less as known, after their log-odds were set to NaN."""
         self._known -= voxels
 
+    def set_free(self, slots: NDArray[np.int64], voxels: NDArray[np.bool_]) -> int:
+        """Make occupied voxels free, at the sensor model's least log-odds; return how many there were.
+
+        Args:
+            slots: (B,) distinct slots of blocks.
+            voxels: (B, 512) mask of their voxels, in Morton order.
+        """
+        values = self.blocks.table.values[slots]
+        occupied = voxels & (values >= self.occupied_log_odds)
+        values[occupied] = self.sensor.lowest
+        self.blocks.table.values[slots] = values
+        return int(np.count_nonzero(occupied))
+
+    def set_unknown(self, slots: NDArray[np.int64], voxels: NDArray[np.bool_]) -> int:
+        """Make voxels unknown, as :meth:`set_free` makes them free; call ``drop_unknown`` after the last."""
+        values = self.blocks.table.values[slots]
+        known = voxels & ~np.isnan(values)
+        values[known] = np.nan
+        self.blocks.table.values[slots] = values
+        count = int(np.count_nonzero(known))
+        self.forget(count)
+        return count
+
+    def drop_unknown(self) -> None:
+        """Remove what is left of voxels that were made unknown: their attributes, and blocks without others.
+
+        Files have no node for such a block, and cannot be written before.
+        """
+        if self.attributes is not None:
+            self.attributes.clear_unknown()
+        kept = self.blocks.drop_unknown()
+        if self.attributes is not None:
+            self.attributes.renumber(kept)
+
     def clamp(self) -> None:
         """Clip all log-odds to the sensor model's limits."""
         sensor = self.sensor
