@@ -58,7 +58,7 @@ def load_run_config(path: Path) -> BuildConfig:
     """
     tree = _read(path)
     _drop_former_settings(tree, path)
-    return _checked(BuildConfig, tree, str(path))
+    return checked_config(tree, BuildConfig, str(path))
 
 
 def load_source_config(path: Path | None = None, overrides: Sequence[str] = ()) -> SourceConfig:
@@ -80,12 +80,24 @@ def read_config(path: Path, model: type[AnyConfig]) -> AnyConfig:
     Raises:
         ConfigError: The file cannot be read or parsed, or the model refuses a name or a value.
     """
-    return _checked(model, _read(path), str(path))
+    return checked_config(_read(path), model, str(path))
+
+
+def parse_config(text: str, path: Path, model: type[AnyConfig]) -> AnyConfig:
+    """Return what the text of a TOML or JSON file holds, as :func:`read_config` does.
+
+    Raises:
+        ConfigError: As :func:`read_config`.
+    """
+    return checked_config(_parsed(text, path), model, str(path))
 
 
 def _read(path: Path) -> dict[str, Any]:
+    return _parsed(read_text(path, error=ConfigError, may_be_pipe=True), path)
+
+
+def _parsed(text: str, path: Path) -> dict[str, Any]:
     is_json = path.suffix == ".json"
-    text = read_text(path, error=ConfigError, may_be_pipe=True)
     try:
         tree: dict[str, Any] = json.loads(text) if is_json else tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -169,10 +181,20 @@ def _kind(member: type[Config]) -> str:
 
 
 def _validated(model: type[AnyConfig], tree: dict[str, Any], where: str) -> AnyConfig:
-    return _checked(model, _with_kinds(tree, model()), where)
+    return checked_config(_with_kinds(tree, model()), model, where)
 
 
-def _checked(model: type[AnyConfig], tree: dict[str, Any], where: str) -> AnyConfig:
+def checked_config(tree: Mapping[str, Any], model: type[AnyConfig], where: str) -> AnyConfig:
+    """Return a configuration from values that are nested by name.
+
+    Args:
+        tree: The values.
+        model: Kind of the configuration.
+        where: Where the values come from, for messages.
+
+    Raises:
+        ConfigError: The model refuses a name or a value.
+    """
     try:
         return model.model_validate(tree)
     except ValidationError as error:

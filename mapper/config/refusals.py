@@ -20,6 +20,10 @@ def refusal(model: type[Config], error: Mapping[str, Any]) -> str:
     reason = error["msg"]
     if error["type"] == "extra_forbidden":
         reason = f"unknown; {_hint(model, loc)}"
+    elif error["type"] == "value_error":  # one of ours, which names the setting where several are concerned
+        reason = str(error["ctx"]["error"])
+        if not loc:
+            return reason
     elif error["type"] == "missing" and isinstance(loc[-1], int):
         loc, reason = loc[:-1], f"{loc[-1]} values are too few"
     elif error["type"] == "tuple_type" and isinstance(error["input"], str):

@@ -193,7 +193,7 @@ def test_a_key_tells_what_is_built_and_not_what_it_is_called(swept, desk_log, ti
         (
             ["logs = ['LOG']", "[[method]]\nname = 'a'\nset = {source.camera.distortion = [0, 0]}"],
             ConfigError,
-            "method.0.set: Value error, source.camera.distortion is a list; write it into a config file",
+            "method.0.set: source.camera.distortion is a list; write it into a config file",
         ),
     ],
 )
