@@ -16,6 +16,7 @@ from cli.convert import convert
 from cli.demo import demo
 from cli.diff import diff
 from cli.doctor import doctor
+from cli.edit import edit
 from cli.environment import prepare_environment
 from cli.evaluate import evaluate
 from cli.export import export
@@ -102,6 +103,7 @@ app.command("build")(build)
 app.command("fuse")(fuse)
 app.command("loops", cls=WithPairs)(loops)
 app.command("eval")(evaluate)
+app.command("edit")(edit)
 app.command("export")(export)
 app.command("localise")(localise)
 app.command("merge")(merge)

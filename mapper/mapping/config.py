@@ -1,8 +1,10 @@
-"""Settings of mapping: levelling, the coloured cloud, and the frames in the MCAP log."""
+"""Settings of mapping: levelling, the coloured cloud, the frames in the MCAP log, and edits by hand."""
 
-from typing import Annotated, Literal, Protocol
+import json
+import math
+from typing import Annotated, Literal, Protocol, Self
 
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from mapper.core.config import Config
 from mapper.navigation.config import TraversableConfig
@@ -43,6 +45,110 @@ class CloudConfig(Config):
     """The cloud has one point, the mean, per cube of this edge."""
     frame_stride: PositiveInt = 10
     """Every n-th tracked frame adds its points."""
+
+
+_Point2 = tuple[float, float]
+_Point3 = tuple[float, float, float]
+
+
+class Region(Config):
+    """Part of a map: where all of the conditions hold that are given. Metres in the run's levelled world."""
+
+    box_m: tuple[_Point3, _Point3] | None = None
+    """Lowest and highest corner of a box along the axes."""
+    height_m: tuple[float, float] | None = None
+    """Lowest and highest z."""
+    path_radius_m: PositiveFloat | None = None
+    """Largest distance, seen from above, from where the sensor was in any frame of the maps."""
+    polygon_m: tuple[_Point2, ...] | None = None
+    """Corners, seen from above, in order around it; the last is joined to the first."""
+
+    @model_validator(mode="after")
+    def _holds_space(self) -> Self:
+        if not self.model_fields_set:
+            raise ValueError(f"no condition; want one or more of {', '.join(Region.model_fields)}")
+        if self.box_m is not None and not all(low < high for low, high in zip(*self.box_m, strict=True)):
+            raise ValueError(f"box_m = {_text(self.box_m)}: want the lowest corner, then the highest")
+        if self.height_m is not None and not self.height_m[0] < self.height_m[1]:
+            raise ValueError(f"height_m = {_text(self.height_m)}: want the lowest z, then the highest")
+        low_m, high_m = self.z_range_m
+        if not low_m < high_m:
+            raise ValueError("box_m and height_m have no height in common")
+        if self.polygon_m is not None:
+            _refuse_crossed(self.polygon_m)
+        return self
+
+    @property
+    def z_range_m(self) -> tuple[float, float]:
+        """Lowest and highest z that the conditions allow."""
+        low_m, high_m = self.height_m or (-math.inf, math.inf)
+        if self.box_m is None:
+            return low_m, high_m
+        return max(low_m, self.box_m[0][2]), min(high_m, self.box_m[1][2])
+
+    @property
+    def lines(self) -> list[str]:
+        """The conditions as lines of TOML."""
+        return [f"{name} = {_text(value)}" for name, value in self if value is not None]
+
+
+def _text(value: object) -> str:
+    return json.dumps(value)
+
+
+def _refuse_crossed(corners: tuple[_Point2, ...]) -> None:
+    """Refuse a polygon without an area, or with two sides that cross: its corners are in another order."""
+    if len(set(corners)) < len(corners) or len(corners) < 3:
+        raise ValueError(f"polygon_m has corners {_text(corners)}: want 3 or more, each once")
+    sides = list(zip(corners, corners[1:] + corners[:1], strict=True))
+    for number, (a, b) in enumerate(sides):
+        for c, d in sides[:number]:
+            apart = _cross(a, b, c) * _cross(a, b, d), _cross(c, d, a) * _cross(c, d, b)
+            if max(apart) < 0.0:
+                raise ValueError(
+                    f"polygon_m: its sides {_text([c, d])} and {_text([a, b])} cross; "
+                    "want the corners in order around it"
+                )
+    if math.isclose(sum(_cross((0.0, 0.0), *side) for side in sides), 0.0, abs_tol=1e-9):
+        raise ValueError(f"polygon_m has corners {_text(corners)}, without an area between them")
+
+
+def _cross(a: _Point2, b: _Point2, c: _Point2) -> float:
+    """Return twice the area of a triangle, < 0 if its corners are in clockwise order."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+EditKind = Literal["erase", "keep", "keepout"]
+
+
+class Edits(Config):
+    """``edits.toml``: what a user changes in the maps by hand; each fuse does it again."""
+
+    erase: tuple[Region, ...] = ()
+    """Occupied voxels in these regions become free, and points of the cloud there are left out."""
+    keep: tuple[Region, ...] = ()
+    """What lies in none of these regions, if there are any, is left out of octree, cloud and grids."""
+    keepout: tuple[Region, ...] = ()
+    """Floor in these regions is blocked in the traversable floor; the other maps do not change."""
+
+    def __len__(self) -> int:
+        """Return the number of regions."""
+        return len(self.erase) + len(self.keep) + len(self.keepout)
+
+
+class AppliedEdit(Config):
+    """A region of ``edits.toml`` and what it did when the maps were made."""
+
+    kind: EditKind
+    region: Region
+    count: int
+    """Occupied voxels that were erased, known voxels that are kept, or cells that were not blocked before."""
+
+    @property
+    def text(self) -> str:
+        """Both in one line."""
+        did = {"erase": "voxels erased", "keep": "voxels kept", "keepout": "cells blocked"}[self.kind]
+        return f"{self.kind} {', '.join(self.region.lines)}: {self.count} {did}"
 
 
 class FuseSettings(Protocol):

@@ -14,7 +14,8 @@ from mapper.core.geometry import Transform
 from mapper.core.trajectory import Trajectory
 from mapper.core.voxel_grid import thin
 from mapper.mapping.cloud import CloudBuilder, Colors, height_colors
-from mapper.mapping.config import FuseSettings, McapConfig
+from mapper.mapping.config import AppliedEdit, Edits, FuseSettings, McapConfig
+from mapper.mapping.edits import MapEditor
 from mapper.mapping.thumbnails import encode_jpeg, shrunk_camera
 from mapper.navigation.floor import driven_ground, reachable_floor
 from mapper.navigation.traversable import traversable
@@ -29,6 +30,7 @@ from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef, Log
 
+_NO_EDITS = Edits()
 _COLOURED_HEIGHTS_M = -1.0, 8.0  # the same in every scan
 
 
@@ -76,6 +78,7 @@ class Maps:
         traversable: The floor that a robot can drive on, of the storey on which the path begins.
         storeys: The same of every storey, the lowest first, where floors lie over each other.
         has_path: Whether the path tells the height of the floor.
+        edits: The edits by hand that are in them.
     """
 
     octree: OctreeMap
@@ -87,6 +90,7 @@ class Maps:
     traversable: OccupancyGrid
     storeys: tuple[OccupancyGrid, ...] = ()
     has_path: bool = True
+    edits: tuple[AppliedEdit, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,11 +139,12 @@ def fuse_log(
     on_snapshot: Callable[[Snapshot | ScanSnapshot], None],
     before: ScanUpdateFile | None,
     after: ScanUpdateWriter,
+    edits: Edits = _NO_EDITS,
 ) -> Maps:
     """Fuse every frame of the trajectory, in time order; decoding and casting run ahead in threads.
 
-    Then what moved is removed, unless ``octree.moving`` keeps it. The cached update of a frame whose pose is
-    the same is merged without reading the frame, to the same bits.
+    Then what moved is removed, unless ``octree.moving`` keeps it, and the edits by hand are made. The cached
+    update of a frame whose pose is the same is merged without reading the frame, to the same bits.
 
     Args:
         source: The log that was tracked.
@@ -149,6 +154,10 @@ def fuse_log(
         on_snapshot: Receives every ``mcap.image_stride``-th frame's image, or its points if it has no image.
         before: The frames' updates from the last time they were fused.
         after: Receives the frames' updates.
+        edits: Regions to erase, to keep and to block.
+
+    Raises:
+        DataError: The edits leave nothing of the map, or nothing in the height of the slice.
     """
     octree, cloud = OctreeMap(config.octree), CloudBuilder(config.cloud.voxel_m)
     casters, depth_limit, moved, unreached = _Casters(config.octree), depth_limit_of(config.octree), 0, 0
@@ -191,19 +200,35 @@ def fuse_log(
             things = remove_moving_things(octree, partial(_updates, written, config.workers))
         moving = things.contain(points_world)
         progress.note(f"moving things: {moving.sum()} of {len(moving)} points of the cloud")
-    kept = octree.are_occupied(points_world)
+    editor = MapEditor(edits, trajectory.positions_world, config.traversable.head_room_m)
+    known, occupied = len(octree), np.count_nonzero(octree.are_occupied(points_world))
+    erased = editor.erase(octree)
     floor = reachable_floor(octree, config.traversable, positions_world=trajectory.positions_world)
-    storeys = traversable(floor, config.traversable)
+    driven = editor.crop_ground(driven_ground(floor), floor.columns)
+    cropped = editor.crop(octree)
+    grid = cut_slice(octree, config.slice, driven=driven)
+    octree.drop_unknown()  # the slice has the columns of all blocks, as the floor
+    storeys, blocked = editor.edit_storeys(traversable(floor, config.traversable))
+    kept = octree.are_occupied(points_world)
+    done = (*erased, *cropped, *blocked)
+    if done:
+        progress.note(
+            f"edits by hand: {sum(edit.count for edit in erased)} voxels made free; {known - len(octree)} "
+            f"voxels and {occupied - np.count_nonzero(kept)} points of the cloud left out"
+        )
+    if idle := [edit.text for edit in done if not edit.count]:
+        progress.note(f"edits by hand without effect: {'; '.join(idle)}; are they in the frame of this map?")
     return Maps(
         octree=octree,
         cloud_points_world=points_world[kept],
         cloud_colors=colors[kept],
         dynamic_points_world=points_world[moving],
         dynamic_colors=colors[moving],
-        grid=cut_slice(octree, config.slice, driven=driven_ground(floor)),
+        grid=grid,
         traversable=next(storey.grid for storey in storeys if storey.is_home),
         storeys=tuple(storey.grid for storey in storeys) if len(storeys) > 1 else (),
         has_path=len(floor.path) > 0,
+        edits=done,
     )
 
 

@@ -86,11 +86,17 @@ def _storey(floor: Floor, heights: Heights, config: TraversableConfig, is_home: 
         blocked |= closed & ~reached & _is_edge(heights, limits)
         cells[blocked] = OCCUPIED
         cells[(cells == FREE) & _within(blocked, config.robot_radius_m / columns.resolution_m)] = OCCUPIED
-    rows, across = (_known(cells, axis) for axis in (1, 0))  # without unknown margins
-    first = columns.first + np.array([across.start, rows.start])
-    origin_world_m = (first - KEY_ZERO).astype(np.float64) * columns.resolution_m
-    grid = OccupancyGrid(cells[rows, across].copy(), origin_world_m, columns.resolution_m)
-    return Storey(grid, heights[rows, across].copy(), is_home)
+    origin_world_m = (columns.first - KEY_ZERO).astype(np.float64) * columns.resolution_m
+    return trimmed(Storey(OccupancyGrid(cells, origin_world_m, columns.resolution_m), heights, is_home))
+
+
+def trimmed(storey: Storey) -> Storey:
+    """Return a storey without unknown margins."""
+    cells, resolution_m = storey.grid.cells, storey.grid.resolution_m
+    rows, across = (_known(cells, axis) for axis in (1, 0))
+    first = np.rint(storey.grid.origin_world_m / resolution_m) + np.array([across.start, rows.start])
+    grid = OccupancyGrid(cells[rows, across].copy(), first * resolution_m, resolution_m)
+    return Storey(grid, storey.heights[rows, across].copy(), storey.is_home)
 
 
 def _known(cells: NDArray[np.int8], axis: int) -> slice:

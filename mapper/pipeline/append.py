@@ -26,6 +26,7 @@ from mapper.pipeline.track import (
     track_log,
     wheels_beside,
 )
+from mapper.run.edits_file import edits_text, parse_edits, write_edits
 from mapper.run.folder import Run, appended_log, load_run, open_log, write_run
 from mapper.run.manifest import Manifest, Timing, library_versions, now_text
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
@@ -68,6 +69,8 @@ def append(
         RunError: OUT is there already, or the run's log is not what it was.
     """
     _refuse_unfit(config, run)
+    edits = edits_text(run.path)
+    wanted = parse_edits(edits, run.path)
     first = open_log(run)
     source, warnings = chained(first, second), depth_cautions(second)
     for note in (*source.notes, *(warning.sentence for warning in warnings)):
@@ -92,7 +95,8 @@ def append(
         save_places(writer, tracking)
         save_solved(writer, before.solved(solved.graph, solved.loops).then(later, truth=source.truth))
         writer.update(solve=solved.report)
-        fuse_into(writer, source, joined, progress, before=run.scan_updates())
+        write_edits(writer.folder, edits)
+        fuse_into(writer, source, joined, progress, before=run.scan_updates(), edits=wanted)
     return load_run(out)
 
 

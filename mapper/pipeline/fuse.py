@@ -19,6 +19,7 @@ from mapper.export.picture import write_summary
 from mapper.export.ply import write_ply
 from mapper.export.run_mcap import log_maps, log_results, log_snapshot
 from mapper.graph.model import PoseGraph
+from mapper.mapping.config import Edits
 from mapper.mapping.fusion import Maps, fuse_log
 from mapper.mapping.measured_noise import measure_noise
 from mapper.octree.map_file import write_map
@@ -26,6 +27,7 @@ from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.scan_update_file import ScanUpdateWriter, open_scan_updates
 from mapper.pipeline.judge import judge
 from mapper.run import files
+from mapper.run.edits_file import edits_text, parse_edits, write_edits
 from mapper.run.folder import (
     Run,
     RunWriter,
@@ -91,33 +93,41 @@ def fuse_changed(
     changed: StoredTracking | None = None,
     *,
     solve: Solve | None = None,
+    edits: str | None = None,
     progress: Progress = SILENT,
 ) -> Run:
-    """Make a run's maps again after its graph or its poses have changed; see ``fuse``.
+    """Make a run's maps again after its graph, its poses or its edits have changed; see ``fuse``.
 
     Args:
         source: The log that the run was built from.
         run: A finished run, with the configuration to fuse by.
         changed: What replaces the run's own; None keeps that.
         solve: Record of the solve that changed it, for the manifest; None keeps the old one.
+        edits: Text to replace the run's ``edits.toml``; None keeps that.
         progress: Receives stages, counts and notes.
 
     Raises:
         RunError: The log is not the one that the run was built from.
+        ConfigError: The edits are not valid.
+        DataError: They leave nothing of the map.
     """
     refuse_another_log(run, source)
+    text = edits_text(run.path) if edits is None else edits
+    wanted = parse_edits(text, run.path)
     status: Status = "building"
     manifest = moved_log(run, *paths_of(source)).manifest.model_copy(update={"status": status})
     with write_run(run.path, manifest, run.config, overwrite=True, takes_over=True) as writer:
         carry_times(writer, manifest.timing)
         _copy_kept_files(run, writer.folder)
+        if edits is not None:
+            write_edits(writer.folder, text)
         if changed is not None:
             save_solved(writer, changed)
             for name in files.names_of("poses"):
                 (writer.folder / name).unlink(missing_ok=True)
         if solve is not None:
             writer.update(solve=solve)
-        fuse_into(writer, source, run.config, progress, before=run.scan_updates())
+        fuse_into(writer, source, run.config, progress, before=run.scan_updates(), edits=wanted)
     return load_run(run.path)
 
 
@@ -173,6 +183,7 @@ def fuse_into(
     progress: Progress,
     *,
     before: Path | None = None,
+    edits: Edits | None = None,
     observer: Observer = NULL_OBSERVER,
 ) -> None:
     """Fuse the trajectory of an unfinished run and write everything that is made from the maps."""
@@ -196,6 +207,7 @@ def fuse_into(
                 on_snapshot=lambda snapshot: log_snapshot(log, snapshot),
                 before=known,
                 after=updates,
+                edits=edits or Edits(),
             )
         with writer.clock.stage("write"):
             log_results(log, results)
@@ -204,7 +216,7 @@ def fuse_into(
             _write_pictures(writer, maps, results)
     others = [warning for warning in writer.manifest.warnings if warning.kind != FLOOR]
     found = floor_warnings(config.traversable, config.octree.resolution_m, has_path=maps.has_path)
-    writer.update(warnings=(*others, *found))
+    writer.update(warnings=(*others, *found), edits=maps.edits)
     judge(writer, source, config, results, progress=progress)
     counts = writer.manifest.counts.model_copy(
         update={

@@ -30,6 +30,7 @@ SUMMARY = "summary.png"
 SCAN_UPDATES = "scan_updates.bin"
 FORMER_SCAN_UPDATES = "sights.bin"
 """What ``scan_updates.bin`` was called before 2026-11-22; it is still read."""
+EDITS = "edits.toml"
 CONFIG = "config.json"
 MANIFEST = MANIFEST_NAME
 MESH = "mesh.ply"
@@ -51,12 +52,12 @@ class RunFiles:
         content: Their content, as README.md describes it.
         depends_on: "tracking": written once the log is tracked and its graph is solved; "maps": written by
             every fuse; "poses" and "exported maps": written on request, and outdated when the poses, or the
-            maps, are made again.
+            maps, are made again; "user": a user's own work, which may change at any time.
     """
 
     names: tuple[str, ...]
     content: str
-    depends_on: Literal["tracking", "maps", "poses", "exported maps"]
+    depends_on: Literal["tracking", "maps", "poses", "exported maps", "user"]
 
 
 def _grid(stem: str) -> tuple[str, ...]:
@@ -113,6 +114,11 @@ RUN_FILES = (
         "the outcome of every frame, its doubts and standard deviations, and how long it took",
         "tracking",
     ),
+    RunFiles(
+        (EDITS,),
+        "regions of the map that `mapper edit` or you erased, kept or blocked; every fuse does it again",
+        "user",
+    ),
     RunFiles((CONFIG,), "every setting as it was used; `mapper build --config` takes it back", "maps"),
     RunFiles(
         (MANIFEST,),
@@ -142,7 +148,7 @@ _STOREY_FILES = frozenset(name for number in range(MOST_STOREYS) for name in _gr
 RUN = FolderKind(
     "a run folder",
     manifest_keys=frozenset({"status", "mapper_version", "input"}),
-    files=frozenset(name for files in RUN_FILES for name in files.names)
+    files=frozenset(name for files in RUN_FILES for name in files.names if files.depends_on != "user")
     | _STOREY_FILES
     | {FORMER_SCAN_UPDATES},
 )

@@ -12,6 +12,7 @@ from pydantic import Field, ValidationError
 import mapper
 from mapper.core.config import Config
 from mapper.core.errors import DataError, RunError
+from mapper.mapping.config import AppliedEdit
 from mapper.runtime.atomic import MANIFEST_NAME, write_text
 from mapper.runtime.regular_files import MOST_TEXT_BYTES, read_regular, read_text
 from mapper.sensing.config import DepthNoiseConfig
@@ -259,6 +260,8 @@ class Manifest(Config):
     levelling: Levelling | None = None
     depth: DepthReach | None = None
     """None where the range of octree and cloud is a setting."""
+    edits: tuple[AppliedEdit, ...] = ()
+    """The edits by hand that are in the maps: ``edits.toml`` as it was when they were made."""
     timing: Timing = Timing()
     files: dict[str, FileDigest] = Field(default_factory=dict)
     """Every file of the run but this; empty while it is being built, and in runs of before 2026-11-22."""

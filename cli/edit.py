@@ -1,0 +1,122 @@
+"""``mapper edit``: a finished map cropped and cleaned by hand."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli.console import progress_for
+from cli.environment import prepare_libraries
+from cli.options import MovedLogs, Quiet
+
+if TYPE_CHECKING:
+    from mapper.mapping.config import EditKind, Region
+    from mapper.run.folder import Run
+
+_Corners = tuple[float, float, float, float, float, float]
+
+
+def edit(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder that a build left.")],
+    erase: Annotated[
+        bool, typer.Option("--erase", help="Free what is occupied in a region; its points leave the cloud.")
+    ] = False,
+    keep: Annotated[
+        bool, typer.Option("--keep", help="Leave out what lies outside of a region, and of others kept.")
+    ] = False,
+    keepout: Annotated[
+        bool, typer.Option("--keepout", help="Block the traversable floor in a region.")
+    ] = False,
+    box: Annotated[
+        _Corners | None,
+        typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Region: lowest and highest corner, metres."),
+    ] = None,
+    height: Annotated[
+        tuple[float, float] | None, typer.Option(metavar="LOW HIGH", help="Region: between two heights.")
+    ] = None,
+    radius: Annotated[
+        float | None, typer.Option(help="Region: this near to the sensor's path, seen from above.")
+    ] = None,
+    polygon: Annotated[
+        str | None, typer.Option(metavar='"X,Y X,Y X,Y…"', help="Region: inside of corners in order.")
+    ] = None,
+    undo: Annotated[bool, typer.Option("--undo", help="Take the last edit back.")] = False,
+    list_: Annotated[
+        bool, typer.Option("--list", help="Print the edits; the default without other options.")
+    ] = False,
+    log: MovedLogs = None,
+    quiet: Quiet = False,
+) -> None:
+    """Erase, keep or block a region of a map, where all given conditions hold, and make the maps again.
+
+    Edits are kept in RUN/edits.toml, which can be changed by hand, and hold in every later fuse. Coordinates
+    are those of slice.yaml and cloud.ply.
+
+    Example: mapper edit runs/xyz --erase --box 2.1 0.3 0.1 2.9 1.05 1.5
+    """
+    from mapper.core.errors import ConfigError
+    from mapper.pipeline.edit_map import add_region, undo_region
+    from mapper.run.folder import load_run, moved_log, open_log
+
+    kinds: list[EditKind] = []
+    if erase:
+        kinds.append("erase")
+    if keep:
+        kinds.append("keep")
+    if keepout:
+        kinds.append("keepout")
+    region = _region(box, height, radius, polygon)
+    if len(kinds) + undo > 1:
+        raise ConfigError("--erase, --keep, --keepout and --undo: want one at a time")
+    if kinds and region is None:
+        raise ConfigError(f"--{kinds[0]}: want a region: --box, --height, --radius or --polygon")
+    if region is not None and not kinds:
+        raise ConfigError("a region alone changes nothing: want --erase, --keep or --keepout with it")
+    built = load_run(run)
+    if kinds or undo:
+        prepare_libraries()
+        if log:
+            built = moved_log(built, *log)
+        source, progress = open_log(built), progress_for(quiet=quiet)
+        if region is None:
+            built = undo_region(source, built, progress=progress)
+        else:
+            built = add_region(source, built, kinds[0], region, progress=progress)
+        if not quiet:
+            print(edits_table(built))
+    if list_ or not (kinds or undo):
+        print(edits_table(built))
+
+
+def edits_table(run: "Run") -> str:
+    """Return a line for each region of ``edits.toml``, with what it did; a new one was not fused yet."""
+    from mapper.run.edits_file import edits_text, parse_edits
+
+    edits = parse_edits(edits_text(run.path), run.path)
+    done = list(run.manifest.edits)
+    lines = []
+    for kind, regions in edits:
+        for region in regions:
+            applied = next((edit for edit in done if (edit.kind, edit.region) == (kind, region)), None)
+            if applied is not None:
+                done.remove(applied)
+            what = f"{kind} {', '.join(region.lines)}: not in the maps yet; mapper fuse {run.path}"
+            lines.append(applied.text if applied else what)
+    lines += [f"{edit.text}; no longer in edits.toml: mapper fuse {run.path}" for edit in done]
+    return "\n".join(lines or ["no edits"])
+
+
+def _region(
+    box: _Corners | None, height: tuple[float, float] | None, radius: float | None, polygon: str | None
+) -> "Region | None":
+    from mapper.config.loading import checked_config
+    from mapper.mapping.config import Region
+
+    given = {
+        "box_m": None if box is None else (box[:3], box[3:]),
+        "height_m": height,
+        "path_radius_m": radius,
+        "polygon_m": None if polygon is None else [corner.split(",") for corner in polygon.split()],
+    }
+    given = {name: value for name, value in given.items() if value is not None}
+    return checked_config(given, Region, "region") if given else None

@@ -1,0 +1,199 @@
+"""Edits by hand: regions of a map that are erased, kept or blocked."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mapper.core.errors import DataError
+from mapper.core.geometry import Array, Points
+from mapper.mapping.config import AppliedEdit, Edits, Region
+from mapper.navigation.traversable import Storey, trimmed
+from mapper.octree.columns import NOWHERE, Columns
+from mapper.octree.ground_height import DrivenGround, nearest_heights
+from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS, KEY_MASK, KEY_ZERO, block_keys, gather
+from mapper.octree.map import OctreeMap
+from mapper.octree.slice import OCCUPIED, UNKNOWN
+
+Mask = NDArray[np.bool_]
+
+_EDGE = 1 << BLOCK_BITS
+_X, _Y, _Z = (gather.py_func(np.arange(BLOCK_VOXELS) >> axis) for axis in range(3))
+_CHUNK = 4096  # blocks worked on at a time: 2 million voxels
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapEditor:
+    """Editor of one run's maps.
+
+    Attributes:
+        edits: What to do.
+        path_world: (N, 3) where the sensor was, metres.
+        room_m: Height of a robot: floor belongs to a region if any of the space of a robot on it does.
+    """
+
+    edits: Edits
+    path_world: Points
+    room_m: float
+
+    def erase(self, octree: OctreeMap) -> list[AppliedEdit]:
+        """Free the occupied voxels whose centres lie in regions to erase."""
+        done = []
+        for region in self.edits.erase:
+            count = sum(octree.set_free(slots, inside) for slots, inside in self._voxels(octree, region))
+            done.append(AppliedEdit(kind="erase", region=region, count=count))
+        return done
+
+    def crop(self, octree: OctreeMap) -> list[AppliedEdit]:
+        """Make the voxels unknown whose centres lie in none of the regions to keep, if there are any.
+
+        Raises:
+            DataError: Nothing of the map would be left.
+        """
+        kept = np.zeros((len(octree.blocks), BLOCK_VOXELS // 8), np.uint8)
+        done = []
+        for region in self.edits.keep:
+            count = 0
+            for slots, inside in self._voxels(octree, region):
+                kept[slots] |= np.packbits(inside, axis=1)
+                count += int(np.count_nonzero(inside & ~np.isnan(octree.blocks.table.values[slots])))
+            done.append(AppliedEdit(kind="keep", region=region, count=count))
+        if done and not any(edit.count for edit in done):
+            raise DataError(
+                f"edits: the map has no voxel in a region to keep ({'; '.join(edit.text for edit in done)})"
+            )
+        for slots in _chunks(np.arange(len(octree.blocks))) if done else ():
+            octree.set_unknown(slots, ~np.unpackbits(kept[slots], axis=1).view(np.bool_))
+        return done
+
+    def crop_ground(self, driven: DrivenGround, columns: Columns) -> DrivenGround:
+        """Return the driven ground, swept only in regions to keep, if there are any."""
+        if not self.edits.keep:
+            return driven
+        first_world = (columns.first - KEY_ZERO) * columns.resolution_m
+        floor = _Cells(first_world, driven.heights, columns.resolution_m)
+        return replace(driven, swept=driven.swept & self._on_floor(self.edits.keep, floor))
+
+    def edit_storeys(self, storeys: tuple[Storey, ...]) -> tuple[tuple[Storey, ...], list[AppliedEdit]]:
+        """Return a floor cropped and with its keep-out regions blocked.
+
+        Storeys of which nothing is left are gone. The path begins on the first storey that is left if its own
+        is gone.
+        """
+        if not self.edits.keep and not self.edits.keepout:
+            return storeys, []
+        edited, blocked = [], np.zeros(len(self.edits.keepout), np.int64)
+        for storey in storeys:
+            cells, counts = self._edited_cells(storey)
+            edited.append(trimmed(replace(storey, grid=replace(storey.grid, cells=cells))))
+            blocked += np.array(counts, np.int64)
+        left = [storey for storey in edited if (storey.grid.cells != UNKNOWN).any()] or edited[:1]
+        if not any(storey.is_home for storey in left):
+            left[0] = replace(left[0], is_home=True)
+        done = [
+            AppliedEdit(kind="keepout", region=region, count=int(count))
+            for region, count in zip(self.edits.keepout, blocked, strict=True)
+        ]
+        return tuple(left), done
+
+    def _edited_cells(self, storey: Storey) -> tuple[NDArray[np.int8], list[int]]:
+        """Return the (H, W) cells of a storey, and how many each keep-out region has blocked."""
+        cells, counts = storey.grid.cells.copy(), [0] * len(self.edits.keepout)
+        if not (storey.heights > NOWHERE).any():
+            return cells, counts
+        heights, _ = nearest_heights(storey.heights)
+        floor = _Cells(storey.grid.origin_world_m, heights, storey.grid.resolution_m)
+        if self.edits.keep:
+            cells[~self._on_floor(self.edits.keep, floor)] = UNKNOWN
+        for number, region in enumerate(self.edits.keepout):
+            inside = self._on_floor((region,), floor)
+            counts[number] = int(np.count_nonzero(cells[inside] != OCCUPIED))
+            cells[inside] = OCCUPIED
+        return cells, counts
+
+    def _voxels(self, octree: OctreeMap, region: Region) -> Iterator[tuple[NDArray[np.int64], Mask]]:
+        """Yield (B,) slots of blocks that a region may overlap, and the (B, 512) mask of its voxels."""
+        keys, layer = block_keys(octree.blocks.codes), _Z == 0
+        low_m, high_m = region.z_range_m
+        z_m = _centres(keys[:, 2:] + np.arange(_EDGE), octree)
+        in_height = (z_m >= low_m) & (z_m <= high_m)
+        slots = np.flatnonzero(in_height.any(axis=1))
+        columns, column_of = np.unique(keys[slots, 0] << KEY_BITS | keys[slots, 1], return_inverse=True)
+        x, y = (
+            (columns >> KEY_BITS)[:, np.newaxis] + _X[layer],
+            (columns & KEY_MASK)[:, np.newaxis] + _Y[layer],
+        )
+        centres_world = _centres(np.column_stack([x.ravel(), y.ravel()]), octree)
+        in_plan = np.empty((len(columns), _EDGE, _EDGE), np.bool_)
+        in_plan[:, _X[layer], _Y[layer]] = covered(region, centres_world, self.path_world).reshape(x.shape)
+        for some in _chunks(np.flatnonzero(in_plan.any(axis=(1, 2))[column_of])):
+            inside = in_plan[column_of[some]][:, _X, _Y] & in_height[slots[some]][:, _Z]
+            yield slots[some], inside
+
+    def _on_floor(self, regions: tuple[Region, ...], floor: "_Cells") -> Mask:
+        """Return the (H, W) mask of the cells on whose floor a robot is in any of the regions."""
+        inside = np.zeros(floor.heights.shape, np.bool_)
+        floor_m = floor.heights * floor.resolution_m
+        for region in regions:
+            low_m, high_m = region.z_range_m
+            in_height = (floor_m + self.room_m >= low_m) & (floor_m <= high_m)
+            inside |= in_height & covered(region, floor.centres_world, self.path_world).reshape(inside.shape)
+        return inside
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cells:
+    """Cells of a grid with the (H, W) heights of their floor, voxels above z = 0."""
+
+    origin_world_m: Array
+    heights: NDArray[np.int32]
+    resolution_m: float
+
+    @property
+    def centres_world(self) -> Points:
+        """(H · W, 2) x and y of the cells' centres, metres."""
+        rows, columns = np.indices(self.heights.shape).reshape(2, -1)
+        return self.origin_world_m + (np.column_stack([columns, rows]) + 0.5) * self.resolution_m
+
+
+def covered(region: Region, points_world: Points, path_world: Points) -> Mask:
+    """Return the (N,) mask of (N, 2) points that lie in a region seen from above.
+
+    Args:
+        region: The region.
+        points_world: x and y, metres.
+        path_world: (P, 3) where the sensor was, metres.
+    """
+    inside = np.ones(len(points_world), np.bool_)
+    if region.box_m is not None:
+        low_m, high_m = np.array(region.box_m)[:, :2]
+        inside &= ((points_world >= low_m) & (points_world <= high_m)).all(axis=1)
+    if region.polygon_m is not None:
+        inside &= _in_polygon(points_world, np.array(region.polygon_m))
+    if region.path_radius_m is not None:
+        path = cKDTree(path_world[:, :2])
+        distance_m, _ = path.query(points_world, distance_upper_bound=region.path_radius_m)
+        inside &= np.isfinite(distance_m)
+    return inside
+
+
+def _in_polygon(points: Points, corners: Points) -> Mask:
+    """Return the (N,) mask of (N, 2) points from which a ray along x crosses an odd number of sides."""
+    inside = np.zeros(len(points), np.bool_)
+    x, y = points.T
+    for (x_a, y_a), (x_b, y_b) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if y_a != y_b:
+            crosses = (y_a > y) != (y_b > y)
+            inside ^= crosses & (x < x_a + (y - y_a) * (x_b - x_a) / (y_b - y_a))
+    return inside
+
+
+def _centres(keys: NDArray[np.int64], octree: OctreeMap) -> Array:
+    return (keys - KEY_ZERO + 0.5) * octree.resolution_m
+
+
+def _chunks(slots: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    for first in range(0, len(slots), _CHUNK):
+        yield slots[first : first + _CHUNK]
