@@ -33,6 +33,8 @@ def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
         rows.insert(0, ("logs", run.manifest.input.title))
     if run.manifest.levelling is not None:
         rows.append(("levelled by", f"{run.manifest.levelling.method}: {run.manifest.levelling.detail}"))
+    if run.manifest.edits:
+        rows.append(("edited by hand", f"{len(run.manifest.edits)} regions; mapper edit lists them"))
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in timing.stage_s.items())
     rows += [
         ("seconds", f"{timing.total_s:.1f} ({stages})"),

@@ -72,7 +72,7 @@ class MapEditor:
         """Return the driven ground, swept only in regions to keep, if there are any."""
         if not self.edits.keep:
             return driven
-        first_world = (columns.first - KEY_ZERO) * columns.resolution_m
+        first_world = (columns.first - KEY_ZERO).astype(np.float64) * columns.resolution_m
         floor = _Cells(first_world, driven.heights, columns.resolution_m)
         return replace(driven, swept=driven.swept & self._on_floor(self.edits.keep, floor))
 
@@ -115,16 +115,14 @@ class MapEditor:
 
     def _voxels(self, octree: OctreeMap, region: Region) -> Iterator[tuple[NDArray[np.int64], Mask]]:
         """Yield (B,) slots of blocks that a region may overlap, and the (B, 512) mask of its voxels."""
-        keys, layer = block_keys(octree.blocks.codes), _Z == 0
+        keys, layer = block_keys(octree.blocks.codes), np.flatnonzero(_Z == 0)
         low_m, high_m = region.z_range_m
         z_m = _centres(keys[:, 2:] + np.arange(_EDGE), octree)
         in_height = (z_m >= low_m) & (z_m <= high_m)
         slots = np.flatnonzero(in_height.any(axis=1))
         columns, column_of = np.unique(keys[slots, 0] << KEY_BITS | keys[slots, 1], return_inverse=True)
-        x, y = (
-            (columns >> KEY_BITS)[:, np.newaxis] + _X[layer],
-            (columns & KEY_MASK)[:, np.newaxis] + _Y[layer],
-        )
+        x = (columns >> KEY_BITS)[:, np.newaxis] + _X[layer]
+        y = (columns & KEY_MASK)[:, np.newaxis] + _Y[layer]
         centres_world = _centres(np.column_stack([x.ravel(), y.ravel()]), octree)
         in_plan = np.empty((len(columns), _EDGE, _EDGE), np.bool_)
         in_plan[:, _X[layer], _Y[layer]] = covered(region, centres_world, self.path_world).reshape(x.shape)
@@ -191,7 +189,7 @@ def _in_polygon(points: Points, corners: Points) -> Mask:
 
 
 def _centres(keys: NDArray[np.int64], octree: OctreeMap) -> Array:
-    return (keys - KEY_ZERO + 0.5) * octree.resolution_m
+    return ((keys - KEY_ZERO).astype(np.float64) + 0.5) * octree.resolution_m
 
 
 def _chunks(slots: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:

@@ -210,13 +210,13 @@ def fuse_log(
     octree.drop_unknown()  # the slice has the columns of all blocks, as the floor
     storeys, blocked = editor.edit_storeys(traversable(floor, config.traversable))
     kept = octree.are_occupied(points_world)
-    done = (*erased, *cropped, *blocked)
-    if done:
+    made = (*erased, *cropped, *blocked)
+    if made:
         progress.note(
             f"edits by hand: {sum(edit.count for edit in erased)} voxels made free; {known - len(octree)} "
             f"voxels and {occupied - np.count_nonzero(kept)} points of the cloud left out"
         )
-    if idle := [edit.text for edit in done if not edit.count]:
+    if idle := [edit.text for edit in made if not edit.count]:
         progress.note(f"edits by hand without effect: {'; '.join(idle)}; are they in the frame of this map?")
     return Maps(
         octree=octree,
@@ -228,7 +228,7 @@ def fuse_log(
         traversable=next(storey.grid for storey in storeys if storey.is_home),
         storeys=tuple(storey.grid for storey in storeys) if len(storeys) > 1 else (),
         has_path=len(floor.path) > 0,
-        edits=done,
+        edits=made,
     )
 
 

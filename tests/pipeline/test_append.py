@@ -11,6 +11,7 @@ from evaluators.metrics.trajectory import align, associate, ate
 from mapper.config.loading import load_config, overridden
 from mapper.core.errors import ConfigError, RunError
 from mapper.loops.config import NoLoopsConfig
+from mapper.octree.octomap_file import read_map
 from mapper.pipeline.append import append
 from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse
@@ -63,6 +64,20 @@ def test_both_sessions_are_one_run_in_the_first_one_s_world(first, joined):
 
     matched = associate(joined.trajectory(), joined.truth())
     assert ate(align(matched, "se3").moved(matched)).rmse < 0.02
+
+
+def test_edits_by_hand_hold_in_the_joined_map(first, joined, desk_log, tmp_path):
+    edited = shutil.copytree(first.path, tmp_path / "edited")
+    (edited / "edits.toml").write_text("[[keep]]\nheight_m = [-1.0, 0.9]  # no ceiling\n")
+
+    mapper("build", desk_log, "--first", 16, "--onto", edited, "--out", tmp_path / "both", "--quiet")
+
+    both = load_run(tmp_path / "both")
+    assert (both.path / "edits.toml").read_text() == (edited / "edits.toml").read_text()
+    (edit,) = both.manifest.edits
+    assert edit.count == both.manifest.counts.leaves < joined.manifest.counts.leaves
+    assert read_map(both.file("map.ot")).leaves().centres_world[:, 2].max() < 0.9
+    assert read_map(joined.file("map.ot")).leaves().centres_world[:, 2].max() > 0.9
 
 
 def test_loops_between_the_sessions_hold(first, joined):
