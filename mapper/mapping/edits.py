@@ -126,7 +126,8 @@ class MapEditor:
         centres_world = _centres(np.column_stack([x.ravel(), y.ravel()]), octree)
         in_plan = np.empty((len(columns), _EDGE, _EDGE), np.bool_)
         in_plan[:, _X[layer], _Y[layer]] = covered(region, centres_world, self.path_world).reshape(x.shape)
-        for some in _chunks(np.flatnonzero(in_plan.any(axis=(1, 2))[column_of])):
+        anywhere: Mask = np.logical_or.reduce(in_plan, axis=(1, 2))
+        for some in _chunks(np.flatnonzero(anywhere[column_of])):
             inside = in_plan[column_of[some]][:, _X, _Y] & in_height[slots[some]][:, _Z]
             yield slots[some], inside
 

@@ -79,6 +79,13 @@ def test_only_voxels_in_one_of_the_kept_regions_are_left():
     assert 0 < len(octree) == inside.any(axis=1).sum() < len(before.keys)
 
 
+def test_a_region_beside_the_map_holds_nothing():
+    octree = mapped(2)
+    high = Region(height_m=(50.0, 60.0), path_radius_m=1.0, polygon_m=SHAPE)
+    aside = Region(box_m=((50.0, 50.0, -9.0), (60.0, 60.0, 9.0)))
+    assert [edit.count for edit in editor(erase=(high, aside)).erase(octree)] == [0, 0]
+
+
 def test_without_regions_nothing_changes():
     octree = mapped(2)
     assert editor().erase(octree) == editor().crop(octree) == []
