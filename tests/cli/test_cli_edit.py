@@ -107,12 +107,12 @@ def test_a_keepout_blocks_the_traversable_floor_alone(run_folder):
         (["--keep", "--height", 50, 60], "the map has no voxel in a region to keep"),
     ],
 )
-def test_a_mistake_is_one_line_and_changes_nothing(options, message, desk_run):
-    before = files_of(desk_run.path)
-    result = mapper("edit", desk_run.path, *options, "--quiet", status=1)
+def test_a_mistake_is_one_line_and_changes_nothing(options, message, run_folder):
+    before = files_of(run_folder)
+    result = mapper("edit", run_folder, *options, "--quiet", status=1)
     assert message in result.stderr
     assert result.stderr.count("\n") == 1
-    assert files_of(desk_run.path) == before
+    assert files_of(run_folder) == before
 
 
 def test_a_mistake_in_the_file_ends_a_fuse_before_it_begins(run_folder):
