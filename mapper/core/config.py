@@ -70,12 +70,15 @@ def drop_unknown(model: type[Config], tree: Any) -> list[str]:
     return []
 
 
-def _delete(tree: Any, loc: Sequence[int | str]) -> str:
+def _delete(tree: Any, loc: Sequence[Any]) -> str:
     """Delete a setting and return its dotted name.
 
     A location also names, after a union, the kind of its member, by which a setting may be called as well.
     """
-    node, parent, names, is_kind_told = tree, tree, [], False
+    node: Any = tree
+    parent: Any = tree
+    names: list[Any] = []
+    is_kind_told = False
     for part in loc:
         if isinstance(node, dict) and part == node.get("kind") and not is_kind_told:
             is_kind_told = True

@@ -4,6 +4,7 @@ from collections import deque
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.errors import PlanError
 from mapper.core.geometry import Array
@@ -79,7 +80,7 @@ def plan_storeys(
     return Plan(waypoints_world, length_m, clearance_m, config, storeys=tuple(chain))
 
 
-def _aligned(storeys: tuple[Storey, ...]) -> tuple[list[OccupancyGrid], list[Array]]:
+def _aligned(storeys: tuple[Storey, ...]) -> tuple[list[OccupancyGrid], list[NDArray[np.int32]]]:
     """Return the grids and heights of all storeys in one raster; heights with a ring like ``layer``."""
     cell_m = storeys[0].grid.resolution_m
     firsts = np.array([np.rint(storey.grid.origin_world_m / cell_m) for storey in storeys], np.int64)
@@ -119,14 +120,14 @@ def _top_at(storey: Storey, point_world: Array) -> float | None:
     return float(storey.heights[row, column]) * grid.resolution_m
 
 
-def _shared(spaces: list[Space], heights: list[Array], one: int, other: int) -> Array:
+def _shared(spaces: list[Space], heights: list[NDArray[np.int32]], one: int, other: int) -> Array:
     """Return the mask of the cells whose floor belongs to both of two storeys, with room for the robot."""
     same = (heights[one] == heights[other]) & (heights[one] != NOWHERE)
     mask: Array = same & spaces[one].free[0] & spaces[other].free[0]
     return mask
 
 
-def _chain(spaces: list[Space], heights: list[Array], start: int, goal: int) -> list[int]:
+def _chain(spaces: list[Space], heights: list[NDArray[np.int32]], start: int, goal: int) -> list[int]:
     """Return the fewest storeys that lead from one to another; none if they are not joined."""
     before, queue = {start: start}, deque([start])
     while queue and goal not in before:
