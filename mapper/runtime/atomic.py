@@ -271,7 +271,12 @@ def _swap(partial: Path, out: Path) -> None:
         flush_to_disk(out.parent)
         return
     with locked(out, wait=True):
-        _exchange(partial, out)
+        try:
+            _exchange(partial, out)
+        except OSError as error:  # as where OUT is a mount point
+            raise WriteError(
+                f"{out}: cannot be replaced: {error.strerror}; choose another --out, or move it away"
+            ) from None
         flush_to_disk(out.parent)
         shutil.rmtree(partial)
 

@@ -1,9 +1,11 @@
+import errno
 import json
 
 import numpy as np
 import pytest
 
 from mapper.core.errors import RunError, SourceError, WriteError
+from mapper.runtime import atomic
 from mapper.runtime.atomic import (
     FolderKind,
     atomic_file,
@@ -147,6 +149,19 @@ def test_symbolic_links_are_not_followed(tmp_path):
     with pytest.raises(RunError, match="is in the way"):
         make_map(tmp_path / "map", "new")
     assert not list((tmp_path / "theirs").iterdir())
+
+
+def test_a_folder_that_cannot_be_renamed_is_told_in_a_line(tmp_path, monkeypatch):
+    make_map(tmp_path / "map", "old")
+
+    def busy(*_):
+        raise OSError(errno.EBUSY, "Device or resource busy", "map", None, ".map.old")
+
+    monkeypatch.setattr(atomic, "_exchange", busy)
+    with pytest.raises(WriteError, match=rf"^{tmp_path}/map: cannot be replaced: Device or resource busy; "):
+        make_map(tmp_path / "map", "new", overwrite=True)
+    assert (tmp_path / "map/map.bt").read_text() == "old"
+    assert (tmp_path / "map.partial/map.bt").read_text() == "new"
 
 
 def test_a_folder_is_replaced_where_names_cannot_be_exchanged(tmp_path, monkeypatch):
