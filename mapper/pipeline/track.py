@@ -216,6 +216,11 @@ def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: 
         raise TrackingError(
             f"none of {len(tracking.skipped)} frames could be read; the first: {tracking.skipped[0].reason}"
         )
+    if tracked == read:
+        raise TrackingError(
+            f"only {read} frames were read, want at least {enough:.0f} (min_tracked_frames); "
+            "give more of the log"
+        )
     hint = _HINTS[config.odometry.kind if config.odometry.kind in _BY_POSES else sensor]
     doubtful = len(tracking.placed) - tracked
     found = f"only {tracked} of {read} frames read could be tracked"

@@ -253,6 +253,12 @@ def test_bad_frames_are_skipped_counted_and_reported(damaged_log, tmp_path):
     assert observer.reached == {"track": (31, 31), "fuse": (29, 29)}
 
 
+def test_a_log_of_few_frames_is_told_from_one_that_is_hard_to_track(desk_log, tmp_path):
+    config = load_config(None, ["source.last_frame=3"])
+    with pytest.raises(TrackingError, match=r"^only 4 frames were read, want at least 10 "):
+        build(open_source(desk_log, config.source), config, tmp_path / "run")
+
+
 def test_a_log_without_texture_and_depth_ends_in_an_error_and_leaves_what_there_is(damaged_log, tmp_path):
     for image in (damaged_log / "rgb").iterdir():
         image.write_bytes(_black_png())
