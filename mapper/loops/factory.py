@@ -4,8 +4,12 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any, assert_never
 
+import numpy as np
+
+from mapper.core.errors import ConfigError
 from mapper.core.frames import Sensor
-from mapper.loops.base import Verifier
+from mapper.features.frame_view import ImageView
+from mapper.loops.base import Proposer, Verifier
 from mapper.loops.config import (
     AnyLoops,
     ImageVerificationConfig,
@@ -18,6 +22,7 @@ from mapper.loops.config import (
 from mapper.loops.detector import KeyframeLoopDetector, LoopDetector, NoLoopDetector
 from mapper.loops.odometry_chain import OdometryChain
 from mapper.loops.online_pose_estimator import Correction, build_pose_estimator
+from mapper.loops.place_file import AnyPlace
 
 LOOPS_OF: Mapping[Sensor, PlaceLoopsConfig | ScanLoopsConfig] = {
     "rgbd": PlaceLoopsConfig(),
@@ -65,6 +70,34 @@ def build_keyframe_loop_detector(
 
             proposer = scan_proposer(config, estimator, chain)
             return KeyframeLoopDetector(config, verifier, lambda _: proposer, estimator, chain)
+        case _:
+            assert_never(config)
+
+
+def build_similarity_proposer(config: PlaceLoopsConfig | ScanLoopsConfig, first: AnyPlace) -> Proposer[Any]:
+    """Return an empty proposer of similar places, wherever they are.
+
+    Args:
+        config: Settings.
+        first: One of the places that will be added.
+
+    Raises:
+        ConfigError: Places such as the first cannot be recognised by similarity.
+    """
+    match config:
+        case PlaceLoopsConfig():
+            from mapper.loops.visual_word_proposer import VisualWordProposer
+
+            if not (isinstance(first, ImageView) and first.is_orb) or config.propose == "nearby":
+                raise ConfigError(
+                    "places of a map are recognised by visual words; want images, an ORB detector, and "
+                    "loops.propose=auto or places"
+                )
+            return VisualWordProposer(config.places)
+        case ScanLoopsConfig():
+            from mapper.loops.scan_context_proposer import ScanContextProposer
+
+            return ScanContextProposer(config.context, lambda _node, _seen, nodes: np.ones(len(nodes), bool))
         case _:
             assert_never(config)
 

@@ -7,16 +7,15 @@ from typing import Any, Generic, assert_never
 
 import numpy as np
 
-from mapper.core.errors import ConfigError, FrameError
+from mapper.core.errors import FrameError
 from mapper.core.geometry import Transform
-from mapper.features.frame_view import ImageView
 from mapper.graph.model import PoseGraph
 from mapper.loops.base import Place, Proposal, Proposer, Verifier, verify_proposal
 from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy, exceeds
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.consistency_check import ConsistencyCheck
 from mapper.loops.detector import ALONE, ViewOf
-from mapper.loops.factory import build_verifier
+from mapper.loops.factory import build_similarity_proposer, build_verifier
 from mapper.loops.odometry_chain import OdometryChain
 from mapper.loops.online_pose_estimator import IncrementalPoseEstimator, OnlinePoseEstimator
 from mapper.loops.place_file import AnyPlace
@@ -190,24 +189,15 @@ def build_map_constraint_detector(
         ConfigError: The places cannot be recognised by similarity.
     """
     verifier = build_verifier(config.verification)
+    similar = build_similarity_proposer(config, next(iter(known.places.values())))
     match config:
         case PlaceLoopsConfig():
-            from mapper.loops.visual_word_proposer import VisualWordProposer, nearby_images
+            from mapper.loops.visual_word_proposer import nearby_images
 
-            first = next(iter(known.places.values()))
-            if not (isinstance(first, ImageView) and first.is_orb) or config.propose == "nearby":
-                raise ConfigError(
-                    "places of a map are recognised by visual words; want images, an ORB detector, and "
-                    "loops.propose=auto or places"
-                )
-            words = VisualWordProposer(config.places)
-            return MapConstraintDetector(config, known, verifier, words, partial(nearby_images, config))
+            return MapConstraintDetector(config, known, verifier, similar, partial(nearby_images, config))
         case ScanLoopsConfig():
-            from mapper.loops.scan_context_proposer import ScanContextProposer, nearby_scans
+            from mapper.loops.scan_context_proposer import nearby_scans
 
-            contexts = ScanContextProposer(
-                config.context, lambda _node, _seen, nodes: np.ones(len(nodes), bool)
-            )
-            return MapConstraintDetector(config, known, verifier, contexts, partial(nearby_scans, config))
+            return MapConstraintDetector(config, known, verifier, similar, partial(nearby_scans, config))
         case _:
             assert_never(config)

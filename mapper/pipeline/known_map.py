@@ -10,9 +10,10 @@ import numpy as np
 from mapper.config.build import BuildConfig
 from mapper.core.config import Config
 from mapper.core.errors import RunError
+from mapper.core.frames import Sensor
 from mapper.core.geometry import Transform
 from mapper.features.frame_view import ImageView
-from mapper.loops.config import KeyframeLoopsConfig
+from mapper.loops.config import AnyLoops, KeyframeLoopsConfig, PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.factory import LOOPS_OF, build_verifier
 from mapper.loops.map_constraints import KnownPlaces
 from mapper.loops.place_file import AnyPlace, read_places
@@ -23,6 +24,9 @@ from mapper.run.fingerprint import fingerprint
 from mapper.run.folder import Run, load_run, open_log
 from mapper.run.manifest import is_merged_map
 from mapper.runtime.progress import SILENT, Progress
+
+_MAX_MOVED_RATIO = 0.14
+"""Least ``max_moved_ratio`` of scans: the map was made on another day."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,10 +44,9 @@ class KnownMap:
     places: KnownPlaces[Any]
 
     @property
-    def sensor(self) -> str:
+    def sensor(self) -> Sensor:
         """What its places were seen by."""
-        is_image = isinstance(next(iter(self.places.places.values())), ImageView)
-        return "rgbd" if is_image else "lidar"
+        return sensor_of(self.places)
 
 
 def load_known_map(path: Path, *, progress: Progress = SILENT) -> KnownMap:
@@ -74,11 +77,10 @@ def load_known_map(path: Path, *, progress: Progress = SILENT) -> KnownMap:
                 f"{run.path}: its features are by another odometry.detector than those of {first.path}; "
                 "localise in one of them"
             )
-        T_world_node = run.graph().T_world_node
-        for node, place in places_of(run, progress=progress).items():
-            if node in T_world_node:
-                number = len(places)
-                places[number], T_map_node[number] = place, T_map_world @ T_world_node[node]
+        own = run_places(run, progress=progress)
+        for node, place in own.places.items():
+            number = len(places)
+            places[number], T_map_node[number] = place, T_map_world @ own.T_map_node[node]
     if not places:
         raise RunError(
             f"{path}: no keyframe of it can be recognised; build it with loops.kind=places or scans"
@@ -86,10 +88,35 @@ def load_known_map(path: Path, *, progress: Progress = SILENT) -> KnownMap:
     return KnownMap(path, first.config, KnownPlaces(places, T_map_node))
 
 
+def sensor_of(places: KnownPlaces[Any]) -> Sensor:
+    """Return what places were seen by; there is at least one."""
+    return "rgbd" if isinstance(next(iter(places.places.values())), ImageView) else "lidar"
+
+
+def loops_between_days(config: AnyLoops, sensor: Sensor) -> PlaceLoopsConfig | ScanLoopsConfig:
+    """Return how keyframes are compared with those of another day, on which some things stood elsewhere."""
+    loops = config if isinstance(config, PlaceLoopsConfig | ScanLoopsConfig) else LOOPS_OF[sensor]
+    if isinstance(loops, PlaceLoopsConfig):
+        return loops
+    moved = max(loops.verification.max_moved_ratio, _MAX_MOVED_RATIO)
+    return loops.model_copy(
+        update={"verification": loops.verification.model_copy(update={"max_moved_ratio": moved})}
+    )
+
+
 def detector_of(config: BuildConfig) -> Config | None:
     """Return the settings of the features by which places are recognised; None of scans."""
     detector: Config | None = getattr(config.odometry, "detector", None)
     return detector
+
+
+def run_places(run: Run, *, progress: Progress = SILENT) -> KnownPlaces[Any]:
+    """Return the places of a run at its solved nodes, in its world; those of an old run from its log."""
+    T_world_node = run.graph().T_world_node
+    places = {
+        node: place for node, place in places_of(run, progress=progress).items() if node in T_world_node
+    }
+    return KnownPlaces(places, T_world_node)
 
 
 def places_of(run: Run, *, progress: Progress = SILENT) -> Mapping[int, AnyPlace]:

@@ -16,13 +16,12 @@ from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.graph.optimize import optimize
 from mapper.loops.closure import Discrepancy, exceeds, write_closures
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
-from mapper.loops.factory import LOOPS_OF
 from mapper.loops.map_constraints import build_map_constraint_detector
 from mapper.odometry.factory import odometry_for
 from mapper.odometry.node_offset import NodeOffset
 from mapper.pipeline.components import component_of
 from mapper.pipeline.kidnapping import without_jumps
-from mapper.pipeline.known_map import KnownMap, detector_of
+from mapper.pipeline.known_map import KnownMap, detector_of, loops_between_days
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import (
     Start,
@@ -51,8 +50,6 @@ _LEAST_CONSTRAINTS = 3
 _FAR, _FAR_BEYOND = 3.0, 0.2
 """Times ``loops.agreement_path_m``: the path from the nearest constraint from which on frames are doubtful,
 between two constraints, and where there is one on one side only: there nothing would show a jump."""
-_MAX_MOVED_RATIO = 0.14
-"""Least ``max_moved_ratio`` of scans: the map was made on another day."""
 _MEDIAN_CHI2 = 5.348
 """Median of χ² with six degrees of freedom."""
 
@@ -99,7 +96,9 @@ def localise(
             tracking = track_log(source, config, progress=progress, start=_start(source, known, config))
         writer.warn(tracking.warnings)
         with writer.clock.stage("solve"):
-            tracking = without_jumps(tracking, map_node, _loops(source, config).gate, progress=progress)
+            tracking = without_jumps(
+                tracking, map_node, loops_between_days(config.loops, source.sensor).gate, progress=progress
+            )
             tracking = _supported(tracking)
             _refuse_unplaced(source, known, tracking)
             solved = solve(tracking.graph, tracking.loops, config.graph)
@@ -107,26 +106,13 @@ def localise(
             _refuse_unplaced(source, known, tracking)
             tracking = component_of(tracking, map_node, progress=progress)
             tracking = replace(tracking, graph=_with_honest_constraints(tracking.graph, config.graph))
-        tracking = _doubtful_unless_confirmed(tracking, _loops(source, config))
+        tracking = _doubtful_unless_confirmed(tracking, loops_between_days(config.loops, source.sensor))
         writer.update(solve=solved.report)
         with writer.clock.stage("write"):
             _write(writer, source, known, tracking)
     finished = writer.manifest
     assert isinstance(finished, LocalisedManifest)  # as it began
     return finished
-
-
-def _loops(source: Log, config: BuildConfig) -> PlaceLoopsConfig | ScanLoopsConfig:
-    """Return how keyframes are compared with the map."""
-    loops = config.loops
-    if not isinstance(loops, PlaceLoopsConfig | ScanLoopsConfig):
-        loops = LOOPS_OF[source.sensor]
-    if isinstance(loops, PlaceLoopsConfig):
-        return loops
-    moved = max(loops.verification.max_moved_ratio, _MAX_MOVED_RATIO)
-    return loops.model_copy(
-        update={"verification": loops.verification.model_copy(update={"max_moved_ratio": moved})}
-    )
 
 
 def _refuse_unfit(source: Log, known: KnownMap, config: BuildConfig) -> None:
@@ -146,7 +132,7 @@ def _refuse_unfit(source: Log, known: KnownMap, config: BuildConfig) -> None:
 def _start(source: Log, known: KnownMap, config: BuildConfig) -> Start:
     map_node = known.places.map_node
     odometry = odometry_for(config.odometry, source, wheels_beside(source, config))
-    detector = build_map_constraint_detector(_loops(source, config), known.places)
+    detector = build_map_constraint_detector(loops_between_days(config.loops, source.sensor), known.places)
     graph = PoseGraph({map_node: np.eye(4)}, {map_node: 0})
     return Start(NodeOffset(odometry, first_node=map_node + 1), detector, graph)
 
