@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cli.console import progress_for
 from cli.environment import prepare_libraries
 from cli.options import Quiet
-from cli.placing import Place, PosesFile, placed_runs
+from cli.placing import Place, PosesFile, placing_of
 
 if TYPE_CHECKING:
     from mapper.merging.differences import Differences
@@ -23,7 +24,8 @@ def diff(
         Place,
         typer.Option(
             help="built: both runs have one world, as sessions of a chain have. "
-            "truth: the runs' truths share a frame. The pose is refined in any case."
+            "truth: the runs' truths share a frame. auto: by places that both have seen. "
+            "The pose is refined in any case."
         ),
     ] = Place.BUILT,
     poses: PosesFile = None,
@@ -47,9 +49,8 @@ def diff(
 
     prepare_libraries()
     earlier, later = load_run(before), load_run(after)
-    found = differences_of(
-        *placed_runs([earlier, later], place, poses), tolerance_m=tolerance_m, min_voxels=min_voxels
-    )
+    placing = placing_of([earlier, later], place, poses, progress=progress_for(quiet=quiet))
+    found = differences_of(*placing.placed, tolerance_m=tolerance_m, min_voxels=min_voxels)
     write_differences(out, found, earlier, later, overwrite=overwrite)
     if not quiet:
         print(f"{summary(found)}\n{found.alignment}")

@@ -8,7 +8,7 @@ import typer
 from cli.console import progress_for
 from cli.environment import prepare_libraries
 from cli.options import Quiet, workers_for
-from cli.placing import Place, PosesFile, placed_runs
+from cli.placing import Place, PosesFile, placing_of
 
 if TYPE_CHECKING:
     from mapper.merging.merge import Merged
@@ -21,7 +21,8 @@ def merge(
         Place,
         typer.Option(
             help="built: every run's world is the map's already. "
-            "truth: the runs' truths share a frame; the first run's world is the map's."
+            "truth: the runs' truths share a frame. auto: by places that the runs share; those that share "
+            "none are left out. By truth and auto the first run's world is the map's."
         ),
     ] = Place.BUILT,
     poses: PosesFile = None,
@@ -50,12 +51,15 @@ def merge(
 
     workers = workers_for(processes, scheduler, default=1)
     prepare_libraries()
+    progress = progress_for(quiet=quiet)
+    placing = placing_of([load_run(run) for run in runs], place, poses, progress=progress)
     merged = merge_runs(
-        placed_runs([load_run(run) for run in runs], place, poses),
+        placing.placed,
         out,
+        notes=placing.notes,
         tile_m=tile_m,
         workers=workers,
-        progress=progress_for(quiet=quiet),
+        progress=progress,
         overwrite=overwrite,
     )
     if not quiet:

@@ -3,13 +3,14 @@
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, assert_never
 
 import typer
 
 if TYPE_CHECKING:
-    from mapper.merging.placing import Placed
+    from mapper.merging.placing import Placing
     from mapper.run.folder import Run
+    from mapper.runtime.progress import Progress
 
 
 class Place(StrEnum):
@@ -17,6 +18,7 @@ class Place(StrEnum):
 
     BUILT = "built"
     TRUTH = "truth"
+    AUTO = "auto"
 
 
 PosesFile = Annotated[
@@ -27,18 +29,29 @@ PosesFile = Annotated[
 ]
 
 
-def placed_runs(runs: "Sequence[Run]", place: Place, poses: Path | None) -> "list[Placed]":
+def placing_of(runs: "Sequence[Run]", place: Place, poses: Path | None, *, progress: "Progress") -> "Placing":
     """Return the runs with the poses of their worlds.
 
     Raises:
         ConfigError: Two sources of the poses are given.
-        MapperError: A pose is missing; see :mod:`mapper.merging.placing`.
+        MapperError: A pose is missing; see :mod:`mapper.merging.placing` and
+            :func:`mapper.pipeline.place_runs.place_by_shared_places`.
     """
     from mapper.core.errors import ConfigError
-    from mapper.merging.placing import as_built, by_poses, by_truth
+    from mapper.merging.placing import Placing, as_built, by_poses, by_truth
 
-    if poses is None:
-        return by_truth(runs) if place is Place.TRUTH else as_built(runs)
-    if place is not Place.BUILT:
-        raise ConfigError(f"--place {place} and --poses {poses}: both say where the runs lie; give one")
-    return by_poses(runs, poses)
+    if poses is not None:
+        if place is not Place.BUILT:
+            raise ConfigError(f"--place {place} and --poses {poses}: both say where the runs lie; give one")
+        return Placing(by_poses(runs, poses))
+    match place:
+        case Place.BUILT:
+            return Placing(as_built(runs))
+        case Place.TRUTH:
+            return Placing(by_truth(runs))
+        case Place.AUTO:
+            from mapper.pipeline.place_runs import place_by_shared_places
+
+            return place_by_shared_places(runs, progress=progress)
+        case _:
+            assert_never(place)

@@ -74,6 +74,7 @@ def merge(
     workers: Workers = IN_PROCESS,
     progress: Progress = SILENT,
     overwrite: bool = False,
+    notes: Sequence[str] = (),
 ) -> Merged:
     """Add up the maps of runs, tile by tile, as independent evidence (Bayes, prior 0.5).
 
@@ -88,6 +89,7 @@ def merge(
         workers: Where the jobs run; those of a Dask cluster must see the same files.
         progress: Receives stages, counts and notes.
         overwrite: Replace a map that is there, once the new one is whole.
+        notes: What else is to be told, first among the manifest's notes: runs that are left out.
 
     Raises:
         ConfigError: The runs do not agree in resolution or sensor model, or the tiles' edge is impossible.
@@ -110,7 +112,7 @@ def merge(
         ) as folder,
     ):
         manifest.save(folder)
-        warnings = warnings_about(placed)
+        warnings = [*notes, *warnings_about(placed)]
         for note in warnings:
             progress.note(note)
         workspace = Workspace(folder, folder / SCRATCH, tiling, config)

@@ -1,8 +1,8 @@
-"""Poses of the runs' worlds in the map: as they are, by their truths, or from a file."""
+"""Runs in the map, with the poses of their worlds: as they are, by their truths, or from a file."""
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +36,26 @@ class Placed:
     def stays(self) -> bool:
         """Whether its voxels are the map's, so that nothing has to be resampled."""
         return np.array_equal(self.T_map_world, np.eye(4))
+
+
+@dataclass(frozen=True, slots=True)
+class Placing:
+    """Runs in the map, and those whose pose is not known.
+
+    Attributes:
+        placed: In the order they were given.
+        left_out: Why each of the others is not in the map, by the run's path.
+        doubts: What is suspicious about the poses, a line each.
+    """
+
+    placed: Sequence[Placed]
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    doubts: Sequence[str] = ()
+
+    @property
+    def notes(self) -> list[str]:
+        """All that is to be told, a line each."""
+        return [*(f"{path}: left out, {reason}" for path, reason in self.left_out.items()), *self.doubts]
 
 
 def as_built(runs: Sequence[Run]) -> list[Placed]:

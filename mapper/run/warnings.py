@@ -81,7 +81,7 @@ def merge_warnings(name: str, *, agreement: float | None, shared_voxels: int) ->
             sentence=f"{name}: {agreement:.0%} of its walls are where those of the runs before it are, of "
             f"{shared_voxels} voxels known in both (at least {_LEAST_AGREEMENT:.0%} is usual): "
             "are the runs of one world?",
-            suggestion="--place truth, or --poses FILE",
+            suggestion="--place auto, --place truth, or --poses FILE",
             weight="doubt",
         )
     ]

@@ -1,0 +1,121 @@
+"""Places that several runs share: keyframes of one run recognised and measured in another."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic
+
+import numpy as np
+
+from mapper.core.geometry import Transform
+from mapper.loops.base import Place, Proposal, Proposer, Verifier
+from mapper.loops.closure import Discrepancy, discrepancy, exceeds
+from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
+from mapper.loops.factory import build_similarity_proposer, build_verifier
+from mapper.loops.map_constraints import KnownPlaces
+from mapper.runtime.progress import SILENT, Progress
+
+_MAX_COMPARED = 300
+"""Pairs of places that are compared for each run, the most similar ones of all earlier runs."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SharedPlace:
+    """A keyframe of a run that was measured from a place of an earlier run.
+
+    Attributes:
+        first: Number of the earlier run.
+        second: Number of the run whose keyframe it is.
+        T_first_place: (4, 4) pose of the place in the earlier run's world.
+        T_first_body: (4, 4) pose of the keyframe in the earlier run's world, as measured.
+        T_second_body: (4, 4) the same in its own run's world.
+    """
+
+    first: int
+    second: int
+    T_first_place: Transform
+    T_first_body: Transform
+    T_second_body: Transform
+
+
+def find_shared_places(
+    runs: Sequence[KnownPlaces[Any]],
+    config: PlaceLoopsConfig | ScanLoopsConfig,
+    *,
+    progress: Progress = SILENT,
+) -> list[SharedPlace]:
+    """Return the places of runs that were recognised in earlier ones, as measured: some may be false.
+
+    All runs' places are in one index, and for each run a limited number of pairs is verified, as loops are:
+    those most similar. So verification grows with the number of runs, not with its square.
+
+    Args:
+        runs: Their places, each in its own world; one run may have none.
+        config: How places are proposed and verified.
+        progress: Receives how many runs are done.
+
+    Raises:
+        ConfigError: The places cannot be recognised by similarity.
+    """
+    first = next((place for run in runs for place in run.places.values()), None)
+    if first is None:
+        return []
+    search = _Search(config, build_similarity_proposer(config, first), build_verifier(config.verification))
+    found = list[SharedPlace]()
+    with progress.stage("places") as report:
+        for number, run in enumerate(runs):
+            found += search.add(run)
+            report(number + 1, len(runs))
+    return found
+
+
+class _Search(Generic[Place]):
+    """The places of the runs so far, in which those of the next are searched."""
+
+    def __init__(
+        self,
+        config: PlaceLoopsConfig | ScanLoopsConfig,
+        proposer: Proposer[Place],
+        verifier: Verifier[Place],
+    ) -> None:
+        self._config = config
+        self._proposer = proposer
+        self._verifier = verifier
+        self._runs: list[KnownPlaces[Place]] = []
+        self._known: list[tuple[int, int]] = []
+
+    def add(self, run: KnownPlaces[Place]) -> Iterator[SharedPlace]:
+        """Add a run; yield its keyframes that were measured from places of earlier ones."""
+        number, candidates = len(self._runs), self._candidates(run)
+        self._runs.append(run)
+        for node, proposal in candidates:
+            first, place = self._known[proposal.node]
+            earlier = self._runs[first]
+            measured = self._verifier.verify(earlier.places[place], run.places[node])
+            if measured.reason or measured.T_i_j is None:
+                continue
+            T_first_place = earlier.T_map_node[place]
+            yield SharedPlace(
+                first, number, T_first_place, T_first_place @ measured.T_i_j, run.T_map_node[node]
+            )
+
+    def _candidates(self, run: KnownPlaces[Place]) -> list[tuple[int, Proposal]]:
+        """Return nodes with places of earlier runs, the most similar first, and add the run's places."""
+        before, moved_to, last = len(self._known), len(self._runs), None
+        candidates = list[tuple[int, Proposal]]()
+        for node, place in run.places.items():
+            if last is None or self._has_moved(run.T_map_node, last, node):
+                last = node
+                candidates += [
+                    (node, proposal)
+                    for proposal in self._proposer.propose(
+                        node, place, before=before, limit=self._config.max_candidates
+                    )
+                ]
+            self._proposer.add(len(self._known), place)
+            self._known.append((moved_to, node))
+        candidates.sort(key=lambda of: -(of[1].similarity or 0.0))
+        return candidates[:_MAX_COMPARED]
+
+    def _has_moved(self, T_map_node: Mapping[int, Transform], last: int, node: int) -> bool:
+        moved = discrepancy(np.eye(4), T_map_node[last], T_map_node[node])
+        return exceeds(moved, Discrepancy(self._config.min_motion_m, self._config.min_motion_rad))

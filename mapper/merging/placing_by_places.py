@@ -1,0 +1,226 @@
+"""Poses of the runs' worlds in the map, by the places that the runs share."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.core.geometry import Array, Transform, adjoint, angle_between, inverse
+from mapper.graph.config import GraphConfig
+from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
+from mapper.graph.optimize import optimize
+from mapper.loops.closure import Discrepancy, discrepancy, exceeds
+from mapper.loops.config import GateConfig
+from mapper.loops.odometry_chain import NodePath, allowed
+from mapper.loops.shared_places import SharedPlace
+
+LEAST_PLACES = 3
+"""Fewer places that agree tie no run to another."""
+_LEAST_LEAD = 2.0
+"""How many times the places of the best pose are to be those of any other: where rooms look alike, a run may
+fit in several."""
+_TIED_APART = "shares places only with runs that nothing ties to the first"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WorldByPlaces:
+    """Pose of a run's world in the first run's, by shared places.
+
+    Attributes:
+        T_map_world: (4, 4).
+        places: Number of shared places by which it lies there.
+        rms_m: Root mean square distance of the two poses of their keyframes.
+    """
+
+    T_map_world: Transform
+    places: int
+    rms_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolvedWorlds:
+    """Runs placed by the places that they share; runs are known by their numbers.
+
+    Attributes:
+        worlds: Of run 0 and of the runs tied to it.
+        refused: A reason for every run that shares places and is not tied to another by them.
+        contradicting: Pairs of runs whose shared places were not used, as stronger ones contradict them.
+    """
+
+    worlds: Mapping[int, WorldByPlaces]
+    refused: Mapping[int, str]
+    contradicting: Sequence[tuple[int, int]]
+
+
+def solve_worlds(shared: Sequence[SharedPlace], gate: GateConfig) -> SolvedWorlds:
+    """Return the poses of the runs that shared places tie to run 0.
+
+    Two runs are tied by the largest set of shared places that agree with one of them. The strongest ties span
+    the runs; one that closes a circle of runs has to agree with the others of the circle. Then all runs are
+    solved together, each as a rigid body, by least squares over their places. Run 0 is held.
+
+    Args:
+        shared: As measured; some may be false.
+        gate: How far two places may disagree, by the distance between them: the drift within a run.
+    """
+    pairs = defaultdict[tuple[int, int], list[SharedPlace]](list)
+    for place in shared:
+        pairs[place.first, place.second].append(place)
+    ties, refused = dict[tuple[int, int], list[SharedPlace]](), dict[int, str]()
+    for pair, places in sorted(pairs.items()):
+        agreeing, reason = _consensus(places, gate)
+        if not reason:
+            ties[pair] = agreeing
+        for number in pair:
+            refused[number] = refused.get(number, reason) if reason else _TIED_APART
+    span = _spanned(ties)
+    tied = {pair: places for pair, places in ties.items() if pair[0] in span.T_map_worlds}
+    contradicting = [pair for pair in tied if pair not in span.tree and not span.agrees(pair, ties, gate)]
+    used = [place for pair, places in tied.items() if pair not in contradicting for place in places]
+    T_map_worlds = _solved(span.T_map_worlds, used, gate) if used else span.T_map_worlds
+    worlds = {number: _judged(number, T_map_worlds, used) for number in sorted(T_map_worlds)}
+    return SolvedWorlds(worlds, refused, contradicting)
+
+
+def _consensus(places: Sequence[SharedPlace], gate: GateConfig) -> tuple[list[SharedPlace], str]:
+    """Return the places that agree on the pose of one run in the other, or why they tie the two not."""
+    agree = _agreement(places, gate)
+    best = int(agree.sum(axis=1).argmax())
+    inside = agree[best]
+    agreeing = [place for place, is_inside in zip(places, inside, strict=True) if is_inside]
+    if len(agreeing) < LEAST_PLACES:
+        return [], f"{len(agreeing)} of {len(places)} places agree, want {LEAST_PLACES}"
+    rival = int(agree[~inside][:, ~inside].sum(axis=1).max(initial=0))
+    if len(agreeing) < _LEAST_LEAD * rival:
+        return [], f"{len(agreeing)} places agree on one pose and {rival} on another: places look alike"
+    in_first, in_second = zip(
+        *((place.T_first_place, place.T_second_body) for place in agreeing), strict=True
+    )
+    if not (_are_several(in_first, gate) and _are_several(in_second, gate)):
+        return [], f"the {len(agreeing)} places that agree are one place"
+    return agreeing, ""
+
+
+def _agreement(places: Sequence[SharedPlace], gate: GateConfig) -> NDArray[np.bool_]:
+    """Return (N, N) whether two places lie alike in both runs, by what these may have drifted between."""
+    agree = np.eye(len(places), dtype=bool)
+    for (a, one), (b, other) in combinations(enumerate(places), 2):
+        in_second = inverse(one.T_second_body) @ other.T_second_body
+        path = NodePath(float(np.linalg.norm(in_second[:3, 3])), angle_between(np.eye(3), in_second[:3, :3]))
+        miss = discrepancy(in_second, one.T_first_body, other.T_first_body)
+        agree[a, b] = agree[b, a] = not exceeds(miss, allowed(gate, path))
+    return agree
+
+
+def _are_several(T_world_bodies: Sequence[Transform], gate: GateConfig) -> bool:
+    """Return whether poses are of more than one place."""
+    same = Discrepancy(gate.slack_m, gate.slack_rad)
+    first = T_world_bodies[0]
+    return any(exceeds(discrepancy(np.eye(4), first, other), same) for other in T_world_bodies[1:])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Span:
+    """Runs along the tree of strongest ties.
+
+    Attributes:
+        T_map_worlds: (4, 4) poses of their worlds in that of run 0.
+        before: The run before each on the way from run 0, but for run 0.
+    """
+
+    T_map_worlds: Mapping[int, Transform]
+    before: Mapping[int, int]
+
+    @property
+    def tree(self) -> set[tuple[int, int]]:
+        return {(min(pair), max(pair)) for pair in self.before.items()}
+
+    def agrees(
+        self,
+        pair: tuple[int, int],
+        ties: Mapping[tuple[int, int], Sequence[SharedPlace]],
+        gate: GateConfig,
+    ) -> bool:
+        """Return whether most places of a pair lie where the tree has them, within the circle's drift.
+
+        That is the drift on the way from place to place through the runs of the circle.
+        """
+        circle = [self._bodies_map(ties[step])[:, :3, 3] for step in self._steps(*pair)]
+        agreeing = 0
+        for place in ties[pair]:
+            T_map_first, T_map_second = (self.T_map_worlds[number] for number in pair)
+            T_map_body = T_map_second @ place.T_second_body
+            begin_m = at_m = T_map_body[:3, 3]
+            path_m = 0.0
+            for places_m in circle:
+                next_m = places_m[np.linalg.norm(places_m - at_m, axis=1).argmin()]
+                path_m, at_m = path_m + float(np.linalg.norm(next_m - at_m)), next_m
+            path = NodePath(path_m + float(np.linalg.norm(begin_m - at_m)), 0.0)
+            miss = discrepancy(np.eye(4), T_map_first @ place.T_first_body, T_map_body)
+            agreeing += not exceeds(miss, allowed(gate, path))
+        return 2 * agreeing > len(ties[pair])
+
+    def _bodies_map(self, places: Sequence[SharedPlace]) -> Array:
+        return np.array([self.T_map_worlds[place.second] @ place.T_second_body for place in places])
+
+    def _steps(self, first: int, second: int) -> list[tuple[int, int]]:
+        """Return the tree's pairs on the way from the second run to the first."""
+        ways = [[number] for number in (first, second)]
+        for way in ways:
+            while way[-1] in self.before:
+                way.append(self.before[way[-1]])
+        from_first, from_second = (list(pairwise(way)) for way in ways)
+        up = [step for step in from_second if step not in from_first]
+        down = [step for step in from_first if step not in from_second]
+        return [(min(step), max(step)) for step in (*up, *reversed(down))]
+
+
+def _spanned(ties: Mapping[tuple[int, int], Sequence[SharedPlace]]) -> _Span:
+    """Return the worlds along the tree of strongest ties from run 0."""
+    T_map_worlds, before = {0: np.eye(4)}, dict[int, int]()
+    by_strength = sorted(ties, key=lambda pair: (-len(ties[pair]), pair))
+    while pair := next((p for p in by_strength if (p[0] in T_map_worlds) != (p[1] in T_map_worlds)), None):
+        first, second = pair
+        middle = ties[pair][len(ties[pair]) // 2]
+        T_first_second = middle.T_first_body @ inverse(middle.T_second_body)
+        if first in T_map_worlds:
+            T_map_worlds[second], before[second] = T_map_worlds[first] @ T_first_second, first
+        else:
+            T_map_worlds[first], before[first] = T_map_worlds[second] @ inverse(T_first_second), second
+    return _Span(T_map_worlds, before)
+
+
+def _solved(
+    T_map_worlds: Mapping[int, Transform], places: Sequence[SharedPlace], gate: GateConfig
+) -> dict[int, Transform]:
+    """Return the worlds by which all places agree best."""
+    at_body = PoseSigmas(gate.slack_rad, gate.slack_m).information
+    factors = []
+    for place in places:
+        to_body = adjoint(inverse(place.T_second_body))
+        T_first_second = place.T_first_body @ inverse(place.T_second_body)
+        information = to_body.T @ at_body @ to_body
+        factors.append(BetweenFactor(place.first, place.second, T_first_second, information))
+    graph = PoseGraph(dict(sorted(T_map_worlds.items())), dict.fromkeys(T_map_worlds, 0), factors)
+    solution = optimize(graph, GraphConfig(robust="none"))
+    return solution.T_world_node | {0: np.eye(4)}  # held but for rounding
+
+
+def _judged(
+    number: int, T_map_worlds: Mapping[int, Transform], places: Sequence[SharedPlace]
+) -> WorldByPlaces:
+    """Return the pose of a run, judged by the places that it shares with any other."""
+    misses_m = [
+        discrepancy(
+            np.eye(4),
+            T_map_worlds[place.first] @ place.T_first_body,
+            T_map_worlds[place.second] @ place.T_second_body,
+        ).translation_m
+        for place in places
+        if number in (place.first, place.second)
+    ]
+    rms_m = float(np.sqrt(np.mean(np.square(misses_m)))) if misses_m else 0.0
+    return WorldByPlaces(T_map_worlds[number], len(misses_m), rms_m)
