@@ -74,12 +74,15 @@ def build_keyframe_loop_detector(
             assert_never(config)
 
 
-def build_similarity_proposer(config: PlaceLoopsConfig | ScanLoopsConfig, first: AnyPlace) -> Proposer[Any]:
+def build_similarity_proposer(
+    config: PlaceLoopsConfig | ScanLoopsConfig, first: AnyPlace, *, most: int
+) -> Proposer[Any]:
     """Return an empty proposer of similar places, wherever they are.
 
     Args:
         config: Settings.
         first: One of the places that will be added.
+        most: Largest number of scans that are proposed, whatever the limit.
 
     Raises:
         ConfigError: Places such as the first cannot be recognised by similarity.
@@ -97,7 +100,9 @@ def build_similarity_proposer(config: PlaceLoopsConfig | ScanLoopsConfig, first:
         case ScanLoopsConfig():
             from mapper.loops.scan_context_proposer import ScanContextProposer
 
-            return ScanContextProposer(config.context, lambda _node, _seen, nodes: np.ones(len(nodes), bool))
+            return ScanContextProposer(
+                config.context, lambda _node, _seen, nodes: np.ones(len(nodes), bool), most=most
+            )
         case _:
             assert_never(config)
 

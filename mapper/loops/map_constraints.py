@@ -20,6 +20,7 @@ from mapper.loops.odometry_chain import OdometryChain
 from mapper.loops.online_pose_estimator import IncrementalPoseEstimator, OnlinePoseEstimator
 from mapper.loops.place_file import AnyPlace
 from mapper.loops.proposers import NodePoses, PoseProposer
+from mapper.loops.scan_context_proposer import MAX_SIMILAR
 from mapper.odometry.base import FrameResult
 
 
@@ -189,7 +190,8 @@ def build_map_constraint_detector(
         ConfigError: The places cannot be recognised by similarity.
     """
     verifier = build_verifier(config.verification)
-    similar = build_similarity_proposer(config, next(iter(known.places.values())))
+    first = next(iter(known.places.values()))
+    similar = build_similarity_proposer(config, first, most=MAX_SIMILAR)
     match config:
         case PlaceLoopsConfig():
             from mapper.loops.visual_word_proposer import nearby_images

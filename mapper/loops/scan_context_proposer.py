@@ -18,7 +18,7 @@ from mapper.places.config import ScanContextConfig
 from mapper.places.scan_context import ScanContext, ScanContexts, scan_context
 
 MAX_SIMILAR = 2
-"""Largest number of candidates that are proposed for their similarity; the others are proposed as near."""
+"""Largest number of candidates of a loop that are proposed for their similarity; the others, as near."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,15 +43,17 @@ Among = Callable[[int, ScanPlace, Sequence[int]], NDArray[np.bool_]]
 class ScanContextProposer:
     """Scan context proposer: similar scans, in any heading, among those that may be one."""
 
-    def __init__(self, config: ScanContextConfig, among: Among) -> None:
+    def __init__(self, config: ScanContextConfig, among: Among, *, most: int = MAX_SIMILAR) -> None:
         """Start without places.
 
         Args:
             config: Scan contexts, and their least similarity.
             among: Excludes places.
+            most: Largest number that is proposed, whatever the limit.
         """
         self._config = config
         self._among = among
+        self._most = most
         self._index = ScanContexts(config)
         self._nodes: list[int] = []
         self._context = lru_cache(1)(self._context_of)  # a place is queried and then added
@@ -61,7 +63,7 @@ class ScanContextProposer:
         among = self._among(node, seen, self._nodes[:before])
         if not among.any():
             return []
-        found = self._index.query(self._context(seen), among, limit=min(limit, MAX_SIMILAR))
+        found = self._index.query(self._context(seen), among, limit=min(limit, self._most))
         return [Proposal(other, "scans", similarity) for other, similarity in found]
 
     def add(self, node: int, seen: ScanPlace) -> None:

@@ -1,21 +1,24 @@
 """Places that several runs share: keyframes of one run recognised and measured in another."""
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic
+from typing import Any, Generic, NamedTuple
 
 import numpy as np
 
 from mapper.core.geometry import Transform
-from mapper.loops.base import Place, Proposal, Proposer, Verifier
+from mapper.loops.base import Place, Proposer, Verifier
 from mapper.loops.closure import Discrepancy, discrepancy, exceeds
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.factory import build_similarity_proposer, build_verifier
 from mapper.loops.map_constraints import KnownPlaces
 from mapper.runtime.progress import SILENT, Progress
 
-_MAX_COMPARED = 300
-"""Pairs of places that are compared for each run, the most similar ones of all earlier runs."""
+_MOST_SIMILAR = 12
+"""Places that are proposed for a keyframe, of all earlier runs."""
+_MAX_COMPARED, _MAX_COMPARED_IN_RUN = 300, 60
+"""Pairs of places that are compared for each run, with all earlier runs and with any one of them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,8 +48,8 @@ def find_shared_places(
 ) -> list[SharedPlace]:
     """Return the places of runs that were recognised in earlier ones, as measured: some may be false.
 
-    All runs' places are in one index, and for each run a limited number of pairs is verified, as loops are:
-    those most similar. So verification grows with the number of runs, not with its square.
+    All runs' places are in one index, and for each run a limited number of pairs is verified, as loops are,
+    the most similar first. So verification grows with the number of runs, not with its square.
 
     Args:
         runs: Their places, each in its own world; one run may have none.
@@ -59,13 +62,34 @@ def find_shared_places(
     first = next((place for run in runs for place in run.places.values()), None)
     if first is None:
         return []
-    search = _Search(config, build_similarity_proposer(config, first), build_verifier(config.verification))
+    search = _Search(
+        config,
+        build_similarity_proposer(config, first, most=_MOST_SIMILAR),
+        build_verifier(config.verification),
+    )
     found = list[SharedPlace]()
     with progress.stage("places") as report:
         for number, run in enumerate(runs):
             found += search.add(run)
             report(number + 1, len(runs))
     return found
+
+
+class _Candidate(NamedTuple):
+    """A pair of places to be compared: the less, the sooner.
+
+    Attributes:
+        rank: Number of more similar places that the earlier run has for the keyframe. Each keyframe is
+            compared with the most similar one before any is with another: pairs lie along the whole path.
+        dissimilarity: Similarity with its sign changed.
+        node: Of the keyframe.
+        place: Number of the earlier run's place in the index.
+    """
+
+    rank: int
+    dissimilarity: float
+    node: int
+    place: int
 
 
 class _Search(Generic[Place]):
@@ -87,8 +111,9 @@ class _Search(Generic[Place]):
         """Add a run; yield its keyframes that were measured from places of earlier ones."""
         number, candidates = len(self._runs), self._candidates(run)
         self._runs.append(run)
-        for node, proposal in candidates:
-            first, place = self._known[proposal.node]
+        for candidate in candidates:
+            node = candidate.node
+            first, place = self._known[candidate.place]
             earlier = self._runs[first]
             measured = self._verifier.verify(earlier.places[place], run.places[node])
             if measured.reason or measured.T_i_j is None:
@@ -98,23 +123,29 @@ class _Search(Generic[Place]):
                 first, number, T_first_place, T_first_place @ measured.T_i_j, run.T_map_node[node]
             )
 
-    def _candidates(self, run: KnownPlaces[Place]) -> list[tuple[int, Proposal]]:
-        """Return nodes with places of earlier runs, the most similar first, and add the run's places."""
+    def _candidates(self, run: KnownPlaces[Place]) -> list[_Candidate]:
+        """Return the pairs of places to be compared, and add the run's places."""
         before, moved_to, last = len(self._known), len(self._runs), None
-        candidates = list[tuple[int, Proposal]]()
+        candidates = list[_Candidate]()
         for node, place in run.places.items():
             if last is None or self._has_moved(run.T_map_node, last, node):
                 last = node
-                candidates += [
-                    (node, proposal)
-                    for proposal in self._proposer.propose(
-                        node, place, before=before, limit=self._config.max_candidates
+                ranks = Counter[int]()
+                for proposal in self._proposer.propose(node, place, before=before, limit=_MOST_SIMILAR):
+                    first, _ = self._known[proposal.node]
+                    candidates.append(
+                        _Candidate(ranks[first], -(proposal.similarity or 0.0), node, proposal.node)
                     )
-                ]
+                    ranks[first] += 1
             self._proposer.add(len(self._known), place)
             self._known.append((moved_to, node))
-        candidates.sort(key=lambda of: -(of[1].similarity or 0.0))
-        return candidates[:_MAX_COMPARED]
+        compared, chosen = Counter[int](), list[_Candidate]()
+        for candidate in sorted(candidates):
+            first, _ = self._known[candidate.place]
+            if compared[first] < _MAX_COMPARED_IN_RUN:
+                compared[first] += 1
+                chosen.append(candidate)
+        return chosen[:_MAX_COMPARED]
 
     def _has_moved(self, T_map_node: Mapping[int, Transform], last: int, node: int) -> bool:
         moved = discrepancy(np.eye(4), T_map_node[last], T_map_node[node])
