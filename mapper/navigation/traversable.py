@@ -175,12 +175,11 @@ def _closed(reached: Mask, gap: int) -> Mask:
 def _is_edge(heights: Heights, limits: Limits) -> Mask:
     """Return the mask of the columns within a gap of which floor lies that no slope joins."""
     square = np.ones((2 * limits.gap + 1, 2 * limits.gap + 1), np.uint8)
-    reached = heights > NOWHERE
-    highest, lowest = (np.where(reached, heights, sign * _FAR).astype(np.float32) for sign in (-1.0, 1.0))
-    highest, lowest = cv2.dilate(highest, square), cv2.erode(lowest, square)
-    edge: Mask = np.maximum(highest, -_FAR) - np.minimum(lowest, _FAR) > limits.step + limits.slope * len(
-        square
-    )
+    missing = heights == NOWHERE
+    highest, lowest = heights.astype(np.float32), heights.astype(np.float32)
+    highest[missing], lowest[missing] = -_FAR, _FAR
+    rise = cv2.dilate(highest, square) - cv2.erode(lowest, square)
+    edge: Mask = rise > limits.step + limits.slope * len(square)
     return edge
 
 
