@@ -22,7 +22,7 @@ from mapper.navigation.traversable import traversable
 from mapper.octree.casting import Caster, depth_limit_of, reach_m
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
-from mapper.octree.moving_things import remove_moving_things
+from mapper.octree.moving_objects import remove_moving_objects
 from mapper.octree.scan_update import ScanUpdate, pack
 from mapper.octree.scan_update_file import CachedUpdate, ScanUpdateFile, ScanUpdateWriter, cache_update
 from mapper.octree.slice import OccupancyGrid, cut_slice
@@ -197,9 +197,9 @@ def fuse_log(
     moving = np.zeros(len(points_world), np.bool_)
     if config.octree.moving == "removed":
         with after.reopened() as written:
-            things = remove_moving_things(octree, partial(_updates, written, config.workers))
-        moving = things.contain(points_world)
-        progress.note(f"moving things: {moving.sum()} of {len(moving)} points of the cloud")
+            objects = remove_moving_objects(octree, partial(_updates, written, config.workers))
+        moving = objects.contain(points_world)
+        progress.note(f"moving objects: {moving.sum()} of {len(moving)} points of the cloud")
     editor = MapEditor(edits, trajectory.positions_world, config.traversable.head_room_m)
     known, occupied = len(octree), np.count_nonzero(octree.are_occupied(points_world))
     erased = editor.erase(octree)

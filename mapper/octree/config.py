@@ -39,7 +39,7 @@ class OctreeConfig(Config):
     the default tolerates the rounding of poses that were text."""
     moving: Literal["removed", "kept"] = "removed"
     """Whether fusing frees the voxels in which something moved, and keeps surfaces that rays only grazed; see
-    ``mapper.octree.moving_things``. "kept" is OctoMap's map."""
+    ``mapper.octree.moving_objects``. "kept" is OctoMap's map."""
 
     @property
     def range_limit_m(self) -> float:

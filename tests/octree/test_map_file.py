@@ -156,10 +156,3 @@ def test_a_failed_write_leaves_the_old_file(path, monkeypatch):
         write_map(path, mapped(attributes=False))
     assert path.read_bytes() == before
     assert [file.name for file in path.parent.iterdir()] == ["map.octree"]
-
-
-def test_settings_of_an_older_version_are_ignored(path):
-    data = path.read_bytes()
-    path.write_bytes(resealed(data, lambda header: header["config"].update(seen_through_scans=3)))
-    write_map(path, read_map(path))
-    assert path.read_bytes() == data

@@ -10,7 +10,7 @@ from mapper.core.errors import DataError
 from mapper.octree.casting import Caster
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
-from mapper.octree.moving_things import remove_moving_things
+from mapper.octree.moving_objects import remove_moving_objects
 from mapper.octree.scan_update import pack
 from mapper.simulation import Boxes, CameraSimulator, read_scene, write_tum_log
 from mapper.simulation.config import IDEAL_SENSOR, SynthConfig
@@ -118,11 +118,11 @@ def test_what_moves_is_seen_where_it_is_and_leaves_the_truth_alone(busy):
     np.testing.assert_array_equal(exact.render(30).depth_m[~moving], still.depth_m[~moving])
 
 
-def test_removal_of_moving_things_leaves_fewer_ghosts_and_spares_the_walls(busy):
+def test_removal_of_moving_objects_leaves_fewer_ghosts_and_spares_the_walls(busy):
     source, updates = busy
     truth = source.scene.boxes.signed_distance_m
     plain, removed = merged(updates), merged(updates)
-    remove_moving_things(removed, lambda: updates)
+    remove_moving_objects(removed, lambda: updates)
 
     assert ghosts(plain, truth) > 200
     assert ghosts(removed, truth) < 0.6 * ghosts(plain, truth)

@@ -1,4 +1,4 @@
-"""Moving things: what was seen through is freed, what was grazed stays, and feet go with the body."""
+"""Moving objects: what was seen through is freed, what was grazed stays, and feet go with the body."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from mapper.core.frames import Scan
 from mapper.octree.casting import Caster
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
-from mapper.octree.moving_things import remove_moving_things
+from mapper.octree.moving_objects import remove_moving_objects
 from mapper.octree.scan_update import pack
 
 CONFIG = OctreeConfig(resolution_m=0.2, max_range_m=30.0)
@@ -81,11 +81,11 @@ def street():
 def test_people_leave_and_ground_walls_and_poles_stay(street):
     octree, updates = fused(street)
 
-    things = remove_moving_things(octree, lambda: updates)
+    objects = remove_moving_objects(octree, lambda: updates)
 
     points = np.concatenate([points for points, _, _ in street]).astype(np.float64)
     owner = np.concatenate([owner for _, owner, _ in street])
-    moving, kept = things.contain(points), octree.are_occupied(points)
+    moving, kept = objects.contain(points), octree.are_occupied(points)
     body = (owner == 2) & (points[:, 2] > 0.2)
     assert moving[body].mean() > 0.98
     assert kept[body].mean() < 0.01
@@ -100,7 +100,7 @@ def test_space_where_a_thing_stood_is_free_and_the_floor_below_it_stays(street):
     octree, updates = fused(street)
     assert octree.query(np.array([[4.3, -2.0, 1.1]]))[0] > 0.0
 
-    remove_moving_things(octree, lambda: updates)
+    remove_moving_objects(octree, lambda: updates)
 
     chest, floor = octree.query(np.array([[4.3, -2.0, 1.1], [4.3, -2.0, 0.1]]))
     assert chest < 0.0 < floor
@@ -114,35 +114,35 @@ def test_ground_that_octomap_erases_at_a_slant_is_kept():
     ground = points[points[:, 2] < 0.1]
     lost = 1.0 - octree.are_occupied(ground).mean()
 
-    things = remove_moving_things(octree, lambda: updates)
+    objects = remove_moving_objects(octree, lambda: updates)
 
     assert lost > 0.05
     assert 1.0 - octree.are_occupied(ground).mean() < 0.2 * lost
-    assert things.contain(ground).mean() < 0.001
+    assert objects.contain(ground).mean() < 0.001
 
 
 def test_a_scene_without_motion_loses_nothing_and_the_order_of_scans_does_not_matter(street):
     still = [scan_of([POLE], x_m=-0.05 * i) for i in range(10)]
     octree, updates = fused(still)
-    assert len(remove_moving_things(octree, lambda: updates)) == 0
+    assert len(remove_moving_objects(octree, lambda: updates)) == 0
 
     (one, updates), (other, _) = fused(street), fused(street)
-    remove_moving_things(one, lambda: updates)
-    remove_moving_things(other, lambda: reversed(updates))
+    remove_moving_objects(one, lambda: updates)
+    remove_moving_objects(other, lambda: reversed(updates))
     np.testing.assert_array_equal(one.leaves().log_odds, other.leaves().log_odds)
 
 
 def test_the_number_of_known_voxels_stays_right(street):
     octree, updates = fused(street)
 
-    remove_moving_things(octree, lambda: updates)
+    remove_moving_objects(octree, lambda: updates)
 
     assert len(octree) == np.isfinite(octree.blocks.table.values[: len(octree.blocks)]).sum()
 
 
 def test_points_without_a_voxel_are_in_no_moving_thing(street):
     octree, updates = fused(street)
-    things = remove_moving_things(octree, lambda: updates)
+    objects = remove_moving_objects(octree, lambda: updates)
 
     far = np.array([[1e9, 0.0, 0.0], [np.nan, 0.0, 0.0], [500.0, 500.0, 500.0]])
-    assert not things.contain(far).any()
+    assert not objects.contain(far).any()

@@ -1,6 +1,6 @@
-"""Removal of moving things by point, on synthetic streets and flats: mapper beside DUFOMap and its like.
+"""Removal of moving objects by point, on synthetic streets and flats: mapper beside DUFOMap and its like.
 
-    python benchmarks/moving_things.py [--quick] [--peers VENV/bin/python]
+    python benchmarks/moving_objects.py [--quick] [--peers VENV/bin/python]
 
 Peers run in an environment of their own, and are left out where it or a package is missing:
 
@@ -28,7 +28,7 @@ from mapper.core.geometry import exp
 from mapper.octree.casting import Caster
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
-from mapper.octree.moving_things import remove_moving_things
+from mapper.octree.moving_objects import remove_moving_objects
 from mapper.octree.scan_update import pack
 from mapper.simulation.config import COURTYARD, STREET, LidarSynthConfig, SynthConfig
 from mapper.simulation.lidar import LidarSimulator
@@ -161,9 +161,9 @@ def ours(log: Labelled) -> tuple[np.ndarray, np.ndarray, float]:
     for points, T_world_body in zip(log.scans, log.T_world_body, strict=True):
         updates.append(pack(caster.cast(Scan(0, points), T_world_body)))
         octree.merge(updates[-1])
-    things = remove_moving_things(octree, lambda: updates)
+    objects = remove_moving_objects(octree, lambda: updates)
     points_world = log.points_world()
-    removed, empty = things.contain(points_world), ~octree.are_occupied(points_world)
+    removed, empty = objects.contain(points_world), ~octree.are_occupied(points_world)
     return removed, empty, (time.process_time() - begin) / len(log.scans)
 
 

@@ -1,7 +1,7 @@
 """Removal of what moved: voxels that held something in some scans and were seen empty in others.
 
-OctoMap lets the majority of scans decide, and every ray frees whatever voxels it crosses. So a thing that
-stood for long stays, and ground that is seen at a slant is erased by the rays that pass low above it. Here
+OctoMap lets the majority of scans decide, and every ray frees whatever voxels it crosses. So what stood
+for long stays, and ground that is seen at a slant is erased by the rays that pass low above it. Here
 the evidence of a ray is weighed by what the same scan saw around it:
 
 - A miss is *void* if all 26 voxels around were observed in the same scan (Duberg et al. 2024, DUFOMap).
@@ -14,7 +14,7 @@ A voxel with h hits held something that moved if no surface is beside it and it 
 times and in more than h/2 scans. A sparse sensor seldom observes all voxels around in one scan; for it, 8
 passes and more than 2h are enough. A surface is a voxel that was hit and has a voxel beside it that no
 scan observed: the ground, a wall. Feet and wheels touch the ground: a voxel that was hit beside a voxel of
-a moving thing that was hit too, in 9 of 10 of its hits, belongs to the thing; this is repeated once.
+a moving object that was hit too, in 9 of 10 of its hits, belongs to the object; this is repeated once.
 
 What remains of the voxels that were ever hit is occupied, unless its void misses alone outweigh its hits.
 """
@@ -51,7 +51,7 @@ _ATTACHING_ROUNDS = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MovingThings:
+class MovingObjects:
     """Voxels that held something that moved.
 
     Attributes:
@@ -77,7 +77,7 @@ class MovingThings:
         return int(np.unpackbits(self.removed.view(np.uint8)).sum())
 
 
-def remove_moving_things(octree: OctreeMap, scans: Callable[[], Iterable[ScanUpdate]]) -> MovingThings:
+def remove_moving_objects(octree: OctreeMap, scans: Callable[[], Iterable[ScanUpdate]]) -> MovingObjects:
     """Free the voxels of an octree in which something moved, and keep those of grazed surfaces.
 
     A voxel that was never passed becomes unknown. Memory: about 24 bytes a voxel that was ever hit, and a few
@@ -107,7 +107,7 @@ def remove_moving_things(octree: OctreeMap, scans: Callable[[], Iterable[ScanUpd
             _count_one(hit & near, slots, ever, starts, beside)
         moved |= beside >= _ATTACHED_RATIO * hits
     octree.forget(_decide(blocks.table.values, ever, moved, counts, octree.sensor, octree.occupied_log_odds))
-    return MovingThings(blocks, _scattered(moved, ever), octree.resolution_m)
+    return MovingObjects(blocks, _scattered(moved, ever), octree.resolution_m)
 
 
 def _evidence(scan: ScanUpdate) -> tuple[Words, Words, Words]:
