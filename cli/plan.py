@@ -70,6 +70,7 @@ def plan(
     Example: mapper plan runs/xyz --from 2.1 -0.3 --to 1.9 1.4 --radius 0.15
     """
     from mapper.config.loading import overridden
+    from mapper.core.errors import ConfigError
     from mapper.export.grid import stored_grid
     from mapper.export.plan import draw_plan, write_plan
     from mapper.export.run_maps import storeys_of_run
@@ -87,6 +88,8 @@ def plan(
     start, goal = (_point(text, name, counts) for text, name in zip((from_, to), _POINT_OPTIONS, strict=True))
     config = overridden(PlanConfig(), assignments({"radius_m": radius, "unknown": unknown, "layer": layer}))
     built = open_map(run) if is_merged_map(run) else load_run(run)
+    if not isinstance(built, Run) and config.layer == "traversable":
+        raise ConfigError(f"{run}: a merged map has no traversable floor; plan with --layer slice, or --3d")
     grid = stored_grid(built, config.layer)
     if in_3d:
         found = plan_3d(read_map(built.file(files.OCTREE_OT)), start, goal, config=config)

@@ -151,7 +151,9 @@ def _put(tree: dict[str, Any], override: str) -> None:
     *parents, leaf = dotted.split(".")
     node = tree
     for key in parents:
-        node = node.setdefault(key, {})
+        if node.get(key) is None:  # a part that may be missing, such as octree.depth_noise
+            node[key] = {}
+        node = node[key]
         if not isinstance(node, dict):
             raise ConfigError(f"override {override!r}: {key} is a value, not a table")
     node[leaf] = value

@@ -222,3 +222,9 @@ def test_turning_one_knob_leaves_the_others_of_its_part():
     assert turned == default.model_copy(update={"max_ratio": 0.7})
     fallback = load_config(None, ["odometry.kind=isvd", "odometry.fallback.homography_iterations=7"]).odometry
     assert (fallback.fallback.filter, fallback.fallback.max_ratio) == ("none", 0.95)
+
+
+def test_a_part_that_was_missing_can_be_set():
+    config = overridden(BuildConfig(), ["octree.depth_noise.constant_m=0.01"])
+    assert config.octree.depth_noise is not None
+    assert config.octree.depth_noise.constant_m == 0.01

@@ -339,6 +339,11 @@ def test_a_path_is_planned_on_a_merged_map(tmp_path, capsys):
     assert capsys.readouterr().out.startswith("2.06 m in the slice")
     assert (tmp_path / "map/plan.png").stat().st_size > 10_000
     assert '"map": "slice"' in (tmp_path / "map/plan.json").read_text()
+    app(
+        ["plan", str(tmp_path / "map"), "--from", "-1 0", "--to", "1 0.5", "--layer", "traversable"],
+        standalone_mode=False,
+    )
+    assert "has no traversable floor" in capsys.readouterr().err
 
 
 def test_a_map_of_an_older_version_is_opened_and_a_damaged_one_refused(merged):
