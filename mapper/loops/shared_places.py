@@ -125,7 +125,7 @@ class _Search(Generic[Place]):
 
     def _candidates(self, run: KnownPlaces[Place]) -> list[_Candidate]:
         """Return the pairs of places to be compared, and add the run's places."""
-        before, moved_to, last = len(self._known), len(self._runs), None
+        before, number, last = len(self._known), len(self._runs), None
         candidates = list[_Candidate]()
         for node, place in run.places.items():
             if last is None or self._has_moved(run.T_map_node, last, node):
@@ -138,7 +138,7 @@ class _Search(Generic[Place]):
                     )
                     ranks[first] += 1
             self._proposer.add(len(self._known), place)
-            self._known.append((moved_to, node))
+            self._known.append((number, node))
         compared, chosen = Counter[int](), list[_Candidate]()
         for candidate in sorted(candidates):
             first, _ = self._known[candidate.place]
