@@ -24,8 +24,7 @@ def diff(
         Place,
         typer.Option(
             help="built: both runs have one world, as sessions of a chain have. "
-            "truth: the runs' truths share a frame. auto: by places that both have seen. "
-            "The pose is refined in any case."
+            "truth: the runs' truths share a frame. auto: by places that both have seen."
         ),
     ] = Place.BUILT,
     poses: PosesFile = None,
@@ -49,11 +48,15 @@ def diff(
 
     prepare_libraries()
     earlier, later = load_run(before), load_run(after)
-    placing = placing_of([earlier, later], place, poses, progress=progress_for(quiet=quiet))
+    progress = progress_for(quiet=quiet)
+    placing = placing_of([earlier, later], place, poses, progress=progress)
     found = differences_of(*placing.placed, tolerance_m=tolerance_m, min_voxels=min_voxels)
-    write_differences(out, found, earlier, later, overwrite=overwrite)
+    placed = placing.placed[-1].how
+    write_differences(out, found, earlier, later, placed=placed, overwrite=overwrite)
+    if found.doubt:
+        progress.note(found.doubt)
     if not quiet:
-        print(f"{summary(found)}\n{found.alignment}")
+        print(f"{summary(found)}\nplaced {placed}")
         print(_table(found, earlier.config.octree.resolution_m))
         print(out)
 

@@ -27,7 +27,7 @@ _MOST_CELLS = 2000  # more than a page has pixels
 
 
 def write_differences(
-    out: Path, found: Differences, before: Run, after: Run, *, overwrite: bool = False
+    out: Path, found: Differences, before: Run, after: Run, *, placed: str, overwrite: bool = False
 ) -> None:
     """Write a list (``manifest.json``), a picture (``diff.png``) and a cloud of voxels for each kind.
 
@@ -36,6 +36,7 @@ def write_differences(
         found: The differences.
         before: The earlier run, whose slice lies below the picture.
         after: The later run.
+        placed: How the later run was placed, in a few words.
         overwrite: Replace a folder of such files.
 
     Raises:
@@ -56,13 +57,13 @@ def write_differences(
             grid=shrunk(stored_grid(before, files.SLICE), _MOST_CELLS),
             layers=layers,
             title=f"{before.path.resolve().name} → {after.path.resolve().name}",
-            lines=[summary(found), found.alignment],
+            lines=[summary(found), placed],
         )
         record = {
             "before": str(before.path.resolve()),
             "after": str(after.path.resolve()),
             "T_before_after": found.T_before_after.tolist(),
-            "alignment": found.alignment,
+            "placed": placed,
             "appeared": [_described(cluster, resolution_m) for cluster in found.appeared],
             "vanished": [_described(cluster, resolution_m) for cluster in found.vanished],
             "voxels": {
@@ -77,10 +78,9 @@ def write_differences(
 
 def summary(found: Differences) -> str:
     """Return the counts in one line."""
-    seen = found.same + sum(len(cluster.centres_world) for cluster in found.vanished)
     return (
-        f"{len(found.appeared)} appeared, {len(found.vanished)} vanished; {found.same} of {seen} voxels seen "
-        f"again are the same, {len(found.not_seen_again)} were not seen again"
+        f"{len(found.appeared)} appeared, {len(found.vanished)} vanished; {found.same} of {found.seen_again} "
+        f"voxels seen again are the same, {len(found.not_seen_again)} were not seen again"
     )
 
 

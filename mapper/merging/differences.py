@@ -5,7 +5,7 @@ space, and vanished where the later run's did. Weak evidence, one hit or a few m
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,18 +14,17 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mapper.core.errors import ConfigError
-from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Points, Transform, apply, inverse
 from mapper.merging.placing import Placed
 from mapper.octree.map import OctreeMap, log_odds
 from mapper.octree.octomap_file import read_map
-from mapper.registration.config import PlaneIcpConfig
-from mapper.registration.icp import Icp
 from mapper.run import files
 
 _TOLERANCE_VOXELS = 2.0
 _MIN_VOXELS = 8
 _SURE_HITS, _SURE_MISSES = 2, 4
+_LEAST_SAME = 0.8
+"""Most of a place stays as it is from one session to the next."""
 _NEIGHBOUR_VOXELS = 1.8
 """Voxels that share a corner belong to one cluster: √3, and the rounding of a turned grid."""
 
@@ -64,8 +63,7 @@ class Differences:
         newly_seen: (N, 3) the same of the later map, where the earlier run did not look.
         same: Number of occupied voxels of the earlier map that are occupied still.
         small: Number of voxels in clusters too small to be listed.
-        T_before_after: (4, 4) pose of the later run's world in the earlier one's, as it was compared.
-        alignment: How the pose was refined, in a few words.
+        T_before_after: (4, 4) pose of the later run's world in the earlier one's.
     """
 
     appeared: Sequence[Cluster]
@@ -75,16 +73,27 @@ class Differences:
     same: int
     small: int
     T_before_after: Transform
-    alignment: str
+
+    @property
+    def seen_again(self) -> int:
+        """Number of voxels of the earlier map that the later run looked at: the same, or vanished."""
+        return self.same + sum(len(cluster.centres_world) for cluster in self.vanished)
+
+    @property
+    def doubt(self) -> str:
+        """Why the runs may not lie as they were placed; empty if nothing speaks against it."""
+        if self.same >= _LEAST_SAME * self.seen_again:
+            return ""
+        return (
+            f"only {self.same} of {self.seen_again} voxels seen again are the same; do the runs lie in one "
+            "world? --place auto finds out"
+        )
 
 
 def differences_of(
     before: Placed, after: Placed, *, tolerance_m: float | None = None, min_voxels: int = _MIN_VOXELS
 ) -> Differences:
     """Compare the maps of two runs.
-
-    The later run's pose is refined by plane ICP (Chen & Medioni 1992) of the occupied voxels, unless they do
-    not fit together.
 
     Args:
         before: The earlier run; the answer is in its world.
@@ -102,10 +111,9 @@ def differences_of(
             f"{before.run.path}; make its maps again with mapper fuse {after.run.path} "
             f"--set octree.resolution_m={old.resolution_m:g}"
         )
-    T_before_after, alignment = _refined(old, new, inverse(before.T_map_world) @ after.T_map_world)
+    T_before_after = inverse(before.T_map_world) @ after.T_map_world
     tolerance_m = _TOLERANCE_VOXELS * old.resolution_m if tolerance_m is None else tolerance_m
-    found = compare_maps(old, new, T_before_after, tolerance_m=tolerance_m, min_voxels=min_voxels)
-    return replace(found, alignment=alignment)
+    return compare_maps(old, new, T_before_after, tolerance_m=tolerance_m, min_voxels=min_voxels)
 
 
 def compare_maps(
@@ -125,7 +133,6 @@ def compare_maps(
         same=int(np.count_nonzero(old_is.occupied)),
         small=few_new + few_old,
         T_before_after=T_before_after,
-        alignment="as placed",
     )
 
 
@@ -165,15 +172,3 @@ def _clusters(centres: Points, resolution_m: float, min_voxels: int) -> tuple[li
     order = large[np.argsort(-sizes[large], kind="stable")]
     clusters = [Cluster(centres[cluster_of == number]) for number in order]
     return clusters, int(sizes.sum() - sizes[large].sum())
-
-
-def _refined(before: OctreeMap, after: OctreeMap, T_before_after: Transform) -> tuple[Transform, str]:
-    """Return the pose by which most surfaces coincide, and what was done."""
-    target, source = (Scan(0, _surely_occupied(octree).astype(np.float32)) for octree in (before, after))
-    found = (
-        Icp(PlaneIcpConfig(voxel_m=2.0 * before.resolution_m)).prepare(target).align(source, T_before_after)
-    )
-    if not found.converged:
-        return T_before_after, f"as placed, not refined: {found.reason}"
-    moved = inverse(T_before_after) @ found.T_target_source
-    return found.T_target_source, f"refined by {np.linalg.norm(moved[:3, 3]):.2g} m"

@@ -70,6 +70,12 @@ def test_a_room_is_the_same_as_itself_seen_in_another_frame():
     assert found.same > 0.99 * (found.same + len(found.not_seen_again))
 
 
+def test_maps_of_two_places_are_doubted():
+    found = compared(room(CHAIR), room(SHELF), exp(np.array([0.0, 0.0, 0.8]), np.array([1.5, 1.0, 0.0])))
+    assert "--place auto" in found.doubt
+    assert not compared(room(CHAIR), room(SHELF)).doubt
+
+
 def test_what_was_not_looked_at_again_has_not_vanished():
     eye = np.array([-1.5, 0.2, 1.3])
     away = directions()[directions()[:, 0] < -0.2]
