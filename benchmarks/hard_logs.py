@@ -146,6 +146,11 @@ HARD_LOGS: Mapping[str, HardLog] = {
         "sensor.rings=16", "rate_hz=2", "yaw_swing_rad=1.57", "tilt_rad=0.35", "speed_mps=1.2", "laps=2",
         "sensor.motion_distortion=false", scene="flat",
     ),
+    "lidar_swept": _lidar(
+        "the same with sweeps of 0.1 s, distorted by turning at rates that change between two scans",
+        "sensor.rings=16", "rate_hz=2", "yaw_swing_rad=1.57", "tilt_rad=0.35", "speed_mps=1.2",
+        scene="flat",
+    ),
     "lidar_roll": _lidar(
         "a street, the sensor rolling by 30 degrees", "sensor.rings=32", "tilt_rad=0.52", "duration_s=25",
         scene="street",

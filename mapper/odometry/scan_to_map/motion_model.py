@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.core.deskew import STILL, Twist, twist_between
-from mapper.core.geometry import Transform, angle_between, inverse
+from mapper.core.geometry import Array, Transform, angle_between, inverse
 from mapper.core.timebase import NS_PER_S
 
 _MIN_ELAPSED_S = 0.005  # over less, an error of millimetres becomes a large velocity
@@ -37,6 +37,7 @@ class MotionModel:
         self._time_ns = time_ns
         self._elapsed_s = 0.0
         self._placed = 0
+        self._covariance = np.zeros((6, 6))
         self._median = np.zeros(2)
         self._errors: deque[tuple[float, float]] = deque(maxlen=_ERRORS)
 
@@ -66,8 +67,60 @@ class MotionModel:
             float(np.hypot(translation * time_s2, _LEAST_M + _LEAST_SHARE * moved)),
         )
 
-    def follow(self, time_ns: int, T_world_body: Transform, *, is_certain: bool = True) -> None:
-        """Take over the pose of a scan; an uncertain one says nothing on the errors of predictions."""
+    def acceleration(self, time_ns: int, T_world_body: Transform, twist: Twist) -> float:
+        """Return the angular acceleration to a velocity at a pose, at least the usual one, rad/s²."""
+        usual, elapsed_s = float(self._median[0]), self.elapsed_s(time_ns)
+        if elapsed_s < _MIN_ELAPSED_S:
+            return usual
+        change = twist.rotation_radps - self.mean_twist(time_ns, T_world_body).rotation_radps
+        return max(usual, 2.0 * float(np.linalg.norm(change)) / elapsed_s)
+
+    def velocity(self, time_ns: int, T_world_body: Transform) -> tuple[Twist, Array]:
+        """Return the expected velocity at a pose, and its (6, 6) covariance, rotation before translation.
+
+        Under white noise of the acceleration (Anderson & Barfoot 2015) the velocity w₁ after an interval t,
+        given that before it, w₀, and the mean m, is 3/2 m − 1/2 w₀, with the variance qt/4; that of the pose
+        predicted with w₀ is qt³/3.
+        """
+        mean = self.mean_twist(time_ns, T_world_body)
+        expected = Twist(
+            1.5 * mean.rotation_radps - 0.5 * self.twist.rotation_radps,
+            1.5 * mean.translation_mps - 0.5 * self.twist.translation_mps,
+        )
+        return expected, np.diag(0.75 * self.velocity_sigmas(time_ns) ** 2) + 0.25 * self._covariance
+
+    def velocity_sigmas(self, time_ns: int) -> Array:
+        """Return (6,) standard deviations of what the velocity changes until a time, rad/s and m/s."""
+        spread, elapsed_s = self.spread(time_ns), self.elapsed_s(time_ns)
+        if spread is None or elapsed_s < _MIN_ELAPSED_S:
+            sigmas = float(np.linalg.norm(self.twist.rotation_radps)), 0.0  # it may just have begun to turn
+        else:
+            sigmas = spread.rotation_rad / elapsed_s, spread.translation_m / elapsed_s
+        return np.repeat(sigmas, 3)
+
+    def mean_twist(self, time_ns: int, T_world_body: Transform) -> Twist:
+        """Return the mean velocity from the last scan to a pose."""
+        elapsed_s = self.elapsed_s(time_ns)
+        if elapsed_s < _MIN_ELAPSED_S:
+            return self.twist
+        return twist_between(self.T_world_last, T_world_body, duration_s=elapsed_s)
+
+    def follow(
+        self,
+        time_ns: int,
+        T_world_body: Transform,
+        *,
+        is_certain: bool = True,
+        measured: tuple[Twist, Array] | None = None,
+    ) -> None:
+        """Take over the pose of a scan; an uncertain one says nothing on the errors of predictions.
+
+        Args:
+            time_ns: Of the pose.
+            T_world_body: (4, 4) the pose.
+            is_certain: Whether it is.
+            measured: Velocity then and its (6, 6) covariance; None is the mean one since the last scan.
+        """
         elapsed_s = self.elapsed_s(time_ns)
         self._placed += 1
         if elapsed_s >= _MIN_ELAPSED_S:
@@ -77,8 +130,12 @@ class MotionModel:
                 time_s2 = _time_s2(elapsed_s, self._elapsed_s)
                 self._errors.append((lengths[0] / time_s2, lengths[1] / time_s2))
                 self._median = np.median(np.array(self._errors), axis=0) / _MEDIAN_LENGTH
-            self.twist = twist_between(self.T_world_last, T_world_body, duration_s=elapsed_s)
-            self._elapsed_s = elapsed_s
+            if measured is None:
+                covariance = np.diag(self.velocity_sigmas(time_ns) ** 2)
+                self.twist, self._covariance = self.mean_twist(time_ns, T_world_body), covariance
+            else:
+                self.twist, self._covariance = measured
+            self._elapsed_s = elapsed_s if measured is None else 0.0
         self.T_world_last, self._time_ns = T_world_body, time_ns
 
 

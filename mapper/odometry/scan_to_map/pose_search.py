@@ -76,6 +76,7 @@ class PoseSearch:
         last: ScanKeyframe | None,
         motion: MotionModel,
         time_ns: int,
+        T_world_guess: Transform | None = None,
     ) -> PoseCandidate | None:
         """Return the pose that fits best; None if no method finds one.
 
@@ -86,6 +87,7 @@ class PoseSearch:
             last: The last scan, if it is not a keyframe.
             motion: For the predicted pose.
             time_ns: Of the middle of the sweep.
+            T_world_guess: (4, 4) where the matcher begins; None is the predicted pose.
         """
         T_world_predicted = motion.predicted(time_ns)
         spread = motion.spread(time_ns)
@@ -110,7 +112,8 @@ class PoseSearch:
             jump = jump_between(T_world_predicted, T_world_middle, spread)
             return PoseCandidate(key, T_world_middle, fit, shares, jump, open_m, method)
 
-        T_world_near = self._matcher.match(deskewed, T_world_predicted, reach="near")
+        T_world_begin = T_world_predicted if T_world_guess is None else T_world_guess
+        T_world_near = self._matcher.match(deskewed, T_world_begin, reach="near")
         best: PoseCandidate | None = None
         for key in keyframes:
             near = assessed(T_world_near, key, "map")

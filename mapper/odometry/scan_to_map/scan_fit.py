@@ -1,6 +1,6 @@
 """Fit of a scan to a keyframe under a motion: overlap, agreement by direction, free space, observability."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -41,12 +41,14 @@ class ScanKeyframe:
         deskewed: The scan as taken all at once in the middle of its sweep.
         T_world_middle: (4, 4) pose of the body then.
         T_world_body: (4, 4) pose of the body at the scan's stamp.
+        covariance_at_stamp: (6, 6) of that pose relative to the other, in the body's tangent.
     """
 
     node: int
     deskewed: DeskewedScan
     T_world_middle: Transform
     T_world_body: Transform
+    covariance_at_stamp: Array = field(default_factory=lambda: np.zeros((6, 6)))
 
     @cached_property
     def description(self) -> ScanDescription:

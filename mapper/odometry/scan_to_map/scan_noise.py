@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, angle_between
-from mapper.odometry.scan_to_map.motion_model import Spread
 from mapper.odometry.scan_to_map.scan_fit import ScanFit
 from mapper.odometry.scan_to_map.usual_fit import Jump
 
@@ -14,7 +13,6 @@ _SECTORS = 12  # of azimuth, each of two elevations
 _LEAST_RAD, _LEAST_M = 5e-4, 2e-3
 _SHARE = 0.007
 """Of distance and angle: what a sensor's calibration adds, alike in all points; 7 mm on a metre in KITTI."""
-_SWEEP_SHARE = 0.35  # of two of them, each half of the change of the velocity
 _DOUBTFUL_RAD, _DOUBTFUL_M = 0.1, 0.5
 _TRUSTED_MPS = 0.1  # what is predicted is doubtful from here on
 _SHORTEST_S = 0.01
@@ -82,9 +80,8 @@ class ScanNoise:
         fit: ScanFit,
         open_m: Array,
         T_key_scan: Transform,
-        spread: Spread | None,
         elapsed_s: float,
-        middle_s: float,
+        at_stamps: Array,
     ) -> PoseNoise:
         """Return the noise of the next scan.
 
@@ -92,19 +89,13 @@ class ScanNoise:
             fit: On the keyframe.
             open_m: (6,) errors of its motions that were predicted instead of measured.
             T_key_scan: (4, 4) the pose relative to the keyframe.
-            spread: Of the predicted pose.
             elapsed_s: Since the scan before.
-            middle_s: Of the sweep, after the stamp.
+            at_stamps: (6, 6) covariance of the motion from the stamps to the middles of both sweeps.
         """
         covariance = surface_covariance(fit)
         turned, moved = angle_between(np.eye(3), T_key_scan[:3, :3]), np.linalg.norm(T_key_scan[:3, 3])
         least = np.hypot([_LEAST_RAD] * 3 + [_LEAST_M] * 3, [_SHARE * turned] * 3 + [_SHARE * moved] * 3)
-        if spread is not None and elapsed_s > 0.0:
-            # The pose at the stamp is that in the middle of the sweep, moved back by an uncertain velocity.
-            share = _SWEEP_SHARE * middle_s / elapsed_s
-            turn, shift = share * spread.rotation_rad, share * spread.translation_m
-            least = np.hypot(least, [turn] * 3 + [shift] * 3)
-        covariance = covariance + np.diag(least**2)
+        covariance = covariance + np.diag(least**2) + at_stamps
         if fit.observability.min() >= 1.0:
             self._unseen = 0
             return PoseNoise(covariance)

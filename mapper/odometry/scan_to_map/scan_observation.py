@@ -25,12 +25,16 @@ class ScanObservation:
     Attributes:
         scan: Points in range, body frame, with their times if the log has them.
         middle_s: Middle of the sweep, seconds after the scan's stamp; 0 without times.
+        half_s: Half of the sweep's duration, seconds; 0 without times.
+        range_m: Median distance of the points from the sensor.
         deskewed: The scan as taken all at once; None if that depends on the motion during the sweep.
         voxel_m: Voxel size of the prepared points.
     """
 
     scan: Scan
     middle_s: float
+    half_s: float
+    range_m: float
     deskewed: DeskewedScan | None
     voxel_m: float
 
@@ -40,17 +44,22 @@ class ScanObservation:
         In the middle an error of the velocity cancels: half of the points move one way and half the other. At
         the start of the sweep it would move the pose, and so increase the next velocity's error.
         """
-        return self.deskewed or _prepared(self._scan_at(self.middle_s, twist), self.voxel_m)
+        return self.deskewed or _prepared(deskewed(self.sweep(self.middle_s), twist), self.voxel_m)
+
+    def displacement(self, turning_radps: float) -> float:
+        """Return how far a change of the rotation, rad/s, displaces the sweep's outer points, in voxels."""
+        return turning_radps * self.half_s * self.range_m / self.voxel_m
 
     def view(self, twist: Twist | None) -> ScanView:
         """Return the points as taken all at once at the stamp, one per voxel; no twist is no motion."""
-        points = self._scan_at(0.0, twist or STILL).points_body
+        points = deskewed(self.scan, twist or STILL).points_body
         return ScanView(self.scan.stamp_ns, points[thin(points, self.voxel_m)])
 
-    def _scan_at(self, moment_s: float, twist: Twist) -> Scan:
+    def sweep(self, moment_s: float) -> Scan:
+        """Return the points with times from a moment after the stamp, seconds."""
         if self.scan.times_s is None:
             return self.scan
-        return deskewed(replace(self.scan, times_s=self.scan.times_s - np.float32(moment_s)), twist)
+        return replace(self.scan, times_s=self.scan.times_s - np.float32(moment_s))
 
 
 def observe_scan(frame: Frame, config: ScanOdometryConfig) -> ScanObservation:
@@ -71,11 +80,15 @@ def observe_scan(frame: Frame, config: ScanOdometryConfig) -> ScanObservation:
             f"want {_MIN_POINTS} (odometry.min_range_m, max_range_m, voxel_m)"
         )
     thinned = replace(scan, points_body=points_body[kept], colors=None, times_s=None)
+    median_m = float(np.median(range_m[in_range][kept]))
     if scan.times_s is None:
-        return ScanObservation(thinned, 0.0, _prepared(thinned, config.voxel_m), config.voxel_m)
+        whole = _prepared(thinned, config.voxel_m)
+        return ScanObservation(thinned, 0.0, 0.0, median_m, whole, config.voxel_m)
     times_s = scan.times_s[in_range][kept]
-    middle_s = 0.5 * float(times_s.min() + times_s.max())
-    return ScanObservation(replace(thinned, times_s=times_s), middle_s, None, config.voxel_m)
+    first_s, last_s = float(times_s.min()), float(times_s.max())
+    middle_s, half_s = 0.5 * (first_s + last_s), 0.5 * (last_s - first_s)
+    swept = replace(thinned, times_s=times_s)
+    return ScanObservation(swept, middle_s, half_s, median_m, None, config.voxel_m)
 
 
 def _prepared(scan: Scan, voxel_m: float) -> DeskewedScan:
