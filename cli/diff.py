@@ -26,7 +26,7 @@ def diff(
             help="built: both runs have one world, as sessions of a chain have. "
             "truth: the runs' truths share a frame. auto: by places that both have seen."
         ),
-    ] = Place.BUILT,
+    ] = Place.AUTO,
     poses: PosesFile = None,
     tolerance_m: Annotated[
         float | None,

@@ -23,7 +23,7 @@ from mapper.odometry.scan_to_map.scan_observation import ScanObservation, observ
 from mapper.odometry.scan_to_map.sweep_motion import SweepMotion, sweep_motion
 
 _KEYFRAMES = 5  # so many last ones are compared with
-_NEGLIGIBLE, _SETTLED, _DISPLACED = 0.1, 0.05, 0.5
+_NEGLIGIBLE, _SETTLED, _DISPLACED = 0.2, 0.05, 0.5
 """Displacement of a sweep's outer points, in voxels, by a change of the velocity: less is not looked for,
 less ends the search for the velocity, more makes a pose doubtful."""
 _ROUNDS = 3
