@@ -1,11 +1,9 @@
 """The command line: its verbs, and the one place that turns an error into a line and an exit status."""
 
 import errno
-import signal
 import sys
 import warnings
-from types import FrameType
-from typing import Annotated, Any, NoReturn, TextIO
+from typing import Annotated, Any, TextIO
 
 import typer
 from typer.core import TyperGroup
@@ -22,6 +20,7 @@ from cli.evaluate import evaluate
 from cli.export import export
 from cli.fuse import fuse
 from cli.inspect import inspect
+from cli.interrupts import handle_interrupts
 from cli.localise import localise
 from cli.loops import WithPairs, loops
 from cli.merge import merge
@@ -136,14 +135,10 @@ def version(
         raise typer.Exit
 
 
-def _terminate(_signal: int, _frame: FrameType | None) -> NoReturn:
-    raise Terminated("SIGTERM")
-
-
 def main() -> None:
     """Run the command line."""
     prepare_environment()
-    signal.signal(signal.SIGTERM, _terminate)
+    handle_interrupts()
     for name in ("stdout", "stderr"):
         if stream := getattr(sys, name):  # None where the shell has closed it
             setattr(sys, name, EscapingStream(stream))

@@ -106,7 +106,8 @@ RUN_FILES = (
     ),
     RunFiles(
         (PLACES,),
-        "the features or points by which keyframes are recognised: `mapper localise` needs no log of the map",
+        "the features or points by which keyframes are recognised: `mapper localise` and `--place auto` need no "
+        "log",
         "tracking",
     ),
     RunFiles(
