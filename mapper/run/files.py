@@ -106,8 +106,8 @@ RUN_FILES = (
     ),
     RunFiles(
         (PLACES,),
-        "the features or points by which keyframes are recognised: `mapper localise` and `--place auto` need no "
-        "log",
+        "the features or points by which keyframes are recognised: `mapper localise` and `--place auto` need "
+        "no log",
         "tracking",
     ),
     RunFiles(
