@@ -45,7 +45,6 @@ from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solve
 from mapper.run.warnings import FLOOR, floor_warnings
 from mapper.runtime.atomic import is_temporary
 from mapper.runtime.progress import SILENT, Progress
-from mapper.runtime.timing import peak_memory_mb
 from mapper.sensing.depth_limit import DepthLimit
 from mapper.sources.base import Log
 
@@ -225,7 +224,9 @@ def fuse_into(
             "dynamic_points": len(maps.dynamic_points_world),
         }
     )
-    writer.update(counts=counts, timing=_timing(writer, trajectory, counts.read))
+    writer.update(counts=counts)
+    log_s = _duration_s(trajectory, [log.begins_ns for log in writer.manifest.input.appended])
+    writer.record_timing(log_s=log_s, frames=counts.read)
     observer.on_mapped(Run(writer.folder, config, writer.manifest), results, maps)
 
 
@@ -294,19 +295,3 @@ def _duration_s(trajectory: Trajectory, begins_ns: Sequence[int]) -> float:
     """Return the seconds from first to last frame, without the pauses before logs that begin later."""
     sessions = np.split(trajectory.stamps_ns, np.searchsorted(trajectory.stamps_ns, begins_ns))
     return float(sum(stamps[-1] - stamps[0] for stamps in sessions if len(stamps))) / NS_PER_S
-
-
-def _timing(writer: RunWriter, trajectory: Trajectory, frames: int) -> Timing:
-    seconds = {stage: round(value, 3) for stage, value in writer.clock.seconds.items()}
-    total_s = sum(seconds.values())
-    log_s = _duration_s(trajectory, [log.begins_ns for log in writer.manifest.input.appended])
-    return writer.manifest.timing.model_copy(
-        update={
-            "stage_s": seconds,
-            "total_s": round(total_s, 3),
-            "log_s": log_s,
-            "frames_per_s": round(frames / total_s, 2),
-            "real_time_factor": round(log_s / total_s, 3),
-            "peak_memory_mb": round(max(peak_memory_mb(), writer.manifest.timing.peak_memory_mb), 1),
-        }
-    )

@@ -14,7 +14,7 @@ from mapper.graph.components import components
 from mapper.graph.config import GraphConfig
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.graph.optimize import optimize
-from mapper.loops.closure import Discrepancy, exceeds, write_closures
+from mapper.loops.closure import Discrepancy, exceeds
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.map_constraints import build_map_constraint_detector
 from mapper.odometry.factory import odometry_for
@@ -33,17 +33,14 @@ from mapper.pipeline.track import (
 )
 from mapper.run import files
 from mapper.run.folder import RunWriter, first_manifest, write_run
-from mapper.run.frame_outcomes import write_frame_ms, write_records
 from mapper.run.localised import LocalisedManifest, find_stretches
-from mapper.run.manifest import SkippedFrame
 from mapper.run.pose_covariances import uncertain_poses, write_poses
 from mapper.run.results import RunResults
+from mapper.run.stored_tracking import save_frames
 from mapper.run.verdict import verdict_of
 from mapper.run.warnings import localisation_warnings
 from mapper.runtime.progress import SILENT, Progress
-from mapper.runtime.timing import peak_memory_mb
 from mapper.sources.base import Log
-from mapper.sources.trajectory_files import write_tum
 
 _LEAST_CONSTRAINTS = 3
 """A part of the path that fewer constraints tie to the map is not localised."""
@@ -241,28 +238,10 @@ def _write(writer: RunWriter, source: Log, known: KnownMap, tracking: TrackingRe
     folder, held = writer.folder, [loop for loop in tracking.loops if loop.verdict == "accepted"]
     stored = from_tracking(tracking, source.truth)
     poses = uncertain_poses(stored.trajectory, stored.graph, stored.records)
-    write_tum(folder / files.TRAJECTORY, stored.trajectory)
+    save_frames(writer, stored, nodes=len(stored.graph.T_world_node) - 1)
     write_poses(folder / files.POSES, poses)
-    write_records(folder / files.FRAMES, stored.records)
-    write_frame_ms(folder / files.FRAME_MS, stored.frame_ms)
-    write_closures(folder / files.LOOPS, stored.loops)
-    if source.truth is not None:
-        write_tum(folder / files.TRUTH, source.truth)
-    outcomes = [record.outcome for record in stored.records]
-    counts = writer.manifest.counts.model_copy(
-        update={
-            "listed": len(outcomes),
-            "read": len(outcomes) - outcomes.count("skipped"),
-            **{name: outcomes.count(name) for name in ("skipped", "lost", "doubtful", "tracked")},
-            "nodes": len(stored.graph.T_world_node) - 1,
-            "factors": len(stored.graph.factors),
-            "loops": len(held),
-            "loop_candidates": len(stored.loops),
-        }
-    )
+    counts = writer.manifest.counts
     writer.update(
-        counts=counts,
-        skipped=tuple(SkippedFrame(stamp_ns=s.stamp_ns, reason=s.reason) for s in stored.skipped),
         stretches=tuple(find_stretches(stored.records, poses, [loop.stamp_j_ns for loop in held])),
     )
     results = RunResults(stored.trajectory, stored.graph, stored.records, held, stored.frame_ms, None, poses)
@@ -277,16 +256,4 @@ def _write(writer: RunWriter, source: Log, known: KnownMap, tracking: TrackingRe
         title=f"{source.path.name} in {known.path.name}",
         lines=[counts.frames_text],
     )
-    seconds = {stage: round(value, 3) for stage, value in writer.clock.seconds.items()}
-    total_s = sum(seconds.values())
-    writer.update(
-        timing=writer.manifest.timing.model_copy(
-            update={
-                "stage_s": seconds,
-                "total_s": round(total_s, 3),
-                "log_s": float(np.ptp(source.stamps_ns)) / 1e9,
-                "frames_per_s": round(counts.read / max(total_s, 1e-9), 2),
-                "peak_memory_mb": round(peak_memory_mb(), 1),
-            }
-        )
-    )
+    writer.record_timing(log_s=float(np.ptp(source.stamps_ns)) / 1e9, frames=counts.read)

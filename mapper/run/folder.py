@@ -34,7 +34,7 @@ from mapper.run.manifest import (
 )
 from mapper.run.pose_covariances import UncertainPoses, read_poses
 from mapper.runtime.atomic import FolderKind, atomic_folder, flush_to_disk, partial_of, write_text
-from mapper.runtime.timing import Stopwatch
+from mapper.runtime.timing import Stopwatch, peak_memory_mb
 from mapper.sources import open_source
 from mapper.sources.base import Log, Session
 from mapper.sources.chained import chained, sessions_of
@@ -240,6 +240,29 @@ class RunWriter:
             self.update(input=known.model_copy(update={"appended": (*others, last)}))
         else:
             self.update(input=known.model_copy(update={"notes": (*known.notes, *notes)}))
+
+    def record_timing(self, *, log_s: float, frames: int) -> None:
+        """Put the seconds of the stages so far into the manifest, and what follows from them.
+
+        Args:
+            log_s: Duration of the log that was worked on.
+            frames: How many of its frames were read.
+        """
+        seconds = {stage: round(value, 3) for stage, value in self.clock.seconds.items()}
+        total_s = max(sum(seconds.values()), 1e-9)
+        timing = self.manifest.timing
+        self.update(
+            timing=timing.model_copy(
+                update={
+                    "stage_s": seconds,
+                    "total_s": round(total_s, 3),
+                    "log_s": log_s,
+                    "frames_per_s": round(frames / total_s, 2),
+                    "real_time_factor": round(log_s / total_s, 3),
+                    "peak_memory_mb": round(max(peak_memory_mb(), timing.peak_memory_mb), 1),
+                }
+            )
+        )
 
     def save(self) -> None:
         """Write the manifest as it stands."""

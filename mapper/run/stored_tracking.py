@@ -107,27 +107,36 @@ def save_solved(writer: RunWriter, tracked: StoredTracking) -> None:
 def save_tracking(writer: RunWriter, tracked: StoredTracking) -> None:
     """Write the files that keep it, and count what is in them; a graph without nodes is not written."""
     folder, graph = writer.folder, tracked.graph
+    save_frames(writer, tracked, nodes=len(graph.T_world_node))
+    if graph.T_world_node:
+        write_g2o(folder / files.GRAPH, graph)
+        keyframes = trajectory_from((graph.stamps_ns[node], T) for node, T in graph.T_world_node.items())
+        write_tum(folder / files.KEYFRAMES, keyframes)
+
+
+def save_frames(writer: RunWriter, tracked: StoredTracking, *, nodes: int) -> None:
+    """Write the files about frames and loops, without the graph, and count what is in them.
+
+    Args:
+        writer: Of the run, or of a localised log.
+        tracked: What to write.
+        nodes: Number of the graph's nodes that are of the log.
+    """
+    folder = writer.folder
     write_records(folder / files.FRAMES, tracked.records)
     write_frame_ms(folder / files.FRAME_MS, tracked.frame_ms)
     write_tum(folder / files.TRAJECTORY, tracked.trajectory)
     write_closures(folder / files.LOOPS, tracked.loops)
     if tracked.truth is not None:
         write_tum(folder / files.TRUTH, tracked.truth)
-    if graph.T_world_node:
-        write_g2o(folder / files.GRAPH, graph)
-        keyframes = trajectory_from((graph.stamps_ns[node], T) for node, T in graph.T_world_node.items())
-        write_tum(folder / files.KEYFRAMES, keyframes)
     outcomes = [record.outcome for record in tracked.records]
     counts = writer.manifest.counts.model_copy(
         update={
             "listed": len(outcomes),
             "read": len(outcomes) - outcomes.count("skipped"),
-            "skipped": outcomes.count("skipped"),
-            "lost": outcomes.count("lost"),
-            "doubtful": outcomes.count("doubtful"),
-            "tracked": outcomes.count("tracked"),
-            "nodes": len(graph.T_world_node),
-            "factors": len(graph.factors),
+            **{name: outcomes.count(name) for name in ("skipped", "lost", "doubtful", "tracked")},
+            "nodes": nodes,
+            "factors": len(tracked.graph.factors),
             "loops": sum(loop.verdict == "accepted" for loop in tracked.loops),
             "loop_candidates": len(tracked.loops),
         }
