@@ -84,6 +84,31 @@ class FrameRef(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class WrappedEntry:
+    """Frame of another log as it is; subclasses change what is read of it. See :class:`FrameRef`."""
+
+    entry: FrameRef
+
+    @property
+    def stamp_ns(self) -> int:
+        """Time of the frame, nanoseconds."""
+        return self.entry.stamp_ns
+
+    @property
+    def files(self) -> ImageFiles | None:
+        """The encoded images as they were recorded."""
+        return self.entry.files
+
+    def load(self, *, colour: bool = True) -> Frame:
+        """Read and decode the frame."""
+        return self.entry.load(colour=colour)
+
+    def scan(self) -> Scan:
+        """Read the returns alone."""
+        return self.entry.scan()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Accelerations:
     """Accelerometer readings of a log, in the accelerometer's own axes.

@@ -11,7 +11,7 @@ import numpy as np
 from mapper.core.frames import Frame, Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
-from mapper.sources.base import Accelerations, FrameRef, ImageFiles, Log, Session
+from mapper.sources.base import Accelerations, FrameRef, ImageFiles, Log, Session, WrappedEntry
 
 _Stamped = TypeVar("_Stamped", Trajectory, Accelerations)
 
@@ -20,10 +20,9 @@ _PAUSE_NS = NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
-class _ShiftedEntry:
+class _ShiftedEntry(WrappedEntry):
     """An entry on another clock."""
 
-    entry: FrameRef
     shift_ns: int
 
     @property

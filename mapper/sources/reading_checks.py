@@ -10,7 +10,7 @@ from isal import isal_zlib
 
 from mapper.core.frames import DepthImage, Frame, Image, Scan
 from mapper.core.timebase import NS_PER_S
-from mapper.sources.base import FrameRef, ImageFiles, Log
+from mapper.sources.base import Log, WrappedEntry
 from mapper.sources.valid_returns import FARTHEST_M
 
 FROZEN_FRAMES = 10
@@ -41,7 +41,7 @@ class ReadingChecks:
     def __init__(self, log: Log) -> None:
         self._stamps_ns = log.stamps_ns
         self._readings: dict[int, _Reading] = {}
-        self.log = replace(log, entry_at=lambda index: _CheckedEntry(self, index, log.entry_at(index)))
+        self.log = replace(log, entry_at=lambda index: _CheckedEntry(log.entry_at(index), self, index))
 
     def add(self, index: int, frame: Frame) -> None:
         """Take in frame ``index`` of the log; what was loaded first counts, be it in colour or in grey."""
@@ -111,28 +111,16 @@ class ReadingChecks:
 
 
 @dataclass(frozen=True, slots=True)
-class _CheckedEntry:
-    """An entry whose frame is checked when it is loaded; see :class:`mapper.sources.base.FrameRef`."""
+class _CheckedEntry(WrappedEntry):
+    """An entry whose frame is checked when it is loaded."""
 
     checks: ReadingChecks
     index: int
-    entry: FrameRef
-
-    @property
-    def stamp_ns(self) -> int:
-        return self.entry.stamp_ns
-
-    @property
-    def files(self) -> ImageFiles | None:
-        return self.entry.files
 
     def load(self, *, colour: bool = True) -> Frame:
         frame = self.entry.load(colour=colour)
         self.checks.add(self.index, frame)
         return frame
-
-    def scan(self) -> Scan:
-        return self.entry.scan()
 
 
 def _reading_of(frame: Frame) -> _Reading:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, RgbdFrame, Scan
-from mapper.sources.base import FrameRef, ImageFiles, Log
+from mapper.sources.base import Log, WrappedEntry
 from mapper.sources.config import BodyConfig
 
 
@@ -17,21 +17,10 @@ def without_vehicle(log: Log, config: BodyConfig) -> Log:
 
 
 @dataclass(frozen=True, slots=True)
-class _ClearedEntry:
-    """Frame of another log without the returns of the vehicle."""
+class _ClearedEntry(WrappedEntry):
+    """Frame of another log without the returns of the vehicle; its files include them."""
 
-    entry: FrameRef
     config: BodyConfig
-
-    @property
-    def stamp_ns(self) -> int:
-        """Time of the frame, nanoseconds."""
-        return self.entry.stamp_ns
-
-    @property
-    def files(self) -> ImageFiles | None:
-        """The encoded images as they were recorded, vehicle included."""
-        return self.entry.files
 
     def load(self, *, colour: bool = True) -> Frame:
         """Read the frame; depth of the vehicle is 0, as where nothing was measured.
