@@ -162,13 +162,15 @@ def _given(record: FrameRecord) -> FrameRecord:
 
 def _copy_kept_files(run: Run, new: Path) -> None:
     """Copy the results of tracking and a user's own files; what was made from the old maps is left out."""
-    for name in files.names_of("tracking") - files.DISPENSABLE:
+    needed = files.names_of("tracking") - files.DISPENSABLE
+    for name in needed:
         run.file(name)
     made_again = files.names_of("maps", "exported maps") | {files.FORMER_SCAN_UPDATES}
     for child in run.path.iterdir():
         if child.name in made_again or is_temporary(child.name):
             continue
-        run.file(child.name)
+        if child.name not in needed:
+            run.file(child.name)
         if child.is_dir() and not child.is_symlink():
             shutil.copytree(child, new / child.name, symlinks=True)
         else:

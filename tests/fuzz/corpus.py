@@ -6,12 +6,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import cv2
-import laspy
 import numpy as np
 from foxglove import messages as fox
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
-from pypcd4 import Encoding, PointCloud
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Bag2Writer
@@ -20,7 +18,6 @@ from mapper.core.frames import Frame, RgbdFrame, Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.export.exporters import EXPORTERS
-from mapper.export.ply import write_ply
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import write_bt, write_ot
@@ -29,6 +26,7 @@ from mapper.sources.base import Accelerations, Log
 from mapper.sources.calibration_file import calibration_text
 from mapper.sources.ros.typestore import typestore
 from mapper.sources.writers import LogKind, write_log
+from tests.support.clouds import save_cloud
 from tests.support.desk import DESK, build_desk_run
 from tests.support.logs import MemoryEntry, log_in_memory
 from tests.support.octree_maps import COLORED, mapped
@@ -241,28 +239,6 @@ def _poznan(folder: Path) -> Path:
     rows = [f"{i} {0.1 * i} 0 1 0 0 {i}" for i in range(FRAMES)]
     (log / "groundtruth.txt").write_text("\n".join(["# number x y z roll pitch yaw, deg", *rows]) + "\n")
     return log
-
-
-def save_cloud(path: Path, points: np.ndarray) -> None:
-    """Write (N, 3) points in the format of a path's ending."""
-    match path.suffix:
-        case ".bin":
-            np.pad(points, ((0, 0), (0, 1))).astype("<f4").tofile(path)
-        case ".npy":
-            np.save(path, points)
-        case ".pcd":
-            PointCloud.from_xyz_points(points.round(1)).save(path, Encoding.BINARY_COMPRESSED)
-        case ".ply":
-            write_ply(path, points, np.full(points.shape, 7, np.uint8))
-        case ".las" | ".laz":
-            header = laspy.LasHeader(point_format=3 if path.stem.endswith("0") else 7)
-            header.scales = np.full(3, 1e-3)
-            cloud = laspy.LasData(header)
-            cloud.x, cloud.y, cloud.z = points.astype(np.float64).T
-            cloud.gps_time = np.linspace(0.0, 0.1, len(points))
-            cloud.write(path)
-        case ending:
-            np.savetxt(path, points, delimiter="," if ending == ".csv" else " ", fmt="%.4f")
 
 
 def _clouds(ending: str) -> Maker:

@@ -8,31 +8,18 @@ import pytest
 
 from cli.summary import summary_text
 from evaluators.metrics.trajectory import align, associate, ate
-from mapper.config.loading import load_config, overridden
+from mapper.config.loading import overridden
 from mapper.core.errors import ConfigError, RunError
 from mapper.loops.config import NoLoopsConfig
 from mapper.octree.octomap_file import read_map
 from mapper.pipeline.append import append
-from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse
 from mapper.run.folder import load_run, moved_log, open_log
-from mapper.simulation import write_tum_log
-from mapper.simulation.config import SynthConfig
 from mapper.sources import open_source
 from mapper.sources.chained import sessions_of
 from mapper.sources.config import SourceConfig
 from tests.support.command_line import mapper
 from tests.support.files import files_of
-
-# A keyframe every few frames, so that a second of walking leaves enough of them to tie.
-SETTINGS = ("odometry.max_keyframe_gap=3", "loops.min_motion_m=0.0")
-
-
-@pytest.fixture(scope="module")
-def first(desk_log, tmp_path_factory):
-    """The first half of the walk."""
-    config = load_config(None, [*SETTINGS, "source.last_frame=15"])
-    return build(open_source(desk_log, config.source), config, tmp_path_factory.mktemp("first") / "run")
 
 
 @pytest.fixture(scope="module")
@@ -41,15 +28,6 @@ def joined(first, desk_log):
     out = first.path.with_name("joined")
     mapper("build", desk_log, "--first", 16, "--onto", first.path, "--out", out)
     return load_run(out)
-
-
-@pytest.fixture(scope="module")
-def elsewhere(tmp_path_factory):
-    """A log of another flat."""
-    log = tmp_path_factory.mktemp("synthetic") / "elsewhere"
-    size = {"width_px": 320, "height_px": 240, "texture_px_per_m": 64}
-    write_tum_log(log, SynthConfig(seed=5, path="desk", duration_s=0.8, frame_rate_hz=15.0, **size))
-    return log
 
 
 def test_both_sessions_are_one_run_in_the_first_one_s_world(first, joined):

@@ -19,8 +19,7 @@ from mapper.run.checks import check_run
 from mapper.run.folder import load_run
 from mapper.run.frame_outcomes import read_records
 from mapper.run.pose_covariances import read_poses
-from mapper.simulation import write_tum_log
-from mapper.simulation.config import STREET, LidarSensorConfig, SynthConfig
+from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source
 from mapper.sources.chained import chained
@@ -28,15 +27,6 @@ from mapper.sources.config import SourceConfig
 from mapper.sources.trajectory_files import read_tum
 from tests.support.command_line import mapper
 from tests.support.files import files_of
-
-SETTINGS = ("odometry.max_keyframe_gap=3", "loops.min_motion_m=0.0")
-
-
-@pytest.fixture(scope="module")
-def first(desk_log, tmp_path_factory):
-    """The map of the first half of the walk."""
-    config = load_config(None, [*SETTINGS, "source.last_frame=15"])
-    return build(open_source(desk_log, config.source), config, tmp_path_factory.mktemp("first") / "run")
 
 
 @pytest.fixture(scope="module")
@@ -47,14 +37,6 @@ def localised(first, desk_log):
     mapper("localise", desk_log, "--in", first.path, "--first", 16, "--out", out)
     assert files_of(first.path) == before
     return out
-
-
-@pytest.fixture(scope="module")
-def elsewhere(tmp_path_factory):
-    log = tmp_path_factory.mktemp("synthetic") / "elsewhere"
-    size = {"width_px": 320, "height_px": 240, "texture_px_per_m": 64}
-    write_tum_log(log, SynthConfig(seed=5, path="desk", duration_s=0.8, frame_rate_hz=15.0, **size))
-    return log
 
 
 def in_map(first, log, out, *overrides):

@@ -15,16 +15,13 @@ from mapper.pipeline import place_runs
 from mapper.pipeline.build import build
 from mapper.pipeline.known_map import run_places
 from mapper.pipeline.place_runs import place_by_shared_places
-from mapper.simulation import write_tum_log
-from mapper.simulation.config import SynthConfig
 from mapper.sources import open_source
 from tests.support.command_line import mapper
-
-SETTINGS = ("odometry.max_keyframe_gap=3", "loops.min_motion_m=0.0")
+from tests.support.desk import MANY_KEYFRAMES, write_log_of_another_flat
 
 
 def built(log, out, *overrides):
-    config = load_config(None, [*SETTINGS, *overrides])
+    config = load_config(None, [*MANY_KEYFRAMES, *overrides])
     return build(open_source(log, config.source), config, out)
 
 
@@ -41,8 +38,7 @@ def halves(desk_log, tmp_path_factory):
 @pytest.fixture(scope="module")
 def elsewhere(halves, tmp_path_factory):
     log = tmp_path_factory.mktemp("synthetic") / "log"
-    size = {"width_px": 320, "height_px": 240, "texture_px_per_m": 64}
-    write_tum_log(log, SynthConfig(seed=5, path="desk", duration_s=0.8, frame_rate_hz=15.0, **size))
+    write_log_of_another_flat(log)
     return built(log, halves[0].path.with_name("elsewhere"))
 
 
