@@ -150,7 +150,7 @@ def _errors(folder: Path, log: Log, run: Run) -> str:
     is_tracked = np.isin(
         poses.trajectory.stamps_ns, [record.stamp_ns for record in records if record.outcome == "tracked"]
     )
-    own, own_truth = run.tracked_trajectory(), run.truth()
+    own, own_truth = run.tracked_trajectory, run.truth
     if log.truth is None or own_truth is None:
         return f"{'no truth':>38}"
     index, gap_ns = nearest(own_truth.stamps_ns, own.stamps_ns)

@@ -131,7 +131,7 @@ def built(
         progress.note(note)
     with nullcontext(NULL_OBSERVER) if onlooker is None else onlooker(source, config) as observer:
         run = build_run(source, config, out, progress=progress, observer=observer, overwrite=overwrite)
-    return run, evaluate(run.trajectory(), run.truth())
+    return run, evaluate(run.trajectory, run.truth)
 
 
 def _onlooker(rerun: str | None, *, step: bool, overwrite: bool) -> "Onlooker | None":
@@ -181,7 +181,7 @@ def appended(
     config = overridden(first.config.model_copy(update={"source": SourceConfig()}), overrides)
     source = open_source(log, config.source)
     run = append(source, first, config, out, progress=progress_for(quiet=quiet), overwrite=overwrite)
-    return run, evaluate(run.trajectory(), run.truth())
+    return run, evaluate(run.trajectory, run.truth)
 
 
 def _refuse_both(config: Path | None, onto: Path, rerun: str | None) -> None:

@@ -138,7 +138,7 @@ def evaluate(
             "--map-world, --register and --tolerance tell how to compare with --map, which is missing"
         )
     if sharp_log is not None:
-        metrics += _sharpness_of(sharp_log, run.tracked_trajectory() if run else trajectory)
+        metrics += _sharpness_of(sharp_log, run.tracked_trajectory if run else trajectory)
     print(_text(metrics, found, Format.JSON if json else format_))
     if run is not None and not json and format_ in (Format.TEXT, Format.MARKDOWN):
         from cli.summary import verdict_text
@@ -170,7 +170,7 @@ def _loaded(
     if estimate.is_file():
         return None, read_poses(estimate, times=times), known
     run = load_run(estimate)
-    return run, run.trajectory(), known or run.truth()
+    return run, run.trajectory, known or run.truth
 
 
 def _needed(run: "Run | None", path: Path, option: str) -> "Run":
@@ -214,7 +214,7 @@ def _frames_ns(run: "Run | None", log: Path | None, *, used: bool) -> "Stamps | 
     if run is not None:
         if log is not None and not used:
             raise DataError(f"{log}: --log is for bare trajectories; {run.path} knows the frames of its log")
-        return np.array([record.stamp_ns for record in run.records()], dtype=np.int64)
+        return np.array([record.stamp_ns for record in run.records], dtype=np.int64)
     if log is None:
         return None
     return open_source(log, load_source_config(None, [])).stamps_ns
@@ -234,8 +234,8 @@ def _loops_of(run: "Run", truth: "Trajectory") -> "list[Metric]":
 
     loops = run.config.loops
     looked_every_m = loops.min_motion_m if loops.kind == "scans" else 0.0
-    keyframes_ns = run.keyframes().stamps_ns
-    return loop_metrics(run.loops(), keyframes_ns, truth, looked_every_m=looked_every_m)
+    keyframes_ns = run.keyframes.stamps_ns
+    return loop_metrics(run.loops, keyframes_ns, truth, looked_every_m=looked_every_m)
 
 
 def _text(metrics: "list[Metric]", found: "Assessment", format_: Format) -> str:

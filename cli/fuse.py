@@ -45,4 +45,4 @@ def fuse(
         progress=progress_for(quiet=quiet),
     )
     if not quiet:
-        print(summary_text(fused, evaluate(fused.trajectory(), fused.truth())))
+        print(summary_text(fused, evaluate(fused.trajectory, fused.truth)))

@@ -65,9 +65,9 @@ def loops(
             progress=progress_for(quiet=quiet),
         )
         if not quiet:
-            print(summary_text(built, evaluate(built.trajectory(), built.truth())))
+            print(summary_text(built, evaluate(built.trajectory, built.truth)))
     if list_ or accepted or not (add or remove):
-        shown = [loop for loop in built.loops() if loop.verdict == "accepted" or not accepted]
+        shown = [loop for loop in built.loops if loop.verdict == "accepted" or not accepted]
         print(loops_text(shown))
 
 

@@ -57,11 +57,11 @@ def _figures(run: "Run") -> "list[Figure]":
     from mapper.export.report.data import Figure
     from mapper.run.verdict import verdict_on
 
-    counts, truth = run.manifest.counts, run.truth()
-    frames_ns = np.array([record.stamp_ns for record in run.records()], dtype=np.int64)
-    metrics = list(assess(run.trajectory(), truth, frames_ns=frames_ns).metrics)
+    counts, truth = run.manifest.counts, run.truth
+    frames_ns = np.array([record.stamp_ns for record in run.records], dtype=np.int64)
+    metrics = list(assess(run.trajectory, truth, frames_ns=frames_ns).metrics)
     if truth is not None:
-        metrics += loop_metrics(run.loops(), run.keyframes().stamps_ns, truth)
+        metrics += loop_metrics(run.loops, run.keyframes.stamps_ns, truth)
     return [
         Figure("log", run.manifest.input.title),
         Figure("verdict", verdict_on(run).state),

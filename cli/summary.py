@@ -24,9 +24,9 @@ def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
     rows = [
         ("frames", counts.frames_text),
         ("keyframes", f"{counts.nodes}, with {counts.factors} factors"),
-        ("loops", _loops_text(run.loops())),
+        ("loops", _loops_text(run.loops)),
         *((metric.name, _value_text(metric)) for metric in metrics if metric.name.startswith(_SHOWN)),
-        *_left_open(run.records()),
+        *_left_open(run.records),
         ("octree", f"{counts.leaves} leaves of {run.config.octree.resolution_m:g} m"),
     ]
     if run.manifest.input.appended:

@@ -81,10 +81,10 @@ def _laid_by_truth(run: Run) -> Transform:
 
     Positions alone would leave a log that hardly leaves its place to turn about it.
     """
-    truth = run.truth()
+    truth = run.truth
     if truth is None:
         raise DataError(f"{run.path}: its log has no truth to lay a reference by; pass --map-world map")
-    matched = associate(run.trajectory(), truth, names=(str(run.path), "its truth"))
+    matched = associate(run.trajectory, truth, names=(str(run.path), "its truth"))
     R_map, R_truth = matched.T_map_body[:, :3, :3], matched.T_truth_body[:, :3, :3]
     R = mean_rotation(R_map @ np.swapaxes(R_truth, 1, 2), np.ones(len(matched)))
     return transform(R, (matched.T_map_body[:, :3, 3] - matched.T_truth_body[:, :3, 3] @ R.T).mean(axis=0))

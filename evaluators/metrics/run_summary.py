@@ -22,7 +22,7 @@ def summary(run: Run, *, alignment: AlignmentKind = "se3") -> dict[str, Value]:
         run: A finished run.
         alignment: How its path is aligned with the truth.
     """
-    counts, trajectory, truth = run.manifest.counts, run.trajectory(), run.truth()
+    counts, trajectory, truth = run.manifest.counts, run.trajectory, run.truth
     matched = None if truth is None else _aligned(trajectory, truth, alignment)
     errors = PathErrors() if matched is None else path_errors(matched, ONE_SECOND)
     relative = _relative(matched, 0.0 if truth is None else truth.path_length_m)

@@ -133,7 +133,7 @@ class ZhaoJob:
             counts = run.manifest.counts
             values = {
                 ("3", _OURS): run.manifest.timing.total_s,
-                ("4", _OURS): ate_rmse_m(run.trajectory(), truth),
+                ("4", _OURS): ate_rmse_m(run.trajectory, truth),
                 ("5", _CLOUD): (run.path / CLOUD).stat().st_size / _MB,
                 ("5", _OCTREE): (run.path / OCTREE_BT).stat().st_size / _MB,
             }

@@ -153,7 +153,7 @@ def _max_depth_m(run: Run) -> float:
 
 def _views(run: Run, octree: OctreeMap, progress: Progress) -> Iterator[_View]:
     """Yield the frames to fuse, read and rectified ahead in threads."""
-    trajectory = run.tracked_trajectory()
+    trajectory = run.tracked_trajectory
     stride = run.config.mesh.frame_stride
     T_world_body = dict(
         zip(trajectory.stamps_ns[::stride].tolist(), trajectory.T_world_body[::stride], strict=True)

@@ -32,7 +32,7 @@ def write_plan(run: Run, plan: Plan, *, grid: OccupancyGrid) -> None:
     log_path = run.file(files.MCAP)
     if not log_path.is_file():
         raise RunError(f"{log_path}: is missing from the run; make it again with mapper fuse {run.path}")
-    stamp_ns = int(run.trajectory().stamps_ns[0])
+    stamp_ns = int(run.trajectory.stamps_ns[0])
     with run.changing({files.PLAN, files.PLAN_VIEW, files.MCAP}):
         with McapLog(log_path) as log:
             log.copy(log_path, without=PLAN_TOPICS)

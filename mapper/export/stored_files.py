@@ -52,7 +52,7 @@ def g2o(run: Run, path: Path, _progress: Progress) -> None:
 
 def kitti(run: Run, path: Path, _progress: Progress) -> None:
     """Write the trajectory without its stamps, for which KITTI text has no place."""
-    write_kitti(path, run.trajectory())
+    write_kitti(path, run.trajectory)
 
 
 def grid(run: Run, path: Path, _progress: Progress) -> None:

@@ -178,7 +178,7 @@ def _floor_z_m(first: Placed) -> float:
     """Return the height in the map of the first run's floor, below the middle of its path."""
     if first.stays:
         return 0.0
-    middle = first.run.trajectory().positions_world.mean(axis=0) * [1.0, 1.0, 0.0]
+    middle = first.run.trajectory.positions_world.mean(axis=0) * [1.0, 1.0, 0.0]
     return float(apply(first.T_map_world, middle[np.newaxis])[0, 2])
 
 

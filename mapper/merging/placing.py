@@ -126,7 +126,7 @@ def _name(run: Run) -> str:
 
 def _frames_used(run: Run) -> dict[str, set[int]]:
     """Return the stamps of the frames that a run has used of each log, by the log's fingerprint."""
-    stamps_ns = run.trajectory().stamps_ns
+    stamps_ns = run.trajectory.stamps_ns
     logs = (run.manifest.input, *run.manifest.input.appended)
     begins = np.searchsorted(stamps_ns, [log.begins_ns for log in run.manifest.input.appended])
     sessions = np.split(stamps_ns, begins)
@@ -139,7 +139,7 @@ def _frames_used(run: Run) -> dict[str, set[int]]:
 
 def _fit_to_truth(run: Run) -> tuple[Transform, float]:
     """Return T_truth_world, and the RMS distance in metres that it leaves."""
-    truth, trajectory = run.truth(), run.trajectory()
+    truth, trajectory = run.truth, run.trajectory
     if truth is None:
         raise RunError(f"{run.path}: has no truth to be placed by; tell its pose with --poses")
     index, gap_ns = nearest(truth.stamps_ns, trajectory.stamps_ns)

@@ -118,7 +118,7 @@ def draw(path: Path, grid: OccupancyGrid, placed: Sequence[Placed], manifest: Ma
         path,
         grid=shrunk(grid, _MOST_CELLS),
         paths_world={
-            item.run.path.name: apply(item.T_map_world, item.run.trajectory().positions_world)
+            item.run.path.name: apply(item.T_map_world, item.run.trajectory.positions_world)
             for item in placed
         },
         tile_m=manifest.tile_m,

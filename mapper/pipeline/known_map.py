@@ -112,7 +112,7 @@ def detector_of(config: BuildConfig) -> Config | None:
 
 def run_places(run: Run, *, progress: Progress = SILENT) -> KnownPlaces[Any]:
     """Return the places of a run at its solved nodes, in its world; those of an old run from its log."""
-    T_world_node = run.graph().T_world_node
+    T_world_node = run.graph.T_world_node
     places = {
         node: place for node, place in places_of(run, progress=progress).items() if node in T_world_node
     }
@@ -125,6 +125,6 @@ def places_of(run: Run, *, progress: Progress = SILENT) -> Mapping[int, AnyPlace
         return read_places(run.file(files.PLACES))
     log = open_log(run)
     loops = run.config.loops if isinstance(run.config.loops, KeyframeLoopsConfig) else LOOPS_OF[log.sensor]
-    verifier, graph = build_verifier(loops.verification), run.graph()
-    views = reobserve(log, run.trajectory(), set(graph.stamps_ns.values()), run.config, progress=progress)
+    verifier, graph = build_verifier(loops.verification), run.graph
+    views = reobserve(log, run.trajectory, set(graph.stamps_ns.values()), run.config, progress=progress)
     return {node: verifier.describe(views[stamp_ns]) for node, stamp_ns in graph.stamps_ns.items()}

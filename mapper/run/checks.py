@@ -64,12 +64,12 @@ def _hashed(
 def _counted(run: Run) -> Iterator[Finding]:
     counts = run.manifest.counts
     readers: tuple[tuple[str, Callable[[], int], int], ...] = (
-        (files.FRAMES, lambda: len(run.records()), counts.listed),
-        (files.TRAJECTORY, lambda: len(run.trajectory()), counts.tracked + counts.doubtful),
-        (files.KEYFRAMES, lambda: len(run.keyframes()), counts.nodes),
-        (files.GRAPH, lambda: len(run.graph().T_world_node), counts.nodes),
-        (f"{files.GRAPH}: factors", lambda: len(run.graph().factors), counts.factors),
-        (files.LOOPS, lambda: len(run.loops()), counts.loop_candidates),
+        (files.FRAMES, lambda: len(run.records), counts.listed),
+        (files.TRAJECTORY, lambda: len(run.trajectory), counts.tracked + counts.doubtful),
+        (files.KEYFRAMES, lambda: len(run.keyframes), counts.nodes),
+        (files.GRAPH, lambda: len(run.graph.T_world_node), counts.nodes),
+        (f"{files.GRAPH}: factors", lambda: len(run.graph.factors), counts.factors),
+        (files.LOOPS, lambda: len(run.loops), counts.loop_candidates),
     )
     for name, count, wanted in readers:
         remedy = files.remedy_for(name.split(":")[0], run.path)

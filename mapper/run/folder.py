@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -42,9 +43,9 @@ from mapper.sources.config import SourceConfig
 from mapper.sources.trajectory_files import read_tum
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Run:
-    """A finished run.
+    """A finished run: its folder, whose files are read when they are asked for, each once.
 
     Attributes:
         path: Its folder.
@@ -71,42 +72,51 @@ class Run:
         """Return a context in which files of the run may be written; it records their digests at its end."""
         return changing(self.path, names) if self.manifest.files else nullcontext()
 
+    @cached_property
     def trajectory(self) -> Trajectory:
-        """Return the solved body poses of all placed frames, doubtful ones too, in the levelled world."""
+        """Solved body poses of all placed frames, doubtful ones too, in the levelled world."""
         return read_tum(self.file(files.TRAJECTORY))
 
+    @cached_property
     def tracked_trajectory(self) -> Trajectory:
-        """Return the poses of the frames that maps are made from: those that are not doubtful."""
-        return without_doubtful(self.trajectory(), self.records())
+        """Poses of the frames that maps are made from: those that are not doubtful."""
+        return without_doubtful(self.trajectory, self.records)
 
+    @cached_property
     def poses(self) -> UncertainPoses | None:
-        """Return the same poses with their covariance; None in a run of before 2026-11-22."""
+        """The poses of ``trajectory`` with their covariance; None in a run of before 2026-11-22."""
         path = self.file(files.POSES)
         return read_poses(path) if path.exists() else None
 
+    @cached_property
     def truth(self) -> Trajectory | None:
-        """Return the true body poses, in the truth's own frame, if the log has them."""
+        """True body poses, in the truth's own frame; None if the log has none."""
         path = self.file(files.TRUTH)
         return read_tum(path) if path.exists() else None
 
+    @cached_property
     def graph(self) -> PoseGraph:
-        """Return the pose graph with its nodes at the solution, in the levelled world."""
+        """Pose graph with its nodes at the solution, in the levelled world."""
         return read_g2o(self.file(files.GRAPH))
 
+    @cached_property
     def loops(self) -> list[LoopClosure]:
-        """Return every loop candidate with its verdict."""
+        """Every loop candidate with its verdict."""
         return read_closures(self.file(files.LOOPS))
 
+    @cached_property
     def records(self) -> list[FrameRecord]:
-        """Return the outcome of every frame."""
+        """Outcome of every frame."""
         return read_records(self.file(files.FRAMES))
 
+    @cached_property
     def frame_ms(self) -> dict[int, float]:
-        """Return how many milliseconds each frame took to track, by stamp."""
+        """Milliseconds that each frame took to track, by stamp."""
         return read_frame_ms(self.file(files.FRAME_MS))
 
+    @cached_property
     def keyframes(self) -> Trajectory:
-        """Return the poses of the keyframes."""
+        """Poses of the keyframes."""
         return read_tum(self.file(files.KEYFRAMES))
 
     def scan_updates(self) -> Path | None:

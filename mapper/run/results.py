@@ -46,10 +46,10 @@ class RunResults:
 
 def load_results(run: Run) -> RunResults:
     """Return the results of a run; its maps may still be missing."""
-    trajectory, truth = run.trajectory(), run.truth()
+    trajectory, truth = run.trajectory, run.truth
     if truth is not None:
         truth = aligned_truth(truth, trajectory)
-    return RunResults(trajectory, run.graph(), run.records(), run.loops(), run.frame_ms(), truth, run.poses())
+    return RunResults(trajectory, run.graph, run.records, run.loops, run.frame_ms, truth, run.poses)
 
 
 def aligned_truth(truth: Trajectory, trajectory: Trajectory) -> Trajectory | None:

@@ -87,13 +87,13 @@ class StoredTracking:
 def load_tracking(run: Run) -> StoredTracking:
     """Return the stored tracking of a finished run."""
     return StoredTracking(
-        records=run.records(),
+        records=run.records,
         skipped=[Skipped(frame.stamp_ns, frame.reason) for frame in run.manifest.skipped],
-        frame_ms=run.frame_ms(),
-        trajectory=run.trajectory(),
-        graph=run.graph(),
-        loops=run.loops(),
-        truth=run.truth(),
+        frame_ms=run.frame_ms,
+        trajectory=run.trajectory,
+        graph=run.graph,
+        loops=run.loops,
+        truth=run.truth,
     )
 
 

@@ -212,7 +212,7 @@ def test_eval_states_the_alignment_and_agrees_with_the_library(run_folder, desk_
     of_files = json.loads(mapper("eval", estimate, "--truth", truth, "--log", desk_log, "--json").stdout)
 
     values = {metric["name"]: metric["value"] for metric in of_files}
-    frames_ns = np.array([record.stamp_ns for record in load_run(run_folder).records()])
+    frames_ns = np.array([record.stamp_ns for record in load_run(run_folder).records])
     found = assess(read_tum(estimate), read_tum(truth), frames_ns=frames_ns)
     assert {m.name: m.value for m in found.metrics}.items() <= values.items()
     told = {metric["name"]: metric["value"] for metric in of_run}
@@ -269,7 +269,7 @@ def test_a_converted_log_gives_the_same_trajectory(run_folder, desk_log, tmp_pat
     mapper("convert", desk_log, "--as", "mbag", "--out", tmp_path / "log")
     mapper("build", tmp_path / "log", "--out", tmp_path / "run", "--quiet")
 
-    ours, theirs = load_run(tmp_path / "run").trajectory(), load_run(run_folder).trajectory()
+    ours, theirs = load_run(tmp_path / "run").trajectory, load_run(run_folder).trajectory
     assert ours.stamps_ns.tolist() == theirs.stamps_ns.tolist()
     assert abs(ours.T_world_body - theirs.T_world_body).max() < 1e-12
 

@@ -34,18 +34,18 @@ def run(built, tmp_path):
 
 
 def held(run):
-    return [(loop.i, loop.j) for loop in load_run(run).loops() if loop.verdict == "accepted"]
+    return [(loop.i, loop.j) for loop in load_run(run).loops if loop.verdict == "accepted"]
 
 
 def untied(run):
     """Two nodes that show nearly the same and are not known as a loop."""
-    nodes = list(load_run(run).graph().T_world_node)
-    known = {(loop.i, loop.j) for loop in load_run(run).loops()}
+    nodes = list(load_run(run).graph.T_world_node)
+    known = {(loop.i, loop.j) for loop in load_run(run).loops}
     return next((i, j) for i, j in zip(nodes, nodes[2:], strict=False) if (i, j) not in known)
 
 
 def test_lists_every_candidate(run):
-    loops = load_run(run).loops()
+    loops = load_run(run).loops
     assert loops
     head, *lines, total = mapper("loops", run).stdout.splitlines()
     assert head.split()[:3] == ["i", "j", "by"]
@@ -57,34 +57,34 @@ def test_lists_every_candidate(run):
 
 def test_an_added_loop_is_a_factor_and_moves_what_hangs_on_it(run):
     i, j = untied(run)
-    before, nodes = load_run(run), load_run(run).graph().T_world_node
+    before, nodes = load_run(run), load_run(run).graph.T_world_node
     result = mapper("loops", run, "--add", j, i)
     after = load_run(run)
 
-    added = after.loops()[-1]
+    added = after.loops[-1]
     assert (added.i, added.j, added.proposed_by, added.verdict) == (i, j, "hand", "accepted")
-    assert after.graph().factors[-1].origin == "loop"
-    assert (after.graph().factors[-1].i, after.graph().factors[-1].j) == (i, j)
+    assert after.graph.factors[-1].origin == "loop"
+    assert (after.graph.factors[-1].i, after.graph.factors[-1].j) == (i, j)
     assert after.manifest.counts.loops == before.manifest.counts.loops + 1 == len(held(run))
     assert after.manifest.counts.factors == before.manifest.counts.factors + 1
     assert "ATE RMSE" in result.stdout
 
-    T = dict(zip(after.trajectory().stamps_ns.tolist(), after.trajectory().T_world_body, strict=True))
-    graph = after.graph()
+    T = dict(zip(after.trajectory.stamps_ns.tolist(), after.trajectory.T_world_body, strict=True))
+    graph = after.graph
     assert max(np.abs(graph.T_world_node[n] - nodes[n]).max() for n in nodes) > 1e-7
     for node, stamp_ns in graph.stamps_ns.items():
         np.testing.assert_allclose(T[stamp_ns], graph.T_world_node[node], atol=1e-9)
 
 
 def test_removing_what_was_added_leads_back(run):
-    before = load_run(run).trajectory()
+    before = load_run(run).trajectory
     i, j = untied(run)
     mapper("loops", run, "--add", i, j, "--quiet")
     mapper("loops", run, "--remove", j, i, "--quiet")
     after = load_run(run)
-    assert after.loops()[-1].reason == "hand: removed"
+    assert after.loops[-1].reason == "hand: removed"
     assert (i, j) not in held(run)
-    np.testing.assert_allclose(after.trajectory().T_world_body, before.T_world_body, atol=1e-6)
+    np.testing.assert_allclose(after.trajectory.T_world_body, before.T_world_body, atol=1e-6)
 
 
 def test_several_edits_are_one_solve(run):
@@ -92,7 +92,7 @@ def test_several_edits_are_one_solve(run):
     mapper("loops", run, "--remove", *gone, "--add", *new, "--quiet")
     assert gone not in held(run)
     assert new in held(run)
-    factors = load_run(run).graph().factors
+    factors = load_run(run).graph.factors
     assert [(f.i, f.j) for f in factors if f.origin == "loop"] == held(run)
 
 

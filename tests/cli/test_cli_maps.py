@@ -39,7 +39,7 @@ def test_plan_leads_from_start_to_goal(run_folder):
 
 
 def test_fuse_takes_another_trajectory_and_casts_only_what_moved(run_folder, tmp_path):
-    old = load_run(run_folder).trajectory()
+    old = load_run(run_folder).trajectory
     poses = old.T_world_body.copy()
     poses[-3:] = exp(np.zeros(3), np.array([0.0, 0.0, 0.2])) @ poses[-3:]
     write_tum(tmp_path / "moved.tum", Trajectory(old.stamps_ns, poses))

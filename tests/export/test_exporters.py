@@ -127,15 +127,15 @@ def check_costmap(run, path):
 
 
 def check_tum(run, path):
-    np.testing.assert_array_equal(read_tum(path).T_world_body, run.trajectory().T_world_body)
+    np.testing.assert_array_equal(read_tum(path).T_world_body, run.trajectory.T_world_body)
 
 
 def check_kitti(run, path):
-    np.testing.assert_allclose(read_kitti(path).T_world_body, run.trajectory().T_world_body, atol=1e-12)
+    np.testing.assert_allclose(read_kitti(path).T_world_body, run.trajectory.T_world_body, atol=1e-12)
 
 
 def check_g2o(run, path):
-    assert read_g2o(path).T_world_node.keys() == run.graph().T_world_node.keys()
+    assert read_g2o(path).T_world_node.keys() == run.graph.T_world_node.keys()
 
 
 def check_layout(run, path):

@@ -59,18 +59,18 @@ def test_the_numbers_are_the_run_s(runs):
     run = runs[0]
     data = drawn(chapter_of(run, "desk", []))
 
-    trajectory = run.trajectory()
+    trajectory = run.trajectory
     np.testing.assert_allclose(data["path"]["x"], trajectory.positions_world[:, 0], atol=6e-4)
     assert data["path"]["t"][0] == 0.0
-    assert data["frames"]["inliers"] == [record.diagnostics.inliers for record in run.records()]
+    assert data["frames"]["inliers"] == [record.diagnostics.inliers for record in run.records]
     assert [(loop["i"], loop["j"], loop["verdict"]) for loop in data["loops"]] == [
-        (loop.i, loop.j, loop.verdict) for loop in run.loops()
+        (loop.i, loop.j, loop.verdict) for loop in run.loops
     ]
 
 
 def test_uncertainty_and_doubt_are_the_poses_s(runs):
     chapter = chapter_of(runs[0], "desk", [])
-    path, poses = drawn(chapter)["path"], runs[0].poses()
+    path, poses = drawn(chapter)["path"], runs[0].poses
     np.testing.assert_allclose(path["band_m"], 2.0 * poses.horizontal_sigmas_m, rtol=2e-3, atol=1e-12)
     np.testing.assert_allclose(path["band_3d_m"], 2.0 * poses.position_sigmas_m, rtol=2e-3, atol=1e-12)
     assert path["band_m"][-1] > 0.0
@@ -86,7 +86,7 @@ def test_uncertainty_and_doubt_are_the_poses_s(runs):
 def test_the_errors_are_the_terms_of_the_ate(runs):
     run = runs[0]
     errors_m = np.array(drawn(chapter_of(run, "desk", []))["error"]["m"])
-    ate = next(m.value for m in evaluate(run.trajectory(), run.truth()) if m.name.startswith("ATE RMSE"))
+    ate = next(m.value for m in evaluate(run.trajectory, run.truth) if m.name.startswith("ATE RMSE"))
     assert np.sqrt((errors_m**2).mean()) == pytest.approx(ate, rel=1e-3)
 
 

@@ -85,20 +85,20 @@ def test_two_recordings_of_a_run_say_the_same(run, tmp_path):
 
 def test_the_paths_are_the_run_s(run, told):
     estimate = told.one("/world/path/estimate", "LineStrips3D:strips")[0]
-    np.testing.assert_allclose(estimate, run.trajectory().positions_world, atol=1e-6)
+    np.testing.assert_allclose(estimate, run.trajectory.positions_world, atol=1e-6)
     truth = told.one("/world/path/truth", "LineStrips3D:strips")[0]
     assert np.linalg.norm(truth[0] - estimate[0]) < 0.05  # laid over the estimate, in its own world
 
 
 def test_the_body_has_a_pose_at_every_exact_stamp(run, told):
-    trajectory = run.trajectory()
+    trajectory = run.trajectory
     rows = told.values("/world/body", "Transform3D:translation")
     assert [stamp for stamp, _ in rows] == trajectory.stamps_ns.tolist()
     np.testing.assert_allclose([value[0] for _, value in rows], trajectory.positions_world, atol=1e-6)
 
 
 def test_the_graph_is_nodes_and_lines_between_them(run, told):
-    graph = run.graph()
+    graph = run.graph
     nodes = told.one("/world/graph/nodes", "Points3D:positions")
     np.testing.assert_allclose(nodes, [T[:3, 3] for T in graph.T_world_node.values()], atol=1e-6)
     lines = told.one("/world/graph/odometry", "LineStrips3D:strips")
@@ -106,7 +106,7 @@ def test_the_graph_is_nodes_and_lines_between_them(run, told):
 
 
 def test_every_loop_is_a_line_by_verdict_and_a_line_of_text(run, told):
-    loops = run.loops()
+    loops = run.loops
     for verdict in ("accepted", "rejected"):
         count = sum(loop.verdict == verdict for loop in loops)
         entity = f"/world/loops/{verdict}"
@@ -140,7 +140,7 @@ def test_the_slice_lies_as_rerun_s_own_importer_lays_the_one_in_the_mcap(run, to
 def test_images_come_from_the_run_s_own_log(run, told):
     snapshots = list(snapshots_of(run))
     rows = told.values("/world/body/camera", "EncodedImage:blob")
-    assert len(rows) == len(snapshots) == -(-len(run.trajectory()) // run.config.mcap.image_stride)
+    assert len(rows) == len(snapshots) == -(-len(run.trajectory) // run.config.mcap.image_stride)
     assert [stamp for stamp, _ in rows] == [snapshot.stamp_ns for snapshot in snapshots]
     assert bytes(rows[0][1][0]) == snapshots[0].jpeg
     matrix = told.one("/world/body/camera", "Pinhole:image_from_camera")[0]
@@ -150,9 +150,9 @@ def test_images_come_from_the_run_s_own_log(run, told):
 def test_diagnostics_are_curves(run, told):
     for name in ("features", "matches", "inliers", "residual"):
         rows = told.values(f"/diagnostics/{name}", "Scalars:scalars")
-        wanted = [(record.stamp_ns, getattr(record.diagnostics, name)) for record in run.records()]
+        wanted = [(record.stamp_ns, getattr(record.diagnostics, name)) for record in run.records]
         assert [(stamp, value[0]) for stamp, value in rows] == wanted
-    assert len(told.values("/diagnostics/ms", "Scalars:scalars")) == len(run.records())
+    assert len(told.values("/diagnostics/ms", "Scalars:scalars")) == len(run.records)
 
 
 def test_a_run_without_images_loops_and_truth_can_be_told(desk_log, tmp_path):
@@ -275,7 +275,7 @@ def test_looking_on_changes_nothing(run, live):
 def test_a_build_is_told_frame_by_frame(live):
     run, told = live
     assert {name for chunks in told.chunks.values() for c in chunks for name in c.timeline_names} == {"stamp"}
-    records, trajectory = run.records(), run.trajectory()
+    records, trajectory = run.records, run.trajectory
     inliers = told.values("/diagnostics/inliers", "Scalars:scalars")
     assert [(stamp, value[0]) for stamp, value in inliers] == [
         (record.stamp_ns, record.diagnostics.inliers) for record in records
@@ -287,7 +287,7 @@ def test_a_build_is_told_frame_by_frame(live):
 
 def test_images_come_with_the_features_that_were_found_and_those_that_agreed(live):
     run, told = live
-    records = run.records()[::5]
+    records = run.records[::5]
     images = told.values("/world/live/body/camera", "EncodedImage:blob")
     assert [stamp for stamp, _ in images] == [record.stamp_ns for record in records]
     assert bytes(images[0][1][0])[:2] == b"\xff\xd8"
@@ -317,7 +317,7 @@ def test_estimates_end_up_in_the_levelled_world(live):
         [value[0] for _, value in told.values("/world/live/body", "Transform3D:translation")]
     )
     on_levelled = positions @ T[:3, :3].T + T[:3, 3]
-    assert np.abs(on_levelled - run.trajectory().positions_world).max() < 0.03  # what loops have moved
+    assert np.abs(on_levelled - run.trajectory.positions_world).max() < 0.03  # what loops have moved
 
     paths = [value for _, value in told.values("/world/live/estimates", "LineStrips3D:strips") if value]
     assert len(paths[-1][0]) > 0.9 * run.manifest.counts.nodes
@@ -328,7 +328,7 @@ def test_estimates_end_up_in_the_levelled_world(live):
 def test_the_results_follow(live):
     run, told = live
     estimate = told.one("/world/path/estimate", "LineStrips3D:strips")[0]
-    np.testing.assert_allclose(estimate, run.trajectory().positions_world, atol=1e-6)
+    np.testing.assert_allclose(estimate, run.trajectory.positions_world, atol=1e-6)
     assert {
         "/world/map/voxels",
         "/world/map/slice",

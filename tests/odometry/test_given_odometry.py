@@ -187,7 +187,7 @@ def test_a_desk_is_mapped_by_its_truth_on_the_command_line(desk_log, tmp_path):
     mapper("build", desk_log, "--out", tmp_path / "run", *settings, "--quiet")
     run = load_run(tmp_path / "run")
     assert run.manifest.counts.tracked == 31
-    (ate,) = (m.value for m in evaluate(run.trajectory(), run.truth()) if m.name.startswith("ATE RMSE"))
+    (ate,) = (m.value for m in evaluate(run.trajectory, run.truth) if m.name.startswith("ATE RMSE"))
     assert ate < 1e-6
     assert run.config.odometry.path == poses
 
@@ -196,7 +196,7 @@ def test_loops_move_given_poses_by_their_noise_only(desk_log, tmp_path):
     log = open_source(desk_log)
     for loops in ("none", "places"):
         run = build(log, given(f"loops.kind={loops}"), tmp_path / loops)
-        path = run.trajectory()
+        path = run.trajectory
         error = inverse(path.T_world_body[0]) @ path.T_world_body[-1]
         np.testing.assert_allclose(
             error,

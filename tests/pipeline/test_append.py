@@ -32,15 +32,15 @@ def joined(first, desk_log):
 
 def test_both_sessions_are_one_run_in_the_first_one_s_world(first, joined):
     counts = joined.manifest.counts
-    assert counts.listed == counts.tracked == len(joined.trajectory()) == 31
-    assert [record.stamp_ns for record in joined.records()] == joined.trajectory().stamps_ns.tolist()
+    assert counts.listed == counts.tracked == len(joined.trajectory) == 31
+    assert [record.stamp_ns for record in joined.records] == joined.trajectory.stamps_ns.tolist()
     assert joined.manifest.levelling == first.manifest.levelling
 
-    T_first, T_joined = (run.graph().T_world_node for run in (first, joined))
+    T_first, T_joined = (run.graph.T_world_node for run in (first, joined))
     assert list(T_joined)[: len(T_first)] == list(T_first)
     np.testing.assert_allclose(T_joined[0], T_first[0], atol=1e-9)
 
-    matched = associate(joined.trajectory(), joined.truth())
+    matched = associate(joined.trajectory, joined.truth)
     assert ate(align(matched, "se3").moved(matched)).rmse < 0.02
 
 
@@ -59,29 +59,27 @@ def test_edits_by_hand_hold_in_the_joined_map(first, joined, desk_log, tmp_path)
 
 
 def test_loops_between_the_sessions_hold(first, joined):
-    known = first.graph().T_world_node.keys()
-    loops = joined.loops()
-    assert [(loop.i, loop.j) for loop in loops[: len(first.loops())]] == [
-        (loop.i, loop.j) for loop in first.loops()
+    known = first.graph.T_world_node.keys()
+    loops = joined.loops
+    assert [(loop.i, loop.j) for loop in loops[: len(first.loops)]] == [
+        (loop.i, loop.j) for loop in first.loops
     ]
     assert any(loop.verdict == "accepted" and loop.i in known and loop.j not in known for loop in loops)
     held = [(loop.i, loop.j) for loop in loops if loop.verdict == "accepted"]
-    factors = joined.graph().factors
+    factors = joined.graph.factors
     assert [(f.i, f.j) for f in factors[len(factors) - len(held) :]] == held
     assert {f.origin for f in factors[: len(factors) - len(held)]} == {"odometry"}
 
 
 def test_every_frame_hangs_on_its_node(joined):
-    graph = joined.graph()
-    T_by_stamp = dict(
-        zip(joined.trajectory().stamps_ns.tolist(), joined.trajectory().T_world_body, strict=True)
-    )
-    for record in joined.records():
+    graph = joined.graph
+    T_by_stamp = dict(zip(joined.trajectory.stamps_ns.tolist(), joined.trajectory.T_world_body, strict=True))
+    for record in joined.records:
         if record.is_keyframe:
             np.testing.assert_allclose(
                 T_by_stamp[record.stamp_ns], graph.T_world_node[record.node], atol=1e-9
             )
-    assert {record.node for record in joined.records()} == set(graph.T_world_node)
+    assert {record.node for record in joined.records} == set(graph.T_world_node)
 
 
 def test_the_manifest_remembers_both_logs(joined, desk_log):
@@ -123,10 +121,10 @@ def test_moved_logs_are_told_in_their_order(joined, desk_log, tmp_path):
 
 def test_loops_can_be_edited_afterwards(first, joined, tmp_path):
     run = shutil.copytree(joined.path, tmp_path / "run")
-    known = first.graph().T_world_node.keys()
+    known = first.graph.T_world_node.keys()
     between = [
         (loop.i, loop.j)
-        for loop in joined.loops()
+        for loop in joined.loops
         if loop.verdict == "accepted" and loop.i in known and loop.j not in known
     ]
     mapper("loops", run, "--remove", *between[0], "--quiet")
@@ -144,7 +142,7 @@ def test_a_third_session_is_appended_to_two(joined, desk_log, tmp_path):
     assert three.manifest.counts.tracked == 31 + 13
     assert [len(session.log) for session in sessions_of(open_log(three))] == [16, 15, 13]
     assert three.manifest.input.appended[1].shift_ns > 0
-    matched = associate(three.trajectory(), three.truth())
+    matched = associate(three.trajectory, three.truth)
     assert len(matched) == 44
     assert ate(align(matched, "se3").moved(matched)).rmse < 0.02
     assert three.manifest.timing.log_s == pytest.approx(31 / 15 + 11 / 15, abs=0.2)

@@ -60,35 +60,33 @@ class Observer:
 
 def test_every_frame_is_tracked_close_to_the_truth(run):
     counts = run.manifest.counts
-    assert counts.listed == counts.tracked == len(run.trajectory()) == 31
-    assert counts.nodes == len(run.graph().T_world_node) >= 2
+    assert counts.listed == counts.tracked == len(run.trajectory) == 31
+    assert counts.nodes == len(run.graph.T_world_node) >= 2
 
-    matched = associate(run.trajectory(), run.truth())
+    matched = associate(run.trajectory, run.truth)
     assert ate(align(matched, "se3").moved(matched)).rmse < 0.02
 
 
 def test_the_world_is_levelled_with_the_floor_at_zero(run):
-    T_world_body = run.trajectory().T_world_body
+    T_world_body = run.trajectory.T_world_body
     assert run.manifest.levelling.method == "planes"
     assert (T_world_body[:, 2, 3] > 0.5).all()
     assert (T_world_body[:, 2, 3] < 2.0).all()
 
-    truth = (
-        run.truth()
-    )  # the synthetic world's z is up and its floor at 0, so heights agree without alignment
+    truth = run.truth  # the synthetic world's z is up and its floor at 0, so heights agree without alignment
     np.testing.assert_allclose(T_world_body[:, 2, 3], truth.T_world_body[:, 2, 3], atol=0.05)
 
 
 def test_the_graph_is_the_trajectory_s(run):
-    T_by_stamp = dict(zip(run.trajectory().stamps_ns.tolist(), run.trajectory().T_world_body, strict=True))
-    graph = run.graph()
+    T_by_stamp = dict(zip(run.trajectory.stamps_ns.tolist(), run.trajectory.T_world_body, strict=True))
+    graph = run.graph
     for node, stamp_ns in graph.stamps_ns.items():
         np.testing.assert_allclose(graph.T_world_node[node], T_by_stamp[stamp_ns], atol=1e-9)
 
 
 def test_poses_are_less_certain_the_farther_they_are(run):
-    poses = run.poses()
-    np.testing.assert_allclose(poses.trajectory.T_world_body, run.trajectory().T_world_body, atol=1e-12)
+    poses = run.poses
+    np.testing.assert_allclose(poses.trajectory.T_world_body, run.trajectory.T_world_body, atol=1e-12)
     assert not poses.is_doubtful.any()
     np.testing.assert_array_equal(poses.covariances[0], np.zeros((6, 6)))
     sigmas_m = poses.position_sigmas_m
@@ -152,7 +150,7 @@ def test_the_log_holds_the_whole_story(run):
     assert topics["/camera/image"] == 4
     assert {"/trajectory/estimate", "/trajectory/truth", "/graph/factors"} <= set(topics)
     assert {"/map/octree", "/map/cloud", "/map/slice"} <= set(topics)
-    stamps = run.trajectory().stamps_ns
+    stamps = run.trajectory.stamps_ns
     assert summary.statistics.message_start_time == stamps[0]
     assert summary.statistics.message_end_time == stamps[-1]
 
@@ -248,7 +246,7 @@ def test_bad_frames_are_skipped_counted_and_reported(damaged_log, tmp_path):
     assert run.manifest.counts.skipped == len(run.manifest.skipped) == 2
     assert run.manifest.counts.tracked == 29
     assert images[5].name in run.manifest.skipped[0].reason
-    assert [record.outcome for record in run.records()].count("skipped") == 2
+    assert [record.outcome for record in run.records].count("skipped") == 2
     assert sum(note.startswith("skipped: ") for note in observer.notes) == 2
     assert observer.reached == {"track": (31, 31), "fuse": (29, 29)}
 

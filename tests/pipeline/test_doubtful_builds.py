@@ -43,27 +43,27 @@ def doubted(desk_log, tmp_path_factory):
 def test_doubtful_frames_are_counted_and_named(doubted):
     counts = doubted.manifest.counts
     assert (counts.tracked, counts.doubtful, counts.lost) == (28, 3, 0)
-    records = doubted.records()
+    records = doubted.records
     assert [k for k, record in enumerate(records) if record.outcome == "doubtful"] == list(DOUBTED)
     assert records[14].doubts == (DOUBT, "12 inliers on one side of the image")
     assert counts.frames_text == "28 tracked, 3 doubtful, 0 lost, 0 skipped"
 
 
 def test_they_have_poses_between_their_neighbours(doubted, desk_run):
-    ours, right = doubted.trajectory(), desk_run.trajectory()
+    ours, right = doubted.trajectory, desk_run.trajectory
     assert len(ours) == 31
     apart = np.linalg.norm(ours.positions_world - right.positions_world, axis=1)
     assert apart.max() < 0.05
 
 
 def test_they_are_in_no_map(doubted):
-    stamps_ns = doubted.trajectory().stamps_ns
-    assert set(stamps_ns) - set(doubted.tracked_trajectory().stamps_ns) == set(stamps_ns[list(DOUBTED)])
+    stamps_ns = doubted.trajectory.stamps_ns
+    assert set(stamps_ns) - set(doubted.tracked_trajectory.stamps_ns) == set(stamps_ns[list(DOUBTED)])
     with open_scan_updates(doubted.path / "scan_updates.bin") as updates:
         fused = {
             k
             for k, (stamp_ns, T) in enumerate(
-                zip(stamps_ns.tolist(), doubted.trajectory().T_world_body, strict=True)
+                zip(stamps_ns.tolist(), doubted.trajectory.T_world_body, strict=True)
             )
             if updates.holds(stamp_ns, T, config=doubted.config.octree)
         }
@@ -83,7 +83,7 @@ def test_fusing_again_leaves_them_out_again(doubted, tmp_path):
 
 def test_a_pose_that_is_given_is_not_doubted(doubted, desk_run, tmp_path):
     again = load_run(shutil.copytree(doubted.path, tmp_path / "again"))
-    fused = fuse(open_log(again), again, again.config, trajectory=desk_run.trajectory())
+    fused = fuse(open_log(again), again, again.config, trajectory=desk_run.trajectory)
     assert fused.manifest.counts.doubtful == 0
     assert (fused.path / "map.ot").read_bytes() == (desk_run.path / "map.ot").read_bytes()
 
@@ -99,12 +99,12 @@ def test_an_appended_session_keeps_those_of_both(desk_log, tmp_path, monkeypatch
     doubt_frames(monkeypatch, {7: WRONG, 8: WRONG, 10: WRONG})
     config = load_config(None, [*settings, "source.last_frame=15"])
     first = build(open_source(desk_log, config.source), config, tmp_path / "first")
-    before = {r.stamp_ns for r in first.records() if r.outcome == "doubtful"}
+    before = {r.stamp_ns for r in first.records if r.outcome == "doubtful"}
     assert before
     second = load_config(None, [*settings, "source.first_frame=16"])
     joined = append(open_source(desk_log, second.source), first, second, tmp_path / "joined")
-    doubtful = {r.stamp_ns for r in joined.records() if r.outcome == "doubtful"}
+    doubtful = {r.stamp_ns for r in joined.records if r.outcome == "doubtful"}
     assert before < doubtful
     assert joined.manifest.counts.doubtful == len(doubtful)
-    matched = associate(joined.trajectory(), joined.truth())
+    matched = associate(joined.trajectory, joined.truth)
     assert ate(align(matched, "se3").moved(matched)).max < 0.1

@@ -69,7 +69,7 @@ def test_strict_builds_end_with_status_1_and_are_whole(desk_log, tmp_path, monke
     printed = result.stdout
     assert "\nverdict " in printed
     assert "24 tracked, 7 doubtful, 0 lost" in printed
-    assert evaluate(run.trajectory(), run.truth())
+    assert evaluate(run.trajectory, run.truth)
 
     said = mapper("eval", run.path).stdout
     assert "verdict  doubtful\n" in said

@@ -41,16 +41,16 @@ def run(log, tmp_path_factory):
 
 
 def error_m(run):
-    return next(m.value for m in evaluate(run.trajectory(), run.truth()) if m.name.startswith("ATE"))
+    return next(m.value for m in evaluate(run.trajectory, run.truth) if m.name.startswith("ATE"))
 
 
 def test_every_scan_is_placed_close_to_the_truth(run):
-    assert run.manifest.counts.read == len(run.trajectory()) == 21
+    assert run.manifest.counts.read == len(run.trajectory) == 21
     assert error_m(run) < 0.02
 
 
 def test_the_floor_is_under_the_vehicle(run):
-    heights_m = run.trajectory().positions_world[:, 2]
+    heights_m = run.trajectory.positions_world[:, 2]
 
     assert "m below the sensor" in run.manifest.levelling.detail
     np.testing.assert_allclose(heights_m, 1.7, atol=0.25)  # the street undulates
@@ -58,7 +58,7 @@ def test_the_floor_is_under_the_vehicle(run):
 
 def test_the_street_is_free_where_the_vehicle_drove(run):
     grid = read_grid(run.path / "slice.yaml")
-    for position in run.trajectory().positions_world[5:-1]:
+    for position in run.trajectory.positions_world[5:-1]:
         column, row = np.floor((position[:2] - grid.origin_world_m) / grid.resolution_m).astype(int)
         assert grid.cells[row, column] == FREE
 

@@ -47,7 +47,7 @@ def in_map(first, log, out, *overrides):
 
 def miss_m(first, log, trajectory):
     """Return how far poses are from the truth, brought into the map by what fits the map's own path best."""
-    own, own_truth, truth = first.trajectory(), first.truth(), open_source(log).truth
+    own, own_truth, truth = first.trajectory, first.truth, open_source(log).truth
     known = own_truth.positions_world[nearest(own_truth.stamps_ns, own.stamps_ns)[0]]
     T_map_truth, _ = fit_rigid(own.positions_world, known)
     true = truth.moved(T_map_truth).positions_world[nearest(truth.stamps_ns, trajectory.stamps_ns)[0]]

@@ -52,7 +52,7 @@ def appended(run, log, out):
 
 
 def error_m(run):
-    matched = associate(run.trajectory(), run.truth())
+    matched = associate(run.trajectory, run.truth)
     return ate(align(matched, "se3").moved(matched)).rmse
 
 
@@ -60,8 +60,8 @@ def test_a_loop_between_scans_can_be_added_by_hand(first, tmp_path):
     shutil.copytree(first.path, tmp_path / "run")
     copy = load_run(tmp_path / "run")
     edited = edit_loops(open_log(copy), copy, add=[(2, 9)])
-    (loop,) = edited.loops()
-    truth = edited.truth()
+    (loop,) = edited.loops
+    truth = edited.truth
     T_world_body = dict(zip(truth.stamps_ns.tolist(), truth.T_world_body, strict=True))
     miss = discrepancy(loop.T_i_j, T_world_body[loop.stamp_i_ns], T_world_body[loop.stamp_j_ns])
     assert (loop.proposed_by, loop.verdict) == ("hand", "accepted")
@@ -75,17 +75,17 @@ def test_scans_of_two_places_are_no_loop_whoever_says_so(first, tmp_path):
     copy = load_run(tmp_path / "run")
     with pytest.raises(LoopError, match=r"loop 0 → 20: not added; (vote|overlap|sight): "):
         edit_loops(open_log(copy), copy, add=[(0, 20)])
-    assert load_run(copy.path).loops() == []
+    assert load_run(copy.path).loops == []
 
 
 def test_a_second_drive_is_tied_to_the_first(first, logs, tmp_path):
     joined = appended(first, logs / "again", tmp_path / "joined")
-    nodes = len(first.graph().T_world_node)
-    between = [loop for loop in joined.loops() if loop.verdict == "accepted" and loop.i < nodes <= loop.j]
+    nodes = len(first.graph.T_world_node)
+    between = [loop for loop in joined.loops if loop.verdict == "accepted" and loop.i < nodes <= loop.j]
     assert len(between) >= 5
     assert {loop.proposed_by for loop in between} == {"scans"}
     assert error_m(joined) < 0.1
-    np.testing.assert_allclose(joined.graph().T_world_node[0], first.graph().T_world_node[0], atol=1e-9)
+    np.testing.assert_allclose(joined.graph.T_world_node[0], first.graph.T_world_node[0], atol=1e-9)
 
 
 def test_a_drive_elsewhere_is_refused(first, logs, tmp_path):

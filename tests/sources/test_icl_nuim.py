@@ -180,7 +180,7 @@ def test_a_build_has_the_error_of_the_same_frames_in_a_tum_folder(desk_log, tmp_
     for folder in (icl, tum):
         log = open_source(folder)
         run = build(log, load_config(), tmp_path / f"run of {folder.name}")
-        metrics[log.kind] = {m.name: m.value for m in evaluate(run.trajectory(), run.truth())}
+        metrics[log.kind] = {m.name: m.value for m in evaluate(run.trajectory, run.truth)}
 
     assert metrics["icl-nuim"] == pytest.approx(metrics["tum"], rel=1e-6, abs=1e-9)
     assert metrics["icl-nuim"]["ATE RMSE, SE(3)-aligned"] < 0.02
