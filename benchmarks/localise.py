@@ -28,7 +28,7 @@ from mapper.pipeline.build import build
 from mapper.pipeline.known_map import load_known_map
 from mapper.pipeline.localise import localise
 from mapper.run import files
-from mapper.run.folder import Run, load_run
+from mapper.run.folder import Run, open_run
 from mapper.run.frame_outcomes import read_records
 from mapper.run.pose_covariances import read_poses
 from mapper.simulation import write_tum_log
@@ -104,7 +104,7 @@ def _synthetic(out: Path, scene: str, seed: int, day: int) -> Path:
 def _built(out: Path, log: Log) -> tuple[Run, float]:
     """Return the map of a log and the CPU seconds that it took; NaN if it was there."""
     if out.exists():
-        return load_run(out), float("nan")
+        return open_run(out), float("nan")
     config: BuildConfig = load_config(None, ["min_tracked_frames=5"], sensor=log.sensor)
     began = time.process_time()
     run = build(log, config, out)

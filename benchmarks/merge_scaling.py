@@ -31,8 +31,8 @@ from mapper.merging.merge import merge
 from mapper.merging.placing import as_built
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
-from mapper.octree.octomap_file import read_map
-from mapper.run.folder import Run, load_run, write_run
+from mapper.octree.octomap_file import read_octree
+from mapper.run.folder import Run, open_run, write_run
 from mapper.run.manifest import Input, Manifest
 from mapper.simulation.config import LIDAR_SCENES
 from mapper.simulation.lidar import write_lidar_log
@@ -76,7 +76,7 @@ def make_runs(source: Log, resolution_m: float, *, stride: int, folder: Path) ->
             write_tum(
                 writer.folder / "trajectory.tum", Trajectory(truth.stamps_ns[indices[list(piece)]], poses)
             )
-        runs.append(load_run(path))
+        runs.append(open_run(path))
     return runs
 
 
@@ -108,7 +108,7 @@ def print_merge(runs: list[Run], out: Path, poses: Path | None = None) -> None:
     """Print a line of that table."""
     cost = merged_apart(runs, out, processes=1, poses=poses)
     manifest = json.loads((out / "manifest.json").read_text())
-    whole = read_map(out / "map.ot")
+    whole = read_octree(out / "map.ot")
     print(
         f"{len(runs):4} {len(manifest['tiles']):6} {1e6 * manifest['area_km2']:8.0f} {len(whole):11} "
         f"{cost.peak_mb:8.0f} {whole.memory_bytes / 1e6:9.0f} {cost.wall_s:7.1f}",
@@ -124,7 +124,7 @@ def copied(runs: list[Run], folder: Path, *, copies: int) -> tuple[list[Run], Pa
         for run in runs:
             path = folder / f"{run.path.name}_{column}_{row}"
             shutil.copytree(run.path, path, dirs_exist_ok=True)
-            many.append(load_run(path))
+            many.append(open_run(path))
             lines.append(f"{path.name} {column * pitch_m!r} {row * pitch_m!r} 0 0 0 0 1")
     poses = folder / "poses.txt"
     poses.write_text("\n".join(lines) + "\n")
@@ -159,7 +159,7 @@ def print_costs(runs: list[Run], folder: Path) -> None:
 
 def print_peer(runs: list[Run], folder: Path) -> None:
     """Merge the same maps in OctoMap, voxel by voxel, and compare time and every log-odds."""
-    maps = [read_map(run.path / "map.octree") for run in runs[:PEER_RUNS]]
+    maps = [read_octree(run.path / "map.octree") for run in runs[:PEER_RUNS]]
     OctreeMap(maps[0].config).add(maps[0])  # compiled, or loaded, before it is timed
     began = process_time()
     ours = OctreeMap(maps[0].config)
@@ -183,7 +183,7 @@ def print_peer(runs: list[Run], folder: Path) -> None:
         binding_s += process_time() - began
     tree.updateInnerOccupancy()
     tree.write(str(folder / "theirs.ot"))
-    theirs, leaves = read_map(folder / "theirs.ot").leaves(), ours.leaves()
+    theirs, leaves = read_octree(folder / "theirs.ot").leaves(), ours.leaves()
     equal = np.array_equal(theirs.keys, leaves.keys) and np.array_equal(theirs.log_odds, leaves.log_odds)
     print(
         f"{PEER_RUNS} runs, {len(leaves.keys)} voxels: ours {ours_s:.3f} s CPU, OctoMap {theirs_s:.1f} s, "

@@ -24,7 +24,7 @@ from mapper.core.timebase import nearest
 from mapper.octree import kernels
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
-from mapper.octree.octomap_file import read_map, write_bt, write_ot
+from mapper.octree.octomap_file import read_octree, write_bt, write_ot
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.trajectory_files import read_kitti
@@ -100,7 +100,7 @@ def fuse_theirs(case: Case, *, discretize: bool) -> tuple[Any, list[float], list
 def same_leaves(octree: OctreeMap, tree: Any, folder: Path) -> bool:
     """Tell whether keys and float32 log-odds agree, by way of the C++ library's own file."""
     tree.write(str(folder / "theirs.ot"))
-    ours, theirs = octree.leaves(), read_map(folder / "theirs.ot").leaves()
+    ours, theirs = octree.leaves(), read_octree(folder / "theirs.ot").leaves()
     return np.array_equal(ours.keys, theirs.keys) and np.array_equal(ours.log_odds, theirs.log_odds)
 
 

@@ -172,12 +172,12 @@ def appended(
     from evaluators.metrics.evaluate import evaluate
     from mapper.config.loading import overridden
     from mapper.pipeline.append import append
-    from mapper.run.folder import load_run
+    from mapper.run.folder import open_run
     from mapper.sources import open_source
     from mapper.sources.config import SourceConfig
 
     prepare_libraries()
-    first = load_run(onto)
+    first = open_run(onto)
     config = overridden(first.config.model_copy(update={"source": SourceConfig()}), overrides)
     source = open_source(log, config.source)
     run = append(source, first, config, out, progress=progress_for(quiet=quiet), overwrite=overwrite)

@@ -44,10 +44,10 @@ def diff(
     """
     from mapper.merging.difference_files import summary, write_differences
     from mapper.merging.differences import differences_of
-    from mapper.run.folder import load_run
+    from mapper.run.folder import open_run
 
     prepare_libraries()
-    earlier, later = load_run(before), load_run(after)
+    earlier, later = open_run(before), open_run(after)
     progress = progress_for(quiet=quiet)
     placing = placing_of([earlier, later], place, poses, progress=progress)
     found = differences_of(*placing.placed, tolerance_m=tolerance_m, min_voxels=min_voxels)

@@ -69,7 +69,7 @@ def _accept(run: Path | None, names: "Sequence[str]") -> None:
     from mapper.core.errors import ConfigError
     from mapper.export.grid import read_grid
     from mapper.run import files
-    from mapper.run.folder import load_run
+    from mapper.run.folder import open_run
 
     if run is None:
         raise ConfigError(f"--accept {names[0]}: want the run that it is a file of: mapper doctor RUN")
@@ -80,7 +80,7 @@ def _accept(run: Path | None, names: "Sequence[str]") -> None:
             )
             raise ConfigError(f"--accept {name}: is no map that can be edited; want one of {known}")
         read_grid((run / name).with_suffix(".yaml"))
-    with load_run(run).changing(names):
+    with open_run(run).changing(names):
         pass
 
 

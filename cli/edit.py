@@ -56,7 +56,7 @@ def edit(
     """
     from mapper.core.errors import ConfigError
     from mapper.pipeline.edit_map import add_region, undo_region
-    from mapper.run.folder import load_run, moved_log, open_log
+    from mapper.run.folder import moved_log, open_run
 
     kinds: list[EditKind] = []
     if erase:
@@ -72,12 +72,12 @@ def edit(
         raise ConfigError(f"--{kinds[0]}: want a region: --box, --height, --radius or --polygon")
     if region is not None and not kinds:
         raise ConfigError("a region alone changes nothing: want --erase, --keep or --keepout with it")
-    built = load_run(run)
+    built = open_run(run)
     if kinds or undo:
         prepare_libraries()
         if log:
             built = moved_log(built, *log)
-        source, progress = open_log(built), progress_for(quiet=quiet)
+        source, progress = built.open_log(), progress_for(quiet=quiet)
         if region is None:
             built = undo_region(source, built, progress=progress)
         else:

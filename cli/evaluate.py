@@ -159,7 +159,7 @@ def _loaded(
 ) -> "tuple[Run | None, Trajectory, Trajectory | None]":
     from evaluators.metrics.pose_files import is_kitti, read_poses
     from mapper.core.errors import DataError
-    from mapper.run.folder import load_run
+    from mapper.run.folder import open_run
 
     untimed = [path for path in (estimate, truth) if path and path.is_file() and is_kitti(path)]
     if times is not None and not untimed:
@@ -169,7 +169,7 @@ def _loaded(
     known = read_poses(truth, times=times) if truth else None
     if estimate.is_file():
         return None, read_poses(estimate, times=times), known
-    run = load_run(estimate)
+    run = open_run(estimate)
     return run, run.trajectory, known or run.truth
 
 
@@ -192,9 +192,9 @@ def _quality(run: "Run", path: Path, *, world: World | None, register: bool, tol
 
 
 def _log_of(run: "Run", log: Path | None) -> "Log":
-    from mapper.run.folder import moved_log, open_log
+    from mapper.run.folder import moved_log
 
-    return open_log(run if log is None else moved_log(run, log))
+    return (run if log is None else moved_log(run, log)).open_log()
 
 
 def _sharpness_of(source: "Log", trajectory: "Trajectory") -> "list[Metric]":

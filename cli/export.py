@@ -34,10 +34,10 @@ def export(
     """
     from mapper.config.loading import overridden
     from mapper.export.exporters import export as export_run
-    from mapper.run.folder import load_run, moved_log
+    from mapper.run.folder import moved_log, open_run
 
     prepare_libraries()
-    built = load_run(run)
+    built = open_run(run)
     if log:
         built = moved_log(built, *log)
     changes = merged(assignments({"octomap.level": level}), set_)

@@ -29,16 +29,16 @@ def fuse(
     from evaluators.metrics.evaluate import evaluate
     from mapper.config.loading import overridden
     from mapper.pipeline.fuse import fuse as fuse_run
-    from mapper.run.folder import load_run, moved_log, open_log
+    from mapper.run.folder import moved_log, open_run
     from mapper.sources.trajectory_files import read_tum
 
     prepare_libraries()
-    built = load_run(run)
+    built = open_run(run)
     if log:
         built = moved_log(built, *log)
     config = overridden(built.config, set_ or ())
     fused = fuse_run(
-        open_log(built),
+        built.open_log(),
         built,
         config,
         trajectory=None if trajectory is None else read_tum(trajectory),

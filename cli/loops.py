@@ -46,9 +46,9 @@ def loops(
 
     Example: mapper loops runs/xyz, or: mapper loops runs/xyz --add 3 71 --remove 17 40
     """
-    from mapper.run.folder import load_run, moved_log, open_log
+    from mapper.run.folder import moved_log, open_run
 
-    built = load_run(run)
+    built = open_run(run)
     if add or remove:
         from cli.summary import summary_text
         from evaluators.metrics.evaluate import evaluate
@@ -58,7 +58,7 @@ def loops(
         if log:
             built = moved_log(built, *log)
         built = edit_loops(
-            open_log(built),
+            built.open_log(),
             built,
             add=[_pair("--add", text) for text in add or ()],
             remove=[_pair("--remove", text) for text in remove or ()],

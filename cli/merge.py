@@ -47,12 +47,12 @@ def merge(
     --out maps/city --place truth --scheduler tcp://10.0.0.1:8786
     """
     from mapper.merging.merge import merge as merge_runs
-    from mapper.run.folder import load_run
+    from mapper.run.folder import open_run
 
     workers = workers_for(processes, scheduler, default=1)
     prepare_libraries()
     progress = progress_for(quiet=quiet)
-    placing = placing_of([load_run(run) for run in runs], place, poses, progress=progress)
+    placing = placing_of([open_run(run) for run in runs], place, poses, progress=progress)
     merged = merge_runs(
         placing.placed,
         out,

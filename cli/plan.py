@@ -78,21 +78,21 @@ def plan(
     from mapper.navigation.config import PlanConfig
     from mapper.navigation.planner import plan_2d, plan_3d
     from mapper.navigation.storey_planner import plan_storeys
-    from mapper.octree.octomap_file import read_map
+    from mapper.octree.octomap_file import read_octree
     from mapper.run import files
-    from mapper.run.folder import Run, load_run
+    from mapper.run.folder import Run, open_run
     from mapper.run.manifest import is_merged_map
 
     has_storeys = not in_3d and layer == Layer.TRAVERSABLE and (run / f"{files.storey(0)}.yaml").exists()
     counts = (3,) if in_3d else (2, 3) if has_storeys else (2,)
     start, goal = (_point(text, name, counts) for text, name in zip((from_, to), _POINT_OPTIONS, strict=True))
     config = overridden(PlanConfig(), assignments({"radius_m": radius, "unknown": unknown, "layer": layer}))
-    built = open_map(run) if is_merged_map(run) else load_run(run)
+    built = open_map(run) if is_merged_map(run) else open_run(run)
     if not isinstance(built, Run) and config.layer == "traversable":
         raise ConfigError(f"{run}: a merged map has no traversable floor; plan with --layer slice, or --3d")
     grid = stored_grid(built, config.layer)
     if in_3d:
-        found = plan_3d(read_map(built.file(files.OCTREE_OT)), start, goal, config=config)
+        found = plan_3d(read_octree(built.file(files.OCTREE_OT)), start, goal, config=config)
     elif has_storeys and isinstance(built, Run):
         found = plan_storeys(storeys_of_run(built), start, goal, config=config)
     else:

@@ -30,11 +30,11 @@ def report(
     from mapper.core.errors import RunError
     from mapper.export.report.data import chapter_of
     from mapper.export.report.page import write_report
-    from mapper.run.folder import load_run
+    from mapper.run.folder import open_run
 
     if out.exists() and not overwrite:
         raise RunError(f"{out}: exists already; choose another --out, or pass --overwrite to replace it")
-    loaded = [load_run(run) for run in runs]
+    loaded = [open_run(run) for run in runs]
     names = _names(runs)
     write_report(out, [chapter_of(run, name, _figures(run)) for run, name in zip(loaded, names, strict=True)])
     if not quiet:

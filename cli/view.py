@@ -29,13 +29,13 @@ def view(
     from mapper.core.errors import ConfigError, RunError
     from mapper.export.rerun.finished import show_run
     from mapper.run.files import RERUN
-    from mapper.run.folder import load_run
+    from mapper.run.folder import open_run
 
     if (rrd is not None) + spawn + (connect is not None) > 1:
         raise ConfigError("--rrd, --spawn and --connect: choose one")
     if rrd is not None and rrd.exists() and not overwrite:
         raise RunError(f"{rrd}: exists already; choose another --rrd, or pass --overwrite to replace it")
-    built = load_run(run)
+    built = open_run(run)
     if spawn or connect is not None:
         show_run(built, "spawn" if connect is None else f"connect:{connect}")
         return

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from mapper.core.errors import MapperError
 from mapper.run.checks import check_run
-from mapper.run.folder import load_run
+from mapper.run.folder import open_run
 from mapper.runtime.atomic import partial_of
 
 MAPPER = [sys.executable, "-c", "import sys; sys.argv[0] = 'mapper'; from cli.main import main; main()"]
@@ -157,7 +157,7 @@ class Soak:
 
     def _check(self, run: Path, what: str) -> None:
         try:
-            load_run(run)
+            open_run(run)
             findings = check_run(run)
         except (MapperError, OSError) as error:
             self.faults.append(f"{what}: {error}")

@@ -48,11 +48,11 @@ def desk_log(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 @pytest.fixture(scope="session")
 def desk_run(desk_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator["Run"]:
     """The run built of the desk log with the defaults, repeatable; tests that change it work on a copy."""
-    from mapper.run.folder import load_run
+    from mapper.run.folder import open_run
     from tests.support.desk import build_desk_run
 
     with shared_folder(tmp_path_factory, "runs/desk", partial(build_desk_run, desk_log)) as run:
-        yield load_run(run)
+        yield open_run(run)
 
 
 @pytest.fixture(scope="session")

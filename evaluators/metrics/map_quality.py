@@ -13,7 +13,7 @@ from evaluators.metrics.trajectory import associate
 from mapper.core.errors import DataError
 from mapper.core.frames import Points32
 from mapper.core.geometry import Transform, apply, inverse, mean_rotation, transform
-from mapper.octree.octomap_file import read_map
+from mapper.octree.octomap_file import read_octree
 from mapper.registration.refining import refined_motion
 from mapper.registration.surfaces import prepared
 from mapper.run import files
@@ -58,7 +58,7 @@ def map_quality(
             no points to register.
     """
     world = world or ("truth" if reference.in_truth else "map")
-    octree = read_map(run.file(files.OCTREE_MAP))
+    octree = read_octree(run.file(files.OCTREE_MAP))
     cloud = read_cloud(run.file(files.CLOUD), scale=1.0).points
     T_map_reference = _laid_by_truth(run) if world == "truth" else np.eye(4)
     how = "by the truth's poses" if world == "truth" else "in the run's own world"

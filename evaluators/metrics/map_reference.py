@@ -17,7 +17,7 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import Points, Transform, apply, inverse
 from mapper.core.voxel_grid import thin
 from mapper.octree.map import OctreeMap
-from mapper.octree.octomap_file import read_map
+from mapper.octree.octomap_file import read_octree
 from mapper.run.files import OCTREE_MAP
 from mapper.sources.cloud_files import ENDINGS, read_cloud
 
@@ -71,7 +71,7 @@ def read_reference(path: Path, *, voxel_m: float) -> Reference:
     if ending == ".json":
         return Reference("synthetic world", signed_distance_m=scene_distance(path), in_truth=True)
     if ending in MAP_ENDINGS:
-        return _octree(read_map(path), voxel_m)
+        return _octree(read_octree(path), voxel_m)
     if ending in ENDINGS:
         points = read_cloud(path).points
         return Reference("cloud", points=points[thin(points, _THINNED_RATIO * voxel_m)].astype(np.float64))

@@ -24,9 +24,9 @@ from mapper.export.mesh_files import Triangles, write_mesh
 from mapper.mapping.cloud import Colors
 from mapper.octree.blocks import check_memory
 from mapper.octree.map import OctreeMap
-from mapper.octree.octomap_file import read_map
+from mapper.octree.octomap_file import read_octree
 from mapper.run import files
-from mapper.run.folder import Run, open_log
+from mapper.run.folder import Run
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef
@@ -77,7 +77,7 @@ def surface(run: Run, path: Path, progress: Progress) -> None:
     """
     o3d = _open3d()
     config = run.config.mesh
-    octree, max_depth_m = read_map(run.file(files.OCTREE_MAP)), _max_depth_m(run)
+    octree, max_depth_m = read_octree(run.file(files.OCTREE_MAP)), _max_depth_m(run)
     volume = _Volume(o3d, config, max_depth_m=max_depth_m, blocks=_expected_blocks(octree, config))
     for view in _views(run, octree, progress):
         volume.add(view)
@@ -158,7 +158,7 @@ def _views(run: Run, octree: OctreeMap, progress: Progress) -> Iterator[_View]:
     T_world_body = dict(
         zip(trajectory.stamps_ns[::stride].tolist(), trajectory.T_world_body[::stride], strict=True)
     )
-    source = open_log(run)
+    source = run.open_log()
     entries = (entry for entry in source.entries() if entry.stamp_ns in T_world_body)
 
     def prepare(entry: FrameRef) -> _View | str:

@@ -14,7 +14,7 @@ from mapper.mapping.cloud import Colors
 from mapper.mapping.fusion import Maps, Snapshot
 from mapper.navigation.floor import reachable_floor
 from mapper.navigation.traversable import Storey, traversable
-from mapper.octree.octomap_file import read_map
+from mapper.octree.octomap_file import read_octree
 from mapper.octree.slice import OccupancyGrid
 from mapper.run import files
 from mapper.run.folder import Run
@@ -39,7 +39,7 @@ def maps_of(run: Run) -> Maps:
     if (run.path / files.DYNAMIC).exists():  # runs of before 2026-11-22 have none
         dynamic_world, dynamic_colors = _coloured_cloud(run.file(files.DYNAMIC))
     return Maps(
-        octree=read_map(run.file(files.OCTREE_MAP)),
+        octree=read_octree(run.file(files.OCTREE_MAP)),
         cloud_points_world=points_world,
         cloud_colors=colors,
         dynamic_points_world=dynamic_world,
@@ -57,7 +57,7 @@ def storeys_of_run(run: Run) -> tuple[Storey, ...]:
         MapFileError: The octree cannot be read.
     """
     config, path = run.config.traversable, load_results(run).tracked
-    octree = read_map(run.file(files.OCTREE_MAP))
+    octree = read_octree(run.file(files.OCTREE_MAP))
     return traversable(reachable_floor(octree, config, positions_world=path.positions_world), config)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from mapper.core.errors import RunError
 from mapper.export.grid import stored_grid, write_grid
-from mapper.octree.octomap_file import read_map, write_bt, write_ot
+from mapper.octree.octomap_file import read_octree, write_bt, write_ot
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.runtime.atomic import atomic_file
@@ -26,7 +26,7 @@ def octomap(run: Run, path: Path, _progress: Progress) -> None:
         return
     if _is_same(run.path / name, path):
         raise RunError(f"{path}: is the run's own octree; name another file to write level {level} to")
-    octree = read_map(run.file(files.OCTREE_MAP)).coarser(level, parent=run.config.octomap.parent)
+    octree = read_octree(run.file(files.OCTREE_MAP)).coarser(level, parent=run.config.octomap.parent)
     (write_ot if full else write_bt)(path, octree)
 
 

@@ -11,7 +11,7 @@ from mapper.export.ply import write_ply
 from mapper.mapping.cloud import height_colors
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import Leaves
-from mapper.octree.octomap_file import read_map
+from mapper.octree.octomap_file import read_octree
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.runtime.progress import Progress
@@ -93,7 +93,7 @@ def _codes(lattice: Corners) -> Corners:
 
 
 def _occupied(run: Run) -> Leaves:
-    octree = read_map(run.file(files.OCTREE_OT), run.config.octree)
+    octree = read_octree(run.file(files.OCTREE_OT), run.config.octree)
     leaves = octree.leaves()
     is_occupied = leaves.log_odds >= octree.occupied_log_odds
     if not is_occupied.any():

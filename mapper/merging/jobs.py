@@ -22,7 +22,7 @@ from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.ground_height import GroundHeights, lowest_occupied
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
-from mapper.octree.octomap_file import read_map
+from mapper.octree.octomap_file import read_octree
 from mapper.octree.resampling import blocks_reached, resampled
 from mapper.octree.slice import see_band
 from mapper.octree.summing import Overlap
@@ -116,7 +116,7 @@ def split_run(workspace: Workspace, run: int, path: Path, T_map_world: Transform
         path: Its map.
         T_map_world: (4, 4) pose of its world in the map; None is the identity.
     """
-    octree = read_map(path)
+    octree = read_octree(path)
     part_bytes: dict[int, int] = {}
     has_colors = False
     for tile, part in _parts(workspace, octree, T_map_world):
@@ -164,7 +164,7 @@ def join_tile(
         follows_ground: Whether the slice's band does.
     """
     octree = OctreeMap(workspace.config)
-    overlaps = tuple(octree.add(read_map(workspace.part(tile, run))) for run in runs)
+    overlaps = tuple(octree.add(read_octree(workspace.part(tile, run))) for run in runs)
     octree.clamp()
     write_map(workspace.tile(tile), octree)
     depth = workspace.tiling.depth
@@ -209,7 +209,7 @@ def slice_column(
     ground_m = None if ground is None else load_ground(ground).under(first=first, shape=shape)
     seen, known = np.zeros(shape, np.uint8), np.zeros(shape, np.bool_)
     for tile in tiles:
-        octree = read_map(workspace.tile(tile))
+        octree = read_octree(workspace.tile(tile))
         seen |= see_band(octree, config, first=first, shape=shape, ground_m=ground_m, floor_z_m=floor_z_m)
         x, y = (octree.leaves().keys[:, :2] - first).T
         known[y, x] = True

@@ -14,7 +14,7 @@ from mapper.core.errors import RunError
 from mapper.core.geometry import Array
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.map import OctreeMap
-from mapper.octree.octomap_file import read_map
+from mapper.octree.octomap_file import read_octree
 from mapper.run import files
 from mapper.run.manifest import is_merged_map
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, partial_of, write_text
@@ -126,7 +126,7 @@ class MergedMap:
         octree = OctreeMap(self.manifest.octree)
         for tile in self.manifest.tiles:
             if np.less_equal(tile.lower_m, upper_m).all() and np.greater_equal(tile.upper_m, lower_m).all():
-                octree.add(read_map(self.tile_path(tile)))
+                octree.add(read_octree(self.tile_path(tile)))
         return octree
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, MapFileError, MapSizeError
+from mapper.core.paths import AnyPath
 from mapper.octree import tree_reader
 from mapper.octree.attributes import UNSET
 from mapper.octree.blocks import check_memory
@@ -111,7 +112,7 @@ def _header_bytes(first_line: bytes, node_count: int, resolution_m: float, tree_
     ).encode("ascii")
 
 
-def read_map(path: Path, config: OctreeConfig | None = None) -> OctreeMap:
+def read_octree(path: AnyPath, config: OctreeConfig | None = None) -> OctreeMap:
     """Return the map of a ``.bt`` or ``.ot`` file of an OcTree or a ColorOcTree, or of an ``.octree`` file.
 
     Leaves of a ``.bt`` file take the clamping values of the sensor model. A file with colours makes a map
@@ -126,6 +127,7 @@ def read_map(path: Path, config: OctreeConfig | None = None) -> OctreeMap:
         MapFileError: The file cannot be read, is truncated, foreign or damaged.
         MapSizeError: Its leaves, expanded to voxels, would not fit into memory.
     """
+    path = Path(path)
     try:
         size = path.stat().st_size
         check_memory(size, f"the map in {path}")

@@ -27,7 +27,7 @@ from mapper.pipeline.track import (
     wheels_beside,
 )
 from mapper.run.edits_file import edits_text, parse_edits, write_edits
-from mapper.run.folder import Run, appended_log, load_run, open_log, write_run
+from mapper.run.folder import Run, appended_log, open_run, write_run
 from mapper.run.manifest import Manifest, Timing, library_versions, now_text
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
 from mapper.run.warnings import INPUT_KINDS
@@ -71,7 +71,7 @@ def append(
     _refuse_unfit(config, run)
     edits = edits_text(run.path)
     wanted = parse_edits(edits, run.path)
-    first = open_log(run)
+    first = run.open_log()
     source, warnings = chained(first, second), depth_cautions(second)
     for note in (*source.notes, *(warning.sentence for warning in warnings)):
         progress.note(note)
@@ -97,7 +97,7 @@ def append(
         writer.update(solve=solved.report)
         write_edits(writer.folder, edits)
         fuse_into(writer, source, joined, progress, before=run.scan_updates(), edits=wanted)
-    return load_run(out)
+    return open_run(out)
 
 
 def _refuse_unfit(config: BuildConfig, run: Run) -> None:

@@ -23,7 +23,7 @@ from mapper.pipeline.track import (
 from mapper.run.folder import (
     Run,
     first_manifest,
-    load_run,
+    open_run,
     write_run,
 )
 from mapper.run.manifest import Levelling, RunWarning
@@ -89,7 +89,7 @@ def build(
             levelling=Levelling(method=level.method, detail=level.detail, has_floor=level.has_floor),
         )
         fuse_into(writer, source, config, progress, observer=observer)
-    return load_run(out)
+    return open_run(out)
 
 
 def _height_warning(source: Log, trajectory: Trajectory) -> str:

@@ -31,8 +31,8 @@ from mapper.run.edits_file import edits_text, parse_edits, write_edits
 from mapper.run.folder import (
     Run,
     RunWriter,
-    load_run,
     moved_log,
+    open_run,
     paths_of,
     refuse_another_log,
     write_run,
@@ -127,7 +127,7 @@ def fuse_changed(
         if solve is not None:
             writer.update(solve=solve)
         fuse_into(writer, source, run.config, progress, before=run.scan_updates(), edits=wanted)
-    return load_run(run.path)
+    return open_run(run.path)
 
 
 def carry_times(writer: RunWriter, timing: Timing) -> None:

@@ -21,7 +21,7 @@ from mapper.merging.merged_map import open_map
 from mapper.pipeline.reobserve import reobserve
 from mapper.run import files
 from mapper.run.fingerprint import fingerprint
-from mapper.run.folder import Run, load_run, open_log
+from mapper.run.folder import Run, open_run
 from mapper.run.manifest import is_merged_map
 from mapper.runtime.progress import SILENT, Progress
 
@@ -59,12 +59,12 @@ def load_known_map(path: Path, *, progress: Progress = SILENT) -> KnownMap:
             settings, or the log of an old run is no longer there.
     """
     if not is_merged_map(path):
-        run = load_run(path)
+        run = open_run(path)
         members = [(run, np.eye(4))]
     else:
         members = []
         for member in open_map(path).manifest.runs:
-            run = load_run(Path(member.path))
+            run = open_run(Path(member.path))
             if fingerprint(run.file(files.OCTREE_MAP)) != member.fingerprint:
                 raise RunError(f"{run.path}: changed since it was merged into {path}; merge again")
             members.append((run, np.array(member.T_map_world)))
@@ -123,7 +123,7 @@ def places_of(run: Run, *, progress: Progress = SILENT) -> Mapping[int, AnyPlace
     """Return the stored places of a run; those of an old run are observed again from its log."""
     if (run.path / files.PLACES).exists():
         return read_places(run.file(files.PLACES))
-    log = open_log(run)
+    log = run.open_log()
     loops = run.config.loops if isinstance(run.config.loops, KeyframeLoopsConfig) else LOOPS_OF[log.sensor]
     verifier, graph = build_verifier(loops.verification), run.graph
     views = reobserve(log, run.trajectory, set(graph.stamps_ns.values()), run.config, progress=progress)

@@ -8,7 +8,7 @@ from mapper.core.errors import MapperError
 from mapper.doctor.finding import Finding
 from mapper.run import files
 from mapper.run.digests import fault_of
-from mapper.run.folder import Run, load_run
+from mapper.run.folder import Run, open_run
 from mapper.run.localised import LocalisedManifest
 from mapper.run.manifest import FileDigest, is_localised_log, read_manifest_of
 from mapper.runtime.atomic import is_temporary
@@ -36,7 +36,7 @@ def check_run(folder: Path, *, progress: Progress = SILENT) -> list[Finding]:
         digests = localised.files
         found = _hashed(folder, digests, lambda _: f"restore it, or localise again in {localised.map}")
     else:
-        run = load_run(folder)
+        run = open_run(folder)
         digests, others = run.manifest.files, _unrecorded(run)
         remedy = partial(files.remedy_for, folder=folder)
         found = _hashed(folder, digests, remedy) if digests else _counted(run)

@@ -11,6 +11,7 @@ from typing import Any
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_run_config
 from mapper.core.errors import MapperError, RunError, WriteError
+from mapper.core.paths import AnyPath
 from mapper.core.trajectory import Trajectory
 from mapper.graph.g2o import read_g2o
 from mapper.graph.model import PoseGraph
@@ -124,18 +125,35 @@ class Run:
         path = files.scan_updates_path(self.path)
         return self.file(path.name) if path.exists() else None
 
+    def open_log(self) -> Log:
+        """Return the log that it was built from, with the same frames selected and all that was appended.
+
+        Raises:
+            RunError: It is no longer there, or is not what it was.
+            SourceError: It cannot be opened.
+        """
+        source = _open(self, self.manifest.input, self.config.source)
+        for log in self.manifest.input.appended:
+            source = chained(source, _open(self, log, log.source), shift_ns=log.shift_ns)
+        refuse_another_log(self, source)
+        return source
+
     def files(self) -> list[Path]:
         """Return the folder's files, by name."""
         return sorted(child for child in self.path.iterdir() if child.is_file())
 
 
-def load_run(path: Path) -> Run:
-    """Return a finished run.
+def open_run(path: AnyPath) -> Run:
+    """Return a finished run; its files are read when they are asked for.
+
+    Args:
+        path: Its folder.
 
     Raises:
         RunError: The folder is missing, is no run, or is not finished; the message says how it ended. Or its
             settings are not as they were written.
     """
+    path = Path(path)
     if not path.is_dir():
         partial = partial_of(path)
         if is_merged_map(partial):
@@ -178,20 +196,6 @@ def moved_log(run: Run, *logs: Path) -> Run:
     return replace(run, manifest=run.manifest.model_copy(update={"input": moved}))
 
 
-def open_log(run: Run) -> Log:
-    """Return the log that a run was built from, with the same frames selected and all that was appended.
-
-    Raises:
-        RunError: It is no longer there, or is not what it was.
-        SourceError: It cannot be opened.
-    """
-    source = _open(run, run.manifest.input, run.config.source)
-    for log in run.manifest.input.appended:
-        source = chained(source, _open(run, log, log.source), shift_ns=log.shift_ns)
-    refuse_another_log(run, source)
-    return source
-
-
 def _open(run: Run, log: InputLog, config: SourceConfig) -> Log:
     path = Path(log.path)
     if not path.exists():
@@ -209,7 +213,7 @@ def refuse_another_log(run: Run, source: Log) -> None:
     for path, log in zip_longest(paths_of(source), logs):
         if path is None or log is None:
             raise RunError(
-                f"{source.path}: {run.path} was made from {len(logs)} logs; open them with open_log"
+                f"{source.path}: {run.path} was made from {len(logs)} logs; open them with Run.open_log"
             )
         if fingerprint(path) != log.fingerprint:
             raise RunError(f"{path}: changed since {run.path} was built from it; build it again")

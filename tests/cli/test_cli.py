@@ -13,7 +13,7 @@ from cli.console import Bars, Lines
 from cli.evaluate import evaluate as evaluate_verb
 from cli.main import app
 from evaluators.metrics.evaluate import assess
-from mapper.run.folder import load_run
+from mapper.run.folder import open_run
 from mapper.sources.trajectory_files import read_tum
 from tests.support.command_line import mapper
 
@@ -98,7 +98,7 @@ def test_build_prints_a_table(desk_log, tmp_path):
     assert "11 tracked, 0 doubtful, 0 lost, 0 skipped" in result.stdout
     for row in ("keyframes", "ATE RMSE, SE(3)-aligned", "path length", "peak memory", "trajectory.tum"):
         assert row in result.stdout
-    source = load_run(tmp_path / "run").config.source
+    source = open_run(tmp_path / "run").config.source
     assert (source.first_frame, source.last_frame, source.stride, source.require_truth) == (3, 24, 2, False)
 
 
@@ -111,7 +111,7 @@ def test_spelled_out_overrides_win(desk_log, tmp_path):
     mapper(
         "build", desk_log, "--out", tmp_path / "run", "--last", 5, "--set", "source.last_frame=12", "--quiet"
     )
-    assert load_run(tmp_path / "run").config.source.last_frame == 12
+    assert open_run(tmp_path / "run").config.source.last_frame == 12
 
 
 @pytest.mark.parametrize(
@@ -189,7 +189,7 @@ def test_fuse_changes_the_map_of_a_run(run_folder, tmp_path):
 
     assert "leaves of 0.2 m" in mapper("fuse", run, "--set", "octree.resolution_m=0.2").stdout
 
-    assert load_run(run).manifest.counts.leaves < load_run(run_folder).manifest.counts.leaves
+    assert open_run(run).manifest.counts.leaves < open_run(run_folder).manifest.counts.leaves
     assert (run / "trajectory.tum").read_bytes() == (run_folder / "trajectory.tum").read_bytes()
 
 
@@ -212,7 +212,7 @@ def test_eval_states_the_alignment_and_agrees_with_the_library(run_folder, desk_
     of_files = json.loads(mapper("eval", estimate, "--truth", truth, "--log", desk_log, "--json").stdout)
 
     values = {metric["name"]: metric["value"] for metric in of_files}
-    frames_ns = np.array([record.stamp_ns for record in load_run(run_folder).records])
+    frames_ns = np.array([record.stamp_ns for record in open_run(run_folder).records])
     found = assess(read_tum(estimate), read_tum(truth), frames_ns=frames_ns)
     assert {m.name: m.value for m in found.metrics}.items() <= values.items()
     told = {metric["name"]: metric["value"] for metric in of_run}
@@ -269,7 +269,7 @@ def test_a_converted_log_gives_the_same_trajectory(run_folder, desk_log, tmp_pat
     mapper("convert", desk_log, "--as", "mbag", "--out", tmp_path / "log")
     mapper("build", tmp_path / "log", "--out", tmp_path / "run", "--quiet")
 
-    ours, theirs = load_run(tmp_path / "run").trajectory, load_run(run_folder).trajectory
+    ours, theirs = open_run(tmp_path / "run").trajectory, open_run(run_folder).trajectory
     assert ours.stamps_ns.tolist() == theirs.stamps_ns.tolist()
     assert abs(ours.T_world_body - theirs.T_world_body).max() < 1e-12
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from mapper.export.grid import read_grid
-from mapper.octree.octomap_file import read_map
+from mapper.octree.octomap_file import read_octree
 from mapper.octree.slice import OCCUPIED
-from mapper.run.folder import load_run
+from mapper.run.folder import open_run
 from tests.support.command_line import mapper
 from tests.support.files import files_of
 
@@ -21,7 +21,7 @@ def run_folder(desk_run, tmp_path):
 
 
 def occupied(folder):
-    octree = read_map(folder / "map.ot")
+    octree = read_octree(folder / "map.ot")
     leaves = octree.leaves()
     return leaves.centres_world[leaves.log_odds >= octree.occupied_log_odds]
 
@@ -120,7 +120,7 @@ def test_a_mistake_in_the_file_ends_a_fuse_before_it_begins(run_folder):
     result = mapper("fuse", run_folder, status=1)
     assert "edits.toml: erase.0.height: unknown; did you mean height_m?" in result.stderr
     assert not run_folder.with_name("desk.partial").exists()
-    assert load_run(run_folder).manifest.status == "complete"
+    assert open_run(run_folder).manifest.status == "complete"
 
 
 def test_a_build_replaces_no_run_with_edits(run_folder, desk_log):

@@ -13,7 +13,7 @@ from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.graph.odometry_poses import by_odometry
 from mapper.pipeline.build import build
 from mapper.pipeline.edit_loops import edit_loops
-from mapper.run.folder import load_run, open_log
+from mapper.run.folder import open_run
 from mapper.sources import open_source
 from tests.support.command_line import mapper
 from tests.support.files import files_of
@@ -34,18 +34,18 @@ def run(built, tmp_path):
 
 
 def held(run):
-    return [(loop.i, loop.j) for loop in load_run(run).loops if loop.verdict == "accepted"]
+    return [(loop.i, loop.j) for loop in open_run(run).loops if loop.verdict == "accepted"]
 
 
 def untied(run):
     """Two nodes that show nearly the same and are not known as a loop."""
-    nodes = list(load_run(run).graph.T_world_node)
-    known = {(loop.i, loop.j) for loop in load_run(run).loops}
+    nodes = list(open_run(run).graph.T_world_node)
+    known = {(loop.i, loop.j) for loop in open_run(run).loops}
     return next((i, j) for i, j in zip(nodes, nodes[2:], strict=False) if (i, j) not in known)
 
 
 def test_lists_every_candidate(run):
-    loops = load_run(run).loops
+    loops = open_run(run).loops
     assert loops
     head, *lines, total = mapper("loops", run).stdout.splitlines()
     assert head.split()[:3] == ["i", "j", "by"]
@@ -57,9 +57,9 @@ def test_lists_every_candidate(run):
 
 def test_an_added_loop_is_a_factor_and_moves_what_hangs_on_it(run):
     i, j = untied(run)
-    before, nodes = load_run(run), load_run(run).graph.T_world_node
+    before, nodes = open_run(run), open_run(run).graph.T_world_node
     result = mapper("loops", run, "--add", j, i)
-    after = load_run(run)
+    after = open_run(run)
 
     added = after.loops[-1]
     assert (added.i, added.j, added.proposed_by, added.verdict) == (i, j, "hand", "accepted")
@@ -77,11 +77,11 @@ def test_an_added_loop_is_a_factor_and_moves_what_hangs_on_it(run):
 
 
 def test_removing_what_was_added_leads_back(run):
-    before = load_run(run).trajectory
+    before = open_run(run).trajectory
     i, j = untied(run)
     mapper("loops", run, "--add", i, j, "--quiet")
     mapper("loops", run, "--remove", j, i, "--quiet")
-    after = load_run(run)
+    after = open_run(run)
     assert after.loops[-1].reason == "hand: removed"
     assert (i, j) not in held(run)
     np.testing.assert_allclose(after.trajectory.T_world_body, before.T_world_body, atol=1e-6)
@@ -92,7 +92,7 @@ def test_several_edits_are_one_solve(run):
     mapper("loops", run, "--remove", *gone, "--add", *new, "--quiet")
     assert gone not in held(run)
     assert new in held(run)
-    factors = load_run(run).graph.factors
+    factors = open_run(run).graph.factors
     assert [(f.i, f.j) for f in factors if f.origin == "loop"] == held(run)
 
 
@@ -137,7 +137,7 @@ def test_a_loop_that_is_there_already_is_not_added_again(run):
 def test_a_loop_that_is_not_believed_is_refused(run, knob, value, reason):
     config = (run / "config.json").read_text()
     assert knob in config
-    with load_run(run).changing(["config.json"]):
+    with open_run(run).changing(["config.json"]):
         (run / "config.json").write_text(config.replace(knob, value))
     before = files_of(run)
     i, j = untied(run)
@@ -147,11 +147,11 @@ def test_a_loop_that_is_not_believed_is_refused(run, knob, value, reason):
 
 
 def test_a_graph_that_is_not_solved_takes_no_loops(run):
-    built = load_run(run)
+    built = open_run(run)
     graph = built.config.graph.model_copy(update={"solve": "none"})
     unsolved = replace(built, config=built.config.model_copy(update={"graph": graph}))
     with pytest.raises(ConfigError, match=r"graph\.solve=none, so loops change nothing"):
-        edit_loops(open_log(built), unsolved, add=[(0, 1)])
+        edit_loops(built.open_log(), unsolved, add=[(0, 1)])
 
 
 def test_odometry_alone_leaves_loops_out_and_the_first_node_where_it_is():

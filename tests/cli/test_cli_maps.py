@@ -10,7 +10,7 @@ from mapper.core.geometry import exp
 from mapper.core.trajectory import Trajectory
 from mapper.export.grid import read_grid
 from mapper.navigation.distance import distance_2d
-from mapper.run.folder import load_run
+from mapper.run.folder import open_run
 from mapper.sources.trajectory_files import read_tum, write_tum
 from tests.support.command_line import mapper
 
@@ -39,7 +39,7 @@ def test_plan_leads_from_start_to_goal(run_folder):
 
 
 def test_fuse_takes_another_trajectory_and_casts_only_what_moved(run_folder, tmp_path):
-    old = load_run(run_folder).trajectory
+    old = open_run(run_folder).trajectory
     poses = old.T_world_body.copy()
     poses[-3:] = exp(np.zeros(3), np.array([0.0, 0.0, 0.2])) @ poses[-3:]
     write_tum(tmp_path / "moved.tum", Trajectory(old.stamps_ns, poses))

@@ -14,11 +14,11 @@ from mapper.core.errors import ConfigError, DependencyError, MapSizeError, RunEr
 from mapper.export.exporters import EXPORTERS, export
 from mapper.export.grid import read_grid
 from mapper.graph.g2o import read_g2o
-from mapper.octree.octomap_file import read_map
+from mapper.octree.octomap_file import read_octree
 from mapper.octree.slice import OCCUPIED, UNKNOWN
 from mapper.pipeline.build import build
 from mapper.run.checks import check_run
-from mapper.run.folder import load_run, moved_log
+from mapper.run.folder import moved_log, open_run
 from mapper.sources import open_source
 from mapper.sources.trajectory_files import read_kitti, read_tum
 from tests.support.files import files_of
@@ -59,7 +59,7 @@ def positions_and_faces(path):
 
 
 def occupied_centres(run):
-    octree = read_map(run.path / "map.ot", run.config.octree)
+    octree = read_octree(run.path / "map.ot", run.config.octree)
     leaves = octree.leaves()
     return leaves.centres_world[leaves.log_odds >= octree.occupied_log_odds]
 
@@ -108,7 +108,7 @@ def check_grid(run, path):
 
 
 def check_native(run, path):
-    ours, theirs = read_map(path), read_map(run.path / "map.ot", run.config.octree)
+    ours, theirs = read_octree(path), read_octree(run.path / "map.ot", run.config.octree)
     assert ours.config.model_copy(update={"depth_noise": None}) == run.config.octree
     np.testing.assert_array_equal(ours.leaves().keys, theirs.leaves().keys)
     np.testing.assert_array_equal(ours.leaves().log_odds, theirs.leaves().log_odds)
@@ -175,7 +175,7 @@ def test_an_octree_of_wider_voxels_is_one_that_octomap_reads(untouched, tmp_path
     else:
         tree = tree.read(str(path))
     assert tree.getResolution() == pytest.approx(0.4)
-    mean = read_map(untouched.path / "map.octree").leaves(depth=14, parent="mean")
+    mean = read_octree(untouched.path / "map.octree").leaves(depth=14, parent="mean")
     for centre, log_odds in zip(mean.centres_world, mean.log_odds, strict=True):
         assert tree.isNodeOccupied(tree.search(centre)) == (log_odds >= 0.0)
 
@@ -259,7 +259,7 @@ def test_every_ending_of_octomap_is_its_own_format(untouched, tmp_path):
     export(untouched, "octomap", tmp_path / "taken.ot")
     tree = pyoctomap.OcTree(1.0).read(str(tmp_path / "taken.ot"))
     centre = occupied_centres(untouched)[0]
-    octree = read_map(untouched.path / "map.ot", untouched.config.octree)
+    octree = read_octree(untouched.path / "map.ot", untouched.config.octree)
     assert tree.search(centre).getLogOdds() == pytest.approx(octree.query(centre[None])[0])
 
 
@@ -358,4 +358,4 @@ def copy_of(run, folder):
     folder.mkdir()
     for name, data in files_of(run.path).items():
         (folder / name).write_bytes(data)
-    return load_run(folder).path
+    return open_run(folder).path

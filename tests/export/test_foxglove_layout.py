@@ -8,14 +8,14 @@ from mapper.config.loading import overridden
 from mapper.export.exporters import export
 from mapper.export.mcap_log import PLAN_TOPICS
 from mapper.pipeline.fuse import fuse
-from mapper.run.folder import load_run
+from mapper.run.folder import open_run
 from mapper.sources import open_source
 
 
 @pytest.fixture(scope="module")
 def run(desk_run, desk_log, tmp_path_factory):
     """A copy with larger voxels than the default, and with the frames' times in its log."""
-    copy = load_run(shutil.copytree(desk_run.path, tmp_path_factory.mktemp("layout") / "desk"))
+    copy = open_run(shutil.copytree(desk_run.path, tmp_path_factory.mktemp("layout") / "desk"))
     config = overridden(copy.config, ["octree.resolution_m=0.1", "mcap.frame_times=true"])
     return fuse(open_source(desk_log), copy, config)
 

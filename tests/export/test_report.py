@@ -12,7 +12,7 @@ from mapper.core.errors import ConfigError
 from mapper.export.report.data import Figure, chapter_of, drawn
 from mapper.export.report.page import page_of, write_report
 from mapper.pipeline.build import build
-from mapper.run.folder import load_run
+from mapper.run.folder import open_run
 from mapper.sources import open_source
 from tests.support.chromium import CHROMIUM, MISSING, Page
 from tests.support.command_line import invoke
@@ -147,7 +147,7 @@ def test_runs_of_one_name_are_told_apart(runs, tmp_path):
     twin = tmp_path / "desk"
     twin.symlink_to(runs[0].path)
     invoke("report", runs[0].path, twin, "--out", tmp_path / "r.html")
-    assert load_run(twin).manifest == runs[0].manifest
+    assert open_run(twin).manifest == runs[0].manifest
     names = re.findall(r"checked> (\S+) <small>", (tmp_path / "r.html").read_text())
     assert names == [str(runs[0].path), str(twin)]
 

@@ -21,7 +21,7 @@ from mapper.export.rerun.target import check_target, streaming
 from mapper.export.run_maps import maps_of, snapshots_of
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.pipeline.build import build
-from mapper.run.folder import load_run
+from mapper.run.folder import open_run
 from mapper.run.observers import Step
 from mapper.sources import open_source
 from tests.support.command_line import invoke
@@ -63,7 +63,7 @@ class Told:
 @pytest.fixture(scope="module")
 def run(desk_run, tmp_path_factory):
     """A copy, for recordings to lie in."""
-    return load_run(shutil.copytree(desk_run.path, tmp_path_factory.mktemp("rerun") / "desk"))
+    return open_run(shutil.copytree(desk_run.path, tmp_path_factory.mktemp("rerun") / "desk"))
 
 
 @pytest.fixture(scope="module")
@@ -265,7 +265,7 @@ def live(desk_log, tmp_path_factory):
         desk_log, folder / "run", "--rerun", folder / "live.rrd", "--set", "rerun.image_stride=5"
     )
     assert (result.exit_code, result.output) == (0, "")
-    return load_run(folder / "run"), Told(folder / "live.rrd")
+    return open_run(folder / "run"), Told(folder / "live.rrd")
 
 
 def test_looking_on_changes_nothing(run, live):

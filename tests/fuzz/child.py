@@ -31,9 +31,9 @@ def read_all(path: Path) -> str:
         MapperError: It is damaged, or a frame of it is.
     """
     if path.suffix in (".octree", ".ot", ".bt"):
-        from mapper.octree.octomap_file import read_map
+        from mapper.octree.octomap_file import read_octree
 
-        read_map(path).leaves()
+        read_octree(path).leaves()
         return ""
     from mapper.sources import open_source
     from mapper.sources.config import SourceConfig

@@ -25,7 +25,7 @@ from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.resampling import blocks_reached, resampled
 from mapper.octree.slice import cut_slice
 from mapper.run.files import SUMMARY
-from mapper.run.folder import load_run, write_run
+from mapper.run.folder import open_run, write_run
 from mapper.run.manifest import Input, Manifest, Verdict
 from mapper.runtime import resumable_jobs
 from mapper.runtime.executor import Workers, run_jobs
@@ -48,7 +48,7 @@ def make_run(path, octree, *, band=BAND, log="sha256:0", T_truth_world=None):
         write_tum(writer.folder / "trajectory.tum", trajectory)
         if T_truth_world is not None:
             write_tum(writer.folder / "truth.tum", trajectory.moved(T_truth_world))
-    return load_run(path)
+    return open_run(path)
 
 
 @pytest.fixture(scope="module")
@@ -185,7 +185,7 @@ def test_a_merge_that_was_stopped_goes_on_where_it_was(runs, merged, tmp_path, m
     with pytest.raises(RunError, match="not finished"):
         open_map(out)
     with pytest.raises(RunError, match="not finished; the mapper merge that began it goes on"):
-        load_run(out)
+        open_run(out)
     lost = joined[3:5]
     joined.clear()
     joined.extend([0] * 5)
@@ -278,7 +278,7 @@ def test_poses_come_from_a_file(runs, tmp_path, monkeypatch):
     assert placed[0].stays
     np.testing.assert_array_equal(placed[1].T_map_world[:3, 3], [1.0, 2.0, 3.0])
     monkeypatch.chdir(runs[1].path)
-    np.testing.assert_array_equal(by_poses([load_run(Path())], path)[0].T_map_world, placed[1].T_map_world)
+    np.testing.assert_array_equal(by_poses([open_run(Path())], path)[0].T_map_world, placed[1].T_map_world)
 
 
 @pytest.mark.parametrize(
@@ -395,4 +395,4 @@ def test_the_verb_says_what_it_made(runs, tmp_path, capsys):
     assert lines[-1] == str(tmp_path / "map")
     assert open_map(tmp_path / "map").manifest.status == "complete"
     with pytest.raises(RunError, match=r"is a merged map, not a run"):
-        load_run(tmp_path / "map")
+        open_run(tmp_path / "map")

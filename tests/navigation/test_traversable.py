@@ -7,7 +7,7 @@ from mapper.navigation.floor import driven_ground, reachable_floor
 from mapper.navigation.traversable import traversable
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.map import OctreeMap
-from mapper.octree.octomap_file import read_map, write_ot
+from mapper.octree.octomap_file import read_octree, write_ot
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, cut_slice
 
 CELL = 0.05
@@ -152,7 +152,7 @@ def test_the_grid_does_not_depend_on_the_order_of_the_blocks(tmp_path):
     write_ot(tmp_path / "map.ot", octree)
     ours, theirs = (
         traversable_grid(octree, TraversableConfig()),
-        traversable_grid(read_map(tmp_path / "map.ot"), TraversableConfig()),
+        traversable_grid(read_octree(tmp_path / "map.ot"), TraversableConfig()),
     )
     np.testing.assert_array_equal(ours.cells, theirs.cells)
     np.testing.assert_array_equal(ours.origin_world_m, theirs.origin_world_m)

@@ -5,7 +5,7 @@ import pyoctomap
 import pytest
 
 from mapper.octree.map_file import write_map
-from mapper.octree.octomap_file import read_map, write_bt, write_ot
+from mapper.octree.octomap_file import read_octree, write_bt, write_ot
 from tests.support.octomap_oracle import voxels
 from tests.support.octree_maps import COLORED, as_dict, mapped
 
@@ -56,7 +56,7 @@ def test_files_of_a_map_whose_blocks_were_emptied_are_those_of_octomap(x_m, tmp_
     write_ot(tmp_path / "map.ot", octree)
     write_bt(tmp_path / "map.bt", octree)
     write_map(tmp_path / "map.octree", octree)
-    assert as_dict(read_map(tmp_path / "map.octree")) == left
+    assert as_dict(read_octree(tmp_path / "map.octree")) == left
     assert voxels(pyoctomap.OcTree(0.1).read(str(tmp_path / "map.ot")), resolution_m=0.1) == left
     binary = pyoctomap.OcTree(0.1)
     assert binary.readBinary(str(tmp_path / "map.bt"))
@@ -87,7 +87,7 @@ def test_attributes_go_with_their_voxels_and_stay_with_the_others(tmp_path):
     for name in ("colors", "hits", "last_seen_ns"):
         np.testing.assert_array_equal(getattr(now, name), getattr(was, name)[right])
     write_map(tmp_path / "map.octree", octree)
-    read = read_map(tmp_path / "map.octree")
+    read = read_octree(tmp_path / "map.octree")
     np.testing.assert_array_equal(read.attributes.of_leaves().hits, was.hits[right])
     gone = octree.attributes.at(before.leaves().centres_world[~right])
     assert not gone.hits.any()

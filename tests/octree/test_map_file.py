@@ -11,7 +11,7 @@ from mapper.octree import blocks
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import MAGIC, write_map
-from mapper.octree.octomap_file import read_map
+from mapper.octree.octomap_file import read_octree
 
 HEADER = len(MAGIC) + 12
 
@@ -38,7 +38,7 @@ def test_everything_comes_back(attributes, tmp_path):
     octree = mapped(attributes=attributes)
     write_map(tmp_path / "map.octree", octree)
 
-    again = read_map(tmp_path / "map.octree")
+    again = read_octree(tmp_path / "map.octree")
 
     assert again.config == octree.config
     assert len(again) == len(octree)
@@ -53,7 +53,7 @@ def test_everything_comes_back(attributes, tmp_path):
 
 
 def test_a_map_that_was_read_goes_on_as_if_it_had_not_been_written(path):
-    again, octree = read_map(path), mapped(attributes=True)
+    again, octree = read_octree(path), mapped(attributes=True)
     scan = Scan(9, np.random.default_rng(9).normal(0.0, 1.0, (300, 3)).astype(np.float32))
     for each in (again, octree):
         each.insert(scan, np.eye(4))
@@ -64,7 +64,7 @@ def test_a_map_that_was_read_goes_on_as_if_it_had_not_been_written(path):
 
 
 def test_bytes_do_not_depend_on_how_blocks_came_about(path):
-    write_map(path.with_name("again.octree"), read_map(path))
+    write_map(path.with_name("again.octree"), read_octree(path))
 
     assert path.with_name("again.octree").read_bytes() == path.read_bytes()
 
@@ -72,24 +72,24 @@ def test_bytes_do_not_depend_on_how_blocks_came_about(path):
 def test_an_empty_map_comes_back(tmp_path):
     write_map(tmp_path / "map.octree", OctreeMap(OctreeConfig(resolution_m=0.2, attributes=True)))
 
-    again = read_map(tmp_path / "map.octree")
+    again = read_octree(tmp_path / "map.octree")
 
     assert (len(again), again.resolution_m) == (0, 0.2)
 
 
 def test_another_sensor_model_replaces_the_file_s_but_not_its_resolution(path):
-    again = read_map(path, OctreeConfig(resolution_m=0.5, hit_probability=0.6))
+    again = read_octree(path, OctreeConfig(resolution_m=0.5, hit_probability=0.6))
 
     assert (again.resolution_m, again.config.hit_probability) == (0.1, 0.6)
     assert again.attributes is not None
 
 
 def test_settings_that_were_dropped_since_the_file_was_written_do_not_matter(path):
-    before = read_map(path)
+    before = read_octree(path)
     dropped = {"dynamic": "none", "seen_through_scans": 3}
     path.write_bytes(resealed(path.read_bytes(), lambda header: header["config"].update(dropped)))
 
-    again = read_map(path)
+    again = read_octree(path)
 
     assert again.config == before.config
     assert len(again) == len(before)
@@ -126,7 +126,7 @@ def test_damage_is_one_line(path, damage, complaint):
     path.write_bytes(damage(path.read_bytes()))
 
     with pytest.raises(MapFileError, match=complaint) as caught:
-        read_map(path)
+        read_octree(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
 
@@ -135,7 +135,7 @@ def test_a_map_larger_than_memory_is_refused_before_it_is_unpacked(path, monkeyp
     monkeypatch.setattr(blocks.os, "sysconf", lambda _name: 10)
 
     with pytest.raises(MapSizeError, match="GiB"):
-        read_map(path)
+        read_octree(path)
 
 
 def test_everything_that_a_header_announces_has_to_fit_into_memory(path, monkeypatch):
@@ -145,7 +145,7 @@ def test_everything_that_a_header_announces_has_to_fit_into_memory(path, monkeyp
     path.write_bytes(resealed(path.read_bytes(), announce))
     monkeypatch.setattr(blocks.os, "sysconf", lambda _name: 1 << 16)  # of 4 GiB; the blocks alone take 2
     with pytest.raises(MapSizeError, match=r"map\.octree needs 4\.1 GiB and this machine has 4\.0"):
-        read_map(path)
+        read_octree(path)
 
 
 def test_a_failed_write_leaves_the_old_file(path, monkeypatch):

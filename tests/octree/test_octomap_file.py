@@ -8,7 +8,7 @@ from mapper.core.errors import MapFileError, MapSizeError
 from mapper.octree import blocks
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap, log_odds
-from mapper.octree.octomap_file import read_map, write_bt, write_ot
+from mapper.octree.octomap_file import read_octree, write_bt, write_ot
 from tests.support.octomap_oracle import fr1_xyz_scans, fuse, voxels
 from tests.support.octree_maps import octree_of
 from tests.support.paths import DATA, FR1_XYZ
@@ -77,13 +77,13 @@ def test_the_cpp_library_reads_our_files(octree, tmp_path):
 def test_ot_keeps_every_log_odds(octree, tmp_path):
     write_ot(tmp_path / "map.ot", octree)
 
-    assert_equal_leaves(read_map(tmp_path / "map.ot"), octree)
+    assert_equal_leaves(read_octree(tmp_path / "map.ot"), octree)
 
 
 def test_bt_keeps_free_occupied_and_unknown(octree, tmp_path):
     write_bt(tmp_path / "map.bt", octree)
 
-    read, leaves = read_map(tmp_path / "map.bt").leaves(), octree.leaves()
+    read, leaves = read_octree(tmp_path / "map.bt").leaves(), octree.leaves()
 
     np.testing.assert_array_equal(read.keys, leaves.keys)
     np.testing.assert_array_equal(read.log_odds, np.where(leaves.log_odds >= 0, OCCUPIED, FREE))
@@ -94,15 +94,15 @@ def test_an_empty_map_is_a_file_without_payload(write, tmp_path):
     write(tmp_path / "map", OctreeMap(OctreeConfig(resolution_m=0.125)))
 
     assert (tmp_path / "map").read_bytes().endswith(b"id OcTree\nsize 0\nres 0.125\ndata\n")
-    assert len(read_map(tmp_path / "map")) == 0
-    assert read_map(tmp_path / "map").resolution_m == 0.125
+    assert len(read_octree(tmp_path / "map")) == 0
+    assert read_octree(tmp_path / "map").resolution_m == 0.125
 
 
 @pytest.mark.skipif(not DATA.exists(), reason="needs ../shared/data/octomap")
 @pytest.mark.parametrize("name", ["geb079.bt", "freiburg1_360.bt", "velma.ot"])
 def test_published_maps_survive_a_round_trip(name, tmp_path):
     path = DATA / "octomap" / name
-    octree = read_map(path)
+    octree = read_octree(path)
     write = write_bt if path.suffix == ".bt" else write_ot
 
     write(tmp_path / "again", octree)
@@ -111,13 +111,13 @@ def test_published_maps_survive_a_round_trip(name, tmp_path):
         payload = (tmp_path / "again").read_bytes().partition(b"data\n")[2]
         assert payload == path.read_bytes().partition(b"data\n")[2]
     else:
-        assert_equal_leaves(read_map(tmp_path / "again"), octree)
+        assert_equal_leaves(read_octree(tmp_path / "again"), octree)
 
 
 @pytest.mark.skipif(not DATA.exists(), reason="needs ../shared/data/octomap")
 def test_a_published_map_reads_as_the_cpp_library_reads_it():
     path = DATA / "octomap" / "velma.ot"
-    octree, tree = read_map(path), pyoctomap.OcTree(0.1).read(str(path))
+    octree, tree = read_octree(path), pyoctomap.OcTree(0.1).read(str(path))
 
     theirs = [
         (leaf.getCoordinate(), leaf.current_node.getLogOdds(), leaf.getDepth()) for leaf in tree.begin_leafs()
@@ -134,7 +134,7 @@ def test_a_color_octree_gives_its_log_odds(tmp_path):
         tree.updateNode(np.array([0.1 * i, -0.3 * i, 0.05]), i % 2 == 0)
     tree.write(str(tmp_path / "color.ot"))
 
-    octree = read_map(tmp_path / "color.ot")
+    octree = read_octree(tmp_path / "color.ot")
 
     centres = np.array([[0.1 * i, -0.3 * i, 0.05] for i in range(20)])
     assert len(octree) == 20
@@ -143,7 +143,7 @@ def test_a_color_octree_gives_its_log_odds(tmp_path):
 
 def test_what_is_inserted_after_reading_goes_on_from_there(octree, tmp_path):
     write_ot(tmp_path / "map.ot", octree)
-    again, leaves = read_map(tmp_path / "map.ot"), octree.leaves()
+    again, leaves = read_octree(tmp_path / "map.ot"), octree.leaves()
     first = leaves.centres_world[:1]
 
     again.insert_points(first.astype(np.float32), first[0])
@@ -168,7 +168,7 @@ DEEP = b"".join(struct.pack("<fB", 1.0, 1) for _ in range(16)) + struct.pack("<f
 def test_headers_may_differ(header, tmp_path):
     (tmp_path / "map.ot").write_bytes(header + DEEP)
 
-    leaves = read_map(tmp_path / "map.ot").leaves()
+    leaves = read_octree(tmp_path / "map.ot").leaves()
 
     assert leaves.keys.tolist() == [[0, 0, 0]]
     assert leaves.resolution_m == 0.1
@@ -202,7 +202,7 @@ def test_files_that_are_no_maps_are_refused(data, message, tmp_path):
     (tmp_path / "map.ot").write_bytes(data)
 
     with pytest.raises(MapFileError, match=message) as caught:
-        read_map(tmp_path / "map.ot")
+        read_octree(tmp_path / "map.ot")
     assert "\n" not in str(caught.value)
     assert str(tmp_path / "map.ot") in str(caught.value)
 
@@ -216,7 +216,7 @@ def test_a_bt_of_another_size_is_refused(octree, change, tmp_path):
     (tmp_path / "map.bt").write_bytes(data.replace(b"size %d" % size, b"size %d" % wrong))
 
     with pytest.raises(MapFileError, match=f"{wrong} nodes"):
-        read_map(tmp_path / "map.bt")
+        read_octree(tmp_path / "map.bt")
 
 
 @BOTH_KINDS
@@ -227,7 +227,7 @@ def test_truncated_files_are_refused(write, octree, share, tmp_path):
     (tmp_path / "map").write_bytes(data[: int(share * len(data)) // 2 * 2])
 
     with pytest.raises(MapFileError, match=r"truncated|promises|cannot hold"):
-        read_map(tmp_path / "map")
+        read_octree(tmp_path / "map")
 
 
 @BOTH_KINDS
@@ -246,7 +246,7 @@ def test_no_damage_goes_unnoticed_as_anything_but_a_map_or_an_error(write, octre
             damaged[at] ^= 1 << int(rng.integers(8))
         (tmp_path / "damaged").write_bytes(damaged)
         try:
-            assert len(read_map(tmp_path / "damaged").leaves().keys) >= 0
+            assert len(read_octree(tmp_path / "damaged").leaves().keys) >= 0
             outcomes["read"] += 1
         except (MapFileError, MapSizeError):
             outcomes["refused"] += 1
@@ -258,12 +258,12 @@ def test_a_leaf_too_large_for_memory_is_refused(tmp_path):
     (tmp_path / "map.ot").write_bytes(data)
 
     with pytest.raises(MapSizeError, match="pruned leaves expanded needs 131072"):
-        read_map(tmp_path / "map.ot")
+        read_octree(tmp_path / "map.ot")
 
 
 def test_a_missing_file_is_one_clear_line(tmp_path):
     with pytest.raises(MapFileError, match=r"nothing\.bt: cannot be read: No such file"):
-        read_map(tmp_path / "nothing.bt")
+        read_octree(tmp_path / "nothing.bt")
 
 
 @BOTH_KINDS

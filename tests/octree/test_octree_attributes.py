@@ -9,7 +9,7 @@ from mapper.octree import attributes as layer_module
 from mapper.octree.attributes import NEVER_SEEN
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap, log_odds
-from mapper.octree.octomap_file import read_map, write_bt, write_ot
+from mapper.octree.octomap_file import read_octree, write_bt, write_ot
 
 BOTH_MODES = pytest.mark.parametrize("discretize", [True, False], ids=["discretize", "every-point"])
 
@@ -194,7 +194,7 @@ def test_colours_come_back_from_a_file(tmp_path):
     octree = mapped()
     write_ot(tmp_path / "map.ot", octree)
 
-    again = read_map(tmp_path / "map.ot")
+    again = read_octree(tmp_path / "map.ot")
 
     found, before = again.attributes.of_leaves(), octree.attributes.of_leaves()
     np.testing.assert_array_equal(again.leaves().log_odds, octree.leaves().log_odds)
@@ -207,7 +207,7 @@ def test_colours_come_back_from_a_file(tmp_path):
 def test_a_pruned_leaf_s_colour_comes_back_for_all_its_voxels(tmp_path):
     write_ot(tmp_path / "map.ot", saturated(1, holes=0.0))
 
-    again = read_map(tmp_path / "map.ot")
+    again = read_octree(tmp_path / "map.ot")
 
     write_ot(tmp_path / "again.ot", again)
     assert (tmp_path / "again.ot").read_bytes() == (tmp_path / "map.ot").read_bytes()
@@ -221,4 +221,4 @@ def test_a_map_without_colours_stays_an_octree(tmp_path):
     write_bt(tmp_path / "map.bt", octree)
 
     assert b"id OcTree\n" in (tmp_path / "map.ot").read_bytes()
-    assert read_map(tmp_path / "map.ot").attributes is None
+    assert read_octree(tmp_path / "map.ot").attributes is None

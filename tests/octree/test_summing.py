@@ -7,7 +7,7 @@ import pytest
 from mapper.octree.attributes import NEVER_SEEN
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
-from mapper.octree.octomap_file import read_map
+from mapper.octree.octomap_file import read_octree
 from mapper.octree.summing import Overlap
 from tests.support.octomap_oracle import voxels
 from tests.support.octree_maps import COLORED, CONFIG, as_dict, mapped, total
@@ -92,6 +92,6 @@ def test_a_map_added_to_an_empty_one_is_the_same_file(tmp_path, config):
     octree = mapped(6, config=config)
     write_map(tmp_path / "a.octree", octree)
 
-    write_map(tmp_path / "b.octree", total([read_map(tmp_path / "a.octree")], config=config)[0])
+    write_map(tmp_path / "b.octree", total([read_octree(tmp_path / "a.octree")], config=config)[0])
 
     assert (tmp_path / "b.octree").read_bytes() == (tmp_path / "a.octree").read_bytes()

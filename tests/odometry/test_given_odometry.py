@@ -16,7 +16,7 @@ from mapper.odometry.factory import build_odometry
 from mapper.odometry.given_poses import poses_for
 from mapper.pipeline.build import build
 from mapper.pipeline.track import refuse_a_fragment, track_log
-from mapper.run.folder import load_run
+from mapper.run.folder import open_run
 from mapper.runtime.progress import SILENT
 from mapper.simulation import CameraSimulator, make_scene
 from mapper.simulation.lidar import LidarSimulator
@@ -185,7 +185,7 @@ def test_a_desk_is_mapped_by_its_truth_on_the_command_line(desk_log, tmp_path):
     poses = desk_log / "groundtruth.txt"
     settings = ["--set", "odometry.kind=given", "--set", "loops.kind=none", "--set", f"odometry.path={poses}"]
     mapper("build", desk_log, "--out", tmp_path / "run", *settings, "--quiet")
-    run = load_run(tmp_path / "run")
+    run = open_run(tmp_path / "run")
     assert run.manifest.counts.tracked == 31
     (ate,) = (m.value for m in evaluate(run.trajectory, run.truth) if m.name.startswith("ATE RMSE"))
     assert ate < 1e-6

@@ -11,10 +11,10 @@ from evaluators.metrics.trajectory import align, associate, ate
 from mapper.config.loading import overridden
 from mapper.core.errors import ConfigError, RunError
 from mapper.loops.config import NoLoopsConfig
-from mapper.octree.octomap_file import read_map
+from mapper.octree.octomap_file import read_octree
 from mapper.pipeline.append import append
 from mapper.pipeline.fuse import fuse
-from mapper.run.folder import load_run, moved_log, open_log
+from mapper.run.folder import moved_log, open_run
 from mapper.sources import open_source
 from mapper.sources.chained import sessions_of
 from mapper.sources.config import SourceConfig
@@ -27,7 +27,7 @@ def joined(first, desk_log):
     """The second half, appended by the command line."""
     out = first.path.with_name("joined")
     mapper("build", desk_log, "--first", 16, "--onto", first.path, "--out", out)
-    return load_run(out)
+    return open_run(out)
 
 
 def test_both_sessions_are_one_run_in_the_first_one_s_world(first, joined):
@@ -50,12 +50,12 @@ def test_edits_by_hand_hold_in_the_joined_map(first, joined, desk_log, tmp_path)
 
     mapper("build", desk_log, "--first", 16, "--onto", edited, "--out", tmp_path / "both", "--quiet")
 
-    both = load_run(tmp_path / "both")
+    both = open_run(tmp_path / "both")
     assert (both.path / "edits.toml").read_text() == (edited / "edits.toml").read_text()
     (edit,) = both.manifest.edits
     assert edit.count == both.manifest.counts.leaves < joined.manifest.counts.leaves
-    assert read_map(both.file("map.ot")).leaves().centres_world[:, 2].max() < 0.9
-    assert read_map(joined.file("map.ot")).leaves().centres_world[:, 2].max() > 0.9
+    assert read_octree(both.file("map.ot")).leaves().centres_world[:, 2].max() < 0.9
+    assert read_octree(joined.file("map.ot")).leaves().centres_world[:, 2].max() > 0.9
 
 
 def test_loops_between_the_sessions_hold(first, joined):
@@ -88,7 +88,7 @@ def test_the_manifest_remembers_both_logs(joined, desk_log):
     assert second["path"] == manifest["input"]["path"] == str(desk_log)
     assert (second["source"]["first_frame"], second["shift_ns"]) == (16, 0)
     assert joined.config.source.last_frame == 15
-    source = open_log(joined)
+    source = joined.open_log()
     assert [entry.stamp_ns for entry in source.entries()] == [
         entry.stamp_ns for entry in open_source(desk_log).entries()
     ]
@@ -108,10 +108,10 @@ def test_the_maps_are_those_of_fusing_from_scratch(joined, tmp_path):
 
 
 def test_moved_logs_are_told_in_their_order(joined, desk_log, tmp_path):
-    run = load_run(shutil.copytree(joined.path, tmp_path / "run"))
+    run = open_run(shutil.copytree(joined.path, tmp_path / "run"))
     moved = shutil.copytree(desk_log, tmp_path / "moved")
     mapper("fuse", run.path, "--log", moved, "--log", desk_log, "--set", "cloud.voxel_m=0.1", "--quiet")
-    known = load_run(run.path).manifest.input
+    known = open_run(run.path).manifest.input
     assert [known.path, known.appended[0].path] == [str(moved), str(desk_log)]
     result = mapper("fuse", run.path, "--log", moved, status=1)
     assert "made from 2 logs" in result.stderr
@@ -140,13 +140,13 @@ def test_a_third_session_is_appended_to_two(joined, desk_log, tmp_path):
     source = open_source(desk_log, SourceConfig(last_frame=12))
     three = append(source, joined, overridden(joined.config, ["source.last_frame=12"]), tmp_path / "three")
     assert three.manifest.counts.tracked == 31 + 13
-    assert [len(session.log) for session in sessions_of(open_log(three))] == [16, 15, 13]
+    assert [len(session.log) for session in sessions_of(three.open_log())] == [16, 15, 13]
     assert three.manifest.input.appended[1].shift_ns > 0
     matched = associate(three.trajectory, three.truth)
     assert len(matched) == 44
     assert ate(align(matched, "se3").moved(matched)).rmse < 0.02
     assert three.manifest.timing.log_s == pytest.approx(31 / 15 + 11 / 15, abs=0.2)
-    fuse(open_log(three), three, three.config)
+    fuse(three.open_log(), three, three.config)
 
 
 def test_another_place_is_refused_and_the_run_is_untouched(first, elsewhere, tmp_path):

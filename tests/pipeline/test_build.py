@@ -12,10 +12,10 @@ from mapper.config.loading import load_config, overridden
 from mapper.core.errors import ConfigError, RunError, TrackingError
 from mapper.export.grid import read_grid
 from mapper.export.run_maps import maps_of
-from mapper.octree.octomap_file import read_map
+from mapper.octree.octomap_file import read_octree
 from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse
-from mapper.run.folder import load_run
+from mapper.run.folder import open_run
 from mapper.run.manifest import read_manifest
 from mapper.sensing.depth_noise import depth_sigma_m
 from mapper.sources import open_source
@@ -94,7 +94,7 @@ def test_poses_are_less_certain_the_farther_they_are(run):
 
 
 def test_the_maps_agree_with_each_other(run):
-    octree = read_map(run.path / "map.ot")
+    octree = read_octree(run.path / "map.ot")
     grid = read_grid(run.path / "slice.yaml")
     assert len(octree) == run.manifest.counts.leaves > 1000
     assert grid.resolution_m == octree.resolution_m == run.config.octree.resolution_m
@@ -111,7 +111,7 @@ def test_every_point_of_the_cloud_lies_in_an_occupied_voxel(run):
     cloud = read_cloud(run.path / "cloud.ply", scale=1.0).points
     assert len(cloud) == run.manifest.counts.cloud_points > 1000
     for name in ("map.ot", "map.octree"):
-        assert read_map(run.path / name).are_occupied(cloud).all()
+        assert read_octree(run.path / name).are_occupied(cloud).all()
 
 
 def test_depth_counts_as_far_as_its_noise_is_below_a_voxel(run, desk_log, tmp_path):
@@ -121,7 +121,7 @@ def test_depth_counts_as_far_as_its_noise_is_below_a_voxel(run, desk_log, tmp_pa
     assert reach.detail.startswith("measured on planes")
     assert 3.0 < reach.limit_m < 8.0, "the camera is simulated after a Kinect"
 
-    copy = load_run(shutil.copytree(run.path, tmp_path / "run"))
+    copy = open_run(shutil.copytree(run.path, tmp_path / "run"))
     again = fuse(
         open_source(desk_log, run.config.source), copy, overridden(run.config, ["octree.max_range_m=1"])
     )
@@ -170,7 +170,7 @@ def test_the_same_log_gives_the_same_bytes(run, desk_log, tmp_path, workers):
 
 
 def test_fusing_again_changes_the_maps_alone(run, desk_log, tmp_path):
-    fine = load_run(shutil.copytree(run.path, tmp_path / "fine"))
+    fine = open_run(shutil.copytree(run.path, tmp_path / "fine"))
     config = overridden(fine.config, ["octree.resolution_m=0.1", "slice.max_height_m=0.8"])
 
     fused = fuse(open_source(desk_log), fine, config)
@@ -189,7 +189,7 @@ def test_fusing_again_changes_the_maps_alone(run, desk_log, tmp_path):
 
 
 def test_fusing_spares_a_user_s_files_and_learns_where_the_log_is(run, desk_log, tmp_path):
-    own = load_run(shutil.copytree(run.path, tmp_path / "own"))
+    own = open_run(shutil.copytree(run.path, tmp_path / "own"))
     (own.path / "notes").mkdir()
     (own.path / "notes" / "monday.txt").write_text("the door was open")
     (own.path / "mesh.ply").write_bytes(b"of the same trajectory")
@@ -207,7 +207,7 @@ def test_fusing_spares_a_user_s_files_and_learns_where_the_log_is(run, desk_log,
 def test_a_run_whose_scan_updates_have_their_former_name_is_fused_without_reading_every_frame(
     run, desk_log, tmp_path
 ):
-    old = load_run(shutil.copytree(run.path, tmp_path / "old"))
+    old = open_run(shutil.copytree(run.path, tmp_path / "old"))
     (old.path / "scan_updates.bin").rename(old.path / "sights.bin")
     observer = Observer()
 

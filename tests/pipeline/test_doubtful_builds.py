@@ -11,12 +11,12 @@ from mapper.config.loading import load_config, overridden
 from mapper.core.errors import TrackingError
 from mapper.core.geometry import exp
 from mapper.export.mesh import _views
-from mapper.octree.octomap_file import read_map
+from mapper.octree.octomap_file import read_octree
 from mapper.octree.scan_update_file import open_scan_updates
 from mapper.pipeline.append import append
 from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse
-from mapper.run.folder import load_run, open_log
+from mapper.run.folder import open_run
 from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
 from tests.support.desk import REPEATABLE
@@ -69,21 +69,21 @@ def test_they_are_in_no_map(doubted):
         }
     assert fused == set(range(31)) - DOUBTED.keys()
     run = replace(doubted, config=overridden(doubted.config, ["mesh.frame_stride=1"]))
-    assert len(list(_views(run, read_map(run.file("map.octree")), SILENT))) == 28
+    assert len(list(_views(run, read_octree(run.file("map.octree")), SILENT))) == 28
 
 
 def test_fusing_again_leaves_them_out_again(doubted, tmp_path):
-    again = load_run(shutil.copytree(doubted.path, tmp_path / "again"))
+    again = open_run(shutil.copytree(doubted.path, tmp_path / "again"))
     (again.path / "scan_updates.bin").unlink()
-    fused = fuse(open_log(again), again, again.config)
+    fused = fuse(again.open_log(), again, again.config)
     ours, theirs = files_of(fused.path), files_of(doubted.path)
     for name in ("map.ot", "cloud.ply", "frames.csv", "trajectory.tum", "run.mcap"):
         assert ours[name] == theirs[name], name
 
 
 def test_a_pose_that_is_given_is_not_doubted(doubted, desk_run, tmp_path):
-    again = load_run(shutil.copytree(doubted.path, tmp_path / "again"))
-    fused = fuse(open_log(again), again, again.config, trajectory=desk_run.trajectory)
+    again = open_run(shutil.copytree(doubted.path, tmp_path / "again"))
+    fused = fuse(again.open_log(), again, again.config, trajectory=desk_run.trajectory)
     assert fused.manifest.counts.doubtful == 0
     assert (fused.path / "map.ot").read_bytes() == (desk_run.path / "map.ot").read_bytes()
 

@@ -12,7 +12,7 @@ from mapper.odometry.factory import odometry_for
 from mapper.pipeline import judge, track
 from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse
-from mapper.run.folder import load_run, open_log
+from mapper.run.folder import open_run
 from mapper.run.verdict import verdict_on
 from mapper.sources import open_source
 from tests.support.command_line import mapper
@@ -52,7 +52,7 @@ def test_a_build_tells_what_helped_in_a_trial(desk_log, tmp_path, monkeypatch):
         raise AssertionError("the trial of the build is still good")
 
     monkeypatch.setattr(judge, "try_settings", fails)
-    again = fuse(open_log(run), run, run.config)
+    again = fuse(run.open_log(), run, run.config)
     assert again.manifest.verdict == manifest.verdict
     assert again.manifest.warnings == manifest.warnings
 
@@ -62,7 +62,7 @@ def test_strict_builds_end_with_status_1_and_are_whole(desk_log, tmp_path, monke
     monkeypatch.setattr(judge, "_FACTORS", {})
     arguments = ["build", desk_log, "--out", tmp_path / "run", "--set", SETTINGS[1], "--strict"]
     result = mapper(*arguments, status=1)
-    run = load_run(tmp_path / "run")
+    run = open_run(tmp_path / "run")
     assert run.manifest.status == "complete"
     assert "mapper: " in result.stderr
     assert "run: doubtful: 7 of 31 placed frames are doubtful" in result.stderr.splitlines()[-1]

@@ -12,7 +12,7 @@ from mapper.export.grid import read_grid
 from mapper.octree.slice import FREE
 from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse
-from mapper.run.folder import load_run, open_log
+from mapper.run.folder import open_run
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source
@@ -84,7 +84,7 @@ def test_fusing_again_along_the_same_poses_gives_the_same_map(log, tmp_path):
     copy = built(log, tmp_path / "copy")
     before = (copy.path / "map.ot").read_bytes()
 
-    fused = fuse(open_log(load_run(copy.path)), copy, overridden(copy.config, ["slice.max_height_m=1.5"]))
+    fused = fuse(open_run(copy.path).open_log(), copy, overridden(copy.config, ["slice.max_height_m=1.5"]))
 
     assert (fused.path / "map.ot").read_bytes() == before
 

@@ -11,12 +11,11 @@ from mapper.config.loading import load_config, overridden
 from mapper.core.errors import ConfigError, RunError
 from mapper.core.geometry import exp, fit_rigid
 from mapper.core.timebase import nearest
-from mapper.pipeline import known_map
 from mapper.pipeline.build import build
 from mapper.pipeline.known_map import load_known_map
 from mapper.pipeline.localise import localise
 from mapper.run.checks import check_run
-from mapper.run.folder import load_run
+from mapper.run.folder import Run, open_run
 from mapper.run.frame_outcomes import read_records
 from mapper.run.pose_covariances import read_poses
 from mapper.simulation.config import STREET, LidarSensorConfig
@@ -72,7 +71,7 @@ def test_the_manifest_tells_the_map_the_stretches_and_a_verdict(first, localised
     assert manifest["verdict"]["state"] == "trusted"
     assert (localised / "summary.png").stat().st_size > 1000
     with pytest.raises(RunError, match="is a localised log, not a run"):
-        load_run(localised)
+        open_run(localised)
 
 
 def test_a_map_is_not_replaced_by_a_log_localised_in_it(first, desk_log, localised):
@@ -103,7 +102,7 @@ def test_the_map_s_log_is_not_needed(first, desk_log, localised, tmp_path, monke
     def missing(_run):
         raise RunError("the map's log is gone")
 
-    monkeypatch.setattr(known_map, "open_log", missing)
+    monkeypatch.setattr(Run, "open_log", missing)
     in_map(first, desk_log, tmp_path / "out", "workers=1")
     name = "trajectory.tum"
     assert (tmp_path / "out" / name).read_bytes() == (localised / name).read_bytes()
@@ -112,7 +111,7 @@ def test_the_map_s_log_is_not_needed(first, desk_log, localised, tmp_path, monke
 def test_a_run_without_stored_places_has_them_observed_again(first, desk_log, tmp_path):
     old = shutil.copytree(first.path, tmp_path / "old")
     (old / "places.bin").unlink()
-    manifest = in_map(load_run(old), desk_log, tmp_path / "out")
+    manifest = in_map(open_run(old), desk_log, tmp_path / "out")
     assert manifest.counts.tracked == 15
     assert miss_m(first, desk_log, read_tum(tmp_path / "out" / "trajectory.tum")).max() < 0.02
 

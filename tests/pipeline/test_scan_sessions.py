@@ -12,7 +12,7 @@ from mapper.loops.closure import discrepancy
 from mapper.pipeline.append import append
 from mapper.pipeline.build import build
 from mapper.pipeline.edit_loops import edit_loops
-from mapper.run.folder import load_run, open_log
+from mapper.run.folder import open_run
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source
@@ -58,8 +58,8 @@ def error_m(run):
 
 def test_a_loop_between_scans_can_be_added_by_hand(first, tmp_path):
     shutil.copytree(first.path, tmp_path / "run")
-    copy = load_run(tmp_path / "run")
-    edited = edit_loops(open_log(copy), copy, add=[(2, 9)])
+    copy = open_run(tmp_path / "run")
+    edited = edit_loops(copy.open_log(), copy, add=[(2, 9)])
     (loop,) = edited.loops
     truth = edited.truth
     T_world_body = dict(zip(truth.stamps_ns.tolist(), truth.T_world_body, strict=True))
@@ -72,10 +72,10 @@ def test_a_loop_between_scans_can_be_added_by_hand(first, tmp_path):
 
 def test_scans_of_two_places_are_no_loop_whoever_says_so(first, tmp_path):
     shutil.copytree(first.path, tmp_path / "run")
-    copy = load_run(tmp_path / "run")
+    copy = open_run(tmp_path / "run")
     with pytest.raises(LoopError, match=r"loop 0 → 20: not added; (vote|overlap|sight): "):
-        edit_loops(open_log(copy), copy, add=[(0, 20)])
-    assert load_run(copy.path).loops == []
+        edit_loops(copy.open_log(), copy, add=[(0, 20)])
+    assert open_run(copy.path).loops == []
 
 
 def test_a_second_drive_is_tied_to_the_first(first, logs, tmp_path):

@@ -10,7 +10,7 @@ from mapper.pipeline.fuse import fuse
 from mapper.run import digests, files
 from mapper.run.checks import check_run
 from mapper.run.digests import changing
-from mapper.run.folder import load_run, open_log
+from mapper.run.folder import open_run
 from mapper.run.manifest import read_manifest
 from mapper.run.results import load_results
 from tests.support.command_line import mapper
@@ -25,13 +25,13 @@ READERS = {
     "loops.jsonl": lambda run: run.loops,
     "frames.csv": lambda run: run.records,
     "frame_ms.csv": lambda run: run.frame_ms,
-    "config.json": lambda run: load_run(run.path),
+    "config.json": lambda run: open_run(run.path),
 }
 
 
 @pytest.fixture
 def run(desk_run, tmp_path):
-    return load_run(shutil.copytree(desk_run.path, tmp_path / "run"))
+    return open_run(shutil.copytree(desk_run.path, tmp_path / "run"))
 
 
 def cut(path):
@@ -101,7 +101,7 @@ def test_fusing_does_not_take_over_damage(run, name):
     cut(run.path / name)
     before = files_of(run.path)
     with pytest.raises(RunError, match=rf"{name}: has \d+ bytes"):
-        fuse(open_log(run), run, run.config)
+        fuse(run.open_log(), run, run.config)
     assert files_of(run.path) == before
 
 
@@ -143,7 +143,7 @@ def test_a_map_that_was_edited_is_kept_once_accepted(run):
     assert "not a grey 8-bit image" in refused.output
     path.write_bytes(original[:-40] + bytes(40))
     mapper("doctor", run.path, "--accept", "slice.pgm")
-    export(load_run(run.path), "costmap")
+    export(open_run(run.path), "costmap")
     cut(run.path / "map.octree")
     assert verdicts_of(run.path)["map.octree"] == "failed", "no other file is accepted"
 
@@ -165,7 +165,7 @@ def test_exports_into_the_run_are_recorded(run):
 def test_a_run_may_be_named_by_a_link(run):
     link = run.path.with_name("link")
     link.symlink_to(run.path, target_is_directory=True)
-    export(load_run(link), "costmap")
+    export(open_run(link), "costmap")
     assert verdicts_of(link)["costmap.pgm"] == "well"
 
 
@@ -184,10 +184,10 @@ def test_a_run_without_digests_is_read_and_counted(run):
     old = run.manifest.model_copy(update={"files": {}})
     old.save(run.path / "manifest.json")
     assert set(verdicts_of(run.path).values()) == {"well", "warning"}
-    export(load_run(run.path), "costmap")
+    export(open_run(run.path), "costmap")
     assert not read_manifest(run.path / "manifest.json").files
 
     lines = (run.path / "trajectory.tum").read_text().splitlines(keepends=True)
     (run.path / "trajectory.tum").write_text("".join(lines[: len(lines) // 2]))
-    assert len(load_run(run.path).trajectory) < len(lines) - 1
+    assert len(open_run(run.path).trajectory) < len(lines) - 1
     assert verdicts_of(run.path)["trajectory.tum"] == "failed"

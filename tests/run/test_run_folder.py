@@ -9,7 +9,7 @@ from mapper.loops.closure import read_closures
 from mapper.odometry.base import Diagnostics
 from mapper.run.files import RUN
 from mapper.run.fingerprint import fingerprint
-from mapper.run.folder import load_run, write_run
+from mapper.run.folder import open_run, write_run
 from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records, write_frame_ms, write_records
 from mapper.run.manifest import Input, Manifest, read_manifest
 from mapper.run.pose_covariances import read_poses
@@ -36,7 +36,7 @@ def test_a_run_appears_only_when_it_is_whole(tmp_path):
         assert not out.exists()
         assert read_manifest(writer.folder / "manifest.json").status == "building"
 
-    run = load_run(out)
+    run = open_run(out)
     assert run.manifest.status == "complete"
     assert run.config == BuildConfig(workers=1)
     assert not partial_of(out).exists()
@@ -62,7 +62,7 @@ def test_a_run_that_ends_early_says_how(tmp_path, error, status, reason):
     assert reason in manifest.reason
     assert (partial_of(out) / "trajectory.tum").read_text() == "saved"
     with pytest.raises(RunError, match=status):
-        load_run(out)
+        open_run(out)
 
 
 def test_a_killed_process_leaves_a_folder_that_says_so(tmp_path):
@@ -73,9 +73,9 @@ def test_a_killed_process_leaves_a_folder_that_says_so(tmp_path):
     os.waitpid(child, 0)
 
     with pytest.raises(RunError, match="still being built, or its process was killed"):
-        load_run(tmp_path / "lab")
+        open_run(tmp_path / "lab")
     make_run(tmp_path / "lab", "second try")
-    assert load_run(tmp_path / "lab").manifest.status == "complete"
+    assert open_run(tmp_path / "lab").manifest.status == "complete"
 
 
 def test_an_existing_run_is_refused_before_any_work(tmp_path):
@@ -121,12 +121,12 @@ def test_two_builds_of_one_run_do_not_mix(tmp_path):
 
 def test_folders_that_are_no_runs(tmp_path):
     with pytest.raises(RunError, match="no such run folder"):
-        load_run(tmp_path / "none")
+        open_run(tmp_path / "none")
     with pytest.raises(RunError, match="run folder"):
-        load_run(tmp_path)
+        open_run(tmp_path)
     (tmp_path / "manifest.json").write_text('{"status": "complete"}')
     with pytest.raises(RunError, match="input: Field required"):
-        load_run(tmp_path)
+        open_run(tmp_path)
 
 
 def test_records_survive_the_disk(tmp_path):

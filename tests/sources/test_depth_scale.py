@@ -10,7 +10,7 @@ from mapper.config.loading import load_config
 from mapper.core.frames import PinholeCamera, RgbdFrame
 from mapper.core.timebase import NS_PER_S
 from mapper.pipeline.build import build
-from mapper.run.folder import load_run
+from mapper.run.folder import open_run
 from mapper.simulation import CameraSimulator
 from mapper.simulation.config import SynthConfig, SynthWheelsConfig
 from mapper.sources import open_source
@@ -153,7 +153,7 @@ def test_inspect_and_build_tell_and_the_setting_alone_mends_it(desk_log, tmp_pat
         "slice.max_height_m=9",
     )
     assert "depth: a tenth of it is beyond" in result.stderr
-    notes = load_run(tmp_path / "run").manifest.input.notes
+    notes = open_run(tmp_path / "run").manifest.input.notes
     assert any(note.startswith("depth: a tenth of it is beyond") for note in notes)
 
     mended = mapper("inspect", log, "--set", "source.camera.depth_factor=5000").stdout

@@ -16,7 +16,7 @@ from mapper.export.grid import grid_image, stored_grid
 from mapper.export.path_band import SIGMAS
 from mapper.loops.closure import LoopClosure
 from mapper.mapping.thumbnails import encode_jpeg
-from mapper.octree.octomap_file import bt_bytes, read_map
+from mapper.octree.octomap_file import bt_bytes, read_octree
 from mapper.octree.slice import OccupancyGrid
 from mapper.run import files
 from mapper.run.folder import Run
@@ -98,7 +98,7 @@ def drawn(chapter: Chapter) -> dict[str, Any]:
 def map_sizes(chapter: Chapter) -> dict[str, str]:
     """Return the sizes of the cloud and of the octree at a few levels (Zhao et al. 2020, Table 5)."""
     run = chapter.run
-    octree = read_map(run.file(files.OCTREE_MAP))
+    octree = read_octree(run.file(files.OCTREE_MAP))
     cloud_bytes = run.file(files.CLOUD).stat().st_size
     points = run.manifest.counts.cloud_points
     sizes = {"coloured cloud": f"{cloud_bytes / 1e6:.3g} MB, {points} points"}
