@@ -18,7 +18,9 @@ class BuildConfig(Config):
 
     source: SourceConfig = SourceConfig()
     odometry: OdometryConfig = LocalMapConfig()
+    """Method that finds the sensor's motion from frame to frame."""
     loops: LoopsConfig = PlaceLoopsConfig()
+    """Method that recognises places where the sensor was before."""
     graph: GraphConfig = GraphConfig()
     octree: OctreeConfig = OctreeConfig()
     level: LevelConfig = LevelConfig()
@@ -33,6 +35,6 @@ class BuildConfig(Config):
     min_tracked_frames: PositiveInt = 10
     """With fewer frames tracked no map is made, and the build ends in an error."""
     min_tracked_ratio: Ratio = 0.2
-    """The same, as a share of the frames that could be read."""
+    """With a smaller share of the readable frames tracked no map is made, and the build ends in an error."""
     workers: NonNegativeInt = 2
-    """Threads that decode and detect ahead; the result does not depend on it."""
+    """Threads that read, decode and detect features ahead; the result does not depend on their number."""

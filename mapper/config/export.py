@@ -12,6 +12,7 @@ class MeshConfig(Config):
     """The surface of ``mapper export --as mesh``: truncated signed distances (Curless & Levoy 1996)."""
 
     voxel_m: PositiveFloat = 0.01
+    """Edge of a voxel of the signed distances. Smaller shows finer shapes and needs far more memory."""
     truncation_voxels: Annotated[float, Field(ge=1.0)] = 4.0
     """How far from the surface distances count; thinner than the depth noise tears holes."""
     max_depth_m: PositiveFloat | None = None

@@ -15,12 +15,16 @@ class SurfConfig(Config):
 
     kind: Literal["surf"] = "surf"
     max_features: PositiveInt = 1000
+    """Largest number of features of an image, the strongest first. More in images of higher resolution; fewer
+    are faster."""
     threshold: PositiveFloat = 100.0
     """First threshold of the Hessian's determinant, grey levels²; halved while there are too few features."""
     min_threshold: PositiveFloat = 1.0
     """Last threshold; raise it where noise gives features."""
     min_features: PositiveInt = 300
+    """With fewer features the threshold is halved."""
     octaves: PositiveInt = 4
+    """Number of times that the filter's size doubles: more find larger features."""
 
 
 class SiftConfig(Config):
@@ -28,11 +32,14 @@ class SiftConfig(Config):
 
     kind: Literal["sift"] = "sift"
     max_features: PositiveInt = 1000
+    """Largest number of features of an image, the strongest first. More in images of higher resolution; fewer
+    are faster."""
     threshold: PositiveFloat = 0.04
     """First contrast threshold; halved while there are too few features."""
     min_threshold: PositiveFloat = 0.01
     """Last threshold; raise it where noise gives features."""
     min_features: PositiveInt = 300
+    """With fewer features the threshold is halved."""
 
 
 class AkazeConfig(Config):
@@ -40,11 +47,14 @@ class AkazeConfig(Config):
 
     kind: Literal["akaze"] = "akaze"
     max_features: PositiveInt = 1000
+    """Largest number of features of an image, the strongest first. More in images of higher resolution; fewer
+    are faster."""
     threshold: PositiveFloat = 0.001
     """First threshold of the detector's response; halved while there are too few features."""
     min_threshold: PositiveFloat = 0.0001
     """Last threshold; raise it where noise gives features."""
     min_features: PositiveInt = 300
+    """With fewer features the threshold is halved."""
 
 
 class OrbConfig(Config):
@@ -52,13 +62,18 @@ class OrbConfig(Config):
 
     kind: Literal["orb"] = "orb"
     max_features: PositiveInt = 1000
+    """Largest number of features of an image, the strongest first. More in images of higher resolution; fewer
+    are faster."""
     threshold: PositiveInt = 20
     """First FAST threshold, grey levels; halved while there are too few features."""
     min_threshold: PositiveInt = 5
     """Last threshold; raise it where noise gives features."""
     min_features: PositiveInt = 300
+    """With fewer features the threshold is halved."""
     levels: PositiveInt = 8
+    """Number of pyramid levels. More find features again from farther away or nearer."""
     scale_factor: ScaleFactor = 1.2
+    """Size of a pixel on one pyramid level relative to the next finer one."""
 
 
 class UniformOrbConfig(Config):
@@ -66,13 +81,18 @@ class UniformOrbConfig(Config):
 
     kind: Literal["uniform-orb"] = "uniform-orb"
     max_features: PositiveInt = 1000
+    """Largest number of features of an image, the strongest first. More in images of higher resolution; fewer
+    are faster."""
     threshold: PositiveInt = 20
     """FAST threshold, grey levels, tried first in every cell."""
     min_threshold: PositiveInt = 7
     """FAST threshold of cells in which the first finds nothing; raise it where noise gives features."""
     cell_px: PositiveInt = 30
+    """Edge of the cells in which corners are searched. Smaller cells spread features more evenly."""
     levels: PositiveInt = 8
+    """Number of pyramid levels. More find features again from farther away or nearer."""
     scale_factor: ScaleFactor = 1.2
+    """Size of a pixel on one pyramid level relative to the next finer one."""
 
 
 DetectorConfig = Annotated[

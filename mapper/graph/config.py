@@ -15,13 +15,16 @@ class WheelNoiseConfig(Config):
     max_gap_s: PositiveFloat = 0.2
     """Largest gap between two readings across which wheel poses are interpolated."""
     least_m: PositiveFloat = 0.01
+    """Error of the position that every step has, also a short one."""
     path_share: NonNegativeFloat = 0.05
-    """Error of the position, as a share of the metres driven."""
+    """Error of the position that is added, as a share of the metres driven. More, where wheels slip."""
     least_rad: PositiveFloat = 0.01
+    """Error of the heading that every step has, also a short one."""
     turn_share: NonNegativeFloat = 0.05
-    """Error of the heading, as a share of the radians turned."""
+    """Error of the heading that is added, as a share of the radians turned. More for a robot that turns on
+    the spot."""
     rad_per_m: NonNegativeFloat = 0.02
-    """Error of the heading per metre driven."""
+    """Error of the heading that is added per metre driven."""
 
 
 class WheelFactorsConfig(WheelNoiseConfig):

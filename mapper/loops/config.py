@@ -38,13 +38,16 @@ class GateConfig(Config):
     """Drift gate: how far a loop may move a node, by the drift of odometry on the path between its ends."""
 
     slack_m: PositiveFloat = 0.2
+    """What a loop may move a node, however short the path. More, where the odometry loses its way in places:
+    more true loops hold, and more false ones."""
     slack_rad: PositiveFloat = 0.1
+    """What a loop may turn a node, however short the path."""
     drift_ratio: NonNegativeFloat = 0.05
-    """Metres per metre of path."""
+    """What is added to ``slack_m``, in metres per metre of path."""
     drift_rad_per_m: NonNegativeFloat = 0.02
-    """Radians per metre of path."""
+    """What is added to ``slack_rad`` per metre of path."""
     drift_rad_per_rad: NonNegativeFloat = 0.05
-    """Radians per radian turned."""
+    """What is added to ``slack_rad`` per radian turned."""
 
 
 class NoLoopsConfig(Config):
@@ -58,12 +61,15 @@ class KeyframeLoopsConfig(Config):
 
     kind: str
     min_gap_s: PositiveFloat = 5.0
-    """Places younger than this are left to the odometry,"""
+    """Places younger than this are left to the odometry."""
     min_gap_m: NonNegativeFloat = 0.0
-    """and so are those less far back along the path."""
+    """Places less far back along the path are left to the odometry."""
     min_motion_m: NonNegativeFloat = 0.02
+    """No loop is searched before the sensor has moved so far since the last search, or turned by
+    ``min_motion_rad``."""
     min_motion_rad: NonNegativeFloat = 0.02
-    """No loop is searched before the sensor has moved so far or turned so much since the last search."""
+    """No loop is searched before the sensor has turned so much since the last search, or moved by
+    ``min_motion_m``."""
     max_distance_m: PositiveFloat = 1.0
     """Largest distance of a nearby place, before the drift since is added."""
     max_candidates: PositiveInt = 4
@@ -71,7 +77,8 @@ class KeyframeLoopsConfig(Config):
     finds more loops and takes longer."""
     gate: GateConfig = GateConfig()
     min_agreeing: NonNegativeInt = 1
-    """So many loops found from other keyframes nearby must agree before one is accepted."""
+    """So many loops found from other keyframes nearby must agree before one is accepted. 0 accepts every loop
+    that passes the other tests: more hold, also false ones."""
     agreement_path_m: PositiveFloat = 3.0
     """How far along the path two loops' ends may lie apart to be compared. More, where keyframes lie farther
     apart."""
@@ -103,7 +110,7 @@ class ScanVerificationConfig(Config):
     pair_distances_m: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (2.0, 1.0)
     """Largest distance between the points of a GICP pair, from coarse to fine."""
     max_iterations: PositiveInt = 20
-    """At each of these distances."""
+    """Largest number of iterations at each of these distances."""
     margin_m: PositiveFloat = 0.3
     """Margin of the free-space check along a ray, after GICP."""
     min_agreeing_ratio: Ratio = 0.3
@@ -121,8 +128,9 @@ class ScanVerificationConfig(Config):
     """By how much a motion's share that agrees, less the share that contradicts, has to lead that of others:
     where two fit alike, as in a square yard, neither is accepted."""
     sigma_rad: NonNegativeFloat = 0.002
+    """Error of the rotation that all points share: of deskewing, calibration and voxels."""
     sigma_m: NonNegativeFloat = 0.03
-    """Errors that all points share: of deskewing, calibration and voxels."""
+    """Error of the translation that all points share."""
 
 
 class ScanLoopsConfig(KeyframeLoopsConfig):
@@ -152,7 +160,7 @@ class ThesisLoopsConfig(Config):
     sharp_ratio: PositiveFloat = 1.2
     """A frame is sharp when it has this many times the median number of features of the last frames."""
     median_frames: PositiveInt = 20
-    """Number of these frames. More, where the camera is shaken for long."""
+    """Number of frames of that median. More, where the camera is shaken for long."""
     max_distance_m: PositiveFloat = 0.5
     """Largest distance of a near keyframe; the thesis leaves it open, as it does the angle."""
     max_angle_rad: PositiveFloat = 0.5

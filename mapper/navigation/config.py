@@ -41,6 +41,7 @@ class PlanConfig(Config):
     """Settings of path planning for a disc on a grid or a ball in the octree."""
 
     radius_m: NonNegativeFloat = 0.2
+    """Radius of the disc, or of the ball."""
     unknown: Literal["blocked", "free"] = "blocked"
     """Unknown space counts as blocked or as free."""
     layer: Literal["slice", "traversable"] = "slice"

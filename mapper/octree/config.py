@@ -19,11 +19,21 @@ class OctreeConfig(Config):
     """OctoMap's sensor model and geometry (Hornung et al. 2013); its defaults."""
 
     resolution_m: PositiveFloat = 0.05
+    """Edge of a voxel. Half of it takes 6 to 8 times the memory and time; smaller than the sensor's noise it
+    shows no more."""
     hit_probability: Annotated[float, Field(ge=0.5, lt=1.0)] = 0.7
+    """Probability that a voxel is occupied in which one ray ends. More, where few frames see each surface."""
     miss_probability: Annotated[float, Field(gt=0.0, le=0.5)] = 0.4
+    """Probability that a voxel is occupied through which one ray passes. Less frees sooner what has left, and
+    thins surfaces that rays graze."""
     clamp_min_probability: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.1192
+    """Least probability of a voxel: no further ray makes it freer. Nearer to 0.5, a thing that arrives is
+    mapped sooner."""
     clamp_max_probability: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.971
+    """Largest probability of a voxel: no further ray makes it fuller. Nearer to 0.5, a thing that leaves is
+    freed sooner."""
     occupied_probability: Probability = 0.5
+    """A voxel counts as occupied above it. More leaves out what few rays have hit."""
     max_range_m: Annotated[float, Field(gt=0.0, allow_inf_nan=True)] | None = None
     """Beyond it a ray only frees space, up to this range. None is as far as ``depth_noise`` allows."""
     depth_noise: DepthNoiseConfig | None = None

@@ -28,6 +28,7 @@ class MatchConfig(Config):
     homography_tolerance_px: PositiveFloat = 4.0
     """ε of alg. 8; the thesis states neither it nor the ratio."""
     homography_iterations: PositiveInt = 2000
+    """Largest number of RANSAC samples for the homography."""
     seed: NonNegativeInt = 0
     """Seed of RANSAC's samples, here and in the verification of loops by P3P."""
 
@@ -37,10 +38,13 @@ class IsvdOdometryConfig(Config):
 
     kind: Literal["isvd"] = "isvd"
     detector: DetectorConfig = SurfConfig()
+    """Features by which frames are matched."""
     match: MatchConfig = MatchConfig()
+    """How features of two frames are paired."""
     fallback: MatchConfig = MatchConfig(filter="none", max_ratio=0.95)
     """Matching once ``match`` has led to no motion."""
     registration: IsvdConfig = IsvdConfig()
+    """ISVD on the matched points."""
     previous_frames: PositiveInt = 4
     """MP: number of earlier frames that each frame is registered against."""
     average: Literal["weighted", "mean"] = "weighted"
@@ -52,6 +56,7 @@ class IsvdOdometryConfig(Config):
     undistort: bool = True
     """Undistort features before back-projection; the thesis does not state it."""
     max_depth_m: PositiveFloat = 5.0
+    """Depth beyond it is not used: a Kinect's error grows with the square of the depth."""
     keyframe_interval: PositiveInt = 20
     """One keyframe, the sharpest, in this many frames (Somlyai, PhD thesis, §4.1.2)."""
     relocalisation_keyframes: PositiveInt = 20
@@ -99,6 +104,7 @@ class KeyframeOdometryConfig(Config):
     mapped_ratio: Ratio = 0.5
     """Keyframe when the inliers are a smaller share of the features with depth: much of the view is new."""
     max_keyframe_gap: PositiveInt = 20
+    """Keyframe at the latest so many frames after the last one."""
     bundle_keyframes: PositiveInt = 10
     """Keyframes in the window of the local bundle adjustment; fewer are faster and less accurate."""
     vocabulary: Path | None = None
@@ -140,8 +146,9 @@ class WheelsOdometryConfig(WheelNoiseConfig):
 
     kind: Literal["wheels"] = "wheels"
     keyframe_distance_m: PositiveFloat = 0.3
+    """A frame this far from the last keyframe becomes a keyframe. Less finds more loops and takes longer."""
     keyframe_angle_rad: PositiveFloat = 0.2
-    """A frame this far from the last keyframe, or turned this much, becomes a keyframe."""
+    """A frame turned this much from the last keyframe becomes a keyframe."""
     detector: Annotated[OrbConfig | UniformOrbConfig, Field(discriminator="kind")] = UniformOrbConfig()
     """Features by which loops recognise images; scans are recognised by their points."""
 
@@ -166,8 +173,9 @@ class GivenOdometryConfig(WheelNoiseConfig):
     rad_per_m: NonNegativeFloat = 0.0
     """What is added to it per metre in between."""
     keyframe_distance_m: PositiveFloat = 0.3
+    """A frame this far from the last keyframe becomes a keyframe. Less finds more loops and takes longer."""
     keyframe_angle_rad: PositiveFloat = 0.2
-    """A frame this far, or turned this much, from the last keyframe is one itself."""
+    """A frame turned this much from the last keyframe becomes a keyframe."""
     detector: Annotated[OrbConfig | UniformOrbConfig, Field(discriminator="kind")] = UniformOrbConfig()
     """Features by which loops recognise images; scans are recognised by their points."""
 

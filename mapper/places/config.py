@@ -13,6 +13,7 @@ class VocabularyConfig(Config):
     """Training of a vocabulary: a tree of k-means++ clusters (Zhao et al. 2020, §1.1)."""
 
     detector: Annotated[OrbConfig | UniformOrbConfig, Field(discriminator="kind")] = UniformOrbConfig()
+    """Features that become words."""
     frames_per_log: PositiveInt = 200
     """This many frames of a log are used, evenly spread."""
     branching: Annotated[int, Field(ge=2, le=255)] = 13
@@ -41,8 +42,9 @@ class ScanContextConfig(Config):
     """Scan Context: decision whether two scans show the same place (Kim & Kim 2018)."""
 
     rings: PositiveInt = 20
+    """Number of rings around the sensor. More tell places apart better, and forgive less offset."""
     sectors: PositiveInt = 60
-    """Fewer are faster; more resolve the heading better."""
+    """Number of sectors of a full turn. Fewer are faster; more resolve the heading better."""
     reach_m: PositiveFloat = 48.0
     """Radius of the outermost ring; 80 m as published, but loop detection keeps no farther points."""
     max_height_m: PositiveFloat = 15.0

@@ -43,7 +43,7 @@ class RefinedConfig(Config):
     pair_distances_voxels: Distances = (7.0, 3.5)
     """Largest distance between the points of a pair, from coarse to fine."""
     max_iterations: PositiveInt = 40
-    """At each of these distances."""
+    """Largest number of iterations at each of these distances."""
     acceptance: AcceptanceConfig = AcceptanceConfig()
 
 
@@ -78,7 +78,7 @@ class NdtConfig(Config):
     min_points: Annotated[int, Field(ge=4)] = 6
     """Cells with fewer points have none."""
     max_iterations: PositiveInt = 30
-    """At each of these cells."""
+    """Largest number of iterations at each of these cell sizes."""
     acceptance: AcceptanceConfig = AcceptanceConfig()
 
 
@@ -104,14 +104,17 @@ class IsvdConfig(Config):
     threshold: Literal["power", "halving"] = "power"
     """How the largest pair distance shrinks: α·j^β (alg. 7), or by half from ``start_error_mm`` (alg. 6)."""
     alpha_mm: PositiveFloat = 1200.0
+    """α of the power law, as published: the first limit. Larger where frames lie farther apart."""
     beta: Annotated[float, Field(lt=0.0)] = -2.6
-    """α and β of the power law, as published. Larger ones where frames lie farther apart."""
+    """β of the power law, as published. Nearer to 0, where frames lie farther apart, the limit shrinks
+    slower."""
     start_error_mm: PositiveFloat = 1000.0
     """e_start of the halving threshold, which the thesis leaves open. Larger where frames lie farther
     apart."""
     step: Literal["svd", "icp"] = "svd"
     """The motion in each iteration: the SVD of the pairs (alg. 6, 7), or ICP on their points (alg. 5)."""
     max_iterations: PositiveInt = 25
+    """Largest number of iterations."""
     min_error_mm: NonNegativeFloat = 0.0
     """Stop once the threshold falls below this (e_min of alg. 5, 6)."""
     min_pairs: PositiveInt = 100

@@ -15,11 +15,11 @@ class DepthNoiseConfig(Config):
     """
 
     constant_m: NonNegativeFloat = 0.0
-    """a."""
+    """a: what noise there is at any depth."""
     linear: float = 0.0
-    """b, metres per metre."""
+    """b: what is added, in metres per metre of depth."""
     quadratic_per_m: NonNegativeFloat = 0.0
-    """c, metres per square metre."""
+    """c: what is added, in metres per square metre of depth."""
 
     @model_validator(mode="after")
     def _is_positive(self) -> Self:

@@ -12,9 +12,13 @@ class CameraConfig(Config):
     """Intrinsics, all four, and depth units that override what the log or its folder's name says."""
 
     fx_px: PositiveFloat | None = None
+    """Focal length along the image's rows. None keeps the log's own, as in the other three."""
     fy_px: PositiveFloat | None = None
+    """Focal length along the image's columns."""
     cx_px: float | None = None
+    """Column of the principal point."""
     cy_px: float | None = None
+    """Row of the principal point."""
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2, k3 (OpenCV's order)."""
     depth_factor: PositiveFloat | None = None
@@ -100,15 +104,19 @@ class SourceConfig(Config):
     last_frame: NonNegativeInt | None = None
     """Index of the last frame to use, inclusive; None is the end of the log."""
     stride: PositiveInt = 1
-    """Use every n-th frame."""
+    """Use every n-th frame. More is faster, and loses track where the sensor moves fast."""
     require_truth: bool = False
-    """Drop frames without ground truth within ``max_truth_gap_s``."""
+    """Leave out frames without ground truth within ``max_truth_gap_s``: a comparison then counts them all."""
     max_truth_gap_s: NonNegativeFloat = 0.02
+    """Largest time between a frame and a pose of the truth for the two to be compared. More, where the truth
+    has fewer poses a second than the log has frames."""
     max_pair_gap_s: NonNegativeFloat = 0.02
-    """Largest time between a colour image and its depth image."""
+    """Largest time between a colour image and its depth image. More, where the two are not synchronised and
+    the camera moves slowly; frames without a partner are left out."""
     rate_hz: PositiveFloat | None = None
     """Frames per second of numbered files without stamps; None is the format's own (30, Poznań, scans 10)."""
     camera: CameraConfig | None = None
+    """Intrinsics and depth units; None keeps the log's own."""
     topics: TopicsConfig = TopicsConfig()
     wheels: WheelsConfig = WheelsConfig()
     body: BodyConfig = BodyConfig()

@@ -20,10 +20,12 @@ class ScanOdometryConfig(Config):
     max_range_m: PositiveFloat = 100.0
     """Farther returns are too sparse for registration."""
     voxel_m: PositiveFloat = 0.4
-    """Scans are thinned to one point, the mean of at most eight, per voxel of this size."""
+    """Scans are thinned to one point, the mean of at most eight, per voxel of this size. Larger is faster;
+    smaller keeps thin things in narrow places."""
     keyframe_distance_m: PositiveFloat = 1.0
+    """A scan this far from the last keyframe becomes a keyframe. Less finds more loops and takes longer."""
     keyframe_angle_rad: PositiveFloat = 0.2
-    """A scan this far from the last keyframe, or turned this much, becomes a keyframe."""
+    """A scan turned this much from the last keyframe becomes a keyframe."""
     usual_ratio: Ratio = 0.8
     """A scan whose overlap with the last keyframe is a smaller share of the usual one, and unusual for this
     log, is searched again; it is doubtful if more speaks against its pose. 0 believes every pose."""
@@ -54,8 +56,9 @@ class GicpOdometryConfig(ScanOdometryConfig):
     cell_m: PositiveFloat = 0.5
     """Cell size of the map, which has one Gaussian per cell."""
     coarse_cell_m: PositiveFloat = 2.0
-    """Cell size of a second map, to which scans are registered first."""
+    """Cell size of a second map, to which scans are registered first. Larger for fast motion."""
     max_iterations: PositiveInt = 30
+    """Largest number of iterations at each cell size."""
 
     lengths = (*ScanOdometryConfig.lengths, "cell_m", "coarse_cell_m")
 
@@ -70,6 +73,7 @@ class IcpOdometryConfig(ScanOdometryConfig):
     pair_distances_m: tuple[PositiveFloat, ...] = (2.0, 1.0, 0.5)
     """Largest distance between the points of a pair, from coarse to fine."""
     max_iterations: PositiveInt = 40
+    """Largest number of iterations at each of these distances."""
 
     def scaled(self, factor: float) -> Self:
         """Return the settings with all lengths but the ranges multiplied."""
@@ -89,6 +93,7 @@ class KissOdometryConfig(ScanOdometryConfig):
     min_motion_m: PositiveFloat = 0.1
     """Smaller deviations from the predicted motion do not change the adaptive threshold."""
     max_iterations: PositiveInt = 500
+    """Largest number of iterations."""
 
     lengths = (*ScanOdometryConfig.lengths, "map_voxel_m", "initial_threshold_m", "min_motion_m")
 
@@ -98,6 +103,7 @@ class HoughOdometryConfig(ScanOdometryConfig):
 
     kind: Literal["hough-ndt"] = "hough-ndt"
     registration: HoughNdtConfig = HoughNdtConfig()
+    """Registration of each scan to the one before it."""
     rescue: HoughGicpConfig | None = None
 
 

@@ -18,8 +18,9 @@ class LevellingConfig(Config):
     inlier_m: PositiveFloat = 0.12
     """Largest distance of a ground point from the plane."""
     min_height_m: float = 0.3
+    """Least height of the sensor above the plane."""
     max_height_m: float = 4.0
-    """The sensor stands between these heights above the plane."""
+    """Largest height of the sensor above the plane. More for a sensor on a mast."""
     cell_m: PositiveFloat = 1.0
     """One point per cubic cell is used, so that near ground does not outvote the rest."""
     reach_m: PositiveFloat = 40.0
@@ -27,7 +28,7 @@ class LevellingConfig(Config):
     samples: PositiveInt = 400
     """Planes tried."""
     seed: NonNegativeInt = 0
-    """Of the random samples."""
+    """Seed of the random samples."""
 
 
 class GroundConfig(Config):
@@ -36,11 +37,12 @@ class GroundConfig(Config):
     cell_m: PositiveFloat = 0.5
     """Edge of a cell of the grid."""
     max_thickness_m: PositiveFloat = 0.25
-    """Between the lowest and the highest point of a ground cell, as published."""
+    """Largest height between the lowest and the highest point of a ground cell, as published."""
     window_m: PositiveFloat = 8.0
-    """Neighbourhood of a cell."""
+    """Edge of the neighbourhood of a cell, in which the lowest flat cell is searched."""
     max_rise_m: PositiveFloat = 0.5
-    """A ground cell's mean height above the lowest flat cell of its neighbourhood."""
+    """Largest mean height of a ground cell above the lowest flat cell of its neighbourhood. More on
+    slopes."""
     radius_m: PositiveFloat = 60.0
     """Half the edge of the grid: points farther away along an axis are dropped."""
     min_obstacle_m: float = 0.5
@@ -78,8 +80,11 @@ class ConstellationConfig(Config):
     """From one scan to the centres that vote."""
 
     levelling: LevellingConfig = LevellingConfig()
+    """Level frame of a scan."""
     ground: GroundConfig = GroundConfig()
+    """Ground removal, and which points are obstacles."""
     centres: Annotated[CellsConfig | ObjectsConfig, Field(discriminator="kind")] = CellsConfig()
+    """What votes."""
 
 
 class VotingConfig(Config):
@@ -97,8 +102,9 @@ class VotingConfig(Config):
     peaks: PositiveInt = 20
     """Distinct peaks that are verified."""
     distinct_m: PositiveFloat = 2.0
+    """A peak nearer to a higher one than this, and than ``distinct_rad``, is the same peak."""
     distinct_rad: PositiveFloat = 0.09
-    """Peaks nearer to a higher one than both are the same peak."""
+    """A peak nearer to a higher one than this, and than ``distinct_m``, is the same peak."""
 
 
 class OverlapConfig(Config):
@@ -109,14 +115,17 @@ class OverlapConfig(Config):
     obstacles: PositiveInt = 1000
     """Number of obstacle voxels, and of ground columns, that are compared, evenly chosen."""
     step_m: PositiveFloat = 0.4
+    """First step in which the overlap is maximised from each peak, along each axis."""
     step_rad: PositiveFloat = 0.0175
+    """First step of the heading."""
     halvings: NonNegativeInt = 2
-    """From each peak the overlap is maximised in these steps, halved so often."""
+    """So often both steps are halved."""
     candidates: PositiveInt = 6
     """Number of peaks, those with most overlap, that pass to the free-space check."""
     distinct_m: PositiveFloat = 1.0
+    """Motions nearer to each other than this, and than ``distinct_rad``, are the same."""
     distinct_rad: PositiveFloat = 0.05
-    """Motions nearer than both are the same."""
+    """Motions nearer to each other than this, and than ``distinct_m``, are the same."""
     rays: PositiveInt = 40_000
     """Number of points, evenly chosen, whose rays make the range image."""
     margin_m: PositiveFloat = 0.2
@@ -143,7 +152,7 @@ class GicpStagesConfig(Config):
     pair_distances_m: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (1.0,)
     """Largest distance between the points of a pair, from coarse to fine."""
     max_iterations: PositiveInt = 30
-    """At each of these distances."""
+    """Largest number of iterations at each of these distances."""
 
 
 class NdtStagesConfig(Config):
@@ -153,14 +162,16 @@ class NdtStagesConfig(Config):
     cells_m: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (2.0, 1.0)
     """Edges of the cells, from coarse to fine."""
     max_iterations: PositiveInt = 30
-    """At each of these cells."""
+    """Largest number of iterations at each of these cell sizes."""
 
 
 class HoughConfig(Config):
     """Settings common to the Hough registrations."""
 
     constellation: ConstellationConfig
+    """From a scan to the centres that vote."""
     voting: VotingConfig
+    """Search of the motions that most pairs of centres agree on."""
     overlap: OverlapConfig = OverlapConfig()
     acceptance: HoughAcceptanceConfig = HoughAcceptanceConfig()
     voxel_m: PositiveFloat = 0.4
@@ -168,6 +179,7 @@ class HoughConfig(Config):
     neighbours: Annotated[int, Field(ge=5)] = 10
     """Nearest points that give each of these its normal."""
     refinement: Annotated[GicpStagesConfig | NdtStagesConfig, Field(discriminator="kind")]
+    """Registration that refines the motion found by voting."""
 
 
 class HoughGicpConfig(HoughConfig):
