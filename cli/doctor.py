@@ -67,7 +67,7 @@ def doctor(
 
 def _accept(run: Path | None, names: "Sequence[str]") -> None:
     from mapper.core.errors import ConfigError
-    from mapper.export.grid import read_grid
+    from mapper.octree.grid_file import read_grid
     from mapper.run import files
     from mapper.run.folder import open_run
 

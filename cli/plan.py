@@ -71,13 +71,13 @@ def plan(
     """
     from mapper.config.loading import overridden
     from mapper.core.errors import ConfigError
-    from mapper.export.grid import stored_grid
     from mapper.export.plan import draw_plan, write_plan
     from mapper.export.run_maps import storeys_of_run
     from mapper.merging.merged_map import open_map
     from mapper.navigation.config import PlanConfig
     from mapper.navigation.planner import plan_2d, plan_3d
     from mapper.navigation.storey_planner import plan_storeys
+    from mapper.octree.grid_file import stored_grid
     from mapper.octree.octomap_file import read_octree
     from mapper.run import files
     from mapper.run.folder import Run, open_run

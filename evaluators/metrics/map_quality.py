@@ -13,7 +13,6 @@ from evaluators.metrics.trajectory import associate
 from mapper.core.errors import DataError
 from mapper.core.frames import Points32
 from mapper.core.geometry import Transform, apply, inverse, mean_rotation, transform
-from mapper.octree.octomap_file import read_octree
 from mapper.registration.refining import refined_motion
 from mapper.registration.surfaces import prepared
 from mapper.run import files
@@ -58,15 +57,14 @@ def map_quality(
             no points to register.
     """
     world = world or ("truth" if reference.in_truth else "map")
-    octree = read_octree(run.file(files.OCTREE_MAP))
     cloud = read_cloud(run.file(files.CLOUD), scale=1.0).points
     T_map_reference = _laid_by_truth(run) if world == "truth" else np.eye(4)
     how = "by the truth's poses" if world == "truth" else "in the run's own world"
     if register:
-        refined = _registered(reference, cloud, T_map_reference, voxel_m=octree.resolution_m)
+        refined = _registered(reference, cloud, T_map_reference, voxel_m=run.octree.resolution_m)
         moved_m = float(np.linalg.norm((inverse(T_map_reference) @ refined)[:3, 3]))
         T_map_reference, how = refined, f"{how}, then registered"
-    check = check_occupancy(octree, reference, T_map_reference, voxels=voxels)
+    check = check_occupancy(run.octree, reference, T_map_reference, voxels=voxels)
     metrics = [
         Metric(f"map held against the {reference.name}, laid {how}", len(check.occupied), "voxels"),
         *([Metric("registration moved it by", moved_m, "m")] if register else []),

@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.export.grid import stored_grid, write_values
+from mapper.export.grid import write_values
 from mapper.export.palette import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
 from mapper.navigation.costmap import INSCRIBED, LETHAL, NO_INFORMATION, Costmap, inflate
-from mapper.run import files
 from mapper.run.folder import Run
 from mapper.runtime.atomic import write_bytes
 from mapper.runtime.progress import Progress
@@ -27,7 +26,7 @@ def costmap(run: Run, path: Path, _progress: Progress) -> None:
     """
     config = run.config.costmap
     inflated = inflate(
-        stored_grid(run, files.SLICE),
+        run.slice,
         robot_radius_m=config.robot_radius_m,
         inflation_radius_m=config.inflation_radius_m,
         cost_scaling=config.cost_scaling,

@@ -24,8 +24,6 @@ from mapper.export.mesh_files import Triangles, write_mesh
 from mapper.mapping.cloud import Colors
 from mapper.octree.blocks import check_memory
 from mapper.octree.map import OctreeMap
-from mapper.octree.octomap_file import read_octree
-from mapper.run import files
 from mapper.run.folder import Run
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
@@ -77,7 +75,7 @@ def surface(run: Run, path: Path, progress: Progress) -> None:
     """
     o3d = _open3d()
     config = run.config.mesh
-    octree, max_depth_m = read_octree(run.file(files.OCTREE_MAP)), _max_depth_m(run)
+    octree, max_depth_m = run.octree, _max_depth_m(run)
     volume = _Volume(o3d, config, max_depth_m=max_depth_m, blocks=_expected_blocks(octree, config))
     for view in _views(run, octree, progress):
         volume.add(view)

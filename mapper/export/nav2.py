@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
-from mapper.export.grid import stored_grid, write_grid, write_values
+from mapper.export.grid import write_grid, write_values
 from mapper.navigation.config import CostmapConfig
 from mapper.navigation.distance_transform import NONE, squares_to_centres
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from mapper.run import files
 from mapper.run.folder import Run
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text
 from mapper.runtime.progress import Progress
@@ -35,7 +34,7 @@ def nav2(run: Run, path: Path, _progress: Progress) -> None:
         DataError: The slice and the traversable floor do not cover the same cells.
         RunError: PATH holds something else.
     """
-    grid, floor = stored_grid(run, files.SLICE), stored_grid(run, files.TRAVERSABLE)
+    grid, floor = run.slice, run.traversable
     keepout = keepout_mask(grid, floor)
     slowed = slowed_percent(grid, keepout, run.config.costmap)
     with atomic_folder(path, FOLDER, overwrite=True) as folder:

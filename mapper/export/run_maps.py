@@ -7,19 +7,17 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.errors import DataError
-from mapper.core.frames import PinholeCamera, Points32
-from mapper.export.grid import stored_grid
+from mapper.core.frames import PinholeCamera
 from mapper.export.run_mcap import BODY, CAMERA
-from mapper.mapping.cloud import Colors
 from mapper.mapping.fusion import Maps, Snapshot
 from mapper.navigation.floor import reachable_floor
 from mapper.navigation.traversable import Storey, traversable
-from mapper.octree.octomap_file import read_octree
+from mapper.octree.grid_file import stored_grid
 from mapper.octree.slice import OccupancyGrid
 from mapper.run import files
+from mapper.run.cloud import Cloud, read_cloud
 from mapper.run.folder import Run
 from mapper.run.results import load_results
-from mapper.sources.cloud_files.ply import read_ply
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.frame_tree import FrameTree
 from mapper.sources.ros.mcap_file import open_mcap
@@ -34,18 +32,17 @@ def maps_of(run: Run) -> Maps:
         FrameError: The cloud cannot be read.
         DataError: A grid cannot be read.
     """
-    points_world, colors = _coloured_cloud(run.file(files.CLOUD))
-    dynamic_world, dynamic_colors = np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8)
+    moved = Cloud(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))
     if (run.path / files.DYNAMIC).exists():  # runs of before 2026-11-22 have none
-        dynamic_world, dynamic_colors = _coloured_cloud(run.file(files.DYNAMIC))
+        moved = read_cloud(run.file(files.DYNAMIC))
     return Maps(
-        octree=read_octree(run.file(files.OCTREE_MAP)),
-        cloud_points_world=points_world,
-        cloud_colors=colors,
-        dynamic_points_world=dynamic_world,
-        dynamic_colors=dynamic_colors,
-        grid=stored_grid(run, files.SLICE),
-        traversable=stored_grid(run, files.TRAVERSABLE),
+        octree=run.octree,
+        cloud_points_world=run.cloud.points,
+        cloud_colors=run.cloud.colors,
+        dynamic_points_world=moved.points,
+        dynamic_colors=moved.colors,
+        grid=run.slice,
+        traversable=run.traversable,
         storeys=tuple(_storeys(run)),
     )
 
@@ -57,8 +54,7 @@ def storeys_of_run(run: Run) -> tuple[Storey, ...]:
         MapFileError: The octree cannot be read.
     """
     config, path = run.config.traversable, load_results(run).tracked
-    octree = read_octree(run.file(files.OCTREE_MAP))
-    return traversable(reachable_floor(octree, config, positions_world=path.positions_world), config)
+    return traversable(reachable_floor(run.octree, config, positions_world=path.positions_world), config)
 
 
 def _storeys(run: Run) -> Iterator[OccupancyGrid]:
@@ -66,13 +62,6 @@ def _storeys(run: Run) -> Iterator[OccupancyGrid]:
         if not (run.path / f"{stem}.yaml").exists():
             return
         yield stored_grid(run, stem)
-
-
-def _coloured_cloud(path: Path) -> tuple[Points32, Colors]:
-    cloud = read_ply(path)
-    points_world: Points32 = np.column_stack([cloud[axis] for axis in ("x", "y", "z")])
-    colors: Colors = np.column_stack([cloud[channel] for channel in ("red", "green", "blue")])
-    return points_world, colors
 
 
 def snapshots_of(run: Run) -> Iterator[Snapshot]:

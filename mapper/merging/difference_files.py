@@ -7,13 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.geometry import Points
-from mapper.export.grid import stored_grid
 from mapper.export.palette import APPEARED, NOT_SEEN_AGAIN, VANISHED, Rgb
 from mapper.export.picture import write_layers
 from mapper.export.ply import write_ply
 from mapper.merging.differences import Cluster, Differences
 from mapper.octree.slice import shrunk
-from mapper.run import files
 from mapper.run.folder import Run
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text
 
@@ -54,7 +52,7 @@ def write_differences(
             write_ply(folder / f"{name.replace(' ', '_')}.ply", centres.astype(np.float32), colors)
         write_layers(
             folder / _PICTURE,
-            grid=shrunk(stored_grid(before, files.SLICE), _MOST_CELLS),
+            grid=shrunk(before.slice, _MOST_CELLS),
             layers=layers,
             title=f"{before.path.resolve().name} → {after.path.resolve().name}",
             lines=[summary(found), placed],

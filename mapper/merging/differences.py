@@ -17,8 +17,6 @@ from mapper.core.errors import ConfigError
 from mapper.core.geometry import Array, Points, Transform, apply, inverse
 from mapper.merging.placing import Placed
 from mapper.octree.map import OctreeMap, log_odds
-from mapper.octree.octomap_file import read_octree
-from mapper.run import files
 
 _TOLERANCE_VOXELS = 2.0
 _MIN_VOXELS = 8
@@ -104,7 +102,7 @@ def differences_of(
     Raises:
         ConfigError: The maps have different resolutions.
     """
-    old, new = (read_octree(placed.run.file(files.OCTREE_MAP)) for placed in (before, after))
+    old, new = (placed.run.octree for placed in (before, after))
     if old.resolution_m != new.resolution_m:
         raise ConfigError(
             f"{after.run.path}: octree.resolution_m is {new.resolution_m:g}, but {old.resolution_m:g} in "

@@ -8,7 +8,6 @@ import numpy as np
 
 from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, LoopError
-from mapper.export.grid import read_grid
 from mapper.export.picture import write_localised
 from mapper.graph.components import components
 from mapper.graph.config import GraphConfig
@@ -17,6 +16,7 @@ from mapper.graph.optimize import optimize
 from mapper.loops.closure import Discrepancy, exceeds
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.map_constraints import build_map_constraint_detector
+from mapper.octree.grid_file import read_grid
 from mapper.odometry.factory import odometry_for
 from mapper.odometry.node_offset import NodeOffset
 from mapper.pipeline.components import component_of

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_run_config
@@ -42,6 +42,11 @@ from mapper.sources.base import Log, Session
 from mapper.sources.chained import chained, sessions_of
 from mapper.sources.config import SourceConfig
 from mapper.sources.trajectory_files import read_tum
+
+if TYPE_CHECKING:  # compiled code, which takes longer to load than most files of a run
+    from mapper.octree.map import OctreeMap
+    from mapper.octree.slice import OccupancyGrid
+    from mapper.run.cloud import Cloud
 
 
 @dataclass(frozen=True)
@@ -119,6 +124,34 @@ class Run:
     def keyframes(self) -> Trajectory:
         """Poses of the keyframes."""
         return read_tum(self.file(files.KEYFRAMES))
+
+    @cached_property
+    def octree(self) -> "OctreeMap":
+        """Occupancy map, with colours and times if it was built with ``octree.attributes``."""
+        from mapper.octree.octomap_file import read_octree
+
+        return read_octree(self.file(files.OCTREE_MAP))
+
+    @cached_property
+    def cloud(self) -> "Cloud":
+        """Coloured cloud."""
+        from mapper.run.cloud import read_cloud
+
+        return read_cloud(self.file(files.CLOUD))
+
+    @cached_property
+    def slice(self) -> "OccupancyGrid":
+        """2D navigation map: the band of heights above the floor that ``config.slice`` tells."""
+        from mapper.octree.grid_file import stored_grid
+
+        return stored_grid(self, files.SLICE)
+
+    @cached_property
+    def traversable(self) -> "OccupancyGrid":
+        """Floor that a robot can drive on, of the storey on which the log begins."""
+        from mapper.octree.grid_file import stored_grid
+
+        return stored_grid(self, files.TRAVERSABLE)
 
     def scan_updates(self) -> Path | None:
         """Return the path of the frames' updates, by its former name too; None where a user deleted it."""

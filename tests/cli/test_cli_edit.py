@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from mapper.export.grid import read_grid
+from mapper.octree.grid_file import read_grid
 from mapper.octree.octomap_file import read_octree
 from mapper.octree.slice import OCCUPIED
 from mapper.run.folder import open_run

@@ -12,8 +12,8 @@ from plyfile import PlyData
 from mapper.config.loading import load_config, overridden
 from mapper.core.errors import ConfigError, DependencyError, MapSizeError, RunError, WriteError
 from mapper.export.exporters import EXPORTERS, export
-from mapper.export.grid import read_grid
 from mapper.graph.g2o import read_g2o
+from mapper.octree.grid_file import read_grid
 from mapper.octree.octomap_file import read_octree
 from mapper.octree.slice import OCCUPIED, UNKNOWN
 from mapper.pipeline.build import build

@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import MapFileError
-from mapper.export.grid import read_grid, write_grid
+from mapper.export.grid import write_grid
+from mapper.octree.grid_file import read_grid
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 

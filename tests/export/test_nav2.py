@@ -5,9 +5,9 @@ import pytest
 
 from mapper.core.errors import ConfigError, RunError
 from mapper.export.exporters import export
-from mapper.export.grid import read_grid
 from mapper.export.nav2 import keepout_mask, slowed_percent
 from mapper.navigation.config import CostmapConfig
+from mapper.octree.grid_file import read_grid
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 

@@ -10,7 +10,6 @@ from evaluators.line_laser.labels import range_records, read_labels
 from evaluators.line_laser.scores import TABLE_2_1, count
 from mapper.config.loading import read_config
 from mapper.core.errors import SourceError
-from mapper.export.grid import read_grid
 from mapper.line_laser.calibration import ahead_m
 from mapper.line_laser.config import THESIS, LineLaserCalibration, LineLaserConfig, LineLaserSynthConfig
 from mapper.line_laser.files import find_images
@@ -19,6 +18,7 @@ from mapper.line_laser.simulation.render import take
 from mapper.line_laser.simulation.room import Patch, Room, make_board, make_room
 from mapper.line_laser.survey import drive, scan_images
 from mapper.line_laser.survey import sensor_poses as drive_poses
+from mapper.octree.grid_file import read_grid
 from mapper.octree.slice import OCCUPIED
 from mapper.sources.images import decode_colour
 from tests.support.command_line import invoke

@@ -13,12 +13,12 @@ from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, DataError, RunError
 from mapper.core.geometry import exp, inverse
 from mapper.core.trajectory import Trajectory
-from mapper.export.grid import read_grid
 from mapper.merging import jobs as merging_jobs
 from mapper.merging.merge import merge
 from mapper.merging.merged_map import open_map
 from mapper.merging.placing import Placed, as_built, by_poses, by_truth, warnings_about
 from mapper.octree.config import SliceConfig
+from mapper.octree.grid_file import read_grid
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import write_bt, write_ot

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapper.export.grid import read_grid, write_grid
+from mapper.export.grid import write_grid
 from mapper.navigation.config import PlanConfig, TraversableConfig
 from mapper.navigation.distance import distance_3d
 from mapper.navigation.floor import reachable_floor
@@ -13,6 +13,7 @@ from mapper.navigation.planner import plan_2d, plan_3d
 from mapper.navigation.traversable import traversable
 from mapper.navigation.voxels import known_box
 from mapper.octree.config import OctreeConfig, SliceConfig
+from mapper.octree.grid_file import read_grid
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import FREE, OCCUPIED, cut_slice
 from mapper.simulation import Boxes, CameraSimulator

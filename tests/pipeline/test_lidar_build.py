@@ -8,7 +8,7 @@ from cli.summary import summary_text
 from evaluators.metrics.evaluate import evaluate
 from mapper.config.loading import load_config, overridden
 from mapper.core.errors import TrackingError
-from mapper.export.grid import read_grid
+from mapper.octree.grid_file import read_grid
 from mapper.octree.slice import FREE
 from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, nearest
-from mapper.export.grid import grid_image, stored_grid
+from mapper.export.grid import grid_image
 from mapper.export.path_band import SIGMAS
 from mapper.loops.closure import LoopClosure
 from mapper.mapping.thumbnails import encode_jpeg
@@ -91,14 +91,14 @@ def drawn(chapter: Chapter) -> dict[str, Any]:
         else _path(results.truth.stamps_ns, results.truth.positions_world, seconds),
         "error": _errors(results, seconds),
         "loops": [_loop(loop, results, seconds) for loop in results.loops],
-        "slice": _plan(stored_grid(chapter.run, files.SLICE)),
+        "slice": _plan(chapter.run.slice),
     }
 
 
 def map_sizes(chapter: Chapter) -> dict[str, str]:
     """Return the sizes of the cloud and of the octree at a few levels (Zhao et al. 2020, Table 5)."""
     run = chapter.run
-    octree = read_octree(run.file(files.OCTREE_MAP))
+    octree = read_octree(run.file(files.OCTREE_MAP))  # not kept: a report is of many runs
     cloud_bytes = run.file(files.CLOUD).stat().st_size
     points = run.manifest.counts.cloud_points
     sizes = {"coloured cloud": f"{cloud_bytes / 1e6:.3g} MB, {points} points"}
