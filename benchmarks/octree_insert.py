@@ -141,8 +141,8 @@ def compare_products(case: Case, octree: OctreeMap, *, repeats: int, folder: Pat
         same = same and other.read_bytes() == bt.read_bytes()
     centres = octree.leaves().centres_world
     points = np.random.default_rng(0).uniform(centres.min(axis=0), centres.max(axis=0), (MAX_QUERIES, 3))
-    octree.query(points[:10])
-    rate = len(points) / cpu_ms(lambda: octree.query(points)) / 1e3
+    octree.log_odds_at(points[:10])
+    rate = len(points) / cpu_ms(lambda: octree.log_odds_at(points)) / 1e3
     their_rate = 20_000 / cpu_ms(lambda: [tree.search(point) for point in points[:20_000]]) / 1e3
     times = {kind: (np.median(ours[kind]), np.median(theirs[kind])) for kind in ours}
     print(

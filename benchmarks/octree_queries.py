@@ -43,7 +43,7 @@ def main() -> None:
     directions = rng.normal(size=(MANY, 3))
     settings = {"max_range_m": 4.0, "through_unknown": True}
     for warm_up in (
-        lambda: octree.query(points[:2]),
+        lambda: octree.log_odds_at(points[:2]),
         lambda: octree.nearest_obstacles(points[:2], max_range_m=1),
     ):
         warm_up()
@@ -51,7 +51,7 @@ def main() -> None:
     print(f"{'µs per query':28} {'ours':>9} {'theirs':>9} {'ratio':>9}")
     few = points[:FEW]
     theirs = cpu_ms(lambda: [tree.search(point) for point in few])
-    line("occupancy", cpu_ms(lambda: octree.query(points)), MANY, theirs, FEW)
+    line("occupancy", cpu_ms(lambda: octree.log_odds_at(points)), MANY, theirs, FEW)
     end = np.zeros(3)
     theirs = cpu_ms(
         lambda: [

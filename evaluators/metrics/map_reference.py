@@ -118,4 +118,4 @@ def _octree(octree: OctreeMap, voxel_m: float) -> Reference:
     steps = ((np.arange(pieces) + 0.5) / pieces - 0.5) * octree.resolution_m
     offsets = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
     points = (centres[:, None] + offsets).reshape(-1, 3)
-    return Reference("octree", points=points, log_odds_at=octree.query)
+    return Reference("octree", points=points, log_odds_at=octree.log_odds_at)

@@ -11,7 +11,8 @@ from evaluators.metrics.metric import Metric
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Points
 from mapper.octree.keys import KEY_COUNT, KEY_ZERO
-from mapper.octree.map import Leaves, OctreeMap
+from mapper.octree.leaves import Leaves
+from mapper.octree.map import OctreeMap
 
 SignedDistance = Callable[[Points], Array]
 """Maps (N, 3) points in metres to their distances from the nearest surface, negative inside solids."""

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mapper.core.errors import DataError
 
@@ -35,6 +35,25 @@ def inverse(T_a_b: Transform) -> Transform:
     """Return T_b_a, using R⁻¹ = Rᵀ rather than a general matrix inverse."""
     R_b_a = T_a_b[:3, :3].T
     return transform(R_b_a, -R_b_a @ T_a_b[:3, 3])
+
+
+def point_rows(points: ArrayLike, owner: str) -> tuple[tuple[int, ...], Points]:
+    """Return the shape of (..., 3) points without the last axis, and the points as contiguous (N, 3) float64.
+
+    Args:
+        points: Anything that numpy takes for an array.
+        owner: What they are given to, for the error.
+
+    Raises:
+        DataError: They are not numbers, or the last axis is not 3.
+    """
+    try:
+        array = np.asarray(points, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{owner}: points are no array of numbers: {error}") from None
+    if array.ndim == 0 or array.shape[-1] != 3:
+        raise DataError(f"{owner}: points {array.shape}, want (..., 3)")
+    return array.shape[:-1], np.ascontiguousarray(array.reshape(-1, 3))
 
 
 def apply(T_a_b: Transform, points_b: Points) -> Points:

@@ -151,7 +151,7 @@ def _surely_occupied(octree: OctreeMap) -> Points:
 
 def _compared(centres: Points, other: OctreeMap, T_other_centres: Transform, tolerance_m: float) -> _Compared:
     points = apply(T_other_centres, centres)
-    values = other.query(points)
+    values = other.log_odds_at(points)
     occupied = other.are_near_occupied(points, max_distance_m=tolerance_m)
     config = other.config
     most = max(_SURE_MISSES * log_odds(config.miss_probability), log_odds(config.clamp_min_probability))

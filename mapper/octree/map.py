@@ -1,67 +1,28 @@
 """The occupancy map: OctoMap's result (Hornung et al. 2013) from sparse blocks and compiled kernels."""
 
-from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mapper.core.errors import DataError, MapSizeError
 from mapper.core.frames import Points32, Scan
-from mapper.core.geometry import Array, Points, Transform, apply
+from mapper.core.geometry import Array, Points, Transform, apply, point_rows
 from mapper.octree import kernels, levels, queries
 from mapper.octree.attributes import NEVER_SEEN, AttributeLayer, ended_blocks
 from mapper.octree.blocks import BlockStore
 from mapper.octree.boxes import BoxCounts, count_boxes
 from mapper.octree.casting import Cast, Caster, depth_limit_of, origin_key
-from mapper.octree.config import OctreeConfig, Parent
+from mapper.octree.config import OctreeConfig, Parent, SliceConfig
 from mapper.octree.keys import KEY_BITS, KEY_ZERO, codes_of
+from mapper.octree.leaves import Leaves, RayEnds
 from mapper.octree.nearest import Nearest, nearest_occupied
 from mapper.octree.scan_update import ScanUpdate
 from mapper.octree.summing import Overlap, add_blocks
 from mapper.octree.tree_reader import TreeLeaves, fill
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Leaves:
-    """Known voxels, or nodes above them, in Morton order.
-
-    Attributes:
-        keys: (N, 3) uint16 keys as in OctoMap; above the voxels they count nodes.
-        log_odds: (N,) float32.
-        resolution_m: Edge of a voxel.
-        depth: Depth of the nodes in the tree; 16 is that of the voxels.
-    """
-
-    keys: NDArray[np.uint16]
-    log_odds: NDArray[np.float32]
-    resolution_m: float
-    depth: int = KEY_BITS
-
-    @property
-    def edge_m(self) -> float:
-        """Edge of a node."""
-        return self.resolution_m * (1 << (KEY_BITS - self.depth))
-
-    @property
-    def centres_world(self) -> Points:
-        """(N, 3) float64 centres, metres."""
-        voxels = 1 << (KEY_BITS - self.depth)
-        return (self.keys.astype(np.float64) * voxels - (KEY_ZERO - 0.5 * voxels)) * self.resolution_m
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RayEnds:
-    """Ends of rays cast through the map.
-
-    Attributes:
-        centres_world: (N, 3) float64 centre of the last voxel, metres.
-        distances_m: (N,) float64 from the ray's origin to that centre.
-        hits: (N,) bool, true where that voxel is occupied.
-    """
-
-    centres_world: Points
-    distances_m: Array
-    hits: NDArray[np.bool_]
+if TYPE_CHECKING:
+    from mapper.octree.slice import OccupancyGrid
 
 
 class OctreeMap:
@@ -177,10 +138,33 @@ class OctreeMap:
         """Least log-odds of an occupied voxel."""
         return log_odds(self.config.occupied_probability)
 
-    def query(
-        self, points_world: Points, *, depth: int = KEY_BITS, parent: Parent = "max"
+    def query(self, points_world: ArrayLike) -> NDArray[np.int8]:
+        """Return the states of points: 100 occupied, 0 free, -1 unknown or out of range.
+
+        Args:
+            points_world: (..., 3) metres, world frame.
+
+        Returns:
+            (...) int8 of ``OCCUPIED``, ``FREE`` and ``UNKNOWN`` of :mod:`mapper.octree.slice`.
+
+        Raises:
+            DataError: The points are not (..., 3) numbers.
+        """
+        from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN
+
+        values = self.log_odds_at(points_world)
+        known = np.where(values >= self.occupied_log_odds, np.int8(OCCUPIED), np.int8(FREE))
+        return np.where(np.isnan(values), np.int8(UNKNOWN), known)
+
+    def probability(self, points_world: ArrayLike) -> NDArray[np.float32]:
+        """Return the (...) probabilities, 0 … 1, that (..., 3) points are occupied; NaN where unknown."""
+        odds: NDArray[np.float32] = np.exp(self.log_odds_at(points_world))
+        return odds / (1.0 + odds)
+
+    def log_odds_at(
+        self, points_world: ArrayLike, *, depth: int = KEY_BITS, parent: Parent = "max"
     ) -> NDArray[np.float32]:
-        """Return the (N,) log-odds of (N, 3) points in metres; NaN where unknown or out of range.
+        """Return the (...) log-odds of (..., 3) points in metres; NaN where unknown or out of range.
 
         Args:
             points_world: Any points.
@@ -189,19 +173,45 @@ class OctreeMap:
             parent: Log-odds of a node above the voxels: ``max`` or ``mean`` of its known children.
 
         Raises:
-            DataError: No such depth or parent.
+            DataError: The points are not (..., 3) numbers, or there is no such depth or parent.
         """
-        points_world = np.ascontiguousarray(points_world, dtype=np.float64)
+        shape, rows = point_rows(points_world, "octree")
+        found: NDArray[np.float32]
         if depth != KEY_BITS:
-            return levels.values_at_depth(
-                self.blocks, points_world, resolution_m=self.resolution_m, depth=depth, parent=parent
+            found = levels.values_at_depth(
+                self.blocks, rows, resolution_m=self.resolution_m, depth=depth, parent=parent
             )
-        found: NDArray[np.float32] = queries.values_at(self.blocks.table, points_world, self.resolution_m)
-        return found
+        else:
+            found = queries.values_at(self.blocks.table, rows, self.resolution_m)
+        return found.reshape(shape)
+
+    def occupied(self) -> Points:
+        """Return the (N, 3) float64 centres of all occupied voxels, metres, in Morton order."""
+        leaves = self.leaves()
+        return leaves.centres_world[leaves.log_odds >= self.occupied_log_odds]
+
+    def free(self) -> Points:
+        """Return the (N, 3) float64 centres of all free voxels, metres, in Morton order."""
+        leaves = self.leaves()
+        return leaves.centres_world[leaves.log_odds < self.occupied_log_odds]
+
+    def slice(self, z_min: float, z_max: float) -> "OccupancyGrid":
+        """Return the 2D map of the voxels with centres between two heights; occupied beats free.
+
+        Args:
+            z_min: Lower height, metres, world frame.
+            z_max: Upper height.
+
+        Raises:
+            DataError: No voxel, or none that is known, has its centre there.
+        """
+        from mapper.octree.slice import cut_slice
+
+        return cut_slice(self, SliceConfig(min_height_m=z_min, max_height_m=z_max))
 
     def are_occupied(self, points_world: Points | Points32) -> NDArray[np.bool_]:
         """Return the (N,) mask of the (N, 3) points, metres, that lie in occupied voxels."""
-        occupied: NDArray[np.bool_] = self.query(points_world.astype(np.float64)) >= self.occupied_log_odds
+        occupied: NDArray[np.bool_] = self.log_odds_at(points_world) >= self.occupied_log_odds
         return occupied
 
     def are_near_occupied(
@@ -327,7 +337,7 @@ class OctreeMap:
 
         Args:
             levels: 0 … 16.
-            parent: See :meth:`query`.
+            parent: See :meth:`log_odds_at`.
 
         Raises:
             DataError: No such level or parent.
@@ -388,8 +398,8 @@ class OctreeMap:
         """Return every known voxel in Morton order, which does not depend on the order of the scans.
 
         Args:
-            depth: 16, or the depth of the nodes to return instead: see :meth:`query`.
-            parent: See :meth:`query`.
+            depth: 16, or the depth of the nodes to return instead: see :meth:`log_odds_at`.
+            parent: See :meth:`log_odds_at`.
 
         Raises:
             DataError: No such depth or parent.

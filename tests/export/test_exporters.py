@@ -260,7 +260,7 @@ def test_every_ending_of_octomap_is_its_own_format(untouched, tmp_path):
     tree = pyoctomap.OcTree(1.0).read(str(tmp_path / "taken.ot"))
     centre = occupied_centres(untouched)[0]
     octree = read_octree(untouched.path / "map.ot", untouched.config.octree)
-    assert tree.search(centre).getLogOdds() == pytest.approx(octree.query(centre[None])[0])
+    assert tree.search(centre).getLogOdds() == pytest.approx(octree.log_odds_at(centre[None])[0])
 
 
 @pytest.mark.parametrize("name", ["cloud.ply", "map.bt", "map.ot", "slice.yaml", "trajectory.tum"])

@@ -224,7 +224,7 @@ def test_a_part_of_the_map_is_opened_alone(maps, merged):
         axis=1
     )
     np.testing.assert_array_equal(
-        part.query(octree.leaves().centres_world[inside]), octree.leaves().log_odds[inside]
+        part.log_odds_at(octree.leaves().centres_world[inside]), octree.leaves().log_odds[inside]
     )
 
 

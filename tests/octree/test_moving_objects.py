@@ -98,11 +98,11 @@ def test_people_leave_and_ground_walls_and_poles_stay(street):
 
 def test_space_where_a_thing_stood_is_free_and_the_floor_below_it_stays(street):
     octree, updates = fused(street)
-    assert octree.query(np.array([[4.3, -2.0, 1.1]]))[0] > 0.0
+    assert octree.log_odds_at(np.array([[4.3, -2.0, 1.1]]))[0] > 0.0
 
     remove_moving_objects(octree, lambda: updates)
 
-    chest, floor = octree.query(np.array([[4.3, -2.0, 1.1], [4.3, -2.0, 0.1]]))
+    chest, floor = octree.log_odds_at(np.array([[4.3, -2.0, 1.1], [4.3, -2.0, 0.1]]))
     assert chest < 0.0 < floor
 
 

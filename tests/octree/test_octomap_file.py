@@ -125,7 +125,7 @@ def test_a_published_map_reads_as_the_cpp_library_reads_it():
 
     assert len(octree) == sum(8 ** (16 - depth) for _, _, depth in theirs)
     inside = np.array([centre for centre, _, _ in theirs]) + 0.01  # off the corner at a pruned leaf's centre
-    assert octree.query(inside).tolist() == [value for _, value, _ in theirs]
+    assert octree.log_odds_at(inside).tolist() == [value for _, value, _ in theirs]
 
 
 def test_a_color_octree_gives_its_log_odds(tmp_path):
@@ -138,7 +138,7 @@ def test_a_color_octree_gives_its_log_odds(tmp_path):
 
     centres = np.array([[0.1 * i, -0.3 * i, 0.05] for i in range(20)])
     assert len(octree) == 20
-    assert octree.query(centres + 1e-6).tolist() == [log_odds(0.7), log_odds(0.4)] * 10
+    assert octree.log_odds_at(centres + 1e-6).tolist() == [log_odds(0.7), log_odds(0.4)] * 10
 
 
 def test_what_is_inserted_after_reading_goes_on_from_there(octree, tmp_path):
@@ -148,7 +148,7 @@ def test_what_is_inserted_after_reading_goes_on_from_there(octree, tmp_path):
 
     again.insert_points(first.astype(np.float32), first[0])
 
-    assert again.query(first)[0] == min(leaves.log_odds[0] + log_odds(0.7), OCCUPIED)
+    assert again.log_odds_at(first)[0] == min(leaves.log_odds[0] + log_odds(0.7), OCCUPIED)
     assert len(again) == len(octree)
 
 

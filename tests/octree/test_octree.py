@@ -126,8 +126,8 @@ def test_a_voxel_changes_once_per_scan_and_a_hit_wins():
     near, far = [0.525, 0.025, 0.025], [1.025, 0.025, 0.025]  # the far ray crosses the near end
     octree = octree_of([(np.array([far, near, near, far], np.float32), np.full(3, 0.025))])
 
-    assert octree.query(np.array([near, far])).tolist() == [log_odds(0.7)] * 2
-    assert octree.query(np.array([[0.325, 0.025, 0.025]])).tolist() == [log_odds(0.4)]
+    assert octree.log_odds_at(np.array([near, far])).tolist() == [log_odds(0.7)] * 2
+    assert octree.log_odds_at(np.array([[0.325, 0.025, 0.025]])).tolist() == [log_odds(0.4)]
 
 
 def test_log_odds_of_exactly_zero_are_known():
@@ -137,7 +137,7 @@ def test_log_odds_of_exactly_zero_are_known():
     octree.insert_points(ahead, origin)
     octree.insert_points(ahead + np.float32([0.5, 0, 0]), origin)
 
-    assert octree.query(ahead.astype(np.float64)).tolist() == [0.0]
+    assert octree.log_odds_at(ahead.astype(np.float64)).tolist() == [0.0]
     assert len(octree) == len(octree.leaves().keys) == 21
 
 
@@ -153,7 +153,7 @@ def test_leaves_agree_with_queries():
     octree = octree_of(random_scans(2))
     leaves = octree.leaves()
 
-    np.testing.assert_array_equal(octree.query(leaves.centres_world), leaves.log_odds)
+    np.testing.assert_array_equal(octree.log_odds_at(leaves.centres_world), leaves.log_odds)
     assert octree.memory_bytes >= 4 * len(octree)
 
 
@@ -161,8 +161,8 @@ def test_voxels_that_no_ray_crossed_are_unknown():
     octree = octree_of(random_scans(2))
     strange = np.array([[1e4, 0, 0], [-1e4, 0, 0], [np.nan, 0, 0], [0, np.inf, 0], [500.0, 500.0, 500.0]])
 
-    assert np.isnan(octree.query(strange)).all()
-    assert np.isnan(OctreeMap(OctreeConfig()).query(strange)).all()
+    assert np.isnan(octree.log_odds_at(strange)).all()
+    assert np.isnan(OctreeMap(OctreeConfig()).log_odds_at(strange)).all()
 
 
 @pytest.mark.parametrize("through_unknown", [True, False])

@@ -42,7 +42,7 @@ def test_coarse_queries_equal_octomap_s(octree, points, depth):
     tree = fuse(scans(0), resolution_m=0.05, max_range_m=4.0, discretize=True)
     tree.updateInnerOccupancy()
 
-    found = octree.query(points, depth=depth)
+    found = octree.log_odds_at(points, depth=depth)
 
     assert np.isfinite(found).any()
     for point, value in zip(points, found, strict=True):
@@ -74,7 +74,7 @@ def test_coarse_leaves_join_their_children(octree, depth, parent):
 def test_coarse_leaves_agree_with_coarse_queries(octree, depth):
     leaves = octree.leaves(depth=depth, parent="mean")
 
-    found = octree.query(leaves.centres_world, depth=depth, parent="mean")
+    found = octree.log_odds_at(leaves.centres_world, depth=depth, parent="mean")
 
     np.testing.assert_array_equal(found, leaves.log_odds)
     assert leaves.edge_m == pytest.approx(0.05 * 2 ** (16 - depth))
@@ -86,26 +86,26 @@ def test_a_coarser_map_answers_as_the_level_does(octree, points, levels, parent)
     coarse = octree.coarser(levels, parent=parent)
     assert coarse.resolution_m == pytest.approx(0.05 * 2**levels)
     assert len(coarse) == len(octree.leaves(depth=16 - levels).log_odds)
-    wanted = octree.query(points, depth=16 - levels, parent=parent)
-    np.testing.assert_array_equal(coarse.query(points), wanted)
+    wanted = octree.log_odds_at(points, depth=16 - levels, parent=parent)
+    np.testing.assert_array_equal(coarse.log_odds_at(points), wanted)
 
 
 def test_a_coarse_query_outside_the_key_range_is_unknown(octree):
     outside = np.array([[1e9, 0.0, 0.0], [-1e9, 0.0, 0.0], [np.nan, 0.0, 0.0], [1638.5, 0.0, 0.0]])
 
-    assert np.isnan(octree.query(outside, depth=3)).all()
-    assert np.isnan(octree.query(outside, depth=0)).all()
+    assert np.isnan(octree.log_odds_at(outside, depth=3)).all()
+    assert np.isnan(octree.log_odds_at(outside, depth=0)).all()
 
 
 def test_an_empty_map_has_no_nodes():
     assert len(OctreeMap(OctreeConfig()).leaves(depth=4).keys) == 0
-    assert np.isnan(OctreeMap(OctreeConfig()).query(np.zeros((2, 3)), depth=4)).all()
+    assert np.isnan(OctreeMap(OctreeConfig()).log_odds_at(np.zeros((2, 3)), depth=4)).all()
 
 
 @pytest.mark.parametrize(("depth", "parent"), [(-1, "max"), (17, "max"), (3, "min")])
 def test_what_is_no_level_is_refused(octree, depth, parent):
     with pytest.raises(DataError, match=r"^octree: (depth|parent) "):
-        octree.query(np.zeros((1, 3)), depth=depth, parent=parent)
+        octree.log_odds_at(np.zeros((1, 3)), depth=depth, parent=parent)
 
 
 @pytest.mark.parametrize("edge_m", [0.0, 0.07, 0.4, 3.0, 100.0])
@@ -187,7 +187,7 @@ def test_nearest_obstacles_equal_brute_force(seed, max_range_m):
     )
     assert np.isnan(found.centres_world[~within & clear]).all()
     near = found.centres_world[hit]
-    assert (octree.query(near) >= octree.occupied_log_odds).all()
+    assert (octree.log_odds_at(near) >= octree.occupied_log_odds).all()
 
 
 def test_the_nearest_of_equals_does_not_depend_on_the_order_of_scans():

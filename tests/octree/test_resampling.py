@@ -28,14 +28,16 @@ def test_every_voxel_holds_what_lies_at_its_centre(seed):
 
     leaves = found.leaves()
     np.testing.assert_array_equal(
-        octree.query(apply(inverse(T_map_world), leaves.centres_world)), leaves.log_odds
+        octree.log_odds_at(apply(inverse(T_map_world), leaves.centres_world)), leaves.log_odds
     )
     # and nothing is missing: voxels all around the moved map that are not in it are unknown there
     edge = found.resolution_m
     low, high = (np.floor(f(leaves.centres_world, axis=0) / edge).astype(int) for f in (np.min, np.max))
     rng = np.random.default_rng(seed)
     probes = (rng.integers(low - 20, high + 20, (20_000, 3)) + 0.5) * edge
-    np.testing.assert_array_equal(found.query(probes), octree.query(apply(inverse(T_map_world), probes)))
+    np.testing.assert_array_equal(
+        found.log_odds_at(probes), octree.log_odds_at(apply(inverse(T_map_world), probes))
+    )
 
 
 def test_a_shift_by_whole_voxels_loses_nothing():

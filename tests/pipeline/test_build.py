@@ -103,7 +103,7 @@ def test_the_maps_agree_with_each_other(run):
     row, column = np.argwhere(grid.cells == 100)[0]
     x, y = grid.origin_world_m + (np.array([column, row]) + 0.5) * grid.resolution_m
     heights_m = np.arange(0.1, 1.2, 0.05) + 0.025
-    column_log_odds = octree.query(np.array([[x, y, z] for z in heights_m]))
+    column_log_odds = octree.log_odds_at(np.array([[x, y, z] for z in heights_m]))
     assert (column_log_odds >= octree.occupied_log_odds).any()
 
 

@@ -65,14 +65,15 @@ def test_the_octree_has_no_obstacle_where_depth_is_poor_but_free_space_before_it
     octree.insert(scan_at(2.02, 20.02), np.eye(4))
 
     along = np.array(RAY)
-    at, free, beyond = (octree.query(np.outer(z, along)) for z in ([2.02], [2.5, 2.7, 2.9], [3.3, 20.02]))
+    depths_m = [2.02], [2.5, 2.7, 2.9], [3.3, 20.02]
+    at, free, beyond = (octree.log_odds_at(np.outer(z, along)) for z in depths_m)
     assert at[0] > 0.0
     assert np.nanmax(free) < 0.0
     assert np.isnan(beyond).all()
 
     fixed = OctreeMap(config.model_copy(update={"max_range_m": 30.0}))  # a number replaces the noise
     fixed.insert(scan_at(2.02, 20.02), np.eye(4))
-    assert fixed.query(20.02 * along[np.newaxis])[0] > 0.0
+    assert fixed.log_odds_at(20.02 * along[np.newaxis])[0] > 0.0
 
 
 def test_colours_are_kept_of_returns_that_count_alone():

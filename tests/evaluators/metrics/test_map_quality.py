@@ -87,7 +87,7 @@ def test_a_map_too_coarse_to_be_cut_up_is_refused(tmp_path, monkeypatch):
 def test_free_space_that_another_map_fills_counts_against_both():
     octree, reference = mapped(wall(2.02)), mapped(wall(1.02), wall(2.02, along=ROW[ROW > 0.5]))
     occupied = reference.leaves().centres_world[reference.leaves().log_odds > 0.0]
-    values = scores(octree, occupied, log_odds_at=reference.query)
+    values = scores(octree, occupied, log_odds_at=reference.log_odds_at)
     assert values["free precision"] < 0.99  # it is free where the other has its nearer wall
     assert values[RECALL] < 0.5
 
