@@ -96,9 +96,8 @@ def build(
 
 def _refuse_untrusted(run: "Run") -> None:
     from mapper.core.errors import UntrustedError
-    from mapper.run.verdict import verdict_on
 
-    verdict = verdict_on(run)
+    verdict = run.verdict
     if verdict.state != "trusted":
         raise UntrustedError(f"{run.path}: {verdict.state}: {verdict.sentences[0]}")
 

@@ -55,7 +55,6 @@ def _figures(run: "Run") -> "list[Figure]":
     from evaluators.metrics.loops import loop_metrics
     from evaluators.metrics.metric import shown
     from mapper.export.report.data import Figure
-    from mapper.run.verdict import verdict_on
 
     counts, truth = run.manifest.counts, run.truth
     frames_ns = np.array([record.stamp_ns for record in run.records], dtype=np.int64)
@@ -64,7 +63,7 @@ def _figures(run: "Run") -> "list[Figure]":
         metrics += loop_metrics(run.loops, run.keyframes.stamps_ns, truth)
     return [
         Figure("log", run.manifest.input.title),
-        Figure("verdict", verdict_on(run).state),
+        Figure("verdict", run.verdict.state),
         Figure("frames tracked", f"{counts.tracked} of {counts.listed}"),
         Figure("frames doubtful", str(counts.doubtful)),
         Figure("frames lost", str(counts.lost)),

@@ -11,7 +11,6 @@ from evaluators.metrics.metric import Metric
 from mapper.loops.closure import LoopClosure
 from mapper.run.folder import Run
 from mapper.run.frame_outcomes import FrameRecord
-from mapper.run.verdict import verdict_on
 
 _LINE_WIDTH = 110
 _SHOWN_NOTES = frozenset({"gap", "lost", "doubtful", "skipped", "levelling"})
@@ -56,7 +55,7 @@ def verdict_text(run: Run) -> str:
 
 def _verdict_rows(run: Run) -> list[tuple[str, str]]:
     """Return the verdict, and below it why the run is not trusted and what to try."""
-    verdict = verdict_on(run)
+    verdict = run.verdict
     notes = [
         warning.text
         for warning in run.manifest.warnings

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mapper.core.back_projection import back_project
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Points, Transform, is_rigid
+from mapper.core.timebase import NS_PER_S
 
 Image = NDArray[np.uint8]
 DepthImage = NDArray[np.float32]
@@ -137,6 +138,16 @@ class Scan:
         if self.times_s is not None and self.times_s.shape != shape[:1]:
             raise DataError(f"scan {self.stamp_ns}: times {self.times_s.shape}, want {shape[:1]}")
 
+    @property
+    def stamp(self) -> float:
+        """Time of capture, seconds, for plots: Unix time is rounded by up to 120 ns."""
+        return self.stamp_ns / NS_PER_S
+
+    @property
+    def points(self) -> Points32:
+        """(N, 3) float32, metres, body frame: ``points_body``."""
+        return self.points_body
+
     def scan(self) -> "Scan":
         """Return the scan itself: frames of every kind can be converted to a scan."""
         return self
@@ -168,6 +179,11 @@ class RgbdFrame:
             raise DataError(f"frame {self.stamp_ns}: depth {self.depth_m.shape}, the camera has {want}")
         if not is_rigid(self.T_body_camera):
             raise DataError(f"frame {self.stamp_ns}: T_body_camera is not a rigid motion")
+
+    @property
+    def stamp(self) -> float:
+        """Time of the image, seconds, for plots: Unix time is rounded by up to 120 ns."""
+        return self.stamp_ns / NS_PER_S
 
     @property
     def gray(self) -> Image:

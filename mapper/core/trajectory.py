@@ -7,7 +7,7 @@ import numpy as np
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Transform, inverse, is_rigid
-from mapper.core.timebase import Stamps
+from mapper.core.timebase import NS_PER_S, Stamps
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +41,21 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    @property
+    def stamps(self) -> Array:
+        """(N,) float64 seconds, for plots: those of Unix time are rounded by up to 120 ns."""
+        return self.stamps_ns / NS_PER_S
+
+    @property
+    def poses(self) -> Array:
+        """(N, 4, 4) rigid motions: ``T_world_body``."""
+        return self.T_world_body
+
+    @property
+    def positions(self) -> Array:
+        """(N, 3) metres, world frame: ``positions_world``."""
+        return self.positions_world
 
     @property
     def positions_world(self) -> Array:

@@ -3,12 +3,16 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from operator import mul
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.errors import GraphError
-from mapper.core.geometry import Array, Transform, is_rigid
+from mapper.core.geometry import Array, Points, Transform, is_rigid
+
+if TYPE_CHECKING:
+    import gtsam
 
 Origin = Literal["odometry", "loop", "wheel"]
 
@@ -70,6 +74,45 @@ class PoseGraph:
     T_world_node: dict[int, Transform] = field(default_factory=dict)
     stamps_ns: dict[int, int] = field(default_factory=dict)
     factors: list[BetweenFactor] = field(default_factory=list)
+
+    @property
+    def nodes(self) -> NDArray[np.int64]:
+        """(N,) numbers of the nodes, in the order in which they were added."""
+        return np.fromiter(self.T_world_node, np.int64, len(self.T_world_node))
+
+    @property
+    def poses(self) -> Array:
+        """(N, 4, 4) poses of ``nodes`` in the world."""
+        return np.array(list(self.T_world_node.values())).reshape(-1, 4, 4)
+
+    @property
+    def positions(self) -> Points:
+        """(N, 3) positions of ``nodes``, metres, world frame."""
+        return self.poses[:, :3, 3]
+
+    @property
+    def loops_world(self) -> Array:
+        """(L, 2, 3) positions of the two nodes that each loop connects, metres, world frame."""
+        ends = [
+            [self.T_world_node[node][:3, 3] for node in (factor.i, factor.j)]
+            for factor in self.factors
+            if factor.origin == "loop"
+        ]
+        return np.array(ends).reshape(-1, 2, 3)
+
+    def to_gtsam(self) -> "tuple[gtsam.NonlinearFactorGraph, gtsam.Values]":
+        """Return the factors and the estimates as GTSAM's, keyed by node; a prior holds the first node.
+
+        Every factor is a ``BetweenFactorPose3`` with Gaussian noise; its tangent is ordered (rotation,
+        translation), as here.
+        """
+        from mapper.graph.batch import problem_of
+        from mapper.graph.terms import anchor, between, values_of
+
+        first = next(iter(self.T_world_node.items()), None)
+        priors = [] if first is None else [anchor(*first)]
+        terms = [*priors, *(between(factor) for factor in self.factors)]
+        return problem_of(terms), values_of(self.T_world_node, self.T_world_node)
 
     def add_node(self, node: int, stamp_ns: int, T_world_node: Transform) -> None:
         """Add a node with its first estimate.

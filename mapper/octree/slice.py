@@ -1,6 +1,7 @@
 """2D navigation map: a horizontal band of the octree projected onto the ground plane."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -35,6 +36,24 @@ class OccupancyGrid:
     cells: NDArray[np.int8]
     origin_world_m: Array
     resolution_m: float
+
+    @property
+    def grid(self) -> NDArray[np.int8]:
+        """(H, W) int8: ``cells``."""
+        return self.cells
+
+    @property
+    def resolution(self) -> float:
+        """Edge of a cell, metres: ``resolution_m``."""
+        return self.resolution_m
+
+    @property
+    def origin(self) -> Array:
+        """(2,) x and y of the lower left corner, metres, world frame: ``origin_world_m``."""
+        return self.origin_world_m
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.array(self.cells, dtype=dtype, copy=copy)
 
     def __post_init__(self) -> None:
         if self.cells.ndim != 2 or self.cells.size == 0 or self.cells.dtype != np.int8:

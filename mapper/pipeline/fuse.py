@@ -276,13 +276,7 @@ def _write_pictures(writer: RunWriter, maps: Maps, results: RunResults) -> None:
         grid=maps.grid,
         trajectory=trajectory,
         truth=results.truth,
-        loops_world=np.array(
-            [
-                [graph.T_world_node[node][:3, 3] for node in (factor.i, factor.j)]
-                for factor in graph.factors
-                if factor.origin == "loop"
-            ]
-        ).reshape(-1, 2, 3),
+        loops_world=graph.loops_world,
         title=writer.manifest.input.title,
         lines=lines,
         poses=results.poses,

@@ -28,6 +28,7 @@ from mapper.run.manifest import (
     Manifest,
     RunWarning,
     Timing,
+    Verdict,
     is_localised_log,
     is_merged_map,
     library_versions,
@@ -124,6 +125,17 @@ class Run:
     def keyframes(self) -> Trajectory:
         """Poses of the keyframes."""
         return read_tum(self.file(files.KEYFRAMES))
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Whether it is to be trusted, and why not; of a run of before 2026-11-22 it is found now."""
+        from mapper.run.results import load_results
+        from mapper.run.verdict import verdict_of
+        from mapper.run.warnings import find_warnings
+
+        if self.manifest.verdict is not None:
+            return self.manifest.verdict
+        return verdict_of(find_warnings(load_results(self), self.manifest))
 
     @cached_property
     def octree(self) -> "OctreeMap":

@@ -2,10 +2,7 @@
 
 from collections.abc import Sequence
 
-from mapper.run.folder import Run
 from mapper.run.manifest import RunWarning, Trial, Verdict
-from mapper.run.results import load_results
-from mapper.run.warnings import find_warnings
 
 TRACKING_KINDS = frozenset({"lost", "doubtful"})
 """Kinds of warnings that other settings of the odometry may mend."""
@@ -29,10 +26,3 @@ def with_trial(warning: RunWarning, trial: Trial | None) -> RunWarning:
     if trial is None or warning.kind not in TRACKING_KINDS or warning.weight == "note":
         return warning
     return warning.model_copy(update={"suggestion": trial.text})
-
-
-def verdict_on(run: Run) -> Verdict:
-    """Return the verdict on a finished run; on one of before 2026-11-22 it is found now, without a trial."""
-    if run.manifest.verdict is not None:
-        return run.manifest.verdict
-    return verdict_of(find_warnings(load_results(run), run.manifest))

@@ -3,11 +3,12 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.errors import DataError
 from mapper.core.frames import Frame, Scan, Sensor
 from mapper.core.geometry import Array
 from mapper.core.timebase import Stamps
@@ -154,6 +155,34 @@ class Log:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield every frame in time order, read and decoded; ``entries`` reads none before it is asked to.
+
+        Raises:
+            FrameError: A frame cannot be read.
+        """
+        return (entry.load() for entry in self.entries())
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "Log": ...
+
+    def __getitem__(self, index: int | slice) -> "Frame | Log":
+        """Return a frame, read and decoded, counted from 0, or from the end if negative; or part of the log.
+
+        Raises:
+            IndexError: There is no such frame.
+            FrameError: It cannot be read.
+            DataError: The part would run backwards.
+        """
+        if isinstance(index, slice):
+            if index.step is not None and index.step < 0:
+                raise DataError(f"{self.path}: frames {index}: a log has no backward order; want a step > 0")
+            return self.subset(np.arange(len(self))[index])
+        return self.entry_at(range(len(self))[index]).load()
 
     def entries(self) -> Iterator[FrameRef]:
         """Yield every frame's entry in time order; nothing is decoded yet."""

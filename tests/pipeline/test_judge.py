@@ -13,7 +13,6 @@ from mapper.pipeline import judge, track
 from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse
 from mapper.run.folder import open_run
-from mapper.run.verdict import verdict_on
 from mapper.sources import open_source
 from tests.support.command_line import mapper
 from tests.support.desk import REPEATABLE
@@ -86,7 +85,7 @@ def test_a_trusted_run_passes_strictly(desk_run):
     assert desk_run.manifest.verdict.state == "trusted"
     assert desk_run.manifest.trial is None
     old = replace(desk_run, manifest=desk_run.manifest.model_copy(update={"verdict": None, "warnings": ()}))
-    assert verdict_on(old) == desk_run.manifest.verdict
+    assert old.verdict == desk_run.manifest.verdict
 
 
 def test_a_trial_looks_where_most_went_wrong():

@@ -11,7 +11,6 @@ from typing import Any
 from mapper.core.errors import ConfigError
 from mapper.export.html import document, section
 from mapper.export.report.data import Chapter, drawn, map_sizes, residual_unit, views_uri
-from mapper.run.verdict import verdict_on
 from mapper.runtime.atomic import write_text
 
 _CURVES = (
@@ -177,7 +176,7 @@ def _curves(chapters: Sequence[Chapter]) -> str:
 
 def _verdict(number: int, chapter: Chapter) -> str:
     """Return why a run is not trusted, and below it what is worth knowing."""
-    verdict = verdict_on(chapter.run)
+    verdict = chapter.run.verdict
     notes = [warning.text for warning in chapter.run.manifest.warnings if warning.weight == "note"]
     told = "".join(
         f'<li class="{kind}">{escape(text)}</li>'

@@ -10,7 +10,6 @@ from mapper.export.run_maps import maps_of, snapshots_of
 from mapper.mapping.fusion import Maps
 from mapper.run.folder import Run
 from mapper.run.results import RunResults, load_results
-from mapper.run.verdict import verdict_on
 
 
 def show_run(run: Run, target: str) -> None:
@@ -62,7 +61,7 @@ def extent(results: RunResults, maps: Maps) -> Array:
 def in_words(run: Run, *, name: str) -> str:
     """Return a run as Markdown: its log, counts, odometry and times."""
     manifest = run.manifest
-    counts, timing, verdict = manifest.counts, manifest.timing, verdict_on(run)
+    counts, timing, verdict = manifest.counts, manifest.timing, run.verdict
     rows: Iterable[tuple[str, str]] = (
         ("log", f"{manifest.input.title} ({manifest.input.kind})"),
         ("verdict", " ".join([verdict.state, *verdict.sentences])),
