@@ -53,10 +53,24 @@ def write_summary(
         lines: Figures worth knowing, shown below the headline.
         poses: The trajectory with its covariances, if known.
     """
-    positions = trajectory.positions_world
-    reached = [positions] if truth is None else [positions, truth.positions_world]
-    low, high = _extent(grid, reached)
+    low, high = _extent(grid, [path.positions_world for path in (trajectory, truth) if path is not None])
     figure, axes = _map_page(title, lines, aspect=float(np.divide(*(high - low)[::-1])))
+    draw_summary(axes, grid=grid, trajectory=trajectory, truth=truth, loops_world=loops_world, poses=poses)
+    save(figure, path)
+
+
+def draw_summary(
+    axes: "Axes",
+    *,
+    grid: OccupancyGrid,
+    trajectory: Trajectory,
+    truth: Trajectory | None,
+    loops_world: Array,
+    poses: UncertainPoses | None = None,
+) -> None:
+    """Draw what ``write_summary`` writes on axes in metres, whose limits follow."""
+    positions = trajectory.positions_world
+    low, high = _extent(grid, [path.positions_world for path in (trajectory, truth) if path is not None])
     _draw_over(axes, grid_image(grid), grid)
     if poses is not None:
         _draw_band(axes, poses, low, high)
@@ -70,7 +84,6 @@ def write_summary(
     _mark(axes, positions[0], color=START, marker="o", label="start")
     _mark(axes, positions[-1], color=END, marker="s", label="end")
     _finish_map(axes, low, high)
-    save(figure, path)
 
 
 def _draw_band(axes: "Axes", poses: UncertainPoses, low: Array, high: Array) -> None:

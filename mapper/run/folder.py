@@ -45,6 +45,8 @@ from mapper.sources.config import SourceConfig
 from mapper.sources.trajectory_files import read_tum
 
 if TYPE_CHECKING:  # compiled code, which takes longer to load than most files of a run
+    from matplotlib.axes import Axes
+
     from mapper.octree.map import OctreeMap
     from mapper.octree.slice import OccupancyGrid
     from mapper.run.cloud import Cloud
@@ -164,6 +166,27 @@ class Run:
         from mapper.octree.grid_file import stored_grid
 
         return stored_grid(self, files.TRAVERSABLE)
+
+    def plot(self, axes: "Axes | None" = None) -> "Axes":
+        """Draw the path over the slice, seen from above, with loops, uncertainty and the truth if known.
+
+        Args:
+            axes: Matplotlib's axes to draw on; None makes a figure of pyplot's.
+
+        Returns:
+            The axes, in metres of the levelled world.
+        """
+        from mapper.export.run_plot import plot_run
+
+        return plot_run(self, axes)
+
+    def _repr_html_(self) -> str:
+        from mapper.export.run_plot import run_html
+
+        return run_html(self)
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.path)!r})"
 
     def scan_updates(self) -> Path | None:
         """Return the path of the frames' updates, by its former name too; None where a user deleted it."""

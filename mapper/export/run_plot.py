@@ -1,0 +1,60 @@
+"""A run drawn on a caller's axes, and its summary for a notebook."""
+
+import base64
+from html import escape
+from typing import TYPE_CHECKING
+
+from mapper.export.html import table
+from mapper.export.picture import draw_summary
+from mapper.run import files
+from mapper.run.folder import Run
+from mapper.run.results import load_results
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+def plot_run(run: Run, axes: "Axes | None" = None) -> "Axes":
+    """Draw a run's path over its slice, seen from above; axes are in metres.
+
+    Args:
+        run: A finished run.
+        axes: Where to draw; None makes a figure of pyplot's.
+
+    Returns:
+        The axes.
+    """
+    if axes is None:
+        import matplotlib.pyplot as plt  # keeps global state, which only a caller without axes wants
+
+        axes = plt.subplots(layout="constrained")[1]
+    results = load_results(run)
+    draw_summary(
+        axes,
+        grid=run.slice,
+        trajectory=results.trajectory,
+        truth=results.truth,
+        loops_world=results.graph.loops_world,
+        poses=results.poses,
+    )
+    axes.set_title(run.manifest.input.title)
+    axes.set_xlabel("x (m)")
+    axes.set_ylabel("y (m)")
+    return axes
+
+
+def run_html(run: Run) -> str:
+    """Return the HTML of a run's verdict, its sizes and its picture, which loads nothing from elsewhere."""
+    counts = run.manifest.counts
+    rows = [
+        ("verdict", ". ".join([run.verdict.state, *run.verdict.sentences])),
+        ("frames", counts.frames_text),
+        ("keyframes", f"{counts.nodes}, {counts.loops} loops"),
+        ("path", f"{run.trajectory.path_length_m:.2f} m"),
+        ("octree", f"{counts.leaves} voxels of {run.config.octree.resolution_m:g} m"),
+    ]
+    picture = ""
+    if (run.path / files.SUMMARY).is_file():
+        data = base64.b64encode(run.file(files.SUMMARY).read_bytes()).decode("ascii")
+        picture = f'<img alt="path over the slice" style="max-width:100%" src="data:image/png;base64,{data}">'
+    return f"<b>{escape(str(run.path))}</b>{table(('', ''), rows)}{picture}"
