@@ -1,6 +1,7 @@
 """Configurations read from files and overrides, with errors that name the setting."""
 
 import json
+import os
 import tomllib
 import warnings
 from collections.abc import Mapping, Sequence
@@ -15,36 +16,49 @@ from mapper.config.sensors import DEFAULTS
 from mapper.core.config import Config, drop_unknown
 from mapper.core.errors import ConfigError, MapperWarning
 from mapper.core.frames import Sensor
+from mapper.core.paths import AnyPath
 from mapper.runtime.atomic import MANIFEST_NAME
 from mapper.runtime.regular_files import read_text
 from mapper.sources.config import SourceConfig
 
 AnyConfig = TypeVar("AnyConfig", bound=Config)
+Settings = Mapping[str, Any]
+"""Values of settings by dotted name, ``{"octree.resolution_m": 0.1}``, or nested by name."""
 
 
 def load_config(
-    path: Path | None = None, overrides: Sequence[str] = (), *, sensor: Sensor = "rgbd"
+    path: AnyPath | None = None,
+    overrides: Sequence[str] = (),
+    *,
+    settings: Settings | None = None,
+    sensor: Sensor = "rgbd",
 ) -> BuildConfig:
-    """Return the configuration of a TOML file, or a run's JSON, with ``key.path=value`` overrides on top.
+    """Return the configuration of a TOML file, or a run's JSON, with single settings on top.
 
     Args:
         path: The file; None begins with the defaults.
-        overrides: Text, parsed by the model.
-        sensor: Whose defaults hold where neither says anything.
+        overrides: ``key.path=value`` as text, parsed by the model.
+        settings: The same as values by dotted name; they come last.
+        sensor: Whose defaults hold where nothing else says anything.
 
     Raises:
         ConfigError: The file cannot be read or parsed, or the model refuses a name or a value.
+
+    Example:
+        >>> load_config(settings={"octree.resolution_m": 0.1}).octree.resolution_m
+        0.1
+        >>> load_config(overrides=["octree.resolution_m=0.1"]).octree.resolution_m
+        0.1
     """
+    path = None if path is None else Path(path)
     tree = {} if path is None else _read(path)
     if path is not None:
         if _is_of_a_run(path):
             _drop_former_settings(tree, path)
         _validated(BuildConfig, _over(DEFAULTS[sensor], tree), str(path))
-    for override in overrides:
-        _put(tree, override)
-    return _validated(
-        BuildConfig, _over(DEFAULTS[sensor], tree), "overrides" if overrides or path is None else str(path)
-    )
+    _put_all(tree, overrides, settings)
+    where = "overrides" if overrides or settings or path is None else str(path)
+    return _validated(BuildConfig, _over(DEFAULTS[sensor], tree), where)
 
 
 def load_run_config(path: Path) -> BuildConfig:
@@ -61,16 +75,25 @@ def load_run_config(path: Path) -> BuildConfig:
     return checked_config(tree, BuildConfig, str(path))
 
 
-def load_source_config(path: Path | None = None, overrides: Sequence[str] = ()) -> SourceConfig:
+def load_source_config(
+    path: AnyPath | None = None, overrides: Sequence[str] = (), *, settings: Settings | None = None
+) -> SourceConfig:
     """Return the part of a configuration that opens a log, before it is known which sensor took it.
+
+    Args:
+        path: As of ``load_config``.
+        overrides: The same; those of other parts are left out.
+        settings: The same.
 
     Raises:
         ConfigError: As ``load_config``, of that part alone.
     """
-    tree = {} if path is None else _read(path)
-    for override in overrides:
-        if override.startswith("source."):
-            _put(tree, override)
+    tree = {} if path is None else _read(Path(path))
+    _put_all(
+        tree,
+        [override for override in overrides if override.startswith("source.")],
+        {name: value for name, value in (settings or {}).items() if name.split(".")[0] == "source"},
+    )
     return _validated(BuildConfig, {"source": tree.get("source", {})}, str(path or "overrides")).source
 
 
@@ -131,23 +154,35 @@ def _over(defaults: Mapping[str, Any], tree: Mapping[str, Any]) -> dict[str, Any
     return filled
 
 
-def overridden(config: AnyConfig, overrides: Sequence[str]) -> AnyConfig:
-    """Return a configuration of any kind with ``key.path=value`` overrides on top.
+def overridden(
+    config: AnyConfig, overrides: Sequence[str] = (), *, settings: Settings | None = None
+) -> AnyConfig:
+    """Return a configuration of any kind with single settings on top, given as for ``load_config``.
 
     Raises:
         ConfigError: The model refuses a name or a value.
     """
     tree = config.model_dump()
-    for override in overrides:
-        _put(tree, override)
+    _put_all(tree, overrides, settings)
     return _validated(type(config), tree, "overrides")
 
 
-def _put(tree: dict[str, Any], override: str) -> None:
-    """Set one dotted key; the value stays text, and the model parses it."""
-    dotted, equals, value = override.partition("=")
-    if not equals or not dotted:
-        raise ConfigError(f"override {override!r}: want key.path=value")
+def _put_all(tree: dict[str, Any], overrides: Sequence[str], settings: Settings | None) -> None:
+    for override in overrides:
+        dotted, equals, value = override.partition("=")
+        if not equals or not dotted:
+            raise ConfigError(f"override {override!r}: want key.path=value")
+        _put(tree, dotted, value)
+    for dotted, value in (settings or {}).items():
+        _put(tree, dotted, value)
+
+
+def _put(tree: dict[str, Any], dotted: str, value: Any) -> None:
+    """Set one dotted key; a table of values sets each of them, and text is parsed by the model."""
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            _put(tree, f"{dotted}.{key}", inner)
+        return
     *parents, leaf = dotted.split(".")
     node = tree
     for key in parents:
@@ -155,8 +190,8 @@ def _put(tree: dict[str, Any], override: str) -> None:
             node[key] = {}
         node = node[key]
         if not isinstance(node, dict):
-            raise ConfigError(f"override {override!r}: {key} is a value, not a table")
-    node[leaf] = value
+            raise ConfigError(f"override {f'{dotted}={value}'!r}: {key} is a value, not a table")
+    node[leaf] = os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
 def _with_kinds(tree: dict[str, Any], default: Config) -> dict[str, Any]:

@@ -228,3 +228,15 @@ def test_a_part_that_was_missing_can_be_set():
     config = overridden(BuildConfig(), ["octree.depth_noise.constant_m=0.01"])
     assert config.octree.depth_noise is not None
     assert config.octree.depth_noise.constant_m == 0.01
+
+
+def test_settings_are_values_by_name_dotted_or_nested(tmp_path):
+    file = tmp_path / "lab.toml"
+    file.write_text("octree.resolution_m = 0.2\noctree.hit_probability = 0.8\n")
+    dotted = load_config(str(file), settings={"octree.resolution_m": 0.1, "odometry.kind": "isvd"})
+    assert dotted == load_config(file, ["octree.resolution_m=0.1", "odometry.kind=isvd"])
+    nested = load_config(file, settings={"octree": {"resolution_m": 0.1}, "odometry": {"kind": "isvd"}})
+    assert nested == dotted
+    assert nested.octree.hit_probability == 0.8
+    with pytest.raises(ConfigError, match="octree.resolution: unknown; did you mean resolution_m"):
+        load_config(settings={"octree.resolution": 0.1})
