@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,6 +119,7 @@ class MotionCheck(Protocol):
 Observation = TypeVar("Observation")
 
 
+@runtime_checkable
 class Odometry(Protocol[Observation]):
     """Frame-by-frame tracking in two steps, the first of them stateless, so that threads can run it ahead."""
 

@@ -180,6 +180,14 @@ class GivenOdometryConfig(WheelNoiseConfig):
     """Features by which loops recognise images; scans are recognised by their points."""
 
 
+class OwnOdometryConfig(Config):
+    """A caller's own odometry, handed to ``mapper.build`` as an object: only that program has it."""
+
+    kind: Literal["own"] = "own"
+    name: str = "the caller's"
+    """Name of its class, as a record."""
+
+
 FrameOdometryConfig = (
     IsvdOdometryConfig
     | LocalMapConfig
@@ -192,5 +200,6 @@ FrameOdometryConfig = (
 """Settings of the methods that use the frames' images or scans."""
 
 OdometryConfig = Annotated[
-    FrameOdometryConfig | WheelsOdometryConfig | GivenOdometryConfig, Field(discriminator="kind")
+    FrameOdometryConfig | WheelsOdometryConfig | GivenOdometryConfig | OwnOdometryConfig,
+    Field(discriminator="kind"),
 ]

@@ -12,6 +12,7 @@ from mapper.odometry.config import (
     IsvdOdometryConfig,
     LocalMapConfig,
     OdometryConfig,
+    OwnOdometryConfig,
     PnpConfig,
     WheelsOdometryConfig,
 )
@@ -54,7 +55,7 @@ def build_odometry(
         motion_check: Another measurement of the motion, which rules out poses after a gap.
 
     Raises:
-        ConfigError: Wheel odometry or known poses are chosen, and the log has none.
+        ConfigError: Wheel odometry or known poses are chosen, and the log has none; or a caller's own.
     """
     match config:
         case WheelsOdometryConfig():
@@ -75,6 +76,11 @@ def build_odometry(
                     "--set odometry.path=poses.tum"
                 )
             return GivenOdometry(config, poses)
+        case OwnOdometryConfig():
+            raise ConfigError(
+                f"odometry.kind=own: {config.name} odometry is an object of the program that built the run; "
+                "choose another kind, or give it to mapper.build(…, odometry=…)"
+            )
         case _:
             return build_frame_odometry(config, motion_check)
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,16 +11,19 @@ from mapper.core.deskew import deskewed, twist_at
 from mapper.core.errors import FrameError
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.levelling import AXES, Level, find_level
+from mapper.odometry.base import Odometry
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.fuse import fuse_into
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import (
     depth_cautions,
+    first_session,
     from_tracking,
     refuse_a_fragment,
     save_places,
     track_log,
 )
+from mapper.run import files
 from mapper.run.folder import (
     Run,
     first_manifest,
@@ -31,6 +35,7 @@ from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.stored_tracking import save_solved, save_tracking
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
+from mapper.sources.trajectory_files import write_tum
 
 _MAX_CAMERA_HEIGHT_M = 4.0
 """Median height above the floor, in a hand, on a robot or upstairs; wrong units of depth multiply it by 5."""
@@ -41,6 +46,7 @@ def build(
     config: BuildConfig,
     out: Path,
     *,
+    odometry: Odometry[Any] | Trajectory | None = None,
     progress: Progress = SILENT,
     observer: Observer = NULL_OBSERVER,
     overwrite: bool = False,
@@ -51,6 +57,9 @@ def build(
         source: The log.
         config: All settings.
         out: Run folder to create; until it is whole it is called ``OUT.partial``.
+        odometry: A caller's own, before its first frame, with ``odometry.kind=own``; or poses of the body in
+            the log's time, with ``odometry.kind=given``, which the run keeps. None is what the configuration
+            chooses.
         progress: Receives stages, counts and notes.
         observer: Receives every tracked frame and the results.
         overwrite: Replace a run that is there, once the new one is whole.
@@ -65,10 +74,13 @@ def build(
     with write_run(out, first_manifest(source), config, overwrite=overwrite) as writer:
         writer.warn(warnings)
         with writer.clock.stage("track"):
-            tracking = track_log(source, config, progress=progress, observer=observer)
+            start = first_session(source, config, odometry)
+            tracking = track_log(source, config, progress=progress, start=start, observer=observer)
             tracking = largest_component(tracking, progress=progress)
         writer.warn(tracking.warnings)
         save_tracking(writer, from_tracking(tracking, source.truth))
+        if isinstance(odometry, Trajectory):
+            write_tum(writer.folder / files.ODOMETRY, odometry)
         refuse_a_fragment(tracking, config, sensor=source.sensor)
         with writer.clock.stage("solve"):
             solved = solve(tracking.graph, tracking.loops, config.graph)

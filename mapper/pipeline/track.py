@@ -17,7 +17,7 @@ from mapper.loops.detector import LoopDetector
 from mapper.loops.factory import build_loop_detector
 from mapper.loops.place_file import AnyPlace, write_places
 from mapper.odometry.base import FrameResult, Odometry
-from mapper.odometry.factory import odometry_for
+from mapper.odometry.factory import build_odometry, odometry_for
 from mapper.run import files
 from mapper.run.doubtful_frames import placed_by_neighbours
 from mapper.run.folder import RunWriter
@@ -107,8 +107,15 @@ class Start:
     loops: Sequence[LoopClosure] = ()
 
 
-def first_session(source: Log, config: BuildConfig) -> Start:
+def first_session(
+    source: Log, config: BuildConfig, odometry: Odometry[Any] | Trajectory | None = None
+) -> Start:
     """Return the start of a log that is the first of its place.
+
+    Args:
+        source: The log.
+        config: All settings.
+        odometry: A caller's own, before its first frame, or its poses; None is that of the configuration.
 
     Raises:
         ConfigError: The odometry needs wheels or poses and there are none, or the loops need feature counts.
@@ -118,7 +125,10 @@ def first_session(source: Log, config: BuildConfig) -> Start:
             "loops.kind=thesis looks from frames with many features, and "
             f"odometry.kind={config.odometry.kind} counts none; want loops.kind=places, scans or none"
         )
-    odometry = odometry_for(config.odometry, source, wheels_beside(source, config))
+    if odometry is None:
+        odometry = odometry_for(config.odometry, source, wheels_beside(source, config))
+    elif isinstance(odometry, Trajectory):
+        odometry = build_odometry(config.odometry, odometry)
     return Start(odometry, build_loop_detector(config.loops, config.graph.solve), PoseGraph())
 
 

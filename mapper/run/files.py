@@ -11,6 +11,7 @@ TRAJECTORY = "trajectory.tum"
 KEYFRAMES = "keyframes.tum"
 POSES = "poses.csv"
 TRUTH = "truth.tum"
+ODOMETRY = "odometry.tum"
 KITTI = "trajectory.kitti"
 GRAPH = "graph.g2o"
 LOOPS = "loops.jsonl"
@@ -75,6 +76,7 @@ RUN_FILES = (
         "tracking",
     ),
     RunFiles((TRUTH,), "the log's own truth, in its own frame, where there is any", "tracking"),
+    RunFiles((ODOMETRY,), "the poses of a caller's own odometry, where the build was given some", "tracking"),
     RunFiles((GRAPH,), "the pose graph at its solution", "tracking"),
     RunFiles(
         (LOOPS,),

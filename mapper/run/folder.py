@@ -16,6 +16,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.graph.g2o import read_g2o
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure, read_closures
+from mapper.odometry.config import GivenOdometryConfig
 from mapper.run import files
 from mapper.run.digests import changing, checked, digests_of
 from mapper.run.doubtful_frames import without_doubtful
@@ -241,7 +242,18 @@ def open_run(path: AnyPath) -> Run:
     manifest = read_manifest(path / files.MANIFEST)
     if manifest.status != "complete":
         raise RunError(f"{path}: not finished: {_ending(path)}")
-    return Run(path, load_run_config(checked(path, files.CONFIG, manifest.files)), manifest)
+    return Run(
+        path, _with_own_poses(load_run_config(checked(path, files.CONFIG, manifest.files)), path), manifest
+    )
+
+
+def _with_own_poses(config: BuildConfig, folder: Path) -> BuildConfig:
+    """Return a run's configuration with the poses that the run keeps where its folder is now."""
+    poses = folder / files.ODOMETRY
+    if not isinstance(config.odometry, GivenOdometryConfig) or not poses.is_file():
+        return config
+    odometry = config.odometry.model_copy(update={"path": poses.resolve()})
+    return config.model_copy(update={"odometry": odometry})
 
 
 def moved_log(run: Run, *logs: Path) -> Run:

@@ -238,5 +238,5 @@ def test_settings_are_values_by_name_dotted_or_nested(tmp_path):
     nested = load_config(file, settings={"octree": {"resolution_m": 0.1}, "odometry": {"kind": "isvd"}})
     assert nested == dotted
     assert nested.octree.hit_probability == 0.8
-    with pytest.raises(ConfigError, match="octree.resolution: unknown; did you mean resolution_m"):
+    with pytest.raises(ConfigError, match=r"octree\.resolution: unknown; did you mean resolution_m"):
         load_config(settings={"octree.resolution": 0.1})
