@@ -32,8 +32,9 @@ from mapper.merging.placing import as_built
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import read_octree
-from mapper.run.folder import Run, open_run, write_run
+from mapper.run.folder import Run, open_run
 from mapper.run.manifest import Input, Manifest
+from mapper.run.writer import write_run
 from mapper.simulation.config import LIDAR_SCENES
 from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source

@@ -27,10 +27,11 @@ from mapper.pipeline.track import (
     wheels_beside,
 )
 from mapper.run.edits_file import edits_text, parse_edits, write_edits
-from mapper.run.folder import Run, appended_log, open_run, write_run
+from mapper.run.folder import Run, open_run
 from mapper.run.manifest import Manifest, Timing, library_versions, now_text
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
 from mapper.run.warnings import INPUT_KINDS
+from mapper.run.writer import appended_log, write_run
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 from mapper.sources.chained import chained

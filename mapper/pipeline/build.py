@@ -24,15 +24,11 @@ from mapper.pipeline.track import (
     track_log,
 )
 from mapper.run import files
-from mapper.run.folder import (
-    Run,
-    first_manifest,
-    open_run,
-    write_run,
-)
+from mapper.run.folder import Run, open_run
 from mapper.run.manifest import Levelling, RunWarning
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.stored_tracking import save_solved, save_tracking
+from mapper.run.writer import first_manifest, write_run
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 from mapper.sources.trajectory_files import write_tum

@@ -28,21 +28,14 @@ from mapper.octree.scan_update_file import ScanUpdateWriter, open_scan_updates
 from mapper.pipeline.judge import judge
 from mapper.run import files
 from mapper.run.edits_file import edits_text, parse_edits, write_edits
-from mapper.run.folder import (
-    Run,
-    RunWriter,
-    moved_log,
-    open_run,
-    paths_of,
-    refuse_another_log,
-    write_run,
-)
+from mapper.run.folder import Run, moved_log, open_run, paths_of, refuse_another_log
 from mapper.run.frame_outcomes import FrameRecord
 from mapper.run.manifest import DepthReach, Solve, Status, Timing
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.results import RunResults, load_results
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
 from mapper.run.warnings import FLOOR, floor_warnings
+from mapper.run.writer import RunWriter, write_run
 from mapper.runtime.atomic import is_temporary
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.depth_limit import DepthLimit

@@ -15,11 +15,11 @@ from mapper.loops.config import NoLoopsConfig
 from mapper.odometry.config import PnpConfig
 from mapper.odometry.scan_to_map.config import HoughOdometryConfig
 from mapper.pipeline.track import track_log
-from mapper.run.folder import RunWriter
 from mapper.run.manifest import Trial
 from mapper.run.results import RunResults
 from mapper.run.verdict import TRACKING_KINDS, verdict_of
 from mapper.run.warnings import find_warnings
+from mapper.run.writer import RunWriter
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 

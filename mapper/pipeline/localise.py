@@ -32,13 +32,13 @@ from mapper.pipeline.track import (
     wheels_beside,
 )
 from mapper.run import files
-from mapper.run.folder import RunWriter, first_manifest, write_run
 from mapper.run.localised import LocalisedManifest, find_stretches
 from mapper.run.pose_covariances import uncertain_poses, write_poses
 from mapper.run.results import RunResults
 from mapper.run.stored_tracking import save_frames
 from mapper.run.verdict import verdict_of
 from mapper.run.warnings import localisation_warnings
+from mapper.run.writer import RunWriter, first_manifest, write_run
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 

@@ -20,11 +20,11 @@ from mapper.odometry.base import FrameResult, Odometry
 from mapper.odometry.factory import build_odometry, odometry_for
 from mapper.run import files
 from mapper.run.doubtful_frames import placed_by_neighbours
-from mapper.run.folder import RunWriter
 from mapper.run.frame_outcomes import records_of
 from mapper.run.manifest import RunWarning
 from mapper.run.observers import NULL_OBSERVER, Observer, Step
 from mapper.run.stored_tracking import StoredTracking
+from mapper.run.writer import RunWriter
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef, Log, Skipped

@@ -12,10 +12,11 @@ from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure, write_closures
 from mapper.run import files
 from mapper.run.doubtful_frames import placed_by_neighbours
-from mapper.run.folder import Run, RunWriter
+from mapper.run.folder import Run
 from mapper.run.frame_outcomes import FrameRecord, write_frame_ms, write_records
 from mapper.run.manifest import SkippedFrame
 from mapper.run.pose_covariances import uncertain_poses, write_poses
+from mapper.run.writer import RunWriter
 from mapper.sources.base import Skipped
 from mapper.sources.trajectory_files import write_tum
 

@@ -25,8 +25,9 @@ from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.resampling import blocks_reached, resampled
 from mapper.octree.slice import cut_slice
 from mapper.run.files import SUMMARY
-from mapper.run.folder import open_run, write_run
+from mapper.run.folder import open_run
 from mapper.run.manifest import Input, Manifest, Verdict
+from mapper.run.writer import write_run
 from mapper.runtime import resumable_jobs
 from mapper.runtime.executor import Workers, run_jobs
 from mapper.sources.trajectory_files import write_tum

@@ -9,10 +9,11 @@ from mapper.loops.closure import read_closures
 from mapper.odometry.base import Diagnostics
 from mapper.run.files import RUN
 from mapper.run.fingerprint import fingerprint
-from mapper.run.folder import open_run, write_run
+from mapper.run.folder import open_run
 from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records, write_frame_ms, write_records
 from mapper.run.manifest import Input, Manifest, read_manifest
 from mapper.run.pose_covariances import read_poses
+from mapper.run.writer import write_run
 from mapper.runtime.atomic import atomic_folder, partial_of
 
 MANIFEST = Manifest(status="building", input=Input(path="/log", kind="tum", fingerprint="sha256:0"))
