@@ -50,7 +50,7 @@ class RunFiles:
 
     Attributes:
         names: What they are called.
-        content: Their content, as README.md describes it.
+        content: Their content, as docs/formats.md describes it.
         depends_on: "tracking": written once the log is tracked and its graph is solved; "maps": written by
             every fuse; "poses" and "exported maps": written on request, and outdated when the poses, or the
             maps, are made again; "user": a user's own work, which may change at any time.

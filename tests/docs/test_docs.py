@@ -13,11 +13,11 @@ from pydantic import BaseModel
 
 from mapper.config.build import BuildConfig
 from mapper.run.files import RUN_FILES
+from tests.support.pages import PAGES
 from tests.support.paths import ROOT
 
-DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
-IDS = [path.name for path in DOCUMENTS]
-WITH_CODE = [ROOT / "docs" / name for name in ("ARCHITECTURE.md", "algorithms.md", "glossary.md")]
+IDS = [path.name for path in PAGES]
+LINKED_TO_CODE = [ROOT / "docs" / name for name in ("ARCHITECTURE.md", "algorithms.md")]
 
 LINK = re.compile(r"\[([^\]]*)\]\(([^)\s]+)\)")
 CODE = re.compile(r"`([^`\n]+)`")
@@ -60,6 +60,13 @@ def links_of(path: Path) -> list[tuple[str, str]]:
     ]
 
 
+def anchors_of(path: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub and MkDocs make them."""
+    headings = re.findall(r"^#+ (.+)$", FENCE.sub("", path.read_text(encoding="utf-8")), re.MULTILINE)
+    texts = (re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).lower() for heading in headings)
+    return {re.sub(r"[^\w -]", "", text).strip().replace(" ", "-") for text in texts}
+
+
 def code_of(path: Path) -> list[str]:
     """Every piece of code within a line."""
     return CODE.findall(FENCE.sub("", path.read_text(encoding="utf-8")))
@@ -92,7 +99,7 @@ def is_setting(names: list[str], models: list[type[BaseModel]]) -> bool:
     )
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=IDS)
+@pytest.mark.parametrize("path", PAGES, ids=IDS)
 def test_links_lead_to_files_and_to_the_names_that_they_show(path):
     for text, target in links_of(path):
         file = path.parent / target
@@ -103,7 +110,16 @@ def test_links_lead_to_files_and_to_the_names_that_they_show(path):
             assert name in names_in(file), f"{path.name}: {target} has no {name}"
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=IDS)
+@pytest.mark.parametrize("path", PAGES, ids=IDS)
+def test_links_to_headings_lead_to_one(path):
+    for _, target in LINK.findall(FENCE.sub("", path.read_text(encoding="utf-8"))):
+        name, _, anchor = target.partition("#")
+        if anchor and "://" not in target:
+            page = path.parent / name if name else path
+            assert anchor in anchors_of(page), f"{path.name}: {target}"
+
+
+@pytest.mark.parametrize("path", PAGES, ids=IDS)
 def test_files_and_dotted_names_exist(path):
     for code in code_of(path):
         if FILE.fullmatch(code):
@@ -120,7 +136,7 @@ def test_files_in_the_picture_exist():
         assert (ROOT / file).exists() or (ROOT / "mapper" / file).exists(), file
 
 
-@pytest.mark.parametrize("path", WITH_CODE, ids=lambda path: path.name)
+@pytest.mark.parametrize("path", PAGES, ids=IDS)
 def test_settings_exist(path):
     for code in code_of(path):
         setting = SETTING.fullmatch(code)
@@ -156,6 +172,9 @@ def layers() -> tuple[str, ...]:
 
 
 def test_what_does_not_exist_is_found():
+    assert {"seams", "decisions"} <= anchors_of(ROOT / "docs/ARCHITECTURE.md")
+    assert "the-sensors-own-vehicle" in anchors_of(ROOT / "docs/your-sensor.md")
+    assert "seems" not in anchors_of(ROOT / "docs/ARCHITECTURE.md")
     assert "Isvd.fit_weighted" in names_in(ROOT / "mapper/registration/isvd.py")
     assert "Isvd.weighted_fit" not in names_in(ROOT / "mapper/registration/isvd.py")
     assert resolves("mapper.pipeline.build.build")
@@ -163,5 +182,5 @@ def test_what_does_not_exist_is_found():
     assert not resolves("mapper.pipelines")
     assert is_setting(["odometry", "registration", "alpha_mm"], [BuildConfig])
     assert not is_setting(["odometry", "registration", "alpha_m"], [BuildConfig])
-    for path in WITH_CODE[:2]:
+    for path in LINKED_TO_CODE:
         assert len(links_of(path)) > 20

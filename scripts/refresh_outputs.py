@@ -1,0 +1,168 @@
+"""Run the commands that README.md and the pages show on the real logs, and write what they print into them.
+
+    python scripts/refresh_outputs.py --logs DIR [--work DIR] [--page NAME …] [--slow]
+
+DIR holds the logs as shared/data has them: tum_fr1_xyz and kitti_00. Each page gets an emptied folder of its
+own below the work folder, with these logs under the names that pages use. Blocks are those that the tests
+run, and those marked "real logs"; blocks marked "slow", which take many minutes, only with --slow.
+
+A line "…" stays where a page leaves lines out: as many rows before and behind it are shown as before, unless
+only two or fewer would be left out. The exit status is 1 if a command failed; its output stays as it was.
+"""
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from tests.support.pages import OMITTED, PAGES, Block, blocks_of, files_of, page_name, row_names  # noqa: E402
+
+LOGS = {"rgbd_dataset_freiburg1_xyz": "tum_fr1_xyz", "kitti_00": "kitti_00"}
+MAPPER = [sys.executable, "-c", "from cli.main import main; main()"]
+FEWEST_OMITTED = 3
+"""Fewer rows are shown instead of being left out."""
+
+
+def refresh(path: Path, logs: Path, work: Path, *, slow: bool) -> int:
+    """Run a page's blocks, rewrite the page, and return how many commands failed."""
+    page = path.read_text(encoding="utf-8")
+    folder = _folder_for(path, page, logs, work)
+    failed = 0
+    texts: list[tuple[Block, str]] = []
+    for block in blocks_of(page):
+        if "slow" in block.marks and not slow:
+            continue
+        if block.kind == "python":
+            failed += _run([sys.executable, "-c", block.text], folder) is None
+            continue
+        text = ""
+        for command in block.commands:
+            begun = time.perf_counter()
+            printed = _run([*MAPPER, *command.words[1:]], folder)
+            failed += printed is None
+            shown = command.shown if printed is None else abridged(command.shown, printed)
+            text += "".join(f"{line}\n" for line in [f"$ {command.text}", *shown])
+            state = "failed" if printed is None else "same" if list(command.shown) == shown else "changed"
+            print(
+                f"{state:8} {time.perf_counter() - begun:6.1f} s  {page_name(path)}: {command.text}",
+                flush=True,
+            )
+        texts.append((block, text))
+    for block, text in reversed(texts):
+        page = page[: block.start] + text + page[block.start + len(block.text) :]
+    path.write_text(page, encoding="utf-8")
+    return failed
+
+
+def abridged(shown: Sequence[str], printed: Sequence[str]) -> list[str]:
+    """Return what is printed, with rows left out where what is shown leaves some out.
+
+    Args:
+        shown: Lines of the page, of which some may be "…".
+        printed: Lines that the command prints now.
+    """
+    if OMITTED not in (line.strip() for line in shown):
+        return list(printed)
+    pieces: list[list[str]] = [[]]
+    for line in shown:
+        if line.strip() == OMITTED:
+            pieces.append([])
+        else:
+            pieces[-1].append(line)
+    rows = _rows(printed)
+    head, *middle, tail = (_rows(piece) for piece in pieces)
+    kept = {*range(min(len(head), len(rows))), *range(max(len(rows) - len(tail), 0), len(rows))}
+    named = {name for piece in middle for row in piece for name in row_names(row)}
+    kept |= {i for i, row in enumerate(rows) if named & set(row_names(row[:1]))}
+    if len(rows) - len(kept) < FEWEST_OMITTED:
+        return list(printed)
+    lines: list[str] = []
+    for i, row in enumerate(rows):
+        if i in kept:
+            lines += row
+        elif lines[-1:] != [OMITTED]:
+            lines.append(OMITTED)
+    return lines
+
+
+def _rows(lines: Sequence[str]) -> list[list[str]]:
+    """Return the lines by row: one that begins with many spaces goes on with the row above."""
+    rows: list[list[str]] = []
+    for line in lines:
+        if rows and re.match(r"\s{8}", line):
+            rows[-1].append(line)
+        else:
+            rows.append([line])
+    return rows
+
+
+def _folder_for(path: Path, page: str, logs: Path, work: Path) -> Path:
+    folder = work / path.stem
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for name, source in LOGS.items():
+        (folder / name).symlink_to((logs / source).resolve())
+    (folder / "configs").symlink_to(ROOT / "configs")
+    for name, text in files_of(page).items():
+        (folder / name).write_text(text, encoding="utf-8")
+    return folder
+
+
+def _run(command: Sequence[str], folder: Path) -> list[str] | None:
+    """Return the lines that a command prints; None where it fails, which is reported."""
+    environment = {
+        name: value for name, value in os.environ.items() if name not in ("COLUMNS", "FORCE_COLOR")
+    }
+    done = subprocess.run(
+        command,
+        cwd=folder,
+        env={**environment, "NO_COLOR": "1", "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode != 0:
+        print(done.stderr.strip()[-2000:], file=sys.stderr)
+        return None
+    text = done.stdout.replace(f"{folder.resolve()}/", "").replace(f"{folder}/", "")
+    return [line.rstrip() for line in text.rstrip("\n").splitlines()]
+
+
+def main() -> int:
+    """Refresh the pages that were asked for, or all."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--logs", type=Path, required=True, help="folder with tum_fr1_xyz and kitti_00")
+    parser.add_argument("--work", type=Path, help="folder to work in; a temporary one by default")
+    parser.add_argument("--page", action="append", help="README.md or docs/NAME.md; may be given again")
+    parser.add_argument("--slow", action="store_true", help="run blocks that take many minutes, too")
+    arguments = parser.parse_args()
+    names = [page_name(path) for path in PAGES]
+    if unknown := set(arguments.page or ()) - set(names):
+        parser.error(f"no page {', '.join(sorted(unknown))}; want one of {', '.join(names)}")
+    if missing := [name for name in LOGS.values() if not (arguments.logs / name).is_dir()]:
+        parser.error(f"{arguments.logs}: has no {', '.join(missing)}")
+    with tempfile.TemporaryDirectory() as temporary:
+        work = (arguments.work or Path(temporary)).resolve()
+        failed = sum(
+            refresh(path, arguments.logs, work, slow=arguments.slow)
+            for path, name in zip(PAGES, names, strict=True)
+            if arguments.page is None or name in arguments.page
+        )
+    if failed:
+        print(f"{failed} commands failed; their outputs stay as they were", file=sys.stderr)
+    return min(failed, 1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

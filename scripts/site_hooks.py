@@ -1,0 +1,180 @@
+"""Hooks of MkDocs: pages that are made from the code, and links from pages to files of the repository.
+
+Where a page says ``<!-- generated: settings -->`` or ``<!-- generated: commands -->``, the reference takes
+the place of that line. README.md is the first page. A file of the repository that a page links to is copied
+into the site as text, so that the site is complete without a network.
+"""
+
+import os
+import re
+from collections.abc import Iterator
+from itertools import groupby
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).resolve().parents[1]
+_GENERATED = re.compile(r"^<!-- generated: (\w+) -->\n(?:\n.*\n(?!#))*", re.MULTILINE)
+_LINK = re.compile(r"(?<!\!)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
+_CODE = re.compile(r"^```.*?^```|``.*?``|`[^`\n]*`", re.DOTALL | re.MULTILINE)
+_NAMES = {"rgbd": "RGB-D", "lidar": "LiDAR"}
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the first page, and the files that pages link to."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    files.append(File.generated(config, "index.md", content=_moved(readme)))
+    linked = {
+        target for page in files.documentation_pages() for target in _outside(page.content_string, page)
+    }
+    for target in sorted(linked):
+        files.append(File.generated(config, _copy_of(target), abs_src_path=str(ROOT / target)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
+    """Put in what is generated, and point links at the copies of the repository's files."""
+    markdown = _GENERATED.sub(lambda found: "\n".join(_REFERENCES[found[1]]()), markdown)
+    return _relinked(markdown, page.file)
+
+
+def _moved(readme: str) -> str:
+    """Return README.md as a page of docs/: links to pages lose the folder, others leave it."""
+
+    def link(found: re.Match[str]) -> str:
+        target = found[2]
+        if "://" in target or target.startswith("#"):
+            return found[0]
+        inside = target.removeprefix("docs/")
+        return f"{found[1]}({inside if inside != target else f'../{target}'})"
+
+    return re.sub(r"(\!?\[[^\]]*\])\(([^)\s]+)\)", link, readme)
+
+
+def _target(link: str, page: File) -> str | None:
+    """Return the path in the repository of a file outside of docs/ that a link of a page leads to, if any."""
+    path = link.partition("#")[0]
+    if "://" in link or not path:
+        return None
+    full = os.path.normpath(PurePosixPath("docs", page.src_uri).parent / path)
+    return None if full.startswith("docs/") else full
+
+
+def _outside(markdown: str, page: File) -> Iterator[str]:
+    for _, link in _LINK.findall(markdown):
+        target = _target(link, page)
+        if target is not None and (ROOT / target).is_file():
+            yield target
+
+
+def _copy_of(target: str) -> str:
+    """Return where a file of the repository lies in the site; as text, which every browser shows."""
+    return f"source/{target}.txt"
+
+
+def _relinked(markdown: str, page: File) -> str:
+    def link(found: re.Match[str]) -> str:
+        target = _target(found[2], page)
+        if target is None:
+            return found[0]
+        if target == "README.md":
+            return f"[{found[1]}](index.md)"
+        if (ROOT / target).is_file():
+            return f"[{found[1]}]({os.path.relpath(_copy_of(target), PurePosixPath(page.src_uri).parent)})"
+        return found[1] if (ROOT / target).is_dir() else found[0]
+
+    return _LINK.sub(link, markdown)
+
+
+def _settings() -> Iterator[str]:
+    """Yield the Markdown of the settings, a table for each part."""
+    from mapper.config.describe import settings
+
+    of_lidar = {(one.key, one.needs): one for one in settings("lidar")}
+    yield "“LiDAR: …” is the default for LiDAR logs where it differs. Each kind of a method has its table."
+    described = list(settings())
+    for part, members in groupby(described, key=lambda one: one.key.split(".")[0]):
+        listed = list(members)
+        yield f"\n### {part}\n"
+        if listed[0].is_table:
+            yield f"{_cell(listed[0].doc)}\n"
+        tables = {one.key: one.doc for one in listed if one.is_table}
+        rows = [one for one in listed if not one.is_table or one.type != "table"]
+        for (parent, needs), group in groupby(rows, key=lambda one: (one.key.rpartition(".")[0], one.needs)):
+            if needs or parent != part:
+                where = ", ".join(
+                    f"`{key}` = {' or '.join(f'`{v}`' for v in values)}" for key, values in needs
+                )
+                about = "" if parent in (part, "") else f"`{parent}` {_cell(tables.get(parent, ''))}"
+                yield f"\n{about}{' ' if about else ''}{f'With {where}:' if where else ''}\n"
+            yield "\n| setting | default | values | meaning |\n| --- | --- | --- | --- |"
+            for one in group:
+                other = of_lidar.get((one.key, one.needs))
+                default = f"`{one.default_text}`"
+                if other is not None and other.default != one.default and not one.is_table:
+                    default += f"<br>LiDAR: `{other.default_text}`"
+                values = ", ".join(f"`{choice}`" for choice in one.choices) or one.type
+                unit = f", {one.unit}" if one.unit else ""
+                yield f"| `{one.key}` | {default} | {values}{unit} | {_cell(one.doc)} |"
+
+
+def _commands() -> Iterator[str]:
+    """Yield the Markdown of the verbs: usage, description, arguments and options of each."""
+    import click
+    import typer
+
+    from cli.main import app
+
+    yield from _command(
+        typer.main.get_command(app), click.Context(click.Command("mapper"), info_name="mapper")
+    )
+
+
+def _command(command: Any, parent: Any) -> Iterator[str]:
+    for name, verb in command.commands.items():
+        if verb.hidden:
+            continue
+        context = verb.make_context(name, [], parent=parent, resilient_parsing=True)
+        yield f"\n## {context.command_path}\n\n{_prose(verb.help or '')}\n"
+        yield f"```text\n{verb.get_usage(context).removeprefix('Usage: ')}\n```\n"
+        rows = [row for parameter in verb.params if (row := _parameter(parameter, context))]
+        if rows:
+            yield "| argument or option | meaning |\n| --- | --- |"
+            yield from rows
+        if hasattr(verb, "commands"):
+            yield from _command(verb, context)
+
+
+def _parameter(parameter: Any, context: Any) -> str | None:
+    record = parameter.get_help_record(context)
+    if record is None or parameter.name == "help":
+        return None
+    name, about = record
+    return f"| `{' '.join(name.split())}` | {_cell(about)} |"
+
+
+def _prose(docstring: str) -> str:
+    """Return a verb's help as paragraphs, its example as code."""
+    paragraphs = [" ".join(part.split()) for part in docstring.replace("\b", "").split("\n\n")]
+    return "\n\n".join(
+        re.sub(r"(Example: |, or(?: just)?: |, then: )(mapper [^,]*)", r"\1`\2`", part)
+        if part.startswith("Example")
+        else _escaped(part)
+        for part in paragraphs
+    )
+
+
+def _cell(text: str) -> str:
+    return _escaped(" ".join(text.split())).replace("|", "\\|")
+
+
+def _escaped(text: str) -> str:
+    """Keep what Markdown would take for markup, outside of code."""
+    parts = re.split(r"(`[^`]*`)", text)
+    return "".join(part if part.startswith("`") else re.sub(r"([*_<\[\]])", r"\\\1", part) for part in parts)
+
+
+_REFERENCES = {"settings": _settings, "commands": _commands}
