@@ -11,7 +11,7 @@ fail() {
   exit 1
 }
 
-extra=""
+extra=all
 wheels="numpy cv2 numba gtsam mahotas matplotlib foxglove mcap open3d kiss_icp kiss_matcher rerun"
 for option in "$@"; do
   case "$option" in
@@ -19,9 +19,8 @@ for option in "$@"; do
     *) fail "unknown option $option; want --dev" ;;
   esac
 done
-extra="${extra:+[$extra]}"
 venv=.venv
-stamp="$venv/.installed${extra}"
+stamp="$venv/.installed[$extra]"
 
 # Installs Debian packages if we may; otherwise says exactly what to type.
 need_packages() {
@@ -127,8 +126,11 @@ fi
 # The folder counts as well: an editable install and its scripts name it.
 want=$( (pwd; "$venv/bin/python" --version; cat pyproject.toml scripts/setup.sh) | sha256sum)
 if [ "$(cat "$stamp" 2>/dev/null)" != "$want" ]; then
-  say "installing the project${extra:+ with its extras $extra}"
-  "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable ".$extra" >&2
+  say "installing the project with its extras [$extra]"
+  if [ -n "$(find "$venv" -name 'mapper-0.1.0.dist-info' -print -quit)" ]; then # its name until 0.2
+    "$venv/bin/python" -m pip uninstall --quiet --yes mapper >&2
+  fi
+  "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable ".[$extra]" >&2
   install_missing_libraries
   printf '%s\n' "$want" >"$stamp"
 fi

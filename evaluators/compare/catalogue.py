@@ -1,6 +1,7 @@
 """Catalogue of the methods of `mapper compare`, set up for a log's sensor."""
 
 from functools import partial
+from importlib.util import find_spec
 
 from evaluators.compare.config import CompareConfig
 from evaluators.compare.methods import AnyRegistration, Method, odometry_method, registration_method
@@ -11,24 +12,41 @@ from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig, PnpConfig
 from mapper.odometry.factory import build_frame_odometry
 from mapper.registration.config import NEED_NO_GUESS
 from mapper.registration.factory import build_registration
+from mapper.runtime.extras import install_line, require
 from mapper.sources.base import Log
+
+_LIBRARIES = {
+    "rgbd": "open3d",
+    "ndt": "open3d",
+    "hough-ndt": "open3d",
+    "kiss-matcher": "kiss_matcher",
+    "kiss-icp": "kiss_icp",
+}
+"""Optional libraries of methods, by the method's name."""
 
 
 def methods_for(source: Log, config: CompareConfig) -> tuple[list[Method], list[str]]:
-    """Return the chosen methods that can use a log, and a sentence on those that cannot.
+    """Return the chosen methods that can use a log, and sentences on those that cannot.
 
     Raises:
         ConfigError: No method of such a name, or none of them can use the log.
+        DependencyError: The library of a method that is named is not installed.
     """
     images, scans = _image_methods(config.rgbd.max_depth_m), _scan_methods(source.sensor)
     names = [method.name for method in (*images, *scans)]
     for name in config.methods:
         if name not in names:
             raise ConfigError(f"no method {name!r}; want one of {', '.join(names)}")
-    chosen = config.methods or names
+        if name in _LIBRARIES:
+            require(_LIBRARIES[name], "peers", f"--methods {name}")
+    absent = {} if config.methods else {n: lib for n, lib in _LIBRARIES.items() if find_spec(lib) is None}
+    chosen = config.methods or [name for name in names if name not in absent]
     blind = [m.name for m in images if m.name in chosen and source.sensor != "rgbd"]
     methods = [m for m in (*images, *scans) if m.name in chosen and m.name not in blind]
     notes = [f"{', '.join(blind)}: left out, for the log has no images"] if blind else []
+    if absent:
+        libraries = ", ".join(sorted(set(absent.values())))
+        notes.append(f"{', '.join(absent)}: left out without {libraries}: {install_line('peers')}")
     if not methods:
         raise ConfigError(f"{source.path}: {notes[0]}; choose others of {', '.join(m.name for m in scans)}")
     return methods, notes

@@ -23,6 +23,7 @@ from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.run.fingerprint import fingerprint
 from mapper.runtime.atomic import resumable_folder, write_text
 from mapper.runtime.executor import IN_PROCESS, Workers
+from mapper.runtime.extras import require
 from mapper.runtime.progress import SILENT, Progress
 from mapper.runtime.resumable_jobs import Job, JobResult
 from mapper.sources import open_source
@@ -82,7 +83,9 @@ def plan_sweep(path: Path, out: Path) -> Plan:
     Raises:
         ConfigError: The file, or a configuration that results from it, is wrong; no log fits a glob.
         SourceError: A log cannot be opened.
+        DependencyError: The library that writes the table is not installed.
     """
+    require("pyarrow", "study", "mapper sweep")
     config = read_config(path, SweepConfig)
     out = out.resolve()
     entries: dict[BuildName, Job | str] = {}

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from evaluators.tables.table import Record
 from mapper.runtime.atomic import atomic_file
+from mapper.runtime.extras import extra
 
 
 def write_parquet(path: Path, records: Sequence[Record]) -> None:
@@ -16,8 +17,9 @@ def write_parquet(path: Path, records: Sequence[Record]) -> None:
         path: File to write.
         records: One or more, all with the first one's names.
     """
-    import pyarrow as pa  # takes a second
-    from pyarrow import parquet
+    with extra("study", path.name):
+        import pyarrow as pa  # takes a second
+        from pyarrow import parquet
 
     columns = {}
     for name in records[0]:

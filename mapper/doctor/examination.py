@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from mapper.doctor import machine
 from mapper.doctor.finding import Finding
-from mapper.doctor.libraries import look_at_library, requirements
+from mapper.doctor.libraries import Requirement, look_at_library, requirements
 from mapper.doctor.self_tests import SELF_TESTS
 from mapper.doctor.system_libraries import look_at_system_libraries
 from mapper.runtime.ordered_map import ordered_map
@@ -23,11 +23,11 @@ _MACHINE: tuple[Callable[[], Finding], ...] = (
 
 def examine(*, progress: Progress = SILENT) -> list[Finding]:
     """Check the machine, then try every library in a process of its own, one per processor at a time."""
-    least = requirements()
+    wanted = requirements()
     findings = [look() for look in _MACHINE]
     with progress.stage("try") as report:
         tried = ordered_map(
-            lambda name: look_at_library(name, least.get(name, "0")),
+            lambda name: look_at_library(name, wanted.get(name, Requirement())),
             SELF_TESTS,
             workers=machine.processors(),
         )

@@ -6,32 +6,62 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib import metadata
 
 from mapper.doctor.finding import Finding
 from mapper.doctor.system_libraries import apt_line
+from mapper.runtime.extras import DISTRIBUTION, install_line
 
 _PATIENCE_S = 60.0
 _REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(\[[\w,]*\])?(>=(?P<least>[\d.]+))?")
+_EXTRA = re.compile(r"""extra == ['"](?P<name>[\w-]+)['"]""")
 _MISSING_OBJECT = re.compile(r"(?P<object>lib[\w.+-]+\.so[\w.]*): cannot open shared object file")
 
 
-def requirements() -> dict[str, str]:
-    """Return the least version of every required library, by its name in pip."""
-    found = {}
-    for line in metadata.requires("mapper") or ():
-        match = _REQUIREMENT.match(line)
-        if match is not None and "extra ==" not in line:
-            found[match["name"]] = match["least"] or "0"
+@dataclass(frozen=True, slots=True)
+class Requirement:
+    """A library that this package names.
+
+    Attributes:
+        least: Its least version.
+        extra: The extra that brings it; None if all need it.
+    """
+
+    least: str = "0"
+    extra: str | None = None
+
+
+_ANY = Requirement()
+
+
+def requirements() -> dict[str, Requirement]:
+    """Return every library that this package needs or can use, by its name in pip.
+
+    There are none where the package is not installed.
+    """
+    found: dict[str, Requirement] = {}
+    try:
+        lines = metadata.requires(DISTRIBUTION) or ()
+    except metadata.PackageNotFoundError:
+        return found
+    for line in lines:
+        match, extra = _REQUIREMENT.match(line), _EXTRA.search(line)
+        if match is None or (extra is not None and extra["name"] in {"all", "dev"}):
+            continue
+        found.setdefault(match["name"], Requirement(match["least"] or "0", extra and extra["name"]))
     return found
 
 
-def look_at_library(name: str, least: str = "0") -> Finding:
+def look_at_library(name: str, wanted: Requirement = _ANY) -> Finding:
     """Return whether a library is installed, of at least a version, and passes its self-test."""
+    least = wanted.least
     mend = f"pip install '{name}>={least}'"
     try:
         version = metadata.version(name)
     except metadata.PackageNotFoundError:
+        if wanted.extra is not None:
+            return Finding(name, "well", f"optional, not installed: {install_line(wanted.extra)}")
         return Finding(name, "failed", "not installed", mend)
     if _numbers(version) < _numbers(least):
         return Finding(name, "failed", f"{version}, want at least {least}", mend)

@@ -253,7 +253,15 @@ def typer(_folder: Path) -> None:
     _expect(callable(typer.Typer()), "no command line")
 
 
+def distributed(_folder: Path) -> None:
+    """Parse an address of a scheduler."""
+    from distributed.comm import parse_address
+
+    _expect(parse_address("tcp://127.0.0.1:8786") == ("tcp", "127.0.0.1:8786"), "an address was misread")
+
+
 SELF_TESTS: dict[str, Callable[[Path], None]] = {
+    "distributed": distributed,
     "foxglove-sdk": foxglove,
     "gtsam": gtsam,
     "isal": isal,

@@ -25,6 +25,7 @@ from mapper.mapping.cloud import Colors
 from mapper.octree.blocks import check_memory
 from mapper.octree.map import OctreeMap
 from mapper.run.folder import Run
+from mapper.runtime.extras import extra
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef
@@ -233,9 +234,8 @@ def _expected_blocks(octree: OctreeMap, config: MeshConfig) -> int:
 
 def _open3d() -> Any:
     try:
-        import open3d
-    except ModuleNotFoundError as error:
-        raise DependencyError(f"mesh needs {error.name}, which is missing: pip install open3d") from None
+        with extra("mesh", "a mesh"):
+            import open3d
     except (ImportError, OSError) as error:
         found = re.search(r"lib[\w.+-]+\.so[.\d]*", str(error))
         raise DependencyError(

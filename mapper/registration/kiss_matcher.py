@@ -13,6 +13,7 @@ from mapper.registration.base import Alignment, failed
 from mapper.registration.config import KissMatcherConfig
 from mapper.registration.icp import cloud_of, refined
 from mapper.registration.surfaces import Prepared, prepared
+from mapper.runtime.extras import extra
 
 _CROWD = 5  # points this near together, in feature voxels, are certain to have a normal and a feature
 _CROWD_VOXELS = 1.5
@@ -95,7 +96,8 @@ def _library() -> Any:
 
     Its thread pool is sized at the first use, by the cores that the process may run on then.
     """
-    import kiss_matcher
+    with extra("peers", "KISS-Matcher (Python 3.11 or 3.12)"):
+        import kiss_matcher
 
     few = np.random.default_rng(0).uniform(size=(300, 3)).astype(np.float32)
     if sys.platform == "linux":

@@ -11,6 +11,7 @@ from mapper.registration.acceptance import assess
 from mapper.registration.base import Alignment, failed
 from mapper.registration.config import NdtConfig
 from mapper.registration.surfaces import Prepared, prepared
+from mapper.runtime.extras import extra
 
 
 class Ndt:
@@ -86,7 +87,8 @@ def refine_by_cells(
 def _by_cells(
     target: Points, source: Points, T: Transform, cell_m: float, min_points: int, max_iterations: int
 ) -> Transform | str:
-    import open3d
+    with extra("peers", "NDT"):
+        import open3d
 
     registration = open3d.pipelines.registration
     option = registration.NormalDistributionsTransformOption(

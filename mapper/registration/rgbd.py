@@ -5,12 +5,15 @@ from typing import Any
 
 import cv2
 import numpy as np
-import open3d
 from numpy.typing import NDArray
 
 from mapper.core.frames import NO_DISTORTION, PinholeCamera, RgbdFrame
 from mapper.core.geometry import Transform, inverse, nearest_rotation, transform
 from mapper.registration.base import Alignment, failed
+from mapper.runtime.extras import extra
+
+with extra("peers", "hybrid RGB-D registration"):
+    import open3d
 
 _O3D: Any = open3d  # its stubs lack buffers
 _MIN_PAIRS = 100

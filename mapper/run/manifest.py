@@ -298,8 +298,15 @@ def read_manifest_of(path: Path, kind: type[AnyManifest]) -> AnyManifest:
 
 
 def library_versions() -> dict[str, str]:
-    """Return the installed version of every library that can change a result."""
-    return {name: metadata.version(name) for name in _LIBRARIES}
+    """Return the installed version of every library that can change a result, or "absent"."""
+    return {name: _version(name) for name in _LIBRARIES}
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "absent"
 
 
 def now_text() -> str:

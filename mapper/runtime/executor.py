@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
 
-from mapper.core.errors import ConfigError, DependencyError
+from mapper.core.errors import ConfigError
+from mapper.runtime.extras import extra
 from mapper.runtime.threads import one_thread_per_library
 from mapper.runtime.worker_process import Failure, Work, WorkerProcess, _reason, attempt
 
@@ -175,12 +176,8 @@ class _DaskCluster(AbstractContextManager["_DaskCluster"]):
     def __init__(self, scheduler: str) -> None:
         if not _ADDRESS.fullmatch(scheduler):  # Dask itself would try for a while first
             raise ConfigError(f"scheduler {scheduler!r}: not an address; want tcp://HOST:PORT")
-        try:
+        with extra("cluster", "a Dask scheduler"):
             import distributed
-        except ImportError:
-            raise DependencyError(
-                "a Dask scheduler needs an extra that is not installed: pip install 'mapper[cluster]'"
-            ) from None
         self._scheduler, self._killed = scheduler, distributed.KilledWorker
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what matters is raised here
         try:

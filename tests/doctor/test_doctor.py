@@ -1,6 +1,7 @@
 import json
 import sys
 import tomllib
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from mapper.core.errors import DataError
 from mapper.doctor import libraries, machine
 from mapper.doctor.finding import Finding
-from mapper.doctor.libraries import look_at_library, tried
+from mapper.doctor.libraries import Requirement, look_at_library, tried
 from mapper.doctor.self_tests import SELF_TESTS, WrongAnswerError, _expect_near
 from mapper.doctor.system_libraries import apt_line, look_at_system_libraries
 from tests.support.command_line import invoke
@@ -23,13 +24,38 @@ def ended(code, **options):
 
 
 def test_every_library_that_we_need_has_a_self_test():
-    needed = tomllib.loads(PYPROJECT.read_text())["project"]["dependencies"]
-    names = {libraries._REQUIREMENT.match(line)["name"] for line in needed}
-    assert names == set(SELF_TESTS)
+    project = tomllib.loads(PYPROJECT.read_text())["project"]
+    extras = project["optional-dependencies"]
+    lines = chain(project["dependencies"], *(extras[name] for name in extras if name not in {"all", "dev"}))
+    assert {libraries._REQUIREMENT.match(line)["name"] for line in lines} == set(SELF_TESTS)
+
+
+def test_requirements_know_what_is_optional(monkeypatch):
+    lines = [
+        "numpy>=2.0",
+        "laspy[lazrs]>=2.7",
+        'rerun-sdk>=0.41; extra == "viewer"',
+        'kiss-matcher>=1.0; (python_version < "3.13") and extra == "peers"',
+        'octree-mapper[viewer]; extra == "all"',
+        'evo>=1.31; extra == "dev"',
+    ]
+    monkeypatch.setattr(libraries.metadata, "requires", lambda _name: lines)
+    assert libraries.requirements() == {
+        "numpy": Requirement("2.0"),
+        "laspy": Requirement("2.7"),
+        "rerun-sdk": Requirement("0.41", "viewer"),
+        "kiss-matcher": Requirement("1.0", "peers"),
+    }
+
+
+def test_an_optional_library_that_is_absent_is_well_and_told():
+    finding = look_at_library("no-such-library", Requirement("1.5", "viewer"))
+    assert finding.verdict == "well"
+    assert finding.detail == "optional, not installed: pip install 'octree-mapper[viewer]'"
 
 
 def test_a_library_that_works_is_well():
-    finding = look_at_library("gtsam", "4.3")
+    finding = look_at_library("gtsam", Requirement("4.3"))
     assert (finding.verdict, finding.remedy) == ("well", "")
     assert finding.detail.startswith("4.")
 
@@ -61,10 +87,10 @@ def test_a_library_that_hangs_is_given_up():
 
 
 def test_a_library_that_is_missing_or_old_is_told_with_the_line_that_mends_it():
-    missing = look_at_library("no-such-library", "1.5")
+    missing = look_at_library("no-such-library", Requirement("1.5"))
     assert (missing.detail, missing.remedy) == ("not installed", "pip install 'no-such-library>=1.5'")
 
-    old = look_at_library("numpy", "99.1")
+    old = look_at_library("numpy", Requirement("99.1"))
     assert old.detail.endswith(", want at least 99.1")
     assert old.remedy == "pip install 'numpy>=99.1'"
 

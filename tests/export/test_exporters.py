@@ -298,7 +298,10 @@ class Missing:
 @pytest.mark.parametrize(
     ("error", "message"),
     [
-        (ModuleNotFoundError("No module named 'open3d'", name="open3d"), "pip install open3d"),
+        (
+            ModuleNotFoundError("not there", name="open3d"),
+            r"pip install 'octree-mapper\[mesh\]'",
+        ),
         (
             OSError("libGL.so.1: cannot open shared object file"),
             r"libGL\.so\.1 is missing; apt-get install libgl1",

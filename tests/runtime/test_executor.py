@@ -138,5 +138,5 @@ def test_a_scheduler_that_is_not_there_is_told(monkeypatch, address, message):
 
 def test_a_missing_extra_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(DependencyError, match=r"pip install 'mapper\[cluster\]'"):
+    with pytest.raises(DependencyError, match=r"pip install 'octree-mapper\[cluster\]'"):
         make_executor(Workers(scheduler="tcp://127.0.0.1:8786"))

@@ -5,6 +5,7 @@ import numpy as np
 from mapper.core.geometry import Array, Points, Transform, inverse, is_rigid
 from mapper.odometry.scan_to_map.config import KissOdometryConfig
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan, Reach
+from mapper.runtime.extras import extra
 
 _MAX_POINTS_PER_VOXEL, _CONVERGENCE = 20, 1e-4  # the library's defaults
 
@@ -15,8 +16,9 @@ class KissMatcher:
     uses_guess = True
 
     def __init__(self, config: KissOdometryConfig) -> None:
-        from kiss_icp.config import KISSConfig
-        from kiss_icp.registration import get_registration
+        with extra("peers", "odometry.kind=kiss-icp"):
+            from kiss_icp.config import KISSConfig
+            from kiss_icp.registration import get_registration
 
         self._settings = KISSConfig()
         self._settings.data.max_range = config.max_range_m

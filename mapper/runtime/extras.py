@@ -1,0 +1,51 @@
+"""Extras: groups of optional libraries that pip installs on demand, as in ``octree-mapper[viewer]``."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+
+from mapper.core.errors import DependencyError
+
+DISTRIBUTION = "octree-mapper"
+"""Name of this package in pip; it is imported as ``mapper``."""
+
+
+@contextmanager
+def extra(name: str, purpose: str) -> Iterator[None]:
+    """Import libraries of an extra while inside.
+
+    Args:
+        name: Of the extra, as in pyproject.toml.
+        purpose: What they are needed for, as a message begins.
+
+    Raises:
+        DependencyError: One of them is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise _missing(str(error.name), name, purpose) from None
+
+
+def require(library: str, name: str, purpose: str) -> None:
+    """Refuse a job at its start that will need a library of an extra; the library is not loaded.
+
+    Args:
+        library: As it is imported.
+        name: Of the extra.
+        purpose: What it is needed for, as a message begins.
+
+    Raises:
+        DependencyError: It is not installed.
+    """
+    if find_spec(library) is None:
+        raise _missing(library, name, purpose)
+
+
+def install_line(name: str) -> str:
+    """Return the command that installs an extra."""
+    return f"pip install '{DISTRIBUTION}[{name}]'"
+
+
+def _missing(library: str, name: str, purpose: str) -> DependencyError:
+    return DependencyError(f"{purpose} needs {library}, which is not installed: {install_line(name)}")
