@@ -12,7 +12,7 @@ fail() {
 }
 
 extra=all
-wheels="numpy cv2 numba gtsam mahotas matplotlib foxglove mcap open3d kiss_icp kiss_matcher rerun"
+wheels="numpy cv2 numba gtsam matplotlib foxglove mcap open3d kiss_icp kiss_matcher rerun"
 for option in "$@"; do
   case "$option" in
     --dev) extra=dev ;;

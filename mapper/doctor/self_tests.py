@@ -73,14 +73,6 @@ def kiss_matcher(_folder: Path) -> None:
     _expect(np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6), f"no rotation: {rotation.tolist()}")
 
 
-def mahotas(_folder: Path) -> None:
-    """Find SURF features in noise."""
-    from mahotas.features import surf
-
-    found = surf.surf(_texture(), max_points=100)
-    _expect(found.shape[1] == 70 and len(found) > 10, f"SURF gave {found.shape}")
-
-
 def numba(_folder: Path) -> None:
     """Compile a loop."""
     import numba
@@ -269,7 +261,6 @@ SELF_TESTS: dict[str, Callable[[Path], None]] = {
     "kiss-matcher": kiss_matcher,
     "laspy": laspy,
     "lz4": lz4,
-    "mahotas": mahotas,
     "matplotlib": matplotlib,
     "mcap": mcap,
     "numba": numba,

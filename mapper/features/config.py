@@ -11,20 +11,22 @@ ScaleFactor = Annotated[float, Field(gt=1.0)]
 
 
 class SurfConfig(Config):
-    """SURF (Bay et al. 2008), described by mahotas; chosen by Somlyai (PhD thesis)."""
+    """SURF (Bay et al. 2008), chosen by Somlyai (PhD thesis); octaves, layers and thresholds as OpenCV's."""
 
     kind: Literal["surf"] = "surf"
     max_features: PositiveInt = 1000
     """Largest number of features of an image, the strongest first. More in images of higher resolution; fewer
     are faster."""
-    threshold: PositiveFloat = 100.0
+    threshold: PositiveFloat = 400.0
     """First threshold of the Hessian's determinant, grey levels²; halved while there are too few features."""
-    min_threshold: PositiveFloat = 1.0
+    min_threshold: PositiveFloat = 25.0
     """Last threshold; raise it where noise gives features."""
     min_features: PositiveInt = 300
     """With fewer features the threshold is halved."""
     octaves: PositiveInt = 4
     """Number of times that the filter's size doubles: more find larger features."""
+    layers: PositiveInt = 3
+    """Filter sizes per octave in which points are found."""
 
 
 class SiftConfig(Config):

@@ -24,7 +24,6 @@ _LIBRARIES = (
     "foxglove-sdk",
     "gtsam",
     "kiss-icp",
-    "mahotas",
     "matplotlib",
     "mcap",
     "numba",

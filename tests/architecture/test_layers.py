@@ -69,7 +69,6 @@ HOMES = {
     "rosbags": ("mapper/sources/ros/",),
     "foxglove": ("mapper/export/", "mapper/sources/ros/decode_foxglove.py"),
     "google": ("mapper/sources/ros/decode_foxglove.py",),
-    "mahotas": ("mapper/features/",),
     "laspy": ("mapper/sources/cloud_files/las.py",),
     "pypcd4": ("mapper/sources/cloud_files/pcd.py",),
     "typer": ("cli/",),

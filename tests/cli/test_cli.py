@@ -47,7 +47,6 @@ HEAVY = {
     "numba",
     "gtsam",
     "matplotlib",
-    "mahotas",
     "foxglove",
     "mcap",
     "pydantic",

@@ -1,4 +1,4 @@
-"""Detectors: contract for every one of them, and the parts that uniform ORB and SURF are made of."""
+"""Detectors: contract for every one of them, and the parts that uniform ORB is made of."""
 
 from concurrent.futures import ThreadPoolExecutor
 from typing import get_args
@@ -9,10 +9,9 @@ import pytest
 
 from mapper.core.errors import DataError
 from mapper.features.base import Features
-from mapper.features.config import DetectorConfig, OrbConfig, SurfConfig, UniformOrbConfig
+from mapper.features.config import DetectorConfig, OrbConfig, UniformOrbConfig
 from mapper.features.factory import build_detector
 from mapper.features.fast import corners, fast_scores, orientations
-from mapper.features.fast_hessian import interest_points
 from mapper.features.quadtree import spread
 
 EVERY_DETECTOR = [member() for member in get_args(get_args(DetectorConfig)[0])]
@@ -177,24 +176,3 @@ def test_uniform_orb_reaches_parts_that_orb_leaves_out():
 
     assert (uniform.pixels[:, 0] > 170).mean() > 2 * (plain.pixels[:, 0] > 170).mean()
     assert (uniform.pixels[:, 0] > 170).mean() > 0.2
-
-
-@pytest.mark.parametrize("sigma_px", [2.5, 3.5, 7.0])
-def test_surf_locates_a_blob_between_pixels(sigma_px):
-    y, x = np.mgrid[0:200, 0:220]
-    column, row = 110.3, 101.6
-    blob = 20 + 200 * np.exp(-((x - column) ** 2 + (y - row) ** 2) / (2 * sigma_px**2))
-
-    strongest = max(interest_points(blob.round().astype(np.uint8), 4, 50.0), key=lambda point: point[3])
-
-    assert strongest[1] == pytest.approx(column, abs=0.1)
-    assert strongest[0] == pytest.approx(row, abs=0.1)
-    assert strongest[4] < 0  # brighter than its surroundings
-    assert 0.5 < strongest[2] / sigma_px < 0.8
-
-
-def test_surf_features_are_those_with_the_highest_response():
-    image = texture(5)
-    few, many = (build_detector(SurfConfig(max_features=n)).detect(image) for n in (50, 1000))
-
-    assert few.response.min() >= np.sort(many.response)[-60]
