@@ -3,29 +3,31 @@
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.console import progress_for
+from cli.answer import Answer, Output
 from cli.environment import has_compiled_code, prepare_libraries
 from cli.options import (
     ConfigFile,
     First,
     Last,
     Overrides,
-    Quiet,
     RequireTruth,
     Stride,
     merged,
     selection,
 )
+from cli.places import RUNS, name_of, place_of
 from cli.stepping import Stepping
 
 if TYPE_CHECKING:
     from evaluators.metrics.metric import Metric
     from mapper.config.build import BuildConfig
+    from mapper.core.errors import UntrustedError
     from mapper.run.folder import Run
     from mapper.run.observers import Observer
     from mapper.sources.base import Log
@@ -41,7 +43,9 @@ def build(
             help="Recorded log: a folder (TUM, Poznań, KITTI, numbered, clouds), .mcap, .bag or .mbag.",
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Run folder to create.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Run folder to create.  [default: runs/LOG, or with a number]")
+    ] = None,
     config: ConfigFile = None,
     set_: Overrides = None,
     first: First = None,
@@ -71,35 +75,36 @@ def build(
     step: Annotated[
         bool, typer.Option("--step", help="With --rerun: wait for Enter after each frame.")
     ] = False,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Turn a recorded log into a pose graph, an octree map, a 2D slice and an MCAP log.
 
-    Example: mapper build rgbd_dataset_freiburg1_xyz --out runs/xyz --set octree.resolution_m=0.1
+    Example: mapper build rgbd_dataset_freiburg1_xyz --set octree.resolution_m=0.1
     """
+    from cli.summary import summary_of
+
+    out = place_of(out, RUNS / name_of(log), overwrite=overwrite)
     overrides = merged(selection(first, last, stride, require_truth), set_)
     onlooker = _onlooker(rerun, step=step, overwrite=overwrite)
     if onto is None:
         run, metrics = built(
-            log, config, overrides, out, overwrite=overwrite, quiet=quiet, prompts=step, onlooker=onlooker
+            log, config, overrides, out, overwrite=overwrite, output=output, prompts=step, onlooker=onlooker
         )
     else:
         _refuse_both(config, onto, rerun)
-        run, metrics = appended(log, onto, overrides, out, overwrite=overwrite, quiet=quiet)
-    if not quiet:
-        from cli.summary import summary_text
-
-        print(summary_text(run, metrics))
-    if strict:
-        _refuse_untrusted(run)
+        run, metrics = appended(log, onto, overrides, out, overwrite=overwrite, output=output)
+    error = _untrusted(run) if strict else None
+    return replace(summary_of(run, metrics), error=error)
 
 
-def _refuse_untrusted(run: "Run") -> None:
+def _untrusted(run: "Run") -> "UntrustedError | None":
     from mapper.core.errors import UntrustedError
 
     verdict = run.verdict
-    if verdict.state != "trusted":
-        raise UntrustedError(f"{run.path}: {verdict.state}: {verdict.sentences[0]}")
+    if verdict.state == "trusted":
+        return None
+    return UntrustedError(f"{run.path}: {verdict.state}: {verdict.sentences[0]}")
 
 
 def built(
@@ -109,7 +114,7 @@ def built(
     out: Path,
     *,
     overwrite: bool,
-    quiet: bool,
+    output: Output,
     prompts: bool = False,
     onlooker: "Onlooker | None" = None,
 ) -> "tuple[Run, list[Metric]]":
@@ -123,7 +128,7 @@ def built(
     prepare_libraries()
     source = open_source(log, load_source_config(config_file, overrides))
     config = load_config(config_file, overrides, sensor=source.sensor)
-    progress = progress_for(quiet=quiet, prompts=prompts)
+    progress = output.progress(prompts=prompts)
     if not has_compiled_code():
         progress.note("first run here: the kernels are compiled once, which takes about a minute")
     for note in source.notes:
@@ -165,7 +170,7 @@ def _onlooker(rerun: str | None, *, step: bool, overwrite: bool) -> "Onlooker | 
 
 
 def appended(
-    log: Path, onto: Path, overrides: "Sequence[str]", out: Path, *, overwrite: bool, quiet: bool
+    log: Path, onto: Path, overrides: "Sequence[str]", out: Path, *, overwrite: bool, output: Output
 ) -> "tuple[Run, list[Metric]]":
     """Build a run from a run and a later log of the same place, by the run's configuration."""
     from evaluators.metrics.evaluate import evaluate
@@ -179,7 +184,7 @@ def appended(
     first = open_run(onto)
     config = overridden(first.config.model_copy(update={"source": SourceConfig()}), overrides)
     source = open_source(log, config.source)
-    run = append(source, first, config, out, progress=progress_for(quiet=quiet), overwrite=overwrite)
+    run = append(source, first, config, out, progress=output.progress(), overwrite=overwrite)
     return run, evaluate(run.trajectory, run.truth)
 
 

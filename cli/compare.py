@@ -5,9 +5,10 @@ from typing import Annotated
 
 import typer
 
-from cli.console import print_files, progress_for
+from cli.answer import Answer, Output, record_in
+from cli.console import files_text
 from cli.environment import prepare_libraries
-from cli.options import First, Last, Overrides, Quiet, Stride, assignments, merged, selection
+from cli.options import First, Last, Overrides, Stride, assignments, merged, selection
 
 
 def compare(
@@ -30,8 +31,9 @@ def compare(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace OUT, once the new comparison is whole.")
     ] = False,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Run every method over the same frames, as odometry and on pairs with guesses that are off.
 
     A comparison that was stopped goes on after its last finished method: give the same command again.
@@ -39,7 +41,7 @@ def compare(
     Example: mapper compare rgbd_dataset_freiburg1_xyz --method isvd --method gicp --out runs/compared
     """
     from evaluators.compare.config import CompareConfig
-    from evaluators.compare.files import compare_into
+    from evaluators.compare.files import REPORT, compare_into
     from evaluators.compare.tables import tables_text
     from mapper.config.loading import overridden
     from mapper.sources import open_source
@@ -49,7 +51,5 @@ def compare(
     sugar = [*selection(first, last, stride, None), *assignments({"pairs": pairs, "seed": seed})]
     config = overridden(given, merged(sugar, set_))
     source = open_source(log, config.source)
-    comparison = compare_into(out, source, config, overwrite=overwrite, progress=progress_for(quiet=quiet))
-    if not quiet:
-        print(tables_text(comparison))
-        print_files(out)
+    comparison = compare_into(out, source, config, overwrite=overwrite, progress=output.progress())
+    return Answer(record_in(out, REPORT), f"{tables_text(comparison)}\n{files_text(out)}")

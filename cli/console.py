@@ -13,32 +13,34 @@ _SECONDS_BETWEEN_LINES = 10.0
 _MOST_NOTES = 5
 
 
-def progress_for(*, quiet: bool, prompts: bool = False) -> Progress:
+def progress_for(*, quiet: bool, prompts: bool = False, every_note: bool = False) -> Progress:
     """Return the progress of a job: silent, bars on a terminal, or lines; bars would overdraw prompts."""
     if quiet:
         return SILENT
-    return Bars() if sys.stderr.isatty() and not prompts else Lines()
+    most_notes = sys.maxsize if every_note else _MOST_NOTES
+    return Bars(most_notes) if sys.stderr.isatty() and not prompts else Lines(most_notes)
 
 
-def print_files(out: Path, names: Iterable[str] = (), *, width: int = 7) -> None:
-    """Print what a verb has left in a folder: the names given, or all that is there."""
+def files_text(out: Path, names: Iterable[str] = (), *, width: int = 7) -> str:
+    """Return what a verb has left in a folder, as two rows: the names given, or all that is there."""
     names = names or sorted(child.name for child in out.iterdir())
-    print(f"{'files':<{width}}{', '.join(names)}\n{'in':<{width}}{out}")
+    return f"{'files':<{width}}{', '.join(names)}\n{'in':<{width}}{out}"
 
 
 class _Notes:
     """Notes as lines, the first few only: a damaged log may have thousands."""
 
-    def __init__(self) -> None:
+    def __init__(self, most_notes: int = _MOST_NOTES) -> None:
+        self._most = most_notes
         self._seen = 0
 
     def note(self, message: str) -> None:
         """Print the message."""
         self._seen += 1
-        if self._seen <= _MOST_NOTES:
+        if self._seen <= self._most:
             self._show(f"mapper: {message}")
-        elif self._seen == _MOST_NOTES + 1:
-            self._show("mapper: … and more of these; the manifest lists all")
+        elif self._seen == self._most + 1:
+            self._show("mapper: … and more of these; --verbose prints all")
 
     def _show(self, line: str) -> None:
         print(escaped(line, one_line=True), file=sys.stderr)

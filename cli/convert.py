@@ -6,9 +6,10 @@ from typing import Annotated
 
 import typer
 
-from cli.console import progress_for
+from cli.answer import Answer, Output
 from cli.environment import prepare_libraries
-from cli.options import First, Last, Overrides, Quiet, RequireTruth, Stride, merged, selection
+from cli.options import First, Last, Overrides, RequireTruth, Stride, merged, selection
+from cli.places import LOGS, name_of, place_of
 
 
 class LogFormat(StrEnum):
@@ -23,15 +24,21 @@ class LogFormat(StrEnum):
 
 def convert(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Recorded log that mapper build can read.")],
-    out: Annotated[Path, typer.Option(help="Folder to create, or a file that ends in .mcap or .bag.")],
     as_: Annotated[LogFormat, typer.Option("--as", help="Format to write.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder to create, or a file that ends in .mcap or .bag.  [default: logs/LOG, or a number]"
+        ),
+    ] = None,
     first: First = None,
     last: Last = None,
     stride: Stride = None,
     require_truth: RequireTruth = None,
     set_: Overrides = None,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Write a log in another format; image files go over byte for byte where it has room for them.
 
     Example: mapper convert rgbd_dataset_freiburg1_xyz --as mcap --out xyz.mcap
@@ -45,7 +52,9 @@ def convert(
     source = open_source(
         log, load_source_config(None, merged(selection(first, last, stride, require_truth), set_))
     )
-    progress = progress_for(quiet=quiet)
+    ending = f".{as_}" if as_ in (LogFormat.MCAP, LogFormat.BAG) else ""
+    out = place_of(out, LOGS / f"{name_of(log)}{ending}")
+    progress = output.progress()
     for note in (*source.notes, *left_out(source, as_.value)):
         progress.note(note)
     checks = ReadingChecks(source)
@@ -55,5 +64,8 @@ def convert(
         )
     for note in (*(f"skipped: {skip.reason}" for skip in skipped), *checks.notes()):
         progress.note(note)
-    if not quiet:
-        print(f"{out}: {len(source) - len(skipped)} frames as {as_.value}, {len(skipped)} skipped")
+    frames = len(source) - len(skipped)
+    return Answer(
+        {"path": out, "format": as_, "frames": frames, "skipped": len(skipped)},
+        f"{out}: {frames} frames as {as_.value}, {len(skipped)} skipped",
+    )

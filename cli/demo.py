@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cli.answer import Answer, Output
 from cli.build import built
-from cli.console import progress_for
 from cli.environment import prepare_libraries
-from cli.options import Overrides, Quiet
+from cli.options import Overrides
 
 if TYPE_CHECKING:
     from mapper.simulation.config import SynthConfig
@@ -21,14 +21,15 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder for the log and the run.")] = Path("demo"),
     seconds: Annotated[float | None, typer.Option(help="Length of the log; omit for one round.")] = None,
     set_: Overrides = None,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Make a synthetic log of a walk through a flat, build a map from it, and print where its pictures are.
 
     Example: mapper demo --out /tmp/demo --seconds 20
     """
     from cli.options import assignments
-    from cli.summary import summary_text
+    from cli.summary import summary_of
     from mapper.config.loading import load_config, overridden
     from mapper.run import files
     from mapper.simulation import write_tum_log
@@ -39,13 +40,16 @@ def demo(
     log = out / "log"
     scene = overridden(SynthConfig(), [*DEMO_LOG, *assignments({"duration_s": seconds})])
     if not _is_made(log, scene):
-        with progress_for(quiet=quiet).stage("render") as report:
+        with output.progress().stage("render") as report:
             write_tum_log(log, scene, on_progress=report)
-    run, metrics = built(log, None, set_ or (), out / "run", overwrite=True, quiet=quiet)
-    if not quiet:
-        print(summary_text(run, metrics))
-    for picture in (files.SUMMARY, files.CLOUD_VIEWS, f"{files.SLICE}.png"):
-        print(run.path / picture)
+    run, metrics = built(log, None, set_ or (), out / "run", overwrite=True, output=output)
+    pictures = [run.path / name for name in (files.SUMMARY, files.CLOUD_VIEWS, f"{files.SLICE}.png")]
+    summary, below = summary_of(run, metrics), "\n".join(map(str, pictures))
+    return Answer(
+        {**summary.document, "pictures": pictures},
+        f"{summary.text}\n{below}",
+        f"{summary.details}\n{below}",
+    )
 
 
 def _is_made(log: Path, scene: "SynthConfig") -> bool:

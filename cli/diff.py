@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.console import progress_for
+from cli.answer import Answer, Output, record_in
 from cli.environment import prepare_libraries
-from cli.options import Quiet
+from cli.places import DIFFS, joined_names, place_of
 from cli.placing import Place, PosesFile, placing_of
 
 if TYPE_CHECKING:
@@ -19,7 +19,10 @@ _LISTED = 10
 def diff(
     before: Annotated[Path, typer.Argument(metavar="RUN_A", help="Run folder of the earlier session.")],
     after: Annotated[Path, typer.Argument(metavar="RUN_B", help="Run folder of the later session.")],
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder to create.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Folder to create.  [default: diffs/RUN_A+RUN_B]"),
+    ] = None,
     place: Annotated[
         Place,
         typer.Option(
@@ -34,8 +37,9 @@ def diff(
     ] = None,
     min_voxels: Annotated[int, typer.Option(help="Smaller clusters are counted, not listed.", min=1)] = 8,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace FOLDER.")] = False,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Compare the maps of two runs: what appeared, what vanished, and what was not seen again.
 
     Only space that both runs looked at is compared. FOLDER gets a list, a picture, and a cloud of each kind.
@@ -48,17 +52,16 @@ def diff(
 
     prepare_libraries()
     earlier, later = open_run(before), open_run(after)
-    progress = progress_for(quiet=quiet)
+    progress = output.progress()
+    out = place_of(out, DIFFS / joined_names([before, after]), overwrite=overwrite)
     placing = placing_of([earlier, later], place, poses, progress=progress)
     found = differences_of(*placing.placed, tolerance_m=tolerance_m, min_voxels=min_voxels)
     placed = placing.placed[-1].how
     write_differences(out, found, earlier, later, placed=placed, overwrite=overwrite)
     if found.doubt:
         progress.note(found.doubt)
-    if not quiet:
-        print(f"{summary(found)}\nplaced {placed}")
-        print(_table(found, earlier.config.octree.resolution_m))
-        print(out)
+    table = _table(found, earlier.config.octree.resolution_m)
+    return Answer(record_in(out), f"{summary(found)}\nplaced {placed}\n{table}\n{out}")
 
 
 def _table(found: "Differences", resolution_m: float) -> str:

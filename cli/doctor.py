@@ -1,12 +1,13 @@
 """``mapper doctor``: is this machine fit for the job, or a run undamaged, and what to do if not."""
 
-import json
 import sys
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from cli.answer import Answer, Output
+from mapper.runtime.progress import SILENT
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,8 +32,9 @@ def doctor(
             "Repeatable.",
         ),
     ] = None,
-    json_: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Check the machine, try every library in a process of its own, and print what to do.
 
     With RUN, compare all its files with the sizes and digests in its manifest instead. The exit status is 1
@@ -40,11 +42,11 @@ def doctor(
 
     Example: mapper doctor --json, or: mapper doctor runs/xyz, or just: mapper doctor
     """
-    from cli.console import progress_for
+    from mapper.core.errors import MapperError
 
     if accept:
         _accept(run, accept)
-    progress = progress_for(quiet=json_ or not sys.stderr.isatty())
+    progress = output.progress() if sys.stderr.isatty() else SILENT
     if run is None:
         from mapper.doctor.examination import examine
 
@@ -53,16 +55,11 @@ def doctor(
         from mapper.run.checks import check_run
 
         findings = check_run(run, progress=progress)
-    if json_:
-        print(json.dumps([asdict(finding) for finding in findings], indent=2))
-    else:
-        print(_table(findings))
     failed = [finding.name for finding in findings if finding.verdict == "failed"]
+    error = None
     if failed:
-        print(
-            f"mapper: doctor: {len(failed)} of {len(findings)} failed: {', '.join(failed)}", file=sys.stderr
-        )
-        raise typer.Exit(1)
+        error = MapperError(f"doctor: {len(failed)} of {len(findings)} failed: {', '.join(failed)}")
+    return Answer({"findings": findings}, _table(findings), error=error)
 
 
 def _accept(run: Path | None, names: "Sequence[str]") -> None:

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.console import progress_for
+from cli.answer import Answer, Output
 from cli.environment import prepare_libraries
-from cli.options import MovedLogs, Quiet
+from cli.options import MovedLogs
 
 if TYPE_CHECKING:
     from mapper.mapping.config import EditKind, Region
@@ -41,12 +41,13 @@ def edit(
         str | None, typer.Option(metavar='"X,Y X,Y X,Y…"', help="Region: inside of corners in order.")
     ] = None,
     undo: Annotated[bool, typer.Option("--undo", help="Take the last edit back.")] = False,
-    list_: Annotated[
+    list_: Annotated[  # noqa: ARG001 - says what is done anyway
         bool, typer.Option("--list", help="Print the edits; the default without other options.")
     ] = False,
     log: MovedLogs = None,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Erase, keep or block a region of a map, where all given conditions hold, and make the maps again.
 
     Edits are kept in RUN/edits.toml, which can be changed by hand, and hold in every later fuse. Coordinates
@@ -77,15 +78,12 @@ def edit(
         prepare_libraries()
         if log:
             built = moved_log(built, *log)
-        source, progress = built.open_log(), progress_for(quiet=quiet)
+        source, progress = built.open_log(), output.progress()
         if region is None:
             built = undo_region(source, built, progress=progress)
         else:
             built = add_region(source, built, kinds[0], region, progress=progress)
-        if not quiet:
-            print(edits_table(built))
-    if list_ or not (kinds or undo):
-        print(edits_table(built))
+    return Answer({"run": built.path, "edits": built.manifest.edits}, edits_table(built))
 
 
 def edits_table(run: "Run") -> str:

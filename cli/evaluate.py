@@ -2,11 +2,11 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli.console import progress_for
+from cli.answer import Answer, Output
 from cli.environment import prepare_libraries
 
 if TYPE_CHECKING:
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from mapper.core.timebase import Stamps
     from mapper.core.trajectory import Trajectory
     from mapper.run.folder import Run
+    from mapper.runtime.progress import Progress
     from mapper.sources.base import Log
 
 _TOLERANCE = 1
@@ -96,10 +97,15 @@ def evaluate(
     plot: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder to draw the errors into.")] = None,
     format_: Annotated[
         Format,
-        typer.Option("--format", help="csv and json have every digit and each length, angles in radians."),
+        typer.Option(
+            "--format",
+            help="csv and json have every digit and each length, angles in radians; json is the list of "
+            "metrics in what --json prints.",
+        ),
     ] = Format.TEXT,
-    json: Annotated[bool, typer.Option("--json", help="Short for --format json.")] = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Print ATE, RPE, relative errors and coverage of a path, which loops are right, and what a map is worth.
 
     Example: mapper eval runs/xyz --align yaw --plot plots, or: mapper eval 00.txt --truth poses/00.txt, or:
@@ -138,12 +144,16 @@ def evaluate(
             "--map-world, --register and --tolerance tell how to compare with --map, which is missing"
         )
     if sharp_log is not None:
-        metrics += _sharpness_of(sharp_log, run.tracked_trajectory if run else trajectory)
-    print(_text(metrics, found, Format.JSON if json else format_))
-    if run is not None and not json and format_ in (Format.TEXT, Format.MARKDOWN):
+        path = run.tracked_trajectory if run else trajectory
+        metrics += _sharpness_of(sharp_log, path, progress=output.progress())
+    text = _text(metrics, found, format_)
+    document: dict[str, Any] = {"metrics": _every_metric(metrics, found)}
+    if run is not None:
         from cli.summary import verdict_text
 
-        print(f"\n{verdict_text(run)}")
+        document["verdict"] = run.verdict
+        if format_ in (Format.TEXT, Format.MARKDOWN):
+            text += f"\n\n{verdict_text(run)}"
     if plot is not None:
         from evaluators.pictures.map_agreement import write_map_errors
         from evaluators.pictures.path_errors import write_trajectory_errors
@@ -152,6 +162,7 @@ def evaluate(
             write_trajectory_errors(plot, found, title=f"{name}, {ALIGNED[align.value]}")
         if quality is not None and map_ is not None:
             write_map_errors(plot, quality.check, title=f"{name} against {map_.resolve().name}")
+    return Answer(document, text)
 
 
 def _loaded(
@@ -197,10 +208,10 @@ def _log_of(run: "Run", log: Path | None) -> "Log":
     return (run if log is None else moved_log(run, log)).open_log()
 
 
-def _sharpness_of(source: "Log", trajectory: "Trajectory") -> "list[Metric]":
+def _sharpness_of(source: "Log", trajectory: "Trajectory", *, progress: "Progress") -> "list[Metric]":
     from evaluators.metrics.sharpness import RADIUS_M, sharpness_metrics, views_of
 
-    views = views_of(source, trajectory, progress=progress_for(quiet=False))
+    views = views_of(source, trajectory, progress=progress)
     return sharpness_metrics(views, radius_m=RADIUS_M[source.sensor])
 
 
@@ -238,19 +249,26 @@ def _loops_of(run: "Run", truth: "Trajectory") -> "list[Metric]":
     return loop_metrics(run.loops, keyframes_ns, truth, looked_every_m=looked_every_m)
 
 
+def _every_metric(metrics: "list[Metric]", found: "Assessment") -> "list[Metric]":
+    """Return the metrics, and after them those of each length of the segments."""
+    from evaluators.metrics.segments import segment_metrics
+
+    if len(found.lengths) <= 1:
+        return metrics
+    return metrics + [one for length in found.lengths for one in segment_metrics([length])]
+
+
 def _text(metrics: "list[Metric]", found: "Assessment", format_: Format) -> str:
     from dataclasses import asdict
 
     from evaluators.metrics import metric
-    from evaluators.metrics.segments import LENGTH_COLUMNS, length_records, segment_metrics
+    from evaluators.metrics.segments import LENGTH_COLUMNS, length_records
     from evaluators.tables import table as tables
 
-    if format_ in (Format.JSON, Format.CSV):
-        if len(found.lengths) > 1:
-            metrics = metrics + [one for length in found.lengths for one in segment_metrics([length])]
-        if format_ is Format.JSON:
-            return metric.json_text(metrics)
-        return tables.csv_text([asdict(one) for one in metrics]).rstrip("\n")
+    if format_ is Format.JSON:
+        return metric.json_text(_every_metric(metrics, found))
+    if format_ is Format.CSV:
+        return tables.csv_text([asdict(one) for one in _every_metric(metrics, found)]).rstrip("\n")
     records = length_records(found.lengths)
     if format_ is Format.MARKDOWN:
         shown = [metric.markdown_table(metrics), tables.markdown_table(LENGTH_COLUMNS, records)]

@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from cli.console import progress_for
+from cli.answer import Answer, Output, made
 from cli.environment import prepare_libraries
-from cli.options import MovedLogs, Overrides, Quiet, assignments, merged
+from cli.options import MovedLogs, Overrides, assignments, merged
 from mapper.export.exporters import EXPORTERS
 
 _KINDS = "; ".join(f"{kind}: {exporter.summary}" for kind, exporter in EXPORTERS.items())
@@ -26,8 +26,9 @@ def export(
     ] = None,
     set_: Overrides = None,
     log: MovedLogs = None,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Write a run's map, cloud, surface, slice, trajectory or graph for other programs, and print its path.
 
     Example: mapper export runs/xyz --as octomap --out xyz.ot, or: mapper export runs/xyz --as mesh
@@ -42,7 +43,6 @@ def export(
         built = moved_log(built, *log)
     changes = merged(assignments({"octomap.level": level}), set_)
     config = overridden(built.config, changes) if changes else None
-    progress = progress_for(quiet=quiet)
+    progress = output.progress()
     path = export_run(built, as_, out, config=config, overwrite=overwrite, progress=progress)
-    if not quiet:
-        print(path)
+    return made(path, kind=as_)

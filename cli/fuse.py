@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from cli.console import progress_for
+from cli.answer import Answer, Output
 from cli.environment import prepare_libraries
-from cli.options import MovedLogs, Overrides, Quiet
+from cli.options import MovedLogs, Overrides
 
 
 def fuse(
@@ -17,15 +17,16 @@ def fuse(
     trajectory: Annotated[
         Path | None, typer.Option(help="TUM file of better poses; only frames that moved are fused again.")
     ] = None,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Make a run's maps again, for instance finer or with another slice, without tracking again.
 
     Octree, slice, cloud and MCAP settings can change; the old maps stay until the new ones are whole.
 
     Example: mapper fuse runs/xyz --set octree.resolution_m=0.1 --set slice.max_height_m=1.8
     """
-    from cli.summary import summary_text
+    from cli.summary import summary_of
     from evaluators.metrics.evaluate import evaluate
     from mapper.config.loading import overridden
     from mapper.pipeline.fuse import fuse as fuse_run
@@ -42,7 +43,6 @@ def fuse(
         built,
         config,
         trajectory=None if trajectory is None else read_tum(trajectory),
-        progress=progress_for(quiet=quiet),
+        progress=output.progress(),
     )
-    if not quiet:
-        print(summary_text(fused, evaluate(fused.trajectory, fused.truth)))
+    return summary_of(fused, evaluate(fused.trajectory, fused.truth))

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cli.answer import Answer, Output
 from cli.environment import prepare_libraries
 from cli.options import Overrides
 
@@ -16,8 +17,9 @@ if TYPE_CHECKING:
 def inspect(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Recorded log: a folder, .mbag, .mcap or .bag.")],
     set_: Overrides = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
-) -> None:
+    *,
+    output: Output,  # noqa: ARG001
+) -> Answer:
     """Tell what is in a log: topics, rates, gaps, calibration, truth, and what mapper build would do with it.
 
     Exit status 1 means that nothing can be mapped.
@@ -25,9 +27,9 @@ def inspect(
     Example: mapper inspect drive.mcap
     """
     import dataclasses
-    import json
 
     from mapper.config.loading import load_config, load_source_config
+    from mapper.core.errors import DataError
     from mapper.sources.inspection import inspect_log
 
     prepare_libraries()
@@ -41,13 +43,8 @@ def inspect(
             f"{found.log.sensor} frames, odometry {config.odometry.kind}, loops {config.loops.kind}, "
             f"octree of {config.octree.resolution_m:g} m"
         )
-    if as_json:
-        facts = {**dataclasses.asdict(found), "path": str(found.path), "build": plan}
-        print(json.dumps(facts, ensure_ascii=False, indent=1))
-    else:
-        print("\n".join(_lines(found, plan)))
-    if found.problem is not None:
-        raise typer.Exit(1)
+    error = None if found.problem is None else DataError(f"nothing can be mapped: {found.problem}")
+    return Answer({**dataclasses.asdict(found), "build": plan}, "\n".join(_lines(found, plan)), error=error)
 
 
 def _lines(found: "Inspection", plan: str) -> Iterator[str]:

@@ -1,13 +1,14 @@
 """``mapper localise``: where a new log lies in a finished map."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli.console import progress_for
+from cli.answer import Answer, Output, rows_text
 from cli.environment import prepare_libraries
-from cli.options import First, Last, Overrides, Quiet, Stride, merged, selection
+from cli.options import First, Last, Overrides, Stride, merged, selection
+from cli.places import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
     from mapper.run.localised import LocalisedManifest
@@ -18,7 +19,9 @@ def localise(
     in_: Annotated[
         Path, typer.Option("--in", metavar="RUN", help="Finished run, or merged map; it stays as it is.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder to create.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to create.  [default: runs/LOG-in-RUN, or with a number]")
+    ] = None,
     set_: Overrides = None,
     first: First = None,
     last: Last = None,
@@ -32,8 +35,9 @@ def localise(
             "--strict", help="Exit with status 1 if the result is not trusted; it is written whole."
         ),
     ] = False,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Place a new log in a finished map: its trajectory in the map's frame, and which of it is trusted.
 
     A log of another place is refused, with exit status 1.
@@ -48,7 +52,8 @@ def localise(
     from mapper.sources.config import SourceConfig
 
     prepare_libraries()
-    progress = progress_for(quiet=quiet)
+    out = place_of(out, RUNS / f"{name_of(log)}-in-{name_of(in_)}", overwrite=overwrite)
+    progress = output.progress()
     known = load_known_map(in_, progress=progress)
     overrides = merged(selection(first, last, stride, None), set_)
     config = overridden(known.config.model_copy(update={"source": SourceConfig()}), overrides)
@@ -56,11 +61,26 @@ def localise(
     for note in source.notes:
         progress.note(note)
     manifest = localise_log(source, known, config, out, progress=progress, overwrite=overwrite)
-    if not quiet:
-        print(_text(manifest, out))
-    verdict = manifest.verdict
+    verdict, error = manifest.verdict, None
     if strict and verdict is not None and verdict.state != "trusted":
-        raise UntrustedError(f"{out}: {verdict.state}: {verdict.sentences[0]}")
+        error = UntrustedError(f"{out}: {verdict.state}: {verdict.sentences[0]}")
+    return Answer(_document(manifest, out), _text(manifest, out), error=error)
+
+
+def _document(manifest: "LocalisedManifest", out: Path) -> dict[str, Any]:
+    from cli.summary import frame_counts
+
+    counts = manifest.counts
+    return {
+        "path": out,
+        "map": manifest.map,
+        "frames": frame_counts(counts),
+        "localised_ratio": manifest.localised_share,
+        "constraints": {"accepted": counts.loops, "candidates": counts.loop_candidates},
+        "stretches": manifest.stretches,
+        "total_s": manifest.timing.total_s,
+        "verdict": manifest.verdict,
+    }
 
 
 def _text(manifest: "LocalisedManifest", out: Path) -> str:
@@ -82,5 +102,4 @@ def _text(manifest: "LocalisedManifest", out: Path) -> str:
     rows.append(("in", str(out)))
     if verdict is not None:
         rows += [("verdict", verdict.state), *(("", sentence) for sentence in verdict.sentences)]
-    width = 2 + max(len(name) for name, _ in rows)
-    return "\n".join(f"{name:<{width}}{text}" for name, text in rows)
+    return rows_text(rows)

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand
 
-from cli.console import progress_for
+from cli.answer import Answer, Output
 from cli.environment import prepare_libraries
-from cli.options import MovedLogs, Quiet
+from cli.groups import Verb
+from cli.options import MovedLogs
 
 if TYPE_CHECKING:
     from mapper.loops.closure import Discrepancy, LoopClosure
@@ -19,7 +19,7 @@ _COLUMNS = ("i", "j", "by", "similar", "matches", "inliers", "before", "after", 
 _PAIR_OPTIONS = ("--add", "--remove")
 
 
-class WithPairs(TyperCommand):
+class WithPairs(Verb):
     """Lets ``--add`` and ``--remove`` take two numbers each, as often as they are given."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -40,17 +40,18 @@ def loops(
     ] = None,
     remove: Annotated[list[str] | None, typer.Option(metavar="I J", help="Take a loop back.")] = None,
     log: MovedLogs = None,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """List a run's loop candidates, or add and remove loops by hand: solved and fused again, not tracked.
 
     Example: mapper loops runs/xyz, or: mapper loops runs/xyz --add 3 71 --remove 17 40
     """
     from mapper.run.folder import moved_log, open_run
 
-    built = open_run(run)
+    built, solved = open_run(run), None
     if add or remove:
-        from cli.summary import summary_text
+        from cli.summary import summary_of
         from evaluators.metrics.evaluate import evaluate
         from mapper.pipeline.edit_loops import edit_loops
 
@@ -62,13 +63,16 @@ def loops(
             built,
             add=[_pair("--add", text) for text in add or ()],
             remove=[_pair("--remove", text) for text in remove or ()],
-            progress=progress_for(quiet=quiet),
+            progress=output.progress(),
         )
-        if not quiet:
-            print(summary_text(built, evaluate(built.trajectory, built.truth)))
-    if list_ or accepted or not (add or remove):
-        shown = [loop for loop in built.loops if loop.verdict == "accepted" or not accepted]
-        print(loops_text(shown))
+        solved = summary_of(built, evaluate(built.trajectory, built.truth))
+    shown = [loop for loop in built.loops if loop.verdict == "accepted" or not accepted]
+    if solved is None:
+        return Answer({"run": built.path, "loops": shown}, loops_text(shown))
+    if not (list_ or accepted):
+        return solved
+    document = {**solved.document, "candidates": shown}
+    return Answer(document, f"{solved.text}\n{loops_text(shown)}", f"{solved.details}\n{loops_text(shown)}")
 
 
 def loops_text(closures: "Sequence[LoopClosure]") -> str:

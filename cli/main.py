@@ -3,11 +3,12 @@
 import errno
 import sys
 import warnings
+from collections.abc import Callable
 from typing import Annotated, Any, TextIO
 
 import typer
-from typer.core import TyperGroup
 
+from cli.answer import Answer, verb
 from cli.build import build
 from cli.compare import compare
 from cli.convert import convert
@@ -19,6 +20,7 @@ from cli.environment import prepare_environment
 from cli.evaluate import evaluate
 from cli.export import export
 from cli.fuse import fuse
+from cli.groups import HELP, Verb, VerbGroup, show_help
 from cli.inspect import inspect
 from cli.interrupts import handle_interrupts
 from cli.localise import localise
@@ -43,10 +45,10 @@ _INTERRUPTED, _TERMINATED = 130, 143  # 128 + SIGINT, 128 + SIGTERM, as shells c
 _USER_CAN_HELP = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EPERM, errno.EROFS}
 
 
-class Guarded(TyperGroup):
+class Guarded(VerbGroup):
     """Turns a user's mistake into one line; a bug keeps its traceback."""
 
-    def invoke(self, ctx: Any) -> Any:
+    def invoke(self, ctx: Any) -> object:
         """Run the verb."""
         try:
             return super().invoke(ctx)
@@ -90,49 +92,73 @@ def _show_warning(
 
 _python_shows_warning = warnings.showwarning
 
+_VERBS: dict[str, list[tuple[str, Callable[..., Answer], type[Verb], str]]] = {
+    "map": [
+        ("build", build, Verb, "Map a recorded log: path, pose graph, octree, 2D slice"),
+        ("demo", demo, Verb, "Make a synthetic log and map it"),
+        ("fuse", fuse, Verb, "Make a run's maps again, finer or along other poses"),
+        ("localise", localise, Verb, "Place a new log in a finished map"),
+        ("merge", merge, Verb, "Join the maps of many runs"),
+        ("solve", solve, Verb, "Solve a pose graph from a g2o file"),
+    ],
+    "look": [
+        ("view", view, Verb, "Show a run in Rerun"),
+        ("report", report, Verb, "Write one page about runs, side by side"),
+        ("export", export, Verb, "Write a run's map, cloud, path … for other programs"),
+        ("plan", plan, WithPoints, "Plan a robot's path through a map"),
+    ],
+    "judge": [
+        ("eval", evaluate, Verb, "Measure the errors of a path and a map"),
+        ("diff", diff, Verb, "Tell what changed between two runs"),
+        ("inspect", inspect, Verb, "Tell what is in a log, and whether it can be mapped"),
+        ("doctor", doctor, Verb, "Check this machine, or the files of a run"),
+    ],
+    "edit": [
+        ("edit", edit, Verb, "Erase, keep or block regions of a map"),
+        ("loops", loops, WithPairs, "List loop closures, add and remove them"),
+    ],
+    "study": [
+        ("compare", compare, Verb, "Run every method on one log"),
+        ("register", register, Verb, "Align two clouds or frames"),
+        ("sweep", sweep, Verb, "Run many logs by many settings"),
+        ("reproduce", reproduce, Verb, "Measure the papers' tables again"),
+    ],
+    "tools": [
+        ("config", show_config, Verb, "Print and explain the settings"),
+        ("convert", convert, Verb, "Write a log in another format"),
+        ("synth", synth, Verb, "Make a synthetic log with exact truth"),
+    ],
+}
+"""The verbs by what they are for, as the help lists them; in the list of a group, those used most first."""
+
 app = typer.Typer(
     cls=Guarded,
-    epilog="Example: mapper demo, or: mapper build LOG --out RUN",
-    no_args_is_help=True,
+    context_settings=HELP,
+    epilog="Example: mapper build LOG, or without a log: mapper demo",
+    invoke_without_command=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # its pretty help takes longer to import than everything else to run
     add_completion=False,
 )
-app.command("build")(build)
-app.command("fuse")(fuse)
-app.command("loops", cls=WithPairs)(loops)
-app.command("eval")(evaluate)
-app.command("edit")(edit)
-app.command("export")(export)
-app.command("localise")(localise)
-app.command("merge")(merge)
-app.command("diff")(diff)
-app.command("plan", cls=WithPoints)(plan)
-app.command("solve")(solve)
-app.command("register")(register)
-app.command("compare")(compare)
-app.command("sweep")(sweep)
-app.command("reproduce")(reproduce)
-app.command("inspect")(inspect)
-app.command("convert")(convert)
-app.command("synth")(synth)
-app.command("demo")(demo)
-app.command("config")(show_config)
-app.command("view")(view)
-app.command("report")(report)
-app.command("doctor")(doctor)
-app.add_typer(sensor, name="sensor")
-app.add_typer(vocabulary, name="vocabulary")
+for _panel, _members in _VERBS.items():
+    for _name, _function, _class, _short in _members:
+        app.command(_name, cls=_class, short_help=_short, rich_help_panel=_panel)(verb(_function))
+app.add_typer(sensor, name="sensor", short_help="Measure what a sensor is worth", rich_help_panel="study")
+app.add_typer(
+    vocabulary, name="vocabulary", short_help="Train and show visual words", rich_help_panel="tools"
+)
 
 
-@app.callback(invoke_without_command=True)
-def version(
-    show: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+@app.callback()
+def start(
+    ctx: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
 ) -> None:
     """Map recorded RGB-D and LiDAR logs: trajectory, pose graph, octree, 2D slice and MCAP log."""
-    if show:
+    if version:
         print(f"mapper {__version__}")
-        raise typer.Exit
+    elif ctx.invoked_subcommand is None:
+        show_help(ctx)
 
 
 def main() -> None:

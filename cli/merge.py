@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.console import progress_for
+from cli.answer import Answer, Output
 from cli.environment import prepare_libraries
-from cli.options import Quiet, workers_for
+from cli.options import workers_for
+from cli.places import MAPS, joined_names
 from cli.placing import Place, PosesFile, placing_of
 
 if TYPE_CHECKING:
@@ -16,7 +17,9 @@ if TYPE_CHECKING:
 
 def merge(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN…", help="Run folders that builds left.")],
-    out: Annotated[Path, typer.Option(metavar="MAP", help="Folder to create.")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="MAP", help="Folder to create.  [default: maps/RUN+RUN…]")
+    ] = None,
     place: Annotated[
         Place,
         typer.Option(
@@ -37,8 +40,9 @@ def merge(
         typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler whose workers see the same files."),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a map that is there.")] = False,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Add up the octrees of many runs tile by tile, out of core: map.bt, map.ot, the slice, and the tiles.
 
     A merge that was stopped goes on where it was: give the same command again.
@@ -51,7 +55,8 @@ def merge(
 
     workers = workers_for(processes, scheduler, default=1)
     prepare_libraries()
-    progress = progress_for(quiet=quiet)
+    progress = output.progress()
+    out = out or MAPS / joined_names(runs)
     placing = placing_of([open_run(run) for run in runs], place, poses, progress=progress)
     merged = merge_runs(
         placing.placed,
@@ -62,8 +67,14 @@ def merge(
         progress=progress,
         overwrite=overwrite,
     )
-    if not quiet:
-        print(_summary(merged))
+    document = {
+        "path": merged.map.path,
+        "runs": merged.map.manifest.runs,
+        "summary": merged.map.manifest.summary,
+        "worker_s": {name: sum(cost.seconds for cost in of) for name, of in merged.costs.items()},
+        "shuffle_bytes": merged.shuffle_bytes,
+    }
+    return Answer(document, _summary(merged))
 
 
 def _summary(merged: "Merged") -> str:

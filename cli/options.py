@@ -17,7 +17,6 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one setting; mapper config lists them all."),
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", help="Print errors only.")]
 MovedLogs = Annotated[
     list[Path] | None,
     typer.Option(

@@ -1,14 +1,16 @@
 """``mapper plan``: a path for a robot through a finished map."""
 
+import json
 from enum import StrEnum
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand
 
-from cli.options import Quiet, assignments
+from cli.answer import Answer, Output
+from cli.groups import Verb
+from cli.options import assignments
 
 if TYPE_CHECKING:
     from mapper.core.geometry import Array
@@ -30,7 +32,7 @@ class Layer(StrEnum):
     TRAVERSABLE = "traversable"
 
 
-class WithPoints(TyperCommand):
+class WithPoints(Verb):
     """Lets ``--from`` and ``--to`` take two numbers or three, negative ones too."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -60,8 +62,9 @@ def plan(
         Unknown | None, typer.Option(help="What unknown space counts as.  [default: blocked]")
     ] = None,
     layer: Annotated[Layer | None, typer.Option(help="Grid for a path in 2D.  [default: slice]")] = None,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,  # noqa: ARG001
+) -> Answer:
     """Plan the shortest collision-free path, and draw it into the run: plan.json, plan.png, run.mcap.
 
     Where floors lie over each other (--layer traversable), a third number tells the storey of a point. A
@@ -71,7 +74,7 @@ def plan(
     """
     from mapper.config.loading import overridden
     from mapper.core.errors import ConfigError
-    from mapper.export.plan import draw_plan, write_plan
+    from mapper.export.plan import draw_plan, plan_json, write_plan
     from mapper.export.run_maps import storeys_of_run
     from mapper.merging.merged_map import open_map
     from mapper.navigation.config import PlanConfig
@@ -101,11 +104,11 @@ def plan(
         write_plan(built, found, grid=grid)
     else:
         draw_plan(run, found, grid=grid)
-    if not quiet:
-        print(found.summary)
-        for waypoint in found.waypoints_world:
-            print("  ".join(f"{value:7.3f}" for value in waypoint))
-        print(run / files.PLAN_VIEW)
+    points = ["  ".join(f"{value:7.3f}" for value in waypoint) for waypoint in found.waypoints_world]
+    return Answer(
+        {"picture": run / files.PLAN_VIEW, **json.loads(plan_json(found))},
+        "\n".join([found.summary, *points, str(run / files.PLAN_VIEW)]),
+    )
 
 
 def _point(text: str, name: str, counts: tuple[int, ...]) -> "Array":

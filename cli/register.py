@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.console import print_files
+from cli.answer import Answer, Output
+from cli.console import files_text
 from cli.environment import prepare_libraries
-from cli.options import Overrides, Quiet
+from cli.options import Overrides
 
 if TYPE_CHECKING:
     from evaluators.register.registration import Registered
@@ -46,14 +47,20 @@ def register(
     ] = None,
     set_: Overrides = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT, and the .rrd file.")] = False,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,  # noqa: ARG001
+) -> Answer:
     """Register two clouds; the exit status is 1 when the answer is not to be trusted.
 
     Example: mapper register scan_10.bin scan_00.bin --method hough-gicp --out registered
     """
     from evaluators.register.config import check_method, register_config
-    from evaluators.register.files import FOLDER, registration_text, write_registration
+    from evaluators.register.files import (
+        FOLDER,
+        registration_record,
+        registration_text,
+        write_registration,
+    )
     from evaluators.register.registration import register as register_frames
     from mapper.config.loading import overridden
     from mapper.core.errors import RegistrationError
@@ -72,8 +79,7 @@ def register(
     seen_by: Sensor = "rgbd" if "rgbd" in (target_sensor, source_sensor) else "lidar"
     config = overridden(register_config(method, seen_by), overrides)
     registered = register_frames(target_frame, source_frame, config.registration, T_target_source)
-    if not quiet:
-        print(registration_text(registered))
+    text = registration_text(registered)
     if out is not None:
         with atomic_folder(out, FOLDER, overwrite=overwrite) as folder:
             write_registration(
@@ -85,13 +91,15 @@ def register(
                 sensor=target_sensor,
                 config=config,
             )
-        if not quiet:
-            print_files(out, width=9)
+        text = f"{text}\n{files_text(out, width=9)}"
     if rerun is not None:
         name = f"{source} on {target}"
         _shown(rerun, registered, target_frame.scan(), source_frame.scan(), name, target_sensor)
+    error = None
     if not registered.alignment.converged:
-        raise RegistrationError(f"{source} on {target}: not trusted: {registered.alignment.reason}")
+        error = RegistrationError(f"{source} on {target}: not trusted: {registered.alignment.reason}")
+    document = {**registration_record(registered), "target": target, "source": source, "path": out}
+    return Answer(document, text, error=error)
 
 
 def _check_not_there(rerun: str, *, overwrite: bool) -> None:

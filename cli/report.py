@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.options import Quiet
+from cli.answer import Answer, Output, made
 
 if TYPE_CHECKING:
     from mapper.export.report.data import Figure
@@ -21,8 +21,9 @@ def report(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders that builds left.")],
     out: Annotated[Path, typer.Option(help="HTML file to write.")] = Path("report.html"),
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,  # noqa: ARG001
+) -> Answer:
     """Write one self-contained page about a run, or about several side by side; it opens offline.
 
     Example: mapper report runs/xyz runs/xyz-isvd --out report.html
@@ -37,8 +38,7 @@ def report(
     loaded = [open_run(run) for run in runs]
     names = _names(runs)
     write_report(out, [chapter_of(run, name, _figures(run)) for run, name in zip(loaded, names, strict=True)])
-    if not quiet:
-        print(out)
+    return made(out)
 
 
 def _names(runs: Sequence[Path]) -> list[str]:

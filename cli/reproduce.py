@@ -8,9 +8,10 @@ from typing import Annotated
 
 import typer
 
-from cli.console import print_files, progress_for
+from cli.answer import Answer, Output
+from cli.console import files_text
 from cli.environment import has_compiled_code, prepare_libraries
-from cli.options import First, Last, Quiet, workers_for
+from cli.options import First, Last, workers_for
 
 
 class Paper(StrEnum):
@@ -53,8 +54,9 @@ def reproduce(
         str | None,
         typer.Option(metavar="tcp://HOST:PORT", help="Let the workers of this Dask scheduler measure."),
     ] = None,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Measure a paper's tables again on those of its logs that are there, and print ours beside theirs.
 
     What is finished is kept in OUT, so the same command goes on where it was killed.
@@ -62,6 +64,7 @@ def reproduce(
     Example: mapper reproduce thesis --logs logs --tables 5.1,5.2 --out runs/thesis
     """
     from evaluators.papers.files import tables_text
+    from evaluators.papers.layout import everything
     from evaluators.papers.paper import Cut
     from evaluators.papers.reproduce import Request
     from evaluators.papers.reproduce import reproduce as reproduce_tables
@@ -77,7 +80,7 @@ def reproduce(
         seeds=seeds,
         cut=Cut(first or 0, last),
     )
-    progress = progress_for(quiet=quiet)
+    progress = output.progress()
     if not has_compiled_code():
         progress.note("first run here: the kernels are compiled once, which takes about a minute")
     out = out or Path(paper.value)
@@ -87,9 +90,8 @@ def reproduce(
         workers=workers,
         progress=progress,
     )
-    if not quiet:
-        print(tables_text(reproduction))
-        print_files(out)
+    document = {"path": out, "missing": reproduction.missing, "cells": everything(reproduction)}
+    return Answer(document, f"{tables_text(reproduction)}\n{files_text(out)}")
 
 
 def _given(assignments: Sequence[str]) -> dict[str, Path]:

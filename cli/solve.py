@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.console import progress_for
-from cli.options import Overrides, Quiet, assignments, merged
+from cli.answer import Answer, Output, rows_text
+from cli.options import Overrides, assignments, merged
+from cli.places import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
     from mapper.export.solved_graph import SolvedGraph
@@ -35,15 +36,21 @@ class Initial(StrEnum):
 
 def solve(
     graph: Annotated[Path, typer.Argument(metavar="GRAPH.g2o", help="Pose graph in 3D or 2D.")],
-    out: Annotated[Path, typer.Option(metavar="FILE.g2o|FOLDER", help="File to write, or folder to create.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.g2o|FOLDER", help="File to write, or folder to create.  [default: runs/GRAPH]"
+        ),
+    ] = None,
     robust: Annotated[
         RobustKernel | None,
         typer.Option(help="Doubt the loops; in files of others, edges between ids that are not neighbours."),
     ] = None,
     initial: Annotated[Initial | None, typer.Option(help="Where the solver begins.  [default: auto]")] = None,
     set_: Overrides = None,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Solve a pose graph, each connected component on its own, and say what it cost before and after.
 
     Example: mapper solve sphere2500.g2o --out solved, or: mapper solve city.g2o --out city2.g2o --robust dcs
@@ -51,7 +58,7 @@ def solve(
     import time
 
     from mapper.config.loading import overridden
-    from mapper.export.solved_graph import SolvedGraph, write_solved_graph
+    from mapper.export.solved_graph import SolvedGraph, solve_report, write_solved_graph
     from mapper.graph.config import GraphConfig
     from mapper.graph.g2o import read_g2o
     from mapper.graph.optimize import optimize
@@ -60,7 +67,8 @@ def solve(
     overrides = [override.removeprefix("graph.") for override in overrides]
     config = overridden(GraphConfig(), overrides)
     doubts = config.robust != "none" and any(override.startswith("robust=") for override in overrides)
-    progress = progress_for(quiet=quiet)
+    out = place_of(out, RUNS / name_of(graph))
+    progress = output.progress()
     began = time.perf_counter()
     given = read_g2o(graph, guess_loops=doubts, progress=progress)
     read = time.perf_counter()
@@ -68,9 +76,7 @@ def solve(
     seconds = {"read": read - began, "solve": time.perf_counter() - read}
     solved = SolvedGraph(graph, given, solution, config, seconds)
     write_solved_graph(out, solved)
-    if not quiet:
-        print(_table(solved))
-        print(out)
+    return Answer({"path": out, **solve_report(solved)}, f"{_table(solved)}\n{out}")
 
 
 def _table(solved: "SolvedGraph") -> str:
@@ -85,7 +91,7 @@ def _table(solved: "SolvedGraph") -> str:
     ]
     if solved.loops:
         rows.insert(2, ("loops", f"{solved.loops - len(solved.rejected)} of {solved.loops} accepted"))
-    return "\n".join(f"{name:<12}{text}" for name, text in rows)
+    return rows_text(rows)
 
 
 def _sizes_text(sizes: list[int]) -> str:

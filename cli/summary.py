@@ -1,24 +1,82 @@
-"""The table at the end of a build."""
+"""What a run amounts to: the lines at the end of a build, all rows of ``--verbose``, and the same as JSON."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from math import degrees
 from pathlib import Path
+from shlex import quote
 from statistics import median
-from textwrap import wrap
+from typing import Any
 
+from cli.answer import Answer, rows_text
 from evaluators.metrics.metric import Metric
 from mapper.loops.closure import LoopClosure
 from mapper.run.folder import Run
 from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.manifest import Counts
 
-_LINE_WIDTH = 110
 _SHOWN_NOTES = frozenset({"gap", "lost", "doubtful", "skipped", "levelling"})
-_SHOWN = ("ATE RMSE", "RPE translation RMSE", "RPE rotation RMSE", "path length", "start-to-end offset")
+_ATE, _RPE_M, _RPE_RAD, _LENGTH = "ATE RMSE", "RPE translation RMSE", "RPE rotation RMSE", "path length"
+_SHOWN = (_ATE, _RPE_M, _RPE_RAD, _LENGTH, "start-to-end offset")
+
+
+def summary_of(run: Run, metrics: Sequence[Metric]) -> Answer:
+    """Return a run as the answer of the verb that made it."""
+    return Answer(run_document(run, metrics), short_text(run, metrics), summary_text(run, metrics))
+
+
+def run_document(run: Run, metrics: Sequence[Metric]) -> dict[str, Any]:
+    """Return a run's numbers for other programs."""
+    counts, timing, verdict = run.manifest.counts, run.manifest.timing, run.verdict
+    return {
+        "run": run.path,
+        "logs": [log.path for log in (run.manifest.input, *run.manifest.input.appended)],
+        "frames": frame_counts(counts),
+        "keyframes": counts.nodes,
+        "factors": counts.factors,
+        "loops": _loop_counts(run.loops),
+        "metrics": [asdict(metric) for metric in metrics],
+        "octree": {"leaves": counts.leaves, "resolution_m": run.config.octree.resolution_m},
+        "cloud_points": counts.cloud_points,
+        "stage_s": timing.stage_s,
+        "total_s": timing.total_s,
+        "frames_per_s": timing.frames_per_s,
+        "real_time_factor": timing.real_time_factor,
+        "peak_memory_mb": timing.peak_memory_mb,
+        "files": {path.name: path.stat().st_size for path in run.files()},
+        "verdict": verdict,
+    }
+
+
+def frame_counts(counts: Counts) -> dict[str, int]:
+    """Return how many frames had which outcome."""
+    return {key: getattr(counts, key) for key in ("listed", "read", "tracked", "doubtful", "lost", "skipped")}
+
+
+def short_text(run: Run, metrics: Sequence[Metric]) -> str:
+    """Return what a person wants to know first: eight lines, and why a run is not trusted."""
+    counts, timing, verdict = run.manifest.counts, run.manifest.timing, run.verdict
+    logs = f", of {run.manifest.input.title}" if run.manifest.input.appended else ""
+    lengths_m = [metric.value for metric in metrics if metric.name.startswith(_LENGTH)]
+    path = f", along a path of {lengths_m[0]:.2f} m" if lengths_m else ""
+    speed = f"{timing.frames_per_s:.1f} frames/s, {timing.real_time_factor:.2f} × real time"
+    rows = [
+        ("frames", f"{counts.frames_text}{logs}"),
+        ("loops", f"{counts.loops} of {counts.loop_candidates} candidates hold"),
+        ("accuracy", _accuracy_text(metrics)),
+        ("map", f"{counts.leaves} voxels of {run.config.octree.resolution_m:g} m{path}"),
+        ("speed", f"{speed}; {timing.total_s:.1f} s and {timing.peak_memory_mb:.0f} MB in all"),
+        ("run", f"{run.path} ({len(run.files())} files, {_size_mb(run.files()):.1f} MB)"),
+        ("verdict", verdict.state),
+        *(("", sentence) for sentence in verdict.sentences),
+        ("next", f"mapper view {quote(str(run.path))}"),
+    ]
+    return rows_text([(name, text) for name, text in rows if text])
 
 
 def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
-    """Return what a run amounts to, a line per fact."""
+    """Return all that is to be told of a run, a line per fact."""
     counts, timing = run.manifest.counts, run.manifest.timing
     rows = [
         ("frames", counts.frames_text),
@@ -39,18 +97,16 @@ def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
         ("seconds", f"{timing.total_s:.1f} ({stages})"),
         ("speed", f"{timing.frames_per_s:.1f} frames/s, {timing.real_time_factor:.2f} × real time"),
         ("peak memory", f"{timing.peak_memory_mb:.0f} MB"),
-        ("files", _files_text(run.files())),
+        ("files", f"{', '.join(path.name for path in run.files())} ({_size_mb(run.files()):.1f} MB)"),
         ("in", str(run.path)),
         *_verdict_rows(run),
     ]
-    width = max(len(name) for name, _ in rows)
-    return "\n".join(_row(name, text, indent=width + 2) for name, text in rows)
+    return rows_text(rows)
 
 
 def verdict_text(run: Run) -> str:
     """Return the verdict on a run, a line per sentence."""
-    rows = _verdict_rows(run)
-    return "\n".join(_row(name, text, indent=len("verdict") + 2) for name, text in rows)
+    return rows_text(_verdict_rows(run))
 
 
 def _verdict_rows(run: Run) -> list[tuple[str, str]]:
@@ -64,19 +120,45 @@ def _verdict_rows(run: Run) -> list[tuple[str, str]]:
     return [("verdict", verdict.state), *(("", text) for text in (*verdict.sentences, *notes))]
 
 
-def _loops_text(loops: Sequence[LoopClosure]) -> str:
+def _accuracy_text(metrics: Sequence[Metric]) -> str:
+    """Return the errors by the truth; empty without one."""
+    found = {start: metric for metric in metrics for start in _SHOWN if metric.name.startswith(start)}
+    if _ATE not in found:
+        return ""
+    text = f"{found[_ATE].name} {_value_text(found[_ATE])}"
+    if _RPE_M in found and _RPE_RAD in found:
+        text += f"; from frame to frame {_value_text(found[_RPE_M])} and {_value_text(found[_RPE_RAD])}"
+    return text
+
+
+def _loop_counts(loops: Sequence[LoopClosure]) -> Mapping[str, Any]:
     """Return how many loops hold, how far they moved the path, and why the other candidates do not."""
     held = [loop for loop in loops if loop.verdict == "accepted"]
-    refused = Counter(loop.reason.split(":")[0] for loop in loops if loop.verdict == "rejected")
-    text = f"{len(held)} of {len(loops)} candidates hold"
-    if refused:
-        text += f"; refused by {', '.join(f'{why} {count}' for why, count in refused.most_common())}"
     moved = [
         (loop.before.translation_m, loop.after.translation_m) for loop in held if loop.before and loop.after
     ]
-    if moved:
-        before_m, after_m = (median(column) for column in zip(*moved, strict=True))
-        text += f"; median residual {before_m:.3f} m before the solve, {after_m:.3f} m after"
+    before_m, after_m = (median(column) for column in zip(*moved, strict=True)) if moved else (None, None)
+    return {
+        "candidates": len(loops),
+        "accepted": len(held),
+        "refused": dict(
+            Counter(loop.reason.split(":")[0] for loop in loops if loop.verdict == "rejected").most_common()
+        ),
+        "median_residual_before_m": before_m,
+        "median_residual_after_m": after_m,
+    }
+
+
+def _loops_text(loops: Sequence[LoopClosure]) -> str:
+    counts = _loop_counts(loops)
+    text = f"{counts['accepted']} of {counts['candidates']} candidates hold"
+    if counts["refused"]:
+        text += f"; refused by {', '.join(f'{why} {count}' for why, count in counts['refused'].items())}"
+    if counts["median_residual_before_m"] is not None:
+        text += (
+            f"; median residual {counts['median_residual_before_m']:.3f} m before the solve, "
+            f"{counts['median_residual_after_m']:.3f} m after"
+        )
     return text
 
 
@@ -89,17 +171,11 @@ def _left_open(records: Sequence[FrameRecord]) -> list[tuple[str, str]]:
     return [("left open", f"in {unseen.total()} frames, mostly {text}: no surface showed it")]
 
 
-def _row(name: str, text: str, *, indent: int) -> str:
-    lines = wrap(text, _LINE_WIDTH - indent, break_long_words=False, break_on_hyphens=False)
-    return "\n".join([f"{name:<{indent}}{lines[0]}", *(" " * indent + line for line in lines[1:])])
-
-
 def _value_text(metric: Metric) -> str:
     if metric.unit == "rad":
         return f"{degrees(metric.value):.3f}°"
     return f"{metric.value:.4f} {metric.unit}"
 
 
-def _files_text(paths: Sequence[Path]) -> str:
-    size_mb = sum(path.stat().st_size for path in paths) / 1e6
-    return f"{', '.join(path.name for path in paths)} ({size_mb:.1f} MB)"
+def _size_mb(paths: Sequence[Path]) -> float:
+    return sum(path.stat().st_size for path in paths) / 1e6

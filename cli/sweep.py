@@ -6,9 +6,10 @@ from typing import Annotated
 
 import typer
 
-from cli.console import print_files, progress_for
+from cli.answer import Answer, Output
+from cli.console import files_text
 from cli.environment import has_compiled_code, prepare_libraries
-from cli.options import Quiet, workers_for
+from cli.options import workers_for
 
 
 def sweep(
@@ -17,8 +18,11 @@ def sweep(
         typer.Argument(metavar="SWEEP.toml", help="Names the logs, the methods and the configurations."),
     ],
     out: Annotated[
-        Path, typer.Option(help="Folder for the results; what is finished there is not run again.")
-    ],
+        Path | None,
+        typer.Option(
+            help="Folder for the results; what is finished there is not run again.  [default: sweeps/SWEEP]"
+        ),
+    ] = None,
     processes: Annotated[
         int | None, typer.Option(help="Builds at a time, a core each; omit for one on every core.")
     ] = None,
@@ -26,8 +30,9 @@ def sweep(
         str | None,
         typer.Option(metavar="tcp://HOST:PORT", help="Let the workers of this Dask scheduler build instead."),
     ] = None,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Build every log by every method in every configuration, and set the results side by side.
 
     The same command goes on where a sweep was interrupted or killed, and tries again what failed.
@@ -40,7 +45,8 @@ def sweep(
 
     workers = workers_for(processes, scheduler, default=os.cpu_count() or 1)
     prepare_libraries()
-    progress = progress_for(quiet=quiet)
+    progress = output.progress()
+    out = out or Path("sweeps") / file.stem
     plan = plan_sweep(file, out)
     if not has_compiled_code():
         progress.note("first run here: the kernels are compiled once, which takes about a minute")
@@ -50,6 +56,4 @@ def sweep(
         progress=progress,
     )
     records = write_sweep(plan, results, title=file.stem)
-    if not quiet:
-        print(summary_text(records))
-        print_files(out, FILES)
+    return Answer({"path": out, "builds": records}, f"{summary_text(records)}\n{files_text(out, FILES)}")

@@ -7,9 +7,10 @@ from typing import Annotated, TypeVar
 
 import typer
 
-from cli.console import progress_for
+from cli.answer import Answer, Output
 from cli.environment import prepare_libraries
-from cli.options import Quiet, assignments, merged
+from cli.options import assignments, merged
+from cli.places import LOGS, place_of
 
 Settings = TypeVar("Settings")
 
@@ -38,7 +39,12 @@ class SceneName(StrEnum):
 
 
 def synth(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="Log folder to create.")],
+    out: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[OUT]", help="Log folder to create.  [default: logs/SCENE, or with a number]"
+        ),
+    ] = None,
     sensor: Annotated[
         SensorKind, typer.Option(help="A camera in a flat, a LiDAR outdoors, or a line laser on a car.")
     ] = SensorKind.RGBD,
@@ -79,8 +85,9 @@ def synth(
         list[str] | None,
         typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change any setting of the scene or sensor."),
     ] = None,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Ray-cast a walk through rooms, or a LiDAR's way through streets or stairs, as a log with exact truth.
 
     Example: mapper synth logs/spin --path spin --seconds 10 --set sensor.exposure_s=0.01, or: mapper synth
@@ -100,8 +107,8 @@ def synth(
             },
             f"--sensor {sensor}",
         )
-        _line_laser(out, assignments({"duration_s": seconds, "seed": seed}), noise, set_, quiet=quiet)
-        return
+        out = place_of(out, LOGS / sensor)
+        return _line_laser(out, assignments({"duration_s": seconds, "seed": seed}), noise, set_, output)
 
     from mapper.config.loading import overridden
     from mapper.simulation.config import (
@@ -114,6 +121,7 @@ def synth(
         SynthWheelsConfig,
     )
 
+    out = place_of(out, LOGS / (scene or (SceneName.FLAT if sensor is SensorKind.RGBD else SceneName.STREET)))
     common = {"duration_s": seconds, "seed": seed}
     carried: dict[str, object] = {"wheels": SynthWheelsConfig() if wheels else None}
     if sensor is SensorKind.RGBD:
@@ -135,7 +143,7 @@ def synth(
         )
         indoors = overridden(start.model_copy(update=carried), merged(assignments(given), set_))
         prepare_libraries()
-        with progress_for(quiet=quiet).stage("render") as report:
+        with output.progress().stage("render") as report:
             write_tum_log(out, indoors, on_progress=report)
     else:
         from mapper.simulation.lidar import write_lidar_log
@@ -155,16 +163,15 @@ def synth(
         outdoors = _scene(LIDAR_SCENES, scene or SceneName.STREET, sensor).model_copy(update=carried)
         outdoors = overridden(outdoors, merged(assignments(given), set_))
         prepare_libraries()
-        with progress_for(quiet=quiet).stage("scan") as report:
+        with output.progress().stage("scan") as report:
             write_lidar_log(out, outdoors, on_progress=report)
-    if not quiet:
-        kind = "TUM" if sensor is SensorKind.RGBD else "KITTI"
-        print(f"{out}: a {kind} log; map it with mapper build {out} --out RUN")
+    kind = "TUM" if sensor is SensorKind.RGBD else "KITTI"
+    return Answer({"path": out, "format": kind}, f"{out}: a {kind} log; map it with mapper build {out}")
 
 
 def _line_laser(
-    out: Path, given: list[str], noise: float | None, set_: list[str] | None, *, quiet: bool
-) -> None:
+    out: Path, given: list[str], noise: float | None, set_: list[str] | None, output: Output
+) -> Answer:
     from mapper.config.loading import overridden
     from mapper.line_laser.config import LineLaserSynthConfig
     from mapper.line_laser.simulation.log import write_line_laser_log
@@ -174,13 +181,13 @@ def _line_laser(
         given = [*given, f"noise_levels={noise * usual.noise_levels}"]
     config = overridden(usual, merged(given, set_))
     prepare_libraries()
-    write_line_laser_log(out, config, progress=progress_for(quiet=quiet))
-    if not quiet:
-        vehicle = f"--wheelbase {config.wheelbase_m:g} --sensor-x {config.sensor_x_m:g}"
-        print(
-            f"{out}: a drive with a line laser; calibrate with mapper sensor line-laser-calibrate "
-            f"{out}/shots --reach {config.reach_m:g} {vehicle} --out C.toml"
-        )
+    write_line_laser_log(out, config, progress=output.progress())
+    vehicle = f"--wheelbase {config.wheelbase_m:g} --sensor-x {config.sensor_x_m:g}"
+    return Answer(
+        {"path": out, "format": "line laser"},
+        f"{out}: a drive with a line laser; calibrate with mapper sensor line-laser-calibrate "
+        f"{out}/shots --reach {config.reach_m:g} {vehicle} --out C.toml",
+    )
 
 
 def _scene(known: Mapping[str, Settings], name: SceneName, sensor: SensorKind) -> Settings:

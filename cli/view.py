@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from cli.options import Quiet
+from cli.answer import Answer, Output, made
 
 
 def view(
@@ -20,8 +20,9 @@ def view(
         typer.Option(metavar="URL", help="Show the run in a viewer that runs: rerun+http://HOST:9876/proxy."),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the --rrd file.")] = False,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,  # noqa: ARG001
+) -> Answer:
     """Show a finished run in Rerun: paths, graph, loops, voxels, cloud, slice, images and diagnostics.
 
     Example: mapper view runs/xyz --spawn, or: mapper view runs/xyz --rrd xyz.rrd
@@ -38,9 +39,8 @@ def view(
     built = open_run(run)
     if spawn or connect is not None:
         show_run(built, "spawn" if connect is None else f"connect:{connect}")
-        return
+        return Answer({"run": built.path})
     path = rrd or built.path / RERUN
     with nullcontext() if rrd else built.changing({RERUN}):
         show_run(built, str(path))
-    if not quiet:
-        print(path)
+    return made(path)

@@ -5,32 +5,34 @@ from typing import Annotated
 
 import typer
 
-from cli.console import progress_for
+from cli.answer import Answer, Output, verb
 from cli.environment import prepare_libraries
-from cli.options import Quiet, assignments, merged
+from cli.groups import Verb, VerbGroup
+from cli.options import assignments, merged
+from cli.places import name_of, place_of
 
 _SEED = 0  # of the draws of k-means++: the same logs give the same bytes
 
 vocabulary = typer.Typer(
     help="Train and inspect the visual words by which places are recognised.",
     epilog="Example: mapper vocabulary train LOG --out office.words",
-    no_args_is_help=True,
+    cls=VerbGroup,
     rich_markup_mode=None,
 )
 
 
-@vocabulary.command("train")
 def train(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG", help="Logs that mapper build can read.")],
-    out: Annotated[Path, typer.Option(help="Vocabulary file to create.")],
+    out: Annotated[Path | None, typer.Option(help="Vocabulary file to create.  [default: LOG.words]")] = None,
     frames: Annotated[int | None, typer.Option(help="Frames to use of each log.")] = None,
     set_: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY.PATH=VALUE", help="branching, levels, detector.max_features, …"),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Cluster the ORB descriptors of logs into a vocabulary.
 
     Example: mapper vocabulary train logs/office logs/lab --out lab.words --set branching=8
@@ -45,10 +47,11 @@ def train(
     from mapper.sources import open_source
 
     config = overridden(VocabularyConfig(), merged(assignments({"frames_per_log": frames}), set_))
+    out = place_of(out, Path(f"{name_of(logs[0])}.words"), overwrite=overwrite)
     if out.exists() and not overwrite:
         raise VocabularyError(f"{out}: exists already; give --overwrite to replace it")
     prepare_libraries()
-    progress = progress_for(quiet=quiet)
+    progress = output.progress()
     sources = [open_source(log) for log in logs]
     images = [bits for source in sources for bits in descriptors_of(source, config, progress=progress)]
     trained = train_words(
@@ -59,34 +62,49 @@ def train(
         progress=progress,
     )
     trained.save(out)
-    if not quiet:
-        _print_summary(out)
+    return _summary(out)
 
 
-@vocabulary.command("show")
 def show(
     path: Annotated[
         Path | None,
         typer.Argument(metavar="[VOCABULARY]", help="File to show; omit for the one that comes with mapper."),
     ] = None,
-) -> None:
+    *,
+    output: Output,  # noqa: ARG001
+) -> Answer:
     """Print what a vocabulary holds.
 
     Example: mapper vocabulary show lab.words
     """
     from mapper.places.vocabulary import SHIPPED
 
-    _print_summary(path or SHIPPED)
+    return _summary(path or SHIPPED)
 
 
-def _print_summary(path: Path) -> None:
+def _summary(path: Path) -> Answer:
     from mapper.places.vocabulary import load_vocabulary
 
     loaded = load_vocabulary(path)
     branching = int(loaded.tree.children.max())
-    print(
+    document = {
+        "path": path,
+        "words": loaded.words,
+        "branching": branching,
+        "levels": loaded.levels,
+        "size_bytes": path.stat().st_size,
+        "trained_on": loaded.trained_on,
+        "least_weight": loaded.idf.min(),
+        "greatest_weight": loaded.idf.max(),
+    }
+    text = (
         f"{path}: {loaded.words} words, {branching} × {loaded.levels} levels, "
         f"{path.stat().st_size / 1e3:.0f} kB\n"
         f"trained on {loaded.trained_on}\n"
         f"weights ln(N / N_w): {loaded.idf.min():.2f} … {loaded.idf.max():.2f}"
     )
+    return Answer(document, text)
+
+
+vocabulary.command("train", cls=Verb, short_help="Train visual words on logs")(verb(train))
+vocabulary.command("show", cls=Verb, short_help="Print what a vocabulary holds")(verb(show))

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.console import progress_for
+from cli.answer import Answer, Output
 from cli.environment import prepare_libraries
-from cli.options import First, Last, Overrides, Quiet, Stride, merged, selection
+from cli.options import First, Last, Overrides, Stride, merged, selection
 
 if TYPE_CHECKING:
     from evaluators.depth_camera.accuracy import Patch
@@ -55,8 +55,9 @@ def depth(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace OUT, once the new one is whole.")
     ] = False,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Measure a depth camera's errors and noise on planes.
 
     Largest error and noise, before and after the depth filter DIF, and a noise model for mapper build.
@@ -65,7 +66,7 @@ def depth(
     sensor depth rgbd_dataset_freiburg1_xyz --fit-plane --out kinect, then: mapper build LOG --out RUN
     --config kinect/sensor.toml
     """
-    from evaluators.depth_camera.study import depth_text, study_depth
+    from evaluators.depth_camera.study import depth_text, records_of, study_depth
     from evaluators.pictures.depth_camera import FOLDER, SENSOR, write_depth_study
     from mapper.config.loading import load_config
     from mapper.runtime.atomic import atomic_folder
@@ -83,14 +84,14 @@ def depth(
             patch=where,
             keep_tilt=keep_tilt,
             most_frames=_FITTED_FRAMES if stride is None else None,
-            progress=progress_for(quiet=quiet),
+            progress=output.progress(),
         )
         if folder is not None:
             write_depth_study(folder, study)
-    if not quiet:
-        print(depth_text(study))
-        if out is not None:
-            print(f"\nin     {out}; use it with mapper build LOG --out RUN --config {out / SENSOR}")
+    text = depth_text(study)
+    if out is not None:
+        text += f"\n\nin     {out}; use it with mapper build LOG --config {out / SENSOR}"
+    return Answer({"path": out, "noise": study.fit.noise, "levels": records_of(study)}, text)
 
 
 def _distances(

@@ -5,9 +5,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.console import print_files, progress_for
+from cli.answer import Answer, Output
+from cli.console import files_text
 from cli.environment import prepare_libraries
-from cli.options import Quiet, assignments
+from cli.options import assignments
+from cli.places import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -28,7 +30,12 @@ Knobs = Annotated[
 
 def line_laser(
     images: Annotated[Path, typer.Argument(metavar="IMAGES", help="Folder of images, stamped by name.")],
-    out: Annotated[Path, typer.Option(help="Folder to create for ranges, grids, map and pictures.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder to create for ranges, grids, map and pictures.  [default: runs/IMAGES, or a number]"
+        ),
+    ] = None,
     calibration: Annotated[
         Path | None, typer.Option(help="Of line-laser-calibrate.  [default: the thesis's sensor]")
     ] = None,
@@ -43,8 +50,9 @@ def line_laser(
     ] = None,
     set_: Knobs = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Range what a laser's stripe falls on in images.
 
     With the wheels' readings, map it too.
@@ -60,7 +68,8 @@ def line_laser(
     from mapper.runtime.atomic import atomic_folder
 
     prepare_libraries()
-    progress = progress_for(quiet=quiet)
+    out = place_of(out, RUNS / name_of(images), overwrite=overwrite)
+    progress = output.progress()
     config = overridden(LineLaserConfig(), set_ or [])
     known = read_config(calibration, LineLaserCalibration) if calibration else THESIS
     paths, stamps_ns, notes = find_images(images, times=times, rate_hz=config.rate_hz)
@@ -83,11 +92,9 @@ def line_laser(
             scores.write(folder)
     for note in notes:
         progress.note(note)
-    if not quiet:
-        if scores is not None:
-            print(f"{scores.text}\n")
-        print(_summary(scans))
-        print_files(out, width=9)
+    text = f"{_summary(scans)}\n{files_text(out, width=9)}"
+    document = {"path": out, "images": len(scans), **_counts(scans)}
+    return Answer(document, text if scores is None else f"{scores.text}\n\n{text}")
 
 
 def calibrate(
@@ -97,14 +104,18 @@ def calibrate(
             metavar="SHOTS", help="CSV of image,range_m,width_m, or a folder with such a shots.csv."
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Calibration file (TOML) to create, and a picture beside it.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Calibration file to create, and a picture beside it.  [default: line-laser.toml]"),
+    ] = None,
     reach: Annotated[float, typer.Option(help="How far ahead the laser meets the floor, m.")] = 1.9,
     wheelbase: Annotated[float | None, typer.Option(help="Between the vehicle's axles, m.")] = None,
     sensor_x: Annotated[float, typer.Option(help="How far ahead of the rear axle ranges begin, m.")] = 0.0,
     set_: Knobs = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Fit a line laser's laws to images of boards.
 
     The boards face the sensor at known distances; two or more have known widths.
@@ -120,6 +131,7 @@ def calibrate(
     from mapper.line_laser.files import read_shots
     from mapper.runtime.atomic import write_text
 
+    out = place_of(out, Path("line-laser.toml"), overwrite=overwrite)
     picture = out.with_suffix(".png")
     if picture == out:
         raise RunError(f"{out}: the picture's place; want an --out that ends in .toml")
@@ -128,7 +140,7 @@ def calibrate(
             raise RunError(f"{path}: exists already; choose another --out, or pass --overwrite to replace it")
     vehicle = overridden(VehicleConfig(), assignments({"wheelbase_m": wheelbase, "sensor_x_m": sensor_x}))
     prepare_libraries()
-    progress = progress_for(quiet=quiet)
+    progress = output.progress()
     config = overridden(LineLaserConfig(), set_ or [])
     seen, size_px, notes = read_shots(shots, config.stripe, progress=progress)
     for note in notes:
@@ -136,9 +148,10 @@ def calibrate(
     fit = fit_laws(seen, size_px=size_px, reach_m=reach, vehicle=vehicle)
     write_text(out, calibration_text(fit.calibration))
     write_calibration_picture(picture, fit, seen)
-    if not quiet:
-        print(_laws(fit, seen))
-        print(f"in       {out}, {picture.name}")
+    return Answer(
+        {"path": out, "picture": picture, "calibration": fit.calibration},
+        f"{_laws(fit, seen)}\nin       {out}, {picture.name}",
+    )
 
 
 def accuracy(
@@ -146,8 +159,9 @@ def accuracy(
     out: Annotated[Path | None, typer.Option(help="Folder to create for both tables as CSV.")] = None,
     set_: Knobs = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
-    quiet: Quiet = False,
-) -> None:
+    *,
+    output: Output,
+) -> Answer:
     """Print how well each method finds the stripe in rendered rooms.
 
     The rooms have lamps, red things and noise. The thesis's Table 2.1 is measured again, too.
@@ -171,14 +185,14 @@ def accuracy(
         files=frozenset({DETECTIONS, _TABLE_2_1}),
     )
     with atomic_folder(out, tables, overwrite=overwrite) if out else nullcontext() as folder:
-        found = study(config, range(seeds), progress=progress_for(quiet=quiet))
+        found = study(config, range(seeds), progress=output.progress())
         scenes, ranges = detections(found), table_2_1(found)
         if folder is not None:
             write_text(folder / DETECTIONS, csv_text(scenes.records))
             write_text(folder / _TABLE_2_1, csv_text(ranges.records))
             write_text(folder / MANIFEST_NAME, config.model_dump_json(indent=1) + "\n")
-    if not quiet:
-        print(f"{scenes.text()}\n\n{ranges.text()}")
+    document = {"path": out, "detections": scenes.records, "ranges": ranges.records}
+    return Answer(document, f"{scenes.text()}\n\n{ranges.text()}")
 
 
 def _draw(
@@ -199,9 +213,18 @@ def _draw(
 
 
 def _summary(scans: "Mapping[Path, LineScan]") -> str:
-    found = sum(len(scan.columns) for scan in scans.values())
-    floor = sum(int(scan.is_floor.sum()) for scan in scans.values())
-    return f"stripe   {len(scans)} images, {found} columns with a stripe, {floor} of them on the floor"
+    counts = _counts(scans)
+    return (
+        f"stripe   {len(scans)} images, {counts['columns']} columns with a stripe, "
+        f"{counts['floor_columns']} of them on the floor"
+    )
+
+
+def _counts(scans: "Mapping[Path, LineScan]") -> dict[str, int]:
+    return {
+        "columns": sum(len(scan.columns) for scan in scans.values()),
+        "floor_columns": sum(int(scan.is_floor.sum()) for scan in scans.values()),
+    }
 
 
 def _laws(fit: "Fit", shots: "Sequence[CalibrationShot]") -> str:

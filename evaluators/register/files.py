@@ -92,7 +92,7 @@ def write_registration(
             for stage in registered.stages
         ],
     )
-    record = _record(registered) | {
+    record = registration_record(registered) | {
         "target": names[0],
         "source": names[1],
         "config": config.model_dump(mode="json"),
@@ -100,7 +100,8 @@ def write_registration(
     write_text(folder / MANIFEST_NAME, json.dumps(record, indent=2, ensure_ascii=False) + "\n")
 
 
-def _record(registered: Registered) -> dict[str, Any]:
+def registration_record(registered: Registered) -> dict[str, Any]:
+    """Return what ``manifest.json`` tells of the registration itself."""
     alignment = registered.alignment
     return {
         "method": registered.method,

@@ -79,10 +79,11 @@ def write_solved_graph(out: Path, solved: SolvedGraph) -> None:
         poses = ((stamp, solved.solution.T_world_node[node]) for stamp, node in by_time)
         write_tum(folder / KEYFRAMES, trajectory_from(poses))
         write_graph_views(folder / PICTURE, solved.graph, solved.solution, title=solved.path.name)
-        write_text(folder / REPORT, json.dumps(_report(solved), indent=2) + "\n")
+        write_text(folder / REPORT, json.dumps(solve_report(solved), indent=2) + "\n")
 
 
-def _report(solved: SolvedGraph) -> dict[str, object]:
+def solve_report(solved: SolvedGraph) -> dict[str, object]:
+    """Return what ``solve.json`` holds."""
     return {
         "graph": str(solved.path.resolve()),
         "config": solved.config.model_dump(),

@@ -94,9 +94,12 @@ def test_a_build_on_images_loads_nothing_that_only_scans_recordings_and_viewers_
 def test_build_prints_a_table(desk_log, tmp_path):
     result = mapper("build", desk_log, "--out", tmp_path / "run", "--first", 3, "--last", 24, "--stride", 2)
 
-    assert "11 tracked, 0 doubtful, 0 lost, 0 skipped" in result.stdout
-    for row in ("keyframes", "ATE RMSE, SE(3)-aligned", "path length", "peak memory", "trajectory.tum"):
-        assert row in result.stdout
+    lines = result.stdout.splitlines()
+    names = ["frames", "loops", "accuracy", "map", "speed", "run", "verdict", "next"]
+    assert [line.split()[0] for line in lines] == names
+    assert "11 tracked, 0 doubtful, 0 lost, 0 skipped" in lines[0]
+    assert "ATE RMSE, SE(3)-aligned 0.00" in lines[2]
+    assert lines[-1].split("  ")[-1].strip() == f"mapper view {tmp_path / 'run'}"
     source = open_run(tmp_path / "run").config.source
     assert (source.first_frame, source.last_frame, source.stride, source.require_truth) == (3, 24, 2, False)
 
@@ -186,7 +189,7 @@ def test_a_bug_keeps_its_traceback(desk_log, tmp_path, monkeypatch):
 def test_fuse_changes_the_map_of_a_run(run_folder, tmp_path):
     run = shutil.copytree(run_folder, tmp_path / "run")
 
-    assert "leaves of 0.2 m" in mapper("fuse", run, "--set", "octree.resolution_m=0.2").stdout
+    assert "voxels of 0.2 m" in mapper("fuse", run, "--set", "octree.resolution_m=0.2").stdout
 
     assert open_run(run).manifest.counts.leaves < open_run(run_folder).manifest.counts.leaves
     assert (run / "trajectory.tum").read_bytes() == (run_folder / "trajectory.tum").read_bytes()
@@ -210,11 +213,11 @@ def test_eval_states_the_alignment_and_agrees_with_the_library(run_folder, desk_
     of_run = json.loads(mapper("eval", run_folder, "--json").stdout)
     of_files = json.loads(mapper("eval", estimate, "--truth", truth, "--log", desk_log, "--json").stdout)
 
-    values = {metric["name"]: metric["value"] for metric in of_files}
+    values = {metric["name"]: metric["value"] for metric in of_files["metrics"]}
     frames_ns = np.array([record.stamp_ns for record in open_run(run_folder).records])
     found = assess(read_tum(estimate), read_tum(truth), frames_ns=frames_ns)
     assert {m.name: m.value for m in found.metrics}.items() <= values.items()
-    told = {metric["name"]: metric["value"] for metric in of_run}
+    told = {metric["name"]: metric["value"] for metric in of_run["metrics"]}
     assert {name: told[name] for name in values} == pytest.approx(values)
     assert told.keys() - values.keys() == {
         "loops",
@@ -242,7 +245,7 @@ def test_eval_holds_the_map_against_the_world_of_a_synthetic_log(run_folder, des
     ).stdout
     assert "| occupied F-score, within 0 voxels | 1 | ratio |" in of_itself
     lost = json.loads(mapper("eval", run_folder, "--map", desk_log, "--map-world", "map", "--json").stdout)
-    scores = {row["name"]: row["value"] for row in lost}
+    scores = {row["name"]: row["value"] for row in lost["metrics"]}
     assert scores["occupied F-score, within 1 voxel"] < 0.7
 
 
@@ -255,8 +258,8 @@ def test_eval_reads_kitti_text_with_and_without_times(run_folder, tmp_path):
         mapper("eval", poses, "--truth", run_folder / "truth.tum", "--times", times, "--json").stdout
     )
     of_run = json.loads(mapper("eval", run_folder, "--json").stdout)
-    assert by_line[1]["value"] < 1e-9
-    assert by_time[1] == pytest.approx(of_run[1])
+    assert by_line["metrics"][1]["value"] < 1e-9
+    assert by_time["metrics"][1] == pytest.approx(of_run["metrics"][1])
 
 
 def test_eval_has_the_library_s_default():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import rerun as rr
 
+from cli.answer import Output
 from cli.build import _onlooker, built
 from mapper.config.build import BuildConfig
 from mapper.config.export import RerunConfig
@@ -385,7 +386,7 @@ def test_stepping_waits_after_each_frame_until_told_to_run_on(desk_log, tmp_path
         ["source.last_frame=11"],
         tmp_path / "run",
         overwrite=False,
-        quiet=True,
+        output=Output(quiet=True),
         onlooker=_onlooker(str(path), step=True, overwrite=False),
     )
     assert keys.lines == []

@@ -72,8 +72,9 @@ def test_strict_builds_end_with_status_1_and_are_whole(desk_log, tmp_path, monke
 
     said = mapper("eval", run.path).stdout
     assert "verdict  doubtful\n" in said
-    metrics = json.loads(mapper("eval", run.path, "--json").stdout)
-    assert {"name", "value", "unit"} <= metrics[0].keys()
+    told = json.loads(mapper("eval", run.path, "--json").stdout)
+    assert {"name", "value", "unit"} == told["metrics"][0].keys()
+    assert told["verdict"]["state"] == "doubtful"
     page = tmp_path / "report.html"
     mapper("report", run.path, "--out", page)
     text = page.read_text()

@@ -1,0 +1,149 @@
+"""Answers of the verbs: one mechanism prints each as lines for people or as one JSON document."""
+
+import functools
+import inspect
+import json
+import math
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, is_dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from cli.console import progress_for
+from cli.terminal import print_text
+from mapper.core.errors import MapperError
+from mapper.runtime.atomic import MANIFEST_NAME
+from mapper.runtime.progress import Progress
+
+_LINE_WIDTH = 110
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """What a verb prints, by the options that every verb has.
+
+    Attributes:
+        json: One JSON document instead of lines; progress is shown on a terminal only.
+        quiet: Nothing but errors.
+        verbose: Every row and every note.
+    """
+
+    json: bool = False
+    quiet: bool = False
+    verbose: bool = False
+
+    def progress(self, *, prompts: bool = False) -> Progress:
+        """Return the progress of a job, on stderr; bars would overdraw prompts."""
+        quiet = self.quiet or (self.json and not sys.stderr.isatty())
+        return progress_for(quiet=quiet, prompts=prompts, every_note=self.verbose)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """What a verb made or found.
+
+    Attributes:
+        document: For ``--json``; keys are stable and end in the unit: ``total_s``, ``path_length_m``.
+        text: Lines for people.
+        details: What ``--verbose`` prints instead; empty if that is the text.
+        error: Raised after printing: the answer is whole, but the exit status is 1.
+    """
+
+    document: Mapping[str, Any] = field(default_factory=dict)
+    text: str = ""
+    details: str = ""
+    error: MapperError | None = None
+
+
+def made(path: Path, **more: object) -> Answer:
+    """Return the answer of a verb that writes one file or folder: its path."""
+    return Answer({"path": path, **more}, str(path))
+
+
+def record_in(folder: Path, name: str = MANIFEST_NAME) -> dict[str, Any]:
+    """Return the folder's path and what the JSON file in it tells."""
+    return {"path": folder, **json.loads((folder / name).read_bytes())}
+
+
+def verb(function: Callable[..., Answer]) -> Callable[..., None]:
+    """Return a command with ``--json``, ``--verbose`` and ``--quiet``, which prints the function's answer.
+
+    The function takes its :class:`Output` as the keyword ``output``.
+    """
+
+    @functools.wraps(function)
+    def command(*, json: bool, verbose: bool, quiet: bool, **given: Any) -> None:
+        if verbose and quiet:
+            raise MapperError("--verbose and --quiet: choose one")
+        output = Output(json=json, quiet=quiet, verbose=verbose)
+        answer = function(**given, output=output)
+        _show(answer, output)
+        if answer.error is not None:
+            raise answer.error
+
+    own = [p for p in inspect.signature(function).parameters.values() if p.name != "output"]
+    own = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own]
+    options = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=annotation)
+        for name, annotation in _COMMON.items()
+    ]
+    command.__signature__ = inspect.Signature([*own, *options])  # type: ignore[attr-defined]
+    command.__annotations__ = {p.name: p.annotation for p in (*own, *options)}
+    del command.__wrapped__
+    return command
+
+
+_COMMON = {
+    "json": Annotated[bool, typer.Option("--json", help="Print one JSON document.")],
+    "verbose": Annotated[bool, typer.Option("--verbose", help="Print every row and every note.")],
+    "quiet": Annotated[bool, typer.Option("--quiet", help="Print errors only.")],
+}
+
+
+def _show(answer: Answer, output: Output) -> None:
+    if output.quiet:
+        return
+    if output.json:
+        print(json.dumps(plain(answer.document), indent=2, ensure_ascii=False, allow_nan=False))
+    elif text := (output.verbose and answer.details) or answer.text:
+        print_text(text)
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON has it: numbers that are not finite are null."""
+    match value:
+        case Mapping():
+            return {str(key): plain(one) for key, one in value.items()}
+        case Enum():
+            return value.value
+        case str() | bool() | int() | None:
+            return value
+        case float():
+            return value if math.isfinite(value) else None
+        case Path():
+            return str(value)
+        case _ if is_dataclass(value) and not isinstance(value, type):
+            return plain(asdict(value))
+        case _ if hasattr(value, "model_dump"):
+            return value.model_dump(mode="json")
+        case _ if hasattr(value, "tolist"):
+            return plain(value.tolist())
+        case Iterable():
+            return [plain(one) for one in value]
+    raise TypeError(f"{type(value).__name__} has no form in JSON")
+
+
+def rows_text(rows: Sequence[tuple[str, str]], *, width: int = _LINE_WIDTH) -> str:
+    """Return aligned lines of name and text; what does not fit is wrapped below."""
+    from textwrap import wrap
+
+    indent = 2 + max(len(name) for name, _ in rows)
+    lines = []
+    for name, text in rows:
+        folded = wrap(text, width - indent, break_long_words=False, break_on_hyphens=False) or [""]
+        lines += [f"{name:<{indent}}{folded[0]}", *(" " * indent + line for line in folded[1:])]
+    return "\n".join(lines)

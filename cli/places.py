@@ -1,0 +1,51 @@
+"""Places of results that no option tells: named after the log or run, with a number if that is taken."""
+
+from collections.abc import Sequence
+from itertools import count
+from pathlib import Path
+
+from mapper.core.errors import RunError
+from mapper.runtime.atomic import locked, partial_of
+
+RUNS, LOGS, MAPS, DIFFS = Path("runs"), Path("logs"), Path("maps"), Path("diffs")
+_MOST_NAMED = 3
+
+
+def place_of(out: Path | None, usual: Path, *, overwrite: bool = False) -> Path:
+    """Return where a result goes: as told, else the usual place, or with ``-2`` and so on while it is taken.
+
+    With ``overwrite`` the usual place is replaced.
+    """
+    if out is not None:
+        return out
+    if overwrite or not _is_taken(usual):
+        return usual
+    numbered = (usual.with_name(f"{usual.stem}-{number}{usual.suffix}") for number in count(2))
+    return next(path for path in numbered if not _is_taken(path))
+
+
+def name_of(path: Path) -> str:
+    """Return the name of a log or run by its path, without a file's ending."""
+    name = path.name if path.name not in ("", "..") else path.resolve().name
+    return Path(name).stem if path.is_file() else name or "log"
+
+
+def joined_names(paths: Sequence[Path]) -> str:
+    """Return one name for several runs: the same paths always have the same."""
+    names = [name_of(path) for path in paths[:_MOST_NAMED]]
+    more = [f"{len(paths) - _MOST_NAMED}-more"] if len(paths) > _MOST_NAMED else []
+    return "+".join([*names, *more])
+
+
+def _is_taken(path: Path) -> bool:
+    """Tell whether there is something, or another process is making it."""
+    if path.exists() or path.is_symlink():
+        return True
+    partial = partial_of(path.resolve())
+    if not partial.is_dir() or partial.is_symlink():
+        return False
+    try:
+        with locked(partial):
+            return False
+    except RunError:
+        return True

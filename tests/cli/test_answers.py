@@ -1,0 +1,163 @@
+"""What verbs print: lines, every row, or one JSON document, by one mechanism."""
+
+import io
+import json
+import math
+import shutil
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli.answer import plain, rows_text
+from cli.groups import PANELS
+from cli.main import app
+from cli.terminal import print_help, print_text
+from tests.support.command_line import invoke, mapper
+
+ANSWERS = {
+    "build": (["LOG", "--last", "11", "--out", "TMP/run"], {"run", "frames", "loops", "metrics", "verdict"}),
+    "fuse": (["RUN"], {"run", "frames", "octree", "total_s", "verdict"}),
+    "loops": (["RUN"], {"run", "loops"}),
+    "edit": (["RUN"], {"run", "edits"}),
+    "eval": (["RUN"], {"metrics", "verdict"}),
+    "export": (["RUN", "--as", "tum"], {"path", "kind"}),
+    "plan": (
+        ["RUN", "--from", "0", "0", "--to", "0.1", "0", "--radius", "0.01", "--unknown", "free"],
+        {"picture", "length_m", "waypoints_world_m"},
+    ),
+    "report": (["RUN", "--out", "TMP/report.html"], {"path"}),
+    "view": (["RUN"], {"path"}),
+    "diff": (["RUN", "RUN", "--place", "built", "--out", "TMP/diff"], {"path", "appeared", "vanished"}),
+    "merge": (["RUN", "--out", "TMP/map"], {"path", "runs", "worker_s"}),
+    "solve": (["RUN/graph.g2o", "--out", "TMP/solved"], {"path", "nodes", "error_after"}),
+    "inspect": (["LOG"], {"path", "log", "topics", "build", "problem"}),
+    "convert": (["LOG", "--as", "mbag", "--out", "TMP/log"], {"path", "format", "frames", "skipped"}),
+    "synth": (["TMP/new", "--seconds", "0.1", "--set", "width_px=64", "--set", "height_px=48"], {"path"}),
+    "config": ([], {"odometry", "octree", "loops"}),
+    "doctor": (["RUN"], {"findings"}),
+    "register": (["LOG@3", "LOG@0", "--method", "gicp"], {"method", "trusted", "T_target_source"}),
+    "vocabulary": (["show"], {"path", "words", "levels"}),
+}
+LONG = {"compare", "demo", "localise", "reproduce", "sweep", "sensor"}
+"""Verbs that take longer, or need logs of their own; their tests are with what they do."""
+
+
+def everyone():
+    groups = [group.name for group in app.registered_groups]
+    return {*(command.name for command in app.registered_commands), *groups}
+
+
+def test_every_verb_is_tried_here_or_known_to_take_long():
+    assert everyone() == {*ANSWERS, *LONG}
+
+
+@pytest.mark.parametrize("verb", ANSWERS)
+def test_json_is_one_document_with_the_keys_of_its_verb(verb, desk_run, desk_log, tmp_path):
+    run = tmp_path / "desk"
+    shutil.copytree(desk_run.path, run)
+    arguments, keys = ANSWERS[verb]
+    places = {"LOG": str(desk_log), "RUN": str(run), "TMP": str(tmp_path)}
+    for name, place in places.items():
+        arguments = [word.replace(name, place) for word in arguments]
+    result = mapper(verb, *arguments, "--json")
+    document = json.loads(result.stdout)
+    assert keys <= document.keys()
+    assert result.stderr == "", "machines read errors there"
+
+
+def test_verbose_prints_every_row_and_quiet_none(desk_run):
+    shown = mapper("loops", desk_run.path, "--accepted").stdout
+    assert mapper("loops", desk_run.path, "--accepted", "--quiet").output == ""
+    assert shown
+    both = mapper("loops", desk_run.path, "--quiet", "--verbose", status=1)
+    assert both.stderr == "mapper: --verbose and --quiet: choose one\n"
+
+
+def test_a_build_tells_eight_lines_and_the_rest_with_verbose(desk_log, tmp_path):
+    short = mapper("build", desk_log, "--last", 11, "--out", tmp_path / "short").stdout.splitlines()
+    rest = mapper("build", desk_log, "--last", 11, "--out", tmp_path / "long", "--verbose").stdout
+    assert len(short) == 8
+    for row in ("keyframes", "levelled by", "seconds", "peak memory", "trajectory.tum"):
+        assert row in rest
+
+
+def test_values_become_json_without_losing_or_inventing_any():
+    @dataclass
+    class Inner:
+        path: Path
+
+    class Kind(StrEnum):
+        ONE = "one"
+
+    document = {"a": np.float64(0.5), "b": math.nan, "c": (Kind.ONE, True, None), "d": Inner(Path("x"))}
+    assert plain(document) == {"a": 0.5, "b": None, "c": ["one", True, None], "d": {"path": "x"}}
+    assert plain({"rows": np.eye(2, dtype=np.int64)}) == {"rows": [[1, 0], [0, 1]]}
+    with pytest.raises(TypeError, match="object has no form in JSON"):
+        plain(object())
+
+
+def test_rows_are_aligned_and_folded():
+    assert (
+        rows_text([("a", "one two three"), ("long", "x")], width=14) == "a     one two\n      three\nlong  x"
+    )
+
+
+class Screen(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize(
+    ("environment", "coloured"),
+    [({"TERM": "xterm"}, True), ({"TERM": "xterm", "NO_COLOR": "1"}, False), ({"TERM": "dumb"}, False)],
+)
+def test_colours_are_for_terminals_that_want_them(monkeypatch, environment, coloured):
+    screen = Screen()
+    monkeypatch.setattr("sys.stdout", screen)
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    print_text("run      a\x1b[2Jb\nverdict  doubtful")
+    print_help("Usage: mapper\n\nOptions:\n  -h, --help  Help.\n")
+    assert ("\x1b[33mdoubtful\x1b[0m" in screen.getvalue()) is coloured
+    assert ("\x1b[1mOptions:\x1b[0m" in screen.getvalue()) is coloured
+    assert ("\x1b[36m-h, --help\x1b[0m" in screen.getvalue()) is coloured
+    assert ("a\x1b[2Jb" in screen.getvalue()) is not coloured, "escaped by the stream, where there is one"
+
+
+@pytest.mark.parametrize("help_", ["-h", "--help"])
+@pytest.mark.parametrize("words", [[], ["build"], ["sensor"], ["sensor", "depth"], ["vocabulary", "train"]])
+def test_help_is_everywhere(words, help_):
+    assert mapper(*words, help_).stdout.startswith("Usage: ")
+
+
+def test_the_verbs_are_listed_by_what_they_are_for_within_a_screen():
+    lines = mapper("-h").stdout.splitlines()
+    assert tuple(line.split()[0] for line in lines if line[:1].islower()) == PANELS
+    assert len(lines) <= 40
+    assert max(map(len, lines)) < 80
+    assert mapper().stdout == mapper("-h").stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["biuld", "x"], "mapper: no verb 'biuld'; did you mean build?; mapper -h lists them all"),
+        (["sensor", "dept"], "mapper: sensor: no verb 'dept'; did you mean depth?; mapper sensor -h lists"),
+        (["build"], "mapper: build: missing argument 'LOG'; mapper build -h shows how"),
+        (["build", "a", "b"], "mapper: build: does not take b too; want one log: build each, then"),
+        (["build", "a", "--ovt"], "mapper: build: no such option: --ovt"),
+        (["build", "a", "--first", "x"], "mapper: build: invalid value for '--first'"),
+        (["--foo"], "mapper: no such option: --foo; mapper -h shows how"),
+        (["pyproject.toml"], "mapper: no verb 'pyproject.toml', but a file or folder: mapper inspect"),
+    ],
+)
+def test_a_slip_of_the_keyboard_is_one_line_with_status_2(words, line):
+    result = invoke(*words)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert result.stderr.startswith(line)
+    assert len(result.stderr.splitlines()) == 1
