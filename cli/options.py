@@ -17,6 +17,9 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one setting; mapper config lists them all."),
 ]
+SettingKey = Annotated[
+    str | None, typer.Argument(metavar="[KEY]", help="Setting, table of settings, or the end of a name.")
+]
 MovedLogs = Annotated[
     list[Path] | None,
     typer.Option(

@@ -5,6 +5,7 @@ import json
 import shutil
 import subprocess
 import sys
+import tomllib
 
 import numpy as np
 import pytest
@@ -286,12 +287,14 @@ def test_a_synthetic_log_has_the_length_asked_for(tmp_path):
 
 
 def test_config_prints_what_build_would_use(tmp_path):
-    path = tmp_path / "isvd.json"
-    path.write_text(mapper("config", "--set", "odometry.kind=isvd", "--set", "workers=1").stdout)
+    path, overrides = tmp_path / "isvd.toml", ("--set", "odometry.kind=isvd", "--set", "workers=1")
+    path.write_text(mapper("config", *overrides).stdout)
 
-    again = mapper("config", "--config", path).stdout
-    assert json.loads(again) == json.loads(path.read_text())
-    assert json.loads(again)["odometry"]["previous_frames"] == 4
+    again = mapper("config", "--config", path)
+    assert again.stdout == path.read_text()
+    assert tomllib.loads(again.stdout)["odometry"]["previous_frames"] == 4
+    of_json = mapper("config", *overrides, "--json").stdout
+    assert json.loads(mapper("config", "--config", path, "--json").stdout) == json.loads(of_json)
 
 
 def test_a_package_that_cannot_be_written_gets_another_place_for_compiled_code(tmp_path, monkeypatch):
