@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli.answer import Answer, Output
+from cli.completion import run_folders
 from cli.environment import has_compiled_code, prepare_libraries
 from cli.options import (
     ConfigFile,
@@ -56,6 +57,7 @@ def build(
         Path | None,
         typer.Option(
             metavar="RUN",
+            autocompletion=run_folders,
             help="Append the log to this run of the same place; OUT then holds both, by RUN's own settings.",
         ),
     ] = None,

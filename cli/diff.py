@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli.answer import Answer, Output, record_in
+from cli.completion import run_folders
 from cli.environment import prepare_libraries
 from cli.places import DIFFS, joined_names, place_of
 from cli.placing import Place, PosesFile, placing_of
@@ -17,8 +18,16 @@ _LISTED = 10
 
 
 def diff(
-    before: Annotated[Path, typer.Argument(metavar="RUN_A", help="Run folder of the earlier session.")],
-    after: Annotated[Path, typer.Argument(metavar="RUN_B", help="Run folder of the later session.")],
+    before: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN_A", autocompletion=run_folders, help="Run folder of the earlier session."
+        ),
+    ],
+    after: Annotated[
+        Path,
+        typer.Argument(metavar="RUN_B", autocompletion=run_folders, help="Run folder of the later session."),
+    ],
     out: Annotated[
         Path | None,
         typer.Option(metavar="FOLDER", help="Folder to create.  [default: diffs/RUN_A+RUN_B]"),

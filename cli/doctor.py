@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli.answer import Answer, Output
+from cli.completion import run_folders
 from mapper.runtime.progress import SILENT
 
 if TYPE_CHECKING:
@@ -21,7 +22,9 @@ def doctor(
     run: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[RUN]", help="Check the files of this run or localised log instead of the machine."
+            metavar="[RUN]",
+            autocompletion=run_folders,
+            help="Check the files of this run or localised log instead of the machine.",
         ),
     ] = None,
     accept: Annotated[

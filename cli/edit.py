@@ -1,13 +1,12 @@
 """``mapper edit``: a finished map cropped and cleaned by hand."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from cli.answer import Answer, Output
 from cli.environment import prepare_libraries
-from cli.options import MovedLogs
+from cli.options import MovedLogs, RunFolder
 
 if TYPE_CHECKING:
     from mapper.mapping.config import EditKind, Region
@@ -17,7 +16,7 @@ _Corners = tuple[float, float, float, float, float, float]
 
 
 def edit(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder that a build left.")],
+    run: RunFolder,
     erase: Annotated[
         bool, typer.Option("--erase", help="Free what is occupied in a region; its points leave the cloud.")
     ] = False,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli.answer import Answer, Output
+from cli.completion import run_folders
 from cli.environment import prepare_libraries
 
 if TYPE_CHECKING:
@@ -49,7 +50,12 @@ class Format(StrEnum):
 
 def evaluate(
     estimate: Annotated[
-        Path, typer.Argument(metavar="RUN|TRAJECTORY", help="Run folder, or TUM or KITTI trajectory.")
+        Path,
+        typer.Argument(
+            metavar="RUN|TRAJECTORY",
+            autocompletion=run_folders,
+            help="Run folder, or TUM or KITTI trajectory.",
+        ),
     ],
     truth: Annotated[
         Path | None, typer.Option(help="TUM or KITTI trajectory of the truth; omit for the run's own.")

@@ -6,16 +6,20 @@ from typing import Annotated
 import typer
 
 from cli.answer import Answer, Output, made
+from cli.completion import export_kinds
 from cli.environment import prepare_libraries
-from cli.options import MovedLogs, Overrides, assignments, merged
+from cli.options import MovedLogs, Overrides, RunFolder, assignments, merged
 from mapper.export.exporters import EXPORTERS
 
 _KINDS = "; ".join(f"{kind}: {exporter.summary}" for kind, exporter in EXPORTERS.items())
 
 
 def export(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder that a build left.")],
-    as_: Annotated[str, typer.Option("--as", metavar="KIND", help=f"What to write. {_KINDS}.")],
+    run: RunFolder,
+    as_: Annotated[
+        str,
+        typer.Option("--as", metavar="KIND", autocompletion=export_kinds, help=f"What to write. {_KINDS}."),
+    ],
     out: Annotated[
         Path | None, typer.Option(help="File to write; omit to keep it in RUN under its usual name.")
     ] = None,

@@ -7,11 +7,11 @@ import typer
 
 from cli.answer import Answer, Output
 from cli.environment import prepare_libraries
-from cli.options import MovedLogs, Overrides
+from cli.options import MovedLogs, Overrides, RunFolder
 
 
 def fuse(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder that a build left.")],
+    run: RunFolder,
     set_: Overrides = None,
     log: MovedLogs = None,
     trajectory: Annotated[

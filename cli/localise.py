@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli.answer import Answer, Output, rows_text
+from cli.completion import run_folders
 from cli.environment import prepare_libraries
 from cli.options import First, Last, Overrides, Stride, merged, selection
 from cli.places import RUNS, name_of, place_of
@@ -17,7 +18,13 @@ if TYPE_CHECKING:
 def localise(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Recorded log, of the map's kind of sensor.")],
     in_: Annotated[
-        Path, typer.Option("--in", metavar="RUN", help="Finished run, or merged map; it stays as it is.")
+        Path,
+        typer.Option(
+            "--in",
+            metavar="RUN",
+            autocompletion=run_folders,
+            help="Finished run, or merged map; it stays as it is.",
+        ),
     ],
     out: Annotated[
         Path | None, typer.Option(help="Folder to create.  [default: runs/LOG-in-RUN, or with a number]")

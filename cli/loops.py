@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from itertools import islice
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -10,7 +9,7 @@ import typer
 from cli.answer import Answer, Output
 from cli.environment import prepare_libraries
 from cli.groups import Verb
-from cli.options import MovedLogs
+from cli.options import MovedLogs, RunFolder
 
 if TYPE_CHECKING:
     from mapper.loops.closure import Discrepancy, LoopClosure
@@ -30,7 +29,7 @@ class WithPairs(Verb):
 
 
 def loops(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder that a build left.")],
+    run: RunFolder,
     list_: Annotated[
         bool, typer.Option("--list", help="Print every candidate; the default without other options.")
     ] = False,

@@ -1,13 +1,16 @@
 """The command line: its verbs, and the one place that turns an error into a line and an exit status."""
 
 import errno
+import os
 import sys
 import warnings
 from collections.abc import Callable
+from enum import StrEnum
 from typing import Annotated, Any, TextIO
 
 import typer
 
+from cli import completion
 from cli.answer import Answer, verb
 from cli.build import build
 from cli.compare import compare
@@ -43,6 +46,14 @@ from mapper.core.errors import MapperError, MapperWarning, Terminated
 
 _INTERRUPTED, _TERMINATED = 130, 143  # 128 + SIGINT, 128 + SIGTERM, as shells count
 _USER_CAN_HELP = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EPERM, errno.EROFS}
+
+
+class Shell(StrEnum):
+    """Shell that can complete."""
+
+    BASH = "bash"
+    ZSH = "zsh"
+    FISH = "fish"
 
 
 class Guarded(VerbGroup):
@@ -153,16 +164,31 @@ app.add_typer(
 def start(
     ctx: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+    install: Annotated[
+        bool, typer.Option("--install-completion", help="Complete verbs, runs, settings … by Tab.")
+    ] = False,
+    show: Annotated[bool, typer.Option("--show-completion", help="Print the script that completes.")] = False,
+    shell: Annotated[Shell | None, typer.Option(help="Of these two; omit for the shell that calls.")] = None,
 ) -> None:
     """Map recorded RGB-D and LiDAR logs: trajectory, pose graph, octree, 2D slice and MCAP log."""
     if version:
         print(f"mapper {__version__}")
+    elif install or show:
+        name = shell.value if shell else completion.detected_shell()
+        if show:
+            print(completion.SCRIPTS[name], end="")
+        else:
+            print(f"{completion.install(name)}: completion for {name}, from the next shell on")
+        raise typer.Exit
     elif ctx.invoked_subcommand is None:
         show_help(ctx)
 
 
 def main() -> None:
     """Run the command line."""
+    if completion.ASKED_BY in os.environ:
+        completion.answer(typer.main.get_command(app))
+        return
     prepare_environment()
     handle_interrupts()
     for name in ("stdout", "stderr"):

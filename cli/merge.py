@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli.answer import Answer, Output
+from cli.completion import run_folders
 from cli.environment import prepare_libraries
 from cli.options import workers_for
 from cli.places import MAPS, joined_names
@@ -16,7 +17,10 @@ if TYPE_CHECKING:
 
 
 def merge(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN…", help="Run folders that builds left.")],
+    runs: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN…", autocompletion=run_folders, help="Run folders that builds left."),
+    ],
     out: Annotated[
         Path | None, typer.Option(metavar="MAP", help="Folder to create.  [default: maps/RUN+RUN…]")
     ] = None,

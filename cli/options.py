@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cli.completion import assignments_to, run_folders, setting_keys
+
 if TYPE_CHECKING:
     from mapper.runtime.executor import Workers
 
@@ -15,10 +17,24 @@ ConfigFile = Annotated[
 ]
 Overrides = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change one setting; mapper config lists them all."),
+    typer.Option(
+        "--set",
+        metavar="KEY.PATH=VALUE",
+        help="Change one setting; mapper config lists them all.",
+        autocompletion=assignments_to,
+    ),
+]
+RunFolder = Annotated[
+    Path,
+    typer.Argument(metavar="RUN", autocompletion=run_folders, help="Run folder that a build left."),
 ]
 SettingKey = Annotated[
-    str | None, typer.Argument(metavar="[KEY]", help="Setting, table of settings, or the end of a name.")
+    str | None,
+    typer.Argument(
+        metavar="[KEY]",
+        help="Setting, table of settings, or the end of a name.",
+        autocompletion=setting_keys,
+    ),
 ]
 MovedLogs = Annotated[
     list[Path] | None,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cli.answer import Answer, Output
+from cli.completion import run_folders
 from cli.groups import Verb
 from cli.options import assignments
 
@@ -50,7 +51,10 @@ class WithPoints(Verb):
 
 def plan(
     run: Annotated[
-        Path, typer.Argument(metavar="RUN", help="Run folder that a build left, or a merged map.")
+        Path,
+        typer.Argument(
+            metavar="RUN", autocompletion=run_folders, help="Run folder that a build left, or a merged map."
+        ),
     ],
     from_: Annotated[str, typer.Option("--from", metavar="X Y [Z]", help="Where it starts, metres.")],
     to: Annotated[str, typer.Option("--to", metavar="X Y [Z]", help="Where it goes, metres.")],

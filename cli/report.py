@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli.answer import Answer, Output, made
+from cli.completion import run_folders
 
 if TYPE_CHECKING:
     from mapper.export.report.data import Figure
@@ -18,7 +19,10 @@ _DIGITS = 3
 
 
 def report(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders that builds left.")],
+    runs: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN...", autocompletion=run_folders, help="Run folders that builds left."),
+    ],
     out: Annotated[Path, typer.Option(help="HTML file to write.")] = Path("report.html"),
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
     *,

@@ -7,10 +7,11 @@ from typing import Annotated
 import typer
 
 from cli.answer import Answer, Output, made
+from cli.options import RunFolder
 
 
 def view(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder that a build left.")],
+    run: RunFolder,
     rrd: Annotated[
         Path | None, typer.Option(help="File to write; omit all three to keep it in RUN as run.rrd.")
     ] = None,
