@@ -28,6 +28,10 @@ RunFolder = Annotated[
     Path,
     typer.Argument(metavar="RUN", autocompletion=run_folders, help="Run folder that a build left."),
 ]
+RunFolders = Annotated[
+    list[Path],
+    typer.Argument(metavar="RUN...", autocompletion=run_folders, help="Run folders that builds left."),
+]
 SettingKey = Annotated[
     str | None,
     typer.Argument(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli.answer import Answer, Output, made
-from cli.completion import run_folders
+from cli.options import RunFolders
 
 if TYPE_CHECKING:
     from mapper.export.report.data import Figure
@@ -19,10 +19,7 @@ _DIGITS = 3
 
 
 def report(
-    runs: Annotated[
-        list[Path],
-        typer.Argument(metavar="RUN...", autocompletion=run_folders, help="Run folders that builds left."),
-    ],
+    runs: RunFolders,
     out: Annotated[Path, typer.Option(help="HTML file to write.")] = Path("report.html"),
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
     *,
@@ -40,12 +37,12 @@ def report(
     if out.exists() and not overwrite:
         raise RunError(f"{out}: exists already; choose another --out, or pass --overwrite to replace it")
     loaded = [open_run(run) for run in runs]
-    names = _names(runs)
+    names = distinct_names(runs)
     write_report(out, [chapter_of(run, name, _figures(run)) for run, name in zip(loaded, names, strict=True)])
     return made(out)
 
 
-def _names(runs: Sequence[Path]) -> list[str]:
+def distinct_names(runs: Sequence[Path]) -> list[str]:
     """Return the folders' names, or their paths as given where names are not unique."""
     short = [run.resolve().name for run in runs]
     seen = Counter(short)

@@ -1,5 +1,6 @@
-"""``mapper view``: a finished run in Rerun."""
+"""``mapper view``: a finished run in Rerun, or runs as one page with the map in 3D."""
 
+from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
@@ -7,11 +8,31 @@ from typing import Annotated
 import typer
 
 from cli.answer import Answer, Output, made
-from cli.options import RunFolder
+from cli.options import RunFolders
+from cli.report import distinct_names
+
+
+def write_page(runs: Sequence[Path], path: Path, *, overwrite: bool) -> Path:
+    """Write the map of some runs as a page; return its path."""
+    from mapper.core.errors import RunError
+    from mapper.export.report.data import chapter_of
+    from mapper.export.report.map_page import write_map_page
+    from mapper.run.folder import open_run
+
+    if path.exists() and not overwrite:
+        raise RunError(f"{path}: exists already; choose another --out, or pass --overwrite to replace it")
+    loaded = [open_run(run) for run in runs]
+    names = distinct_names(runs)
+    write_map_page(path, [chapter_of(run, name, ()) for run, name in zip(loaded, names, strict=True)])
+    return path
 
 
 def view(
-    run: RunFolder,
+    runs: RunFolders,
+    html: Annotated[
+        bool, typer.Option("--html", help="Write one page with the map in 3D, for any browser, offline.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="With --html: the file; omit for RUN.html here.")] = None,
     rrd: Annotated[
         Path | None, typer.Option(help="File to write; omit all three to keep it in RUN as run.rrd.")
     ] = None,
@@ -20,21 +41,29 @@ def view(
         str | None,
         typer.Option(metavar="URL", help="Show the run in a viewer that runs: rerun+http://HOST:9876/proxy."),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the --rrd file.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the --rrd file or OUT.")] = False,
     *,
     output: Output,  # noqa: ARG001
 ) -> Answer:
-    """Show a finished run in Rerun: paths, graph, loops, voxels, cloud, slice, images and diagnostics.
+    """Show a finished run in Rerun or in a browser: path, graph, loops, voxels, cloud, slice, images.
 
-    Example: mapper view runs/xyz --spawn, or: mapper view runs/xyz --rrd xyz.rrd
+    Example: mapper view runs/xyz --spawn, or: mapper view runs/xyz --html
     """
     from mapper.core.errors import ConfigError, RunError
     from mapper.export.rerun.finished import show_run
     from mapper.run.files import RERUN
     from mapper.run.folder import open_run
 
-    if (rrd is not None) + spawn + (connect is not None) > 1:
-        raise ConfigError("--rrd, --spawn and --connect: choose one")
+    if (rrd is not None) + spawn + (connect is not None) + html > 1:
+        raise ConfigError("--rrd, --spawn, --connect and --html: choose one")
+    if html:
+        page = write_page(runs, out or Path(f"{runs[0].resolve().name}.html"), overwrite=overwrite)
+        return made(page)
+    if out is not None:
+        raise ConfigError(f"--out {out}: needs --html")
+    if len(runs) > 1:
+        raise ConfigError(f"{len(runs)} runs: Rerun shows one; --html shows several")
+    (run,) = runs
     if rrd is not None and rrd.exists() and not overwrite:
         raise RunError(f"{rrd}: exists already; choose another --rrd, or pass --overwrite to replace it")
     built = open_run(run)

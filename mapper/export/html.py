@@ -5,14 +5,22 @@ from html import escape
 from importlib import resources
 
 from mapper import __version__
+from mapper.export import palette
 
 _POLICY = (
-    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
+    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline' data:; "
     "base-uri 'none'; form-action 'none'"
 )
 
 
-def document(title: str, *, header: str, main: Iterable[str], scripts: Iterable[str] = ()) -> str:
+def document(
+    title: str,
+    *,
+    header: str,
+    main: Iterable[str],
+    scripts: Iterable[str] = (),
+    styles: Iterable[str] = (),
+) -> str:
     """Return a page's HTML.
 
     Args:
@@ -20,6 +28,7 @@ def document(title: str, *, header: str, main: Iterable[str], scripts: Iterable[
         header: HTML inside the bar that stays on top.
         main: HTML of the sections.
         scripts: HTML of script elements.
+        styles: CSS after that of every page.
     """
     style = (resources.files("mapper.export.report") / "page.css").read_text(encoding="utf-8")
     return "\n".join(
@@ -31,7 +40,8 @@ def document(title: str, *, header: str, main: Iterable[str], scripts: Iterable[
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f'<meta http-equiv="Content-Security-Policy" content="{escape(_POLICY, quote=False)}">',
             f"<title>{escape(title)}</title>",
-            f"<style>\n{style}</style>",
+            f"<style>\n{_palette_css()}\n{style}</style>",
+            *(f"<style>\n{more}</style>" for more in styles),
             "</head>",
             "<body>",
             f"<header>{header}</header>",
@@ -45,6 +55,24 @@ def document(title: str, *, header: str, main: Iterable[str], scripts: Iterable[
             "",
         ]
     )
+
+
+def _palette_css() -> str:
+    """Return the palette as CSS variables, so that pages and pictures agree."""
+    named: dict[str, palette.Rgb] = {
+        "backdrop": palette.BACKDROP,
+        "estimate": palette.ESTIMATE,
+        "truth": palette.TRUTH,
+        "accepted": palette.ACCEPTED,
+        "rejected": palette.REJECTED,
+        "doubtful": palette.DOUBTFUL,
+        "start": palette.START,
+        "end": palette.END,
+        "end-on-dark": palette.END_ON_DARK,
+        **{f"run{number}": color for number, color in enumerate(palette.RUNS)},
+    }
+    rules = " ".join(f"--{name}: #{bytes(color).hex()};" for name, color in named.items())
+    return f":root {{ {rules} }}"
 
 
 def section(title: str, body: str) -> str:

@@ -14,6 +14,7 @@ Colors = NDArray[np.uint8]
 
 _HALF_SPAN = 1 << (AXIS_BITS - 1)  # voxels on either side of the world's origin
 _BATCH = 1 << 16  # points added at once: bounds the memory reserved ahead of need
+_LOWEST_LEVEL = 30.0  # of 255: where the palette of heights begins
 _SUMS = 7  # x, y, z, red, green, blue, count
 
 
@@ -114,16 +115,19 @@ def _fold(points, colors, voxels_per_m, index, sums, size):  # type: ignore[no-u
 def height_colors(
     heights_m: NDArray[np.floating], *, between_m: tuple[float, float] | None = None
 ) -> NDArray[np.uint8]:
-    """Return (N, 3) uint8 RGB for (N,) heights, from blue to red; the palette is Turbo (Mikhailov 2019).
+    """Return (N, 3) uint8 RGB for (N,) heights, from dark violet to yellow.
+
+    The palette is Viridis (Smith & van der Walt 2015), which people who see no difference of red and green
+    read too, without its darkest tenth, which would not be seen on the dark ground of a viewer.
 
     Args:
         heights_m: (N,) heights in any frame.
-        between_m: Heights of pure blue and red; None is the 2nd and the 98th percentile.
+        between_m: Heights of the first and of the last colour; None is the 2nd and the 98th percentile.
     """
     if len(heights_m) == 0:
         return np.empty((0, 3), np.uint8)
     low, high = between_m or np.percentile(heights_m, [2.0, 98.0])
     share = np.clip((heights_m - low) / max(float(high - low), 1e-9), 0.0, 1.0)
-    levels = np.rint(255.0 * share).astype(np.uint8).reshape(-1, 1)
-    bgr = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)
+    levels = np.rint(_LOWEST_LEVEL + (255.0 - _LOWEST_LEVEL) * share).astype(np.uint8).reshape(-1, 1)
+    bgr = cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)
     return np.ascontiguousarray(bgr.reshape(-1, 3)[:, ::-1], dtype=np.uint8)

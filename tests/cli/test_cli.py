@@ -16,7 +16,7 @@ from cli.main import app
 from evaluators.metrics.evaluate import assess
 from mapper.run.folder import open_run
 from mapper.sources.trajectory_files import read_tum
-from tests.support.command_line import mapper
+from tests.support.command_line import HEAVY, mapper
 
 VERBS = [
     "build",
@@ -43,24 +43,6 @@ VERBS = [
     "doctor",
     "inspect",
 ]
-HEAVY = {
-    "cv2",
-    "numba",
-    "gtsam",
-    "matplotlib",
-    "foxglove",
-    "mcap",
-    "pydantic",
-    "numpy",
-    "rich",
-    "open3d",
-    "kiss_icp",
-    "kiss_matcher",
-    "rerun",
-    "distributed",
-    "rosbags",
-    "laspy",
-}
 
 
 @pytest.fixture

@@ -12,8 +12,7 @@ import typer
 from cli import completion
 from cli.completion import SCRIPTS, candidates, run_folders, words_of
 from cli.main import app
-from tests.cli.test_cli import HEAVY
-from tests.support.command_line import mapper
+from tests.support.command_line import HEAVY, mapper
 
 COMMAND = typer.main.get_command(app)
 PROGRAM = f"#!/bin/sh\nexec {sys.executable} -c 'from cli.main import main; main()' \"$@\"\n"

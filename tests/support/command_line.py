@@ -4,6 +4,26 @@ from typer.testing import CliRunner, Result
 
 from cli.main import app
 
+HEAVY = {
+    "cv2",
+    "numba",
+    "gtsam",
+    "matplotlib",
+    "foxglove",
+    "mcap",
+    "pydantic",
+    "numpy",
+    "rich",
+    "open3d",
+    "kiss_icp",
+    "kiss_matcher",
+    "rerun",
+    "distributed",
+    "rosbags",
+    "laspy",
+}
+"""Packages that take long to import: help and completion do without."""
+
 
 def invoke(*arguments: object) -> Result:
     """Run ``mapper`` with the arguments; what is no mistake of the user's is raised."""

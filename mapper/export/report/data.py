@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.errors import DataError
+from mapper.core.errors import ConfigError, DataError
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, nearest
 from mapper.export.grid import grid_image
 from mapper.export.path_band import SIGMAS
@@ -64,6 +64,17 @@ def chapter_of(run: Run, name: str, figures: Sequence[Figure]) -> Chapter:
         MapperError: A file of the run cannot be read.
     """
     return Chapter(name, run, load_results(run), tuple(figures))
+
+
+def refuse_same_names(chapters: Sequence[Chapter]) -> None:
+    """Refuse a page about no run, or about two of one name.
+
+    Raises:
+        ConfigError: That is so.
+    """
+    names = [chapter.name for chapter in chapters]
+    if not names or len(set(names)) < len(names):
+        raise ConfigError(f"page: runs {', '.join(names) or 'none'}; want one or more, each of its own name")
 
 
 def drawn(chapter: Chapter) -> dict[str, Any]:
@@ -125,7 +136,7 @@ def views_uri(run: Run) -> str | None:
     if image is None:
         raise DataError(f"{path}: cannot be read as an image; make it again with mapper fuse")
     rgb = np.ascontiguousarray(image[:, :, ::-1])
-    return _uri("jpeg", encode_jpeg(rgb, width_px=_VIEW_PX, quality=_VIEW_QUALITY))
+    return data_uri("jpeg", encode_jpeg(rgb, width_px=_VIEW_PX, quality=_VIEW_QUALITY))
 
 
 class _Seconds:
@@ -173,7 +184,7 @@ def _loop(loop: LoopClosure, results: RunResults, seconds: _Seconds) -> dict[str
     T_world_node = results.graph.T_world_node
     ends = None
     if loop.i in T_world_node and loop.j in T_world_node:
-        ends = [[round(float(v), 3) for v in T_world_node[node][:2, 3]] for node in (loop.i, loop.j)]
+        ends = [[round(float(v), 3) for v in T_world_node[node][:3, 3]] for node in (loop.i, loop.j)]
     return {
         "i": loop.i,
         "j": loop.j,
@@ -181,10 +192,10 @@ def _loop(loop: LoopClosure, results: RunResults, seconds: _Seconds) -> dict[str
         "by": loop.proposed_by,
         "matches": loop.matches,
         "inliers": loop.inliers,
-        "rmse_m": _number(loop.rmse_m),
-        "before_m": _number(None if loop.before is None else loop.before.translation_m),
-        "after_m": _number(None if loop.after is None else loop.after.translation_m),
-        "weight": _number(loop.weight),
+        "rmse_m": four_digits(loop.rmse_m),
+        "before_m": four_digits(None if loop.before is None else loop.before.translation_m),
+        "after_m": four_digits(None if loop.after is None else loop.after.translation_m),
+        "weight": four_digits(loop.weight),
         "verdict": loop.verdict,
         "reason": loop.reason,
         "ends": ends,
@@ -198,7 +209,7 @@ def _plan(grid: OccupancyGrid) -> dict[str, Any]:
         raise DataError(f"a slice of {grid.cells.shape} cells cannot be encoded as PNG")
     height, width = grid.cells.shape
     return {
-        "uri": _uri("png", data.tobytes()),
+        "uri": data_uri("png", data.tobytes()),
         "x": float(grid.origin_world_m[0]),
         "y": float(grid.origin_world_m[1]),
         "width_m": width * grid.resolution_m,
@@ -206,13 +217,15 @@ def _plan(grid: OccupancyGrid) -> dict[str, Any]:
     }
 
 
-def _uri(kind: str, data: bytes) -> str:
+def data_uri(kind: str, data: bytes) -> str:
+    """Return an image file of a kind, "png" or "jpeg", as the address that a page shows it by."""
     return f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
 def _rounded(values: Sequence[float]) -> list[float | None]:
-    return [_number(value) for value in values]
+    return [four_digits(value) for value in values]
 
 
-def _number(value: float | None) -> float | None:
+def four_digits(value: float | None) -> float | None:
+    """Return a number to four digits; None if it is not known."""
     return None if value is None or not math.isfinite(value) else float(f"{value:.4g}")

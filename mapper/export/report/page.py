@@ -8,9 +8,9 @@ from itertools import starmap
 from pathlib import Path
 from typing import Any
 
-from mapper.core.errors import ConfigError
 from mapper.export.html import document, section
-from mapper.export.report.data import Chapter, drawn, map_sizes, residual_unit, views_uri
+from mapper.export.report.data import Chapter, drawn, map_sizes, refuse_same_names, residual_unit, views_uri
+from mapper.export.report.map_page import json_element, map_html, map_scripts, map_style
 from mapper.runtime.atomic import write_text
 
 _CURVES = (
@@ -20,6 +20,7 @@ _CURVES = (
     ("inliers", "Inliers of each frame", ""),
     ("ms", "Time to track each frame", "ms"),
 )
+_MOST_POINTS = 500_000  # the page of the map alone has more
 _HINT = '<p class="hint">Drag to zoom in, double-click to see all again.</p>'
 
 
@@ -30,11 +31,7 @@ def write_report(path: Path, chapters: Sequence[Chapter]) -> None:
         ConfigError: No runs, or two of one name.
         MapperError: A file of a run cannot be read.
     """
-    names = [chapter.name for chapter in chapters]
-    if not names or len(set(names)) < len(names):
-        raise ConfigError(
-            f"report: runs {', '.join(names) or 'none'}; want one or more, each of its own name"
-        )
+    refuse_same_names(chapters)
     write_text(path, page_of(chapters))
 
 
@@ -42,12 +39,12 @@ def page_of(chapters: Sequence[Chapter]) -> str:
     """Return the page's HTML."""
     ours = resources.files("mapper.export.report")
     title = " · ".join(chapter.name for chapter in chapters)
-    data = json.dumps([drawn(chapter) for chapter in chapters], allow_nan=False, separators=(",", ":"))
     return document(
         f"{title} – mapper report",
         header=_header(chapters),
         main=[
             section("Verdict", _columns(starmap(_verdict, enumerate(chapters)))),
+            section("Map", map_html(chapters)),
             section("Plans", _HINT + _columns(starmap(_plan, enumerate(chapters)))),
             section("Views", _columns(starmap(_views, enumerate(chapters)))),
             section("Summary", _table(["", *_names(chapters)], _figures(chapters))),
@@ -59,10 +56,11 @@ def page_of(chapters: Sequence[Chapter]) -> str:
             section("Configuration", _settings(chapters)),
         ],
         scripts=[
-            # Nothing inside a script element ends it but its end tag.
-            f'<script type="application/json" id="data">{data.replace("<", chr(92) + "u003c")}</script>',
+            json_element("data", [drawn(chapter) for chapter in chapters]),
+            *map_scripts(chapters, most_points=_MOST_POINTS),
             f"<script>\n{(ours / 'page.js').read_text(encoding='utf-8')}</script>",
         ],
+        styles=[map_style()],
     )
 
 

@@ -1,0 +1,203 @@
+// The scene of all runs, drawn when something has changed: over each other, or side by side.
+
+import { Box3, Color, ColorManagement, LinearSRGBColorSpace, PerspectiveCamera, Scene, Vector3, WebGLRenderer } from "three";
+import { NEVER } from "mapper/points";
+import { Segments } from "mapper/lines";
+import { Markers } from "mapper/markers";
+import { Navigation } from "mapper/navigation";
+import { frameAt, loopAt, pointAt, Screen } from "mapper/picking";
+
+const FOV_DEG = 50;
+const SLOW_MS = 40; // a frame that takes longer while the eye moves is drawn with fewer points
+const FAST_MS = 25;
+const LEAST_SHARE = 0.1;
+const REST_MS = 150; // after a motion all points are drawn again
+
+ColorManagement.enabled = false; // colours are drawn as the palette has them
+
+export class MapView {
+  /** Throws where the browser has no WebGL. */
+  constructor(canvas, layers, ramp) {
+    Object.assign(this, { canvas, layers, ramp });
+    this.renderer = new WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
+    this.renderer.outputColorSpace = LinearSRGBColorSpace;
+    this.renderer.setClearColor(getComputedStyle(canvas).backgroundColor);
+    this.camera = new PerspectiveCamera(FOV_DEG, 1, 0.01, 1000);
+    this.scene = new Scene();
+    this.tools = new Scene(); // what is measured, drawn over every run
+    this.shown = layers.map(() => true);
+    this.state = { points: "cloud", coloring: "height", isBeside: false, cut_m: Infinity, until: NEVER, size: 1 };
+    this.hidden = new Set();
+    this.share = 1;
+    for (const one of layers) this.scene.add(one.group);
+    this.box = this.#box();
+    this.navigation = new Navigation(this.camera, canvas, () => this.#moved());
+    new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
+    this.resize();
+    this.navigation.lookAt(this.box);
+    this.update({});
+    requestAnimationFrame((now) => this.#tick(now));
+  }
+
+  /** Change what is shown; names as in state. */
+  update(changes) {
+    Object.assign(this.state, changes);
+    const { points: kind, coloring } = this.state, range = this.range();
+    const isRepainted = ["points", "coloring"].some((name) => name in changes);
+    this.layers.forEach((one, run) => {
+      one.group.visible = this.shown[run];
+      for (const [id, set] of Object.entries(one.points)) {
+        set.object.visible = id === kind;
+        set.hide(this.state);
+        if (isRepainted && id === kind) set.paint(coloring, range, { ramp: this.ramp, runColor: one.runColor });
+      }
+      for (const [id, object] of Object.entries(one.objects)) object.visible = !this.hidden.has(id);
+    });
+    this.invalidate();
+  }
+
+  /** Lowest and highest value of the colouring, over all runs. */
+  range() {
+    const { points, coloring } = this.state;
+    const key = coloring === "time" || coloring === "hits" ? coloring : "height";
+    const ranges = this.layers.map((one) => one.ranges(points)[key]);
+    return [Math.min(...ranges.map(([low]) => low)), Math.max(...ranges.map(([, high]) => high))];
+  }
+
+  async showLayer(height_m) {
+    await Promise.all(this.layers.map((one) => one.showLayer(height_m)));
+    this.invalidate();
+  }
+
+  /** Mark some points, and the line between two. */
+  measured(places) {
+    this.tools.clear();
+    const color = new Color("#ffffff");
+    const flat = places.flatMap((place) => place.toArray());
+    if (places.length) this.tools.add(new Markers(flat, { color: new Color("#e69f00"), size_px: 12 }).object);
+    this.line = places.length === 2 ? new Segments(flat, { color, width_px: 2 }) : null;
+    if (this.line) this.tools.add(this.line.object);
+    this.invalidate();
+  }
+
+  frameAt(x, y) {
+    return this.#pick(x, y, (one, screen) => {
+      const frame = this.hidden.has("keyframes") ? null : frameAt(one, one.frames, screen, x, y);
+      return frame && { layers: one, frame };
+    });
+  }
+
+  loopAt(x, y) {
+    return this.#pick(x, y, (one, screen) => {
+      const shown = Object.entries(one.loops).filter(([id]) => !this.hidden.has(id)).flatMap(([, loops]) => loops);
+      const loop = loopAt(shown, screen, x, y);
+      return loop && { layers: one, loop };
+    });
+  }
+
+  pointAt(x, y) {
+    return this.#pick(x, y, (one, screen) => pointAt(one.points[this.state.points], screen, x, y));
+  }
+
+  resize() {
+    const { clientWidth: width, clientHeight: height } = this.canvas.parentElement;
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.renderer.setSize(width, height, false);
+    this.#aspect();
+    this.invalidate();
+  }
+
+  invalidate() {
+    this.isStale = true;
+  }
+
+  #moved() {
+    this.movedAt = performance.now();
+    this.invalidate();
+  }
+
+  /** Parts of the canvas, in CSS pixels, with the runs that each shows. */
+  #panes() {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const runs = this.layers.map((_, run) => run).filter((run) => this.shown[run]);
+    if (!this.state.isBeside || runs.length < 2) return [{ left: 0, width, height, runs }];
+    const each = width / runs.length;
+    return runs.map((run, i) => ({ left: i * each, width: each, height, runs: [run] }));
+  }
+
+  #pick(x, y, find) {
+    for (const pane of this.#panes()) {
+      if (x < pane.left || x >= pane.left + pane.width) continue;
+      const screen = new Screen(this.camera, pane);
+      for (const run of pane.runs) {
+        const found = find(this.layers[run], screen);
+        if (found) return found;
+      }
+    }
+    return null;
+  }
+
+  #aspect() {
+    const [{ width, height }] = this.#panes();
+    this.camera.aspect = width / Math.max(height, 1);
+    this.camera.updateProjectionMatrix();
+  }
+
+  #tick(now) {
+    requestAnimationFrame((next) => this.#tick(next));
+    const elapsed_ms = now - (this.tickedAt ?? now);
+    this.tickedAt = now;
+    this.navigation.advance(Math.min(elapsed_ms, 100) / 1000);
+    const isMoving = now - (this.movedAt ?? -Infinity) < REST_MS;
+    if (isMoving && this.wasDrawn) {
+      if (elapsed_ms > SLOW_MS) this.share = Math.max(LEAST_SHARE, this.share * 0.85);
+      else if (elapsed_ms < FAST_MS) this.share = Math.min(1, this.share * 1.1);
+    }
+    const share = isMoving ? this.share : 1;
+    if (share !== this.drawnShare) this.invalidate();
+    this.wasDrawn = this.isStale;
+    if (this.isStale) this.#draw(share);
+  }
+
+  #draw(share) {
+    this.isStale = false;
+    this.drawnShare = share;
+    this.canvas.dataset.share = share;
+    this.#aspect();
+    const { renderer, camera } = this, ratio = renderer.getPixelRatio();
+    const panes = this.#panes();
+    renderer.setScissorTest(panes.length > 1);
+    renderer.autoClear = false;
+    renderer.clear();
+    for (const pane of panes) {
+      renderer.setViewport(pane.left, 0, pane.width, pane.height);
+      renderer.setScissor(pane.left, 0, pane.width, pane.height);
+      const pixels = ratio * pane.height / (2 * Math.tan(camera.fov * Math.PI / 360));
+      this.layers.forEach((one, run) => {
+        one.group.visible = pane.runs.includes(run);
+        for (const set of Object.values(one.points)) set.fit(camera, { pixels, scale: this.state.size, share });
+        for (const segments of Object.values(one.segments)) this.#fit(segments, pane, pixels, ratio);
+      });
+      if (this.line) this.#fit(this.line, pane, pixels, ratio);
+      renderer.render(this.scene, camera);
+      renderer.render(this.tools, camera);
+    }
+  }
+
+  #fit({ uniforms }, { width, height }, pixels, ratio) {
+    uniforms.viewport.value.set(width * ratio, height * ratio);
+    uniforms.pixels.value = pixels;
+  }
+
+  /** Around the paths and all but a few stray points. */
+  #box() {
+    const box = new Box3(), at = new Vector3();
+    for (const one of this.layers) {
+      const { cloud } = one.points, axes = [0, 1, 2].map((axis) => cloud.spread((set, i) => set.low[axis] + set.step * set.places[4 * i + axis]));
+      if (cloud.count) box.expandByPoint(at.fromArray(axes.map(([low]) => low))).expandByPoint(at.fromArray(axes.map(([, high]) => high)));
+      const { x, y, z } = one.run.path;
+      for (let i = 0; i < x.length; i++) box.expandByPoint(at.set(x[i], y[i], z[i]));
+    }
+    return box;
+  }
+}

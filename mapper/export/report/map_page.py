@@ -1,0 +1,130 @@
+"""The map in 3D as a part of a page, or as a page of its own; the browser draws it from ``map/*.js``."""
+
+import json
+from collections.abc import Iterator, Sequence
+from html import escape
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from mapper.export.html import document
+from mapper.export.report.data import Chapter, drawn, refuse_same_names, views_uri
+from mapper.export.report.map_data import MOST_POINTS, map_of
+from mapper.mapping.cloud import height_colors
+from mapper.runtime.atomic import write_text
+
+_LAYERS = (
+    ("path", "path", "run0", True),
+    ("keyframes", "keyframes", "run0", True),
+    ("ends", "start, end, direction", "start", True),
+    ("band", "uncertainty, 2 σ", "run0", True),
+    ("doubtful", "doubtful frames", "doubtful", True),
+    ("truth", "truth", "truth", False),
+    ("accepted", "<b></b> loops that hold", "accepted", True),
+    ("rejected", "<b></b> loops refused", "rejected", False),
+)
+_AS_IS = " !\"$&'()*+,/:;<=>?@[\\]^`{|}~"  # what a data: address may hold as it is, and % and # may not
+
+
+def write_map_page(path: Path, chapters: Sequence[Chapter]) -> None:
+    """Write a page that shows the maps of some runs in 3D, whole or not at all; it loads nothing.
+
+    Raises:
+        ConfigError: No runs, or two of one name.
+        MapperError: A file of a run cannot be read.
+    """
+    refuse_same_names(chapters)
+    title = " · ".join(chapter.name for chapter in chapters)
+    write_text(
+        path,
+        document(
+            f"{title} – map",
+            header=f"<h1>{escape(title)}</h1>",
+            main=[map_html(chapters, css="map whole")],
+            scripts=[json_element("data", [drawn(chapter) for chapter in chapters]), *map_scripts(chapters)],
+            styles=[map_style()],
+        ),
+    )
+
+
+def map_html(chapters: Sequence[Chapter], *, css: str = "map") -> str:
+    """Return the map's place in a page, with its controls; and the pictures that take its place."""
+    runs = "".join(
+        f'<label><input type="checkbox" data-map-run="{i}" checked> '
+        f'<i style="--of: var(--run{i % 6})"></i>{escape(chapter.name)}</label>'
+        for i, chapter in enumerate(chapters)
+    )
+    layers = "".join(
+        f'<label><input type="checkbox" data-map-layer="{layer}"{" checked" if is_on else ""}> '
+        f'<i style="--of: var(--{color})"></i>{label}</label>'
+        for layer, label, color, is_on in _LAYERS
+    )
+    template = (_folder() / "map.html").read_text(encoding="utf-8")
+    pictures = "".join(_pictures(chapters))
+    return (
+        template.replace("{css}", css)
+        .replace("{runs}", runs)
+        .replace("{layers}", layers)
+        .replace("{pictures}", pictures)
+    )
+
+
+def map_scripts(chapters: Sequence[Chapter], *, most_points: int = MOST_POINTS) -> Iterator[str]:
+    """Yield the script elements of the map: its data, the modules by their names, and its start.
+
+    The page has the paths and loops in a JSON element called ``data``.
+    """
+    ramp = height_colors(np.linspace(0.0, 1.0, 256), between_m=(0.0, 1.0))
+    maps = [map_of(chapter, runs=len(chapters), most_points=most_points) for chapter in chapters]
+    yield json_element("maps", {"ramp": ramp.tolist(), "maps": maps})
+    yield f'<script type="importmap">{_safe(json.dumps({"imports": dict(_modules())}))}</script>'
+    yield '<script type="module">import "mapper/main";</script>'
+
+
+def map_style() -> str:
+    """Return the style of the map."""
+    return (_folder() / "map.css").read_text(encoding="utf-8")
+
+
+def json_element(name: str, data: Any) -> str:
+    """Return a script element that holds data for scripts."""
+    text = json.dumps(data, allow_nan=False, separators=(",", ":"))
+    return f'<script type="application/json" id="{name}">{_safe(text)}</script>'
+
+
+def _safe(json_text: str) -> str:
+    """Return JSON as it may stand in a script element, which nothing ends but its end tag."""
+    return json_text.replace("<", "\\u003c")
+
+
+def _modules() -> Iterator[tuple[str, str]]:
+    """Yield the name by which each module is imported, and its text as an address.
+
+    A page that is opened from a disk may import no file beside it, and a module in the page has no name.
+    """
+    vendored = _folder() / "three"
+    yield "three", _address(vendored / "three.module.min.js")
+    yield "three/OrbitControls", _address(vendored / "OrbitControls.js")
+    for module in sorted(_folder().iterdir(), key=lambda module: module.name):
+        stem, _, ending = module.name.rpartition(".")
+        if ending == "js":
+            yield f"mapper/{stem}", _address(module)
+
+
+def _address(module: Traversable) -> str:
+    return f"data:text/javascript;charset=utf-8,{quote(module.read_text(encoding='utf-8'), safe=_AS_IS)}"
+
+
+def _folder() -> Traversable:
+    return resources.files("mapper.export.report") / "map"
+
+
+def _pictures(chapters: Sequence[Chapter]) -> Iterator[str]:
+    for chapter in chapters:
+        uri, name = views_uri(chapter.run), escape(chapter.name)
+        if uri:
+            yield f'<img src="{uri}" alt="{name} from above and from the side">'
