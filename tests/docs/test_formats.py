@@ -85,7 +85,7 @@ def test_the_pages_reader_reads_every_voxel_of_an_octree(run, octree_reader):
     ours = read_octree(run / "map.octree")
     centres = (keys - 32768 + 0.5) * header["config"]["resolution_m"]
     assert len(keys) == len(np.unique(keys, axis=0)) == header["voxels"] > 10_000
-    np.testing.assert_array_equal(ours.query(centres), log_odds)
+    np.testing.assert_array_equal(ours.log_odds_at(centres), log_odds)
     limit = np.log(header["config"]["occupied_probability"] / (1 - header["config"]["occupied_probability"]))
     np.testing.assert_array_equal(ours.are_occupied(centres), log_odds >= np.float32(limit))
     leaves = ours.leaves()
