@@ -88,7 +88,7 @@ class Lines(_Notes):
             nonlocal said, reached
             reached = done, total
             now = time.monotonic()
-            if now - said > _SECONDS_BETWEEN_LINES and done < total:
+            if now - said > _SECONDS_BETWEEN_LINES and 0 < done < total:
                 said = now
                 rate = done / (now - began)
                 self._show(f"{name}: {done}/{total}, {_rate_text(rate)}, {(total - done) / rate:.0f} s left")

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from mapper.doctor.finding import Finding
+    from mapper.runtime.progress import Progress
 
 _MARKS = {"well": "ok  ", "warning": "warn", "failed": "FAIL"}
 
@@ -35,22 +36,28 @@ def doctor(
             "Repeatable.",
         ),
     ] = None,
+    warm: Annotated[
+        bool,
+        typer.Option("--warm", help="Compile the kernels now, so that the first build need not; a minute."),
+    ] = False,
     *,
     output: Output,
 ) -> Answer:
     """Check the machine, try every library in a process of its own, and print what to do.
 
-    With RUN, compare all its files with the sizes and digests in its manifest instead. The exit status is 1
-    if anything failed.
+    With RUN, compare all its files with the sizes and digests in its manifest instead; with --warm, compile
+    the kernels. The exit status is 1 if anything failed.
 
-    Example: mapper doctor --json, or: mapper doctor runs/xyz, or just: mapper doctor
+    Example: mapper doctor --json, or: mapper doctor runs/xyz, or after pip install: mapper doctor --warm
     """
     from mapper.core.errors import MapperError
 
     if accept:
         _accept(run, accept)
-    progress = output.progress() if sys.stderr.isatty() else SILENT
-    if run is None:
+    progress = output.progress() if warm or sys.stderr.isatty() else SILENT
+    if warm:
+        findings = _warmed(run, progress)
+    elif run is None:
         from mapper.doctor.examination import examine
 
         findings = examine(progress=progress)
@@ -63,6 +70,17 @@ def doctor(
     if failed:
         error = MapperError(f"doctor: {len(failed)} of {len(findings)} failed: {', '.join(failed)}")
     return Answer({"findings": findings}, _table(findings), error=error)
+
+
+def _warmed(run: Path | None, progress: "Progress") -> "list[Finding]":
+    from mapper.core.errors import ConfigError
+    from mapper.doctor.machine import look_at_kernels
+    from mapper.pipeline.warm_up import compile_kernels
+
+    if run is not None:
+        raise ConfigError(f"--warm: compiles kernels for all builds, so it takes no run; got {run}")
+    compile_kernels(progress=progress)
+    return [look_at_kernels()]
 
 
 def _accept(run: Path | None, names: "Sequence[str]") -> None:

@@ -38,7 +38,7 @@ def methods_for(source: Log, config: CompareConfig) -> tuple[list[Method], list[
         if name not in names:
             raise ConfigError(f"no method {name!r}; want one of {', '.join(names)}")
         if name in _LIBRARIES:
-            require(_LIBRARIES[name], "peers", f"--methods {name}")
+            require(_LIBRARIES[name], "peers", f"--method {name}")
     absent = {} if config.methods else {n: lib for n, lib in _LIBRARIES.items() if find_spec(lib) is None}
     chosen = config.methods or [name for name in names if name not in absent]
     blind = [m.name for m in images if m.name in chosen and source.sensor != "rgbd"]

@@ -83,16 +83,24 @@ def look_at_disk() -> Finding:
 
 def look_at_kernels() -> Finding:
     """Return where compiled kernels are kept, whether they can be, and how many there are by now."""
-    package = Path(mapper.__file__).parent
-    folder = Path(os.environ.get("NUMBA_CACHE_DIR") or package)
-    compiled = {file.name.rpartition("-")[0] for file in folder.rglob("*.nbi")}
+    folder, compiled = kernel_folder(), compiled_kernels()
     text = f"{len(compiled)} compiled kernels kept in {folder}"
     if not os.access(_nearest_existing(folder), os.W_OK):
         remedy = "set NUMBA_CACHE_DIR to a folder that may be written"
         return Finding("numba cache", "failed", f"{text}, which cannot be written", remedy)
     if not compiled:
-        return Finding("numba cache", "well", f"{text}: the first verb compiles them, in about a minute")
+        return Finding("numba cache", "warning", text, "mapper doctor --warm compiles them")
     return Finding("numba cache", "well", text)
+
+
+def kernel_folder() -> Path:
+    """Return the folder that keeps compiled kernels: NUMBA_CACHE_DIR, or that of this package."""
+    return Path(os.environ.get("NUMBA_CACHE_DIR") or Path(mapper.__file__).parent)
+
+
+def compiled_kernels() -> set[Path]:
+    """Return the kernels that are compiled, as files without the line and the version at the end."""
+    return {file.with_name(file.name.rpartition("-")[0]) for file in kernel_folder().rglob("*.nbi")}
 
 
 def _nearest_existing(folder: Path) -> Path:

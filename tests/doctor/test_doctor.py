@@ -105,7 +105,7 @@ def test_missing_system_libraries_come_with_the_apt_line():
 def test_a_cache_that_cannot_be_written_fails(monkeypatch, tmp_path):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     assert "0 compiled" in machine.look_at_kernels().detail
-    assert machine.look_at_kernels().verdict == "well"
+    assert machine.look_at_kernels().remedy == "mapper doctor --warm compiles them"
 
     monkeypatch.setattr(machine.os, "access", lambda _path, _mode: False)
     finding = machine.look_at_kernels()

@@ -1,0 +1,86 @@
+"""Compilation of the kernels before the first build: numba keeps what a tiny build of a log compiles."""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from mapper.core.errors import DependencyError
+from mapper.doctor.machine import compiled_kernels, processors
+from mapper.runtime.executor import Workers, make_executor, run_jobs
+from mapper.runtime.progress import SILENT, Progress, Report
+from mapper.runtime.worker_process import Failure
+
+KERNELS = 151
+"""About how many kernels are compiled, for the progress bar."""
+_POLL_S = 0.5
+
+
+def compile_kernels(*, progress: Progress = SILENT) -> None:
+    """Compile every kernel that builds of RGB-D and LiDAR logs use by default.
+
+    Two processes, where there are two processors, render and build a second of a synthetic log of each
+    sensor. Code that is compiled already is kept.
+
+    Raises:
+        DependencyError: A build failed, as it does where the compiled code cannot be kept.
+    """
+    with TemporaryDirectory(prefix="mapper-warm-") as scratch, progress.stage("compile") as report:
+        jobs = [partial(build, Path(scratch) / build.__name__) for build in (_build_rgbd, _build_lidar)]
+        workers = Workers(processes=min(2, processors()))
+        with make_executor(workers, jobs=len(jobs)) as executor, _watched(report):
+            for _, outcome in run_jobs(jobs, executor, attempts=1):
+                if isinstance(outcome, Failure):
+                    raise DependencyError(f"the build that compiles kernels failed: {outcome.reason}")
+
+
+def _build_rgbd(folder: Path) -> None:
+    from mapper.features.hamming import match_mutual_bits, pack
+    from mapper.simulation import write_tum_log
+    from mapper.simulation.config import SynthConfig
+
+    bits = pack(np.zeros((2, 32), np.uint8))
+    match_mutual_bits(bits, bits, 50, 0.8)  # of loop closures, which a second has none of
+    write_tum_log(folder / "log", SynthConfig(duration_s=1.0, width_px=320, height_px=240))
+    _build(folder, "odometry.readout_s=0.03")  # it is estimated, but only from longer logs
+
+
+def _build_lidar(folder: Path) -> None:
+    from mapper.simulation.config import LidarSynthConfig
+    from mapper.simulation.lidar import write_lidar_log
+
+    write_lidar_log(folder / "log", LidarSynthConfig(duration_s=1.0))
+    _build(folder)
+
+
+def _build(folder: Path, *overrides: str) -> None:
+    from mapper.config.loading import load_config
+    from mapper.pipeline.build import build
+    from mapper.sources import open_source
+
+    source = open_source(folder / "log")
+    build(source, load_config(None, overrides, sensor=source.sensor), folder / "run")
+
+
+@contextmanager
+def _watched(report: Report) -> Iterator[None]:
+    """Report the kernels that there are by now, again and again while inside."""
+    ended = threading.Event()
+    watcher = threading.Thread(target=_watch, args=(report, ended.wait), daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        watcher.join()
+    report(KERNELS, KERNELS)
+
+
+def _watch(report: Report, wait: Callable[[float], bool]) -> None:
+    while not wait(_POLL_S):
+        if compiled := len(compiled_kernels()):
+            report(min(compiled, KERNELS - 1), KERNELS)
