@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes .venv and installs the project into it; does nothing the second time.
+# Makes .venv, installs the project with all its extras, and compiles its kernels; does nothing the second time.
 # usage: bash scripts/setup.sh [--dev]
 #   --dev   adds what the tests need
 set -euo pipefail
@@ -71,11 +71,13 @@ make_venv() {
 missing_library() {
   # shellcheck disable=SC2086 # one word per wheel
   "$venv/bin/python" - $wheels <<'PYTHON'
-import importlib
+import importlib.util
 import re
 import sys
 
 for name in sys.argv[1:]:
+    if importlib.util.find_spec(name) is None:
+        continue
     try:
         importlib.import_module(name)
     except (ImportError, OSError) as error:
@@ -118,19 +120,39 @@ install_missing_libraries() {
 
 # numba notices a changed kernel, but not a changed kernel that another module's kernel calls.
 kernels=$(grep -rl njit mapper --include='*.py' | sort | xargs cat | sha256sum)
+stale=""
 if [ "$(cat "$venv/.kernels" 2>/dev/null)" != "$kernels" ]; then
   find mapper -name '*.nb[ic]' -delete
-  printf '%s\n' "$kernels" >"$venv/.kernels"
+  stale=yes
 fi
+
+compile_kernels() {
+  if "$venv/bin/mapper" doctor --warm >&2; then
+    printf '%s\n' "$kernels" >"$venv/.kernels"
+  else
+    say "the kernels could not be compiled; the first build will do it, or say why"
+  fi
+}
+
+# Most of what the wheels bring is never imported, so Python compiles it when it is.
+install() {
+  "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile "$@" >&2
+  install_missing_libraries
+}
 
 # The folder counts as well: an editable install and its scripts name it.
 want=$( (pwd; "$venv/bin/python" --version; cat pyproject.toml scripts/setup.sh) | sha256sum)
 if [ "$(cat "$stamp" 2>/dev/null)" != "$want" ]; then
-  say "installing the project with its extras [$extra]"
   if [ -n "$(find "$venv" -name 'mapper-0.1.0.dist-info' -print -quit)" ]; then # its name until 0.2
     "$venv/bin/python" -m pip uninstall --quiet --yes mapper >&2
   fi
-  "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable ".[$extra]" >&2
-  install_missing_libraries
+  say "installing the project"
+  install --editable .
+  [ -z "$stale" ] || compile_kernels &
+  say "installing its extras [$extra]"
+  install "octree-mapper[$extra]"
+  wait
   printf '%s\n' "$want" >"$stamp"
+elif [ -n "$stale" ]; then
+  compile_kernels
 fi
