@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from mapper.core.errors import UntrustedError
     from mapper.run.folder import Run
     from mapper.run.observers import Observer
+    from mapper.runtime.progress import Progress
     from mapper.sources.base import Log
 
     Onlooker = Callable[[Log, BuildConfig], AbstractContextManager[Observer]]
@@ -124,7 +125,7 @@ def built(
     from evaluators.metrics.evaluate import evaluate
     from mapper.config.loading import load_config, load_source_config
     from mapper.pipeline.build import build as build_run
-    from mapper.run.observers import NULL_OBSERVER
+    from mapper.run.observers import Observers
     from mapper.sources import open_source
 
     prepare_libraries()
@@ -135,9 +136,20 @@ def built(
         progress.note("first run here: the kernels are compiled once, which takes about a minute")
     for note in source.notes:
         progress.note(note)
-    with nullcontext(NULL_OBSERVER) if onlooker is None else onlooker(source, config) as observer:
-        run = build_run(source, config, out, progress=progress, observer=observer, overwrite=overwrite)
+    preview = _preview(source, out, progress)
+    with nullcontext(preview) if onlooker is None else onlooker(source, config) as observer:
+        watching = preview if onlooker is None else Observers(observer, preview)
+        run = build_run(source, config, out, progress=progress, observer=watching, overwrite=overwrite)
     return run, evaluate(run.trajectory, run.truth)
+
+
+def _preview(source: "Log", out: Path, progress: "Progress") -> "Observer":
+    """Return the observer that keeps a picture beside the files that are being written."""
+    from mapper.export.preview import PREVIEW, Preview
+    from mapper.runtime.atomic import partial_of
+
+    shown = partial_of(out) / PREVIEW
+    return Preview(shown.resolve(), source, on_first=lambda: progress.note(f"first picture: {shown}"))
 
 
 def _onlooker(rerun: str | None, *, step: bool, overwrite: bool) -> "Onlooker | None":

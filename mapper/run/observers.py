@@ -51,6 +51,28 @@ class Observer(Protocol):
         ...
 
 
+class Observers:
+    """Observer that passes everything on to several, in their order."""
+
+    def __init__(self, *observers: Observer) -> None:
+        self._observers = observers
+
+    def on_frame(self, step: Step, /) -> None:
+        """Pass the frame on."""
+        for observer in self._observers:
+            observer.on_frame(step)
+
+    def on_levelled(self, T_level_world: Transform, /) -> None:
+        """Pass the world on."""
+        for observer in self._observers:
+            observer.on_levelled(T_level_world)
+
+    def on_mapped(self, run: "Run", results: "RunResults", maps: "Maps", /) -> None:
+        """Pass the results on."""
+        for observer in self._observers:
+            observer.on_mapped(run, results, maps)
+
+
 class NullObserver:
     """Observer that ignores everything."""
 
