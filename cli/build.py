@@ -120,7 +120,7 @@ def built(
     output: Output,
     prompts: bool = False,
     onlooker: "Onlooker | None" = None,
-) -> "tuple[Run, list[Metric]]":
+) -> "tuple[Run, Sequence[Metric]]":
     """Build a run and judge its trajectory by the truth, if the log has any."""
     from evaluators.metrics.evaluate import evaluate
     from mapper.config.loading import load_config, load_source_config
@@ -140,7 +140,7 @@ def built(
     with nullcontext(preview) if onlooker is None else onlooker(source, config) as observer:
         watching = preview if onlooker is None else Observers(observer, preview)
         run = build_run(source, config, out, progress=progress, observer=watching, overwrite=overwrite)
-    return run, evaluate(run.trajectory, run.truth)
+    return run, evaluate(run.trajectory, run.truth).metrics
 
 
 def _preview(source: "Log", out: Path, progress: "Progress") -> "Observer":
@@ -185,7 +185,7 @@ def _onlooker(rerun: str | None, *, step: bool, overwrite: bool) -> "Onlooker | 
 
 def appended(
     log: Path, onto: Path, overrides: "Sequence[str]", out: Path, *, overwrite: bool, output: Output
-) -> "tuple[Run, list[Metric]]":
+) -> "tuple[Run, Sequence[Metric]]":
     """Build a run from a run and a later log of the same place, by the run's configuration."""
     from evaluators.metrics.evaluate import evaluate
     from mapper.config.loading import overridden
@@ -199,7 +199,7 @@ def appended(
     config = overridden(first.config.model_copy(update={"source": SourceConfig()}), overrides)
     source = open_source(log, config.source)
     run = append(source, first, config, out, progress=output.progress(), overwrite=overwrite)
-    return run, evaluate(run.trajectory, run.truth)
+    return run, evaluate(run.trajectory, run.truth).metrics
 
 
 def _refuse_both(config: Path | None, onto: Path, rerun: str | None) -> None:

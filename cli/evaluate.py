@@ -118,10 +118,11 @@ def evaluate(
     mapper eval runs/flat --map logs/flat --sharpness
     """
     from evaluators.metrics.evaluate import ALIGNED, assess
+    from evaluators.metrics.inputs import estimate_and_truth
     from mapper.core.errors import DataError
 
     prepare_libraries()
-    run, trajectory, known = _loaded(estimate, truth, times)
+    run, trajectory, known = estimate_and_truth(estimate, truth, times)
     if lengths is not None and known is None:
         raise DataError(f"--lengths {lengths}: relative errors need a truth; tell one with --truth")
     found = assess(
@@ -169,25 +170,6 @@ def evaluate(
         if quality is not None and map_ is not None:
             write_map_errors(plot, quality.check, title=f"{name} against {map_.resolve().name}")
     return Answer(document, text)
-
-
-def _loaded(
-    estimate: Path, truth: Path | None, times: Path | None
-) -> "tuple[Run | None, Trajectory, Trajectory | None]":
-    from evaluators.metrics.pose_files import is_kitti, read_poses
-    from mapper.core.errors import DataError
-    from mapper.run.folder import open_run
-
-    untimed = [path for path in (estimate, truth) if path and path.is_file() and is_kitti(path)]
-    if times is not None and not untimed:
-        raise DataError(f"{times}: --times is for poses in KITTI text, which neither file is")
-    if times is None and len(untimed) == 1 and truth is not None:
-        raise DataError(f"{untimed[0]}: KITTI text has no stamps to pair poses by; tell them with --times")
-    known = read_poses(truth, times=times) if truth else None
-    if estimate.is_file():
-        return None, read_poses(estimate, times=times), known
-    run = open_run(estimate)
-    return run, run.trajectory, known or run.truth
 
 
 def _needed(run: "Run | None", path: Path, option: str) -> "Run":

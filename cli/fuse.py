@@ -45,4 +45,4 @@ def fuse(
         trajectory=None if trajectory is None else read_tum(trajectory),
         progress=output.progress(),
     )
-    return summary_of(fused, evaluate(fused.trajectory, fused.truth))
+    return summary_of(fused, evaluate(fused.trajectory, fused.truth).metrics)

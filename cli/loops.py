@@ -64,7 +64,7 @@ def loops(
             remove=[_pair("--remove", text) for text in remove or ()],
             progress=output.progress(),
         )
-        solved = summary_of(built, evaluate(built.trajectory, built.truth))
+        solved = summary_of(built, evaluate(built.trajectory, built.truth).metrics)
     shown = [loop for loop in built.loops if loop.verdict == "accepted" or not accepted]
     if solved is None:
         return Answer({"run": built.path, "loops": shown}, loops_text(shown))

@@ -12,8 +12,7 @@ from cli.options import Overrides
 
 if TYPE_CHECKING:
     from evaluators.register.registration import Registered
-    from mapper.core.frames import Frame, Scan, Sensor
-    from mapper.sources.config import SourceConfig
+    from mapper.core.frames import Scan, Sensor
 
 _CLOUD = "A cloud (.bin .pcd .ply .xyz .npy .las .laz), or LOG@N: the n-th frame of a log, from 0."
 
@@ -54,7 +53,6 @@ def register(
 
     Example: mapper register scan_10.bin scan_00.bin --method hough-gicp --out registered
     """
-    from evaluators.register.config import check_method, register_config
     from evaluators.register.files import (
         FOLDER,
         registration_record,
@@ -62,7 +60,9 @@ def register(
         write_registration,
     )
     from evaluators.register.registration import register as register_frames
+    from mapper.api.logs import read_frame
     from mapper.config.loading import overridden
+    from mapper.config.register import check_method, register_config
     from mapper.core.errors import RegistrationError
     from mapper.registration.guess import parse_guess
     from mapper.runtime.atomic import atomic_folder
@@ -74,8 +74,8 @@ def register(
     T_target_source = parse_guess(guess)
     overrides = set_ or []
     opening = overridden(register_config(method, "lidar"), [o for o in overrides if o.startswith("source.")])
-    target_frame, target_sensor = _load(target, opening.source)
-    source_frame, source_sensor = _load(source, opening.source)
+    target_frame, target_sensor = read_frame(target, opening.source)
+    source_frame, source_sensor = read_frame(source, opening.source)
     seen_by: Sensor = "rgbd" if "rgbd" in (target_sensor, source_sensor) else "lidar"
     config = overridden(register_config(method, seen_by), overrides)
     registered = register_frames(target_frame, source_frame, config.registration, T_target_source)
@@ -120,23 +120,3 @@ def _shown(
         for stage in registered.stages
     ]
     record_registration(rerun, target.points_body, source.points_body, stages, sensor=sensor, name=name)
-
-
-def _load(name: str, config: "SourceConfig") -> "tuple[Frame, Sensor]":
-    """Return the frame of a name, and its sensor: a file counts as a LiDAR's, with z up."""
-    from mapper.core.errors import SourceError
-    from mapper.sources import open_source
-    from mapper.sources.clouds import read_scan
-
-    log, at, index = name.rpartition("@")
-    if not at or Path(name).exists():
-        if Path(name).is_dir():
-            raise SourceError(
-                f"{name}: is a folder; name a log's frame, as in {name}@0, "
-                f"or a run's cloud, as in {name}/cloud.ply"
-            )
-        return read_scan(Path(name), scale=config.cloud_scale), "lidar"
-    opened = open_source(Path(log), config)
-    if not index.isdecimal() or int(index) >= len(opened):
-        raise SourceError(f"{name}: want a frame of {log} from @0 to @{len(opened) - 1}")
-    return opened.entry_at(int(index)).load(), opened.sensor

@@ -1,3 +1,64 @@
-"""Maps from recorded RGB-D and LiDAR logs: odometry, pose graph, octree and exports."""
+"""Maps from recorded RGB-D and LiDAR logs: odometry, pose graph, octree and exports.
+
+Names are loaded when they are first used, so that ``import mapper`` takes no time:
+
+    >>> import mapper
+    >>> run = mapper.build("rgbd_dataset_freiburg1_xyz", out="runs/xyz")    # doctest: +SKIP
+    >>> run.octree.query(run.trajectory.positions)                          # doctest: +SKIP
+    array([0, 0, 0, ..., 0, 0, 0], dtype=int8)
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from evaluators.metrics.evaluate import evaluate
+    from mapper.api.build import build
+    from mapper.api.logs import open_log
+    from mapper.api.register import register
+    from mapper.config.loading import load_config
+    from mapper.core.errors import MapperError
+    from mapper.octree.map import OctreeMap
+    from mapper.octree.octomap_file import read_octree
+    from mapper.run.folder import Run, open_run
 
 __version__ = "0.2.0"
+
+__all__ = [
+    "MapperError",
+    "OctreeMap",
+    "Run",
+    "build",
+    "evaluate",
+    "load_config",
+    "open_log",
+    "open_run",
+    "read_octree",
+    "register",
+]
+
+_HOMES = {
+    "MapperError": "mapper.core.errors",
+    "OctreeMap": "mapper.octree.map",
+    "Run": "mapper.run.folder",
+    "build": "mapper.api.build",
+    "evaluate": "evaluators.metrics.evaluate",
+    "load_config": "mapper.config.loading",
+    "open_log": "mapper.api.logs",
+    "open_run": "mapper.run.folder",
+    "read_octree": "mapper.octree.octomap_file",
+    "register": "mapper.api.register",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a name when it is first used (PEP 562)."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'mapper' has no attribute {name!r}")
+    value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,12 +1,15 @@
 """Evaluation of one trajectory: all its metrics, with truth or without."""
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from html import escape
 
 import numpy as np
 
 from evaluators.metrics.coverage import frame_coverage, time_coverage
-from evaluators.metrics.metric import Metric
+from evaluators.metrics.inputs import Estimate, estimate_and_truth
+from evaluators.metrics.metric import Metric, shown, text_table
 from evaluators.metrics.segments import LengthErrors, lengths_for, segment_errors, segment_metrics
 from evaluators.metrics.trajectory import (
     AlignmentKind,
@@ -18,6 +21,7 @@ from evaluators.metrics.trajectory import (
     rpe,
     start_end_offset,
 )
+from mapper.core.paths import AnyPath
 from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
 
@@ -44,12 +48,91 @@ class Assessment:
     matched: Matched | None = None
     lengths: tuple[LengthErrors, ...] = ()
 
+    def __iter__(self) -> Iterator[Metric]:
+        return iter(self.metrics)
+
+    def __len__(self) -> int:
+        return len(self.metrics)
+
+    def __getitem__(self, name: str) -> float:
+        """Return the value of a metric, in the unit that it has there, by its name or the beginning of it.
+
+        Raises:
+            KeyError: No metric, or several, begin so.
+        """
+        found = [metric for metric in self.metrics if metric.name == name] or [
+            metric for metric in self.metrics if metric.name.startswith(name)
+        ]
+        if len(found) != 1:
+            names = ", ".join(metric.name for metric in found or self.metrics)
+            raise KeyError(f"{name!r}: want one of {names}")
+        return found[0].value
+
+    @property
+    def ate_m(self) -> float | None:
+        """Absolute trajectory error, RMSE, metres, after the alignment; None without truth."""
+        return next((m.value for m in self.metrics if m.name.startswith("ATE RMSE")), None)
+
+    def __str__(self) -> str:
+        return text_table(self.metrics)
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in shown(metric))}</tr>"
+            for metric in self.metrics
+        )
+        return f"<table>{rows}</table>"
+
 
 def evaluate(
-    estimate: Trajectory, truth: Trajectory | None, *, alignment: AlignmentKind = "se3"
-) -> list[Metric]:
-    """Return the numbers of ``assess``."""
-    return list(assess(estimate, truth, alignment=alignment).metrics)
+    estimate: Estimate,
+    truth: Trajectory | AnyPath | None = None,
+    *,
+    alignment: AlignmentKind = "se3",
+    times: AnyPath | None = None,
+    max_gap_s: float = 0.02,
+    lengths_m: Sequence[float] | None = None,
+) -> Assessment:
+    """Evaluate a path: its length, coverage, and with truth ATE, RPE and relative errors.
+
+    Args:
+        estimate: A run or its folder, a trajectory, or a file of TUM or KITTI text.
+        truth: True poses of the body: the same but a run; None takes a run's own, if its log has any.
+        alignment: How the estimate is laid over the truth first: "none", "yaw" (for worlds with z up), "se3"
+            or "sim3".
+        times: File of seconds, one a line, for poses in KITTI text; else these pair by line.
+        max_gap_s: Largest time between an estimated pose and its true one.
+        lengths_m: Of the segments of the relative errors; None chooses them by the length of the true path.
+
+    Returns:
+        The metrics: ``found["ATE RMSE"]`` is one of them, ``print(found)`` a table of all; distances are
+        metres, angles radians, and degrees in tables.
+
+    Raises:
+        RunError: A folder is no finished run.
+        SourceError: A file cannot be read.
+        DataError: A file is malformed, or no stamps match, or too few.
+
+    Example:
+        >>> found = mapper.evaluate(run)
+        >>> found.ate_m < 0.05, found["ATE RMSE"] == found.ate_m
+        (True, True)
+    """
+    run, trajectory, known = estimate_and_truth(estimate, truth, times)
+    frames_ns = None if run is None else np.array([record.stamp_ns for record in run.records], np.int64)
+    names = [
+        str(one) if isinstance(one, str | os.PathLike) else default
+        for one, default in ((estimate, "the estimate"), (truth, "the truth"))
+    ]
+    return assess(
+        trajectory,
+        known,
+        alignment=alignment,
+        frames_ns=frames_ns,
+        lengths_m=lengths_m,
+        max_gap_s=max_gap_s,
+        names=(names[0], names[1]),
+    )
 
 
 def assess(

@@ -8,8 +8,8 @@ import numpy as np
 
 from evaluators.pictures.registration import write_before_and_after
 from evaluators.pictures.registration_mcap import write_registration_log
-from evaluators.register.config import RegisterConfig
 from evaluators.register.registration import Registered, xyz_rpy
+from mapper.config.register import RegisterConfig
 from mapper.core.frames import Scan, Sensor
 from mapper.core.geometry import apply
 from mapper.export.palette import ESTIMATE

@@ -8,8 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from evaluators.metrics.cloud_distance import CloudDistance, DistanceTo
-from mapper.core.errors import ConfigError
-from mapper.core.frames import Frame, RgbdFrame, Scan
+from mapper.core.frames import Frame, Scan
 from mapper.core.geometry import Transform
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.registration.base import Alignment
@@ -76,7 +75,9 @@ def register(
     hough = None
     if isinstance(config, IsvdOdometryConfig):
         began = time.process_time()
-        alignment, seconds = _by_features(target, source, config)
+        from mapper.odometry.isvd_pair import align_images
+
+        alignment, seconds = align_images(target, source, config)
     else:
         # Loads libraries and compiled code, which is no step's time.
         _by_scans(_thinned(scans[0]), _thinned(scans[1]), config, T_target_source)
@@ -122,27 +123,6 @@ def _thinned(scan: Scan) -> Scan:
     """Return every tenth point of a scan, for a first run that loads and compiles what the method needs."""
     # A view with gaps would have kernels compiled for itself and none for whole scans.
     return Scan(scan.stamp_ns, np.ascontiguousarray(scan.points_body[::_WARM_UP_STRIDE]))
-
-
-def _by_features(
-    target: Frame, source: Frame, config: IsvdOdometryConfig
-) -> tuple[Alignment, dict[str, float]]:
-    from mapper.odometry.isvd_odometry import IsvdOdometry, matched_pairs, shared_points
-    from mapper.registration.isvd import Isvd
-
-    if not isinstance(target, RgbdFrame) or not isinstance(source, RgbdFrame):
-        raise ConfigError("--method isvd matches images, and these are scans; name frames of an RGB-D log")
-    odometry = IsvdOdometry(config)
-    began = time.perf_counter()
-    seen_target = odometry.observe(target)
-    detected = time.perf_counter()
-    seen_source = odometry.observe(source)
-    for match in (config.match, config.fallback):
-        pairs = matched_pairs(seen_target, seen_source, match)
-        alignment = Isvd(config.registration).fit(*shared_points(seen_target, seen_source, pairs))
-        if alignment.converged:
-            break
-    return alignment, {"prepare": detected - began, "align": time.perf_counter() - detected}
 
 
 def xyz_rpy(T_a_b: Transform) -> tuple[list[float], list[float]]:

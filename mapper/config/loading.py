@@ -159,12 +159,26 @@ def overridden(
 ) -> AnyConfig:
     """Return a configuration of any kind with single settings on top, given as for ``load_config``.
 
+    Where another ``kind`` of a part is chosen, the settings of the former one are left out.
+
     Raises:
         ConfigError: The model refuses a name or a value.
     """
-    tree = config.model_dump()
+    tree, changed = config.model_dump(), dict[str, Any]()
+    _put_all(changed, overrides, settings)
+    _drop_other_kinds(tree, changed)
     _put_all(tree, overrides, settings)
     return _validated(type(config), tree, "overrides")
+
+
+def _drop_other_kinds(tree: dict[str, Any], changed: Mapping[str, Any]) -> None:
+    """Empty the parts of a tree for which another kind is chosen."""
+    for name, value in changed.items():
+        part = tree.get(name)
+        if isinstance(part, dict) and isinstance(value, dict):
+            if value.get("kind", part.get("kind")) != part.get("kind"):
+                part.clear()
+            _drop_other_kinds(part, value)
 
 
 def _put_all(tree: dict[str, Any], overrides: Sequence[str], settings: Settings | None) -> None:

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 Report = Callable[[int, int], None]
 """Takes how many items are done, and how many there will be."""
 
 
+@runtime_checkable
 class Progress(Protocol):
     """Receiver of a job's progress."""
 

@@ -34,6 +34,7 @@ LAYERS = (
     "line_laser",
     "merging",
     "pipeline",
+    "api",
 )
 """The folders of mapper/. Each may import those before it, so there is no circle."""
 

@@ -240,3 +240,14 @@ def test_settings_are_values_by_name_dotted_or_nested(tmp_path):
     assert nested.octree.hit_probability == 0.8
     with pytest.raises(ConfigError, match=r"octree\.resolution: unknown; did you mean resolution_m"):
         load_config(settings={"octree.resolution": 0.1})
+
+
+def test_another_kind_leaves_out_the_settings_of_the_former():
+    isvd = load_config(settings={"odometry.kind": "isvd", "odometry.previous_frames": 2})
+    for changed in (
+        overridden(isvd, ["odometry.max_depth_m=4", "odometry.kind=pnp"]),
+        overridden(isvd, settings={"odometry": {"kind": "pnp", "max_depth_m": 4.0}}),
+    ):
+        assert changed.odometry.kind == "pnp"
+        assert changed.odometry.max_depth_m == 4.0
+    assert overridden(isvd, ["odometry.kind=isvd"]) == isvd

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from evaluators.register.config import register_config
 from evaluators.register.files import registration_text
 from evaluators.register.registration import register
+from mapper.config.register import register_config
 from mapper.core.errors import ConfigError
 from mapper.core.frames import Scan
 from mapper.core.geometry import apply, exp, inverse
@@ -184,7 +184,7 @@ def test_it_can_be_watched_in_rerun(clouds, tmp_path):
         (("{log}@999", "{log}@0"), "want a frame of {log} from @0 to @"),
         (("{log}@x", "{log}@0"), "want a frame of"),
         (("{log}", "{log}@0"), "is a folder; name a log's frame, as in"),
-        (("{log}@1", "{log}@0", "--method", "magic"), "--method magic: want one of hough-gicp"),
+        (("{log}@1", "{log}@0", "--method", "magic"), "method magic: want one of hough-gicp"),
         (("{log}@1", "{log}@0", "--method", "gicp", "--guess", "1 2 3"), "3 numbers; want"),
         (("{log}@1", "{log}@0", "--guess", "1 2 3 0 0 0"), "hough-gicp has no use for one"),
         (

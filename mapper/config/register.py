@@ -31,12 +31,10 @@ def check_method(method: str, *, guess: str | None) -> None:
         ConfigError: There is none, or it does not.
     """
     if method not in _METHODS:
-        raise ConfigError(f"--method {method}: want one of {', '.join(_METHODS)}")
+        raise ConfigError(f"method {method}: want one of {', '.join(_METHODS)}")
     if guess is not None and method in {*NEED_NO_GUESS, "isvd"}:
         others = [name for name in _METHODS if name not in {*NEED_NO_GUESS, "isvd"}]
-        raise ConfigError(
-            f"--guess: {method} has no use for one; leave it out, or choose {', '.join(others)}"
-        )
+        raise ConfigError(f"guess: {method} has no use for one; leave it out, or choose {', '.join(others)}")
 
 
 def register_config(method: str, sensor: Sensor) -> RegisterConfig:
@@ -51,6 +49,6 @@ def register_config(method: str, sensor: Sensor) -> RegisterConfig:
     if issubclass(member, HoughConfig):
         others = [name for name, other in _METHODS.items() if not issubclass(other, HoughConfig)]
         raise ConfigError(
-            f"--method {method}: wants z up, and a camera's frame has it ahead; choose {', '.join(others)}"
+            f"method {method}: wants z up, and a camera's frame has it ahead; choose {', '.join(others)}"
         )
     return RegisterConfig(registration=member(voxel_m=VOXEL_M[sensor]))

@@ -1,0 +1,48 @@
+"""What is evaluated: a run, a trajectory, or a file of poses, and what it is compared with."""
+
+import os
+from pathlib import Path
+
+from evaluators.metrics.pose_files import is_kitti, read_poses
+from mapper.core.errors import DataError
+from mapper.core.paths import AnyPath
+from mapper.core.trajectory import Trajectory
+from mapper.run.folder import Run, open_run
+
+Estimate = Run | Trajectory | AnyPath
+"""A run or its folder, a trajectory, or a file of TUM or KITTI text."""
+
+
+def estimate_and_truth(
+    estimate: Estimate, truth: Trajectory | AnyPath | None, times: AnyPath | None
+) -> tuple[Run | None, Trajectory, Trajectory | None]:
+    """Return the run if it is one, the estimated poses, and the true ones, which may be its own.
+
+    Args:
+        estimate: What is evaluated.
+        truth: What it is compared with.
+        times: Seconds, one a line, of poses in KITTI text.
+
+    Raises:
+        RunError: A folder is no finished run.
+        SourceError: A file cannot be read.
+        DataError: It is malformed, or KITTI text and times do not belong together.
+    """
+    paths = [Path(one) if isinstance(one, str | os.PathLike) else None for one in (estimate, truth)]
+    untimed = [path for path in paths if path is not None and path.is_file() and is_kitti(path)]
+    if times is not None and not untimed:
+        raise DataError(f"{times}: --times is for poses in KITTI text, which neither file is")
+    if times is None and len(untimed) == 1 and truth is not None:
+        raise DataError(f"{untimed[0]}: KITTI text has no stamps to pair poses by; tell them with --times")
+    known = truth if isinstance(truth, Trajectory) or truth is None else _poses(truth, times)
+    if isinstance(estimate, Trajectory):
+        return None, estimate, known
+    if isinstance(estimate, str | os.PathLike):
+        if Path(estimate).is_file():
+            return None, _poses(estimate, times), known
+        estimate = open_run(estimate)
+    return estimate, estimate.trajectory, known or estimate.truth
+
+
+def _poses(path: AnyPath, times: AnyPath | None) -> Trajectory:
+    return read_poses(Path(path), times=None if times is None else Path(times))

@@ -1,0 +1,1 @@
+"""Functions of ``import mapper`` that take paths, arrays and plain values."""

@@ -1,0 +1,165 @@
+"""From a log to a run, by a caller's own odometry if one is given."""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from mapper.api.logs import open_log
+from mapper.api.own_poses import poses_of
+from mapper.config.build import BuildConfig
+from mapper.config.loading import Settings, load_config, overridden
+from mapper.core.errors import ConfigError
+from mapper.core.frames import Frame
+from mapper.core.paths import AnyPath
+from mapper.core.trajectory import Trajectory
+from mapper.odometry.base import Odometry
+from mapper.pipeline.build import build as build_run
+from mapper.run import files
+from mapper.run.folder import Run
+from mapper.run.observers import NULL_OBSERVER, Observer
+from mapper.runtime.progress import SILENT, Progress, Report
+from mapper.sources.base import Log
+
+OwnOdometry = Odometry[Any] | Callable[[Frame], ArrayLike | None] | Trajectory
+"""A caller's odometry: an object, a function of one frame after the other, or poses."""
+
+_OWN_POSES: Mapping[str, Any] = {
+    "odometry.kind": "given",
+    "odometry.least_m": 0.01,
+    "odometry.path_share": 0.01,
+    "odometry.least_rad": 0.005,
+    "odometry.turn_share": 0.01,
+    "odometry.rad_per_m": 0.002,
+}
+"""Odometry drifts, unlike the motion capture that ``odometry.kind=given`` expects: loops may mend 1 %."""
+
+
+def build(
+    log: Log | AnyPath,
+    *,
+    out: AnyPath,
+    config: BuildConfig | AnyPath | None = None,
+    settings: Settings | None = None,
+    odometry: OwnOdometry | None = None,
+    progress: Progress | Callable[[str], object] | None = None,
+    observer: Observer = NULL_OBSERVER,
+    overwrite: bool = False,
+) -> Run:
+    """Build a run: track every frame, close loops, solve the graph once, and fuse all frames into the maps.
+
+    Args:
+        log: A log, or its path; see :func:`open_log`. Of a log that is opened already, the ``source``
+            settings are only recorded.
+        out: Run folder to create; until it is whole it is called ``OUT.partial``.
+        config: All settings, or a TOML or JSON file of them; None is what suits the log's sensor.
+        settings: Values by dotted name on top, such as ``{"octree.resolution_m": 0.1}``.
+        odometry: Your own instead of the toolkit's: an object of the
+            :class:`~mapper.odometry.base.Odometry` protocol; or a function that is called with each frame in
+            turn and returns the body's pose in a world of its own, (4, 4), or None where it is lost; or a
+            :class:`~mapper.core.trajectory.Trajectory`. Poses are taken to drift by 1 % of the path;
+            ``odometry.least_m``, ``path_share`` and so on say otherwise.
+        progress: Receives stages, counts and notes; or a function that is called with lines of text, such
+            as ``print``. None is silent.
+        observer: Receives every tracked frame and the results.
+        overwrite: Replace a run that is there, once the new one is whole.
+
+    Returns:
+        The finished run; :attr:`Run.verdict <mapper.run.folder.Run.verdict>` tells whether to trust it.
+
+    Raises:
+        SourceError: The log cannot be opened.
+        ConfigError: A setting is unknown, has no such value, or does not fit the log.
+        TrackingError: Too few frames could be tracked; what there is stays in ``OUT.partial``.
+        RunError: OUT is there already, or cannot be made.
+
+    Example:
+        >>> run = mapper.build(log_folder, out=new_folder, settings={"octree.resolution_m": 0.1})
+        >>> run.verdict.state
+        'trusted'
+    """
+    out = Path(out)
+    receiver = _receiver(progress)
+    if not isinstance(log, Log):
+        log = _opened(log, config, settings)
+    own = None
+    if isinstance(odometry, Trajectory | Odometry) or odometry is None:
+        own = odometry
+    elif callable(odometry):
+        own = poses_of(odometry, log, progress=receiver)
+    else:
+        raise ConfigError(
+            f"odometry: {type(odometry).__name__} is no odometry; want an object with read, track, view, "
+            "matches and finish, a function that returns the pose of a frame, or a Trajectory"
+        )
+    wanted = {**_first_settings(own, out), **_flat(settings or {})}
+    if isinstance(config, BuildConfig):
+        resolved = overridden(config, settings=wanted)
+    else:
+        resolved = load_config(config, settings=wanted, sensor=log.sensor)
+    return build_run(
+        log, resolved, out, odometry=own, progress=receiver, observer=observer, overwrite=overwrite
+    )
+
+
+def _opened(path: AnyPath, config: BuildConfig | AnyPath | None, settings: Settings | None) -> Log:
+    if isinstance(config, BuildConfig):
+        return open_log(path, settings={"source": config.source.model_dump(), **(settings or {})})
+    return open_log(path, config=config, settings=settings)
+
+
+def _first_settings(own: Odometry[Any] | Trajectory | None, out: Path) -> dict[str, Any]:
+    match own:
+        case None:
+            return {}
+        case Trajectory():
+            return {**_OWN_POSES, "odometry.path": out.resolve() / files.ODOMETRY}
+        case _:
+            return {"odometry.kind": "own", "odometry.name": type(own).__name__}
+
+
+def _flat(settings: Settings, prefix: str = "") -> dict[str, Any]:
+    """Return nested settings by dotted name."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        dotted = f"{prefix}{name}"
+        flat |= _flat(value, f"{dotted}.") if isinstance(value, Mapping) else {dotted: value}
+    return flat
+
+
+def _receiver(progress: Progress | Callable[[str], object] | None) -> Progress:
+    if progress is None:
+        return SILENT
+    if isinstance(progress, Progress):
+        return progress
+    if callable(progress):
+        return _Lines(progress)
+    raise ConfigError(f"progress: {progress!r} is no function of a line; want print, or None for silence")
+
+
+class _Lines:
+    """Progress as lines of text, one at the beginning of each stage, each tenth of it, and each note."""
+
+    def __init__(self, write: Callable[[str], object]) -> None:
+        self._write = write
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Report]:
+        """Write the stage's name, and then its tenths."""
+        written = 0
+        self._write(name)
+
+        def report(done: int, total: int) -> None:
+            nonlocal written
+            tenth = 10 * done // max(total, 1)
+            if tenth > written:
+                written = tenth
+                self._write(f"{name} {done}/{total}")
+
+        yield report
+
+    def note(self, message: str) -> None:
+        """Write the note."""
+        self._write(message)

@@ -1,0 +1,107 @@
+"""Registration of two clouds, of arrays, files or logs' frames."""
+
+import os
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mapper.api.logs import read_frame
+from mapper.config.loading import Settings, overridden
+from mapper.config.register import RegisterConfig, check_method, register_config
+from mapper.core.errors import ConfigError
+from mapper.core.frames import Frame, RgbdFrame, Scan, Sensor
+from mapper.core.geometry import Transform, is_rigid, point_rows
+from mapper.core.paths import AnyPath
+from mapper.odometry.config import IsvdOdometryConfig
+from mapper.registration.base import Alignment
+from mapper.registration.factory import build_registration
+from mapper.registration.guess import parse_guess
+from mapper.run.cloud import Cloud
+
+Registrable = ArrayLike | Cloud | Frame | AnyPath
+"""(N, 3) points in metres, a cloud, a frame, a cloud's file, or ``LOG@N``."""
+
+
+def register(
+    source: Registrable,
+    target: Registrable,
+    *,
+    method: str = "hough-gicp",
+    guess: ArrayLike | AnyPath | None = None,
+    settings: Settings | None = None,
+) -> Alignment:
+    """Register two clouds: find the pose of the source in the target.
+
+    Args:
+        source: What is aligned: (N, 3) points in metres, a file (.bin .pcd .ply .xyz .npy .las .laz),
+            ``LOG@N`` for the n-th frame of a log, or a frame. Points are kept as float32, so they lie within
+            a kilometre of their origin.
+        target: What it is aligned to: the same.
+        method: "hough-gicp" or "hough-ndt", which search all motions of clouds with z up; "kiss-matcher",
+            which searches any; "icp", "plane-icp", "gicp" or "ndt", which refine the guess; "isvd" for
+            RGB-D frames.
+        guess: Pose of the source in the target to begin with: (4, 4), "x y z roll pitch yaw" in metres and
+            degrees, or a file; None is the same place.
+        settings: Values by dotted name, such as ``{"registration.voxel_m": 0.05}`` for a cloud of some
+            metres: every length of a method is a multiple of it. Arrays and files begin with 0.3 m.
+
+    Returns:
+        The motion ``T_target_source``, whether it ``converged``, else the ``reason``, and how well the clouds
+        agree (``inlier_ratio``, ``inlier_rmse_m``).
+
+    Raises:
+        ConfigError: No such method or setting, or a guess that the method does not use.
+        DataError: The points are not (N, 3), or not finite.
+        SourceError: A file or a frame cannot be read.
+
+    Example:
+        >>> import numpy
+        >>> cloud = numpy.random.default_rng(0).uniform(-5.0, 5.0, (4000, 3)) * [1.0, 1.0, 0.2]
+        >>> found = mapper.register(cloud - [0.1, 0.0, 0.0], cloud, method="icp")
+        >>> found.converged, float(found.T_target_source[0, 3].round(1))
+        (True, 0.1)
+    """
+    check_method(method, guess=None if guess is None else "given")
+    T_target_source = _guess(guess)
+    settings = settings or {}
+    of_logs = {name: value for name, value in settings.items() if name.split(".")[0] == "source"}
+    opening = overridden(register_config(method, "lidar"), settings=of_logs)
+    (target_frame, target_sensor), (source_frame, source_sensor) = (
+        _frame(cloud, name, opening) for cloud, name in ((target, "target"), (source, "source"))
+    )
+    seen_by: Sensor = "rgbd" if "rgbd" in (target_sensor, source_sensor) else "lidar"
+    config = overridden(register_config(method, seen_by), settings=settings).registration
+    if isinstance(config, IsvdOdometryConfig):
+        from mapper.odometry.isvd_pair import align_images
+
+        return align_images(target_frame, source_frame, config)[0]
+    return build_registration(config).prepare(target_frame.scan()).align(source_frame.scan(), T_target_source)
+
+
+def _frame(cloud: Registrable, name: str, config: RegisterConfig) -> tuple[Frame, Sensor]:
+    match cloud:
+        case RgbdFrame():
+            return cloud, "rgbd"
+        case Scan():
+            return cloud, "lidar"
+        case str() | os.PathLike():
+            return read_frame(cloud, config.source)
+        case _:
+            _, rows = point_rows(cloud, f"register: {name}")
+            return Scan(0, rows.astype(np.float32)), "lidar"
+
+
+def _guess(guess: Any) -> Transform:
+    match guess:
+        case None:
+            return np.eye(4)
+        case str() | os.PathLike():
+            return parse_guess(os.fspath(guess))
+        case _:
+            T_target_source = np.asarray(guess, dtype=np.float64)
+            if T_target_source.shape != (4, 4) or not is_rigid(T_target_source):
+                raise ConfigError(
+                    f"guess: an array {T_target_source.shape}, want a rigid motion (4, 4), or text of six"
+                )
+            return T_target_source

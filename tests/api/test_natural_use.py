@@ -1,0 +1,133 @@
+"""What a new user types, as typed: text for paths, attributes for parts, numpy everywhere."""
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+import mapper
+from mapper.core.frames import RgbdFrame
+
+mpl.use("Agg")
+
+
+@pytest.fixture(scope="module")
+def run(desk_run):
+    return mapper.open_run(str(desk_run.path))
+
+
+def test_a_log_is_built(desk_log, desk_run, tmp_path):
+    run = mapper.build(str(desk_log), out=str(tmp_path / "run"), settings={"mcap.frame_times": False})
+    assert isinstance(run, mapper.Run)
+    for name in ("trajectory.tum", "map.octree", "slice.pgm"):
+        assert (run.path / name).read_bytes() == (desk_run.path / name).read_bytes()
+
+
+def test_a_log_opened_before_is_built_with_a_configuration_loaded_before(desk_log, tmp_path):
+    lines = []
+    run = mapper.build(
+        mapper.open_log(desk_log)[:12],
+        out=tmp_path / "run",
+        config=mapper.load_config(overrides=["octree.resolution_m=0.1"]),
+        settings={"min_tracked_frames": 5},
+        progress=lines.append,
+    )
+    assert run.octree.resolution_m == 0.1
+    assert len(run.trajectory) == 12
+    assert "track" in lines
+    assert "track 12/12" in lines
+
+
+def test_the_trajectory_is_arrays(run):
+    path = run.trajectory
+    assert path.positions.shape == (31, 3)
+    assert path.poses.shape == (31, 4, 4)
+    np.testing.assert_array_equal(path.poses[:, :3, 3], path.positions)
+    np.testing.assert_allclose(np.diff(path.stamps), 1.0 / 15.0, atol=1e-3)
+    assert run.trajectory is path
+
+
+def test_the_octree_answers(run):
+    octree = run.octree
+    states = octree.query(run.trajectory.positions)
+    assert set(states.tolist()) <= {0, -1}
+    assert (states == 0).mean() > 0.5
+    occupied = octree.occupied()
+    assert occupied.shape[1] == 3
+    assert (octree.query(occupied) == 100).all()
+    assert (octree.probability(occupied) >= 0.5).all()
+    assert octree.slice(0.1, 1.2).grid.shape[0] > 10
+    assert mapper.read_octree(str(run.path / "map.ot")).occupied().shape == occupied.shape
+    assert isinstance(mapper.read_octree(run.path / "map.bt"), mapper.OctreeMap)
+
+
+def test_the_cloud_is_points_and_colours(run):
+    assert run.cloud.points.shape == run.cloud.colors.shape == (run.manifest.counts.cloud_points, 3)
+    np.testing.assert_array_equal(np.asarray(run.cloud), run.cloud.points)
+    assert np.asarray(run.cloud, dtype=np.float64).dtype == np.float64
+
+
+def test_the_slice_is_a_grid(run):
+    grid = run.slice
+    assert np.asarray(grid).dtype == np.int8
+    np.testing.assert_array_equal(np.asarray(grid), grid.grid)
+    assert grid.resolution == run.config.octree.resolution_m
+    x, y = run.trajectory.positions[0, :2]
+    column, row = np.floor((np.array([x, y]) - grid.origin) / grid.resolution).astype(int)
+    assert 0 <= row < grid.grid.shape[0]
+    assert 0 <= column < grid.grid.shape[1]
+
+
+def test_the_graph_is_gtsam_s_too(run):
+    graph = run.graph
+    assert len(graph.nodes) == len(graph.positions) == run.manifest.counts.nodes
+    factors, values = graph.to_gtsam()
+    assert factors.size() == len(graph.factors) + 1
+    assert sorted(values.keys()) == graph.nodes.tolist()
+    second = int(graph.nodes[1])
+    np.testing.assert_allclose(values.atPose3(second).matrix(), graph.T_world_node[second], atol=1e-9)
+    assert factors.error(values) < 1.0  # it is the solution
+
+
+def test_loops_and_verdict_tell_why(run):
+    assert all(loop.verdict == "accepted" or loop.reason for loop in run.loops)
+    assert run.verdict.state == "trusted"
+
+
+def test_a_log_is_iterated(desk_log):
+    log = mapper.open_log(str(desk_log))
+    stamps = []
+    for frame in log[5:8]:
+        assert isinstance(frame, RgbdFrame)
+        assert frame.image.shape == (240, 320, 3)
+        assert frame.scan().points.shape[1] == 3
+        stamps.append(frame.stamp)
+    np.testing.assert_allclose(stamps, log.stamps_ns[5:8] / 1e9, atol=1e-6)
+    assert log[-1].stamp_ns == log.stamps_ns[-1]
+    assert sum(1 for _ in log) == len(log) == 31
+    with pytest.raises(IndexError):
+        log[31]
+    with pytest.raises(mapper.MapperError, match="no backward order"):
+        log[::-1]
+
+
+def test_a_run_is_evaluated(run, desk_log):
+    found = mapper.evaluate(str(run.path))
+    assert found.ate_m == found["ATE RMSE"] == found["ATE RMSE, SE(3)-aligned"] < 0.02
+    assert "ATE RMSE" in str(found)
+    assert "<td>ATE RMSE" in found._repr_html_()
+    by_files = mapper.evaluate(str(run.path / "trajectory.tum"), desk_log / "groundtruth.txt")
+    assert by_files.ate_m == pytest.approx(found.ate_m)
+    assert mapper.evaluate(run.trajectory, run.truth).ate_m == pytest.approx(found.ate_m)
+    assert mapper.evaluate(run.trajectory).ate_m is None
+    with pytest.raises(KeyError, match="want one of"):
+        found["ATE"]
+
+
+def test_the_picture_is_drawn_and_the_notebook_has_it(run):
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots()
+    assert run.plot(axes) is axes
+    plt.close(figure)
+    assert "trusted" in run._repr_html_()
+    assert repr(run) == f"Run({str(run.path)!r})"
