@@ -22,7 +22,7 @@ def open_log(path: AnyPath, *, config: AnyPath | None = None, settings: Settings
         path: A TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood or KITTI folder, a folder of clouds, an MCAP file, a
             ROS bag, or an mbag file.
         config: TOML file, or a run's ``config.json``, whose ``source`` settings hold.
-        settings: Values by dotted name, such as ``{"source.last": 100}``.
+        settings: Values by dotted name, such as ``{"source.last_frame": 100}``.
 
     Returns:
         The log, with ``stamps_ns``, ``sensor`` ("rgbd" or "lidar"), and ``truth`` and ``wheels`` where known.
