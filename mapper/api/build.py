@@ -51,8 +51,8 @@ def build(
     """Build a run: track every frame, close loops, solve the graph once, and fuse all frames into the maps.
 
     Args:
-        log: A log, or its path; see :func:`open_log`. Of a log that is opened already, the ``source``
-            settings are only recorded.
+        log: A log, or its path; see :func:`open_log`. A log that is opened already is mapped as it is; give
+            the ``source`` settings by which it was opened, too, if the run is to find the same frames later.
         out: Run folder to create; until it is whole it is called ``OUT.partial``.
         config: All settings, or a TOML or JSON file of them; None is what suits the log's sensor.
         settings: Values by dotted name on top, such as ``{"octree.resolution_m": 0.1}``.

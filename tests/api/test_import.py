@@ -28,6 +28,14 @@ def test_listing_the_names_loads_nothing_either():
     assert "mapper.run" not in modules_after("import mapper; dir(mapper)")
 
 
+def test_a_run_is_opened_without_what_draws_or_evaluates_it():
+    """The two imports against the order of the layers are made when they are used."""
+    loaded = modules_after("import mapper; mapper.open_run, mapper.build, mapper.evaluate")
+    assert "mapper.run.folder" in loaded
+    assert not {"mapper.export.run_plot", "matplotlib.pyplot", "gtsam", "open3d"} & loaded
+    assert not any(name.startswith("evaluators") for name in modules_after("import mapper; mapper.build"))
+
+
 @pytest.mark.parametrize("name", mapper.__all__)
 def test_every_name_is_what_its_module_has(name):
     value = getattr(mapper, name)
