@@ -6,8 +6,9 @@ DIR holds the logs as shared/data has them: tum_fr1_xyz and kitti_00. Each page 
 own below the work folder, with these logs under the names that pages use. Blocks are those that the tests
 run, and those marked "real logs"; blocks marked "slow", which take many minutes, only with --slow.
 
-A line "…" stays where a page leaves lines out: as many rows before and behind it are shown as before, unless
-only two or fewer would be left out. The exit status is 1 if a command failed; its output stays as it was.
+A line "…" stays where a page leaves lines out: as many rows before and behind it are shown as before. An
+output of ten lines or fewer, or of which only two rows would be left out, is shown whole. The exit status is
+1 if a command failed; its output stays as it was.
 """
 
 import argparse
@@ -24,16 +25,26 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from tests.support.pages import OMITTED, PAGES, Block, blocks_of, files_of, page_name, row_names  # noqa: E402
+from tests.support.pages import OMITTED, PAGES, Block, Command, blocks_of, files_of, page_name, row_names  # noqa: E402
 
 LOGS = {"rgbd_dataset_freiburg1_xyz": "tum_fr1_xyz", "kitti_00": "kitti_00"}
 MAPPER = [sys.executable, "-c", "from cli.main import main; main()"]
 FEWEST_OMITTED = 3
 """Fewer rows are shown instead of being left out."""
+MOST_SHORT_LINES = 10
+"""An output of so few lines is shown whole."""
 
 
-def refresh(path: Path, logs: Path, work: Path, *, slow: bool) -> int:
-    """Run a page's blocks, rewrite the page, and return how many commands failed."""
+def refresh(path: Path, logs: Path, work: Path, built: dict[tuple[str, ...], Path], *, slow: bool) -> int:
+    """Run a page's blocks, rewrite the page, and return how many commands failed.
+
+    Args:
+        path: The page.
+        logs: Folder with the logs.
+        work: Folder to work in.
+        built: Runs that were built without an output, by their commands: pages build the same ones.
+        slow: Run blocks that are marked so, too.
+    """
     page = path.read_text(encoding="utf-8")
     folder = _folder_for(path, page, logs, work)
     failed = 0
@@ -47,7 +58,11 @@ def refresh(path: Path, logs: Path, work: Path, *, slow: bool) -> int:
         text = ""
         for command in block.commands:
             begun = time.perf_counter()
-            printed = _run([*MAPPER, *command.words[1:]], folder)
+            printed = _copied(command, folder, built)
+            if printed is None:
+                printed = _run([*MAPPER, *command.words[1:]], folder)
+            if printed == [] and command.words[1] == "build":
+                built.setdefault(tuple(command.words), folder / _out_of(command))
             failed += printed is None
             shown = command.shown if printed is None else abridged(command.shown, printed)
             text += "".join(f"{line}\n" for line in [f"$ {command.text}", *shown])
@@ -63,6 +78,19 @@ def refresh(path: Path, logs: Path, work: Path, *, slow: bool) -> int:
     return failed
 
 
+def _out_of(command: Command) -> str:
+    return command.words[command.words.index("--out") + 1]
+
+
+def _copied(command: Command, folder: Path, built: dict[tuple[str, ...], Path]) -> list[str] | None:
+    """Copy the run of the same command on another page, if there is one; return what it printed, nothing."""
+    run = built.get(tuple(command.words))
+    if run is None:
+        return None
+    shutil.copytree(run, folder / _out_of(command))
+    return []
+
+
 def abridged(shown: Sequence[str], printed: Sequence[str]) -> list[str]:
     """Return what is printed, with rows left out where what is shown leaves some out.
 
@@ -70,7 +98,7 @@ def abridged(shown: Sequence[str], printed: Sequence[str]) -> list[str]:
         shown: Lines of the page, of which some may be "…".
         printed: Lines that the command prints now.
     """
-    if OMITTED not in (line.strip() for line in shown):
+    if OMITTED not in (line.strip() for line in shown) or len(printed) <= MOST_SHORT_LINES:
         return list(printed)
     pieces: list[list[str]] = [[]]
     for line in shown:
@@ -154,8 +182,9 @@ def main() -> int:
         parser.error(f"{arguments.logs}: has no {', '.join(missing)}")
     with tempfile.TemporaryDirectory() as temporary:
         work = (arguments.work or Path(temporary)).resolve()
+        built: dict[tuple[str, ...], Path] = {}
         failed = sum(
-            refresh(path, arguments.logs, work, slow=arguments.slow)
+            refresh(path, arguments.logs, work, built, slow=arguments.slow)
             for path, name in zip(PAGES, names, strict=True)
             if arguments.page is None or name in arguments.page
         )

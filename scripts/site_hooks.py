@@ -128,24 +128,27 @@ def _commands() -> Iterator[str]:
 
     from cli.main import app
 
-    yield from _command(
-        typer.main.get_command(app), click.Context(click.Command("mapper"), info_name="mapper")
-    )
+    mapper: Any = typer.main.get_command(app)
+    program = click.Context(click.Command("mapper"), info_name="mapper")
+    verbs = [(name, verb) for name, verb in mapper.commands.items() if not verb.hidden]
+    for panel in dict.fromkeys(getattr(verb, "rich_help_panel", "") for _, verb in verbs):
+        yield f"\n## {panel.capitalize()}\n"
+        for name, verb in verbs:
+            if getattr(verb, "rich_help_panel", "") == panel:
+                yield from _command(name, verb, program)
 
 
-def _command(command: Any, parent: Any) -> Iterator[str]:
-    for name, verb in command.commands.items():
-        if verb.hidden:
-            continue
-        context = verb.make_context(name, [], parent=parent, resilient_parsing=True)
-        yield f"\n## {context.command_path}\n\n{_prose(verb.help or '')}\n"
-        yield f"```text\n{verb.get_usage(context).removeprefix('Usage: ')}\n```\n"
-        rows = [row for parameter in verb.params if (row := _parameter(parameter, context))]
-        if rows:
-            yield "| argument or option | meaning |\n| --- | --- |"
-            yield from rows
-        if hasattr(verb, "commands"):
-            yield from _command(verb, context)
+def _command(name: str, verb: Any, parent: Any) -> Iterator[str]:
+    """Yield the Markdown of a verb and of those below it."""
+    context = verb.make_context(name, [], parent=parent, resilient_parsing=True)
+    yield f"\n### {context.command_path}\n\n{_prose(verb.help or '')}\n"
+    yield f"```text\n{verb.get_usage(context).removeprefix('Usage: ')}\n```\n"
+    rows = [row for parameter in verb.params if (row := _parameter(parameter, context))]
+    if rows:
+        yield "| argument or option | meaning |\n| --- | --- |"
+        yield from rows
+    for below, sub_verb in getattr(verb, "commands", {}).items():
+        yield from _command(below, sub_verb, context)
 
 
 def _parameter(parameter: Any, context: Any) -> str | None:
