@@ -128,7 +128,8 @@ def make(entry: Entry, logs: Path, work: Path) -> list[str]:
             environment = {**os.environ, "PYTHONPATH": str(ROOT)}
             subprocess.run([*MAPPER, *shlex.split(command), "--quiet"], cwd=work, env=environment, check=True)
     manifest = json.loads((run / "manifest.json").read_text(encoding="utf-8"))
-    counts, verdict = manifest["counts"], manifest["verdict"]["state"]
+    counts = manifest["counts"]
+    verdict = ": ".join([manifest["verdict"]["state"], *manifest["verdict"]["sentences"][:1]])
     lines = [f"## {entry.title}", "", entry.about, "", "```sh"]
     lines += [f"mapper {command}" for command in entry.commands]
     lines += ["```", ""]

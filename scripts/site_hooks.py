@@ -1,8 +1,8 @@
 """Hooks of MkDocs: pages that are made from the code, and links from pages to files of the repository.
 
-Where a page says ``<!-- generated: settings -->`` or ``<!-- generated: commands -->``, the reference takes
-the place of that line. README.md is the first page. A file of the repository that a page links to is copied
-into the site as text, so that the site is complete without a network.
+Where a page says ``<!-- generated: settings -->`` or the like, the reference takes the place of that line and
+of the paragraph below it. README.md is the first page. A file of the repository that a page links to is
+copied into the site as text, so that the site is complete without a network.
 """
 
 import os
@@ -17,10 +17,27 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[1]
-_GENERATED = re.compile(r"^<!-- generated: (\w+) -->\n(?:\n.*\n(?!#))*", re.MULTILINE)
+_GENERATED = re.compile(r"^<!-- generated: (\w+) -->\n\n(?:[^\n#].*\n)+", re.MULTILINE)
 _LINK = re.compile(r"(?<!\!)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
 _CODE = re.compile(r"^```.*?^```|``.*?``|`[^`\n]*`", re.DOTALL | re.MULTILINE)
 _NAMES = {"rgbd": "RGB-D", "lidar": "LiDAR"}
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Leave pages out of the navigation that are not there."""
+    config.nav = _present(config.nav or [])
+    return config
+
+
+def _present(nav: list[Any]) -> list[Any]:
+    """Return the entries of a part of the navigation whose pages are there."""
+    kept: list[Any] = []
+    for entry in nav:
+        if isinstance(entry, dict):
+            kept.append({title: _present(entries) for title, entries in entry.items()})
+        elif entry == "index.md" or (ROOT / "docs" / entry).is_file():
+            kept.append(entry)
+    return kept
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -39,6 +56,14 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
     """Put in what is generated, and point links at the copies of the repository's files."""
     markdown = _GENERATED.sub(lambda found: "\n".join(_REFERENCES[found[1]]()), markdown)
     return _relinked(markdown, page.file)
+
+
+def on_page_content(html: str, page: Page, **_: Any) -> str:
+    """Take Sphinx's roles, which docstrings use, out of the reference of the library."""
+    if page.file.src_uri != "api.md":
+        return html
+    html = re.sub(r":(?:func|class|attr|meth|mod|data|exc):(<code>)~?(?:[a-z]\w*\.)*", r"\1", html)
+    return re.sub(r"(<code>[\w.]+) &lt;[\w.]+&gt;(</code>)", r"\1\2", html)
 
 
 def _moved(readme: str) -> str:
@@ -180,4 +205,12 @@ def _escaped(text: str) -> str:
     return "".join(part if part.startswith("`") else re.sub(r"([*_<\[\]])", r"\\\1", part) for part in parts)
 
 
-_REFERENCES = {"settings": _settings, "commands": _commands}
+def _api() -> Iterator[str]:
+    """Yield mkdocstrings' directive for every public name of the library."""
+    import mapper
+
+    for name in sorted(getattr(mapper, "__all__", []), key=str.lower):
+        yield f"::: mapper.{name}\n"
+
+
+_REFERENCES = {"api": _api, "settings": _settings, "commands": _commands}
