@@ -41,7 +41,7 @@ def look_at_glibc() -> Finding:
 
 def processors() -> int:
     """Return how many processors this process may use."""
-    if sys.platform == "linux":
+    if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))  # a container may have fewer than the machine
     return os.cpu_count() or 1
 

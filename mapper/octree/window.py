@@ -104,9 +104,12 @@ def _sparse_zeros(size: int) -> NDArray[np.uint8]:
 
     ``np.zeros`` asks for huge pages: a ray that enters one would pay for clearing and keeping 2 MiB.
     """
+    advice = getattr(mmap, "MADV_NOHUGEPAGE", None)
+    if advice is None:  # no Linux
+        return np.zeros(size, dtype=np.uint8)
     memory = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     with suppress(OSError):  # a kernel without huge pages refuses advice about them
-        memory.madvise(mmap.MADV_NOHUGEPAGE)
+        memory.madvise(advice)
     return np.frombuffer(memory, dtype=np.uint8)
 
 

@@ -1,7 +1,6 @@
 """KISS-Matcher (Lim et al. 2025): a motion from matched features without a first guess, refined by GICP."""
 
 import os
-import sys
 from functools import cache
 from typing import Any
 
@@ -100,7 +99,7 @@ def _library() -> Any:
         import kiss_matcher
 
     few = np.random.default_rng(0).uniform(size=(300, 3)).astype(np.float32)
-    if sys.platform == "linux":
+    if hasattr(os, "sched_setaffinity"):  # Linux
         cores = os.sched_getaffinity(0)
         os.sched_setaffinity(0, {min(cores)})
         try:

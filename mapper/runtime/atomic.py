@@ -2,7 +2,6 @@
 
 import ctypes
 import errno
-import fcntl
 import json
 import os
 import secrets
@@ -21,6 +20,9 @@ MANIFEST_NAME = "manifest.json"
 _TEMPORARY = ".*.part*"
 _NAMED = 5
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
+_NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)
+_FOLDER = getattr(os, "O_DIRECTORY", None)
+"""None on Windows, which cannot open a folder."""
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
 
 
@@ -113,7 +115,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
     part = path.with_name(f".{path.stem[:100]}.{secrets.token_hex(8)}.part{path.suffix}")
     with writing(path, part):
         path.parent.mkdir(parents=True, exist_ok=True)
-        flags = os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_WRONLY
+        flags = os.O_CREAT | os.O_EXCL | _NO_FOLLOW | os.O_WRONLY
         os.close(os.open(part, flags, 0o666))
         try:
             yield part
@@ -136,6 +138,8 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 def flush_to_disk(path: Path) -> None:
     """Wait until a file or a folder's list of names is on the disk, so that it survives a power cut."""
+    if _FOLDER is None and path.is_dir():
+        return
     handle = os.open(path, os.O_RDONLY)
     try:
         with writing(path):
@@ -227,6 +231,8 @@ def _refuse_to_lose(out: Path, kind: FolderKind, *, overwrite: bool, takes_over:
 def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Hold the folder's lock, which the system releases even when the process is killed.
 
+    Windows has no locks of folders: nothing is held there.
+
     Args:
         folder: An existing folder, no symbolic link.
         wait: Wait for another process, which holds it for a moment only; else refuse.
@@ -235,7 +241,12 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
         RunError: Another process holds it, or has put another folder in its place.
     """
     busy = RunError(f"{folder}: another process is filling it; wait, or choose another --out")
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    if _FOLDER is None:
+        yield
+        return
+    import fcntl
+
+    handle = os.open(folder, os.O_RDONLY | _FOLDER | _NO_FOLLOW)
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
@@ -283,7 +294,7 @@ def _swap(partial: Path, out: Path) -> None:
 
 def _exchange(partial: Path, out: Path) -> None:
     """Exchange two names: at every instant, and after a power cut, OUT is the old folder or the new one."""
-    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    rename = None if _FOLDER is None else getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     names = os.fsencode(partial), os.fsencode(out)
     if rename is not None and not rename(_AT_FDCWD, names[0], _AT_FDCWD, names[1], _RENAME_EXCHANGE):
         return

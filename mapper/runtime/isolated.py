@@ -8,12 +8,11 @@ a file need not allow for, and may be started by a worker.
 import atexit
 import os
 import pickle
-import resource
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar, cast
 
@@ -91,6 +90,8 @@ def memory_limited(more_bytes: int) -> Iterator[None]:
     if not statm.exists():
         yield
         return
+    import resource
+
     used_bytes = int(statm.read_text(encoding="ascii").split()[0]) * resource.getpagesize()
     before, hard = resource.getrlimit(resource.RLIMIT_AS)
     most = [used_bytes + more_bytes, *(limit for limit in (before, hard) if limit != resource.RLIM_INFINITY)]
@@ -118,7 +119,10 @@ def _serve(jobs: BinaryIO, answers: BinaryIO) -> None:
 
 
 if __name__ == "__main__":
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    with suppress(ModuleNotFoundError):  # Windows has none
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     with os.fdopen(os.dup(1), "wb") as stdout:
         os.dup2(2, 1)  # what a library prints is no answer

@@ -23,7 +23,7 @@ def read_regular(path: Path, *, most_bytes: int, may_be_pipe: bool = False) -> b
         OSError: It cannot be read.
         DataError: It is no regular file, or larger; the message does not name it.
     """
-    wait = 0 if may_be_pipe else os.O_NONBLOCK  # opening a pipe waits for its writer
+    wait = 0 if may_be_pipe else getattr(os, "O_NONBLOCK", 0)  # opening a pipe waits for its writer
     with os.fdopen(os.open(path, os.O_RDONLY | wait), "rb") as file:
         status = os.fstat(file.fileno())
         if stat.S_ISREG(status.st_mode):

@@ -2,7 +2,6 @@
 
 import ctypes
 import gc
-import resource
 import sys
 import time
 from collections.abc import Iterator
@@ -40,17 +39,21 @@ class Stopwatch:
 def forget_peak_memory() -> None:
     """Let ``peak_memory_mb`` begin anew, after what is free went back to the system; where it can (Linux)."""
     gc.collect()
-    with suppress(OSError, AttributeError):
+    with suppress(OSError, AttributeError, TypeError):  # TypeError: Windows
         ctypes.CDLL(None).malloc_trim(0)
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # see proc(5)
 
 
 def peak_memory_mb() -> float:
-    """Return the largest resident memory this process has had, in megabytes of 10⁶ bytes."""
+    """Return the largest resident memory this process has had, in megabytes of 10⁶ bytes; 0 if none tells."""
     status = Path("/proc/self/status")
     if status.exists():  # ru_maxrss also counts what the process that started us held before exec
         for line in status.read_text(encoding="ascii", errors="replace").splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024 / 1e6
+    try:
+        import resource
+    except ModuleNotFoundError:  # Windows
+        return 0.0
     largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return largest / 1e6 if sys.platform == "darwin" else largest * 1024 / 1e6

@@ -141,7 +141,7 @@ def test_the_verb_fails_when_a_library_does(monkeypatch, as_json):
     assert result.exit_code == 1
     assert result.stderr.splitlines()[-1] == "mapper: doctor: 1 of 9 failed: no-such-library"
     if as_json:
-        verdicts = {told["name"]: told["verdict"] for told in json.loads(result.stdout)}
+        verdicts = {told["name"]: told["verdict"] for told in json.loads(result.stdout)["findings"]}
         assert (verdicts["zstandard"], verdicts["no-such-library"]) == ("well", "failed")
     else:
         assert "do: pip install 'no-such-library>=0'" in result.stdout

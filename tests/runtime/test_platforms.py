@@ -1,0 +1,124 @@
+"""What Linux alone has is absent here, as on macOS or Windows; the rest has to do without."""
+
+import mmap
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from mapper.doctor.machine import processors
+from mapper.octree.window import _sparse_zeros
+from mapper.runtime import atomic
+from mapper.runtime.atomic import FolderKind, atomic_folder, flush_to_disk
+from mapper.runtime.timing import forget_peak_memory, peak_memory_mb
+from tests.support.paths import ROOT
+
+MAC = """
+import ctypes, mmap, os, pathlib, sys
+
+del mmap.MADV_NOHUGEPAGE, os.sched_getaffinity, os.sched_setaffinity, os.posix_fadvise
+is_there = pathlib.Path.exists
+pathlib.Path.exists = lambda path: not str(path).startswith("/proc/") and is_there(path)
+
+
+class Library(ctypes.CDLL):
+    def __getattr__(self, name):
+        if name in {"renameat2", "malloc_trim"}:
+            raise AttributeError(name)
+        return super().__getattr__(name)
+
+
+ctypes.CDLL = Library
+"""
+WINDOWS = """
+import builtins
+
+is_imported = builtins.__import__
+
+
+def without(name, globals=None, *rest):
+    if name in {"fcntl", "resource"} and (globals or {}).get("__name__", "").startswith("mapper."):
+        raise ModuleNotFoundError(name)
+    return is_imported(name, globals, *rest)
+
+
+builtins.__import__ = without
+del os.O_DIRECTORY, os.O_NOFOLLOW, os.O_NONBLOCK
+"""
+IMPORT_ALL = """
+import pkgutil
+from importlib import import_module
+
+import mapper
+
+for module in pkgutil.walk_packages(mapper.__path__, "mapper."):
+    import_module(module.name)
+"""
+BUILD = """
+from mapper.pipeline.warm_up import _build_lidar
+
+_build_lidar(pathlib.Path(sys.argv[1]))
+_build_lidar(pathlib.Path(sys.argv[1]) / "again")
+"""
+
+
+def run(code, *arguments):
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("absent", [MAC, MAC + WINDOWS], ids=["macos", "windows"])
+def test_every_module_can_be_imported(absent):
+    ended = run(absent + IMPORT_ALL)
+    assert ended.returncode == 0, ended.stderr
+
+
+@pytest.mark.slow
+def test_a_build_needs_nothing_of_linux(tmp_path):
+    ended = run(MAC + BUILD, str(tmp_path))
+    assert ended.returncode == 0, ended.stderr
+    assert (tmp_path / "run/map.octree").stat().st_size > 1000
+
+
+def test_zeros_without_advice_on_huge_pages(monkeypatch):
+    monkeypatch.delattr(mmap, "MADV_NOHUGEPAGE")
+    zeros = _sparse_zeros(5000)
+    zeros[7] = 1
+    assert (zeros.sum(), zeros.dtype, zeros.shape) == (1, np.uint8, (5000,))
+
+
+def test_processors_are_counted_without_affinity(monkeypatch):
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert processors() == os.cpu_count()
+
+
+def test_memory_is_unknown_where_nothing_tells(monkeypatch):
+    monkeypatch.setattr("mapper.runtime.timing.Path.exists", lambda _path: False)
+    assert peak_memory_mb() > 1.0
+    monkeypatch.setitem(sys.modules, "resource", None)
+    assert peak_memory_mb() == 0.0
+
+
+def test_peak_memory_begins_anew_only_where_it_can(monkeypatch):
+    def no_handle(_name):
+        raise TypeError("LoadLibrary() argument 1 must be str, not None")
+
+    monkeypatch.setattr("mapper.runtime.timing.ctypes.CDLL", no_handle)
+    forget_peak_memory()
+
+
+def test_folders_are_replaced_without_locks(monkeypatch, tmp_path):
+    monkeypatch.setattr(atomic, "_FOLDER", None)
+    monkeypatch.setitem(sys.modules, "fcntl", None)
+    kind = FolderKind("a map", manifest_keys=frozenset({"voxels"}), files=frozenset({"map.bt"}))
+    for text in ("old", "new"):
+        with atomic_folder(tmp_path / "map", kind, overwrite=True) as part:
+            (part / "manifest.json").write_text('{"voxels": 1}')
+            (part / "map.bt").write_text(text)
+    assert (tmp_path / "map/map.bt").read_text() == "new"
+    assert [child.name for child in tmp_path.iterdir()] == ["map"]
+    flush_to_disk(tmp_path)
