@@ -6,7 +6,7 @@ import tomllib
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 from pydantic import ValidationError
 
@@ -15,11 +15,13 @@ from mapper.config.refusals import refusal
 from mapper.config.sensors import DEFAULTS
 from mapper.core.config import Config, drop_unknown
 from mapper.core.errors import ConfigError, MapperWarning
-from mapper.core.frames import Sensor
 from mapper.core.paths import AnyPath
 from mapper.runtime.atomic import MANIFEST_NAME
 from mapper.runtime.regular_files import read_text
 from mapper.sources.config import SourceConfig
+
+if TYPE_CHECKING:
+    from mapper.core.frames import Sensor
 
 AnyConfig = TypeVar("AnyConfig", bound=Config)
 Settings = Mapping[str, Any]
@@ -31,7 +33,7 @@ def load_config(
     overrides: Sequence[str] = (),
     *,
     settings: Settings | None = None,
-    sensor: Sensor = "rgbd",
+    sensor: "Sensor" = "rgbd",
 ) -> BuildConfig:
     """Return the configuration of a TOML file, or a run's JSON, with single settings on top.
 

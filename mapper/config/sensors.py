@@ -1,9 +1,12 @@
 """Default settings per sensor, where they differ from the classes' own defaults."""
 
-from collections.abc import Mapping
-from typing import Any
+from __future__ import annotations
 
-from mapper.core.frames import Sensor
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mapper.core.frames import Sensor
 
 DEFAULTS: Mapping[Sensor, Mapping[str, Any]] = {
     "rgbd": {},

@@ -3,8 +3,6 @@
 from collections.abc import Set
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from mapper.core.geometry import Transform, inverse
 from mapper.graph.model import PoseGraph
@@ -12,6 +10,9 @@ from mapper.graph.model import PoseGraph
 
 def components(graph: PoseGraph) -> list[list[int]]:
     """Return the nodes of every connected component; the graph's order holds between and within them."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components  # takes half a second
+
     index_of = {node: index for index, node in enumerate(graph.T_world_node)}
     i = [index_of[factor.i] for factor in graph.factors]
     j = [index_of[factor.j] for factor in graph.factors]

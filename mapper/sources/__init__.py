@@ -1,25 +1,26 @@
 """Recorded logs as sequences of frames."""
 
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mapper.core.errors import SourceError
-from mapper.sources import clouds, icl_nuim, kitti, mbag, numbered, poznan, tum
-from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
-from mapper.sources.ros import files as recordings
-from mapper.sources.selection import selected
-from mapper.sources.wheel_files import read_wheels
+
+if TYPE_CHECKING:
+    from mapper.sources.base import Log
 
 __all__ = ["open_source"]
 
 # The first that recognises a path reads it. Images of ICL-NUIM and Poznań are numbered too, so these come
 # before numbered images; any log's folder may have clouds in it, so clouds come last.
-_FORMATS = (icl_nuim, tum, mbag, poznan, numbered, kitti, recordings, clouds)
+_FORMATS = ("icl_nuim", "tum", "mbag", "poznan", "numbered", "kitti", "ros.files", "clouds")
+"""Modules, imported when a log is opened: settings are in this folder too, which most verbs read alone."""
 _DEFAULTS = SourceConfig()
 
 
-def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> Log:
+def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
     """Return a recorded log, recognised by its files, with the configured selection of its frames.
 
     Args:
@@ -31,13 +32,17 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> Log:
         SourceError: Nothing is there, no format fits, the log is malformed, nothing of it is selected, or it
             has no frame such as is to be its body.
     """
+    from mapper.sources.selection import selected
+    from mapper.sources.wheel_files import read_wheels
+
     if not path.exists():
         raise SourceError(f"{path}: no such file or folder")
     if not (path.is_dir() or path.is_file()):
         raise SourceError(f"{path}: a device or a pipe; want a file or a folder")
-    for log_format in _FORMATS:
+    formats = {name: import_module(f"mapper.sources.{name}") for name in _FORMATS}
+    for name, log_format in formats.items():
         if log_format.recognise(path):
-            if config.body_frame is not None and log_format is not recordings:
+            if config.body_frame is not None and name != "ros.files":
                 raise SourceError(
                     f"{path}: source.body_frame={config.body_frame}: only a recording's tf has such a frame; "
                     "leave it out"
@@ -47,5 +52,5 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> Log:
                 wheels, notes = read_wheels(path, config.wheels, sensor=log.sensor)
                 log = replace(log, wheels=wheels, notes=[*log.notes, *notes])
             return selected(log, config)
-    looked_for = "; ".join(log_format.LOOKED_FOR for log_format in _FORMATS)
+    looked_for = "; ".join(log_format.LOOKED_FOR for log_format in formats.values())
     raise SourceError(f"{path}: not a log of a known format; looked for {looked_for}")
