@@ -46,7 +46,8 @@ def _build_rgbd(folder: Path) -> None:
     bits = pack(np.zeros((2, 32), np.uint8))
     match_mutual_bits(bits, bits, 50, 0.8)  # of loop closures, which a second has none of
     write_tum_log(folder / "log", SynthConfig(duration_s=1.0, width_px=320, height_px=240))
-    _build(folder, "odometry.readout_s=0.03")  # it is estimated, but only from longer logs
+    _build(folder, "run")
+    _build(folder, "short", "odometry.readout_s=0.03", "source.last_frame=9")  # found only in longer logs
 
 
 def _build_lidar(folder: Path) -> None:
@@ -54,16 +55,19 @@ def _build_lidar(folder: Path) -> None:
     from mapper.simulation.lidar import write_lidar_log
 
     write_lidar_log(folder / "log", LidarSynthConfig(duration_s=1.0))
-    _build(folder)
+    _build(folder, "run")
 
 
-def _build(folder: Path, *overrides: str) -> None:
+def _build(folder: Path, name: str, *overrides: str) -> None:
     from mapper.config.loading import load_config
+    from mapper.export.exporters import export
     from mapper.pipeline.build import build
     from mapper.sources import open_source
 
     source = open_source(folder / "log")
-    build(source, load_config(None, overrides, sensor=source.sensor), folder / "run")
+    run = build(source, load_config(None, overrides, sensor=source.sensor), folder / name)
+    export(run, "octomap", folder / f"{name}.bt")  # reads map.octree
+    export(run, "nav2", folder / f"{name}_nav2")  # inflates the slice
 
 
 @contextmanager

@@ -34,15 +34,15 @@ def test_both_sensors_logs_are_built(monkeypatch):
     built = []
     build = warm_up._build
 
-    def build_and_note(folder, *overrides):
-        build(folder, *overrides)
-        built.append(sorted(path.name for path in (folder / "run").iterdir()))
+    def build_and_note(folder, name, *overrides):
+        build(folder, name, *overrides)
+        built.append(sorted(path.name for path in (folder / name).iterdir()))
 
     monkeypatch.setattr(warm_up, "_build", build_and_note)
     progress = Counts()
     compile_kernels(progress=progress)
     assert all("map.octree" in files for files in built)
-    assert len(built) == 2
+    assert len(built) == 3
     assert progress.reported[-1] == (KERNELS, KERNELS)
 
 
