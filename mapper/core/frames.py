@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.back_projection import back_project
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Points, Transform, is_rigid
 from mapper.core.timebase import NS_PER_S
@@ -208,6 +207,8 @@ class RgbdFrame:
             stride_px: Keep every n-th row and column.
             max_depth_m: Drop deeper measurements.
         """
+        from mapper.core.back_projection import back_project  # numba takes long to import
+
         points_body = back_project(
             self.depth_m,
             ray_table(self.camera),

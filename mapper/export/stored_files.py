@@ -4,8 +4,6 @@ import shutil
 from pathlib import Path
 
 from mapper.core.errors import RunError
-from mapper.export.grid import write_grid
-from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.runtime.atomic import atomic_file
@@ -26,6 +24,8 @@ def octomap(run: Run, path: Path, _progress: Progress) -> None:
         return
     if _is_same(run.path / name, path):
         raise RunError(f"{path}: is the run's own octree; name another file to write level {level} to")
+    from mapper.octree.octomap_file import write_bt, write_ot
+
     octree = run.octree.coarser(level, parent=run.config.octomap.parent)
     (write_ot if full else write_bt)(path, octree)
 
@@ -59,6 +59,8 @@ def grid(run: Run, path: Path, _progress: Progress) -> None:
     """Write the slice's YAML with PGM and PNG beside it; the YAML names the PGM, so this is no copy."""
     slice_world = run.slice
     if not _is_same(run.path / f"{files.SLICE}.yaml", path):
+        from mapper.export.grid import write_grid
+
         write_grid(path.parent, path.stem, slice_world)
 
 

@@ -1,6 +1,9 @@
 """Views: the features or points of one frame by which a place is recognised and a loop is measured."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +12,9 @@ from mapper.core.errors import DataError
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, Transform
 from mapper.features.base import Descriptors
-from mapper.features.hamming import Bits, pack
+
+if TYPE_CHECKING:
+    from mapper.features.hamming import Bits
 
 _ORB_BYTES = 32
 
@@ -56,6 +61,8 @@ class ImageView:
                 f"view {self.stamp_ns}: descriptors are {self.descriptors.shape[1]} × "
                 f"{self.descriptors.dtype}, want 256 bits; choose detector 'orb' or 'uniform-orb'"
             )
+        from mapper.features.hamming import pack
+
         return pack(self.descriptors)
 
     def has_depth(self, *, max_depth_m: float) -> NDArray[np.bool_]:

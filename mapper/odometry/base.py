@@ -1,19 +1,23 @@
 """Interface of the odometries: the result of tracking one frame, and the methods that produce it."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.deskew import Twist
 from mapper.core.frames import Frame
 from mapper.core.geometry import Array, Transform
 from mapper.core.timebase import NS_PER_S
 from mapper.features.frame_view import FrameView
 from mapper.graph.model import BetweenFactor
 from mapper.sources.base import FrameRef
+
+if TYPE_CHECKING:
+    from mapper.core.deskew import Twist
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING
 
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_run_config
-from mapper.core.errors import RunError
+from mapper.core.errors import MapperError, RunError
 from mapper.core.paths import AnyPath
 from mapper.core.trajectory import Trajectory
 from mapper.graph.g2o import read_g2o
@@ -44,6 +45,8 @@ if TYPE_CHECKING:  # compiled code, which takes longer to load than most files o
     from mapper.octree.map import OctreeMap
     from mapper.octree.slice import OccupancyGrid
     from mapper.run.cloud import Cloud
+
+_NAMED = 5
 
 
 @dataclass(frozen=True)
@@ -222,6 +225,8 @@ def open_run(path: AnyPath) -> Run:
             raise RunError(f"{path}: not finished; the mapper merge that began it goes on where it was")
         if (partial / files.MANIFEST).is_file():
             raise RunError(f"{path}: not finished: {_ending(partial)}")
+        if path.exists():
+            raise RunError(f"{path}: {_not_a_run(path)}")
         raise RunError(f"{path}: no such run folder; make one with mapper build LOG --out {path}")
     if is_merged_map(path):
         raise RunError(
@@ -232,6 +237,8 @@ def open_run(path: AnyPath) -> Run:
         raise RunError(
             f"{path}: is a localised log, not a run; the map that it lies in is told in its manifest"
         )
+    if not (path / files.MANIFEST).exists():
+        raise RunError(f"{path}: {_not_a_run(path)}")
     manifest = read_manifest(path / files.MANIFEST)
     if manifest.status != "complete":
         raise RunError(f"{path}: not finished: {_ending(path)}")
@@ -295,6 +302,19 @@ def refuse_another_log(run: Run, source: Log) -> None:
 def paths_of(source: Log) -> list[Path]:
     """Return the paths of the logs that a log is made of."""
     return [session.log.path for session in sessions_of(source)]
+
+
+def _not_a_run(path: Path) -> str:
+    """Return what a file or folder is that is no run, and what was perhaps meant."""
+    if path.is_file() and (path.parent / files.MANIFEST).is_file():
+        return f"is a file of a run; give the folder {path.parent}"
+    if path.is_dir() and (runs := sorted(child.parent.name for child in path.glob(f"*/{files.MANIFEST}"))):
+        return f"is no run itself, but holds {', '.join(runs[:_NAMED])}{', …' if len(runs) > _NAMED else ''}"
+    try:
+        open_source(path)
+    except MapperError:
+        return f"is no run folder: it has no {files.MANIFEST}"
+    return f"is a log, not a run; map it first: mapper build {quote(str(path))}"
 
 
 def _ending(folder: Path) -> str:

@@ -2,6 +2,7 @@ import csv
 import inspect
 import io
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -74,6 +75,15 @@ def test_a_build_on_images_loads_nothing_that_only_scans_recordings_and_viewers_
     assert not loaded & {"open3d", "kiss_icp", "kiss_matcher", "rerun", "laspy"}
 
 
+@pytest.mark.parametrize("verb", [["export", "--as", "tum"], ["loops"]])
+def test_verbs_that_only_look_load_no_compiler_and_no_solver(run_folder, verb):
+    code = "import sys; from cli.main import app; app(standalone_mode=False); print(*sys.modules)"
+    arguments = [verb[0], run_folder, *verb[1:], "--quiet"]
+    ran = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True)
+    loaded = {name.split(".")[0] for name in ran.stdout.split()}
+    assert not loaded & {"numba", "gtsam", "scipy", "matplotlib", "open3d", "rerun"}
+
+
 def test_build_prints_a_table(desk_log, tmp_path):
     result = mapper("build", desk_log, "--out", tmp_path / "run", "--first", 3, "--last", 24, "--stride", 2)
 
@@ -111,6 +121,11 @@ def test_spelled_out_overrides_win(desk_log, tmp_path):
         (["build", "LOG", "--out", "run", "--last", "4", "--quiet"], "mapper: only 5 frames were read"),
         (["build", "LOG", "--out", "run", "--config", "no.toml"], "mapper: no.toml: cannot be read"),
         (["fuse", "nowhere"], "mapper: nowhere: no such run folder"),
+        (["fuse", "LOG"], "LOG: is a log, not a run; map it first: mapper build LOG"),
+        (["view", "RUN/map.bt"], "is a file of a run; give the folder RUN"),
+        (["report", "PLACE"], "PLACE: is no run itself, but holds "),
+        (["fuse", "."], "mapper: .: is no run folder: it has no manifest.json"),
+        (["build", "RUN", "--out", "run"], "a run that mapper wrote: its trajectory, its map and images"),
         (["fuse", "RUN", "--set", "graph.solve=none"], "mapper: graph: fuse keeps what was tracked"),
         (["fuse", "RUN", "--log", "gone"], "gone: the log of RUN is no longer there; give its new place"),
         (["export", "nowhere", "--as", "ply"], "mapper: nowhere: no such run folder"),
@@ -139,11 +154,15 @@ def test_spelled_out_overrides_win(desk_log, tmp_path):
 )
 def test_a_mistake_is_one_line(run_folder, desk_log, tmp_path, monkeypatch, arguments, message):
     monkeypatch.chdir(tmp_path)
-    places = {"LOG": str(desk_log), "RUN": str(run_folder)}
-    result = mapper(*(places.get(word, word) for word in arguments), status=1)
+    places = {"LOG": str(desk_log), "RUN": str(run_folder), "PLACE": str(run_folder.parent)}
+
+    def told(text):
+        return re.sub("LOG|RUN|PLACE", lambda found: places[found[0]], text)
+
+    result = mapper(*map(told, arguments), status=1)
 
     assert len(result.stderr.splitlines()) == 1
-    assert message.replace("RUN", str(run_folder)) in result.stderr
+    assert told(message) in result.stderr
 
 
 def test_a_failed_build_says_where_its_rest_is(desk_log, tmp_path):
