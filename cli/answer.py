@@ -5,7 +5,8 @@ import inspect
 import json
 import math
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, is_dataclass
 from enum import Enum
 from pathlib import Path
@@ -17,7 +18,7 @@ from cli.console import progress_for
 from cli.terminal import print_text
 from mapper.core.errors import MapperError
 from mapper.runtime.atomic import MANIFEST_NAME
-from mapper.runtime.progress import Progress
+from mapper.runtime.progress import SILENT, Progress
 
 _LINE_WIDTH = 110
 
@@ -40,6 +41,14 @@ class Output:
         """Return the progress of a job, on stderr; bars would overdraw prompts."""
         quiet = self.quiet or (self.json and not sys.stderr.isatty())
         return progress_for(quiet=quiet, prompts=prompts, every_note=self.verbose)
+
+    @contextmanager
+    def waiting(self, name: str) -> Iterator[None]:
+        """Show, on a terminal, that something of which no part can be counted goes on."""
+        progress = self.progress() if sys.stderr.isatty() else SILENT
+        with progress.stage(name) as report:
+            yield
+            report(1, 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,13 +146,16 @@ def plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} has no form in JSON")
 
 
-def rows_text(rows: Sequence[tuple[str, str]], *, width: int = _LINE_WIDTH) -> str:
-    """Return aligned lines of name and text; what does not fit is wrapped below."""
+def rows_text(rows: Sequence[tuple[str, str]], *, width: int | None = None) -> str:
+    """Return aligned lines of name and text; what does not fit, on the terminal too, is wrapped below."""
+    from shutil import get_terminal_size
     from textwrap import wrap
 
+    if width is None:
+        width = min(_LINE_WIDTH, get_terminal_size().columns) if sys.stdout.isatty() else _LINE_WIDTH
     indent = 2 + max(len(name) for name, _ in rows)
     lines = []
     for name, text in rows:
-        folded = wrap(text, width - indent, break_long_words=False, break_on_hyphens=False) or [""]
+        folded = wrap(text, max(width - indent, 20), break_long_words=False, break_on_hyphens=False) or [""]
         lines += [f"{name:<{indent}}{folded[0]}", *(" " * indent + line for line in folded[1:])]
     return "\n".join(lines)

@@ -23,7 +23,7 @@ def report(
     out: Annotated[Path, typer.Option(help="HTML file to write.")] = Path("report.html"),
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
     *,
-    output: Output,  # noqa: ARG001
+    output: Output,
 ) -> Answer:
     """Write one self-contained page about a run, or about several side by side; it opens offline.
 
@@ -38,7 +38,9 @@ def report(
         raise RunError(f"{out}: exists already; choose another --out, or pass --overwrite to replace it")
     loaded = [open_run(run) for run in runs]
     names = distinct_names(runs)
-    write_report(out, [chapter_of(run, name, _figures(run)) for run, name in zip(loaded, names, strict=True)])
+    with output.waiting("report"):
+        chapters = [chapter_of(run, name, _figures(run)) for run, name in zip(loaded, names, strict=True)]
+        write_report(out, chapters)
     return made(out)
 
 

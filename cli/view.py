@@ -43,7 +43,7 @@ def view(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the --rrd file or OUT.")] = False,
     *,
-    output: Output,  # noqa: ARG001
+    output: Output,
 ) -> Answer:
     """Show a finished run in Rerun or in a browser: path, graph, loops, voxels, cloud, slice, images.
 
@@ -71,6 +71,6 @@ def view(
         show_run(built, "spawn" if connect is None else f"connect:{connect}")
         return Answer({"run": built.path})
     path = rrd or built.path / RERUN
-    with nullcontext() if rrd else built.changing({RERUN}):
+    with nullcontext() if rrd else built.changing({RERUN}), output.waiting("view"):
         show_run(built, str(path))
     return made(path)
