@@ -40,8 +40,8 @@ class EscapingStream:
         self.raw = stream
 
     def write(self, text: str) -> int:
-        """Write the text, escaped."""
-        self.raw.write(escaped(text))
+        """Write the text, escaped; the end of all colours, which colorama writes at exit, as it is."""
+        self.raw.write(text if text == _RESET else escaped(text))
         return len(text)
 
     def writelines(self, lines: Any) -> None:

@@ -26,6 +26,8 @@ def test_a_stream_escapes_what_is_printed_to_it():
     print("topic \x1b]0;title\x07", file=EscapingStream(stream))
     EscapingStream(stream).writelines(["\x1b", "\n"])
     assert stream.getvalue() == "topic \\x1b]0;title\\x07\n\\x1b\n"
+    EscapingStream(stream).write("\x1b[0m")
+    assert stream.getvalue().endswith("\n\x1b[0m")
 
 
 def test_a_name_of_a_log_cannot_write_to_the_terminal(tmp_path):
