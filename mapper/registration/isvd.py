@@ -5,9 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, Points, Transform, apply, fit_rigid
+from mapper.core.geometry import Array, Points, Transform, apply, fit_rigid, transform
 from mapper.registration.base import Alignment, failed
 from mapper.registration.config import IsvdConfig
+from mapper.registration.isvd_trimming import trim
 
 _MM_PER_M = 1000.0
 _MIN_SPREAD_M = 0.01  # about a common line, points nearer to it than this leave the rotation unobservable
@@ -64,18 +65,29 @@ class Isvd:
 
     def _trim(self, target: Points, source: Points) -> tuple[Transform, NDArray[np.intp]]:
         """Return the motion of the last iteration and the indices of the pairs it was fitted to."""
+        config = self._config
+        enough = max(min(config.min_pairs, len(target) // 2), 3)
+        if config.step == "icp":
+            return self._trim_by_icp(target, source, enough)
+        R, t, used = trim(
+            np.ascontiguousarray(target),
+            np.ascontiguousarray(source),
+            np.array([*self._thresholds_m()]),
+            config.min_error_mm / _MM_PER_M,
+            enough,
+        )
+        return transform(R, t), used
+
+    def _trim_by_icp(self, target: Points, source: Points, enough: int) -> tuple[Transform, NDArray[np.intp]]:
+        """Return the same by algorithm 5, whose iterations find their pairs anew."""
         T_target_source = np.eye(4)
         used = kept = np.arange(len(target), dtype=np.intp)
-        enough = min(self._config.min_pairs, len(target) // 2)
         for threshold_m in self._thresholds_m():
             used = kept
-            if self._config.step == "icp":
-                T_target_source = _icp(target[used], source[used], T_target_source)
-            else:
-                T_target_source, _ = fit_rigid(target[used], source[used])
+            T_target_source = _icp(target[used], source[used], T_target_source)
             distances = np.linalg.norm(target[used] - apply(T_target_source, source[used]), axis=1)
             kept = used[distances <= threshold_m]
-            if threshold_m * _MM_PER_M < self._config.min_error_mm or len(kept) < max(enough, 3):
+            if threshold_m * _MM_PER_M < self._config.min_error_mm or len(kept) < enough:
                 break
         return T_target_source, used
 

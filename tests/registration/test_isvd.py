@@ -6,6 +6,7 @@ import pytest
 from mapper.core.geometry import angle_between, apply, exp, fit_rigid, inverse, log
 from mapper.registration.config import IsvdConfig
 from mapper.registration.isvd import Isvd, rigid_fit_information
+from mapper.registration.isvd_trimming import trim
 
 
 def room(rng: np.random.Generator, n: int = 200) -> np.ndarray:
@@ -60,7 +61,40 @@ def test_one_iteration_is_the_plain_fit_of_all_pairs():
 
     found = Isvd(IsvdConfig(max_iterations=1, min_agreement_ratio=0.0, agreement_mm=5000)).fit(target, source)
 
-    assert np.array_equal(found.T_target_source, fit_rigid(target, source)[0])
+    plain, _ = fit_rigid(target, source)
+    assert np.allclose(found.T_target_source, plain, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_iteration_fits_what_the_one_before_left(seed):
+    target, source, _ = pairs_with_outliers(seed, wrong=50, noise_m=0.008)
+    thresholds_m = np.array([1.2, 0.2, 0.05, 0.02, 0.01, 0.005])
+
+    R, t, used = trim(target, source, thresholds_m, 0.0, 30)
+
+    kept = np.arange(len(target))
+    for threshold_m in thresholds_m:
+        expected, fitted = fit_rigid(target[kept], source[kept])[0], kept
+        kept = kept[np.linalg.norm(target[kept] - apply(expected, source[kept]), axis=1) <= threshold_m]
+        if len(kept) < 30:
+            break
+    assert np.array_equal(used, fitted)
+    assert np.allclose(R, expected[:3, :3], rtol=0.0, atol=1e-12)
+    assert np.allclose(t, expected[:3, 3], rtol=0.0, atol=1e-12)
+
+
+def test_points_in_a_plane_give_a_rotation_and_no_mirror():
+    rng = np.random.default_rng(3)
+    T_target_source = motion(rng)
+    source = room(rng, 60)
+    source[:, 2] = 1.5
+    noise_m = rng.normal(0.0, 0.002, source.shape)
+
+    R, t, _ = trim(apply(T_target_source, source) + noise_m, source, np.array([1.0]), 0.0, 3)
+
+    assert np.linalg.det(R) == pytest.approx(1.0)
+    assert np.allclose(R, T_target_source[:3, :3], atol=5e-3)
+    assert np.allclose(t, T_target_source[:3, 3], atol=1e-2)
 
 
 def test_thresholds_are_those_of_equation_4_2():
