@@ -11,11 +11,20 @@ from cli.answer import Answer, Output, made
 from cli.options import RunFolders
 
 if TYPE_CHECKING:
-    from mapper.export.report.data import Figure
+    from mapper.export.report.data import Figure, Question
     from mapper.run.folder import Run
 
 
 _DIGITS = 3
+_OF_ACCURACY = (
+    "ATE RMSE",
+    "RPE translation RMSE",
+    "RPE rotation RMSE",
+    "relative translation mean",
+    "relative rotation mean",
+    "loops wrongly accepted",
+)
+_OF_COVERAGE = ("path length", "longest gap", "true revisits")
 
 
 def report(
@@ -57,26 +66,48 @@ def _figures(run: "Run") -> "list[Figure]":
     from evaluators.metrics.evaluate import assess
     from evaluators.metrics.loops import loop_metrics
     from evaluators.metrics.metric import shown
+    from mapper.export.path_band import SIGMAS
     from mapper.export.report.data import Figure
 
-    counts, truth = run.manifest.counts, run.truth
+    counts, timing, truth, poses = run.manifest.counts, run.manifest.timing, run.truth, run.poses
     frames_ns = np.array([record.stamp_ns for record in run.records], dtype=np.int64)
     metrics = list(assess(run.trajectory, truth, frames_ns=frames_ns).metrics)
     if truth is not None:
         metrics += loop_metrics(run.loops, run.keyframes.stamps_ns, truth)
-    return [
-        Figure("log", run.manifest.input.title),
-        Figure("verdict", run.verdict.state),
-        Figure("frames tracked", f"{counts.tracked} of {counts.listed}"),
-        Figure("frames doubtful", str(counts.doubtful)),
-        Figure("frames lost", str(counts.lost)),
-        Figure("frames skipped", str(counts.skipped)),
-        Figure("nodes", str(counts.nodes)),
-        Figure("factors", str(counts.factors)),
-        Figure("loops that hold", f"{counts.loops} of {counts.loop_candidates}"),
-        Figure("octree leaves", f"{counts.leaves} of {run.config.octree.resolution_m:g} m"),
+    right: list[tuple[str, str]] = [("verdict", run.verdict.state)]
+    if poses is not None and np.isfinite(poses.position_sigmas_m).any():
+        widest_m = SIGMAS * float(np.nanmax(poses.position_sigmas_m))
+        right.append((f"uncertainty of the path, {SIGMAS:g} σ", f"at most {widest_m:.{_DIGITS}g} m"))
+    if counts.loop_candidates:
+        right.append(("loops that hold", f"{counts.loops} of {counts.loop_candidates} candidates"))
+    complete = [
+        ("frames tracked", f"{counts.tracked} of {counts.listed}"),
         *(
-            Figure(name, f"{value} {unit}")
-            for name, value, unit in (shown(metric, digits=_DIGITS) for metric in metrics)
+            (f"frames {what}", str(n))
+            for what, n in (("doubtful", counts.doubtful), ("lost", counts.lost), ("skipped", counts.skipped))
+            if n
         ),
+        ("graph", f"{counts.nodes} nodes, {counts.factors} factors"),
+        ("octree", f"{counts.leaves:,} voxels of {run.config.octree.resolution_m:g} m"),
+        ("cloud", f"{counts.cloud_points:,} points"),
     ]
+    fast = [
+        ("build", f"{timing.total_s:.{_DIGITS}g} s for {timing.log_s:.{_DIGITS}g} s of log"),
+        ("× real time", f"{timing.real_time_factor:.{_DIGITS}g}"),
+        ("frames per second", f"{timing.frames_per_s:.{_DIGITS}g}"),
+        *((f"to {stage}", f"{seconds:.{_DIGITS}g} s") for stage, seconds in timing.stage_s.items()),
+        ("peak memory", f"{timing.peak_memory_mb:.{_DIGITS}g} MB"),
+    ]
+    figures = [Figure(name, value, "Is it right?") for name, value in right]
+    figures += [Figure(name, value, "Is it complete?") for name, value in complete]
+    for metric in metrics:
+        name, value, unit = shown(metric, digits=_DIGITS)
+        figures.append(Figure(name, f"{value} {unit}", _question(name)))
+    return figures + [Figure(name, value, "How fast was it?") for name, value in fast]
+
+
+def _question(metric: str) -> "Question":
+    """Return what a metric answers first of all."""
+    if metric.startswith(_OF_ACCURACY):
+        return "Is it right?"
+    return "Is it complete?" if metric.startswith(_OF_COVERAGE) else ""

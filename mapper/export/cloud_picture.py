@@ -10,21 +10,31 @@ from mapper.core.frames import Points32
 from mapper.core.geometry import Array
 from mapper.core.trajectory import Trajectory
 from mapper.export.page import LINE, hex_of, new_figure, save, scale_bar
-from mapper.export.palette import ESTIMATE, Rgb
+from mapper.export.palette import BACKDROP, END, ESTIMATE, START
+from mapper.mapping.cloud import height_colors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _MARGIN_M = 0.3
 _HEADROOM_M = 0.3  # above the highest camera position; what lies higher would hide the rooms from above
 _VIEW_PX = 900
 _TILT_RAD = np.deg2rad(32.0)
 _TURN_RAD = np.deg2rad(-35.0)
-_BACKDROP: Rgb = (22, 24, 30)
+_VIEW_IN = 5.6  # height of a view
+_WIDEST = 2.0  # width over height
+_GAP_IN, _HEAD_IN, _FOOT_IN = 0.15, 0.4, 0.4
+_STRAY_PERCENT = 1.0
 
 
 def write_cloud_views(
-    path: Path, points: Points32, colors: NDArray[np.uint8], trajectory: Trajectory
+    path: Path,
+    points: Points32,
+    colors: NDArray[np.uint8],
+    trajectory: Trajectory,
+    *,
+    has_colors: bool = True,
 ) -> None:
     """Draw a coloured cloud from above and from an oblique side, with the trajectory through it.
 
@@ -35,33 +45,98 @@ def write_cloud_views(
         points: (N, 3) float32 metres, world frame, z up; N ≥ 1.
         colors: (N, 3) uint8 RGB.
         trajectory: World frame.
+        has_colors: Whether the sensor saw the colours; if not, points are coloured by their height.
     """
     positions = trajectory.positions_world
     below = points[:, 2] <= positions[:, 2].max() + _HEADROOM_M
     if below.any():
         points, colors = points[below], colors[below]
-    figure = new_figure(13.0, 6.6, background=_BACKDROP)
-    views = {"from above": _view(0.0, np.pi / 2), "from the side": _view(_TURN_RAD, _TILT_RAD)}
-    for column, (name, R_view_world) in enumerate(views.items()):
-        axes = figure.add_axes((0.01 + 0.5 * column, 0.02, 0.48, 0.9))
-        _draw_view(axes, R_view_world, points, colors=colors, positions=positions)
+    heights_m = None
+    if not has_colors:
+        low_m, high_m = np.percentile(points[:, 2], [_STRAY_PERCENT, 100.0 - _STRAY_PERCENT]).tolist()
+        heights_m = low_m, high_m
+        colors = height_colors(points[:, 2], between_m=heights_m)
+    views = {
+        "from above": _View(_turned(0.0, np.pi / 2), points, positions),
+        "from the side": _View(_turned(_TURN_RAD, _TILT_RAD), points, positions),
+    }
+    # Both views are as high as the page; its width is what they take.
+    widths_in = [_VIEW_IN * min(view.aspect, _WIDEST) for view in views.values()]
+    width_in = sum(widths_in) + 3 * _GAP_IN
+    height_in = _VIEW_IN + _HEAD_IN + _FOOT_IN
+    figure = new_figure(width_in, height_in, background=BACKDROP)
+    left_in = _GAP_IN
+    for (name, view), view_in in zip(views.items(), widths_in, strict=True):
+        axes = figure.add_axes(
+            (left_in / width_in, _FOOT_IN / height_in, view_in / width_in, _VIEW_IN / height_in)
+        )
+        _draw_view(axes, view, colors)
         axes.set_title(name, color=LINE, fontsize=11)
+        left_in += view_in + _GAP_IN
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(
+        handles,
+        labels,
+        loc="lower left",
+        ncols=3,
+        frameon=False,
+        labelcolor=LINE,
+        fontsize=9,
+        bbox_to_anchor=(0.0, 0.0),
+    )
+    if heights_m is not None:
+        _height_legend(figure, heights_m)
     save(figure, path)
 
 
-def _draw_view(
-    axes: "Axes", R_view_world: Array, points: Points32, *, colors: NDArray[np.uint8], positions: Array
-) -> None:
-    cloud, path = points @ R_view_world.T.astype(np.float32), positions @ R_view_world.T
-    # A few stray points must not shrink the scene.
-    low, high = np.percentile(cloud[:, :2], [0.5, 99.5], axis=0)
-    low = np.minimum(low, path[:, :2].min(axis=0)) - _MARGIN_M
-    high = np.maximum(high, path[:, :2].max(axis=0)) + _MARGIN_M
+class _View:
+    """A cloud and a path as seen from one side, and the part of them that a picture shows."""
+
+    def __init__(self, R_view_world: Array, points: Points32, positions: Array) -> None:
+        self.cloud = points @ R_view_world.T.astype(np.float32)
+        self.path = positions @ R_view_world.T
+        # A few stray points must not shrink the scene.
+        low, high = np.percentile(self.cloud[:, :2], [_STRAY_PERCENT, 100.0 - _STRAY_PERCENT], axis=0)
+        self.low: Array = np.minimum(low, self.path[:, :2].min(axis=0)) - _MARGIN_M
+        self.high: Array = np.maximum(high, self.path[:, :2].max(axis=0)) + _MARGIN_M
+
+    @property
+    def aspect(self) -> float:
+        """Width over height."""
+        width, height = self.high - self.low
+        return float(width / height)
+
+
+def _height_legend(figure: "Figure", heights_m: tuple[float, float]) -> None:
+    """Draw what height each colour is, in the lower right corner."""
+    ramp = height_colors(np.linspace(0.0, 1.0, 256), between_m=(0.0, 1.0))[np.newaxis]
+    width_in, height_in = figure.get_size_inches()
+    axes = figure.add_axes((1.0 - 2.6 / width_in, 0.2 / height_in, 1.6 / width_in, 0.1 / height_in))
+    axes.imshow(ramp, aspect="auto")
+    axes.set_axis_off()
+    for x, (label, alignment) in zip(
+        (-8, 264), ((f"{heights_m[0]:.2g} m", "right"), (f"{heights_m[1]:.2g} m", "left")), strict=True
+    ):
+        axes.text(x, 0.0, label, color=LINE, fontsize=9, ha=alignment, va="center")
+
+
+def _draw_view(axes: "Axes", view: _View, colors: NDArray[np.uint8]) -> None:
+    cloud, path, low, high = view.cloud, view.path, view.low, view.high
     pixel_m = float((high - low).max()) / _VIEW_PX
     image = splat(cloud, colors, low=low, pixel_m=pixel_m, shape=np.ceil((high - low)[::-1] / pixel_m))
     axes.imshow(image, origin="lower", interpolation="antialiased", extent=(low[0], high[0], low[1], high[1]))
     axes.plot(*path[:, :2].T, color="white", linewidth=2.4, alpha=0.75)
-    axes.plot(*path[:, :2].T, color=hex_of(ESTIMATE), linewidth=1.3)
+    axes.plot(*path[:, :2].T, color=hex_of(ESTIMATE), linewidth=1.3, label="path")
+    for place, color, marker, label in ((path[0], START, "o", "start"), (path[-1], END, "s", "end")):
+        axes.plot(
+            *place[:2],
+            marker,
+            color=hex_of(color),
+            markersize=7,
+            markeredgecolor="white",
+            label=label,
+            linestyle="none",
+        )
     scale_bar(axes, low, high, color="white")
     axes.set_axis_off()
 
@@ -85,7 +160,7 @@ def splat(
     """
     height, width = (int(n) for n in shape)
     image = np.empty((height + 2, width + 2, 3), np.uint8)
-    image[:] = _BACKDROP
+    image[:] = BACKDROP
     cell = np.floor((cloud[:, :2] - low) / pixel_m).astype(np.int64) + 1
     inside = (cell >= 1).all(axis=1) & (cell[:, 0] <= width) & (cell[:, 1] <= height)
     nearest_last = np.flatnonzero(inside)[np.argsort(cloud[inside, 2], kind="stable")]
@@ -99,7 +174,7 @@ def splat(
     return image[1:-1, 1:-1]
 
 
-def _view(turn_rad: float, tilt_rad: float) -> Array:
+def _turned(turn_rad: float, tilt_rad: float) -> Array:
     """Return the rotation to (right, up, towards the viewer) of a viewer at an azimuth and elevation."""
     towards = np.array(
         [np.sin(turn_rad) * np.cos(tilt_rad), -np.cos(turn_rad) * np.cos(tilt_rad), np.sin(tilt_rad)]

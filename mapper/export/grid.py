@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array
-from mapper.export.palette import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
+from mapper.export.page import round_length
+from mapper.export.palette import FREE_CELL, INK, OCCUPIED_CELL, PAPER, UNKNOWN_CELL
 from mapper.octree.grid_file import (
     FREE_PIXEL,
     FREE_THRESHOLD,
@@ -22,6 +23,8 @@ from mapper.runtime.atomic import write_bytes, write_text
 
 _PICTURE_PX = 800
 _MOST_PX = 4000
+_STRIP_PX = 36
+_BAR_SHARE = 0.25  # of the picture's width
 
 
 def write_grid(folder: Path, stem: str, grid: OccupancyGrid) -> None:
@@ -93,7 +96,31 @@ def _write_picture(path: Path, grid: OccupancyGrid) -> None:
     grid = shrunk(grid, _MOST_PX)
     enlargement = -(-_PICTURE_PX // max(grid.cells.shape))
     image = grid_image(grid)[::-1].repeat(enlargement, axis=0).repeat(enlargement, axis=1)
+    image = np.vstack([image, _scale_and_legend(image.shape[1], grid.resolution_m / enlargement)])
     encoded, png = cv2.imencode(".png", image[:, :, ::-1])
     if not encoded:
         raise DataError(f"{path}: a grid of {grid.cells.shape} cells cannot be written as PNG")
     write_bytes(path, png.tobytes())
+
+
+def _scale_and_legend(width_px: int, pixel_m: float) -> NDArray[np.uint8]:
+    """Return the strip below a picture: how long a bar is, and what the colours are."""
+    font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.5
+    strip = np.empty((_STRIP_PX, width_px, 3), np.uint8)
+    strip[:] = PAPER
+    length_m = round_length(_BAR_SHARE * width_px * pixel_m)
+    end = 10 + round(length_m / pixel_m)
+    cv2.rectangle(strip, (10, 16), (end, 20), INK, thickness=-1)
+    left, baseline = end + 8, 23
+    named = (("occupied", OCCUPIED_CELL), ("free", FREE_CELL), ("unknown", UNKNOWN_CELL))
+    for label, color in ((f"{length_m:g} m", None), *named):
+        (text_px, _), _ = cv2.getTextSize(label, font, size, 1)
+        if left + text_px + 30 > width_px:
+            break  # a narrow map has no room for all
+        if color is not None:
+            cv2.rectangle(strip, (left, 11), (left + 14, 25), color, thickness=-1)
+            cv2.rectangle(strip, (left, 11), (left + 14, 25), INK, thickness=1)
+            left += 20
+        cv2.putText(strip, label, (left, baseline), font, size, INK, 1, cv2.LINE_AA)
+        left += text_px + 16
+    return strip

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mapper.core.geometry import Array
+from mapper.export import palette
 from mapper.export.palette import Rgb
 from mapper.runtime.atomic import atomic_file
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-INK = "#1e2129"
+INK = "#{:02x}{:02x}{:02x}".format(*palette.INK)
 FAINT = "#6c7280"
 LINE = "#c3c8d0"
 
@@ -54,13 +55,13 @@ def scale_bar(axes: "Axes", low: Array, high: Array, *, color: str) -> None:
         high: (2,) upper right corner.
         color: Of the bar and its length.
     """
-    length_m = _round_length(0.2 * float(high[0] - low[0]))
+    length_m = round_length(0.2 * float(high[0] - low[0]))
     x, y = low + 0.035 * (high - low)
     axes.plot([x, x + length_m], [y, y], color=color, linewidth=3, solid_capstyle="butt")
     axes.annotate(f"{length_m:g} m", (x, y), (0, 5), textcoords="offset points", color=color, fontsize=9)
 
 
-def _round_length(length_m: float) -> float:
+def round_length(length_m: float) -> float:
     """Return the largest of 1, 2 or 5 times a power of ten that is not longer."""
     decade = 10.0 ** np.floor(np.log10(length_m))
     return float(max(step * decade for step in (1.0, 2.0, 5.0) if step * decade <= length_m))

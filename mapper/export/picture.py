@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 _MARGIN_M = 0.3
 _ACCEPTED_WEIGHT = 0.5  # weight from which a factor counts as held
 _NAMED = 12  # of many runs only the first are in the legend
+_ARROWS = 6  # along a path
 _SWEPT_PX = 4  # pixels per cell
 _SWEPT_ALPHA = 70
 
@@ -81,6 +82,7 @@ def draw_summary(
     if poses is not None:
         _draw_doubtful(axes, poses)
     _draw_loops(axes, loops_world)
+    _draw_direction(axes, positions)
     _mark(axes, positions[0], color=START, marker="o", label="start")
     _mark(axes, positions[-1], color=END, marker="s", label="end")
     _finish_map(axes, low, high)
@@ -99,11 +101,36 @@ def _draw_band(axes: "Axes", poses: UncertainPoses, low: Array, high: Array) -> 
 
 def _draw_doubtful(axes: "Axes", poses: UncertainPoses) -> None:
     """Draw the stretches whose poses may be wrong over the estimate."""
-    label = f"{int(poses.is_doubtful.sum())} doubtful frames"
+    count = int(poses.is_doubtful.sum())
+    label = f"{count} doubtful frame{'' if count == 1 else 's'}"
     for stretch in stretches(poses.is_doubtful):
         ends = poses.trajectory.positions_world[stretch, :2].T
         axes.plot(*ends, ".-", color=hex_of(DOUBTFUL), linewidth=2.6, markersize=4.0, label=label)
         label = ""
+
+
+def _draw_direction(axes: "Axes", positions: Array) -> None:
+    """Draw arrows that tell which way a path goes, evenly spread along it."""
+    reached_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1))])
+    style = {
+        "arrowstyle": "-|>",
+        "color": hex_of(ESTIMATE),
+        "mutation_scale": 13.0,
+        "shrinkA": 0,
+        "shrinkB": 0,
+    }
+    for share in (np.arange(_ARROWS) + 0.5) / _ARROWS:
+        ahead = int(np.searchsorted(reached_m, share * reached_m[-1]))
+        if ahead and reached_m[ahead] > reached_m[ahead - 1]:
+            style = {
+                "arrowstyle": "-|>",
+                "color": hex_of(ESTIMATE),
+                "mutation_scale": 13.0,
+                "shrinkA": 0,
+                "shrinkB": 0,
+            }
+            tip, tail = (tuple(positions[k, :2].tolist()) for k in (ahead, ahead - 1))
+            axes.annotate("", tip, tail, arrowprops=style)
 
 
 def _draw_loops(axes: "Axes", loops_world: Array) -> None:

@@ -207,7 +207,7 @@ def fuse_into(
             log_results(log, results)
             log_maps(log, maps, stamp_ns=int(trajectory.stamps_ns[0]))
             _write_maps(writer.folder, maps)
-            _write_pictures(writer, maps, results)
+            _write_pictures(writer, maps, results, has_colors=source.sensor == "rgbd")
     others = [warning for warning in writer.manifest.warnings if warning.kind != FLOOR]
     found = floor_warnings(config.traversable, config.octree.resolution_m, has_path=maps.has_path)
     writer.update(warnings=(*others, *found), edits=maps.edits)
@@ -258,7 +258,7 @@ def _write_maps(folder: Path, maps: Maps) -> None:
         write_grid(folder, files.storey(number), storey)
 
 
-def _write_pictures(writer: RunWriter, maps: Maps, results: RunResults) -> None:
+def _write_pictures(writer: RunWriter, maps: Maps, results: RunResults, *, has_colors: bool) -> None:
     counts, levelling = writer.manifest.counts, writer.manifest.levelling
     trajectory, graph = results.trajectory, results.graph
     lines = [f"{len(trajectory)} frames, {counts.nodes} keyframes, {trajectory.path_length_m:.2f} m of path"]
@@ -276,7 +276,11 @@ def _write_pictures(writer: RunWriter, maps: Maps, results: RunResults) -> None:
     )
     if len(maps.cloud_points_world):
         write_cloud_views(
-            writer.folder / files.CLOUD_VIEWS, maps.cloud_points_world, maps.cloud_colors, trajectory
+            writer.folder / files.CLOUD_VIEWS,
+            maps.cloud_points_world,
+            maps.cloud_colors,
+            trajectory,
+            has_colors=has_colors,
         )
 
 

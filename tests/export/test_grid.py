@@ -4,6 +4,7 @@ import pytest
 
 from mapper.core.errors import MapFileError
 from mapper.export.grid import write_grid
+from mapper.export.palette import INK
 from mapper.octree.grid_file import read_grid
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
@@ -30,6 +31,22 @@ def test_what_is_written_reads_back_exactly(tmp_path, grid):
     np.testing.assert_array_equal(got.origin_world_m, grid.origin_world_m)
     assert got.resolution_m == grid.resolution_m
     assert sorted(path.name for path in tmp_path.iterdir()) == ["slice.pgm", "slice.png", "slice.yaml"]
+
+
+@pytest.mark.parametrize(("resolution_m", "columns"), [(0.05, 120), (0.2, 900), (0.01, 7)])
+def test_the_picture_has_a_bar_of_a_round_length_below_the_map(tmp_path, resolution_m, columns):
+    write_grid(
+        tmp_path, "m", OccupancyGrid(np.zeros((80, columns), np.int8), np.array([0.0, 0.0]), resolution_m)
+    )
+    picture = cv2.imread(str(tmp_path / "m.png"))
+    enlargement = picture.shape[1] // columns
+    below = picture[80 * enlargement :]
+    assert (picture[: 80 * enlargement] == 255).all()  # free
+    bar_px = (below[18] == INK[::-1]).all(axis=1)
+    length_m = (np.argmin(bar_px[10:]) - 1) * resolution_m / enlargement
+    leading = length_m / 10 ** np.floor(np.log10(1.02 * length_m))
+    assert min(abs(leading - step) for step in (1.0, 2.0, 5.0)) < 0.1
+    assert 0.08 < length_m / (columns * resolution_m) < 0.27
 
 
 def test_the_pgm_is_the_one_map_server_saves(tmp_path):
@@ -61,6 +78,7 @@ def test_the_picture_is_large_and_the_right_way_up(tmp_path):
     write_grid(tmp_path, "m", OccupancyGrid(cells, np.array([0.0, 0.0]), 0.05))
 
     picture = cv2.imread(str(tmp_path / "m.png"))
+    picture = picture[:400]  # the scale and the legend are below
 
     assert picture.shape == (400, 800, 3)
     assert picture[-1, 0].max() < 70  # lowest y, lowest x: dark

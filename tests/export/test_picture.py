@@ -6,7 +6,7 @@ import pytest
 
 from mapper.core.trajectory import Trajectory
 from mapper.export.cloud_picture import splat, write_cloud_views
-from mapper.export.palette import DOUBTFUL, ESTIMATE, FACTORS, TRUTH
+from mapper.export.palette import BACKDROP, DOUBTFUL, ESTIMATE, FACTORS, TRUTH
 from mapper.export.path_band import band_image, stretches
 from mapper.export.picture import write_summary
 from mapper.mapping.cloud import height_colors
@@ -116,6 +116,24 @@ def test_views_leave_the_ceiling_out(tmp_path):
     picture = cv2.imread(str(tmp_path / "v.png"))
     assert pixels_like(picture, (20, 180, 20)) > 50_000
     assert pixels_like(picture, (250, 0, 250)) == 0
+
+
+def test_clouds_without_colours_are_coloured_by_height_and_fill_the_page(tmp_path):
+    side = np.linspace(-10.0, 10.0, 300)
+    x, y = (a.ravel() for a in np.meshgrid(side, 0.2 * side))
+    slope = np.column_stack([x, y, 0.1 * x]).astype(np.float32)
+    grey = np.full(slope.shape, 90, np.uint8)
+    write_cloud_views(tmp_path / "v.png", slope, grey, loop(), has_colors=False)
+    write_cloud_views(tmp_path / "grey.png", slope, grey, loop())
+    picture = cv2.imread(str(tmp_path / "v.png"))
+    assert pixels_like(picture, (90, 90, 90)) < 1000
+    below = slope[:, 2] <= 1.5
+    for color in height_colors(slope[below, 2][[0, -1]]):
+        assert pixels_like(picture, tuple(color.tolist())) > 500
+    drawn = (
+        np.abs(cv2.imread(str(tmp_path / "grey.png")).astype(int) - BACKDROP[::-1]).max(axis=2) > 20
+    ).mean()
+    assert drawn > 0.25
 
 
 def test_the_nearest_point_wins_whatever_the_order():

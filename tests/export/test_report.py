@@ -107,9 +107,25 @@ def test_the_tables_hold_every_run_side_by_side(page, runs):
     assert "<tr><th>octree.resolution_m</th>" in text
     size = (runs[0].path / "map.bt").stat().st_size
     cells = text.partition("Map sizes")[2]
-    assert f">{size / 1e6:.3g} MB, {100 * size / (runs[0].path / 'cloud.ply').stat().st_size:.3g} %" in cells
+    assert f">{size / 1e3:.3g} kB, {100 * size / (runs[0].path / 'cloud.ply').stat().st_size:.3g} %" in cells
     for library, version in runs[0].manifest.libraries.items():
         assert f'<th>{library}</th><td data-of="0">{version}</td>' in text
+
+
+def test_numbers_answer_questions_and_none_is_empty(page):
+    numbers = page.read_text().partition('<section id="numbers">')[2].partition("</section>")[0]
+    right, complete, fast = (
+        part.partition("</div></div>")[0] for part in re.split(r"<h3>[^<]*\?</h3>", numbers)[1:]
+    )
+    assert "ATE RMSE" in right
+    assert "frames tracked" in complete
+    assert "frames lost" not in complete  # none was
+    assert "peak memory" in fast
+    more = numbers.partition("<details>")[2]
+    assert "ATE median" in more
+    assert not re.search(r"<tr[^>]*><th>[^<]*</th>(<td[^>]*>(–|0|0 [^<]*)</td>)+</tr>", numbers)
+    for digits in re.findall(r">(?:at most )?(\d[\d.]*)[ <]", right):
+        assert len(digits.replace(".", "").lstrip("0")) <= 3
 
 
 def test_what_a_log_calls_itself_cannot_become_markup(runs):

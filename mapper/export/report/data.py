@@ -4,7 +4,7 @@ import base64
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -27,6 +27,9 @@ _VIEW_PX = 1600
 _VIEW_QUALITY = 85
 
 
+Question = Literal["Is it right?", "Is it complete?", "How fast was it?", ""]
+
+
 @dataclass(frozen=True, slots=True)
 class Figure:
     """One number about a run, as it is to be shown.
@@ -34,10 +37,12 @@ class Figure:
     Attributes:
         name: What it is.
         value: With its unit.
+        question: What it answers first of all; empty if it is only one of all numbers.
     """
 
     name: str
     value: str
+    question: Question = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,14 +117,18 @@ def map_sizes(chapter: Chapter) -> dict[str, str]:
     octree = read_octree(run.file(files.OCTREE_MAP))  # not kept: a report is of many runs
     cloud_bytes = run.file(files.CLOUD).stat().st_size
     points = run.manifest.counts.cloud_points
-    sizes = {"coloured cloud": f"{cloud_bytes / 1e6:.3g} MB, {points} points"}
+    sizes = {"coloured cloud": f"{_size(cloud_bytes)}, {points:,} points"}
     for level in range(_SIZED_LEVELS):
         coarse = octree.coarser(level, parent="max")
         octree_bytes = bt_bytes(coarse)
         sizes[f"octree, {coarse.resolution_m:g} m"] = (
-            f"{octree_bytes / 1e6:.3g} MB, {100.0 * octree_bytes / cloud_bytes:.3g} % of the cloud"
+            f"{_size(octree_bytes)}, {100.0 * octree_bytes / cloud_bytes:.3g} % of the cloud"
         )
     return sizes
+
+
+def _size(size_bytes: int) -> str:
+    return f"{size_bytes / 1e6:.3g} MB" if size_bytes >= 1e6 else f"{size_bytes / 1e3:.3g} kB"
 
 
 def residual_unit(results: RunResults) -> str:

@@ -3,6 +3,7 @@
   const SVG = "http://www.w3.org/2000/svg";
   const MARGIN = { left: 52, right: 12, top: 8, bottom: 22 };
   const CURVE_HEIGHT = 150;
+  const ARROW_EVERY_PX = 70; // along a path
   const runs = JSON.parse(document.getElementById("data").textContent);
   const shown = runs.map(() => true);
   const redraws = [];
@@ -21,7 +22,7 @@
     return made;
   }
 
-  const short = (value) => value === null || value === undefined ? "–" : String(Number(value.toPrecision(4)));
+  const short = (value) => value === null || value === undefined ? "–" : String(Number(value.toPrecision(3)));
 
   /** Round numbers between two values, about as many as asked for. */
   function ticks(low, high, count) {
@@ -231,6 +232,8 @@
       { id: "rejected", label: `${refused.length} refused`, color: "var(--rejected)", on: false, there: refused.length > 0 },
     ].filter((layer) => layer.there);
     legend(figure, layers, () => draw());
+    keyOf(figure, "var(--start)", "start");
+    keyOf(figure, "var(--end)", "end");
     const svg = element(figure, "svg", { role: "img", "aria-label": `${run.name} from above` });
     const readOut = element(figure, "div", { class: "read-out" });
     const margin = 0.3;
@@ -264,10 +267,27 @@
             element(group, "circle", { cx: toX(a[0]), cy: toY(a[1]), r: 1.5 });
           }
       }
-      const bar = [100, 50, 20, 10, 5, 2, 1, 0.5, 0.2, 0.1, 0.05, 0.02].find((length) => length <= 0.25 * (x1 - x0)) || 0.01;
+      drawDirection();
+      const bar = [1000, 500, 200, 100, 50, 20, 10, 5, 2, 1, 0.5, 0.2, 0.1, 0.05, 0.02].find((length) => length <= 0.25 * (x1 - x0)) || 0.01;
       element(svg, "line", { x1: 8, x2: 8 + bar * scale, y1: height - 8, y2: height - 8, style: "stroke: var(--ink)", "stroke-width": 3 });
       element(svg, "text", { x: 8, y: height - 14 }, `${bar} m`);
       dot = element(svg, "circle", { class: "here", r: 5, visibility: "hidden", style: `fill: ${colorOf(index)}; stroke: white; stroke-width: 2` });
+    }
+
+    /** Where the path starts and ends, and arrows along it. */
+    function drawDirection() {
+      const { x, y } = run.path, last = x.length - 1, group = element(svg, "g", { class: "direction" });
+      let since = ARROW_EVERY_PX / 2;
+      for (let i = 1; i <= last; i++) {
+        const [dx, dy] = [toX(x[i]) - toX(x[i - 1]), toY(y[i]) - toY(y[i - 1])];
+        since += Math.hypot(dx, dy);
+        if (since < ARROW_EVERY_PX) continue;
+        since = 0;
+        const turn = Math.atan2(dy, dx) * 180 / Math.PI;
+        element(group, "path", { d: "M5 0L-4 4L-4 -4Z", style: `fill: ${colorOf(index)}`, transform: `translate(${toX(x[i]).toFixed(1)} ${toY(y[i]).toFixed(1)}) rotate(${turn.toFixed(0)})` });
+      }
+      element(group, "rect", { x: toX(x[last]) - 6, y: toY(y[last]) - 6, width: 12, height: 12, style: "fill: var(--end)" });
+      element(group, "circle", { cx: toX(x[0]), cy: toY(y[0]), r: 6, style: "fill: var(--start)" });
     }
 
     /** Lines between poses, as wide as told in metres where that is above zero; none where it is null. */
@@ -326,7 +346,7 @@
     const controls = element(box, "div", { class: "controls" });
     const select = element(controls, "select", { "aria-label": "verdict" });
     for (const choice of ["all", "accepted", "rejected"]) element(select, "option", { value: choice }, choice);
-    const table = element(element(box, "div", { class: "scroll" }), "table", { class: "sortable" });
+    const table = element(element(box, "div", { class: "scroll", tabindex: 0 }), "table", { class: "sortable" });
     const head = element(element(table, "thead"), "tr"), body = element(table, "tbody");
     let sorted = null, rising = true;
     COLUMNS.forEach(([title, valueOf], column) => {

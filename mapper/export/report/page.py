@@ -1,15 +1,24 @@
 """HTML of the report: words and tables; ``page.js`` draws the curves and plans."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
 from importlib import resources
-from itertools import starmap
+from itertools import chain, starmap
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from mapper.export.html import document, section
-from mapper.export.report.data import Chapter, drawn, map_sizes, refuse_same_names, residual_unit, views_uri
+from mapper.export.report.data import (
+    Chapter,
+    Question,
+    drawn,
+    map_sizes,
+    refuse_same_names,
+    residual_unit,
+    views_uri,
+)
 from mapper.export.report.map_page import json_element, map_html, map_scripts, map_style
 from mapper.runtime.atomic import write_text
 
@@ -20,6 +29,7 @@ _CURVES = (
     ("inliers", "Inliers of each frame", ""),
     ("ms", "Time to track each frame", "ms"),
 )
+_NOTHING = re.compile(r"(–|0|0 .*)$")
 _MOST_POINTS = 500_000  # the page of the map alone has more
 _HINT = '<p class="hint">Drag to zoom in, double-click to see all again.</p>'
 
@@ -45,14 +55,17 @@ def page_of(chapters: Sequence[Chapter]) -> str:
         main=[
             section("Verdict", _columns(starmap(_verdict, enumerate(chapters)))),
             section("Map", map_html(chapters)),
-            section("Plans", _HINT + _columns(starmap(_plan, enumerate(chapters)))),
-            section("Views", _columns(starmap(_views, enumerate(chapters)))),
-            section("Summary", _table(["", *_names(chapters)], _figures(chapters))),
+            section(
+                "Plans and views",
+                _HINT + _columns(chain.from_iterable(starmap(_pictures, enumerate(chapters)))),
+            ),
+            section("Numbers", _numbers(chapters)),
             section("Over time", _curves(chapters)),
-            section("Loops", "".join(starmap(_loops, enumerate(chapters)))),
-            section("Map sizes", _table(["", *_names(chapters)], _side_by_side(chapters, map_sizes))),
-            section("Timing", _table(["", *_names(chapters)], _side_by_side(chapters, _timing))),
-            section("Versions", _table(["", *_names(chapters)], _side_by_side(chapters, _versions))),
+            *_loop_sections(chapters),
+            _columns(
+                section(title, _table(["", *_names(chapters)], _side_by_side(chapters, of)))
+                for title, of in (("Map sizes", map_sizes), ("Versions", _versions))
+            ),
             section("Configuration", _settings(chapters)),
         ],
         scripts=[
@@ -82,7 +95,7 @@ def _table(head: Iterable[str], rows: Iterable[Sequence[str]], *, css: str = "be
     top = "".join(_cell("th", text, i) for i, text in enumerate(head))
     body = "".join(f"<tr{_differs(row)}>{_cells(row)}</tr>" for row in rows)
     table = f'<table class="{css}"><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>'
-    return f'<div class="scroll">{table}</div>'
+    return f'<div class="scroll" tabindex="0">{table}</div>'
 
 
 def _cells(row: Sequence[str]) -> str:
@@ -91,6 +104,7 @@ def _cells(row: Sequence[str]) -> str:
 
 def _cell(tag: str, text: str, column: int) -> str:
     run = f' data-of="{column - 1}"' if column else ""
+    tag = tag if text else "td"  # a corner is no headline
     return f"<{tag}{run}>{escape(text)}</{tag}>"
 
 
@@ -102,8 +116,23 @@ def _names(chapters: Sequence[Chapter]) -> list[str]:
     return [chapter.name for chapter in chapters]
 
 
-def _figures(chapters: Sequence[Chapter]) -> list[list[str]]:
-    return _side_by_side(chapters, lambda chapter: {figure.name: figure.value for figure in chapter.figures})
+def _numbers(chapters: Sequence[Chapter]) -> str:
+    """Return the numbers by what a person asks, and below them all others."""
+    tables = "".join(
+        f"<div><h3>{question}</h3>{_table(['', *_names(chapters)], rows)}</div>"
+        for question in get_args(Question)
+        if question and (rows := _figures(chapters, question))
+    )
+    others = _table(["", *_names(chapters)], _figures(chapters, ""))
+    return f'<div class="columns">{tables}</div><details><summary>More numbers</summary>{others}</details>'
+
+
+def _figures(chapters: Sequence[Chapter], question: Question) -> list[list[str]]:
+    """Return the rows that answer a question, without those in which every run has nothing."""
+    rows = _side_by_side(
+        chapters, lambda chapter: {f.name: f.value for f in chapter.figures if f.question == question}
+    )
+    return [row for row in rows if not all(_NOTHING.match(value) for value in row[1:])]
 
 
 def _side_by_side(chapters: Sequence[Chapter], of: Any) -> list[list[str]]:
@@ -111,19 +140,6 @@ def _side_by_side(chapters: Sequence[Chapter], of: Any) -> list[list[str]]:
     columns: list[Mapping[str, str]] = [of(chapter) for chapter in chapters]
     names = dict.fromkeys(name for column in columns for name in column)
     return [[name, *(column.get(name, "–") for column in columns)] for name in names]
-
-
-def _timing(chapter: Chapter) -> dict[str, str]:
-    timing = chapter.run.manifest.timing
-    return {
-        "started": timing.started,
-        **{f"{stage}, s": f"{seconds:.2f}" for stage, seconds in timing.stage_s.items()},
-        "total, s": f"{timing.total_s:.2f}",
-        "log, s": f"{timing.log_s:.2f}",
-        "× real time": f"{timing.real_time_factor:.2f}",
-        "frames per second": f"{timing.frames_per_s:.1f}",
-        "peak memory, MB": f"{timing.peak_memory_mb:.0f}",
-    }
 
 
 def _versions(chapter: Chapter) -> dict[str, str]:
@@ -157,15 +173,19 @@ def _flat(tree: Any, name: str = "") -> Iterable[tuple[str, str]]:
         yield name, json.dumps(tree, ensure_ascii=False)
 
 
-def _plan(number: int, chapter: Chapter) -> str:
-    return f'<figure class="plan" data-of="{number}"><figcaption>{escape(chapter.name)}</figcaption></figure>'
+def _pictures(number: int, chapter: Chapter) -> Iterator[str]:
+    """Yield the place of a run's plan, and its cloud from two sides."""
+    name, uri = escape(chapter.name), views_uri(chapter.run)
+    yield f'<figure class="plan" data-of="{number}"><figcaption>{name}</figcaption></figure>'
+    picture = f'<img src="{uri}" alt="{name} from above and from the side">' if uri else "<p>no picture</p>"
+    yield f'<figure class="view" data-of="{number}"><figcaption>{name}</figcaption>{picture}</figure>'
 
 
 def _curves(chapters: Sequence[Chapter]) -> str:
     """Return the places of the curves; residuals of different units are no one curve's."""
     units = sorted({residual_unit(chapter.results) for chapter in chapters} - {""})
     curves = [*_CURVES, *(("residual", "Residual of each frame", unit) for unit in units)]
-    return _HINT + "".join(
+    return _HINT + _columns(
         f'<figure class="curve" data-curve="{key}" data-unit="{escape(unit)}">'
         f"<figcaption>{title}</figcaption></figure>"
         for key, title, unit in curves
@@ -186,14 +206,13 @@ def _verdict(number: int, chapter: Chapter) -> str:
     return f'<div class="verdict" data-of="{number}"><h3>{title}</h3>{listed}</div>'
 
 
+def _loop_sections(chapters: Sequence[Chapter]) -> Iterator[str]:
+    if any(chapter.results.loops for chapter in chapters):
+        yield section("Loops", "".join(starmap(_loops, enumerate(chapters))))
+
+
 def _loops(number: int, chapter: Chapter) -> str:
     loops = chapter.results.loops
     held = sum(loop.verdict == "accepted" for loop in loops)
     title = f"{escape(chapter.name)}: {held} of {len(loops)} candidates hold"
     return f'<div class="loops" data-of="{number}"><h3>{title}</h3></div>'
-
-
-def _views(number: int, chapter: Chapter) -> str:
-    uri, name = views_uri(chapter.run), escape(chapter.name)
-    picture = f'<img src="{uri}" alt="{name} from above and from the side">' if uri else "<p>no picture</p>"
-    return f'<figure class="view" data-of="{number}"><figcaption>{name}</figcaption>{picture}</figure>'
