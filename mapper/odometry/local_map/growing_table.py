@@ -19,6 +19,13 @@ class GrowingTable:
         column: NDArray[Any] = self._columns[name]
         return column
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the rows in use."""
+        return {
+            "size": self.size,
+            "_columns": {name: column[: self.size] for name, column in self._columns.items()},
+        }
+
     def append(self, count: int, **values: object) -> NDArray[np.int32]:
         """Append rows and return their ids."""
         first, self.size = self.size, self.size + count

@@ -1,0 +1,115 @@
+"""States that come back to the bit, with their arrays' layout, and without what need not be written."""
+
+import os
+import pickle
+
+import numpy as np
+import pytest
+
+from mapper.core.errors import DataError
+from mapper.core.frames import PinholeCamera, Scan
+from mapper.odometry.local_map.growing_table import GrowingTable
+from mapper.odometry.local_map.log_residuals import LogResiduals
+from mapper.runtime.state_pickle import Archivable, dumps, fixed_parts, loads
+
+BASE = np.arange(60.0).reshape(5, 12)
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        BASE,
+        BASE.T,
+        BASE[:, :2],
+        BASE[::2, 1::3],
+        BASE[::-1, ::-2],
+        BASE[1:1],
+        np.broadcast_to(BASE[0], (3, 12)),
+        BASE.astype(np.float32)[:, 3],
+        np.array(2.5),
+    ],
+    ids=["C", "F", "columns", "steps", "backwards", "empty", "broadcast", "float32", "scalar"],
+)
+def test_arrays_keep_their_values_and_their_layout(array):
+    copy = loads(dumps({"array": array}))["array"]
+    np.testing.assert_array_equal(copy, array)
+    assert (copy.dtype, copy.shape) == (array.dtype, array.shape)
+    assert array.size < 2 or copy.strides == array.strides
+    assert copy.flags.writeable == array.flags.writeable
+    assert copy.flags.aligned
+    assert not np.shares_memory(copy, array)
+
+
+def test_what_was_one_object_is_one_again():
+    array = np.zeros(3)
+    first, second = loads(dumps([array, {"same": array}]))
+    assert first is second["same"]
+
+
+def test_fixed_parts_are_not_written_but_taken_from_the_new_object():
+    camera = PinholeCamera(4, 3, 1.0, 1.0, 2.0, 1.5)
+    state = LogResiduals()
+    state.camera = camera
+    parts = fixed_parts(state, (PinholeCamera,))
+    assert parts == {".camera": camera}
+    data = dumps(state, fixed=parts)
+    other = PinholeCamera(8, 6, 1.0, 1.0, 2.0, 1.5)
+    assert loads(data, fixed={".camera": other}).camera is other
+    with pytest.raises(DataError, match=r"a part '\.camera' that is not there"):
+        loads(data)
+
+
+class Clouds(Archivable):
+    """Something that never changes."""
+
+
+def test_archived_data_is_written_once_and_stays_one_object():
+    clouds, places = Clouds(), []
+
+    def archive(data):
+        assert data is clouds
+        places.append(data)
+        return 42
+
+    data = dumps([clouds, clouds], archive=archive)
+    assert len(places) == 2  # asked for each; the journal knows that it has it
+    known = object()
+    assert loads(data, archived={42: known}.__getitem__) == [known, known]
+
+
+def test_a_growing_table_comes_back_with_its_rows_and_grows_on():
+    table = GrowingTable(id=((), np.int32), point=((3,), np.float64))
+    table.append(5, id=np.arange(5), point=1.5)
+    copy = loads(dumps(table))
+    assert len(dumps(table)) < 1000
+    assert copy.append(2, id=7, point=2.0).tolist() == [5, 6]
+    assert copy["id"][: copy.size].tolist() == [0, 1, 2, 3, 4, 7, 7]
+
+
+def test_data_of_mapper_comes_back():
+    scan = Scan(5, np.zeros((2, 3), np.float32), times_s=np.zeros(2, np.float32))
+    copy = loads(dumps(scan))
+    assert copy.stamp_ns == 5
+    np.testing.assert_array_equal(copy.points_body, scan.points_body)
+
+
+class _Command:
+    def __reduce__(self):
+        return os.system, ("exit 3",)
+
+
+class _Hidden:
+    def __reduce__(self):
+        return getattr, (Clouds, "__subclasses__")
+
+
+@pytest.mark.parametrize("foreign", [_Command(), _Hidden(), eval], ids=["system", "getattr", "eval"])
+def test_a_foreign_state_runs_nothing(foreign):
+    with pytest.raises(DataError, match="which is no part of one"):
+        loads(pickle.dumps(foreign))
+
+
+@pytest.mark.parametrize("cut", [0, 1, 20, -1])
+def test_half_a_state_is_refused(cut):
+    with pytest.raises(DataError, match="a state that cannot be read"):
+        loads(dumps(BASE[:, :2])[:cut])
