@@ -31,33 +31,40 @@ LOOPS_OF: Mapping[Sensor, PlaceLoopsConfig | ScanLoopsConfig] = {
 """How keyframes are compared where a run was built without loops."""
 
 
-def build_loop_detector(config: AnyLoops, correction: Correction) -> LoopDetector:
+def build_loop_detector(
+    config: AnyLoops, correction: Correction, verifier: Verifier[Any] | None = None
+) -> LoopDetector:
     """Return the loop detector that the settings choose.
 
     Args:
         config: Settings.
         correction: How the graph is solved in the end; the detector's estimate of the poses is corrected
             alike.
+        verifier: Compares places; None makes the one that the settings choose.
     """
     match config:
         case NoLoopsConfig():
             return NoLoopDetector()
         case PlaceLoopsConfig() | ScanLoopsConfig():
-            return build_keyframe_loop_detector(config, correction)
+            return build_keyframe_loop_detector(config, correction, verifier)
         case ThesisLoopsConfig():
             from mapper.loops.thesis_loop_closure import ThesisLoopDetector
 
-            verifier, estimator = build_verifier(config.verification), build_pose_estimator(correction)
+            verifier = verifier or build_verifier(config.verification)
+            estimator = build_pose_estimator(correction)
             return ThesisLoopDetector(config, verifier, estimator)
         case _:
             assert_never(config)
 
 
 def build_keyframe_loop_detector(
-    config: PlaceLoopsConfig | ScanLoopsConfig, correction: Correction
+    config: PlaceLoopsConfig | ScanLoopsConfig,
+    correction: Correction,
+    verifier: Verifier[Any] | None = None,
 ) -> KeyframeLoopDetector[Any]:
     """Return the loop detector that compares keyframes; it can be preloaded with an earlier session."""
-    verifier, estimator = build_verifier(config.verification), build_pose_estimator(correction)
+    verifier = verifier or build_verifier(config.verification)
+    estimator = build_pose_estimator(correction)
     chain = OdometryChain()
     match config:
         case PlaceLoopsConfig():
