@@ -65,6 +65,9 @@ def build(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace OUT, once the new run is whole.")
     ] = False,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Begin anew; else a build that was stopped goes on where it was.")
+    ] = False,
     rerun: Annotated[
         str | None,
         typer.Option(
@@ -92,7 +95,15 @@ def build(
     onlooker = _onlooker(rerun, step=step, overwrite=overwrite)
     if onto is None:
         run, metrics = built(
-            log, config, overrides, out, overwrite=overwrite, output=output, prompts=step, onlooker=onlooker
+            log,
+            config,
+            overrides,
+            out,
+            overwrite=overwrite,
+            fresh=fresh,
+            output=output,
+            prompts=step,
+            onlooker=onlooker,
         )
     else:
         _refuse_both(config, onto, rerun)
@@ -118,6 +129,7 @@ def built(
     *,
     overwrite: bool,
     output: Output,
+    fresh: bool = False,
     prompts: bool = False,
     onlooker: "Onlooker | None" = None,
 ) -> "tuple[Run, Sequence[Metric]]":
@@ -139,7 +151,9 @@ def built(
     preview = _preview(source, out, progress)
     with nullcontext(preview) if onlooker is None else onlooker(source, config) as observer:
         watching = preview if onlooker is None else Observers(observer, preview)
-        run = build_run(source, config, out, progress=progress, observer=watching, overwrite=overwrite)
+        run = build_run(
+            source, config, out, progress=progress, observer=watching, overwrite=overwrite, fresh=fresh
+        )
     return run, evaluate(run.trajectory, run.truth).metrics
 
 

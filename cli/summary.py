@@ -14,7 +14,7 @@ from evaluators.metrics.metric import Metric
 from mapper.loops.closure import LoopClosure
 from mapper.run.folder import Run
 from mapper.run.frame_outcomes import FrameRecord
-from mapper.run.manifest import Counts
+from mapper.run.manifest import Counts, Timing
 
 _SHOWN_NOTES = frozenset({"gap", "lost", "doubtful", "skipped", "levelling"})
 _ATE, _RPE_M, _RPE_RAD, _LENGTH = "ATE RMSE", "RPE translation RMSE", "RPE rotation RMSE", "path length"
@@ -39,6 +39,7 @@ def run_document(run: Run, metrics: Sequence[Metric]) -> dict[str, Any]:
         "metrics": [asdict(metric) for metric in metrics],
         "octree": {"leaves": counts.leaves, "resolution_m": run.config.octree.resolution_m},
         "cloud_points": counts.cloud_points,
+        "resumed": timing.resumed,
         "stage_s": timing.stage_s,
         "total_s": timing.total_s,
         "frames_per_s": timing.frames_per_s,
@@ -67,12 +68,18 @@ def short_text(run: Run, metrics: Sequence[Metric]) -> str:
         ("accuracy", _accuracy_text(metrics)),
         ("map", f"{counts.leaves} voxels of {run.config.octree.resolution_m:g} m{path}"),
         ("speed", f"{speed}; {timing.total_s:.1f} s and {timing.peak_memory_mb:.0f} MB in all"),
+        ("resumed", _resumed_text(timing)),
         ("run", f"{run.path} ({len(run.files())} files, {_size_mb(run.files()):.1f} MB)"),
         ("verdict", verdict.state),
         *(("", sentence) for sentence in verdict.sentences),
         ("next", f"mapper view {quote(str(run.path))}"),
     ]
     return rows_text([(name, text) for name, text in rows if text])
+
+
+def _resumed_text(timing: Timing) -> str:
+    """Return where processes went on with a build that was stopped; empty if it was not."""
+    return "; ".join(resumption.text for resumption in timing.resumed)
 
 
 def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
@@ -93,6 +100,8 @@ def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
     if run.manifest.edits:
         rows.append(("edited by hand", f"{len(run.manifest.edits)} regions; mapper edit lists them"))
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in timing.stage_s.items())
+    if timing.resumed:
+        rows.append(("resumed", _resumed_text(timing)))
     rows += [
         ("seconds", f"{timing.total_s:.1f} ({stages})"),
         ("speed", f"{timing.frames_per_s:.1f} frames/s, {timing.real_time_factor:.2f} × real time"),

@@ -64,7 +64,7 @@ def compare_into(
     """
     plan = json.dumps(_manifest(source.path, config), indent=2, ensure_ascii=False) + "\n"
     with atomic_folder(
-        out, _FOLDER, overwrite=overwrite, keeps=lambda partial: _begun_with(partial, plan)
+        out, _FOLDER, overwrite=overwrite, keeps=lambda partial: _kept_of(partial, plan)
     ) as folder:
         write_text(folder / MANIFEST_NAME, plan)
         comparison = compare(source, config, folder / CELLS, progress=progress)
@@ -73,10 +73,11 @@ def compare_into(
     return comparison
 
 
-def _begun_with(partial: Path, plan: str) -> bool:
-    """Return whether a folder that was left behind is the beginning of this very comparison."""
+def _kept_of(partial: Path, plan: str) -> list[str]:
+    """Return the files of a folder that was left behind, if it is the beginning of this very comparison."""
     mark = partial / MANIFEST_NAME
-    return mark.is_file() and mark.read_text(encoding="utf-8") == plan
+    is_same = mark.is_file() and mark.read_text(encoding="utf-8") == plan
+    return [child.name for child in partial.iterdir()] if is_same else []
 
 
 def write_comparison(folder: Path, comparison: Comparison) -> None:

@@ -128,7 +128,7 @@ class ZhaoJob:
         source, truth = open_with_truth(self.log, config)
         with TemporaryDirectory(prefix="mapper-zhao-") as folder:
             began = time.process_time()
-            run = build(source, config, Path(folder) / "run")
+            run = build(source, config, Path(folder) / "run", checkpoint_s=None)
             cpu_s = time.process_time() - began
             counts = run.manifest.counts
             values = {

@@ -52,7 +52,7 @@ class BuildJob:
         with TemporaryDirectory(dir=self.scratch, ignore_cleanup_errors=True) as folder:
             try:
                 source = open_source(self.log, self.config.source)
-                run = build(source, self.config, Path(folder) / "run")
+                run = build(source, self.config, Path(folder) / "run", checkpoint_s=None)
             except MapperError as error:
                 raise MapperError(str(error)) from None  # its notes name a folder that will not be there
             record = _measured(run, sensor=source.sensor)

@@ -1,7 +1,7 @@
 """Features of an image, and the interface of the detectors that find them."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,7 @@ class Features:
         return self.descriptors.dtype == np.uint8
 
 
+@runtime_checkable
 class Detector(Protocol):
     """Feature detector. Stateless: safe in any thread, and the result depends on the image alone."""
 

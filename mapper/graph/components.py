@@ -16,7 +16,6 @@ def components(graph: PoseGraph) -> list[list[int]]:
     index_of = {node: index for index, node in enumerate(graph.T_world_node)}
     i = [index_of[factor.i] for factor in graph.factors]
     j = [index_of[factor.j] for factor in graph.factors]
-
     adjacency = coo_array((np.ones(len(i), np.int8), (i, j)), shape=(len(index_of), len(index_of)))
     _, labels = connected_components(adjacency, directed=False)
     members: dict[int, list[int]] = {}

@@ -108,7 +108,7 @@ def merge(
     with (
         make_executor(workers) as executor,
         atomic_folder(
-            out, MERGED_MAP, overwrite=overwrite, keeps=lambda partial: _begun_alike(partial, manifest)
+            out, MERGED_MAP, overwrite=overwrite, keeps=lambda partial: _kept_of(partial, manifest)
         ) as folder,
     ):
         manifest.save(folder)
@@ -182,12 +182,13 @@ def _floor_z_m(first: Placed) -> float:
     return float(apply(first.T_map_world, middle[np.newaxis])[0, 2])
 
 
-def _begun_alike(partial: Path, manifest: MapManifest) -> bool:
-    """Return whether a folder that was left behind is the beginning of this very merge."""
+def _kept_of(partial: Path, manifest: MapManifest) -> list[str]:
+    """Return the files of a folder that was left behind, if it is the beginning of this very merge."""
     try:
-        return MapManifest.model_validate_json((partial / MANIFEST_NAME).read_bytes()) == manifest
+        begun = MapManifest.model_validate_json((partial / MANIFEST_NAME).read_bytes())
     except (OSError, ValidationError):
-        return False
+        return []
+    return [child.name for child in partial.iterdir()] if begun == manifest else []
 
 
 def _split(workspace: Workspace, stages: Stages, placed: Sequence[Placed]) -> list[SplitRun]:

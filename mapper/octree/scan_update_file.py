@@ -85,10 +85,14 @@ class ScanUpdateWriter:
             self._file.write(head.tobytes())
             self._file.write(frame.data)
 
-    def reopened(self) -> "ScanUpdateFile":
-        """Return a reader of what was written so far."""
+    def flush(self) -> None:
+        """Hand what was written so far to the system."""
         with writing(self._path):
             self._file.flush()
+
+    def reopened(self) -> "ScanUpdateFile":
+        """Return a reader of what was written so far."""
+        self.flush()
         return open_scan_updates(self._path)
 
 

@@ -30,12 +30,13 @@ from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
 from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
+from mapper.runtime.state_pickle import Archivable
 from mapper.sensing.depth_filter import dif
 from mapper.sensing.depth_noise import feature_depth_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class IsvdObservation:
+class IsvdObservation(Archivable):
     """A frame's features with their 3D points.
 
     Attributes:

@@ -1,6 +1,8 @@
 """From a recorded log to a run folder: track, solve, level, fuse."""
 
-from dataclasses import replace
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +14,18 @@ from mapper.core.errors import FrameError
 from mapper.core.trajectory import Trajectory
 from mapper.mapping.levelling import AXES, Level, find_level
 from mapper.odometry.base import Odometry
+from mapper.pipeline.checkpoint_identity import identity_of, kept_from_before
+from mapper.pipeline.checkpoints import (
+    EVERY_S,
+    Checkpoints,
+    kept_result,
+    remove_checkpoints,
+)
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.fuse import fuse_into
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import (
+    TrackingResult,
     depth_cautions,
     first_session,
     from_tracking,
@@ -23,12 +33,13 @@ from mapper.pipeline.track import (
     save_places,
     track_log,
 )
+from mapper.pipeline.tracking_checkpoints import TrackingCheckpoints
 from mapper.run import files
 from mapper.run.folder import Run, open_run
-from mapper.run.manifest import Levelling, RunWarning
+from mapper.run.manifest import Levelling, RunWarning, Solve
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.stored_tracking import save_solved, save_tracking
-from mapper.run.writer import first_manifest, write_run
+from mapper.run.writer import RunWriter, first_manifest, write_run
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 from mapper.sources.trajectory_files import write_tum
@@ -46,8 +57,12 @@ def build(
     progress: Progress = SILENT,
     observer: Observer = NULL_OBSERVER,
     overwrite: bool = False,
+    fresh: bool = False,
+    checkpoint_s: float | None = EVERY_S,
 ) -> Run:
     """Track every frame, solve the graph once, level the world, then fuse every frame at its final pose.
+
+    A build that was killed or interrupted goes on where it was, and ends in the same bytes.
 
     Args:
         source: The log.
@@ -59,45 +74,112 @@ def build(
         progress: Receives stages, counts and notes.
         observer: Receives every tracked frame and the results.
         overwrite: Replace a run that is there, once the new one is whole.
+        fresh: Begin anew, whatever an unfinished build has left.
+        checkpoint_s: Seconds between two checkpoints, at least; None makes none, and begins anew, as does a
+            caller's own odometry.
 
     Raises:
         TrackingError: Too few frames could be tracked; what there is stays in ``OUT.partial``.
-        RunError: OUT is there already, or cannot be made.
+        RunError: OUT is there already, or cannot be made; or a build of another log, with other settings or
+            by another version was not finished there.
     """
     warnings = depth_cautions(source)
     for warning in warnings:
         progress.note(warning.sentence)
-    with write_run(out, first_manifest(source), config, overwrite=overwrite) as writer:
+    identity = identity_of(source, config, odometry if isinstance(odometry, Trajectory) else None)
+    if odometry is not None and not isinstance(odometry, Trajectory):
+        checkpoint_s = None  # what the state of a caller's own class is, only the caller knows
+    fresh = fresh or checkpoint_s is None
+    with ExitStack() as stack:
+        writer = stack.enter_context(
+            write_run(
+                out,
+                first_manifest(source),
+                config,
+                overwrite=overwrite,
+                keeps=lambda partial: kept_from_before(partial, identity, fresh=fresh),
+            )
+        )
+        checkpoints = None
+        if checkpoint_s is not None:
+            checkpoints = stack.enter_context(Checkpoints(writer, identity, progress, every_s=checkpoint_s))
         writer.warn(warnings)
-        with writer.clock.stage("track"):
-            start = first_session(source, config, odometry)
-            tracking = track_log(source, config, progress=progress, start=start, observer=observer)
-            tracking = largest_component(tracking, progress=progress)
-        writer.warn(tracking.warnings)
-        save_tracking(writer, from_tracking(tracking, source.truth))
         if isinstance(odometry, Trajectory):
             write_tum(writer.folder / files.ODOMETRY, odometry)
-        refuse_a_fragment(tracking, config, sensor=source.sensor)
-        with writer.clock.stage("solve"):
-            solved = solve(tracking.graph, tracking.loops, config.graph)
-        tracking = replace(tracking, graph=solved.graph, loops=solved.loops)
-        tracking = largest_component(tracking, progress=progress)
-        with writer.clock.stage("level"):
-            level = _level(source, tracking.tracked_trajectory(), config)
-        observer.on_levelled(level.T_level_world)
-        tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
+        solved = kept_result(
+            checkpoints,
+            "solved",
+            partial(
+                _solved,
+                source,
+                config,
+                writer,
+                progress,
+                odometry=odometry,
+                observer=observer,
+                checkpoints=checkpoints,
+            ),
+        )
+        observer.on_levelled(solved.level.T_level_world)
+        tracking = solved.tracking
         if implausible := _height_warning(source, tracking.tracked_trajectory()):
             progress.note(implausible)
             writer.warn([RunWarning(kind="depth", sentence=implausible, weight="doubt")])
         with writer.clock.stage("solve"):
             save_solved(writer, from_tracking(tracking, source.truth))
             save_places(writer, tracking)
+        level = solved.level
         writer.update(
             solve=solved.report,
             levelling=Levelling(method=level.method, detail=level.detail, has_floor=level.has_floor),
         )
-        fuse_into(writer, source, config, progress, observer=observer)
+        fuse_into(writer, source, config, progress, observer=observer, checkpoints=checkpoints)
+    remove_checkpoints(out)
     return open_run(out)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solved:
+    """A log that was tracked, with its graph solved, in the levelled world."""
+
+    tracking: TrackingResult
+    report: Solve
+    level: Level
+
+
+def _solved(
+    source: Log,
+    config: BuildConfig,
+    writer: RunWriter,
+    progress: Progress,
+    *,
+    odometry: Odometry[Any] | Trajectory | None,
+    observer: Observer,
+    checkpoints: Checkpoints | None,
+) -> _Solved:
+    """Track a log, solve its graph and level the world."""
+    kept = None if checkpoints is None else TrackingCheckpoints(checkpoints)
+
+    def tracked() -> TrackingResult:
+        with writer.clock.stage("track"):
+            start = first_session(source, config, odometry)
+            tracking = track_log(
+                source, config, progress=progress, start=start, observer=observer, checkpoints=kept
+            )
+            return largest_component(tracking, progress=progress)
+
+    tracking = kept_result(checkpoints, "tracked", tracked)
+    writer.warn(tracking.warnings)
+    save_tracking(writer, from_tracking(tracking, source.truth))
+    refuse_a_fragment(tracking, config, sensor=source.sensor)
+    with writer.clock.stage("solve"):
+        solved = solve(tracking.graph, tracking.loops, config.graph)
+    tracking = replace(tracking, graph=solved.graph, loops=solved.loops)
+    tracking = largest_component(tracking, progress=progress)
+    with writer.clock.stage("level"):
+        level = _level(source, tracking.tracked_trajectory(), config)
+    tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
+    return _Solved(tracking, solved.report, level)
 
 
 def _height_warning(source: Log, trajectory: Trajectory) -> str:

@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,8 @@ from mapper.mapping.measured_noise import measure_noise
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.scan_update_file import ScanUpdateWriter, open_scan_updates
+from mapper.pipeline.checkpoints import Checkpoints
+from mapper.pipeline.fuse_checkpoints import MarkedUpdates, known_updates
 from mapper.pipeline.judge import judge
 from mapper.run import files
 from mapper.run.edits_file import edits_text, parse_edits, write_edits
@@ -179,19 +182,23 @@ def fuse_into(
     before: Path | None = None,
     edits: Edits | None = None,
     observer: Observer = NULL_OBSERVER,
+    checkpoints: Checkpoints | None = None,
 ) -> None:
     """Fuse the trajectory of an unfinished run and write everything that is made from the maps."""
     results = load_results(Run(writer.folder, config, writer.manifest))
     if not config.mcap.frame_times:
         results = replace(results, frame_ms={})
     trajectory = results.trajectory
+    make_writer = ScanUpdateWriter if checkpoints is None else partial(MarkedUpdates, checkpoints=checkpoints)
     with writer.clock.stage("fuse"):
         settings = _with_depth_noise(writer, source, config, progress)
+        if checkpoints is not None:
+            before = known_updates(checkpoints, settings.octree)
     with McapLog(writer.folder / files.MCAP) as log:
         with (
             writer.clock.stage("fuse"),
             open_scan_updates(before) if before is not None else nullcontext() as known,
-            ScanUpdateWriter(writer.folder / files.SCAN_UPDATES, settings.octree) as updates,
+            make_writer(writer.folder / files.SCAN_UPDATES, settings.octree) as updates,
         ):
             maps = fuse_log(
                 source,

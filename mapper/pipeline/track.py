@@ -1,7 +1,7 @@
 """The first pass over a log: every frame tracked in order, and the pose graph that grows from it."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -10,14 +10,17 @@ from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, FrameError, TrackingError
 from mapper.core.frames import Sensor
 from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.features.frame_view import FrameView
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.graph.wheel_factors import WheelMeasurements, wheel_conflict
 from mapper.loops.closure import LoopClosure
 from mapper.loops.detector import LoopDetector
-from mapper.loops.factory import build_loop_detector
+from mapper.loops.factory import build_loop_detector, build_verifier
 from mapper.loops.place_file import AnyPlace, write_places
+from mapper.loops.verification_log import VerificationLog
 from mapper.odometry.base import FrameResult, Odometry
 from mapper.odometry.factory import build_odometry, odometry_for
+from mapper.pipeline.tracking_checkpoints import FrameCheckpoint, TrackingCheckpoints
 from mapper.run import files
 from mapper.run.doubtful_frames import placed_by_neighbours
 from mapper.run.frame_outcomes import records_of
@@ -99,12 +102,14 @@ class Start:
         detector: With the places of earlier sessions.
         graph: Of earlier sessions, without loops.
         loops: The candidates of earlier sessions.
+        searches: The detector's verifier, if its searches can be repeated; None if there are none.
     """
 
     odometry: Odometry[Any]
     detector: LoopDetector
     graph: PoseGraph
     loops: Sequence[LoopClosure] = ()
+    searches: VerificationLog | None = None
 
 
 def first_session(
@@ -129,7 +134,10 @@ def first_session(
         odometry = odometry_for(config.odometry, source, wheels_beside(source, config))
     elif isinstance(odometry, Trajectory):
         odometry = build_odometry(config.odometry, odometry)
-    return Start(odometry, build_loop_detector(config.loops, config.graph.solve), PoseGraph())
+    loops = config.loops
+    searches = None if loops.kind == "none" else VerificationLog(build_verifier(loops.verification))
+    detector = build_loop_detector(loops, config.graph.solve, searches)
+    return Start(odometry, detector, PoseGraph(), searches=searches)
 
 
 def track_log(
@@ -139,11 +147,13 @@ def track_log(
     progress: Progress,
     start: Start | None = None,
     observer: Observer = NULL_OBSERVER,
+    checkpoints: TrackingCheckpoints | None = None,
 ) -> TrackingResult:
     """Track every frame of a log, in time order; reading and detecting run ahead in threads.
 
     A frame that cannot be read is skipped and reported, not fatal. With a ``start`` the graph and the loops
-    returned are those of all sessions, the tracks those of this log.
+    returned are those of all sessions, the tracks those of this log. With ``checkpoints``, tracking goes on
+    behind the frames that they know, which the observer does not receive.
     """
     start = start or first_session(source, config)
     odometry, detector, before = start.odometry, start.detector, start.graph
@@ -162,27 +172,48 @@ def track_log(
             observation = Skipped(entry.stamp_ns, str(error))
         return entry, observation, time.perf_counter() - began
 
+    def take_in(track: FrameResult, view: Callable[[], FrameView]) -> None:
+        if track.is_keyframe and track.node is not None:
+            graph.add_node(track.node, track.stamp_ns, track.T_world_body)
+            driven = wheels.link(track.node, track.stamp_ns)
+            detector.add(track.node, replace(track, links=(*track.links, *driven)), view)
+            wheel_factors.extend(driven)
+        graph.add_factors(track.factors)
+        tracks.append(track)
+
     checks = ReadingChecks(source)
-    observations = ordered_map(observe, checks.log.entries(), workers=config.workers)
+    searches = start.searches or VerificationLog(None)
+    known: Sequence[FrameCheckpoint] = ()
+    if checkpoints is not None:
+        state = checkpoints.restore(odometry, checks)
+        odometry, known = state.odometry, state.frames
+    for frame in known:
+        if isinstance(frame.result, Skipped):
+            skipped.append(frame.result)
+            continue
+        searches.repeat(frame.search)
+        take_in(frame.result, searches.view)
+        frame_ms[frame.result.stamp_ns] = frame.frame_ms
+    searches.repeat(None)
+    entries = map(checks.log.entry_at, range(len(known), len(source)))
+    observations = ordered_map(observe, entries, workers=config.workers)
     with progress.stage("track") as report:
-        for done, (entry, observation, observed_s) in enumerate(observations, start=1):
+        for done, (entry, observation, observed_s) in enumerate(observations, start=len(known) + 1):
             report(done, len(source))
+            ms, result = 0.0, observation
             if isinstance(observation, Skipped):
                 skipped.append(observation)
                 progress.note(f"skipped: {observation.reason}")
-                continue
-            began = time.perf_counter()
-            track = odometry.track(observation)
-            view = partial(odometry.view, observation, track.twist)
-            if track.is_keyframe and track.node is not None:
-                graph.add_node(track.node, track.stamp_ns, track.T_world_body)
-                driven = wheels.link(track.node, track.stamp_ns)
-                detector.add(track.node, replace(track, links=(*track.links, *driven)), view)
-                wheel_factors += driven
-            frame_ms[track.stamp_ns] = 1e3 * (observed_s + time.perf_counter() - began)
-            graph.add_factors(track.factors)
-            tracks.append(track)
-            observer.on_frame(Step(entry, track, view, odometry.matches, detector))
+            else:
+                began = time.perf_counter()
+                result = odometry.track(observation)
+                view = partial(odometry.view, observation, result.twist)
+                take_in(result, view)
+                ms = frame_ms[result.stamp_ns] = 1e3 * (observed_s + time.perf_counter() - began)
+                observer.on_frame(Step(entry, result, view, odometry.matches, detector))
+            if checkpoints is not None:
+                reading = checks.reading(done - 1)
+                checkpoints.add(FrameCheckpoint(result, searches.take(), ms, reading), odometry)
     doubts = checks.doubts()
     tracks = [
         replace(track, doubts=track.doubts or tuple(doubts.get(track.stamp_ns, ())))

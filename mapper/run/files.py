@@ -173,6 +173,10 @@ DISPENSABLE = names_of("poses", "exported maps") | {SCAN_UPDATES, PLACES}
 """Files that a user may delete: a run is whole without them."""
 
 
+CHECKPOINTS = ".checkpoints.part"
+"""Folder of an unfinished build's checkpoints; a temporary one by its name, which a kill at the very end of a
+build leaves in the run."""
+
 EDITABLE = frozenset(
     f"{stem}{ending}"
     for stem in (SLICE, TRAVERSABLE, *map(storey, range(MOST_STOREYS)))

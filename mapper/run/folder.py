@@ -320,5 +320,8 @@ def _not_a_run(path: Path) -> str:
 def _ending(folder: Path) -> str:
     manifest = read_manifest(folder / files.MANIFEST)
     if manifest.status == "building":
-        return f"{folder} is still being built, or its process was killed"
-    return f"{folder} {manifest.status}: {manifest.reason}"
+        ending = "is still being built, or its process was killed"
+    else:
+        ending = f"{manifest.status}: {manifest.reason}"
+    goes_on = "; the same mapper build goes on where it was" if (folder / files.CHECKPOINTS).is_dir() else ""
+    return f"{folder} {ending}{goes_on}"

@@ -212,6 +212,21 @@ class DepthReach(Config):
         )
 
 
+class Resumption(Config):
+    """A process that went on with a build where another one had ended."""
+
+    at: str
+    """UTC, ISO 8601."""
+    step: Literal["track", "solve", "fuse"]
+    frame: int
+    """The first frame of that step, in the order of the log, that was not done yet."""
+
+    @property
+    def text(self) -> str:
+        """Where the process went on, part of a sentence."""
+        return f"{self.step} at frame {self.frame}" if self.step != "solve" else self.step
+
+
 class Timing(Config):
     """All that differs between two runs on the same input."""
 
@@ -227,6 +242,8 @@ class Timing(Config):
     real_time_factor: float = 0.0
     """Seconds of log mapped per wall second."""
     peak_memory_mb: float = 0.0
+    resumed: tuple[Resumption, ...] = ()
+    """Of a build that was killed or interrupted; its times are the sums over all processes."""
 
 
 class FileDigest(Config):

@@ -1,6 +1,6 @@
 """Run folder being written, whole or not at all."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -93,6 +93,7 @@ def write_run(
     overwrite: bool,
     takes_over: bool = False,
     kind: FolderKind = files.RUN,
+    keeps: Callable[[Path], Collection[str]] = lambda _: (),
 ) -> Iterator[RunWriter]:
     """Yield the writer of a run that becomes OUT on success and stays behind as ``OUT.partial`` otherwise.
 
@@ -105,12 +106,13 @@ def write_run(
         overwrite: Replace a run that is there; one that holds a user's own files only with ``takes_over``.
         takes_over: The caller copies a user's own files from the run that is replaced.
         kind: Of the folder; only one of the same kind is replaced.
+        keeps: Returns the names of what an earlier process left in ``OUT.partial`` that stays.
 
     Raises:
         RunError: OUT exists and may not be replaced, or is being built by another process.
         WriteError: A file cannot be written, as when the disk is full.
     """
-    with atomic_folder(out, kind, overwrite=overwrite, takes_over=takes_over) as folder:
+    with atomic_folder(out, kind, overwrite=overwrite, takes_over=takes_over, keeps=keeps) as folder:
         writer = RunWriter(folder, manifest)
         try:
             write_text(folder / files.CONFIG, config.model_dump_json(indent=2) + "\n")

@@ -6,7 +6,7 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -160,7 +160,7 @@ def atomic_folder(
     *,
     overwrite: bool = False,
     takes_over: bool = False,
-    keeps: Callable[[Path], bool] = lambda _: False,
+    keeps: Callable[[Path], Collection[str]] = lambda _: (),
 ) -> Iterator[Path]:
     """Yield ``OUT.partial`` to fill; on success it takes OUT's place, on failure it stays for inspection.
 
@@ -169,7 +169,8 @@ def atomic_folder(
         kind: What it will be; only such a folder is replaced, and only if nothing else is in it.
         overwrite: Replace a folder that is there; it stays untouched until the new one is whole.
         takes_over: The caller copies what else is in the folder that is replaced.
-        keeps: Returns whether the files that an earlier process left in ``OUT.partial`` can be kept.
+        keeps: Returns the names of what an earlier process left in ``OUT.partial`` that stays; what else is
+            in it is deleted.
 
     Raises:
         RunError: OUT exists and may not be replaced, or another process is filling ``OUT.partial``.
@@ -185,8 +186,7 @@ def atomic_folder(
     except OSError as error:
         raise RunError(f"{partial}: cannot be created: {error.strerror}") from None
     with locked(partial), writing(partial):
-        if not keeps(partial):
-            _empty(partial)
+        _empty(partial, except_for=keeps(partial))
         yield partial
         _swap(partial, out)
 
@@ -267,8 +267,10 @@ def _is_at(handle: int, folder: Path) -> bool:
     return os.path.samestat(os.fstat(handle), there)
 
 
-def _empty(folder: Path) -> None:
+def _empty(folder: Path, *, except_for: Collection[str]) -> None:
     for child in folder.iterdir():
+        if child.name in except_for:
+            continue
         if child.is_dir() and not child.is_symlink():
             shutil.rmtree(child)
         else:

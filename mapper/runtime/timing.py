@@ -18,6 +18,7 @@ class Stopwatch:
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
+        self._running: dict[str, float] = {}
         self._started = time.perf_counter()
 
     @property
@@ -29,11 +30,17 @@ class Stopwatch:
     def stage(self, name: str) -> Iterator[None]:
         """Count the time spent inside towards the stage."""
         self.seconds.setdefault(name, 0.0)
-        began = time.perf_counter()
+        began = self._running[name] = time.perf_counter()
         try:
             yield
         finally:
+            del self._running[name]
             self.seconds[name] += time.perf_counter() - began
+
+    def so_far(self) -> dict[str, float]:
+        """Return the seconds of every stage, with those of the stages that have not ended."""
+        now = time.perf_counter()
+        return {name: seconds + now - self._running.get(name, now) for name, seconds in self.seconds.items()}
 
 
 def forget_peak_memory() -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from isal import isal_zlib
@@ -47,6 +47,15 @@ class ReadingChecks:
         """Take in frame ``index`` of the log; what was loaded first counts, be it in colour or in grey."""
         if index not in self._readings:
             self._readings[index] = _reading_of(frame)
+
+    def reading(self, index: int) -> Any:
+        """Return what is known of a frame, for ``restore``; None if it was not loaded."""
+        return self._readings.get(index)
+
+    def restore(self, index: int, reading: Any) -> None:
+        """Take over what is known of a frame that is not read again."""
+        if reading is not None:
+            self._readings[index] = reading
 
     def repeated(self, what: Literal["image", "depth"], *, fewest: int) -> list[range]:
         """Return the runs of so many frames or more, or of a second and more, with the same images.

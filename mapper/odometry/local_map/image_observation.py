@@ -16,13 +16,14 @@ from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.depth_surfaces import DepthCells, depth_cells
 from mapper.odometry.local_map.pixel_motion import depth_velocity, pixel_velocity, row_phase
 from mapper.places.vocabulary import Vocabulary
+from mapper.runtime.state_pickle import Archivable
 from mapper.sensing.depth_noise import feature_depth_m, feature_depth_sigma_m
 
 _MIN_DEPTH_M = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ImageObservation:
+class ImageObservation(Archivable):
     """The features of one frame.
 
     Attributes:

@@ -1,5 +1,7 @@
 """Scan matcher by KISS-ICP's own library (Vizzo et al. 2023)."""
 
+from typing import Any
+
 import numpy as np
 
 from mapper.core.geometry import Array, Points, Transform, inverse, is_rigid
@@ -20,6 +22,7 @@ class KissMatcher:
             from kiss_icp.config import KISSConfig
             from kiss_icp.registration import get_registration
 
+        self._config = config
         self._settings = KISSConfig()
         self._settings.data.max_range = config.max_range_m
         self._settings.mapping.voxel_size = config.map_voxel_m
@@ -54,7 +57,8 @@ class KissMatcher:
     def add(self, deskewed: DeskewedScan, T_world_body: Transform, *, is_keyframe: bool) -> None:  # noqa: ARG002
         """Add any tracked scan to the map, and the error of its predicted pose to the adaptive threshold."""
         if self._T_world_guess is not None:
-            self._threshold.update_model_deviation(inverse(self._T_world_guess) @ T_world_body)
+            self._deviations.append(inverse(self._T_world_guess) @ T_world_body)
+            self._threshold.update_model_deviation(self._deviations[-1])
             self._T_world_guess = None
         self._map.update(self._thinned(deskewed.scan.points_body.astype(np.float64), 0.5), T_world_body)
 
@@ -65,7 +69,26 @@ class KissMatcher:
 
         self._map = get_voxel_hash_map(self._settings)
         self._threshold = get_threshold_estimator(self._settings)
+        self._deviations: list[Transform] = []
         self._T_world_guess = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what the library's objects were given: a map takes its points again, in their order."""
+        return {
+            "config": self._config,
+            "points": self._map.point_cloud(),
+            "deviations": self._deviations,
+            "guess": self._T_world_guess,
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make the library's objects again."""
+        self.__init__(state["config"])  # type: ignore[misc]
+        if len(state["points"]):
+            self._map.add_points(state["points"])
+        for deviation in state["deviations"]:
+            self._threshold.update_model_deviation(deviation)
+        self._deviations, self._T_world_guess = state["deviations"], state["guess"]
 
     def _thinned(self, points: Points, ratio: float) -> Points:
         from kiss_icp.voxelization import voxel_down_sample

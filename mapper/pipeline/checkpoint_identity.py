@@ -1,0 +1,103 @@
+"""What decides the result of a build: an unfinished one is gone on with only where all of it is the same."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from mapper.config.build import BuildConfig
+from mapper.core.errors import RunError
+from mapper.core.trajectory import Trajectory
+from mapper.run import files
+from mapper.run.fingerprint import fingerprint
+from mapper.run.manifest import Manifest, library_versions
+from mapper.runtime.atomic import MANIFEST_NAME
+from mapper.sources.base import Log
+
+IDENTITY = "identity.json"
+"""File of a folder of checkpoints, written first."""
+_NAMED = 3
+
+
+def identity_of(source: Log, config: BuildConfig, poses: Trajectory | None) -> dict[str, Any]:
+    """Return all that decides the result of a build: log, settings, given poses, versions of the programs."""
+    manifest = Manifest.model_fields
+    return {
+        "log": str(source.path.resolve()),
+        "fingerprint": fingerprint(source.path),
+        "config": json.loads(config.model_dump_json()),
+        "poses": "" if poses is None else _digest_of(poses),
+        "versions": {
+            "mapper": manifest["mapper_version"].default,
+            "mapper's code": _code_digest(),
+            "Python": manifest["python_version"].default,
+            "platform": manifest["platform"].default,
+            **library_versions(),
+        },
+    }
+
+
+def _digest_of(poses: Trajectory) -> str:
+    return hashlib.sha256(poses.stamps_ns.tobytes() + poses.T_world_body.tobytes()).hexdigest()[:12]
+
+
+@cache
+def _code_digest() -> str:
+    """Return a digest of the package's code: a state fits the classes that wrote it."""
+    root, digest = Path(__file__).parents[1], hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        digest.update(f"{path.relative_to(root)}\0".encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def kept_from_before(partial: Path, identity: Mapping[str, Any], *, fresh: bool) -> tuple[str, ...]:
+    """Return the names of what a build can go on from in a folder that an earlier process left.
+
+    Raises:
+        RunError: The folder has checkpoints of another build.
+    """
+    if fresh or not (partial / files.CHECKPOINTS).is_dir():
+        return ()
+    try:
+        known = json.loads((partial / files.CHECKPOINTS / IDENTITY).read_bytes())
+        differences = _differences(known, identity)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        return ()  # it was killed before anything else was written, or is damaged
+    if differences:
+        named = ", ".join(differences[:_NAMED]) + (", …" if len(differences) > _NAMED else "")
+        raise RunError(
+            f"{partial}: an unfinished build with {named}; finish it with the arguments it had, or begin "
+            "anew with --fresh"
+        )
+    return (MANIFEST_NAME, files.CHECKPOINTS, files.SCAN_UPDATES)
+
+
+def _differences(known: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
+    if known["fingerprint"] != wanted["fingerprint"]:
+        return [f"another log ({known['log']}, or as it was before it changed)"]
+    if known["poses"] != wanted["poses"]:
+        return ["other poses"]
+    settings, versions = (
+        [
+            f"{name}{mark}{before.get(name)}, not {now.get(name)}"
+            for name in sorted({*before, *now})
+            if before.get(name) != now.get(name)
+        ]
+        for before, now, mark in (
+            (_flat(known["config"]), _flat(wanted["config"]), "="),
+            (known["versions"], wanted["versions"], " "),
+        )
+    )
+    return settings + versions
+
+
+def _flat(tree: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{before}{name}.")
+        else:
+            flat[before + name] = value
+    return flat

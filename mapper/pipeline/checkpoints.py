@@ -1,0 +1,222 @@
+"""Checkpoints of a build, so that one that was stopped goes on where it was and ends in the same bytes.
+
+They lie in a folder of their own in ``OUT.partial``, and come from three steps:
+
+- while a log is tracked, a journal and the state of the odometry (``tracking_checkpoints``);
+- the results of tracking and of solving, whole, each of which replaces what came before it;
+- while frames are fused, the file of their updates, with a digest of what of it is on the disk
+  (``fuse_checkpoints``).
+
+What is written is taken in the thread that works, between two frames; another thread writes it and waits for
+the disk. A disk that is full ends the checkpoints, not the build.
+"""
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self, TypeVar
+
+from pydantic import ValidationError
+
+from mapper.core.errors import DataError, MapperError, WriteError
+from mapper.pipeline.checkpoint_identity import IDENTITY
+from mapper.run import files
+from mapper.run.manifest import Manifest, Resumption, Timing, now_text
+from mapper.run.writer import RunWriter
+from mapper.runtime.atomic import flush_to_disk, write_text
+from mapper.runtime.journal import StateFile, opened_state
+from mapper.runtime.progress import Progress
+from mapper.runtime.state_pickle import dump, load
+from mapper.runtime.timing import peak_memory_mb
+
+EVERY_S = 4.0
+"""Seconds between two checkpoints."""
+_SHARE, _LONGEST_S = 0.02, 9.0
+"""A checkpoint that costs more of the time between two is made less often, but not more seldom than this."""
+_TIMES = "resumed.json"
+
+Result = TypeVar("Result")
+
+
+class Checkpoints:
+    """Checkpoints of one build; a context manager."""
+
+    def __init__(
+        self,
+        writer: RunWriter,
+        identity: Mapping[str, Any],
+        progress: Progress,
+        *,
+        every_s: float = EVERY_S,
+    ) -> None:
+        """Begin, or go on with what is in the folder.
+
+        Args:
+            writer: Of the run.
+            identity: What decides the result.
+            progress: Receives what the user should know.
+            every_s: Seconds between two checkpoints, at least; 0 keeps one of every frame, and waits for it.
+        """
+        self.folder = writer.folder / files.CHECKPOINTS
+        self.writer = writer
+        self.progress = progress
+        self.is_off = False
+        self.is_solved = False
+        self._every_s = self._interval_s = every_s
+        self._last_s = time.monotonic()
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
+        self._pending: Future[None] | None = None
+        self._try(partial(self._begin, identity))
+        with suppress(OSError, ValidationError):  # the history alone, which decides nothing
+            known = Timing.model_validate_json((self.folder / _TIMES).read_bytes())
+            writer.update(timing=writer.manifest.timing.model_copy(update={"resumed": known.resumed}))
+
+    def _begin(self, identity: Mapping[str, Any]) -> None:
+        path = self.folder / IDENTITY
+        if path.exists():
+            return
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder.mkdir()
+        write_text(path, json.dumps(identity, indent=1) + "\n")
+        run = self.writer.folder
+        for written in (path, self.folder, run / files.MANIFEST, run, run.parent):
+            flush_to_disk(written)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._wait()
+        self._thread.shutdown()
+        if isinstance(error, MapperError) and not isinstance(error, WriteError):
+            shutil.rmtree(self.folder, ignore_errors=True)  # it would fail again
+
+    def result(self, step: Literal["tracked", "solved"], work: Callable[[], Result]) -> Result:
+        """Return the result of a step: as an earlier process left it, or worked out and kept.
+
+        The manifest and the times so far belong to it.
+        """
+        versions, damaged = StateFile(self.folder, step).versions()
+        if damaged:
+            self.progress.note(f"what an earlier process has {step} is damaged; it is worked out again")
+        for path in versions.values():
+            with suppress(DataError), opened_state(path) as file:
+                state = load(file)
+                self.resume(state)
+                self.is_solved = step == "solved"
+                if not self.is_solved:
+                    self.resumed_at("solve", 0)
+                known: Result = state["result"]
+                return known
+        result = work()
+        self._wait()
+        if not self.is_off:
+            self._try(partial(self._replace_by, step, result))
+        return result
+
+    def _replace_by(self, step: str, result: object) -> None:
+        """Write a result, and delete the checkpoints that led to it."""
+        StateFile(self.folder, step).write(0, partial(dump, self.state(result)))
+        kept = {IDENTITY, _TIMES, f"{step}.0"}
+        for path in self.folder.iterdir():
+            if path.name not in kept:
+                path.unlink()
+
+    def state(self, result: object) -> dict[str, Any]:
+        """Return what is written of a result or of a state on the way to it."""
+        return {
+            "result": result,
+            "manifest": self.writer.manifest.model_dump_json(),
+            "seconds": self.writer.clock.so_far(),
+            "peak_memory_mb": peak_memory_mb(),
+        }
+
+    def resume(self, state: Mapping[str, Any]) -> None:
+        """Go on from a state's manifest and times."""
+        writer = self.writer
+        manifest = Manifest.model_validate_json(state["manifest"])
+        peak_mb = max(state["peak_memory_mb"], manifest.timing.peak_memory_mb)
+        timing = manifest.timing.model_copy(
+            update={"peak_memory_mb": peak_mb, "resumed": writer.manifest.timing.resumed}
+        )
+        writer.update(**{**dict(manifest), "timing": timing, "status": "building"})
+        writer.clock.seconds.update(state["seconds"])
+
+    def resumed_at(self, step: Literal["track", "solve", "fuse"], frame: int) -> None:
+        """Tell, in the manifest too, where the build goes on."""
+        here = Resumption(at=now_text(), step=step, frame=frame)
+        timing = self.writer.manifest.timing
+        timing = timing.model_copy(update={"resumed": (*timing.resumed, here)})
+        self.writer.update(timing=timing)
+        self._try(partial(write_text, self.folder / _TIMES, timing.model_dump_json()))
+        self.progress.note(f"an earlier process was stopped; going on with {here.text}")
+
+    def is_due(self) -> bool:
+        """Return whether it is time for the next checkpoint, and the last one is on the disk."""
+        if self.is_off:
+            return False
+        if self._every_s > 0.0:
+            is_busy = self._pending is not None and not self._pending.done()
+            if is_busy or time.monotonic() - self._last_s < self._interval_s:
+                return False
+        self._wait()
+        return not self.is_off
+
+    def keep(self, take: Callable[[], Callable[[], None]]) -> None:
+        """Take a checkpoint now, and write it in another thread.
+
+        Args:
+            take: Copies what changes, and returns what writes it.
+        """
+        self._last_s = time.monotonic()
+        began_s = time.thread_time()
+        write = take()
+        taken_s = time.thread_time() - began_s
+
+        def timed() -> None:
+            began_s = time.thread_time()
+            write()
+            cost_s = taken_s + time.thread_time() - began_s
+            self._interval_s = min(max(self._every_s, cost_s / _SHARE), max(self._every_s, _LONGEST_S))
+
+        self._pending = self._thread.submit(timed)
+
+    def _wait(self) -> None:
+        pending, self._pending = self._pending, None
+        if pending is not None:
+            self._try(pending.result)
+
+    def _try(self, work: Callable[[], None]) -> None:
+        """Do what writes; if that fails, go on without checkpoints, and give back their room."""
+        try:
+            work()
+        except (OSError, WriteError) as error:
+            if self.is_off:
+                return
+            self.is_off = True
+            reason = error.strerror if isinstance(error, OSError) else str(error)
+            self.progress.note(
+                f"checkpoints cannot be written ({reason}); the build goes on without, and begins anew if it "
+                "is stopped"
+            )
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def kept_result(
+    checkpoints: Checkpoints | None, step: Literal["tracked", "solved"], work: Callable[[], Result]
+) -> Result:
+    """Return the result of a step, kept where there are checkpoints."""
+    return work() if checkpoints is None else checkpoints.result(step, work)
+
+
+def remove_checkpoints(run: Path) -> None:
+    """Delete the checkpoints of a run that is whole."""
+    shutil.rmtree(run / files.CHECKPOINTS, ignore_errors=True)
