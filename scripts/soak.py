@@ -2,9 +2,11 @@
 
 After every trial it checks that the earlier run is as it was, that nothing under a final name is written by
 half, and that what went wrong was told in one line; now and then a trial is left to its end, and has to give
-the reference's bytes.
+the reference's bytes. In trials of "resume" a build is killed again and again, goes on each time, and has to
+end in these bytes, too.
 
 Example: python scripts/soak.py --minutes 30 --folder /tmp/soak
+         python scripts/soak.py --minutes 30 --folder /tmp/xyz --trials resume --log LOG
 """
 
 import argparse
@@ -45,17 +47,25 @@ class Soak:
         random: Draws all trials.
         counts: How the trials ended.
         faults: What should not be, a line each.
+        log: The log; a synthetic one is made where there is none.
+        settings: Arguments of every build.
+        kinds: Which trials are drawn.
+        kills: How often a build was killed and went on.
         seconds: How long a verb took that was left to its end.
     """
 
     folder: Path
     random: random.Random
+    log: Path
+    settings: list[str] = field(default_factory=lambda: [*REPEATABLE])
+    kinds: str = "all"
+    kills: int = 0
     counts: Counter[str] = field(default_factory=Counter)
     faults: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.log, self.reference, self.run = (self.folder / name for name in ("log", "reference", "run"))
+        self.reference, self.run = (self.folder / name for name in ("reference", "run"))
         self.duration_s = 0.0
 
     def prepare(self) -> None:
@@ -64,21 +74,23 @@ class Soak:
         if not self.log.exists():
             self._must("synth", self.log, *LOG)
         if not self.reference.exists():
-            self._must("build", self.log, "--out", self.reference, *REPEATABLE)
+            self._must("build", self.log, "--out", self.reference, *self.settings)
         began = time.monotonic()
-        self._must("build", self.log, "--out", self.run, "--overwrite", *REPEATABLE)
+        self._must("build", self.log, "--out", self.run, "--overwrite", "--fresh", *self.settings)
         self.duration_s = time.monotonic() - began
         self._compare("first build")
 
     def trial(self) -> None:
         """Draw one trial, run it and check what it left."""
-        kinds: list[Callable[[], None]] = [self._killed, self._killed, self._full_disk, self._damaged_log]
+        kinds: list[Callable[[], None]] = [self._resumed]
+        if self.kinds == "all":
+            kinds += [self._killed, self._killed, self._full_disk, self._damaged_log]
         self.random.choice(kinds)()
 
     def _work(self) -> list[object]:
         """Draw a verb that writes into the run or replaces it by the same."""
         works: list[list[object]] = [
-            ["build", self.log, "--out", self.run, "--overwrite", "--quiet", *REPEATABLE],
+            ["build", self.log, "--out", self.run, "--overwrite", "--quiet", *self.settings],
             ["fuse", self.run, "--quiet"],
             ["export", self.run, "--as", "costmap"],
             ["view", self.run, "--quiet"],
@@ -104,6 +116,30 @@ class Soak:
         if process.returncode not in ENDINGS or "Traceback" in told:
             self.faults.append(f"{what}: status {process.returncode}: {told}")
         self._compare(what)
+
+    def _resumed(self) -> None:
+        """Kill a build at random instants until it ends by itself, and compare the run with the reference."""
+        out, kills = self.folder / "resumed", []
+        for path in (out, partial_of(out)):
+            shutil.rmtree(path, ignore_errors=True)
+        command = [*MAPPER, "build", str(self.log), "--out", str(out), "--quiet", *self.settings]
+        while not out.exists():
+            after_s = self.random.uniform(0.0, 0.7) * self.duration_s
+            process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+            try:
+                _, told = process.communicate(timeout=after_s)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.communicate()
+                kills.append(round(after_s, 2))
+                continue
+            if process.returncode:
+                self.faults.append(f"resume after kills at {kills} s: status {process.returncode}: {told}")
+                return
+        self.kills += len(kills)
+        known = len(self.faults)
+        self._compare(f"resume after kills at {kills} s", out)
+        self._count(f"resume: {'equal' if len(self.faults) == known else 'DIFFERENT'}")
 
     def _full_disk(self) -> None:
         work = self._work()
@@ -147,11 +183,12 @@ class Soak:
             path.write_bytes(data)
         return f"{path.relative_to(log)} {how}"
 
-    def _compare(self, what: str) -> None:
-        """Check the run, and its bytes against the reference."""
-        self._check(self.run, what)
+    def _compare(self, what: str, run: Path | None = None) -> None:
+        """Check a run, and its bytes against the reference; None is the run that is worked on."""
+        run = run or self.run
+        self._check(run, what)
         for path in sorted(self.reference.iterdir()):
-            ours = self.run / path.name
+            ours = run / path.name
             if path.name not in MEASURED and (not ours.is_file() or ours.read_bytes() != path.read_bytes()):
                 self.faults.append(f"{what}: {path.name} is not the reference's")
 
@@ -189,8 +226,14 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=30.0, help="how long to go on")
     parser.add_argument("--folder", type=Path, required=True, help="scratch folder, kept")
     parser.add_argument("--seed", type=int, default=0, help="draws the trials")
+    parser.add_argument("--trials", choices=("all", "resume"), default="all", help="which are drawn")
+    parser.add_argument("--log", type=Path, help="an own log instead of the synthetic one")
+    parser.add_argument("--set", action="append", default=[], help="setting of every build")
     options = parser.parse_args()
-    soak = Soak(options.folder.resolve(), random.Random(options.seed))
+    folder = options.folder.resolve()
+    settings = [*REPEATABLE, *(word for setting in options.set for word in ("--set", setting))]
+    log = (options.log or folder / "log").resolve()
+    soak = Soak(folder, random.Random(options.seed), log, settings, options.trials)
     soak.prepare()
     end = time.monotonic() + 60.0 * options.minutes
     while time.monotonic() < end:
@@ -203,7 +246,8 @@ def main() -> None:
             shutil.copytree(soak.reference, soak.run)
     for ending, count in sorted(soak.counts.items()):
         print(f"{count:5d}  {ending}")
-    print(f"{sum(soak.counts.values())} trials, {len(soak.faults)} faults")
+    print(f"{sum(soak.counts.values())} trials, {soak.kills} builds killed that went on, ", end="")
+    print(f"{len(soak.faults)} faults")
     sys.exit(bool(soak.faults))
 
 
