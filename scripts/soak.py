@@ -124,7 +124,8 @@ class Soak:
             shutil.rmtree(path, ignore_errors=True)
         command = [*MAPPER, "build", str(self.log), "--out", str(out), "--quiet", *self.settings]
         while not out.exists():
-            after_s = self.random.uniform(0.0, 0.7) * self.duration_s
+            # Longer each time, so that it ends even where starting takes most of the time.
+            after_s = self.random.uniform(0.0, 0.7 + 0.1 * len(kills)) * self.duration_s
             process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
             try:
                 _, told = process.communicate(timeout=after_s)
@@ -140,6 +141,7 @@ class Soak:
         known = len(self.faults)
         self._compare(f"resume after kills at {kills} s", out)
         self._count(f"resume: {'equal' if len(self.faults) == known else 'DIFFERENT'}")
+        print(f"{self.kills} kills in {self.counts.total()} builds that went on", flush=True)
 
     def _full_disk(self) -> None:
         work = self._work()
