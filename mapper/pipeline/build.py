@@ -97,7 +97,7 @@ def build(
                 first_manifest(source),
                 config,
                 overwrite=overwrite,
-                keeps=lambda partial: kept_from_before(partial, identity, fresh=fresh),
+                keeps=lambda left: kept_from_before(left, identity, fresh=fresh),
             )
         )
         checkpoints = None

@@ -22,13 +22,18 @@ _NAMED = 3
 
 
 def identity_of(source: Log, config: BuildConfig, poses: Trajectory | None) -> dict[str, Any]:
-    """Return all that decides the result of a build: log, settings, given poses, versions of the programs."""
+    """Return all that decides the result of a build: log, settings and their files, poses, versions."""
     manifest = Manifest.model_fields
     return {
         "log": str(source.path.resolve()),
         "fingerprint": fingerprint(source.path),
         "config": json.loads(config.model_dump_json()),
-        "poses": "" if poses is None else _digest_of(poses),
+        "poses": "" if poses is None else _digest(poses.stamps_ns.tobytes() + poses.T_world_body.tobytes()),
+        "files": {
+            name: _digest(path.read_bytes())
+            for name, path in _flat(config.model_dump()).items()
+            if isinstance(path, Path) and path.is_file()
+        },
         "versions": {
             "mapper": manifest["mapper_version"].default,
             "mapper's code": _code_digest(),
@@ -39,8 +44,8 @@ def identity_of(source: Log, config: BuildConfig, poses: Trajectory | None) -> d
     }
 
 
-def _digest_of(poses: Trajectory) -> str:
-    return hashlib.sha256(poses.stamps_ns.tobytes() + poses.T_world_body.tobytes()).hexdigest()[:12]
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:12]
 
 
 @cache
@@ -90,7 +95,12 @@ def _differences(known: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[st
             (known["versions"], wanted["versions"], " "),
         )
     )
-    return settings + versions
+    changed = known["files"].items() ^ wanted["files"].items() if not settings else set()
+    return [
+        *settings,
+        *(f"another file of {name}" for name in sorted({name for name, _ in changed})),
+        *versions,
+    ]
 
 
 def _flat(tree: Mapping[str, Any], before: str = "") -> dict[str, Any]:

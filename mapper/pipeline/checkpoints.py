@@ -178,7 +178,11 @@ class Checkpoints:
         """
         self._last_s = time.monotonic()
         began_s = time.thread_time()
-        write = take()
+        try:
+            write = take()
+        except DataError as error:
+            self._give_up(str(error))
+            return
         taken_s = time.thread_time() - began_s
 
         def timed() -> None:
@@ -198,11 +202,14 @@ class Checkpoints:
         """Do what writes; if that fails, go on without checkpoints, and give back their room."""
         try:
             work()
-        except (OSError, WriteError) as error:
-            if self.is_off:
-                return
+        except OSError as error:
+            self._give_up(error.strerror or str(error))
+        except (DataError, WriteError) as error:
+            self._give_up(str(error))
+
+    def _give_up(self, reason: str) -> None:
+        if not self.is_off:
             self.is_off = True
-            reason = error.strerror if isinstance(error, OSError) else str(error)
             self.progress.note(
                 f"checkpoints cannot be written ({reason}); the build goes on without, and begins anew if it "
                 "is stopped"

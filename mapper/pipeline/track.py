@@ -211,9 +211,9 @@ def track_log(
                 take_in(result, view)
                 ms = frame_ms[result.stamp_ns] = 1e3 * (observed_s + time.perf_counter() - began)
                 observer.on_frame(Step(entry, result, view, odometry.matches, detector))
+            search = searches.take()
             if checkpoints is not None:
-                reading = checks.reading(done - 1)
-                checkpoints.add(FrameCheckpoint(result, searches.take(), ms, reading), odometry)
+                checkpoints.add(FrameCheckpoint(result, search, ms, checks.reading(done - 1)), odometry)
     doubts = checks.doubts()
     tracks = [
         replace(track, doubts=track.doubts or tuple(doubts.get(track.stamp_ns, ())))

@@ -12,6 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from isal import isal_zlib
+
 from mapper.core.errors import DataError
 from mapper.core.trajectory import Trajectory
 from mapper.features.base import Detector
@@ -29,7 +31,7 @@ from mapper.sources.reading_checks import ReadingChecks
 _FIXED_PARTS = (Detector, Vocabulary, WheelMeasurements, Trajectory, Odometer)
 """Parts of an odometry that exist before the first frame and never change."""
 _FRAME = b"frame "
-"""Beginning of a frame's record; others are pickled observations, which begin otherwise."""
+"""Beginning of a frame's record; others are observations, whose packed bytes begin otherwise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +72,7 @@ class TrackingCheckpoints:
         self._journal = Journal(checkpoints.folder / "tracking.journal")
         self._states = StateFile(checkpoints.folder, "odometry")
         self._number = 0
-        self._archived: dict[int, tuple[Archivable, int]] = {}
+        self._archived: dict[int, tuple[Archivable, int | None]] = {}
         self._fixed: Mapping[str, object] = {}
 
     def restore(self, odometry: Odometry[Any], checks: ReadingChecks) -> TrackingState:
@@ -114,7 +116,7 @@ class TrackingCheckpoints:
         frames: list[FrameCheckpoint] = []
         for place, record in self._journal.records(state["journal_end"]):
             if record.startswith(_FRAME):
-                frames.append(loads(record[len(_FRAME) :]))
+                frames.append(_unpacked(record[len(_FRAME) :]))
             else:
                 records[place] = record
         known: dict[int, Any] = {}
@@ -123,7 +125,7 @@ class TrackingCheckpoints:
             if place not in known:
                 if place not in records:
                     raise DataError(f"{self._journal.path}: nothing at byte {place}")
-                known[place] = loads(records[place])
+                known[place] = _unpacked(records[place])
             return known[place]
 
         odometry = loads(state["result"], fixed=self._fixed, archived=archived)
@@ -135,7 +137,7 @@ class TrackingCheckpoints:
         """Keep a frame that was tracked, and the state after it if it is time to."""
         if self._checkpoints.is_off:
             return
-        self._journal.append(_FRAME + dumps(frame))
+        self._journal.append(_FRAME + _packed(frame))
         if self._checkpoints.is_due():
             self._checkpoints.keep(partial(self._taken, odometry))
 
@@ -143,10 +145,10 @@ class TrackingCheckpoints:
         """Copy the state of the odometry; return what writes it."""
         before, self._archived = self._archived, {}
 
-        def archive(data: Archivable) -> int:
-            known = self._archived.get(id(data)) or before.get(id(data))
-            if known is None:
-                known = data, self._journal.append(dumps(data))
+        def archive(data: Archivable) -> int | None:
+            known = self._archived.get(id(data)) or before.get(id(data)) or (data, None)
+            if id(data) in before and known[1] is None:  # what was there last time is a keyframe's
+                known = data, self._journal.append(_packed(data))
             self._archived[id(data)] = known
             return known[1]
 
@@ -160,3 +162,12 @@ class TrackingCheckpoints:
             self._states.write(number, partial(dump, state))
 
         return write
+
+
+def _packed(data: object) -> bytes:
+    return bytes(isal_zlib.compress(dumps(data), 1))
+
+
+def _unpacked(record: bytes) -> Any:
+    """Return what was packed; its digest was compared."""
+    return loads(isal_zlib.decompress(record))

@@ -14,10 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from isal import igzip
+
 from mapper.core.errors import DataError
 from mapper.runtime.atomic import flush_to_disk
 from mapper.runtime.state_pickle import Writes
 
+_packed_file: Any = igzip.IGzipFile  # the library has no types
 _HEAD = struct.Struct("<Q16s")
 _STATE = struct.Struct("<16sQ32s")
 _STATE_MAGIC = b"mapper state 1\n\0"
@@ -97,7 +100,8 @@ class StateFile:
         with path.open("wb") as file:
             file.write(bytes(_STATE.size))
             sealed = _Sealed(file, _seal_of(number))
-            save(sealed)
+            with _packed_file(fileobj=sealed, mode="wb", compresslevel=1, mtime=0) as packed:
+                save(packed)
             file.seek(0)
             file.write(_STATE.pack(_STATE_MAGIC, number, sealed.seal.digest()))
             file.flush()
@@ -130,7 +134,8 @@ def opened_state(path: Path) -> Iterator[BinaryIO]:
     """Open a version of a state that ``StateFile.versions`` has found."""
     with path.open("rb") as file:
         file.seek(_STATE.size)
-        yield file
+        with _packed_file(fileobj=file, mode="rb") as packed:
+            yield packed
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +148,9 @@ class _Sealed:
     def write(self, data: Any, /) -> int:
         self.seal.update(data)
         return self.file.write(data)
+
+    def flush(self) -> None:
+        self.file.flush()
 
 
 def _seal_of(number: int) -> "hashlib._Hash":

@@ -40,7 +40,7 @@ def dump(
     file: Writes,
     *,
     fixed: Mapping[str, object] | None = None,
-    archive: Callable[[Archivable], int] | None = None,
+    archive: Callable[[Archivable], int | None] | None = None,
 ) -> None:
     """Write a state.
 
@@ -48,16 +48,22 @@ def dump(
         state: What to write.
         file: Takes its bytes.
         fixed: Parts that are not written, by name; ``loads`` is given their equals.
-        archive: Returns where ``Archivable`` data is kept; None writes it as a part of the state.
+        archive: Returns where ``Archivable`` data is kept, or None to write it as a part of the state.
+
+    Raises:
+        DataError: A part of it cannot be written, as an object of a compiled library.
     """
-    _Pickler(file, {id(part): name for name, part in (fixed or {}).items()}, archive).dump(state)
+    try:
+        _Pickler(file, {id(part): name for name, part in (fixed or {}).items()}, archive).dump(state)
+    except (pickle.PicklingError, TypeError, AttributeError) as error:
+        raise DataError(f"a state that cannot be written: {error}") from None
 
 
 def dumps(
     state: object,
     *,
     fixed: Mapping[str, object] | None = None,
-    archive: Callable[[Archivable], int] | None = None,
+    archive: Callable[[Archivable], int | None] | None = None,
 ) -> bytes:
     """Return the bytes of a state; see ``dump``."""
     file = io.BytesIO()
@@ -118,7 +124,7 @@ def fixed_parts(root: object, kinds: tuple[type, ...]) -> dict[str, object]:
 
 class _Pickler(pickle.Pickler):
     def __init__(
-        self, file: Writes, fixed: Mapping[int, str], archive: Callable[[Archivable], int] | None
+        self, file: Writes, fixed: Mapping[int, str], archive: Callable[[Archivable], int | None] | None
     ) -> None:
         super().__init__(file, pickle.HIGHEST_PROTOCOL)
         self._fixed = fixed

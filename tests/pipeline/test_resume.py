@@ -15,7 +15,9 @@ import pytest
 from cli.summary import summary_text
 from mapper.config.loading import load_config
 from mapper.core.errors import RunError, TrackingError
+from mapper.odometry.local_map.odometry import KeyframeOdometry
 from mapper.pipeline.build import build
+from mapper.places.vocabulary import SHIPPED
 from mapper.run.checks import check_run
 from mapper.run.folder import open_run
 from mapper.run.manifest import read_manifest
@@ -326,6 +328,26 @@ def test_a_full_disk_ends_the_checkpoints_and_not_the_build(desk_log, desk_run, 
     (note,) = [note for note in progress.notes if note.startswith("checkpoints")]
     assert note.startswith("checkpoints cannot be written (No space left on device); the build goes on")
     assert_same(run, desk_run)
+
+
+def test_a_state_that_cannot_be_written_ends_the_checkpoints_and_not_the_build(
+    desk_log, desk_run, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(KeyframeOdometry, "__getstate__", lambda _: {"its": lambda: None}, raising=False)
+    progress = Stage()
+    run = start(desk_log, tmp_path / "run", progress=progress)
+    (note,) = [note for note in progress.notes if note.startswith("checkpoints")]
+    assert "a state that cannot be written" in note
+    assert_same(run, desk_run)
+
+
+def test_files_that_settings_name_have_to_be_the_same(desk_log, tmp_path):
+    words = shutil.copyfile(SHIPPED, tmp_path / "own.words")
+    chosen = f"odometry.vocabulary={words}"
+    stopped(desk_log, tmp_path / "run", chosen, observer=StopAt(2))
+    words.write_bytes(words.read_bytes() + b" ")
+    with pytest.raises(RunError, match=r"an unfinished build with another file of odometry\.vocabulary"):
+        start(desk_log, tmp_path / "run", chosen)
 
 
 def test_a_build_that_is_under_way_is_not_gone_on_with(desk_log, unfinished):

@@ -109,6 +109,11 @@ def test_a_foreign_state_runs_nothing(foreign):
         loads(pickle.dumps(foreign))
 
 
+def test_what_cannot_be_written_is_told():
+    with pytest.raises(DataError, match=r"a state that cannot be written: .*lambda"):
+        dumps([BASE, lambda: None])
+
+
 @pytest.mark.parametrize("cut", [0, 1, 20, -1])
 def test_half_a_state_is_refused(cut):
     with pytest.raises(DataError, match="a state that cannot be read"):
