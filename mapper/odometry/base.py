@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from mapper.core.frames import Frame
 from mapper.core.geometry import Array, Transform
 from mapper.core.timebase import NS_PER_S
-from mapper.features.frame_view import FrameView
 from mapper.graph.model import BetweenFactor
 from mapper.sources.base import FrameRef
 
 if TYPE_CHECKING:
     from mapper.core.deskew import Twist
+    from mapper.features.frame_view import FrameView
 
 
 @dataclass(frozen=True, slots=True)
