@@ -207,14 +207,17 @@ class MapPage(Page):
     def picture(self):
         """Return the pixels of the map as drawn now."""
         x, y, width, height = self.box()
+        frame = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
         before = None
-        for _ in range(20):  # until two in a row are the same: all points are drawn when the eye rests
+        for _ in range(40):  # until all points are drawn, and two pictures in a row are the same
+            self.call("Runtime.evaluate", expression=frame, awaitPromise=True)
+            share = self.run("document.querySelector('.map canvas').dataset.share")
             clip = {"x": x, "y": y, "width": width, "height": height, "scale": 1}
             data = self.call("Page.captureScreenshot", format="png", clip=clip)["data"]
-            if data == before:
+            if share == "1" and data == before:
                 break
             before = data
-            time.sleep(0.3)
+            time.sleep(0.2)
         return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR).astype(int)
 
     def tap(self, x, y):

@@ -1,12 +1,13 @@
 // Lines of any width: WebGL's own are one pixel wide.
 
 import { BufferAttribute, DoubleSide, GLSL3, InstancedBufferAttribute, InstancedBufferGeometry, Mesh, RawShaderMaterial, Vector2 } from "three";
+import { ratio } from "mapper/screen";
 
 const VERTEX = `
 precision highp float;
 uniform mat4 modelViewMatrix, projectionMatrix;
 uniform vec2 viewport;
-uniform float pixels, width;
+uniform float pixels, width, ratio;
 in vec3 position, begin, end;
 in vec2 halfWidths;
 out float along;
@@ -21,7 +22,7 @@ void main() {
   direction = length(direction) > 1e-6 ? normalize(direction) : vec2(1.0, 0.0);
   vec4 place = position.x < 0.5 ? from : to;
   float metres = position.x < 0.5 ? halfWidths.x : halfWidths.y;
-  float reach = max(metres * pixels / place.w, width);
+  float reach = max(metres * pixels / place.w, width * ratio);
   vec2 side = vec2(-direction.y, direction.x) * position.y + direction * (position.x * 2.0 - 1.0) * 0.5;
   place.xy += side * reach * 2.0 / viewport * place.w;
   gl_Position = a.z > near && b.z > near ? vec4(2.0, 2.0, 2.0, 1.0) : place;
@@ -51,11 +52,11 @@ export class Segments {
     geometry.instanceCount = this.count;
     this.uniforms = {
       color: { value: color }, opacity: { value: opacity }, width: { value: width_px / 2 },
-      viewport: { value: new Vector2(1, 1) }, pixels: { value: 1 },
+      viewport: { value: new Vector2(1, 1) }, pixels: { value: 1 }, ratio,
     };
     this.object = new Mesh(geometry, new RawShaderMaterial({
       glslVersion: GLSL3, vertexShader: VERTEX, fragmentShader: FRAGMENT, uniforms: this.uniforms,
-      transparent: opacity < 1, depthTest: false, depthWrite: false, side: DoubleSide,
+      transparent: true, depthTest: false, depthWrite: false, side: DoubleSide,
     }));
     this.object.frustumCulled = false;
   }

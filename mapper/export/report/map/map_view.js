@@ -5,13 +5,16 @@ import { NEVER } from "mapper/points";
 import { Segments } from "mapper/lines";
 import { Markers } from "mapper/markers";
 import { Navigation } from "mapper/navigation";
+import { ratio } from "mapper/screen";
 import { frameAt, loopAt, pointAt, Screen } from "mapper/picking";
 
 const FOV_DEG = 50;
 const SLOW_MS = 40; // a frame that takes longer while the eye moves is drawn with fewer points
 const FAST_MS = 25;
 const LEAST_SHARE = 0.1;
+const COARSE_SHARE = 0.3; // with fewer points than this, pixels are twice as large meanwhile
 const REST_MS = 150; // after a motion all points are drawn again
+const HELD_REST_MS = 600; // the same while the pointer is held down, as the motion may go on
 
 ColorManagement.enabled = false; // colours are drawn as the palette has them
 
@@ -101,7 +104,6 @@ export class MapView {
 
   resize() {
     const { clientWidth: width, clientHeight: height } = this.canvas.parentElement;
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.renderer.setSize(width, height, false);
     this.#aspect();
     this.invalidate();
@@ -148,15 +150,22 @@ export class MapView {
     const elapsed_ms = now - (this.tickedAt ?? now);
     this.tickedAt = now;
     this.navigation.advance(Math.min(elapsed_ms, 100) / 1000);
-    const isMoving = now - (this.movedAt ?? -Infinity) < REST_MS;
+    const isMoving = now - (this.movedAt ?? -Infinity) < (this.navigation.isHeld ? HELD_REST_MS : REST_MS);
     if (isMoving && this.wasDrawn) {
-      if (elapsed_ms > SLOW_MS) this.share = Math.max(LEAST_SHARE, this.share * 0.85);
+      if (elapsed_ms > SLOW_MS) this.share = Math.max(LEAST_SHARE, this.share * Math.max(0.3, FAST_MS / elapsed_ms));
       else if (elapsed_ms < FAST_MS) this.share = Math.min(1, this.share * 1.1);
     }
     const share = isMoving ? this.share : 1;
     if (share !== this.drawnShare) this.invalidate();
     this.wasDrawn = this.isStale;
-    if (this.isStale) this.#draw(share);
+    if (!this.isStale) return;
+    this.#sharpen(Math.min(devicePixelRatio, 2) * (share < COARSE_SHARE ? 0.5 : 1));
+    this.#draw(share);
+  }
+
+  #sharpen(pixels) {
+    if (this.renderer.getPixelRatio() !== pixels) this.renderer.setPixelRatio(pixels);
+    ratio.value = pixels;
   }
 
   #draw(share) {
@@ -164,7 +173,7 @@ export class MapView {
     this.drawnShare = share;
     this.canvas.dataset.share = share;
     this.#aspect();
-    const { renderer, camera } = this, ratio = renderer.getPixelRatio();
+    const { renderer, camera } = this;
     const panes = this.#panes();
     renderer.setScissorTest(panes.length > 1);
     renderer.autoClear = false;
@@ -172,20 +181,20 @@ export class MapView {
     for (const pane of panes) {
       renderer.setViewport(pane.left, 0, pane.width, pane.height);
       renderer.setScissor(pane.left, 0, pane.width, pane.height);
-      const pixels = ratio * pane.height / (2 * Math.tan(camera.fov * Math.PI / 360));
+      const pixels = ratio.value * pane.height / (2 * Math.tan(camera.fov * Math.PI / 360));
       this.layers.forEach((one, run) => {
         one.group.visible = pane.runs.includes(run);
         for (const set of Object.values(one.points)) set.fit(camera, { pixels, scale: this.state.size, share });
-        for (const segments of Object.values(one.segments)) this.#fit(segments, pane, pixels, ratio);
+        for (const segments of Object.values(one.segments)) this.#fit(segments, pane, pixels);
       });
-      if (this.line) this.#fit(this.line, pane, pixels, ratio);
+      if (this.line) this.#fit(this.line, pane, pixels);
       renderer.render(this.scene, camera);
       renderer.render(this.tools, camera);
     }
   }
 
-  #fit({ uniforms }, { width, height }, pixels, ratio) {
-    uniforms.viewport.value.set(width * ratio, height * ratio);
+  #fit({ uniforms }, { width, height }, pixels) {
+    uniforms.viewport.value.set(width * ratio.value, height * ratio.value);
     uniforms.pixels.value = pixels;
   }
 

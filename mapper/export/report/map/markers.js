@@ -1,15 +1,16 @@
 // Marks of a fixed size on the screen: keyframes, doubtful frames, start, end, measured points.
 
 import { BufferAttribute, BufferGeometry, GLSL3, Points, RawShaderMaterial } from "three";
+import { ratio } from "mapper/screen";
 
 const VERTEX = `
 precision highp float;
 uniform mat4 modelViewMatrix, projectionMatrix;
-uniform float size;
+uniform float size, ratio;
 in vec3 position;
 void main() {
   gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
-  gl_PointSize = size;
+  gl_PointSize = size * ratio;
 }`;
 
 const FRAGMENT = `
@@ -31,8 +32,8 @@ export class Markers {
     const geometry = new BufferGeometry();
     geometry.setAttribute("position", new BufferAttribute(Float32Array.from(places), 3));
     this.object = new Points(geometry, new RawShaderMaterial({
-      glslVersion: GLSL3, vertexShader: VERTEX, fragmentShader: FRAGMENT, depthTest: false, depthWrite: false,
-      uniforms: { color: { value: color }, size: { value: size_px }, isSquare: { value: isSquare }, rim: { value: 0.5 - 1.3 / size_px } },
+      glslVersion: GLSL3, vertexShader: VERTEX, fragmentShader: FRAGMENT, transparent: true, depthTest: false, depthWrite: false,
+      uniforms: { color: { value: color }, size: { value: size_px }, ratio, isSquare: { value: isSquare }, rim: { value: 0.5 - 1.3 / size_px } },
     }));
     this.object.frustumCulled = false;
   }

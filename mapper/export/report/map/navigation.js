@@ -12,15 +12,22 @@ const VIEW_RAD = [-0.6, 0.75]; // azimuth and elevation from which a map is firs
 export class Navigation {
   /** @param onMove Called when the eye has moved. */
   constructor(camera, canvas, onMove) {
-    Object.assign(this, { camera, canvas, onMove, pressed: new Set(), isFlying: false });
+    Object.assign(this, { camera, canvas, onMove, pressed: new Set(), isFlying: false, isHeld: false });
     camera.up.set(0, 0, 1);
     this.orbit = new OrbitControls(camera, canvas);
     this.orbit.enableDamping = false;
     this.orbit.zoomToCursor = true;
     this.orbit.addEventListener("change", onMove);
+    if (!canvas.closest(".whole")) { // in a page that scrolls, the wheel is the page's until the map is clicked
+      this.orbit.enableZoom = false;
+      canvas.addEventListener("focus", () => { this.orbit.enableZoom = true; });
+      canvas.addEventListener("blur", () => { this.orbit.enableZoom = false; });
+    }
     canvas.addEventListener("keydown", (event) => this.#keyDown(event));
     canvas.addEventListener("keyup", (event) => this.pressed.delete(event.code));
     canvas.addEventListener("blur", () => this.pressed.clear());
+    canvas.addEventListener("pointerdown", () => { this.isHeld = true; });
+    for (const type of ["pointerup", "pointercancel"]) canvas.addEventListener(type, () => { this.isHeld = false; });
     canvas.addEventListener("pointermove", (event) => this.#drag(event));
   }
 
@@ -31,7 +38,7 @@ export class Navigation {
     const half = Math.tan(this.camera.fov * Math.PI / 360), { aspect } = this.camera;
     const distance = 1.05 * (fromAbove
       ? Math.max(size.y / 2, size.x / 2 / aspect) / half + size.z / 2
-      : 0.5 * Math.hypot(size.x, size.y, size.z) / half / Math.min(aspect, 1) * 0.72);
+      : 0.5 * Math.hypot(size.x, size.y, size.z) / half * (aspect > 1 ? 0.72 : 1.1 / aspect));
     this.orbit.target.copy(centre);
     this.camera.position.set(
       centre.x + distance * Math.sin(azimuth) * Math.cos(elevation),

@@ -1,6 +1,7 @@
 // Clouds and voxels: many points, coloured and cut in the shader.
 
 import { BufferAttribute, BufferGeometry, GLSL3, Matrix4, Points, RawShaderMaterial } from "three";
+import { ratio } from "mapper/screen";
 
 export const NEVER = 1023; // the time of the first hit of a point that no voxel's hit explains
 export const HITS_PER_OCTAVE = 16;
@@ -11,14 +12,14 @@ const LARGEST_PX = 40;
 const VERTEX = `
 precision highp float;
 uniform mat4 toClip;
-uniform float cut, until, size, least, most;
+uniform float cut, until, size, least, most, ratio;
 in vec4 position;
 in vec3 shade;
 flat out vec3 color;
 
 void main() {
   gl_Position = toClip * vec4(position.xyz, 1.0);
-  gl_PointSize = clamp(size / gl_Position.w, least, most);
+  gl_PointSize = clamp(size / gl_Position.w, least * ratio, most * ratio);
   if (position.z > cut || position.w > until) gl_Position.w = -1.0;
   color = shade;
 }`;
@@ -53,7 +54,7 @@ export class PointSet {
     geometry.setAttribute("shade", new BufferAttribute(this.shades, 4, true));
     this.uniforms = {
       toClip: { value: new Matrix4() }, cut: { value: Infinity }, until: { value: NEVER }, size: { value: 1 },
-      least: { value: 1.5 }, most: { value: LARGEST_PX },
+      least: { value: 1.5 }, most: { value: LARGEST_PX }, ratio,
     };
     this.object = new Points(geometry, new RawShaderMaterial({
       glslVersion: GLSL3, vertexShader: VERTEX, fragmentShader: isSquare ? SQUARE : FRAGMENT, uniforms: this.uniforms,

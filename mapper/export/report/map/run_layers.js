@@ -41,7 +41,7 @@ export class RunLayers {
     this.objects = this.#objects(colors);
     this.group.add(this.points.cloud.object, this.points.voxels.object, this.slice, ...Object.values(this.objects));
     const order = ["band", "truth", "rejected", "accepted", "path", "doubtful", "keyframes", "ends"];
-    order.forEach((id, i) => { if (this.objects[id]) this.objects[id].renderOrder = 2 + i; });
+    order.forEach((id, i) => this.objects[id]?.traverse((object) => { object.renderOrder = 2 + i; }));
   }
 
   /** Lowest and highest value of each colouring. */
@@ -136,7 +136,7 @@ export class RunLayers {
     const { x, y, z } = this.run.path, lengths = [0];
     for (let i = 1; i < x.length; i++) lengths.push(lengths[i - 1] + Math.hypot(x[i] - x[i - 1], y[i] - y[i - 1], z[i] - z[i - 1]));
     const total = lengths[lengths.length - 1], size = Math.min(total / 60, this.#reach() / 40);
-    const cones = new InstancedMesh(new ConeGeometry(0.35, 1, 10), new MeshBasicMaterial({ color: colors.run, depthTest: false }), ARROWS);
+    const cones = new InstancedMesh(new ConeGeometry(0.35, 1, 10), new MeshBasicMaterial({ color: colors.run, transparent: true, depthTest: false }), ARROWS);
     const up = new Vector3(0, 1, 0), turn = new Quaternion(), at = new Vector3(), ahead = new Vector3();
     let next = 1;
     for (let arrow = 0; arrow < ARROWS; arrow++) {
