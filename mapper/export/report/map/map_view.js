@@ -68,8 +68,11 @@ export class MapView {
   }
 
   async showLayer(height_m) {
+    const asked = this.askedLayers = (this.askedLayers ?? 0) + 1;
+    this.canvas.setAttribute("aria-busy", "true");
     await Promise.all(this.layers.map((one) => one.showLayer(height_m)));
     this.invalidate();
+    if (asked === this.askedLayers) this.canvas.setAttribute("aria-busy", "false");
   }
 
   /** Mark some points, and the line between two. */

@@ -1,6 +1,6 @@
 // The controls beside the map, and what is told about a frame, a loop or a distance.
 
-import { NEVER } from "mapper/points";
+import { HITS_PER_OCTAVE, NEVER } from "mapper/points";
 
 const UNITS = { height: "m", time: "s", hits: "scans" };
 
@@ -239,7 +239,7 @@ export class Panel {
     if (bar.hidden) return;
     let [low, high] = this.view.range();
     if (coloring === "time") [low, high] = [0, Math.max(...this.view.layers.map((one) => one.duration_s))];
-    if (coloring === "hits") [low, high] = [low, high].map((v) => Math.round(2 ** (v / 16) - 1));
+    if (coloring === "hits") [low, high] = [low, high].map((v) => Math.round(2 ** (v / HITS_PER_OCTAVE) - 1));
     this.find("legend-low").textContent = `${short(low)} ${UNITS[coloring]}`;
     this.find("legend-high").textContent = `${short(high)} ${UNITS[coloring]}`;
     const stops = this.ramp.filter((_, i) => i % 15 === 0).map((rgb) => `rgb(${rgb})`);

@@ -6,7 +6,7 @@ import { ratio } from "mapper/screen";
 export const NEVER = 1023; // the time of the first hit of a point that no voxel's hit explains
 export const HITS_PER_OCTAVE = 16;
 const UNSEEN = [115, 115, 115];
-const LARGEST_PX = 40;
+const SMALLEST_PX = 1.5, LARGEST_PX = 40;
 
 // Little is worked out per point: where a processor draws in place of a graphics card, that is most of the time.
 const VERTEX = `
@@ -54,7 +54,7 @@ export class PointSet {
     geometry.setAttribute("shade", new BufferAttribute(this.shades, 4, true));
     this.uniforms = {
       toClip: { value: new Matrix4() }, cut: { value: Infinity }, until: { value: NEVER }, size: { value: 1 },
-      least: { value: 1.5 }, most: { value: LARGEST_PX }, ratio,
+      least: { value: SMALLEST_PX }, most: { value: LARGEST_PX }, ratio,
     };
     this.object = new Points(geometry, new RawShaderMaterial({
       glslVersion: GLSL3, vertexShader: VERTEX, fragmentShader: isSquare ? SQUARE : FRAGMENT, uniforms: this.uniforms,
