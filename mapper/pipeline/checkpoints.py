@@ -37,8 +37,8 @@ from mapper.runtime.timing import peak_memory_mb
 
 EVERY_S = 4.0
 """Seconds between two checkpoints."""
-_SHARE, _LONGEST_S = 0.02, 9.0
-"""A checkpoint that costs more of the time between two is made less often, but not more seldom than this."""
+_SHARE, _LONGEST_S = 0.015, 9.0
+"""A checkpoint that costs more of the CPU time between two waits, but no longer than this."""
 _TIMES = "resumed.json"
 
 Result = TypeVar("Result")
@@ -68,8 +68,9 @@ class Checkpoints:
         self.progress = progress
         self.is_off = False
         self.is_solved = False
-        self._every_s = self._interval_s = every_s
-        self._last_s = time.monotonic()
+        self._every_s = every_s
+        self._cost_s = 0.0
+        self._last_s, self._last_cpu_s = time.monotonic(), time.process_time()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
         self._pending: Future[None] | None = None
         self._try(partial(self._begin, identity))
@@ -164,8 +165,10 @@ class Checkpoints:
         if self.is_off:
             return False
         if self._every_s > 0.0:
+            since_s, since_cpu_s = time.monotonic() - self._last_s, time.process_time() - self._last_cpu_s
+            is_cheap = self._cost_s <= _SHARE * since_cpu_s
             is_busy = self._pending is not None and not self._pending.done()
-            if is_busy or time.monotonic() - self._last_s < self._interval_s:
+            if is_busy or since_s < self._every_s or not (is_cheap or since_s > _LONGEST_S):
                 return False
         self._wait()
         return not self.is_off
@@ -176,7 +179,7 @@ class Checkpoints:
         Args:
             take: Copies what changes, and returns what writes it.
         """
-        self._last_s = time.monotonic()
+        self._last_s, self._last_cpu_s = time.monotonic(), time.process_time()
         began_s = time.thread_time()
         try:
             write = take()
@@ -188,8 +191,7 @@ class Checkpoints:
         def timed() -> None:
             began_s = time.thread_time()
             write()
-            cost_s = taken_s + time.thread_time() - began_s
-            self._interval_s = min(max(self._every_s, cost_s / _SHARE), max(self._every_s, _LONGEST_S))
+            self._cost_s = taken_s + time.thread_time() - began_s
 
         self._pending = self._thread.submit(timed)
 
