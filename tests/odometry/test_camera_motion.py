@@ -49,7 +49,9 @@ def motion_of(
     z = apply(T_CAMERA_WORLD, now)[:, 2]
     pixels = project(T_CAMERA_WORLD, now, observation.intrinsics) + 0.3 * rng.standard_normal((len(now), 2))
     measured = np.column_stack([pixels, observation.intrinsics[4] / z])
-    observation = replace(observation, measured=measured, weights=np.ones((len(now), 3)))
+    observation = replace(
+        observation, measured=measured, weights=np.ones((len(now), 3)), sensor_weights=np.ones((len(now), 3))
+    )
     counts = np.repeat(observers, [len(still), len(moved)])
     return camera_motion(np.eye(4), points, observation, np.arange(len(points)), counts)
 
@@ -75,7 +77,12 @@ def test_mismatches_are_no_other_motion(observation):
     pixels = project(T_CAMERA_WORLD, points, observation.intrinsics)
     pixels[200:] += rng.uniform(10.0, 60.0, (30, 2)) * rng.choice([-1.0, 1.0], (30, 2))
     disparity = observation.intrinsics[4] / apply(T_CAMERA_WORLD, points)[:, 2]
-    mixed = replace(observation, measured=np.column_stack([pixels, disparity]), weights=np.ones((230, 3)))
+    mixed = replace(
+        observation,
+        measured=np.column_stack([pixels, disparity]),
+        weights=np.ones((230, 3)),
+        sensor_weights=np.ones((230, 3)),
+    )
     motion = camera_motion(np.eye(4), points, mixed, np.arange(230), np.full(230, 2))
     assert miss_m(motion) < 0.01
     assert not motion.moving.any()

@@ -26,6 +26,7 @@ def cells_of(T_world_camera, half_m, rng=None):
 def aligned(target, T_target, source, *, guess, landmarks=NO_LANDMARKS, sigma=0.05):
     return align_depth(
         source,
+        source.points(),
         [surface_of(target)],
         [inverse(T_target)],
         keyframes=1,

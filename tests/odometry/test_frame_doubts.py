@@ -9,7 +9,10 @@ from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import exp
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
+from mapper.odometry.local_map.earlier_depth import Displacement
 from mapper.odometry.local_map.frame_doubts import FrameDoubts
+
+NOT_DISPLACED = Displacement()
 
 
 @pytest.fixture
@@ -50,7 +53,7 @@ def test_doubts_are_measured_against_what_is_usual(frames, odometry):
     pose = odometry._last
     step_ns = 33_000_000
 
-    def assess(k, *, moved_m=0.001, agreement=0.95, sigma_m=0.001):
+    def assess(k, *, moved_m=0.001, agreement=0.95, sigma_m=0.001, displaced=NOT_DISPLACED):
         now = replace(
             pose,
             observation=replace(pose.observation, stamp_ns=k * step_ns, pixels=pose.observation.pixels + k),
@@ -59,7 +62,7 @@ def test_doubts_are_measured_against_what_is_usual(frames, odometry):
         )
         last = replace(pose, observation=replace(pose.observation, stamp_ns=(k - 1) * step_ns))
         covariance = np.diag([1e-6] * 3 + [sigma_m**2] * 3)
-        return doubts.assess(now, covariance, last, pose.T_camera_world)
+        return doubts.assess(now, covariance, last, pose.T_camera_world, displaced)
 
     assert not any(assess(k).phrases for k in range(1, 30))
     assert not assess(30, moved_m=0.3).phrases
@@ -68,6 +71,9 @@ def test_doubts_are_measured_against_what_is_usual(frames, odometry):
     assert doubt.sigma_m == pytest.approx(0.3, rel=0.01)
     assert "which tell the translation to 0.050 m, 0.001 m is usual" in assess(32, sigma_m=0.05).phrases[0]
     assert "40% of the matches agree, 95% is usual" in assess(33, agreement=0.4).phrases
+    doubt = assess(34, displaced=Displacement(0.6, 0.15, 0.4))
+    assert doubt.phrases == ("60% of the surfaces lie elsewhere than 0.4 s before",)
+    assert doubt.sigma_m == pytest.approx(0.15)
 
 
 def test_factors_of_a_doubtful_keyframe_tell_less(frames, odometry):

@@ -88,7 +88,7 @@ def test_covered_frames_are_lost_and_the_next_ones_are_found_again(source, frame
     lost = [i for i, step in enumerate(tracks) if step.node is None]
     assert lost == list(range(15, 22))
     assert all(tracks[i].diagnostics.method == "lost" for i in lost)
-    assert tracks[22].diagnostics.method == "relocalised"
+    assert tracks[22].diagnostics.method.startswith("relocalised")
     assert all((tracks[i].T_world_body == tracks[14].T_world_body).all() for i in lost)
     assert ate_rmse_m(trajectory, source.truth) < 0.01
 

@@ -67,7 +67,9 @@ def camera_motion(
     least = max(_LEAST_OTHERS, _LEAST_OTHER_RATIO * len(features))
     if (~agree).sum() < least:
         return only_motion
-    T_other, _ = refined(T_camera_world, points_world[~agree], observation, features[~agree])
+    T_other, _ = refined(
+        T_camera_world, points_world[~agree], observation, features[~agree], observation.sensor_weights
+    )
     agree_other = agreeing(T_other, points_world, observation, features)
     if (agree_other & ~agree).sum() < least:
         return only_motion
@@ -99,13 +101,20 @@ def refined_by_established(
     is_established = _established(observers)
     if is_established is not None:
         T_found, agree = refined(
-            T_camera_world, points_world[is_established], observation, features[is_established]
+            T_camera_world,
+            points_world[is_established],
+            observation,
+            features[is_established],
+            observation.sensor_weights,
         )
         if agree.sum() >= _MIN_KEPT_RATIO * len(agree):
             agree = agreeing(T_found, points_world, observation, features)
-            T_found, _ = refined(T_found, points_world[agree], observation, features[agree])
+            T_found, _ = refined(
+                T_found, points_world[agree], observation, features[agree], observation.sensor_weights
+            )
             return T_found, agreeing(T_found, points_world, observation, features)
-    return refined(T_camera_world, points_world, observation, features)
+    T_found, _ = refined(T_camera_world, points_world, observation, features, observation.sensor_weights)
+    return T_found, agreeing(T_found, points_world, observation, features)
 
 
 def agreeing(
@@ -120,7 +129,7 @@ def agreeing(
         T_camera_world,
         points_world,
         observation.measured[features],
-        observation.weights[features],
+        observation.sensor_weights[features],
         observation.intrinsics,
         agree,
     )

@@ -114,6 +114,7 @@ class DepthAlignment:
 
 def align_depth(
     cells: DepthCells,
+    points: Points,
     surfaces: Sequence[DepthSurface],
     T_surfaces_world: Sequence[Transform],
     *,
@@ -131,6 +132,7 @@ def align_depth(
 
     Args:
         cells: The depth image.
+        points: (N, 3) of those points of it that stand still, camera frame.
         surfaces: Those of at least one keyframe and of other frames, of the same camera.
         T_surfaces_world: (4, 4) of each.
         keyframes: Number of keyframes, which are the first of them.
@@ -143,7 +145,6 @@ def align_depth(
     Returns:
         The pose, whether it is right or not; None where too few points have a partner.
     """
-    points = cells.points()
     if len(points) < _MIN_POINTS:
         return None
     sigmas = point_sigmas(cells, points, noise)

@@ -27,7 +27,7 @@ _INDEPENDENT = 0.25
 
 
 @njit(cache=True, nogil=True)
-def _between(T_a_w, T_b_w):  # type: ignore[no-untyped-def]
+def between(T_a_w, T_b_w):  # type: ignore[no-untyped-def]
     """Return T_a_b of two poses of the world."""
     T = np.eye(4)
     T[:3, :3] = product(T_a_w, T_b_w[:3, :3].T.copy())
@@ -36,22 +36,33 @@ def _between(T_a_w, T_b_w):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _cell_of(T, p, optics, cell_px, shape):  # type: ignore[no-untyped-def]
-    """Return row and column of the cell that a point is seen in, −1 for none, and its depth, metres."""
+def place_in_cells(T, p, optics, cell_px):  # type: ignore[no-untyped-def]
+    """Return where a point is seen, in rows and columns of cells from their corner, and its depth, metres.
+
+    Row and column are −1 for a point that is not before the camera.
+    """
     x = T[0, 0] * p[0] + T[0, 1] * p[1] + T[0, 2] * p[2] + T[0, 3]
     y = T[1, 0] * p[0] + T[1, 1] * p[1] + T[1, 2] * p[2] + T[1, 3]
     z = T[2, 0] * p[0] + T[2, 1] * p[1] + T[2, 2] * p[2] + T[2, 3]
     if z < _MIN_DEPTH_M:
-        return -1, -1, z
+        return -1.0, -1.0, z
     u, v = x / z, y / z
     s = u * u + v * v
     if s > _WIDEST:
-        return -1, -1, z
+        return -1.0, -1.0, z
     radial = 1.0 + s * (optics[4] + s * (optics[5] + s * optics[8]))
     du = u * radial + 2.0 * optics[6] * u * v + optics[7] * (s + 2.0 * u * u)
     dv = v * radial + optics[6] * (s + 2.0 * v * v) + 2.0 * optics[7] * u * v
-    column = int(np.floor((du * optics[0] + optics[2] + 0.5) / cell_px))
-    line = int(np.floor((dv * optics[1] + optics[3] + 0.5) / cell_px))
+    column = (du * optics[0] + optics[2] + 0.5) / cell_px
+    line = (dv * optics[1] + optics[3] + 0.5) / cell_px
+    return line, column, z
+
+
+@njit(cache=True, nogil=True)
+def cell_of(T, p, optics, cell_px, shape):  # type: ignore[no-untyped-def]
+    """Return row and column of the cell that a point is seen in, −1 for none, and its depth, metres."""
+    down, across, z = place_in_cells(T, p, optics, cell_px)
+    line, column = int(np.floor(down)), int(np.floor(across))
     if 0 <= line < shape[0] and 0 <= column < shape[1]:
         return line, column, z
     return -1, -1, z
@@ -72,7 +83,7 @@ def _plane_row(planes, optics, cell_px, T, p, row):  # type: ignore[no-untyped-d
     Returns:
         The distance, negative in front of the plane; NaN if there is no plane.
     """
-    line, column, z = _cell_of(T, p, optics, cell_px, planes.shape)
+    line, column, z = cell_of(T, p, optics, cell_px, planes.shape)
     if line < 0:
         return np.nan
     plane = planes[line, column]
@@ -180,7 +191,7 @@ def descend(  # type: ignore[no-untyped-def]
         for _ in range(iterations):
             H, g = np.zeros((6, 6)), np.zeros(6)
             for k in range(len(planes)):
-                T_k_c = _between(T_keyframes_world[k], T)
+                T_k_c = between(T_keyframes_world[k], T)
                 for i in range(0, len(points), stride):
                     distance = _plane_row(planes[k], optics, cell_px, T_k_c, points[i], row)
                     if not abs(distance) <= gate_m:
@@ -197,7 +208,7 @@ def descend(  # type: ignore[no-untyped-def]
                     H[a, b] = H[b, a]
             H, g = _projected(kept, H, g)
             _add_landmarks(T, landmarks, measured, weights, intrinsics, active, H, g)
-            D = _between(T_prior, T)
+            D = between(T_prior, T)
             to_prior = np.empty(6)
             to_prior[0], to_prior[1] = 0.5 * (D[2, 1] - D[1, 2]), 0.5 * (D[0, 2] - D[2, 0])
             to_prior[2] = 0.5 * (D[1, 0] - D[0, 1])
@@ -237,7 +248,7 @@ def compare(T_camera_world, points, sigmas, planes, T_keyframes_world, optics, c
     squares = squares_m = 0.0
     shared = _INDEPENDENT / (len(planes) + 1.0)
     for k in range(len(planes)):
-        T_k_c = _between(T_keyframes_world[k], T_camera_world)
+        T_k_c = between(T_keyframes_world[k], T_camera_world)
         for i in range(len(points)):
             distance = _plane_row(planes[k], optics, cell_px, T_k_c, points[i], row)
             if np.isnan(distance):
@@ -290,7 +301,7 @@ def seen_through(  # type: ignore[no-untyped-def]
     rows, columns = inverse_depth.shape
     through = seen = 0
     for k in range(len(planes)):
-        T = _between(T_camera_world, T_keyframes_world[k])
+        T = between(T_camera_world, T_keyframes_world[k])
         for i in range(rows):
             for j in range(columns):
                 plane = planes[k, i, j]
@@ -299,7 +310,7 @@ def seen_through(  # type: ignore[no-untyped-def]
                 if facing <= 0.0:
                     continue
                 z = plane[3] / facing
-                line, column, depth_m = _cell_of(T, (u * z, v * z, z), optics, cell_px, inverse_depth.shape)
+                line, column, depth_m = cell_of(T, (u * z, v * z, z), optics, cell_px, inverse_depth.shape)
                 if line < 1 or column < 1 or line >= rows - 1 or column >= columns - 1:
                     continue
                 nearest = 0.0  # as inverse depth, about the cell

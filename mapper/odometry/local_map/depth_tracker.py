@@ -15,6 +15,7 @@ from mapper.odometry.local_map.depth_alignment import (
     observes_all,
 )
 from mapper.odometry.local_map.depth_surfaces import DepthCells, DepthSurface, surface_of
+from mapper.odometry.local_map.earlier_depth import EarlierDepth
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
@@ -45,6 +46,7 @@ class DepthTracker:
         self._config = config
         self._map = landmark_map
         self._search = LocalSearch(config, landmark_map)
+        self._earlier_depth = EarlierDepth(landmark_map, config.depth_noise)
         self._surfaces: dict[int, DepthSurface] = {}  # of the frames last used, by stamp
         self._keyframes: list[int] = []  # those among them
         self._observed_ns = 0  # when every motion was last observed
@@ -127,8 +129,11 @@ class DepthTracker:
         unsure_s = max(self._unobserved_s(observation), _LEAST_ELAPSED_S)
         ids = unmatched(observation) if found is None else found.landmark_of_feature
         features = np.flatnonzero(ids >= 0)
+        points = observation.depth_cells.points()
+        moved = self._earlier_depth.moved(observation, T_camera_world, last.reference, points)
         return align_depth(
             observation.depth_cells,
+            points[~moved],
             surfaces,
             T_surfaces_world,
             keyframes=len(self._keyframes),
@@ -155,18 +160,28 @@ class DepthTracker:
             for k in self._map.latest(last.reference)
             if keyframes[k].origin == origin and _alike(keyframes[k].observation.depth_cells, cells)
         ]
-        of_stamp = {}
-        models = [(keyframes[k].observation, keyframes[k].T_camera_world) for k in self._keyframes]
+        models = [(keyframes[k].observation, keyframes[k].T_camera_world, k) for k in self._keyframes]
         blind = last.doubts or (last.depth is not None and last.depth.unobservable)
-        if not blind and all(earlier is not last.observation for earlier, _ in models):
-            models.append((last.observation, last.T_camera_world))
-        for earlier, _ in models:
-            there = earlier.depth_cells
-            if there is not None and _alike(there, cells):
-                of_stamp[earlier.stamp_ns] = self._surfaces.get(earlier.stamp_ns) or surface_of(there)
-        self._surfaces = of_stamp
-        known = [(of_stamp[earlier.stamp_ns], T) for earlier, T in models if earlier.stamp_ns in of_stamp]
-        return [surface for surface, _ in known], [T for _, T in known]
+        if not blind and all(earlier is not last.observation for earlier, _, _ in models):
+            models.append((last.observation, last.T_camera_world, last.reference))
+        models = [model for model in models if _alike(model[0].depth_cells, cells)]
+        self._surfaces = {
+            earlier.stamp_ns: self._surfaces.get(earlier.stamp_ns) or self._still_surface(earlier, T, k)
+            for earlier, T, k in models
+        }
+        return [self._surfaces[earlier.stamp_ns] for earlier, _, _ in models], [T for _, T, _ in models]
+
+    def _still_surface(
+        self, observation: ImageObservation, T_camera_world: Transform, reference: int
+    ) -> DepthSurface:
+        """Return the surfaces of a frame without those of what has moved there."""
+        cells = observation.depth_cells
+        assert cells is not None
+        surface = surface_of(cells)
+        moved = self._earlier_depth.moved(observation, T_camera_world, reference, cells.points())
+        planes = surface.planes.copy()
+        planes[cells.inverse_depth > 0.0] *= ~moved[:, np.newaxis]
+        return replace(surface, planes=planes)
 
     def _by_depth(
         self, observation: ImageObservation, alignment: DepthAlignment, reference: int, gap_s: float

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapper.core.geometry import Array, Transform, inverse, log
+from mapper.odometry.local_map.earlier_depth import Displacement
 from mapper.odometry.local_map.pose_tracker import TrackedPose
 
 _MEMORY = 100
@@ -24,6 +25,12 @@ right poses is 3 to 6."""
 _SUPPORT_AGREEMENT, _SUPPORT_RATIO = 0.85, 2.0
 """A jump is believed if the agreement is at least this share of the usual, and the uncertainty at most this
 multiple, and nothing in view moves by itself: fast motions are real."""
+
+_FEW_MOVING = 0.05
+"""Share of the features below which nothing moves by itself: depths at edges look like it."""
+_MOST_DISPLACED = 0.4
+"""When a larger share of the surfaces that two images have in common lies elsewhere, the pose is doubtful: a
+real desk's edges give up to 0.35 under right poses, a passer-by's pose more in every second frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +65,7 @@ class FrameDoubts:
         covariance: Array,
         last: TrackedPose,
         T_camera_world_predicted: Transform | None,
+        displaced: Displacement,
     ) -> Doubt:
         """Return the doubts of a frame; the figures of undoubted ones become part of the usual.
 
@@ -66,6 +74,7 @@ class FrameDoubts:
             covariance: (6, 6) of its pose from the features that agree, (rotation, translation).
             last: The tracked frame before it.
             T_camera_world_predicted: (4, 4) by constant velocity; None if nothing predicts it.
+            displaced: Surfaces that lie elsewhere by this pose than in an earlier frame.
         """
         stamp_ns = tracked_pose.observation.stamp_ns
         elapsed_s = 1e-9 * (stamp_ns - last.observation.stamp_ns)
@@ -93,12 +102,17 @@ class FrameDoubts:
         is_supported = (
             agreement >= _SUPPORT_AGREEMENT * usual_agreement
             and sigma_m <= _SUPPORT_RATIO * usual_m
-            and not len(tracked_pose.moving)
+            and len(tracked_pose.moving) <= _FEW_MOVING * len(tracked_pose.observation)
         )
         if not is_supported:
             phrases += self._jumps(jump, elapsed_s)
         if shown_s > 0.0:
             phrases.append(f"the image has been the same for {shown_s:.2f} s")
+        if displaced.ratio > _MOST_DISPLACED:
+            phrases.append(
+                f"{displaced.ratio:.0%} of the surfaces lie elsewhere than {displaced.since_s:.1f} s before"
+            )
+            sigma_m = max(sigma_m, displaced.distance_m)
         if phrases:
             # How far off it may be: as far as the prediction says, or as the camera moves in the time.
             off = [

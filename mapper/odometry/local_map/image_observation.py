@@ -17,9 +17,12 @@ from mapper.odometry.local_map.depth_surfaces import DepthCells, depth_cells
 from mapper.odometry.local_map.pixel_motion import depth_velocity, pixel_velocity, row_phase
 from mapper.places.vocabulary import Vocabulary
 from mapper.runtime.state_pickle import Archivable
-from mapper.sensing.depth_noise import feature_depth_m, feature_depth_sigma_m
+from mapper.sensing.config import KINECT_NOISE
+from mapper.sensing.depth_noise import depth_sigma_m, feature_depth_m, feature_depth_sigma_m
 
 _MIN_DEPTH_M = 0.05
+_SCALE_ERROR = 0.02
+"""Error of depths beside the sensor's noise, as a share: its scale, and the slope where a feature lies."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +39,8 @@ class ImageObservation(Archivable):
         measured: (N, 3) u, v and virtual disparity bf / z in pixels, as a global shutter would have read them
             when the middle row was read; NaN in the third column without depth or if it is not used.
         weights: (N, 3) inverse variances of the three, px⁻².
+        sensor_weights: (N, 3) likewise, by the depth sensor's noise where that is smaller than the virtual
+            disparity's: they tell which features move alike, and leave errors of its calibration out.
         points_camera: (N, 3) metres, of ``measured``; NaN without depth.
         grid: Index of the features, which are sorted by its cells.
         intrinsics: (5,) fx, fy, cx, cy, bf in pixels (bf in pixel metres).
@@ -54,6 +59,7 @@ class ImageObservation(Archivable):
     words: NDArray[np.int32]
     measured: Array
     weights: Array
+    sensor_weights: Array
     points_camera: Points
     grid: FeatureGrid
     intrinsics: Array
@@ -149,6 +155,8 @@ def observe_image(
         # Without depth the weight is not used, but it is a factor in sums.
         known_px = config.virtual_baseline_px_m / depth_m**2 * sigma_m
         disparity_sigma_px = np.where(np.isnan(depth_m), disparity_sigma_px, known_px)
+    sensor_m = np.hypot(depth_sigma_m(config.depth_noise or KINECT_NOISE, depth_m), _SCALE_ERROR * depth_m)
+    sensor_px = np.fmin(config.virtual_baseline_px_m / depth_m**2 * sensor_m, disparity_sigma_px)
     return ImageObservation(
         stamp_ns=frame.stamp_ns,
         pixels=pixels,
@@ -158,6 +166,7 @@ def observe_image(
         words=vocabulary.words_of(bits),
         measured=np.column_stack([pixels, disparity_px]),
         weights=np.column_stack([sigma_px, sigma_px, disparity_sigma_px]) ** -2.0,
+        sensor_weights=np.column_stack([sigma_px, sigma_px, sensor_px]) ** -2.0,
         points_camera=back_projected(pixels, depth_m, intrinsics),
         grid=grid,
         intrinsics=intrinsics,

@@ -10,10 +10,11 @@ from mapper.features.hamming import Bits
 from mapper.features.window_matching import match_windows
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.camera_motion import refined_by_established
+from mapper.odometry.local_map.earlier_depth import EarlierDepth
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmark_kernels import project_visible
 from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
-from mapper.odometry.local_map.pose_tracker import MAX_HAMMING, TrackedPose, rms_px
+from mapper.odometry.local_map.pose_tracker import MAX_HAMMING, TrackedPose, refined, rms_px
 
 _MAX_RATIO = 0.8
 _CHANCE = 0.02
@@ -33,6 +34,7 @@ class LocalSearch:
     def __init__(self, config: KeyframeOdometryConfig, landmark_map: LandmarkMap) -> None:
         self._config = config
         self._map = landmark_map
+        self._earlier_depth = EarlierDepth(landmark_map, config.depth_noise)
 
     def refine(
         self,
@@ -58,6 +60,8 @@ class LocalSearch:
             The refined pose; None if too few landmarks agree.
         """
         config, landmarks = self._config, self._map.landmarks
+        moved = self._earlier_depth.moved(observation, T_camera_world, reference)
+        landmark_of_feature = np.where(moved, -1, landmark_of_feature).astype(np.int32)
         matched = landmark_of_feature[landmark_of_feature >= 0]
         counts = self._map.shared_counts(matched)
         order = [int(k) for k in np.argsort(-counts, kind="stable") if counts[k] > 0] or [reference]
@@ -81,11 +85,10 @@ class LocalSearch:
             octave,
             landmarks["bits"][visible],
             search_px=config.local_search_px,
-            taken=landmark_of_feature >= 0,
+            taken=moved | (landmark_of_feature >= 0),
             max_ratio=_MAX_RATIO,
         )
         hits = np.flatnonzero(feature >= 0)
-        landmark_of_feature = landmark_of_feature.copy()
         landmark_of_feature[feature[hits]] = visible[hits]
         features = np.flatnonzero(landmark_of_feature >= 0)
         ids = landmark_of_feature[features]
@@ -93,6 +96,9 @@ class LocalSearch:
             return None
         T_camera_world, agree = refined_by_established(
             T_camera_world, landmarks["position"][ids], observation, features, landmarks["observers"][ids]
+        )
+        T_camera_world, _ = refined(
+            T_camera_world, landmarks["position"][ids[agree]], observation, features[agree]
         )
         if agree.sum() < max(config.min_inliers, least_by_chance(len(visible) + len(matched))):
             return None
@@ -110,6 +116,7 @@ class LocalSearch:
             len(visible) + len(matched),
             rms_px(T_camera_world, landmarks["position"][ids[agree]], observation, features[agree]),
             method,
+            moving=np.flatnonzero(moved).astype(np.int32),
         )
 
     def match_near(

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Points, apply, inverse
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.local_map.camera_motion import agreeing, camera_motion
+from mapper.odometry.local_map.earlier_depth import EarlierDepth
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
@@ -15,6 +16,8 @@ from mapper.odometry.local_map.pose_tracker import TrackedPose, predicted, proje
 from mapper.odometry.local_map.relocalizer import Relocalizer
 
 _MAX_RATIO = 0.9
+_LEAST_STILL_RATIO = 0.2
+"""When fewer matches stand still, it is the prediction that is wrong."""
 _RIVAL_RATIO = 0.5
 """A pose of fewer inliers, relative to the better one, does not cast doubt on it."""
 _SAME_RATIO = 0.5
@@ -29,6 +32,7 @@ class MotionPoseTracker:
         self._map = landmark_map
         self._search = LocalSearch(config, landmark_map)
         self._relocalizer = relocalizer
+        self._earlier_depth = EarlierDepth(landmark_map, config.depth_noise)
 
     def track(
         self, observation: ImageObservation, last: TrackedPose, before_last: TrackedPose | None
@@ -93,6 +97,10 @@ class MotionPoseTracker:
                 break
         else:
             return None
+        moved = self._earlier_depth.moved(observation, T_camera_world, last.reference)
+        still = ~moved[feature[hits]]
+        if still.sum() >= max(self._config.min_matches, _LEAST_STILL_RATIO * len(hits)):
+            hits = hits[still]
         motion = camera_motion(
             T_camera_world,
             points_world[hits],
@@ -115,7 +123,11 @@ class MotionPoseTracker:
         )
         if found is None:
             return None
-        return replace(found, doubts=motion.doubts, moving=feature[hits[motion.moving]])
+        return replace(
+            found,
+            doubts=motion.doubts,
+            moving=np.union1d(feature[hits[motion.moving]], found.moving).astype(np.int32),
+        )
 
     def _known_points(self, tracked_pose: TrackedPose) -> tuple[NDArray[np.intp], Points, Ids]:
         """Return the features with a known 3D point: indices, (M, 3) world points, landmark or −1.
@@ -127,5 +139,7 @@ class MotionPoseTracker:
         is_landmark = (ids >= 0) & (landmarks["observers"][ids] > 0)
         points_world = apply(inverse(tracked_pose.T_camera_world), observation.points_camera)
         points_world[is_landmark] = landmarks["position"][ids[is_landmark]]
-        known = np.flatnonzero(is_landmark | observation.has_depth)
+        still = np.ones(len(observation), np.bool_)
+        still[tracked_pose.moving] = False
+        known = np.flatnonzero((is_landmark | observation.has_depth) & still)
         return known, points_world[known], np.where(is_landmark, ids, -1)[known].astype(np.int32)

@@ -24,6 +24,7 @@ from mapper.odometry.base import (
 )
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.depth_tracker import DepthTracker
+from mapper.odometry.local_map.earlier_depth import EarlierDepth
 from mapper.odometry.local_map.frame_doubts import NO_DOUBT, Doubt, FrameDoubts
 from mapper.odometry.local_map.image_observation import ImageObservation, observe_image
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
@@ -77,6 +78,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._last: TrackedPose | None = None
         self._before_last: TrackedPose | None = None
         self._depth = DepthTracker(config, self._map)
+        self._earlier_depth = EarlierDepth(self._map, config.depth_noise)
         self._decision = KeyframeDecision(config)
         self._doubts = FrameDoubts()
         self._residuals = LogResiduals()
@@ -112,7 +114,10 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             to_camera = adjoint(inverse(observation.T_body_camera))
             information += to_camera.T @ tracked_pose.depth.information @ to_camera
         expected = None if self._lost_frames else predicted(observation.stamp_ns, last, self._before_last)
-        doubt = self._doubts.assess(tracked_pose, _covariance_of(information), last, expected)
+        displaced = self._earlier_depth.displacement(
+            observation, tracked_pose.T_camera_world, tracked_pose.reference
+        )
+        doubt = self._doubts.assess(tracked_pose, _covariance_of(information), last, expected, displaced)
         # The motion before a gap does not predict the motion after it.
         before_last = None if self._lost_frames else self._last
         self._lost_frames = self._unknown_frames = 0

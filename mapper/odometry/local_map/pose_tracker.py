@@ -37,7 +37,8 @@ class TrackedPose:
         method: Step that found the pose, e.g. "map", "fallback" or "relocalised".
         depth: Alignment of the depth image that took part in the pose; None if landmarks alone gave it.
         doubts: Why the pose may be wrong, a phrase each.
-        moving: (M,) int32 features that contradict the pose while something else moves in view.
+        moving: (M,) int32 features that stand where earlier depth images saw through, or that contradict the
+            pose while something else moves in view.
     """
 
     observation: ImageObservation
@@ -113,13 +114,14 @@ def refined(
     points_world: Points,
     observation: ImageObservation,
     features: NDArray[np.integer],
+    weights: Array | None = None,
 ) -> tuple[Transform, NDArray[np.bool_]]:
     """Return the refined T_camera_world and which pairs agree with it."""
     T_refined, inlier, _ = refine_pose(
         T_camera_world,
         points_world,
         observation.measured[features],
-        observation.weights[features],
+        (observation.weights if weights is None else weights)[features],
         observation.intrinsics,
         _LM_ROUNDS,
         _LM_ITERATIONS,
