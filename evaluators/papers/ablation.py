@@ -104,7 +104,13 @@ class _SharedDetector:
     def comparing(self, config: IsvdOdometryConfig) -> RegisterPair:
         """Return the comparison of an earlier frame with the newest by an odometry's settings."""
         isvd = Isvd(config.registration)
-        how = (config.registration, config.depth_filter, config.undistort, config.max_depth_m)
+        how = (
+            config.registration,
+            config.depth_filter,
+            config.undistort,
+            config.whole_pixels,
+            config.max_depth_m,
+        )
 
         def compare(
             target: IsvdObservation, source: IsvdObservation, match: MatchConfig

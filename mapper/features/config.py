@@ -17,7 +17,7 @@ class SurfConfig(Config):
     max_features: PositiveInt = 1000
     """Largest number of features of an image, the strongest first. More in images of higher resolution; fewer
     are faster."""
-    threshold: PositiveFloat = 400.0
+    threshold: PositiveFloat = 500.0
     """First threshold of the Hessian's determinant, grey levels²; halved while there are too few features."""
     min_threshold: PositiveFloat = 25.0
     """Last threshold; raise it where noise gives features."""

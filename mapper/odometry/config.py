@@ -55,6 +55,9 @@ class IsvdOdometryConfig(Config):
     """DIF (Somlyai, PhD thesis, alg. 4) before back-projection."""
     undistort: bool = True
     """Undistort features before back-projection; the thesis does not state it."""
+    whole_pixels: bool = False
+    """A feature's 3D point is that of its nearest pixel, as in a cloud indexed by pixels (Somlyai, PhD
+    thesis, §4.1.1); false puts the depth of that pixel on the feature's own ray."""
     max_depth_m: PositiveFloat = 5.0
     """Depth beyond it is not used: a Kinect's error grows with the square of the depth."""
     keyframe_interval: PositiveInt = 20

@@ -191,7 +191,9 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         depth_m = dif(frame.depth_m) if config.depth_filter else frame.depth_m
         z, _, _ = feature_depth_m(depth_m, features.pixels)
         z[z > config.max_depth_m] = np.nan
-        pixels = camera.undistort(features.pixels) if config.undistort else features.pixels
+        pixels = np.rint(features.pixels) if config.whole_pixels else features.pixels
+        if config.undistort:
+            pixels = camera.undistort(pixels)
         rays = (pixels - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
         return apply(frame.T_body_camera, np.column_stack([rays * z[:, None], z]))
 

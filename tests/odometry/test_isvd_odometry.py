@@ -197,6 +197,15 @@ def test_observes_points_where_there_is_depth():
     assert np.allclose(back, observed.features.pixels[measured], atol=1e-3)
 
 
+def test_points_of_whole_pixels_are_those_of_the_depth_image():
+    observed = IsvdOdometry(config(whole_pixels=True)).observe(textured_frame())
+
+    measured = np.isfinite(observed.points_body[:, 2])
+    pixels = observed.features.pixels[measured]
+    assert np.abs(pixels - np.rint(pixels)).max() > 0.1  # coarse octaves lie between pixels
+    assert np.allclose(CAMERA.project(observed.points_body[measured]), np.rint(pixels), atol=1e-3)
+
+
 def test_observes_in_the_body_frame():
     T_body_camera = exp(np.array([0.1, 0.2, 0.3]), np.array([0.5, 0.0, -0.2]))
 

@@ -19,6 +19,7 @@ from mapper.core.trajectory import trajectory_from
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import TrackingResult, track_log
+from mapper.registration.config import IsvdConfig
 from mapper.runtime.progress import SILENT
 from mapper.runtime.resumable_jobs import JobResult
 from mapper.sources import open_source
@@ -57,6 +58,8 @@ def test_tables_compare_what_they_say():
     iterations = {name: setting.config().odometry.registration for name, setting in settings("5.1")}
     assert list(iterations) == ["1", "3", "4", "5", "7", "9", "11", "13", "15", "20", "25", "auto"]
     assert all(config.max_iterations == int(name) for name, config in iterations.items() if name != "auto")
+    assert {config.min_pairs for config in iterations.values()} == {IsvdConfig().min_pairs}
+    assert [name for name, config in iterations.items() if config.min_error_mm > 0] == ["auto"]
     previous = {name: setting.config().odometry.previous_frames for name, setting in settings("5.2")}
     assert previous == {"MP1": 1, "MP2": 2, "MP3": 3, "MP4": 4, "MP6": 6}
     steps = {name: setting.config().odometry.registration.step for name, setting in settings("4.1")}
@@ -286,5 +289,6 @@ def test_isvd_as_published_follows_the_first_second_of_a_real_log(tmp_path):
 
     ours_m = {f"{record['table']} {record['column']}": record["value"] for record in records}
     assert len(ours_m) == 17
-    assert ours_m["5.1 auto"] == ours_m["5.2 MP4"] < 0.01
+    assert ours_m["5.1 25"] == ours_m["5.2 MP4"] < 0.01
+    assert ours_m["5.1 auto"] < 0.01
     assert ours_m["5.1 1"] > ours_m["5.1 7"]
