@@ -158,6 +158,9 @@ def _in_free_space(  # type: ignore[no-untyped-def]
             line, column, z = cell_of(T, points[n], optics, cell_px, shape)
             if line < 1 or column < 1 or line >= shape[0] - 1 or column >= shape[1] - 1:
                 continue
+            here = inverse_depth[k, line, column]
+            if here <= 0.0 or 1.0 / here - z <= _MARGIN_M:
+                continue  # the nearest about it are no farther
             around = inverse_depth[k, line - 1 : line + 2, column - 1 : column + 2]
             if around.min() <= 0.0:
                 continue
@@ -185,12 +188,13 @@ def _apart(  # type: ignore[no-untyped-def]
         if down < 0.0 or across < 0.0 or down >= rows - 1 or across >= columns - 1:
             continue
         line, column = int(down), int(across)
-        around = inverse_depth[line : line + 2, column : column + 2]
-        if around.min() <= 0.0 or around.max() > _SMOOTH * around.min():
+        a, b = inverse_depth[line, column], inverse_depth[line, column + 1]
+        c, d = inverse_depth[line + 1, column], inverse_depth[line + 1, column + 1]
+        least = min(a, b, c, d)
+        if least <= 0.0 or max(a, b, c, d) > _SMOOTH * least:
             continue
         s, t = down - line, across - column
-        upper = (1.0 - t) * around[0, 0] + t * around[0, 1]
-        lower = (1.0 - t) * around[1, 0] + t * around[1, 1]
+        upper, lower = (1.0 - t) * a + t * b, (1.0 - t) * c + t * d
         apart = abs(z - 1.0 / ((1.0 - s) * upper + s * lower))
         sigma_m = noise[0] + z * (noise[1] + z * noise[2])
         if apart <= _SAME_M + _SAME_RATIO * z + _SAME_SIGMAS * sigma_m:
