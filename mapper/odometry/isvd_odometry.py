@@ -298,8 +298,11 @@ def register_pair(
 
 
 def matched_pairs(target: IsvdObservation, source: IsvdObservation, match: MatchConfig) -> Pairs:
-    """Return the features that two frames share (Somlyai, PhD thesis, alg. 8)."""
-    pairs = match_mutual(target.features, source.features, max_ratio=match.max_ratio)
+    """Return the features that two frames share (Somlyai, PhD thesis, alg. 8).
+
+    The ratio test is one of the new frame's features, the source's, as alg. 7 calls match with them first.
+    """
+    pairs = match_mutual(source.features, target.features, max_ratio=match.max_ratio)[:, ::-1]
     if match.filter == "homography":
         pairs = pairs[
             homography_inliers(
