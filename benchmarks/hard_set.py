@@ -25,12 +25,12 @@ import cv2
 import numpy as np
 from hard_logs import HARD_LOGS
 
-from cli.main import app
-from evaluators.metrics.loops import wrong_loops
-from evaluators.metrics.silent_failures import check_doubts
-from evaluators.metrics.trajectory import align, associate, ate
+from mapper.cli.main import app
 from mapper.config.loading import load_config
 from mapper.core.errors import MapperError
+from mapper.evaluators.metrics.loops import wrong_loops
+from mapper.evaluators.metrics.silent_failures import check_doubts
+from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import refuse_a_fragment, track_log

@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluators.metrics.cloud_distance import DistanceTo
-from evaluators.papers.scan_pairs import fewer_rings, merged, perturbed
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, angle_between, inverse
+from mapper.evaluators.metrics.cloud_distance import DistanceTo
+from mapper.evaluators.papers.scan_pairs import fewer_rings, merged, perturbed
 from mapper.registration.base import Registration
 from mapper.registration.config import KissMatcherConfig
 from mapper.registration.factory import build_registration

@@ -19,13 +19,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from evaluators.papers.measurements import ate_rmse_m
-from evaluators.study.versions import digest
 from mapper.config.loading import load_source_config
 from mapper.core.errors import FrameError
 from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import Array, Transform, mean_rotation, transform
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.papers.measurements import ate_rmse_m
+from mapper.evaluators.study.versions import digest
 from mapper.features.config import DetectorConfig, OrbConfig, SiftConfig, SurfConfig
 from mapper.features.factory import build_detector
 from mapper.features.matching import homography_inliers

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluators.metrics.trajectory import align, associate, ate
 from mapper.config.loading import load_config
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.odometry.factory import build_frame_odometry
 from mapper.sources import open_source
 

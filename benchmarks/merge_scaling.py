@@ -83,7 +83,7 @@ def make_runs(source: Log, resolution_m: float, *, stride: int, folder: Path) ->
 
 def merged_apart(runs: list[Run], out: Path, *, processes: int, poses: Path | None = None) -> Cost:
     """Merge by the command, in a process of its own."""
-    command = [sys.executable, "-c", "from cli.main import main; main()", "merge"]
+    command = [sys.executable, "-c", "from mapper.cli.main import main; main()", "merge"]
     command += [str(run.path) for run in runs]
     command += ["--out", str(out), "--overwrite", "--quiet", "--processes", str(processes)]
     if poses is not None:

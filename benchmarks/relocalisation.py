@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from evaluators.metrics.trajectory import align, associate, ate
 from mapper.config.loading import load_config
 from mapper.core.geometry import angle_between
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log
 from mapper.runtime.progress import SILENT

@@ -41,7 +41,7 @@ configuration = [
   {name = "without loops", set = {loops.kind = "none"}},
 ]
 """
-COMMAND = [sys.executable, "-c", "from cli.main import main; main()", "sweep"]
+COMMAND = [sys.executable, "-c", "from mapper.cli.main import main; main()", "sweep"]
 CELLS = 18
 CALM = {  # as it comes, each of a cluster's processes takes 2 to 3 % of a core to watch itself
     "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",

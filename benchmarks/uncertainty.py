@@ -12,9 +12,9 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from evaluators.metrics.consistency import Nees, factor_nees, window_nees
-from evaluators.metrics.trajectory import align, associate, ate
 from mapper.config.loading import load_config, load_source_config
+from mapper.evaluators.metrics.consistency import Nees, factor_nees, window_nees
+from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import track_log

@@ -14,8 +14,8 @@ from typing import Annotated, Any
 
 import typer
 
-from cli.console import progress_for
-from cli.terminal import print_text
+from mapper.cli.console import progress_for
+from mapper.cli.terminal import print_text
 from mapper.core.errors import MapperError
 from mapper.runtime.atomic import MANIFEST_NAME
 from mapper.runtime.progress import SILENT, Progress

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.answer import Answer, Output
-from cli.completion import run_folders
-from cli.environment import has_compiled_code, prepare_libraries
-from cli.options import (
+from mapper.cli.answer import Answer, Output
+from mapper.cli.completion import run_folders
+from mapper.cli.environment import has_compiled_code, prepare_libraries
+from mapper.cli.options import (
     ConfigFile,
     First,
     Last,
@@ -22,13 +22,13 @@ from cli.options import (
     merged,
     selection,
 )
-from cli.places import RUNS, name_of, place_of
-from cli.stepping import Stepping
+from mapper.cli.places import RUNS, name_of, place_of
+from mapper.cli.stepping import Stepping
 
 if TYPE_CHECKING:
-    from evaluators.metrics.metric import Metric
     from mapper.config.build import BuildConfig
     from mapper.core.errors import UntrustedError
+    from mapper.evaluators.metrics.metric import Metric
     from mapper.run.folder import Run
     from mapper.run.observers import Observer
     from mapper.runtime.progress import Progress
@@ -88,7 +88,7 @@ def build(
 
     Example: mapper build rgbd_dataset_freiburg1_xyz --set octree.resolution_m=0.1
     """
-    from cli.summary import summary_of
+    from mapper.cli.summary import summary_of
 
     out = place_of(out, RUNS / name_of(log), overwrite=overwrite)
     overrides = merged(selection(first, last, stride, require_truth), set_)
@@ -134,8 +134,8 @@ def built(
     onlooker: "Onlooker | None" = None,
 ) -> "tuple[Run, Sequence[Metric]]":
     """Build a run and judge its trajectory by the truth, if the log has any."""
-    from evaluators.metrics.evaluate import evaluate
     from mapper.config.loading import load_config, load_source_config
+    from mapper.evaluators.metrics.evaluate import evaluate
     from mapper.pipeline.build import build as build_run
     from mapper.run.observers import Observers
     from mapper.sources import open_source
@@ -201,8 +201,8 @@ def appended(
     log: Path, onto: Path, overrides: "Sequence[str]", out: Path, *, overwrite: bool, output: Output
 ) -> "tuple[Run, Sequence[Metric]]":
     """Build a run from a run and a later log of the same place, by the run's configuration."""
-    from evaluators.metrics.evaluate import evaluate
     from mapper.config.loading import overridden
+    from mapper.evaluators.metrics.evaluate import evaluate
     from mapper.pipeline.append import append
     from mapper.run.folder import open_run
     from mapper.sources import open_source

@@ -5,10 +5,10 @@ from typing import Annotated
 
 import typer
 
-from cli.answer import Answer, Output, record_in
-from cli.console import files_text
-from cli.environment import prepare_libraries
-from cli.options import First, Last, Overrides, Stride, assignments, merged, selection
+from mapper.cli.answer import Answer, Output, record_in
+from mapper.cli.console import files_text
+from mapper.cli.environment import prepare_libraries
+from mapper.cli.options import First, Last, Overrides, Stride, assignments, merged, selection
 
 
 def compare(
@@ -40,10 +40,10 @@ def compare(
 
     Example: mapper compare rgbd_dataset_freiburg1_xyz --method isvd --method gicp --out runs/compared
     """
-    from evaluators.compare.config import CompareConfig
-    from evaluators.compare.files import REPORT, compare_into
-    from evaluators.compare.tables import tables_text
     from mapper.config.loading import overridden
+    from mapper.evaluators.compare.config import CompareConfig
+    from mapper.evaluators.compare.files import REPORT, compare_into
+    from mapper.evaluators.compare.tables import tables_text
     from mapper.sources import open_source
 
     prepare_libraries()

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from cli.terminal import escaped
+from mapper.cli.terminal import escaped
 from mapper.runtime.progress import SILENT, Progress, Report
 
 _SECONDS_BETWEEN_LINES = 10.0

@@ -6,10 +6,10 @@ from typing import Annotated
 
 import typer
 
-from cli.answer import Answer, Output
-from cli.environment import prepare_libraries
-from cli.options import First, Last, Overrides, RequireTruth, Stride, merged, selection
-from cli.places import LOGS, name_of, place_of
+from mapper.cli.answer import Answer, Output
+from mapper.cli.environment import prepare_libraries
+from mapper.cli.options import First, Last, Overrides, RequireTruth, Stride, merged, selection
+from mapper.cli.places import LOGS, name_of, place_of
 
 
 class LogFormat(StrEnum):

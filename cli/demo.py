@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.answer import Answer, Output
-from cli.build import built
-from cli.environment import prepare_libraries
-from cli.options import Overrides
+from mapper.cli.answer import Answer, Output
+from mapper.cli.build import built
+from mapper.cli.environment import prepare_libraries
+from mapper.cli.options import Overrides
 
 if TYPE_CHECKING:
     from mapper.simulation.config import SynthConfig
@@ -28,8 +28,8 @@ def demo(
 
     Example: mapper demo --out /tmp/demo --seconds 20
     """
-    from cli.options import assignments
-    from cli.summary import summary_of
+    from mapper.cli.options import assignments
+    from mapper.cli.summary import summary_of
     from mapper.config.loading import load_config, overridden
     from mapper.run import files
     from mapper.simulation import write_tum_log

@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.answer import Answer, Output, record_in
-from cli.completion import run_folders
-from cli.environment import prepare_libraries
-from cli.places import DIFFS, joined_names, place_of
-from cli.placing import Place, PosesFile, placing_of
+from mapper.cli.answer import Answer, Output, record_in
+from mapper.cli.completion import run_folders
+from mapper.cli.environment import prepare_libraries
+from mapper.cli.places import DIFFS, joined_names, place_of
+from mapper.cli.placing import Place, PosesFile, placing_of
 
 if TYPE_CHECKING:
     from mapper.merging.differences import Differences
@@ -74,7 +74,7 @@ def diff(
 
 
 def _table(found: "Differences", resolution_m: float) -> str:
-    from evaluators.tables.table import Column, Record, text_table
+    from mapper.evaluators.tables.table import Column, Record, text_table
 
     records: list[Record] = [
         {

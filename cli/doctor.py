@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.answer import Answer, Output
-from cli.completion import run_folders
+from mapper.cli.answer import Answer, Output
+from mapper.cli.completion import run_folders
 from mapper.runtime.progress import SILENT
 
 if TYPE_CHECKING:

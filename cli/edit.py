@@ -4,9 +4,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.answer import Answer, Output
-from cli.environment import prepare_libraries
-from cli.options import MovedLogs, RunFolder
+from mapper.cli.answer import Answer, Output
+from mapper.cli.environment import prepare_libraries
+from mapper.cli.options import MovedLogs, RunFolder
 
 if TYPE_CHECKING:
     from mapper.mapping.config import EditKind, Region

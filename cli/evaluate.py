@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli.answer import Answer, Output
-from cli.completion import run_folders
-from cli.environment import prepare_libraries
+from mapper.cli.answer import Answer, Output
+from mapper.cli.completion import run_folders
+from mapper.cli.environment import prepare_libraries
 
 if TYPE_CHECKING:
-    from evaluators.metrics.evaluate import Assessment
-    from evaluators.metrics.map_quality import MapQuality
-    from evaluators.metrics.metric import Metric
     from mapper.core.timebase import Stamps
     from mapper.core.trajectory import Trajectory
+    from mapper.evaluators.metrics.evaluate import Assessment
+    from mapper.evaluators.metrics.map_quality import MapQuality
+    from mapper.evaluators.metrics.metric import Metric
     from mapper.run.folder import Run
     from mapper.runtime.progress import Progress
     from mapper.sources.base import Log
@@ -117,9 +117,9 @@ def evaluate(
     Example: mapper eval runs/xyz --align yaw --plot plots, or: mapper eval 00.txt --truth poses/00.txt, or:
     mapper eval runs/flat --map logs/flat --sharpness
     """
-    from evaluators.metrics.evaluate import ALIGNED, assess
-    from evaluators.metrics.inputs import estimate_and_truth
     from mapper.core.errors import DataError
+    from mapper.evaluators.metrics.evaluate import ALIGNED, assess
+    from mapper.evaluators.metrics.inputs import estimate_and_truth
 
     prepare_libraries()
     run, trajectory, known = estimate_and_truth(estimate, truth, times)
@@ -156,14 +156,14 @@ def evaluate(
     text = _text(metrics, found, format_)
     document: dict[str, Any] = {"metrics": _every_metric(metrics, found)}
     if run is not None:
-        from cli.summary import verdict_text
+        from mapper.cli.summary import verdict_text
 
         document["verdict"] = run.verdict
         if format_ in (Format.TEXT, Format.MARKDOWN):
             text += f"\n\n{verdict_text(run)}"
     if plot is not None:
-        from evaluators.pictures.map_agreement import write_map_errors
-        from evaluators.pictures.path_errors import write_trajectory_errors
+        from mapper.evaluators.pictures.map_agreement import write_map_errors
+        from mapper.evaluators.pictures.path_errors import write_trajectory_errors
 
         if quality is None or found.matched is not None:
             write_trajectory_errors(plot, found, title=f"{name}, {ALIGNED[align.value]}")
@@ -181,8 +181,8 @@ def _needed(run: "Run | None", path: Path, option: str) -> "Run":
 
 
 def _quality(run: "Run", path: Path, *, world: World | None, register: bool, tolerance: int) -> "MapQuality":
-    from evaluators.metrics.map_quality import map_quality
-    from evaluators.metrics.map_reference import read_reference
+    from mapper.evaluators.metrics.map_quality import map_quality
+    from mapper.evaluators.metrics.map_reference import read_reference
 
     reference = read_reference(path, voxel_m=run.config.octree.resolution_m)
     return map_quality(
@@ -197,7 +197,7 @@ def _log_of(run: "Run", log: Path | None) -> "Log":
 
 
 def _sharpness_of(source: "Log", trajectory: "Trajectory", *, progress: "Progress") -> "list[Metric]":
-    from evaluators.metrics.sharpness import RADIUS_M, sharpness_metrics, views_of
+    from mapper.evaluators.metrics.sharpness import RADIUS_M, sharpness_metrics, views_of
 
     views = views_of(source, trajectory, progress=progress)
     return sharpness_metrics(views, radius_m=RADIUS_M[source.sensor])
@@ -229,7 +229,7 @@ def _numbers(text: str) -> list[float]:
 
 
 def _loops_of(run: "Run", truth: "Trajectory") -> "list[Metric]":
-    from evaluators.metrics.loops import loop_metrics
+    from mapper.evaluators.metrics.loops import loop_metrics
 
     loops = run.config.loops
     looked_every_m = loops.min_motion_m if loops.kind == "scans" else 0.0
@@ -239,7 +239,7 @@ def _loops_of(run: "Run", truth: "Trajectory") -> "list[Metric]":
 
 def _every_metric(metrics: "list[Metric]", found: "Assessment") -> "list[Metric]":
     """Return the metrics, and after them those of each length of the segments."""
-    from evaluators.metrics.segments import segment_metrics
+    from mapper.evaluators.metrics.segments import segment_metrics
 
     if len(found.lengths) <= 1:
         return metrics
@@ -249,9 +249,9 @@ def _every_metric(metrics: "list[Metric]", found: "Assessment") -> "list[Metric]
 def _text(metrics: "list[Metric]", found: "Assessment", format_: Format) -> str:
     from dataclasses import asdict
 
-    from evaluators.metrics import metric
-    from evaluators.metrics.segments import LENGTH_COLUMNS, length_records
-    from evaluators.tables import table as tables
+    from mapper.evaluators.metrics import metric
+    from mapper.evaluators.metrics.segments import LENGTH_COLUMNS, length_records
+    from mapper.evaluators.tables import table as tables
 
     if format_ is Format.JSON:
         return metric.json_text(_every_metric(metrics, found))

@@ -5,10 +5,10 @@ from typing import Annotated
 
 import typer
 
-from cli.answer import Answer, Output, made
-from cli.completion import export_kinds
-from cli.environment import prepare_libraries
-from cli.options import MovedLogs, Overrides, RunFolder, assignments, merged
+from mapper.cli.answer import Answer, Output, made
+from mapper.cli.completion import export_kinds
+from mapper.cli.environment import prepare_libraries
+from mapper.cli.options import MovedLogs, Overrides, RunFolder, assignments, merged
 from mapper.export.exporters import EXPORTERS
 
 _KINDS = "; ".join(f"{kind}: {exporter.summary}" for kind, exporter in EXPORTERS.items())

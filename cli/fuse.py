@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from cli.answer import Answer, Output
-from cli.environment import prepare_libraries
-from cli.options import MovedLogs, Overrides, RunFolder
+from mapper.cli.answer import Answer, Output
+from mapper.cli.environment import prepare_libraries
+from mapper.cli.options import MovedLogs, Overrides, RunFolder
 
 
 def fuse(
@@ -26,9 +26,9 @@ def fuse(
 
     Example: mapper fuse runs/xyz --set octree.resolution_m=0.1 --set slice.max_height_m=1.8
     """
-    from cli.summary import summary_of
-    from evaluators.metrics.evaluate import evaluate
+    from mapper.cli.summary import summary_of
     from mapper.config.loading import overridden
+    from mapper.evaluators.metrics.evaluate import evaluate
     from mapper.pipeline.fuse import fuse as fuse_run
     from mapper.run.folder import moved_log, open_run
     from mapper.sources.trajectory_files import read_tum

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.answer import Answer, Output
-from cli.environment import prepare_libraries
-from cli.options import Overrides
+from mapper.cli.answer import Answer, Output
+from mapper.cli.environment import prepare_libraries
+from mapper.cli.options import Overrides
 
 if TYPE_CHECKING:
     from mapper.sources.inspection import Inspection, LogFacts, Timing, TopicFacts

@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli.answer import Answer, Output, rows_text
-from cli.completion import run_folders
-from cli.environment import prepare_libraries
-from cli.options import First, Last, Overrides, Stride, merged, selection
-from cli.places import RUNS, name_of, place_of
+from mapper.cli.answer import Answer, Output, rows_text
+from mapper.cli.completion import run_folders
+from mapper.cli.environment import prepare_libraries
+from mapper.cli.options import First, Last, Overrides, Stride, merged, selection
+from mapper.cli.places import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
     from mapper.run.localised import LocalisedManifest
@@ -75,7 +75,7 @@ def localise(
 
 
 def _document(manifest: "LocalisedManifest", out: Path) -> dict[str, Any]:
-    from cli.summary import frame_counts
+    from mapper.cli.summary import frame_counts
 
     counts = manifest.counts
     return {

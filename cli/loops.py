@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli.answer import Answer, Output
-from cli.environment import prepare_libraries
-from cli.groups import Verb
-from cli.options import MovedLogs, RunFolder
+from mapper.cli.answer import Answer, Output
+from mapper.cli.environment import prepare_libraries
+from mapper.cli.groups import Verb
+from mapper.cli.options import MovedLogs, RunFolder
 
 if TYPE_CHECKING:
     from mapper.loops.closure import Discrepancy, LoopClosure
@@ -50,8 +50,8 @@ def loops(
 
     built, solved = open_run(run), None
     if add or remove:
-        from cli.summary import summary_of
-        from evaluators.metrics.evaluate import evaluate
+        from mapper.cli.summary import summary_of
+        from mapper.evaluators.metrics.evaluate import evaluate
         from mapper.pipeline.edit_loops import edit_loops
 
         prepare_libraries()

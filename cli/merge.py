@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.answer import Answer, Output
-from cli.completion import run_folders
-from cli.environment import prepare_libraries
-from cli.options import workers_for
-from cli.places import MAPS, joined_names
-from cli.placing import Place, PosesFile, placing_of
+from mapper.cli.answer import Answer, Output
+from mapper.cli.completion import run_folders
+from mapper.cli.environment import prepare_libraries
+from mapper.cli.options import workers_for
+from mapper.cli.places import MAPS, joined_names
+from mapper.cli.placing import Place, PosesFile, placing_of
 
 if TYPE_CHECKING:
     from mapper.merging.merge import Merged
@@ -82,7 +82,7 @@ def merge(
 
 
 def _summary(merged: "Merged") -> str:
-    from evaluators.tables.table import MISSING, Column, text_table
+    from mapper.evaluators.tables.table import MISSING, Column, text_table
 
     manifest = merged.map.manifest
     records = [{**run.model_dump(), "name": Path(run.path).name} for run in manifest.runs]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.completion import assignments_to, run_folders, setting_keys
+from mapper.cli.completion import assignments_to, run_folders, setting_keys
 
 if TYPE_CHECKING:
     from mapper.runtime.executor import Workers

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli.answer import Answer, Output
-from cli.completion import run_folders
-from cli.groups import Verb
-from cli.options import assignments
+from mapper.cli.answer import Answer, Output
+from mapper.cli.completion import run_folders
+from mapper.cli.groups import Verb
+from mapper.cli.options import assignments
 
 if TYPE_CHECKING:
     from mapper.core.geometry import Array

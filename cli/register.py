@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.answer import Answer, Output
-from cli.console import files_text
-from cli.environment import prepare_libraries
-from cli.options import Overrides
+from mapper.cli.answer import Answer, Output
+from mapper.cli.console import files_text
+from mapper.cli.environment import prepare_libraries
+from mapper.cli.options import Overrides
 
 if TYPE_CHECKING:
-    from evaluators.register.registration import Registered
     from mapper.core.frames import Scan, Sensor
+    from mapper.evaluators.register.registration import Registered
 
 _CLOUD = "A cloud (.bin .pcd .ply .xyz .npy .las .laz), or LOG@N: the n-th frame of a log, from 0."
 
@@ -53,17 +53,17 @@ def register(
 
     Example: mapper register scan_10.bin scan_00.bin --method hough-gicp --out registered
     """
-    from evaluators.register.files import (
+    from mapper.api.logs import read_frame
+    from mapper.config.loading import overridden
+    from mapper.config.register import check_method, register_config
+    from mapper.core.errors import RegistrationError
+    from mapper.evaluators.register.files import (
         FOLDER,
         registration_record,
         registration_text,
         write_registration,
     )
-    from evaluators.register.registration import register as register_frames
-    from mapper.api.logs import read_frame
-    from mapper.config.loading import overridden
-    from mapper.config.register import check_method, register_config
-    from mapper.core.errors import RegistrationError
+    from mapper.evaluators.register.registration import register as register_frames
     from mapper.registration.guess import parse_guess
     from mapper.runtime.atomic import atomic_folder
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.answer import Answer, Output, made
-from cli.options import RunFolders
+from mapper.cli.answer import Answer, Output, made
+from mapper.cli.options import RunFolders
 
 if TYPE_CHECKING:
     from mapper.export.report.data import Figure, Question
@@ -63,9 +63,9 @@ def distinct_names(runs: Sequence[Path]) -> list[str]:
 def _figures(run: "Run") -> "list[Figure]":
     import numpy as np
 
-    from evaluators.metrics.evaluate import assess
-    from evaluators.metrics.loops import loop_metrics
-    from evaluators.metrics.metric import shown
+    from mapper.evaluators.metrics.evaluate import assess
+    from mapper.evaluators.metrics.loops import loop_metrics
+    from mapper.evaluators.metrics.metric import shown
     from mapper.export.path_band import SIGMAS
     from mapper.export.report.data import Figure
 

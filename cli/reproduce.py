@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
-from cli.answer import Answer, Output
-from cli.console import files_text
-from cli.environment import has_compiled_code, prepare_libraries
-from cli.options import First, Last, workers_for
+from mapper.cli.answer import Answer, Output
+from mapper.cli.console import files_text
+from mapper.cli.environment import has_compiled_code, prepare_libraries
+from mapper.cli.options import First, Last, workers_for
 
 
 class Paper(StrEnum):
@@ -63,11 +63,11 @@ def reproduce(
 
     Example: mapper reproduce thesis --logs logs --tables 5.1,5.2 --out runs/thesis
     """
-    from evaluators.papers.files import tables_text
-    from evaluators.papers.layout import everything
-    from evaluators.papers.paper import Cut
-    from evaluators.papers.reproduce import Request
-    from evaluators.papers.reproduce import reproduce as reproduce_tables
+    from mapper.evaluators.papers.files import tables_text
+    from mapper.evaluators.papers.layout import everything
+    from mapper.evaluators.papers.paper import Cut
+    from mapper.evaluators.papers.reproduce import Request
+    from mapper.evaluators.papers.reproduce import reproduce as reproduce_tables
 
     every_core = os.cpu_count() or 1
     workers = workers_for(processes, scheduler, default=every_core if paper is Paper.THESIS else 1)

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli.answer import Answer, Output, rows_text
-from cli.options import ConfigFile, Overrides, SettingKey
+from mapper.cli.answer import Answer, Output, rows_text
+from mapper.cli.options import ConfigFile, Overrides, SettingKey
 
 if TYPE_CHECKING:
     from mapper.config.describe import Setting
@@ -43,7 +43,7 @@ def show_config(
     loaded = load_config(config, set_ or (), sensor=sensor.value)
     values = loaded.model_dump(mode="json")
     if key is None and not docs:
-        from cli.toml_text import toml_text
+        from mapper.cli.toml_text import toml_text
 
         return Answer(values, toml_text(values))
 

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.answer import Answer, Output, rows_text
-from cli.options import Overrides, assignments, merged
-from cli.places import RUNS, name_of, place_of
+from mapper.cli.answer import Answer, Output, rows_text
+from mapper.cli.options import Overrides, assignments, merged
+from mapper.cli.places import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
     from mapper.export.solved_graph import SolvedGraph

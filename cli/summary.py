@@ -9,8 +9,8 @@ from shlex import quote
 from statistics import median
 from typing import Any
 
-from cli.answer import Answer, rows_text
-from evaluators.metrics.metric import Metric
+from mapper.cli.answer import Answer, rows_text
+from mapper.evaluators.metrics.metric import Metric
 from mapper.loops.closure import LoopClosure
 from mapper.run.folder import Run
 from mapper.run.frame_outcomes import FrameRecord

@@ -6,10 +6,10 @@ from typing import Annotated
 
 import typer
 
-from cli.answer import Answer, Output
-from cli.console import files_text
-from cli.environment import has_compiled_code, prepare_libraries
-from cli.options import workers_for
+from mapper.cli.answer import Answer, Output
+from mapper.cli.console import files_text
+from mapper.cli.environment import has_compiled_code, prepare_libraries
+from mapper.cli.options import workers_for
 
 
 def sweep(
@@ -39,9 +39,9 @@ def sweep(
 
     Example: mapper sweep sweep.toml --out sweeps/first --processes 4
     """
-    from evaluators.sweep.files import FILES, write_sweep
-    from evaluators.sweep.plan import plan_sweep, run_sweep
-    from evaluators.sweep.tables import summary_text
+    from mapper.evaluators.sweep.files import FILES, write_sweep
+    from mapper.evaluators.sweep.plan import plan_sweep, run_sweep
+    from mapper.evaluators.sweep.tables import summary_text
 
     workers = workers_for(processes, scheduler, default=os.cpu_count() or 1)
     prepare_libraries()

@@ -7,10 +7,10 @@ from typing import Annotated, TypeVar
 
 import typer
 
-from cli.answer import Answer, Output
-from cli.environment import prepare_libraries
-from cli.options import assignments, merged
-from cli.places import LOGS, place_of
+from mapper.cli.answer import Answer, Output
+from mapper.cli.environment import prepare_libraries
+from mapper.cli.options import assignments, merged
+from mapper.cli.places import LOGS, place_of
 
 Settings = TypeVar("Settings")
 

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from cli.answer import Answer, Output, made
-from cli.options import RunFolders
-from cli.report import distinct_names
+from mapper.cli.answer import Answer, Output, made
+from mapper.cli.options import RunFolders
+from mapper.cli.report import distinct_names
 
 
 def write_page(runs: Sequence[Path], path: Path, *, overwrite: bool) -> Path:

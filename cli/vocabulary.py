@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
-from cli.answer import Answer, Output, verb
-from cli.environment import prepare_libraries
-from cli.groups import Verb, VerbGroup
-from cli.options import assignments, merged
-from cli.places import name_of, place_of
+from mapper.cli.answer import Answer, Output, verb
+from mapper.cli.environment import prepare_libraries
+from mapper.cli.groups import Verb, VerbGroup
+from mapper.cli.options import assignments, merged
+from mapper.cli.places import name_of, place_of
 
 _SEED = 0  # of the draws of k-means++: the same logs give the same bytes
 

@@ -12,12 +12,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from evaluators.metrics.evaluate import evaluate
     from mapper.api.build import build
     from mapper.api.logs import open_log
     from mapper.api.register import register
     from mapper.config.loading import load_config
     from mapper.core.errors import MapperError
+    from mapper.evaluators.metrics.evaluate import evaluate
     from mapper.octree.map import OctreeMap
     from mapper.octree.octomap_file import read_octree
     from mapper.run.folder import Run, open_run
@@ -42,7 +42,7 @@ _HOMES = {
     "OctreeMap": "mapper.octree.map",
     "Run": "mapper.run.folder",
     "build": "mapper.api.build",
-    "evaluate": "evaluators.metrics.evaluate",
+    "evaluate": "mapper.evaluators.metrics.evaluate",
     "load_config": "mapper.config.loading",
     "open_log": "mapper.api.logs",
     "open_run": "mapper.run.folder",

@@ -19,7 +19,7 @@ from pathlib import Path
 import cv2
 
 ROOT = Path(__file__).resolve().parents[1]
-MAPPER = [sys.executable, "-c", "from cli.main import main; main()"]
+MAPPER = [sys.executable, "-c", "from mapper.cli.main import main; main()"]
 OUT = ROOT / "docs" / "gallery"
 WIDTH_PX = 1000
 QUALITY = 78

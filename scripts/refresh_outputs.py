@@ -28,7 +28,7 @@ sys.path.insert(0, str(ROOT))
 from tests.support.pages import OMITTED, PAGES, Block, Command, blocks_of, files_of, page_name, row_names  # noqa: E402
 
 LOGS = {"rgbd_dataset_freiburg1_xyz": "tum_fr1_xyz", "kitti_00": "kitti_00"}
-MAPPER = [sys.executable, "-c", "from cli.main import main; main()"]
+MAPPER = [sys.executable, "-c", "from mapper.cli.main import main; main()"]
 FEWEST_OMITTED = 3
 """Fewer rows are shown instead of being left out."""
 MOST_SHORT_LINES = 10

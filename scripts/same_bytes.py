@@ -32,7 +32,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 SPEC = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
-MAPPER = [sys.executable, "-P", "-c", "from cli.main import main; main()"]  # -P: nothing from the work folder
+MAPPER = [sys.executable, "-P", "-c", "from mapper.cli.main import main; main()"]  # -P: not from here
 NO_TIMES = ["--set", "mcap.frame_times=false"]
 
 KEPT_CHARACTERS = 20_000

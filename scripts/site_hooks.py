@@ -151,7 +151,7 @@ def _commands() -> Iterator[str]:
     import click
     import typer
 
-    from cli.main import app
+    from mapper.cli.main import app
 
     mapper: Any = typer.main.get_command(app)
     program = click.Context(click.Command("mapper"), info_name="mapper")

@@ -26,7 +26,7 @@ from mapper.run.checks import check_run
 from mapper.run.folder import open_run
 from mapper.runtime.atomic import partial_of
 
-MAPPER = [sys.executable, "-c", "import sys; sys.argv[0] = 'mapper'; from cli.main import main; main()"]
+MAPPER = [sys.executable, "-c", "import sys; sys.argv[0] = 'mapper'; import mapper.cli.main as m; m.main()"]
 LOG = [
     *("--path", "desk", "--seconds", "2", "--set", "frame_rate_hz=15", "--set", "width_px=320"),
     *("--set", "height_px=240", "--set", "texture_px_per_m=64"),

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from cli.console import progress_for
+from mapper.cli.console import progress_for
 from mapper.places.config import VocabularyConfig
 from mapper.places.training import train
 from mapper.places.training_images import descriptors_of

@@ -2,10 +2,10 @@
 
 import typer
 
-from cli.answer import verb
-from cli.groups import Verb, VerbGroup
-from cli.sensor.depth import depth
-from cli.sensor.line_laser import accuracy, calibrate, line_laser
+from mapper.cli.answer import verb
+from mapper.cli.groups import Verb, VerbGroup
+from mapper.cli.sensor.depth import depth
+from mapper.cli.sensor.line_laser import accuracy, calibrate, line_laser
 
 sensor = typer.Typer(
     help="Measure a sensor's accuracy, and what its measurements become.",

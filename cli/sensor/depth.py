@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.answer import Answer, Output
-from cli.environment import prepare_libraries
-from cli.options import First, Last, Overrides, Stride, merged, selection
+from mapper.cli.answer import Answer, Output
+from mapper.cli.environment import prepare_libraries
+from mapper.cli.options import First, Last, Overrides, Stride, merged, selection
 
 if TYPE_CHECKING:
-    from evaluators.depth_camera.accuracy import Patch
+    from mapper.evaluators.depth_camera.accuracy import Patch
 
 _FITTED_FRAMES = 100
 
@@ -66,9 +66,9 @@ def depth(
     sensor depth rgbd_dataset_freiburg1_xyz --fit-plane --out kinect, then: mapper build LOG --out RUN
     --config kinect/sensor.toml
     """
-    from evaluators.depth_camera.study import depth_text, records_of, study_depth
-    from evaluators.pictures.depth_camera import FOLDER, SENSOR, write_depth_study
     from mapper.config.loading import load_config
+    from mapper.evaluators.depth_camera.study import depth_text, records_of, study_depth
+    from mapper.evaluators.pictures.depth_camera import FOLDER, SENSOR, write_depth_study
     from mapper.runtime.atomic import atomic_folder
     from mapper.sources import open_source
 
@@ -117,8 +117,8 @@ def _distances(
 
 
 def _patch(text: str) -> "Patch":
-    from evaluators.depth_camera.accuracy import Patch
     from mapper.core.errors import ConfigError
+    from mapper.evaluators.depth_camera.accuracy import Patch
 
     try:
         column, row, width, height = (int(word) for word in text.split(","))

@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.answer import Answer, Output
-from cli.console import files_text
-from cli.environment import prepare_libraries
-from cli.options import assignments
-from cli.places import RUNS, name_of, place_of
+from mapper.cli.answer import Answer, Output
+from mapper.cli.console import files_text
+from mapper.cli.environment import prepare_libraries
+from mapper.cli.options import assignments
+from mapper.cli.places import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -59,8 +59,8 @@ def line_laser(
 
     Example: mapper sensor line-laser drive/images --calibration C.toml --wheels drive/encoders.txt --out seen
     """
-    from evaluators.line_laser.labels import read_labels, score
     from mapper.config.loading import overridden, read_config
+    from mapper.evaluators.line_laser.labels import read_labels, score
     from mapper.line_laser.config import THESIS, LineLaserCalibration, LineLaserConfig
     from mapper.line_laser.files import find_images
     from mapper.line_laser.products import FOLDER, write_drive, write_scans
@@ -122,9 +122,9 @@ def calibrate(
 
     Example: mapper sensor line-laser-calibrate drive/shots --wheelbase 0.26 --sensor-x 0.2 --out C.toml
     """
-    from evaluators.pictures.line_laser import write_calibration_picture
     from mapper.config.loading import overridden
     from mapper.core.errors import RunError
+    from mapper.evaluators.pictures.line_laser import write_calibration_picture
     from mapper.line_laser.calibration import calibrate as fit_laws
     from mapper.line_laser.calibration import calibration_text
     from mapper.line_laser.config import LineLaserConfig, VehicleConfig
@@ -170,9 +170,9 @@ def accuracy(
     """
     from contextlib import nullcontext
 
-    from evaluators.line_laser.study import detections, study, table_2_1
-    from evaluators.tables.table import csv_text
     from mapper.config.loading import overridden
+    from mapper.evaluators.line_laser.study import detections, study, table_2_1
+    from mapper.evaluators.tables.table import csv_text
     from mapper.line_laser.config import LineLaserConfig
     from mapper.line_laser.products import DETECTIONS
     from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text
@@ -202,7 +202,7 @@ def _draw(
     labels: "Mapping[str, tuple[Array, Array]]",
 ) -> None:
     """Draw the detections in the first image, in the last, and between."""
-    from evaluators.pictures.line_laser import write_detections
+    from mapper.evaluators.pictures.line_laser import write_detections
     from mapper.sources.images import read_colour
 
     for place in sorted({k * (len(paths) - 1) // (_SHOWN - 1) for k in range(_SHOWN)}):

@@ -3,11 +3,11 @@
 from functools import partial
 from importlib.util import find_spec
 
-from evaluators.compare.config import CompareConfig
-from evaluators.compare.methods import AnyRegistration, Method, odometry_method, registration_method
-from evaluators.compare.scales import kiss_icp, registrations_for
 from mapper.core.errors import ConfigError
 from mapper.core.frames import Sensor
+from mapper.evaluators.compare.config import CompareConfig
+from mapper.evaluators.compare.methods import AnyRegistration, Method, odometry_method, registration_method
+from mapper.evaluators.compare.scales import kiss_icp, registrations_for
 from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig, PnpConfig
 from mapper.odometry.factory import build_frame_odometry
 from mapper.registration.config import NEED_NO_GUESS

@@ -10,19 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from evaluators.compare.catalogue import methods_for
-from evaluators.compare.config import CompareConfig, TrialsConfig
-from evaluators.compare.frames import FrameReader, PreparedFrame
-from evaluators.compare.methods import Method, Tracker, reason_of
-from evaluators.compare.pairwise import guesses_for, pairs_of, trials_of
-from evaluators.metrics.odometry import OdometryRun, Step, assess_run, step_for
-from evaluators.study.engine import run_study
-from evaluators.study.versions import digest, versions
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Sensor
 from mapper.core.geometry import inverse
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, Stamps
 from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.evaluators.compare.catalogue import methods_for
+from mapper.evaluators.compare.config import CompareConfig, TrialsConfig
+from mapper.evaluators.compare.frames import FrameReader, PreparedFrame
+from mapper.evaluators.compare.methods import Method, Tracker, reason_of
+from mapper.evaluators.compare.pairwise import guesses_for, pairs_of, trials_of
+from mapper.evaluators.metrics.odometry import OdometryRun, Step, assess_run, step_for
+from mapper.evaluators.study.engine import run_study
+from mapper.evaluators.study.versions import digest, versions
 from mapper.run.fingerprint import fingerprint
 from mapper.runtime.progress import SILENT, Progress
 from mapper.runtime.resumable_jobs import Job, Record

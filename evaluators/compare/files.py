@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import mapper
-from evaluators.compare.comparison import Comparison, compare
-from evaluators.compare.config import CompareConfig
-from evaluators.compare.pairwise import NO_GUESS
-from evaluators.compare.tables import tables_of
-from evaluators.metrics.odometry import OdometryRun
-from evaluators.pictures.comparison import write_path_errors, write_paths, write_registration_errors
-from evaluators.pictures.comparison_mcap import write_comparison_log
-from evaluators.study.engine import CELLS
-from evaluators.tables.table import column, csv_text
 from mapper.core.geometry import Array
+from mapper.evaluators.compare.comparison import Comparison, compare
+from mapper.evaluators.compare.config import CompareConfig
+from mapper.evaluators.compare.pairwise import NO_GUESS
+from mapper.evaluators.compare.tables import tables_of
+from mapper.evaluators.metrics.odometry import OdometryRun
+from mapper.evaluators.pictures.comparison import write_path_errors, write_paths, write_registration_errors
+from mapper.evaluators.pictures.comparison_mcap import write_comparison_log
+from mapper.evaluators.study.engine import CELLS
+from mapper.evaluators.tables.table import column, csv_text
 from mapper.run.manifest import library_versions
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text
 from mapper.runtime.progress import SILENT, Progress

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evaluators.compare.config import RgbdCompareConfig
 from mapper.core.frames import Frame, RgbdFrame, Scan
 from mapper.core.geometry import Transform, inverse
+from mapper.evaluators.compare.config import RgbdCompareConfig
 from mapper.sources.base import FrameRef
 
 # An optical frame looks along z with y down; methods for scans expect x ahead and z up.

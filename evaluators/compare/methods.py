@@ -6,11 +6,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from evaluators.compare.frames import PreparedFrame
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, RgbdFrame, Scan
 from mapper.core.geometry import Transform, apply, interpolate, inverse, nearest_rotation, transform
 from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.evaluators.compare.frames import PreparedFrame
 from mapper.graph.model import PoseGraph
 from mapper.odometry.base import FrameOdometry, FrameResult
 from mapper.pipeline.components import largest_component

@@ -2,9 +2,9 @@
 
 import math
 
-from evaluators.compare.comparison import Comparison
-from evaluators.compare.pairwise import registration_records
-from evaluators.tables.table import Column, Table, decimals
+from mapper.evaluators.compare.comparison import Comparison
+from mapper.evaluators.compare.pairwise import registration_records
+from mapper.evaluators.tables.table import Column, Table, decimals
 
 _DEGREES = decimals(2, times=math.degrees(1.0))
 _CENTIMETRES = decimals(2, times=100.0)

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evaluators.depth_camera.accuracy import DepthLevel, Patch, ResidualMap, check_rgbd
-from evaluators.depth_camera.noise_fit import NoiseFit, fit_noise
-from evaluators.depth_camera.still import depth_at
-from evaluators.depth_camera.tiles import depth_of_planes
-from evaluators.tables.table import Column, Record, text_table
 from mapper.core.geometry import Array
+from mapper.evaluators.depth_camera.accuracy import DepthLevel, Patch, ResidualMap, check_rgbd
+from mapper.evaluators.depth_camera.noise_fit import NoiseFit, fit_noise
+from mapper.evaluators.depth_camera.still import depth_at
+from mapper.evaluators.depth_camera.tiles import depth_of_planes
+from mapper.evaluators.tables.table import Column, Record, text_table
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 
@@ -52,8 +52,8 @@ def study_depth(
         sources: RGB-D logs of one camera.
         distances_m: Of the plane before which the camera stands in each; None searches for planes.
         patch: Part of the image that is used; None is the usual one.
-        keep_tilt: As :func:`evaluators.depth_camera.still.depth_at`.
-        most_frames: As :func:`evaluators.depth_camera.tiles.depth_of_planes`.
+        keep_tilt: As :func:`mapper.evaluators.depth_camera.still.depth_at`.
+        most_frames: As :func:`mapper.evaluators.depth_camera.tiles.depth_of_planes`.
         progress: Receives stages, counts and notes.
 
     Raises:

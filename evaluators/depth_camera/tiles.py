@@ -5,7 +5,10 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluators.depth_camera.accuracy import (
+from mapper.core.errors import DataError, FrameError
+from mapper.core.frames import RgbdFrame, ray_table
+from mapper.core.geometry import Array
+from mapper.evaluators.depth_camera.accuracy import (
     DepthLevel,
     Patch,
     ResidualMap,
@@ -16,9 +19,6 @@ from evaluators.depth_camera.accuracy import (
     seen_plane,
     typical_of,
 )
-from mapper.core.errors import DataError, FrameError
-from mapper.core.frames import RgbdFrame, ray_table
-from mapper.core.geometry import Array
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.depth_filter import dif

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluators.line_laser.scores import (
+from mapper.core.errors import SourceError
+from mapper.core.geometry import Array
+from mapper.evaluators.line_laser.scores import (
     PERCENT,
     TABLE_2_1,
     Counts,
@@ -14,9 +16,7 @@ from evaluators.line_laser.scores import (
     detection_table,
     summed,
 )
-from evaluators.tables.table import Column, Record, Table, csv_text
-from mapper.core.errors import SourceError
-from mapper.core.geometry import Array
+from mapper.evaluators.tables.table import Column, Record, Table, csv_text
 from mapper.line_laser.config import StripeConfig
 from mapper.line_laser.detection import Method
 from mapper.line_laser.products import DETECTIONS, RANGE_ERRORS

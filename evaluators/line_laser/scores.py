@@ -7,9 +7,9 @@ from operator import add
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluators.tables.table import Column, Table, decimals
 from mapper.core.frames import Image
 from mapper.core.geometry import Array
+from mapper.evaluators.tables.table import Column, Table, decimals
 from mapper.line_laser.config import StripeConfig
 from mapper.line_laser.detection import METHODS, Method, Response, responses, stripe_rows
 

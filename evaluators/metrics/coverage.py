@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluators.metrics.metric import Metric
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
+from mapper.evaluators.metrics.metric import Metric
 
 _GAP_INTERVALS = 3.0
 """A pause longer than so many usual intervals is a gap, as in ``mapper inspect``."""

@@ -7,11 +7,14 @@ from html import escape
 
 import numpy as np
 
-from evaluators.metrics.coverage import frame_coverage, time_coverage
-from evaluators.metrics.inputs import Estimate, estimate_and_truth
-from evaluators.metrics.metric import Metric, shown, text_table
-from evaluators.metrics.segments import LengthErrors, lengths_for, segment_errors, segment_metrics
-from evaluators.metrics.trajectory import (
+from mapper.core.paths import AnyPath
+from mapper.core.timebase import Stamps
+from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.coverage import frame_coverage, time_coverage
+from mapper.evaluators.metrics.inputs import Estimate, estimate_and_truth
+from mapper.evaluators.metrics.metric import Metric, shown, text_table
+from mapper.evaluators.metrics.segments import LengthErrors, lengths_for, segment_errors, segment_metrics
+from mapper.evaluators.metrics.trajectory import (
     AlignmentKind,
     Matched,
     Similarity,
@@ -21,9 +24,6 @@ from evaluators.metrics.trajectory import (
     rpe,
     start_end_offset,
 )
-from mapper.core.paths import AnyPath
-from mapper.core.timebase import Stamps
-from mapper.core.trajectory import Trajectory
 
 ALIGNED = {
     "none": "not aligned",

@@ -3,10 +3,10 @@
 import os
 from pathlib import Path
 
-from evaluators.metrics.pose_files import is_kitti, read_poses
 from mapper.core.errors import DataError
 from mapper.core.paths import AnyPath
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.pose_files import is_kitti, read_poses
 from mapper.run.folder import Run, open_run
 
 Estimate = Run | Trajectory | AnyPath

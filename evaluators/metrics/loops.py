@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluators.metrics.metric import Metric
 from mapper.core.geometry import Array
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.metric import Metric
 from mapper.loops.closure import LoopClosure, discrepancy
 
 MAX_ERROR_M, MAX_ERROR_RAD = 0.2, 0.1

@@ -5,14 +5,14 @@ from typing import Literal
 
 import numpy as np
 
-from evaluators.metrics.cloud_distance import CloudDistance, DistanceTo
-from evaluators.metrics.map_reference import Reference, check_occupancy
-from evaluators.metrics.metric import Metric
-from evaluators.metrics.occupancy import OccupancyCheck, check_metrics
-from evaluators.metrics.trajectory import associate
 from mapper.core.errors import DataError
 from mapper.core.frames import Points32
 from mapper.core.geometry import Transform, apply, inverse, mean_rotation, transform
+from mapper.evaluators.metrics.cloud_distance import CloudDistance, DistanceTo
+from mapper.evaluators.metrics.map_reference import Reference, check_occupancy
+from mapper.evaluators.metrics.metric import Metric
+from mapper.evaluators.metrics.occupancy import OccupancyCheck, check_metrics
+from mapper.evaluators.metrics.trajectory import associate
 from mapper.registration.refining import refined_motion
 from mapper.registration.surfaces import prepared
 from mapper.run import files

@@ -5,17 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluators.metrics.occupancy import (
+from mapper.core.errors import DataError
+from mapper.core.geometry import Points, Transform, apply, inverse
+from mapper.core.voxel_grid import thin
+from mapper.evaluators.metrics.occupancy import (
     LogOddsAt,
     OccupancyCheck,
     SignedDistance,
     assess_by_distance,
     assess_by_points,
 )
-from evaluators.metrics.scenes import SCENE, scene_distance
-from mapper.core.errors import DataError
-from mapper.core.geometry import Points, Transform, apply, inverse
-from mapper.core.voxel_grid import thin
+from mapper.evaluators.metrics.scenes import SCENE, scene_distance
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import read_octree
 from mapper.run.files import OCTREE_MAP

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from evaluators.metrics.metric import Metric
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Points
+from mapper.evaluators.metrics.metric import Metric
 from mapper.octree.keys import KEY_COUNT, KEY_ZERO
 from mapper.octree.leaves import Leaves
 from mapper.octree.map import OctreeMap

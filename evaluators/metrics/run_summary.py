@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from evaluators.metrics.odometry import ONE_SECOND, PathErrors, path_errors
-from evaluators.metrics.segments import lengths_for, segment_errors
-from evaluators.metrics.trajectory import AlignmentKind, Matched, align, associate, start_end_offset
-from evaluators.tables.table import Value
 from mapper.core.errors import DataError
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.odometry import ONE_SECOND, PathErrors, path_errors
+from mapper.evaluators.metrics.segments import lengths_for, segment_errors
+from mapper.evaluators.metrics.trajectory import AlignmentKind, Matched, align, associate, start_end_offset
+from mapper.evaluators.tables.table import Value
 from mapper.run.folder import Run
 
 
@@ -16,7 +16,7 @@ def summary(run: Run, *, alignment: AlignmentKind = "se3") -> dict[str, Value]:
 
     Nothing is known of the errors where the log has no truth or too few poses have one, nothing of those over
     a second or over stretches of the path where there are none. ``relative_…`` are means over the
-    segments of :func:`evaluators.metrics.segments.lengths_for`, as KITTI's table has them.
+    segments of :func:`mapper.evaluators.metrics.segments.lengths_for`, as KITTI's table has them.
 
     Args:
         run: A finished run.

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluators.metrics.occupancy import SignedDistance
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Points
+from mapper.evaluators.metrics.occupancy import SignedDistance
 from mapper.simulation import read_scene
 from mapper.simulation.config import LidarSynthConfig
 from mapper.simulation.lidar import OutdoorScene, make_outdoor_scene

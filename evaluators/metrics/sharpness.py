@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from evaluators.metrics.metric import Metric
 from mapper.core.deskew import STILL, deskewed, twist_at
 from mapper.core.errors import DataError
 from mapper.core.frames import Sensor
 from mapper.core.geometry import Array, Points, apply
 from mapper.core.trajectory import Trajectory
 from mapper.core.voxel_grid import thin
+from mapper.evaluators.metrics.metric import Metric
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 

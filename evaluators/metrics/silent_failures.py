@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluators.metrics.metric import Metric
 from mapper.core.geometry import Array, adjoint, inverse, log
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, nearest
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.metric import Metric
 from mapper.run.frame_outcomes import FrameRecord
 
 WRONG_M, WRONG_RAD, WRONG_SIGMAS = 0.2, float(np.deg2rad(5.0)), 5.0

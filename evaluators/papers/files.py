@@ -7,10 +7,18 @@ from dataclasses import replace
 from html import escape
 from pathlib import Path
 
-from evaluators.papers.layout import as_printed, compared, compares, counted, everything, failures, headline
-from evaluators.papers.model import RULE, PaperTable, Reproduction
-from evaluators.papers.plots import write_plots
-from evaluators.tables.table import (
+from mapper.evaluators.papers.layout import (
+    as_printed,
+    compared,
+    compares,
+    counted,
+    everything,
+    failures,
+    headline,
+)
+from mapper.evaluators.papers.model import RULE, PaperTable, Reproduction
+from mapper.evaluators.papers.plots import write_plots
+from mapper.evaluators.tables.table import (
     Table,
     csv_text,
     indented,

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from evaluators.papers.hough_pairs import Clouds, Pair, find_pairs
-from evaluators.papers.layout import file_name
-from evaluators.papers.scan_pairs import perturbed
-from evaluators.pictures.registration import write_before_and_after
-from evaluators.register.registration import distance_to, register
-from evaluators.study.versions import digest, versions
-from evaluators.tables.table import Record, Value
 from mapper.core.geometry import Transform, angle_between, inverse
 from mapper.core.rotations import euler_from_rotation
+from mapper.evaluators.papers.hough_pairs import Clouds, Pair, find_pairs
+from mapper.evaluators.papers.layout import file_name
+from mapper.evaluators.papers.scan_pairs import perturbed
+from mapper.evaluators.pictures.registration import write_before_and_after
+from mapper.evaluators.register.registration import distance_to, register
+from mapper.evaluators.study.versions import digest, versions
+from mapper.evaluators.tables.table import Record, Value
 from mapper.registration.hough.config import HoughGicpConfig, HoughNdtConfig
 from mapper.runtime.resumable_jobs import Job
 
@@ -118,7 +118,7 @@ def hough_jobs(logs: Path, *, seeds: int, pictures: Path) -> dict[HoughTrial, Jo
     """Return the trials of a folder's pairs, by both methods and every seed; those of seed 0 draw a picture.
 
     Args:
-        logs: As for :func:`~evaluators.papers.hough_pairs.find_pairs`.
+        logs: As for :func:`~mapper.evaluators.papers.hough_pairs.find_pairs`.
         seeds: How often each pair is perturbed.
         pictures: Folder for the pictures.
 

@@ -9,13 +9,13 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, PositiveFloat
 
-from evaluators.papers.scan_pairs import fewer_rings, merged, moved
 from mapper.config.loading import read_config
 from mapper.core.config import Config
 from mapper.core.errors import MapperError, SourceError
 from mapper.core.frames import Scan
 from mapper.core.geometry import Transform, inverse, transform
 from mapper.core.rotations import rotation_from_euler, rotation_from_quaternion
+from mapper.evaluators.papers.scan_pairs import fewer_rings, merged, moved
 from mapper.run.fingerprint import fingerprint
 from mapper.sources import clouds, kitti, open_source
 from mapper.sources.base import FrameRef

@@ -8,8 +8,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import mean, median
 
-from evaluators.papers.hough import DISTANCES, METHODS, OFFSET_M, picture_of
-from evaluators.papers.hough_pairs import (
+from mapper.evaluators.papers.hough import DISTANCES, METHODS, OFFSET_M, picture_of
+from mapper.evaluators.papers.hough_pairs import (
     ALL_RINGS,
     EXTRINSIC_DEG,
     EXTRINSIC_M,
@@ -18,9 +18,9 @@ from evaluators.papers.hough_pairs import (
     RIGHT_DEG,
     RIGHT_M,
 )
-from evaluators.papers.model import PaperCell, PaperTable, Reproduction
-from evaluators.papers.published import published
-from evaluators.tables.table import Record, Value
+from mapper.evaluators.papers.model import PaperCell, PaperTable, Reproduction
+from mapper.evaluators.papers.published import published
+from mapper.evaluators.tables.table import Record, Value
 from mapper.runtime.resumable_jobs import JobResult
 
 NEAR_M = 0.03
@@ -50,7 +50,7 @@ def hough_reproduction(results: Iterable[JobResult], *, pictures: Path) -> Repro
     """Return both summed up, the printed table, ours in its layout by each method, and our errors.
 
     Args:
-        results: Of the jobs of :func:`~evaluators.papers.hough.hough_jobs`.
+        results: Of the jobs of :func:`~mapper.evaluators.papers.hough.hough_jobs`.
         pictures: Folder of their pictures.
     """
     results = list(results)

@@ -6,8 +6,8 @@ from collections import Counter
 from collections.abc import Sequence
 from statistics import median
 
-from evaluators.papers.model import PaperCell, PaperTable, Reproduction
-from evaluators.tables.table import Column, Record, Table
+from mapper.evaluators.papers.model import PaperCell, PaperTable, Reproduction
+from mapper.evaluators.tables.table import Column, Record, Table
 
 _DIGITS = 3
 """Significant digits of figures without a printed one beside them."""

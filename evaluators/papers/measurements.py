@@ -7,14 +7,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from evaluators.metrics.trajectory import align, associate, ate
-from evaluators.papers.model import PaperCell, PaperTable
-from evaluators.papers.published import Figures
-from evaluators.study.versions import digest, versions
-from evaluators.tables.table import Record
 from mapper.config.build import BuildConfig
 from mapper.core.errors import DataError
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.trajectory import align, associate, ate
+from mapper.evaluators.papers.model import PaperCell, PaperTable
+from mapper.evaluators.papers.published import Figures
+from mapper.evaluators.study.versions import digest, versions
+from mapper.evaluators.tables.table import Record
 from mapper.run.fingerprint import fingerprint
 from mapper.runtime.resumable_jobs import Job, JobResult
 from mapper.sources import open_source

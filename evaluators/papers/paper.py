@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from evaluators.papers.measurements import Measurement
-from evaluators.papers.model import PaperPath, PaperTable
 from mapper.core.errors import ConfigError
+from mapper.evaluators.papers.measurements import Measurement
+from mapper.evaluators.papers.model import PaperPath, PaperTable
 from mapper.runtime.resumable_jobs import JobResult
 
 

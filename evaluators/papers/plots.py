@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evaluators.metrics.trajectory import associate
-from evaluators.papers.layout import compares, file_name
-from evaluators.papers.model import PaperCell, PaperPath, PaperTable, Reproduction
-from evaluators.pictures.path_errors import add_color_bar, draw_path
 from mapper.core.geometry import Array
+from mapper.evaluators.metrics.trajectory import associate
+from mapper.evaluators.papers.layout import compares, file_name
+from mapper.evaluators.papers.model import PaperCell, PaperPath, PaperTable, Reproduction
+from mapper.evaluators.pictures.path_errors import add_color_bar, draw_path
 from mapper.export.page import INK, LINE, hex_of, save
 from mapper.export.palette import ESTIMATE, TRUTH
 from mapper.export.panels import caption, draw_boxes, page, panel

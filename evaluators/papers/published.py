@@ -13,7 +13,7 @@ Figures = Mapping[str, Mapping[str, float | None]]
 @cache
 def published() -> dict[str, Any]:
     """Return the papers' tables by name; every table carries its ``source``."""
-    text = files("evaluators.papers").joinpath("published.json").read_text("utf-8")
+    text = files("mapper.evaluators.papers").joinpath("published.json").read_text("utf-8")
     tables: dict[str, Any] = json.loads(text)
     return tables
 

@@ -6,16 +6,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from evaluators.papers import thesis, zhao
-from evaluators.papers.files import write_reproduction
-from evaluators.papers.hough import hough_jobs
-from evaluators.papers.hough_tables import hough_reproduction
-from evaluators.papers.measurements import job_for
-from evaluators.papers.model import Reproduction
-from evaluators.papers.paper import Cut, Paper
-from evaluators.papers.sequences import Found, find_sequences
-from evaluators.study.engine import CELLS, run_study
 from mapper.core.errors import ConfigError, DataError
+from mapper.evaluators.papers import thesis, zhao
+from mapper.evaluators.papers.files import write_reproduction
+from mapper.evaluators.papers.hough import hough_jobs
+from mapper.evaluators.papers.hough_tables import hough_reproduction
+from mapper.evaluators.papers.measurements import job_for
+from mapper.evaluators.papers.model import Reproduction
+from mapper.evaluators.papers.paper import Cut, Paper
+from mapper.evaluators.papers.sequences import Found, find_sequences
+from mapper.evaluators.study.engine import CELLS, run_study
 from mapper.runtime.atomic import resumable_folder, write_text
 from mapper.runtime.executor import IN_PROCESS, Workers
 from mapper.runtime.progress import SILENT, Progress

@@ -4,9 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from evaluators.metrics.trajectory import align, associate, ate
-from evaluators.papers.ablation import VariantResult, follow
-from evaluators.papers.measurements import (
+from mapper.config.build import BuildConfig
+from mapper.core.errors import DataError
+from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.trajectory import align, associate, ate
+from mapper.evaluators.papers.ablation import VariantResult, follow
+from mapper.evaluators.papers.measurements import (
     Place,
     Results,
     cells_of,
@@ -15,15 +18,12 @@ from evaluators.papers.measurements import (
     measured,
     open_with_truth,
 )
-from evaluators.papers.model import PaperPath, PaperTable
-from evaluators.papers.paper import Cut, Paper
-from evaluators.papers.sequences import slug
-from evaluators.papers.thesis_tables import Setting, tables
-from evaluators.study.seeds import seeded
-from evaluators.tables.table import Record
-from mapper.config.build import BuildConfig
-from mapper.core.errors import DataError
-from mapper.core.trajectory import Trajectory
+from mapper.evaluators.papers.model import PaperPath, PaperTable
+from mapper.evaluators.papers.paper import Cut, Paper
+from mapper.evaluators.papers.sequences import slug
+from mapper.evaluators.papers.thesis_tables import Setting, tables
+from mapper.evaluators.study.seeds import seeded
+from mapper.evaluators.tables.table import Record
 from mapper.sources.trajectory_files import read_tum, write_tum
 
 

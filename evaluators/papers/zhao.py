@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from evaluators.papers.measurements import (
+from mapper.config.build import BuildConfig
+from mapper.config.loading import load_config
+from mapper.evaluators.papers.measurements import (
     CONFIGS,
     Place,
     Results,
@@ -17,14 +19,12 @@ from evaluators.papers.measurements import (
     measured,
     open_with_truth,
 )
-from evaluators.papers.model import PaperCell, PaperTable
-from evaluators.papers.paper import Cut, Paper
-from evaluators.papers.published import figures, published
-from evaluators.papers.sequences import slug
-from evaluators.study.seeds import seeded
-from evaluators.tables.table import Record
-from mapper.config.build import BuildConfig
-from mapper.config.loading import load_config
+from mapper.evaluators.papers.model import PaperCell, PaperTable
+from mapper.evaluators.papers.paper import Cut, Paper
+from mapper.evaluators.papers.published import figures, published
+from mapper.evaluators.papers.sequences import slug
+from mapper.evaluators.study.seeds import seeded
+from mapper.evaluators.tables.table import Record
 from mapper.pipeline.build import build
 from mapper.run.files import CLOUD, OCTREE_BT
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from evaluators.metrics.odometry import OdometryRun
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.odometry import OdometryRun
 from mapper.export.mcap_log import McapLog
 from mapper.export.palette import TRUTH
 from mapper.export.panels import color_of

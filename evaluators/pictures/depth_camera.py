@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluators.depth_camera.accuracy import Accuracy, DepthLevel, ResidualMap
-from evaluators.depth_camera.noise_fit import NoiseFit
-from evaluators.depth_camera.study import DepthStudy, records_of
-from evaluators.tables.table import csv_text
+from mapper.evaluators.depth_camera.accuracy import Accuracy, DepthLevel, ResidualMap
+from mapper.evaluators.depth_camera.noise_fit import NoiseFit
+from mapper.evaluators.depth_camera.study import DepthStudy, records_of
+from mapper.evaluators.tables.table import csv_text
 from mapper.export.page import FAINT, INK, LINE, hex_of, save
 from mapper.export.palette import Rgb
 from mapper.export.panels import caption, page, panel

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from evaluators.metrics.occupancy import OccupancyCheck
-from evaluators.pictures.path_errors import made_folder
 from mapper.core.geometry import Array
+from mapper.evaluators.metrics.occupancy import OccupancyCheck
+from mapper.evaluators.pictures.path_errors import made_folder
 from mapper.export.page import hex_of, save
 from mapper.export.palette import ESTIMATE, OCCUPIED_CELL, TRUTH, UNKNOWN_CELL, Rgb
 from mapper.export.panels import caption, page, panel

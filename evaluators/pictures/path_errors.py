@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evaluators.metrics.evaluate import Assessment, have_clock
-from evaluators.metrics.trajectory import Matched
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S
+from mapper.evaluators.metrics.evaluate import Assessment, have_clock
+from mapper.evaluators.metrics.trajectory import Matched
 from mapper.export.page import FAINT, INK, LINE, hex_of, save
 from mapper.export.palette import END, ESTIMATE, START, TRUTH
 from mapper.export.panels import caption, draw_boxes, extent, page, panel, widest_axes

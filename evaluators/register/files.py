@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from evaluators.pictures.registration import write_before_and_after
-from evaluators.pictures.registration_mcap import write_registration_log
-from evaluators.register.registration import Registered, xyz_rpy
 from mapper.config.register import RegisterConfig
 from mapper.core.frames import Scan, Sensor
 from mapper.core.geometry import apply
+from mapper.evaluators.pictures.registration import write_before_and_after
+from mapper.evaluators.pictures.registration_mcap import write_registration_log
+from mapper.evaluators.register.registration import Registered, xyz_rpy
 from mapper.export.palette import ESTIMATE
 from mapper.export.ply import write_ply
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, write_text

@@ -7,9 +7,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from evaluators.metrics.cloud_distance import CloudDistance, DistanceTo
 from mapper.core.frames import Frame, Scan
 from mapper.core.geometry import Transform
+from mapper.evaluators.metrics.cloud_distance import CloudDistance, DistanceTo
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.registration.base import Alignment
 from mapper.registration.config import AnyRegistration

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from evaluators.study.versions import SameVersions, versions
+from mapper.evaluators.study.versions import SameVersions, versions
 from mapper.runtime.atomic import locked
 from mapper.runtime.executor import IN_PROCESS, Workers, make_executor
 from mapper.runtime.progress import SILENT, Progress

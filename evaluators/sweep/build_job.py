@@ -7,10 +7,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
 
-from evaluators.metrics.run_summary import summary
-from evaluators.tables.table import Record
 from mapper.config.build import BuildConfig
 from mapper.core.errors import MapperError
+from mapper.evaluators.metrics.run_summary import summary
+from mapper.evaluators.tables.table import Record
 from mapper.pipeline.build import build
 from mapper.run.files import CONFIG, MANIFEST, OCTREE_MAP, SUMMARY, TRAJECTORY, TRUTH
 from mapper.run.folder import Run

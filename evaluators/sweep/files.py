@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping
 
-from evaluators.sweep.page import page_of
-from evaluators.sweep.plan import BuildName, Plan
-from evaluators.sweep.tables import sweep_records
-from evaluators.tables.parquet import write_parquet
-from evaluators.tables.table import Record, csv_text
+from mapper.evaluators.sweep.page import page_of
+from mapper.evaluators.sweep.plan import BuildName, Plan
+from mapper.evaluators.sweep.tables import sweep_records
+from mapper.evaluators.tables.parquet import write_parquet
+from mapper.evaluators.tables.table import Record, csv_text
 from mapper.runtime.atomic import write_text
 from mapper.runtime.resumable_jobs import JobResult
 

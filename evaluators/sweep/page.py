@@ -3,11 +3,11 @@
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 
-from evaluators.study.versions import versions
-from evaluators.sweep.chart import Line, dot_chart
-from evaluators.sweep.config import ConfigurationConfig
-from evaluators.sweep.plan import Plan
-from evaluators.sweep.tables import (
+from mapper.evaluators.study.versions import versions
+from mapper.evaluators.sweep.chart import Line, dot_chart
+from mapper.evaluators.sweep.config import ConfigurationConfig
+from mapper.evaluators.sweep.plan import Plan
+from mapper.evaluators.sweep.tables import (
     COVERED_ALIKE,
     QUANTITIES,
     Group,
@@ -17,7 +17,7 @@ from evaluators.sweep.tables import (
     failures_of,
     grouped,
 )
-from evaluators.tables.table import MISSING, Record, Value
+from mapper.evaluators.tables.table import MISSING, Record, Value
 from mapper.export.html import bullets, document, section
 from mapper.run.files import SUMMARY
 

@@ -9,14 +9,14 @@ from glob import glob, has_magic
 from pathlib import Path
 from typing import Any
 
-from evaluators.study.engine import CELLS, run_study
-from evaluators.study.seeds import seeded
-from evaluators.study.versions import digest, versions
-from evaluators.sweep.build_job import BuildJob
-from evaluators.sweep.config import ConfigurationConfig, MethodConfig, SweepConfig
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_config, load_source_config, read_config
 from mapper.core.errors import ConfigError
+from mapper.evaluators.study.engine import CELLS, run_study
+from mapper.evaluators.study.seeds import seeded
+from mapper.evaluators.study.versions import digest, versions
+from mapper.evaluators.sweep.build_job import BuildJob
+from mapper.evaluators.sweep.config import ConfigurationConfig, MethodConfig, SweepConfig
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig, ThesisLoopsConfig
 from mapper.odometry.config import IsvdOdometryConfig, KeyframeOdometryConfig
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from evaluators.tables.table import Record
+from mapper.evaluators.tables.table import Record
 from mapper.runtime.atomic import atomic_file
 from mapper.runtime.extras import extra
 

@@ -93,5 +93,6 @@ def test_the_image_has_a_python_that_the_project_allows():
 def test_the_builder_gets_all_that_the_wheel_is_made_of():
     sent = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
     packages = {name.rstrip("*") for name in PROJECT["tool"]["setuptools"]["packages"]["find"]["include"]}
+    packages |= {path.resolve().name for path in (ROOT / "mapper").iterdir() if path.is_symlink()}
     files = {PROJECT["project"]["readme"], *PROJECT["project"]["license-files"]}
     assert sent == packages | files | {"pyproject.toml"}

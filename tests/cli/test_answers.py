@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cli.answer import plain, rows_text
-from cli.groups import PANELS
-from cli.main import app
-from cli.terminal import print_help, print_text
+from mapper.cli.answer import plain, rows_text
+from mapper.cli.groups import PANELS
+from mapper.cli.main import app
+from mapper.cli.terminal import print_help, print_text
 from tests.support.command_line import invoke, mapper
 
 OF_A_RUN = (

@@ -11,10 +11,10 @@ import tomllib
 import numpy as np
 import pytest
 
-from cli.console import Bars, Lines
-from cli.evaluate import evaluate as evaluate_verb
-from cli.main import app
-from evaluators.metrics.evaluate import assess
+from mapper.cli.console import Bars, Lines
+from mapper.cli.evaluate import evaluate as evaluate_verb
+from mapper.cli.main import app
+from mapper.evaluators.metrics.evaluate import assess
 from mapper.run.folder import open_run
 from mapper.sources.trajectory_files import read_tum
 from tests.support.command_line import HEAVY, mapper
@@ -61,13 +61,13 @@ def test_no_verb_escapes_these_tests():
 
 
 def test_help_loads_nothing_heavy():
-    code = "import sys; from cli.main import app; print(*sys.modules)"
+    code = "import sys; from mapper.cli.main import app; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert not HEAVY & {name.split(".")[0] for name in loaded.split()}
 
 
 def test_a_build_on_images_loads_nothing_that_only_scans_recordings_and_viewers_need(desk_log, tmp_path):
-    code = "import sys; from cli.main import app; app(standalone_mode=False); print(*sys.modules)"
+    code = "import sys; from mapper.cli.main import app; app(standalone_mode=False); print(*sys.modules)"
     arguments = ["build", desk_log, "--out", tmp_path / "run", "--last", "11", "--quiet"]
     ran = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True)
     assert not ran.stderr
@@ -77,7 +77,7 @@ def test_a_build_on_images_loads_nothing_that_only_scans_recordings_and_viewers_
 
 @pytest.mark.parametrize("verb", [["export", "--as", "tum"], ["loops"]])
 def test_verbs_that_only_look_load_no_compiler_and_no_solver(run_folder, verb):
-    code = "import sys; from cli.main import app; app(standalone_mode=False); print(*sys.modules)"
+    code = "import sys; from mapper.cli.main import app; app(standalone_mode=False); print(*sys.modules)"
     arguments = [verb[0], run_folder, *verb[1:], "--quiet"]
     ran = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True)
     loaded = {name.split(".")[0] for name in ran.stdout.split()}
@@ -299,7 +299,7 @@ def test_config_prints_what_build_would_use(tmp_path):
 
 
 def test_a_package_that_cannot_be_written_gets_another_place_for_compiled_code(tmp_path, monkeypatch):
-    from cli import environment
+    from mapper.cli import environment
 
     monkeypatch.setattr(environment.os, "access", lambda _path, _mode: False)
     monkeypatch.setattr(environment.os, "environ", {"XDG_CACHE_HOME": str(tmp_path)})

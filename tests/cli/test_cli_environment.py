@@ -1,6 +1,6 @@
 """What the command line tells numba, and what it asks of it."""
 
-from cli.environment import has_compiled_code
+from mapper.cli.environment import has_compiled_code
 
 
 def test_compiled_code_is_found_where_numba_keeps_it(tmp_path, monkeypatch):

@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 import typer
 
-from cli import completion
-from cli.completion import SCRIPTS, candidates, run_folders, words_of
-from cli.main import app
+from mapper.cli import completion
+from mapper.cli.completion import SCRIPTS, candidates, run_folders, words_of
+from mapper.cli.main import app
 from tests.support.command_line import HEAVY, mapper
 
 COMMAND = typer.main.get_command(app)
-PROGRAM = f"#!/bin/sh\nexec {sys.executable} -c 'from cli.main import main; main()' \"$@\"\n"
+PROGRAM = f"#!/bin/sh\nexec {sys.executable} -c 'from mapper.cli.main import main; main()' \"$@\"\n"
 
 
 @pytest.fixture(autouse=True)
@@ -102,7 +102,7 @@ def test_an_unfinished_line_is_taken_apart(line, words):
 
 def asked(shell, *words, line=""):
     """What ``mapper`` prints to a shell's script, and the modules that it has loaded."""
-    code = "import sys; from cli.main import main; main(); print(*sys.modules, file=sys.stderr)"
+    code = "import sys; from mapper.cli.main import main; main(); print(*sys.modules, file=sys.stderr)"
     environment = {**os.environ, completion.ASKED_BY: shell, completion.LINE: line}
     told = subprocess.run(
         [sys.executable, "-c", code, *words], capture_output=True, text=True, check=True, env=environment

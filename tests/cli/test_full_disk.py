@@ -9,7 +9,7 @@ from tests.support.command_line import mapper
 from tests.support.files import digest_of
 from tests.support.full_disk import largest_file
 
-MAPPER = [sys.executable, "-c", "from cli.main import main; main()"]
+MAPPER = [sys.executable, "-c", "from mapper.cli.main import main; main()"]
 WRITERS = {
     "fuse": ["fuse", "RUN", "--quiet"],
     "export costmap": ["export", "RUN", "--as", "costmap"],

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from cli.places import joined_names, name_of, place_of
+from mapper.cli.places import joined_names, name_of, place_of
 from mapper.runtime.atomic import locked
 from tests.support.command_line import mapper
 

@@ -6,7 +6,7 @@ import tomllib
 
 import pytest
 
-from cli.toml_text import toml_text
+from mapper.cli.toml_text import toml_text
 from mapper.config.describe import settings
 from mapper.config.loading import load_config
 from tests.support.command_line import mapper

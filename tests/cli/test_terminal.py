@@ -7,10 +7,10 @@ import time
 
 import pytest
 
-from cli.terminal import EscapingStream, escaped
+from mapper.cli.terminal import EscapingStream, escaped
 from mapper.run.manifest import read_manifest
 
-MAPPER = [sys.executable, "-c", "from cli.main import main; main()"]
+MAPPER = [sys.executable, "-c", "from mapper.cli.main import main; main()"]
 
 
 def test_control_characters_are_shown_not_obeyed():

@@ -102,7 +102,7 @@ def copied_or_built(words, built):
 
 def in_a_process_of_its_own(*arguments):
     """As a user runs it; the others are spared the seconds that its imports take."""
-    start = [sys.executable, "-c", "from cli.main import main; main()"]
+    start = [sys.executable, "-c", "from mapper.cli.main import main; main()"]
     done = subprocess.run([*start, *arguments], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout

@@ -6,9 +6,9 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from evaluators.metrics.evaluate import evaluate
 from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError
+from mapper.evaluators.metrics.evaluate import evaluate
 from mapper.export.report.data import Figure, chapter_of, drawn
 from mapper.export.report.page import page_of, write_report
 from mapper.pipeline.build import build

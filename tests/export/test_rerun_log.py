@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from cli.answer import Output
-from cli.build import _onlooker, built
+from mapper.cli.answer import Output
+from mapper.cli.build import _onlooker, built
 from mapper.config.build import BuildConfig
 from mapper.config.export import RerunConfig
 from mapper.core.errors import ConfigError, DataError, ViewerError
@@ -378,7 +378,7 @@ def test_a_build_that_is_refused_leaves_no_recording(desk_log, run, tmp_path):
 
 def test_stepping_waits_after_each_frame_until_told_to_run_on(desk_log, tmp_path, monkeypatch):
     keys = Log(["\n", "\n", "c\n"])
-    monkeypatch.setattr("cli.stepping.sys.stdin", keys)
+    monkeypatch.setattr("mapper.cli.stepping.sys.stdin", keys)
     path = tmp_path / "stepped.rrd"
     built(
         desk_log,

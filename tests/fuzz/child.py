@@ -61,7 +61,7 @@ def run_verb(words: Sequence[str]) -> str:
     """
     from typer.testing import CliRunner
 
-    from cli.main import app
+    from mapper.cli.main import app
 
     result = CliRunner().invoke(app, list(words), catch_exceptions=False)
     if result.exit_code == _EXIT_REFUSED:  # inspect says on its standard output what is wrong

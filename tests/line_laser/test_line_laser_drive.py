@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from evaluators.line_laser import study as line_laser_study
-from evaluators.line_laser.labels import range_records, read_labels
-from evaluators.line_laser.scores import TABLE_2_1, count
 from mapper.config.loading import read_config
 from mapper.core.errors import SourceError
+from mapper.evaluators.line_laser import study as line_laser_study
+from mapper.evaluators.line_laser.labels import range_records, read_labels
+from mapper.evaluators.line_laser.scores import TABLE_2_1, count
 from mapper.line_laser.calibration import ahead_m
 from mapper.line_laser.config import THESIS, LineLaserCalibration, LineLaserConfig, LineLaserSynthConfig
 from mapper.line_laser.files import find_images

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cli.main import app
+from mapper.cli.main import app
 from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, DataError, RunError
 from mapper.core.geometry import exp, inverse

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evaluators.metrics.evaluate import evaluate
 from mapper.config.loading import load_config
 from mapper.core.errors import ConfigError, DataError, TrackingError
 from mapper.core.geometry import angle_between, exp, interpolate, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.evaluate import evaluate
 from mapper.odometry.config import GivenOdometryConfig
 from mapper.odometry.factory import build_odometry
 from mapper.odometry.given_poses import poses_for

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evaluators.metrics.occupancy import assess_by_distance, check_metrics
 from mapper.config.loading import load_config
 from mapper.core.deskew import twist_at
 from mapper.core.errors import ConfigError, TrackingError
 from mapper.core.geometry import angle_between, inverse
 from mapper.core.timebase import NS_PER_S
+from mapper.evaluators.metrics.occupancy import assess_by_distance, check_metrics
 from mapper.features.frame_view import ImageView, ScanView
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap

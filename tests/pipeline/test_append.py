@@ -6,10 +6,10 @@ import shutil
 import numpy as np
 import pytest
 
-from cli.summary import summary_text
-from evaluators.metrics.trajectory import align, associate, ate
+from mapper.cli.summary import summary_text
 from mapper.config.loading import overridden
 from mapper.core.errors import ConfigError, RunError
+from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.loops.config import NoLoopsConfig
 from mapper.octree.octomap_file import read_octree
 from mapper.pipeline.append import append

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from evaluators.metrics.trajectory import align, associate, ate
 from mapper.config.loading import load_config, overridden
 from mapper.core.errors import ConfigError, RunError, TrackingError
+from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.export.run_maps import maps_of
 from mapper.octree.grid_file import read_grid
 from mapper.octree.octomap_file import read_octree

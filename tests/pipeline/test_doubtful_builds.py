@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evaluators.metrics.trajectory import align, associate, ate
 from mapper.config.loading import load_config, overridden
 from mapper.core.errors import TrackingError
 from mapper.core.geometry import exp
+from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.export.mesh import _views
 from mapper.octree.octomap_file import read_octree
 from mapper.octree.scan_update_file import open_scan_updates

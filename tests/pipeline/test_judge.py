@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evaluators.metrics.evaluate import evaluate
 from mapper.config.loading import load_config
+from mapper.evaluators.metrics.evaluate import evaluate
 from mapper.odometry.factory import odometry_for
 from mapper.pipeline import judge, track
 from mapper.pipeline.build import build

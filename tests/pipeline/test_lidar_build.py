@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from cli.summary import summary_text
-from evaluators.metrics.evaluate import evaluate
+from mapper.cli.summary import summary_text
 from mapper.config.loading import load_config, overridden
 from mapper.core.errors import TrackingError
+from mapper.evaluators.metrics.evaluate import evaluate
 from mapper.octree.grid_file import read_grid
 from mapper.octree.slice import FREE
 from mapper.pipeline.build import build

@@ -5,10 +5,10 @@ import shutil
 import numpy as np
 import pytest
 
-from evaluators.metrics.trajectory import align, associate, ate
 from mapper.config.loading import load_config
 from mapper.core.errors import ConfigError
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.odometry.base import Odometry
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from cli.summary import summary_text
+from mapper.cli.summary import summary_text
 from mapper.config.loading import load_config
 from mapper.core.errors import RunError, TrackingError
 from mapper.odometry.local_map.odometry import KeyframeOdometry

@@ -5,9 +5,9 @@ import shutil
 import numpy as np
 import pytest
 
-from evaluators.metrics.trajectory import align, associate, ate
 from mapper.config.loading import load_config, overridden
 from mapper.core.errors import ConfigError, LoopError
+from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.loops.closure import discrepancy
 from mapper.pipeline.append import append
 from mapper.pipeline.build import build

@@ -72,7 +72,7 @@ def ndt():
 def sweep():
     from pathlib import Path
 
-    from evaluators.sweep.plan import plan_sweep
+    from mapper.evaluators.sweep.plan import plan_sweep
 
     plan_sweep(Path("sweep.toml"), Path("out"))
 

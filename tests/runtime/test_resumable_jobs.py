@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from evaluators.study.engine import run_study
 from mapper.core.errors import DataError, RunError
+from mapper.evaluators.study.engine import run_study
 from mapper.runtime.atomic import locked
 from mapper.runtime.executor import Workers
 from mapper.runtime.resumable_jobs import Job
@@ -138,7 +138,7 @@ def test_killed_in_the_middle_it_goes_on_and_runs_nothing_finished_twice(diary, 
     script = tmp_path / "sweep.py"
     script.write_text(
         "from pathlib import Path\n"
-        "from evaluators.study.engine import run_study\n"
+        "from mapper.evaluators.study.engine import run_study\n"
         "from mapper.runtime.resumable_jobs import Job\n"
         "from mapper.runtime.executor import Workers\n"
         "from tests.support.counted_jobs import Work\n"

@@ -5,13 +5,13 @@ import shutil
 import numpy as np
 import pytest
 
-from evaluators.metrics.evaluate import evaluate
 from mapper.config.loading import load_config
 from mapper.core.errors import SourceError
 from mapper.core.geometry import exp
 from mapper.core.rotations import quaternion_from_rotation
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.evaluate import evaluate
 from mapper.pipeline.build import build
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig

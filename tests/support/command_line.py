@@ -2,7 +2,7 @@
 
 from typer.testing import CliRunner, Result
 
-from cli.main import app
+from mapper.cli.main import app
 
 HEAVY = {
     "cv2",

@@ -4,9 +4,9 @@ from functools import cache
 
 import numpy as np
 
-from evaluators.metrics.trajectory import align, associate, ate
 from mapper.core.frames import RgbdFrame
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.simulation.config import SynthConfig
 from mapper.simulation.source import CameraSimulator
 from mapper.sources.base import Log

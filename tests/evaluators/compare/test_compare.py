@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from evaluators.compare import comparison as compare_module
-from evaluators.compare.catalogue import methods_for
-from evaluators.compare.comparison import compare
-from evaluators.compare.config import CompareConfig, LidarCompareConfig
-from evaluators.compare.files import compare_into, write_comparison
-from evaluators.compare.methods import registration_method
-from evaluators.compare.pairwise import registration_records
-from evaluators.compare.tables import tables_of, tables_text
-from evaluators.metrics.odometry import PathErrors
 from mapper.core.errors import ConfigError, DataError, FrameError
+from mapper.evaluators.compare import comparison as compare_module
+from mapper.evaluators.compare.catalogue import methods_for
+from mapper.evaluators.compare.comparison import compare
+from mapper.evaluators.compare.config import CompareConfig, LidarCompareConfig
+from mapper.evaluators.compare.files import compare_into, write_comparison
+from mapper.evaluators.compare.methods import registration_method
+from mapper.evaluators.compare.pairwise import registration_records
+from mapper.evaluators.compare.tables import tables_of, tables_text
+from mapper.evaluators.metrics.odometry import PathErrors
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import LidarSimulator
 from mapper.sources import open_source
@@ -255,7 +255,7 @@ def test_a_comparison_that_was_stopped_goes_on_where_it_was(desk, tmp_path, monk
     config = CompareConfig(methods=("gicp", "kiss-icp"), pairs=0)
     once = compare_into(tmp_path / "once", desk, config)
     with monkeypatch.context() as patch:
-        patch.setattr("evaluators.compare.methods.OdometryTracker.add", interrupt)
+        patch.setattr("mapper.evaluators.compare.methods.OdometryTracker.add", interrupt)
         with pytest.raises(KeyboardInterrupt):
             compare_into(tmp_path / "out", desk, config)
     followed = []

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
-from evaluators.compare.config import GuessConfig, LidarCompareConfig, RgbdCompareConfig
-from evaluators.compare.pairwise import (
+from mapper.core.geometry import exp, inverse, rotation_log
+from mapper.core.trajectory import Trajectory
+from mapper.evaluators.compare.config import GuessConfig, LidarCompareConfig, RgbdCompareConfig
+from mapper.evaluators.compare.pairwise import (
     NO_GUESS,
     Pair,
     guesses_for,
@@ -12,8 +14,6 @@ from evaluators.compare.pairwise import (
     pairs_of,
     registration_records,
 )
-from mapper.core.geometry import exp, inverse, rotation_log
-from mapper.core.trajectory import Trajectory
 from mapper.registration.base import Alignment, failed
 
 FRAME_NS = 100_000_000

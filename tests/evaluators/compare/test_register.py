@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from evaluators.register.files import registration_text
-from evaluators.register.registration import register
 from mapper.config.register import register_config
 from mapper.core.errors import ConfigError
 from mapper.core.frames import Scan
 from mapper.core.geometry import apply, exp, inverse
 from mapper.core.rotations import rotation_from_euler
+from mapper.evaluators.register.files import registration_text
+from mapper.evaluators.register.registration import register
 from mapper.odometry.config import IsvdOdometryConfig
 from mapper.registration.config import GicpConfig
 from mapper.registration.guess import parse_guess

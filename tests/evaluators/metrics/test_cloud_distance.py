@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from evaluators.metrics.cloud_distance import DistanceTo
 from mapper.core.errors import DataError
 from mapper.core.geometry import exp, inverse
+from mapper.evaluators.metrics.cloud_distance import DistanceTo
 
 
 def test_mean_and_median_are_those_of_every_distance_told_by_brute_force():

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from evaluators.metrics.consistency import factor_nees, window_nees
 from mapper.core.geometry import exp
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.consistency import factor_nees, window_nees
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.odometry.base import Diagnostics
 from mapper.run.frame_outcomes import FrameRecord

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from evaluators.metrics.coverage import frame_coverage, time_coverage
-from evaluators.metrics.evaluate import assess
 from mapper.core.geometry import transform
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.coverage import frame_coverage, time_coverage
+from mapper.evaluators.metrics.evaluate import assess
 
 MS = 1_000_000
 FRAMES_NS = 7_000_000_000 + np.arange(100, dtype=np.int64) * 33 * MS

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from evaluators.metrics.loops import loop_metrics, revisits_of
 from mapper.core.geometry import exp
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.loops import loop_metrics, revisits_of
 from mapper.loops.closure import LoopClosure
 
 

@@ -5,13 +5,13 @@ import json
 import numpy as np
 import pytest
 
-from evaluators.metrics.map_reference import check_occupancy, read_reference
-from evaluators.metrics.occupancy import assess_by_points, check_metrics
-from evaluators.metrics.scenes import outdoor_distance_m, scene_distance
-from evaluators.metrics.sharpness import Views, sharpness_metrics
-from evaluators.pictures.map_agreement import write_map_errors
 from mapper.core.errors import DataError, MapperError
 from mapper.core.geometry import exp, inverse, transform
+from mapper.evaluators.metrics.map_reference import check_occupancy, read_reference
+from mapper.evaluators.metrics.occupancy import assess_by_points, check_metrics
+from mapper.evaluators.metrics.scenes import outdoor_distance_m, scene_distance
+from mapper.evaluators.metrics.sharpness import Views, sharpness_metrics
+from mapper.evaluators.pictures.map_agreement import write_map_errors
 from mapper.export.ply import write_ply
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
@@ -79,7 +79,7 @@ def test_a_map_meets_itself_at_any_resolution(resolution_m, tmp_path):
 
 def test_a_map_too_coarse_to_be_cut_up_is_refused(tmp_path, monkeypatch):
     write_bt(tmp_path / "coarse.bt", mapped(wall(2.02), resolution_m=0.1))
-    monkeypatch.setattr("evaluators.metrics.map_reference._MOST_POINTS", 1000)
+    monkeypatch.setattr("mapper.evaluators.metrics.map_reference._MOST_POINTS", 1000)
     with pytest.raises(DataError, match=r"voxels of 0.1 m are too coarse for a map of 0.05 m"):
         read_reference(tmp_path / "coarse.bt", voxel_m=EDGE_M)
 

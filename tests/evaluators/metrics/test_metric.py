@@ -2,8 +2,8 @@ import json
 
 import pytest
 
-from evaluators.metrics.metric import Metric, json_text, markdown_table, text_table
 from mapper.core.errors import DataError
+from mapper.evaluators.metrics.metric import Metric, json_text, markdown_table, text_table
 
 METRICS = [
     Metric("matched poses", 786, "pairs"),

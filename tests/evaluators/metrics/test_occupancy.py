@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from evaluators.metrics.occupancy import assess_by_distance, check_metrics
 from mapper.core.errors import DataError
+from mapper.evaluators.metrics.occupancy import assess_by_distance, check_metrics
 from mapper.octree.casting import Caster
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap

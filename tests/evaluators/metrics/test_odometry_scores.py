@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from evaluators.metrics.odometry import (
+from mapper.core.geometry import exp
+from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.odometry import (
     ONE_FRAME,
     ONE_SECOND,
     OdometryRun,
@@ -11,8 +13,6 @@ from evaluators.metrics.odometry import (
     assess_run,
     step_for,
 )
-from mapper.core.geometry import exp
-from mapper.core.trajectory import Trajectory
 
 FRAME_NS = 100_000_000
 

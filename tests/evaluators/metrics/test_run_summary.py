@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from evaluators.metrics.evaluate import assess
-from evaluators.metrics.run_summary import summary
-from evaluators.pictures.path_errors import write_trajectory_errors
 from mapper.config.build import BuildConfig
 from mapper.core.errors import DataError
 from mapper.core.geometry import exp, transform
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.evaluate import assess
+from mapper.evaluators.metrics.run_summary import summary
+from mapper.evaluators.pictures.path_errors import write_trajectory_errors
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.run.manifest import Counts, Input, Manifest

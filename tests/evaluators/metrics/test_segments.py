@@ -5,18 +5,18 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from evaluators.metrics.evaluate import assess
-from evaluators.metrics.segments import (
+from mapper.core.errors import DataError
+from mapper.core.geometry import angle_between, exp, inverse, transform
+from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.evaluate import assess
+from mapper.evaluators.metrics.segments import (
     KITTI_LENGTHS_M,
     length_records,
     lengths_for,
     segment_errors,
     segment_metrics,
 )
-from evaluators.metrics.trajectory import Matched, associate
-from mapper.core.errors import DataError
-from mapper.core.geometry import angle_between, exp, inverse, transform
-from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.trajectory import Matched, associate
 from mapper.sources.trajectory_files import read_kitti
 from tests.support.paths import DATA
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from evaluators.metrics.silent_failures import check_doubts, doubt_metrics
 from mapper.core.geometry import exp, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.silent_failures import check_doubts, doubt_metrics
 from mapper.odometry.base import Diagnostics
 from mapper.run.frame_outcomes import FrameRecord
 

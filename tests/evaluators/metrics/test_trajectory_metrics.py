@@ -5,11 +5,11 @@ import pytest
 from evo.core import metrics, sync
 from evo.core.trajectory import PoseTrajectory3D
 
-from evaluators.metrics.evaluate import evaluate
-from evaluators.metrics.trajectory import Matched, align, associate, ate, rpe, start_end_offset
 from mapper.core.errors import DataError
 from mapper.core.geometry import exp, inverse, rotation_exp, transform
 from mapper.core.trajectory import Trajectory
+from mapper.evaluators.metrics.evaluate import evaluate
+from mapper.evaluators.metrics.trajectory import Matched, align, associate, ate, rpe, start_end_offset
 from mapper.sources.trajectory_files import read_kitti, read_tum, write_tum
 from tests.support.paths import SHARED
 

@@ -5,11 +5,11 @@ import re
 import numpy as np
 import pytest
 
-from evaluators.papers.files import tables_text, write_reproduction
-from evaluators.papers.layout import as_printed, compared, everything
-from evaluators.papers.model import PaperCell, PaperPath, PaperTable, Reproduction
-from evaluators.tables.table import Column, latex_table, latex_text, markdown_table, shown_cells
 from mapper.core.trajectory import trajectory_from
+from mapper.evaluators.papers.files import tables_text, write_reproduction
+from mapper.evaluators.papers.layout import as_printed, compared, everything
+from mapper.evaluators.papers.model import PaperCell, PaperPath, PaperTable, Reproduction
+from mapper.evaluators.tables.table import Column, latex_table, latex_text, markdown_table, shown_cells
 from mapper.sources.trajectory_files import write_tum
 
 

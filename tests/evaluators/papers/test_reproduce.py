@@ -7,11 +7,11 @@ import pickle
 import numpy as np
 import pytest
 
-from evaluators.papers.paper import Cut
-from evaluators.papers.reproduce import Request, reproduce
-from evaluators.papers.thesis import ThesisJob
-from evaluators.papers.zhao import TABLES, ZhaoJob
 from mapper.core.errors import ConfigError, DataError, RunError, SourceError
+from mapper.evaluators.papers.paper import Cut
+from mapper.evaluators.papers.reproduce import Request, reproduce
+from mapper.evaluators.papers.thesis import ThesisJob
+from mapper.evaluators.papers.zhao import TABLES, ZhaoJob
 from tests.support.command_line import mapper
 
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from pyarrow import parquet
 
-from evaluators.study.versions import SameVersions, versions
-from evaluators.sweep.chart import Line, dot_chart
-from evaluators.sweep.files import write_sweep
-from evaluators.sweep.plan import plan_sweep, run_sweep
-from evaluators.sweep.tables import QUANTITIES, best_of, grouped, summary_text, sweep_records
 from mapper.core.errors import ConfigError, RunError, SourceError
+from mapper.evaluators.study.versions import SameVersions, versions
+from mapper.evaluators.sweep.chart import Line, dot_chart
+from mapper.evaluators.sweep.files import write_sweep
+from mapper.evaluators.sweep.plan import plan_sweep, run_sweep
+from mapper.evaluators.sweep.tables import QUANTITIES, best_of, grouped, summary_text, sweep_records
 from mapper.runtime.executor import Workers
 from mapper.runtime.resumable_jobs import Job, JobResult
 from tests.support.chromium import CHROMIUM, MISSING, Page
