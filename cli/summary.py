@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from importlib.util import find_spec
 from math import degrees
 from pathlib import Path
 from shlex import quote
@@ -60,6 +61,7 @@ def short_text(run: Run, metrics: Sequence[Metric]) -> str:
     counts, timing, verdict = run.manifest.counts, run.manifest.timing, run.verdict
     logs = f", of {run.manifest.input.title}" if run.manifest.input.appended else ""
     lengths_m = [metric.value for metric in metrics if metric.name.startswith(_LENGTH)]
+    in_browser = "" if find_spec("rerun") else " --html"
     path = f", along a path of {lengths_m[0]:.2f} m" if lengths_m else ""
     speed = f"{timing.frames_per_s:.1f} frames/s, {timing.real_time_factor:.2f} × real time"
     rows = [
@@ -72,7 +74,7 @@ def short_text(run: Run, metrics: Sequence[Metric]) -> str:
         ("run", f"{run.path} ({len(run.files())} files, {_size_mb(run.files()):.1f} MB)"),
         ("verdict", verdict.state),
         *(("", sentence) for sentence in verdict.sentences),
-        ("next", f"mapper view {quote(str(run.path))}"),
+        ("next", f"mapper view {quote(str(run.path))}{in_browser}"),
     ]
     return rows_text([(name, text) for name, text in rows if text])
 

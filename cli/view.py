@@ -50,7 +50,6 @@ def view(
     Example: mapper view runs/xyz --spawn, or: mapper view runs/xyz --html
     """
     from mapper.core.errors import ConfigError, RunError
-    from mapper.export.rerun.finished import show_run
     from mapper.run.files import RERUN
     from mapper.run.folder import open_run
 
@@ -67,6 +66,8 @@ def view(
     if rrd is not None and rrd.exists() and not overwrite:
         raise RunError(f"{rrd}: exists already; choose another --rrd, or pass --overwrite to replace it")
     built = open_run(run)
+    from mapper.export.rerun.finished import show_run  # needs Rerun, which the page does not
+
     if spawn or connect is not None:
         show_run(built, "spawn" if connect is None else f"connect:{connect}")
         return Answer({"run": built.path})

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import pytest
 from mapper.cli.console import Bars, Lines
 from mapper.cli.evaluate import evaluate as evaluate_verb
 from mapper.cli.main import app
+from mapper.cli.summary import short_text
 from mapper.evaluators.metrics.evaluate import assess
 from mapper.run.folder import open_run
 from mapper.sources.trajectory_files import read_tum
@@ -95,6 +97,27 @@ def test_build_prints_a_table(desk_log, tmp_path):
     assert lines[-1].split("  ")[-1].strip() == f"mapper view {tmp_path / 'run'}"
     source = open_run(tmp_path / "run").config.source
     assert (source.first_frame, source.last_frame, source.stride, source.require_truth) == (3, 24, 2, False)
+
+
+def test_without_rerun_a_map_is_looked_at_in_a_browser(run_folder, tmp_path):
+    code = (
+        "import sys; from importlib.abc import MetaPathFinder\n"
+        "class Absent(MetaPathFinder):\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name.split('.')[0] == 'rerun': raise ModuleNotFoundError(name=name)\n"
+        "sys.meta_path.insert(0, Absent())\n"
+        "from cli.main import app; app()"
+    )
+    arguments = ["view", run_folder, "--html", "--out", tmp_path / "map.html"]
+    subprocess.run([sys.executable, "-c", code, *arguments], check=True)
+    assert (tmp_path / "map.html").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(("absent", "options"), [(True, " --html"), (False, "")])
+def test_a_summary_ends_with_a_command_that_works(run_folder, monkeypatch, absent, options):
+    monkeypatch.setattr("cli.summary.find_spec", {"rerun": None if absent else find_spec("json")}.get)
+    last = short_text(open_run(run_folder), []).splitlines()[-1]
+    assert last.endswith(f"mapper view {run_folder}{options}")
 
 
 def test_build_is_quiet_when_told(desk_log, tmp_path):
