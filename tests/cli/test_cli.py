@@ -106,7 +106,7 @@ def test_without_rerun_a_map_is_looked_at_in_a_browser(run_folder, tmp_path):
         "    def find_spec(self, name, *_):\n"
         "        if name.split('.')[0] == 'rerun': raise ModuleNotFoundError(name=name)\n"
         "sys.meta_path.insert(0, Absent())\n"
-        "from cli.main import app; app()"
+        "from mapper.cli.main import app; app()"
     )
     arguments = ["view", run_folder, "--html", "--out", tmp_path / "map.html"]
     subprocess.run([sys.executable, "-c", code, *arguments], check=True)
