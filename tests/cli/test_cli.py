@@ -115,7 +115,7 @@ def test_without_rerun_a_map_is_looked_at_in_a_browser(run_folder, tmp_path):
 
 @pytest.mark.parametrize(("absent", "options"), [(True, " --html"), (False, "")])
 def test_a_summary_ends_with_a_command_that_works(run_folder, monkeypatch, absent, options):
-    monkeypatch.setattr("cli.summary.find_spec", {"rerun": None if absent else find_spec("json")}.get)
+    monkeypatch.setattr("mapper.cli.summary.find_spec", {"rerun": None if absent else find_spec("json")}.get)
     last = short_text(open_run(run_folder), []).splitlines()[-1]
     assert last.endswith(f"mapper view {run_folder}{options}")
 
