@@ -28,6 +28,8 @@ def refusal(model: type[Config], error: Mapping[str, Any]) -> str:
         loc, reason = loc[:-1], f"{loc[-1]} values are too few"
     elif error["type"] == "tuple_type" and isinstance(error["input"], str):
         reason = "want a list, as in 1,2,3"
+    elif isinstance(error["input"], (str, int, float)) and error["type"] != "missing":
+        reason = f"{reason}, not {error['input']}"
     return f"{'.'.join(map(str, loc)) or 'configuration'}: {reason}"
 
 

@@ -56,7 +56,7 @@ def test_one_knob_keeps_the_kind_of_the_file_and_its_default_detector(toml):
     ("override", "message"),
     [
         ("octree.resolution=0.1", "overrides: octree.resolution: unknown; did you mean resolution_m?"),
-        ("octree.resolution_m=-1", "overrides: octree.resolution_m: Input should be greater than 0"),
+        ("octree.resolution_m=-1", "overrides: octree.resolution_m: Input should be greater than 0, not -1"),
         (
             "odometry.previous_frames=2",
             "odometry.local-map.previous_frames: unknown; odometry.kind=isvd has it",
@@ -69,7 +69,7 @@ def test_one_knob_keeps_the_kind_of_the_file_and_its_default_detector(toml):
             "odometry: Input tag 'zip' found using 'kind' does not match any of the expected tags: 'isvd',"
             " 'local-map', 'pnp', 'gicp', 'icp', 'kiss-icp', 'hough-ndt', 'wheels', 'given'",
         ),
-        ("workers=many", "overrides: workers: Input should be a valid integer"),
+        ("workers=many", "unable to parse string as an integer, not many"),
         ("workers", "override 'workers': want key.path=value"),
         ("workers.x.y=1", "overrides: workers: Input should be a valid integer"),
     ],
