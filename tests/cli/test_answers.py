@@ -19,7 +19,7 @@ from tests.support.command_line import invoke, mapper
 
 OF_A_RUN = (
     "run logs frames keyframes factors loops metrics octree cloud_points stage_s total_s frames_per_s "
-    "real_time_factor peak_memory_mb files verdict"
+    "real_time_factor peak_memory_mb resumed files verdict"
 )
 ANSWERS = {
     "build": (

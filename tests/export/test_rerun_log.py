@@ -239,7 +239,7 @@ def test_the_verb_keeps_the_recording_in_the_run(run, tmp_path):
     again = invoke("view", run.path, "--rrd", other)
     assert (again.exit_code, "pass --overwrite" in again.stderr) == (1, True)
     both = invoke("view", run.path, "--rrd", other, "--spawn")
-    assert both.stderr == "mapper: --rrd, --spawn and --connect: choose one\n"
+    assert both.stderr == "mapper: --rrd, --spawn, --connect and --html: choose one\n"
 
 
 class Log:
