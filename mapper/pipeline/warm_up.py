@@ -48,6 +48,7 @@ def _build_rgbd(folder: Path) -> None:
     write_tum_log(folder / "log", SynthConfig(duration_s=1.0, width_px=320, height_px=240))
     _build(folder, "run")
     _build(folder, "short", "odometry.readout_s=0.03", "source.last_frame=9")  # found only in longer logs
+    _build(folder, "isvd", "odometry.kind=isvd", "source.last_frame=9")  # which verifies loops, too
 
 
 def _build_lidar(folder: Path) -> None:
