@@ -113,7 +113,7 @@ _VERBS: dict[str, list[tuple[str, Callable[..., Answer], type[Verb], str]]] = {
         ("solve", solve, Verb, "Solve a pose graph from a g2o file"),
     ],
     "look": [
-        ("view", view, Verb, "Show a run in Rerun"),
+        ("view", view, Verb, "Show a run in 3D, in a browser or in Rerun"),
         ("report", report, Verb, "Write one page about runs, side by side"),
         ("export", export, Verb, "Write a run's map, cloud, path … for other programs"),
         ("plan", plan, WithPoints, "Plan a robot's path through a map"),

@@ -122,13 +122,6 @@ def _draw_direction(axes: "Axes", positions: Array) -> None:
     for share in (np.arange(_ARROWS) + 0.5) / _ARROWS:
         ahead = int(np.searchsorted(reached_m, share * reached_m[-1]))
         if ahead and reached_m[ahead] > reached_m[ahead - 1]:
-            style = {
-                "arrowstyle": "-|>",
-                "color": hex_of(ESTIMATE),
-                "mutation_scale": 13.0,
-                "shrinkA": 0,
-                "shrinkB": 0,
-            }
             tip, tail = (tuple(positions[k, :2].tolist()) for k in (ahead, ahead - 1))
             axes.annotate("", tip, tail, arrowprops=style)
 
