@@ -22,8 +22,8 @@ from mapper.cli.options import (
     merged,
     selection,
 )
-from mapper.cli.places import RUNS, name_of, place_of
 from mapper.cli.stepping import Stepping
+from mapper.cli.places import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
     from mapper.config.build import BuildConfig
@@ -88,8 +88,6 @@ def build(
 
     Example: mapper build rgbd_dataset_freiburg1_xyz --set octree.resolution_m=0.1
     """
-    from mapper.cli.summary import summary_of
-
     out = place_of(out, RUNS / name_of(log), overwrite=overwrite)
     overrides = merged(selection(first, last, stride, require_truth), set_)
     onlooker = _onlooker(rerun, step=step, overwrite=overwrite)
@@ -108,6 +106,8 @@ def build(
     else:
         _refuse_both(config, onto, rerun)
         run, metrics = appended(log, onto, overrides, out, overwrite=overwrite, output=output)
+    from mapper.cli.summary import summary_of  # a build begins without what its end needs
+
     error = _untrusted(run) if strict else None
     return replace(summary_of(run, metrics), error=error)
 
@@ -135,7 +135,6 @@ def built(
 ) -> "tuple[Run, Sequence[Metric]]":
     """Build a run and judge its trajectory by the truth, if the log has any."""
     from mapper.config.loading import load_config, load_source_config
-    from mapper.evaluators.metrics.evaluate import evaluate
     from mapper.pipeline.build import build as build_run
     from mapper.run.observers import Observers
     from mapper.sources import open_source
@@ -154,6 +153,8 @@ def built(
         run = build_run(
             source, config, out, progress=progress, observer=watching, overwrite=overwrite, fresh=fresh
         )
+    from mapper.evaluators.metrics.evaluate import evaluate
+
     return run, evaluate(run.trajectory, run.truth).metrics
 
 

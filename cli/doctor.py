@@ -46,7 +46,7 @@ def doctor(
     """Check the machine, try every library in a process of its own, and print what to do.
 
     With RUN, compare all its files with the sizes and digests in its manifest instead; with --warm, compile
-    the kernels. The exit status is 1 if anything failed.
+    the kernels, and keep the bytecode of what builds import. The exit status is 1 if anything failed.
 
     Example: mapper doctor --json, or: mapper doctor runs/xyz, or after pip install: mapper doctor --warm
     """

@@ -1,6 +1,7 @@
 """The command line: its verbs, and the one place that turns an error into a line and an exit status."""
 
 import errno
+import gc
 import os
 import sys
 import warnings
@@ -196,4 +197,7 @@ def main() -> None:
             setattr(sys, name, EscapingStream(stream))
     warnings.showwarning = _show_warning
     warnings.simplefilter("always", MapperWarning)
-    app()
+    try:
+        app()
+    finally:
+        gc.freeze()  # or Python would search all that is left for cycles before it ends, for half a second

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes .venv, installs the project with all its extras, and compiles its kernels; does nothing the second time.
+# Makes .venv, installs the project with all its extras, compiles kernels and bytecode; does nothing the second time.
 # usage: bash scripts/setup.sh [--dev]
 #   --dev   adds what the tests need
 set -euo pipefail
@@ -134,7 +134,7 @@ compile_kernels() {
   fi
 }
 
-# Most of what the wheels bring is never imported, so Python compiles it when it is.
+# Most of what the wheels bring is never imported; the bytecode of what is, mapper doctor --warm keeps.
 install() {
   "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile "$@" >&2
   install_missing_libraries
@@ -148,7 +148,7 @@ if [ "$(cat "$stamp" 2>/dev/null)" != "$want" ]; then
   fi
   say "installing the project"
   install --editable .
-  [ -z "$stale" ] || compile_kernels &
+  compile_kernels &
   say "installing its extras [$extra]"
   install "octree-mapper[$extra]"
   wait

@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,9 +17,6 @@ Points32 = NDArray[np.float32]
 """(N, 3) float32 metres: within a kilometre of the sensor the rounding is below 0.1 mm."""
 
 NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
-
-# OpenCV's own five iterations leave 0.1 px of error in the corners of TUM's freiburg1.
-_UNDISTORT_UNTIL = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +58,16 @@ class PinholeCamera:
         ideal: Array = np.asarray(pixels, dtype=np.float64)
         if self.distortion == NO_DISTORTION or len(ideal) == 0:
             return ideal
+        import cv2  # here and below: a run is read without images
+
+        # Its own five iterations leave 0.1 px of error in the corners of TUM's freiburg1.
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
         ideal = cv2.undistortPoints(
             ideal.reshape(-1, 1, 2),
             self.matrix,
             np.array(self.distortion),
             P=self.matrix,
-            criteria=_UNDISTORT_UNTIL,
+            criteria=criteria,
         ).reshape(-1, 2)
         return ideal
 
@@ -75,6 +75,8 @@ class PinholeCamera:
         """Return the (N, 2) positions of undistorted pixels in the raw image: inverse of ``undistort``."""
         if self.distortion == NO_DISTORTION or len(pixels) == 0:
             return pixels
+        import cv2
+
         rays = (pixels - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
         points_camera = np.column_stack([rays, np.ones(len(rays))])
         measured, _ = cv2.projectPoints(
@@ -189,6 +191,8 @@ class RgbdFrame:
         """(H, W) uint8 luminance."""
         if self.image.ndim == 2:
             return self.image
+        import cv2
+
         gray: Image = cv2.cvtColor(self.image, cv2.COLOR_RGB2GRAY)
         return gray
 

@@ -17,6 +17,7 @@ _MACHINE: tuple[Callable[[], Finding], ...] = (
     machine.look_at_memory,
     machine.look_at_disk,
     machine.look_at_kernels,
+    machine.look_at_bytecode,
     look_at_system_libraries,
 )
 

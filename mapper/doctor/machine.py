@@ -1,4 +1,4 @@
-"""Checks of the machine: interpreter, C library, processors, memory, disk, a place for compiled code."""
+"""Checks of the machine: interpreter, C library, processors, memory, disk, places for compiled code."""
 
 import os
 import platform
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import mapper
 from mapper.doctor.finding import Finding
+from mapper.runtime.bytecode import has_bytecode
 
 _LEAST_PYTHON = (3, 11)
 _LEAST_GLIBC = (2, 35)
@@ -79,6 +80,17 @@ def look_at_disk() -> Finding:
     if min(free_gb.values()) < _LEAST_DISK_GB:
         return Finding("disk", "warning", text, "make room, or choose an --out and a TMPDIR elsewhere")
     return Finding("disk", "well", text)
+
+
+def look_at_bytecode() -> Finding:
+    """Return whether the next start need not compile Python's own modules and numpy's again."""
+    modules = [module for name, module in sys.modules.items() if name.split(".")[0] in ("mapper", "numpy")]
+    missing = sum(not has_bytecode(module) for module in modules)
+    if not missing:
+        return Finding("bytecode", "well", "kept")
+    why = ": PYTHONDONTWRITEBYTECODE is set" if sys.dont_write_bytecode else ""
+    text = f"{missing} of {len(modules)} modules are compiled at every start{why}"
+    return Finding("bytecode", "warning", text, "mapper doctor --warm keeps them, and halves the start")
 
 
 def look_at_kernels() -> Finding:

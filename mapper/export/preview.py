@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -12,13 +13,15 @@ from mapper.core.errors import FrameError, WriteError
 from mapper.core.geometry import Array, Transform, apply
 from mapper.export.palette import ESTIMATE, FREE_CELL, OCCUPIED_CELL, START, Rgb
 from mapper.features.frame_view import ImageView
-from mapper.mapping.fusion import Maps
 from mapper.mapping.levelling import AXES
-from mapper.run.folder import Run
 from mapper.run.observers import Step
-from mapper.run.results import RunResults
 from mapper.runtime.atomic import atomic_file
 from mapper.sources.base import Log
+
+if TYPE_CHECKING:  # a build begins without what its end needs
+    from mapper.mapping.fusion import Maps
+    from mapper.run.folder import Run
+    from mapper.run.results import RunResults
 
 PREVIEW = "preview.png"
 
@@ -89,7 +92,7 @@ class Preview:
     def on_levelled(self, T_level_world: Transform, /) -> None:
         """Ignore the world."""
 
-    def on_mapped(self, run: Run, results: RunResults, maps: Maps, /) -> None:  # noqa: ARG002
+    def on_mapped(self, run: "Run", results: "RunResults", maps: "Maps", /) -> None:  # noqa: ARG002
         """Remove the picture: the run has better ones now."""
         self._path.unlink(missing_ok=True)
 

@@ -6,8 +6,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from mapper.core.geometry import Array, Transform, adjoint, inverse, log
 from mapper.graph.model import BetweenFactor
@@ -98,6 +96,9 @@ def _spanning_tree(factors: Sequence[BetweenFactor], others: Iterable[int]) -> _
 
     Other nodes, without factors, are trees of their own.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree  # takes half a second
+
     places = {node: _root(node) for node in others}
     if not factors:
         return _Tree(places)

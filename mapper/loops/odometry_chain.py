@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from mapper.core.geometry import Array, adjoint, inverse, rotation_log
 from mapper.graph.model import BetweenFactor
@@ -90,6 +88,9 @@ class OdometryChain:
 
     def connected(self, node: int, others: Sequence[int]) -> NDArray[np.bool_]:
         """Return which of (N,) other nodes a path connects to a node."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components  # takes half a second
+
         ends = np.array([self._ends_i, self._ends_j], np.intp)
         size = 1 + max(node, *others, int(ends.max(initial=0)))
         _, labels = connected_components(

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Points
@@ -172,6 +171,8 @@ def covered(region: Region, points_world: Points, path_world: Points) -> Mask:
     if region.polygon_m is not None:
         inside &= _in_polygon(points_world, np.array(region.polygon_m))
     if region.path_radius_m is not None:
+        from scipy.spatial import cKDTree  # takes half a second
+
         path = cKDTree(path_world[:, :2])
         distance_m, _ = path.query(points_world, distance_upper_bound=region.path_radius_m)
         inside &= np.isfinite(distance_m)

@@ -22,7 +22,6 @@ from mapper.pipeline.checkpoints import (
     remove_checkpoints,
 )
 from mapper.pipeline.components import largest_component
-from mapper.pipeline.fuse import fuse_into
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import (
     TrackingResult,
@@ -128,6 +127,8 @@ def build(
         with writer.clock.stage("solve"):
             save_solved(writer, from_tracking(tracking, source.truth))
             save_places(writer, tracking)
+        from mapper.pipeline.fuse import fuse_into  # what it loads would delay the first frame
+
         level = solved.level
         writer.update(
             solve=solved.report,

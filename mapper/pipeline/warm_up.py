@@ -1,4 +1,4 @@
-"""Compilation of the kernels before the first build: numba keeps what a tiny build of a log compiles."""
+"""Compilation before the first build: kernels, which numba keeps, and bytecode of what a build imports."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -11,6 +11,7 @@ import numpy as np
 
 from mapper.core.errors import DependencyError
 from mapper.doctor.machine import compiled_kernels, processors
+from mapper.runtime.bytecode import keep_bytecode
 from mapper.runtime.executor import Workers, make_executor, run_jobs
 from mapper.runtime.progress import SILENT, Progress, Report
 from mapper.runtime.worker_process import Failure
@@ -24,7 +25,7 @@ def compile_kernels(*, progress: Progress = SILENT) -> None:
     """Compile every kernel that builds of RGB-D and LiDAR logs use by default.
 
     Two processes, where there are two processors, render and build a second of a synthetic log of each
-    sensor. Code that is compiled already is kept.
+    sensor. Code that is compiled already is kept. What the builds have imported keeps its bytecode, too.
 
     Raises:
         DependencyError: A build failed, as it does where the compiled code cannot be kept.
@@ -52,6 +53,7 @@ def _build_rgbd(folder: Path) -> None:
     write_tum_log(folder / "log", SynthConfig(duration_s=1.0, width_px=320, height_px=240))
     _build(folder, "run")
     _build(folder, "short", "odometry.readout_s=0.03", "source.last_frame=9")  # found only in longer logs
+    keep_bytecode()
 
 
 def _build_lidar(folder: Path) -> None:
@@ -60,6 +62,7 @@ def _build_lidar(folder: Path) -> None:
 
     write_lidar_log(folder / "log", LidarSynthConfig(duration_s=1.0))
     _build(folder, "run")
+    keep_bytecode()
 
 
 def _build(folder: Path, name: str, *overrides: str) -> None:

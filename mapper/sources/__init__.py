@@ -16,7 +16,7 @@ __all__ = ["open_source"]
 # The first that recognises a path reads it. Images of ICL-NUIM and Poznań are numbered too, so these come
 # before numbered images; any log's folder may have clouds in it, so clouds come last.
 _FORMATS = ("icl_nuim", "tum", "mbag", "poznan", "numbered", "kitti", "ros.files", "clouds")
-"""Modules, imported when a log is opened: settings are in this folder too, which most verbs read alone."""
+"""Modules, imported one after the other when a log is opened, until one recognises it."""
 _DEFAULTS = SourceConfig()
 
 
@@ -39,8 +39,8 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
         raise SourceError(f"{path}: no such file or folder")
     if not (path.is_dir() or path.is_file()):
         raise SourceError(f"{path}: a device or a pipe; want a file or a folder")
-    formats = {name: import_module(f"mapper.sources.{name}") for name in _FORMATS}
-    for name, log_format in formats.items():
+    for name in _FORMATS:
+        log_format = import_module(f"mapper.sources.{name}")
         if log_format.recognise(path):
             if config.body_frame is not None and name != "ros.files":
                 raise SourceError(
@@ -52,5 +52,5 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
                 wheels, notes = read_wheels(path, config.wheels, sensor=log.sensor)
                 log = replace(log, wheels=wheels, notes=[*log.notes, *notes])
             return selected(log, config)
-    looked_for = "; ".join(log_format.LOOKED_FOR for log_format in formats.values())
+    looked_for = "; ".join(import_module(f"mapper.sources.{name}").LOOKED_FOR for name in _FORMATS)
     raise SourceError(f"{path}: not a log of a known format; looked for {looked_for}")

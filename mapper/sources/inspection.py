@@ -10,6 +10,7 @@ from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import Frame, PinholeCamera, RgbdFrame, Scan, Sensor
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
 from mapper.core.trajectory import Trajectory
+from mapper.runtime.ordered_map import ordered_map
 from mapper.sources import open_source
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
@@ -26,6 +27,8 @@ _GAP_PERIODS = 3.0
 """Median periods that a pause must exceed to be a gap."""
 _MOST_LOADED = 200
 """Frames of an RGB-D log that are loaded, evenly spread: a second or two of reading, whatever its length."""
+_WORKERS = 2
+"""Threads; what decodes images releases the interpreter's lock."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,13 +221,16 @@ def _damage(checks: ReadingChecks) -> Iterator[str]:
 
 def _unreadable(log: Log, indices: Iterable[int]) -> list[str]:
     """Load some frames and return why others cannot be loaded."""
-    reasons = []
-    for index in indices:
+
+    def reason(index: int) -> str | None:
         try:
             log.entry_at(index).load(colour=False)
         except FrameError as error:
-            reasons.append(str(error))
-    return reasons
+            return str(error)
+        return None
+
+    reasons = ordered_map(reason, indices, workers=_WORKERS)
+    return [why for why in reasons if why is not None]
 
 
 def _truth_text(truth: Trajectory, stamps_ns: Stamps) -> str:

@@ -47,9 +47,10 @@ def read_tum(path: Path) -> Trajectory:
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write TUM text with exact stamps and every digit of the poses."""
     lines = ["# timestamp tx ty tz qx qy qz qw"]
-    for stamp_ns, T in zip(trajectory.stamps_ns, trajectory.T_world_body, strict=True):
-        values = [*T[:3, 3], *quaternion_from_rotation(T[:3, :3])]
-        lines.append(" ".join([seconds_text_from_ns(int(stamp_ns)), *(repr(float(v)) for v in values)]))
+    quaternions = quaternion_from_rotation(trajectory.T_world_body[:, :3, :3])
+    rows = np.column_stack([trajectory.positions_world, quaternions])
+    for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), rows.tolist(), strict=True):
+        lines.append(" ".join([seconds_text_from_ns(stamp_ns), *map(repr, row)]))
     write_text(path, "\n".join(lines) + "\n")
 
 

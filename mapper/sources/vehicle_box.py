@@ -5,9 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import Sensor
@@ -61,7 +58,7 @@ def vehicle_box(log: Log) -> Box | None:
     clouds = _clouds(log, scale)
     if len(clouds) < _MIN_FRAMES:
         return None
-    cells, standing = _counted(clouds, scale.cell_m)
+    cells, standing = _counted(clouds, scale)
     range_m = np.linalg.norm((cells + 0.5) * scale.cell_m, axis=1)
     still = standing >= _MIN_STANDING_RATIO
     far = range_m > scale.vehicle_m
@@ -112,15 +109,23 @@ def _ground_m(heights_m: Array) -> float:
     return float(edges_m[int(counts.argmax())]) + 0.05
 
 
-def _counted(clouds: list[Points], cell_m: float) -> tuple[NDArray[np.int64], Array]:
+def _counted(clouds: list[Points], scale: _Scale) -> tuple[NDArray[np.int64], Array]:
     """Return the (C, 3) cells with returns, and the share of the clouds that have some in each."""
-    of_each = [np.unique(np.floor(points / cell_m).astype(np.int64), axis=0) for points in clouds]
-    cells, counts = np.unique(np.concatenate(of_each), axis=0, return_counts=True)
-    return cells, counts / len(clouds)
+    reach = int(scale.around_m / scale.cell_m) + 1
+    counts = np.zeros((2 * reach + 1,) * 3, np.int64)
+    for points in clouds:
+        seen = np.zeros(counts.shape, np.bool_)
+        seen[tuple((np.floor(points / scale.cell_m).astype(np.int64) + reach).T)] = True
+        counts += seen
+    return np.argwhere(counts) - reach, counts[counts > 0] / len(clouds)
 
 
 def _joined(cells: NDArray[np.int64]) -> NDArray[np.intp]:
     """Return the (C,) number of the group of each cell; at most one empty cell lies between its members."""
+    from scipy.sparse import coo_array  # these take half a second, and seldom does anything stand still
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
     pairs = cKDTree(cells).query_pairs(2.0, p=np.inf, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs), np.bool_), pairs.T), shape=(len(cells), len(cells)))
     _, labels = connected_components(graph, directed=False)

@@ -112,6 +112,17 @@ def test_a_cache_that_cannot_be_written_fails(monkeypatch, tmp_path):
     assert (finding.verdict, "NUMBA_CACHE_DIR" in finding.remedy) == ("failed", True)
 
 
+def test_modules_that_each_start_compiles_are_a_warning(monkeypatch):
+    monkeypatch.setattr(machine, "has_bytecode", lambda _module: True)
+    assert machine.look_at_bytecode().verdict == "well"
+
+    monkeypatch.setattr(machine, "has_bytecode", lambda module: module.__name__ != "numpy.linalg")
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    finding = machine.look_at_bytecode()
+    assert (finding.verdict, finding.detail[:5]) == ("warning", "1 of ")
+    assert finding.detail.endswith("PYTHONDONTWRITEBYTECODE is set")
+
+
 def test_threads_of_the_libraries_own_are_a_warning(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     assert machine.look_at_threads().verdict == "well"
@@ -139,7 +150,7 @@ def test_the_verb_fails_when_a_library_does(monkeypatch, as_json):
     result = invoke("doctor", *(["--json"] if as_json else []))
 
     assert result.exit_code == 1
-    assert result.stderr.splitlines()[-1] == "mapper: doctor: 1 of 9 failed: no-such-library"
+    assert result.stderr.splitlines()[-1] == "mapper: doctor: 1 of 10 failed: no-such-library"
     if as_json:
         verdicts = {told["name"]: told["verdict"] for told in json.loads(result.stdout)["findings"]}
         assert (verdicts["zstandard"], verdicts["no-such-library"]) == ("well", "failed")

@@ -39,10 +39,13 @@ def test_both_sensors_logs_are_built(monkeypatch):
         built.append(sorted(path.name for path in (folder / name).iterdir()))
 
     monkeypatch.setattr(warm_up, "_build", build_and_note)
+    kept = []
+    monkeypatch.setattr(warm_up, "keep_bytecode", lambda: kept.append(len(built)))
     progress = Counts()
     compile_kernels(progress=progress)
     assert all("map.octree" in files for files in built)
     assert len(built) == 3
+    assert kept == [2, 3]  # after the builds of each sensor, which import what is kept
     assert progress.reported[-1] == (KERNELS, KERNELS)
 
 
