@@ -28,7 +28,7 @@ from mapper.core.deskew import deskewed, twist_at
 from mapper.core.timebase import nearest
 from mapper.core.trajectory import Trajectory
 from mapper.merging.merge import merge
-from mapper.merging.placing import as_built
+from mapper.merging.placing import Placing, as_built
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import read_octree
@@ -134,7 +134,7 @@ def copied(runs: list[Run], folder: Path, *, copies: int) -> tuple[list[Run], Pa
 
 def print_costs(runs: list[Run], folder: Path) -> None:
     """Print bytes per area, seconds per job and what two processes gain."""
-    found = merge(as_built(runs), folder / "map", overwrite=True)
+    found = merge(Placing(as_built(runs)), folder / "map", overwrite=True)
     manifest, area_km2 = found.map.manifest, found.map.manifest.area_km2
     sizes = {"tiles": sum(path.stat().st_size for path in (found.map.path / "tiles").iterdir())}
     sizes |= {name: (found.map.path / name).stat().st_size for name in ("map.ot", "map.bt", "slice.pgm")}

@@ -63,7 +63,7 @@ def diff(
     earlier, later = open_run(before), open_run(after)
     progress = output.progress()
     out = place_of(out, DIFFS / joined_names([before, after]), overwrite=overwrite)
-    placing = placing_of([earlier, later], place, poses, progress=progress)
+    placing = placing_of([earlier, later], place, poses, jointly=False, progress=progress)
     found = differences_of(*placing.placed, tolerance_m=tolerance_m, min_voxels=min_voxels)
     placed = placing.placed[-1].how
     write_differences(out, found, earlier, later, placed=placed, overwrite=overwrite)

@@ -14,6 +14,7 @@ from mapper.cli.placing import Place, PosesFile, placing_of
 
 if TYPE_CHECKING:
     from mapper.merging.merge import Merged
+    from mapper.merging.merged_map import RunInMap
 
 
 def merge(
@@ -28,8 +29,8 @@ def merge(
         Place,
         typer.Option(
             help="built: every run's world is the map's already. "
-            "truth: the runs' truths share a frame. auto: by places that the runs share; those that share "
-            "none are left out. By truth and auto the first run's world is the map's."
+            "truth: the runs' truths share a frame. auto: by places that the runs share, in one pose graph; "
+            "those that share none are left out. By truth and auto the first run's world is the map's."
         ),
     ] = Place.BUILT,
     poses: PosesFile = None,
@@ -49,7 +50,9 @@ def merge(
 ) -> Answer:
     """Add up the octrees of many runs tile by tile, out of core: map.bt, map.ot, the slice, and the tiles.
 
-    A merge that was stopped goes on where it was: give the same command again.
+    With --place auto, runs bend where the others show that they drifted, and their maps are made again there
+    from their logs; the run folders stay as they are. A merge that was stopped goes on where it was: give the
+    same command again.
 
     Example: mapper merge runs/monday runs/tuesday --out maps/campus --processes 2, or: mapper merge runs/*
     --out maps/city --place truth --scheduler tcp://10.0.0.1:8786
@@ -61,11 +64,10 @@ def merge(
     prepare_libraries()
     progress = output.progress()
     out = out or MAPS / joined_names(runs)
-    placing = placing_of([open_run(run) for run in runs], place, poses, progress=progress)
+    placing = placing_of([open_run(run) for run in runs], place, poses, jointly=True, progress=progress)
     merged = merge_runs(
-        placing.placed,
+        placing,
         out,
-        notes=placing.notes,
         tile_m=tile_m,
         workers=workers,
         progress=progress,
@@ -74,6 +76,8 @@ def merge(
     document = {
         "path": merged.map.path,
         "runs": merged.map.manifest.runs,
+        "ties": merged.map.manifest.ties,
+        "left_out": merged.map.manifest.left_out,
         "summary": merged.map.manifest.summary,
         "worker_s": {name: sum(cost.seconds for cost in of) for name, of in merged.costs.items()},
         "shuffle_bytes": merged.shuffle_bytes,
@@ -81,14 +85,24 @@ def merge(
     return Answer(document, _summary(merged))
 
 
+def _bent(run: "RunInMap") -> str:
+    """Return how far the joint graph has moved a run's map within its world."""
+    from mapper.evaluators.tables.table import MISSING
+
+    if run.first_node is None:
+        return MISSING
+    return f"{run.moved_m:.2g} m" + (", fused again" if run.fused_again else "")
+
+
 def _summary(merged: "Merged") -> str:
     from mapper.evaluators.tables.table import MISSING, Column, text_table
 
     manifest = merged.map.manifest
-    records = [{**run.model_dump(), "name": Path(run.path).name} for run in manifest.runs]
+    records = [{**run.model_dump(), "name": Path(run.path).name, "bent": _bent(run)} for run in manifest.runs]
     columns = [
         Column("name", "run"),
         Column("placed", "placed"),
+        Column("bent", "bent"),
         Column("voxels", "voxels"),
         Column("shared_voxels", "known before"),
         Column("agreement", "walls alike", lambda share: MISSING if share is None else f"{share:.0%}"),

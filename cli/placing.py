@@ -29,13 +29,22 @@ PosesFile = Annotated[
 ]
 
 
-def placing_of(runs: "Sequence[Run]", place: Place, poses: Path | None, *, progress: "Progress") -> "Placing":
+def placing_of(
+    runs: "Sequence[Run]", place: Place, poses: Path | None, *, jointly: bool, progress: "Progress"
+) -> "Placing":
     """Return the runs with the poses of their worlds.
+
+    Args:
+        runs: To be placed.
+        place: Source of the poses.
+        poses: File of them.
+        jointly: Whether shared places bend the runs, or place each as a rigid body.
+        progress: Receives stages and notes.
 
     Raises:
         ConfigError: Two sources of the poses are given.
         MapperError: A pose is missing; see :mod:`mapper.merging.placing` and
-            :func:`mapper.pipeline.place_runs.place_by_shared_places`.
+            :mod:`mapper.pipeline.place_runs`.
     """
     from mapper.core.errors import ConfigError
     from mapper.merging.placing import Placing, as_built, by_poses, by_truth
@@ -50,8 +59,9 @@ def placing_of(runs: "Sequence[Run]", place: Place, poses: Path | None, *, progr
         case Place.TRUTH:
             return Placing(by_truth(runs))
         case Place.AUTO:
-            from mapper.pipeline.place_runs import place_by_shared_places
+            from mapper.pipeline.place_runs import place_by_shared_places, place_jointly
 
-            return place_by_shared_places(runs, progress=progress)
+            by_places = place_jointly if jointly else place_by_shared_places
+            return by_places(runs, progress=progress)
         case _:
             assert_never(place)

@@ -18,6 +18,9 @@ from mapper.runtime.regular_files import read_text
 ProposedBy = Literal["places", "scans", "nearby", "hand"]
 Verdict = Literal["accepted", "rejected"]
 
+MIN_WEIGHT = 0.5
+"""A loop with less weight in the solution is rejected, and is no factor of the solved graph."""
+
 
 @dataclass(frozen=True, slots=True)
 class Discrepancy:

@@ -2,14 +2,14 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, NamedTuple
 
 import numpy as np
 
 from mapper.core.geometry import Transform
-from mapper.loops.base import Place, Proposer, Verifier
-from mapper.loops.closure import Discrepancy, discrepancy, exceeds
+from mapper.loops.base import Place, Proposal, Proposer, Verifier, verify_proposal
+from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy, exceeds
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.factory import build_similarity_proposer, build_verifier
 from mapper.loops.map_constraints import KnownPlaces
@@ -31,6 +31,8 @@ class SharedPlace:
         T_first_place: (4, 4) pose of the place in the earlier run's world.
         T_first_body: (4, 4) pose of the keyframe in the earlier run's world, as measured.
         T_second_body: (4, 4) the same in its own run's world.
+        loop: The measurement, accepted; i is the place's node in the earlier run, j that of the keyframe in
+            its own.
     """
 
     first: int
@@ -38,12 +40,28 @@ class SharedPlace:
     T_first_place: Transform
     T_first_body: Transform
     T_second_body: Transform
+    loop: LoopClosure
+
+
+def shared_place(
+    first: int,
+    second: int,
+    loop: LoopClosure,
+    T_first_node: Mapping[int, Transform],
+    T_second_node: Mapping[int, Transform],
+) -> SharedPlace:
+    """Return the place of an accepted loop between two runs, whose nodes have these poses."""
+    assert loop.T_i_j is not None  # it was accepted
+    T_first_place = T_first_node[loop.i]
+    T_first_body = T_first_place @ loop.T_i_j
+    return SharedPlace(first, second, T_first_place, T_first_body, T_second_node[loop.j], loop)
 
 
 def find_shared_places(
     runs: Sequence[KnownPlaces[Any]],
     config: PlaceLoopsConfig | ScanLoopsConfig,
     *,
+    searched: int = 0,
     progress: Progress = SILENT,
 ) -> list[SharedPlace]:
     """Return the places of runs that were recognised in earlier ones, as measured: some may be false.
@@ -54,6 +72,7 @@ def find_shared_places(
     Args:
         runs: Their places, each in its own world; one run may have none.
         config: How places are proposed and verified.
+        searched: So many of the first runs are not searched in each other: what they share is known.
         progress: Receives how many runs are done.
 
     Raises:
@@ -70,7 +89,7 @@ def find_shared_places(
     found = list[SharedPlace]()
     with progress.stage("places") as report:
         for number, run in enumerate(runs):
-            found += search.add(run)
+            found += search.add(run, is_searched=number >= searched)
             report(number + 1, len(runs))
     return found
 
@@ -84,12 +103,14 @@ class _Candidate(NamedTuple):
         dissimilarity: Similarity with its sign changed.
         node: Of the keyframe.
         place: Number of the earlier run's place in the index.
+        proposal: Of that place.
     """
 
     rank: int
     dissimilarity: float
     node: int
     place: int
+    proposal: Proposal
 
 
 class _Search(Generic[Place]):
@@ -107,41 +128,37 @@ class _Search(Generic[Place]):
         self._runs: list[KnownPlaces[Place]] = []
         self._known: list[tuple[int, int]] = []
 
-    def add(self, run: KnownPlaces[Place]) -> Iterator[SharedPlace]:
-        """Add a run; yield its keyframes that were measured from places of earlier ones."""
-        number, candidates = len(self._runs), self._candidates(run)
+    def add(self, run: KnownPlaces[Place], *, is_searched: bool) -> Iterator[SharedPlace]:
+        """Add a run; if it is searched, yield its keyframes that were measured from earlier runs' places."""
+        number, candidates = len(self._runs), self._candidates(run, is_searched=is_searched)
         self._runs.append(run)
         for candidate in candidates:
             node = candidate.node
-            first, place = self._known[candidate.place]
+            first, place = self._known[candidate.proposal.node]
             earlier = self._runs[first]
-            measured = self._verifier.verify(earlier.places[place], run.places[node])
-            if measured.reason or measured.T_i_j is None:
-                continue
-            T_first_place = earlier.T_map_node[place]
-            yield SharedPlace(
-                first, number, T_first_place, T_first_place @ measured.T_i_j, run.T_map_node[node]
-            )
+            proposal = replace(candidate.proposal, node=place)
+            loop = verify_proposal(proposal, node, earlier.places[place], run.places[node], self._verifier)
+            if loop.verdict == "accepted":
+                yield shared_place(first, number, loop, earlier.T_map_node, run.T_map_node)
 
-    def _candidates(self, run: KnownPlaces[Place]) -> list[_Candidate]:
+    def _candidates(self, run: KnownPlaces[Place], *, is_searched: bool) -> list[_Candidate]:
         """Return the pairs of places to be compared, and add the run's places."""
         before, number, last = len(self._known), len(self._runs), None
         candidates = list[_Candidate]()
         for node, place in run.places.items():
-            if last is None or self._has_moved(run.T_map_node, last, node):
+            if is_searched and (last is None or self._has_moved(run.T_map_node, last, node)):
                 last = node
                 ranks = Counter[int]()
                 for proposal in self._proposer.propose(node, place, before=before, limit=_MOST_SIMILAR):
                     first, _ = self._known[proposal.node]
-                    candidates.append(
-                        _Candidate(ranks[first], -(proposal.similarity or 0.0), node, proposal.node)
-                    )
+                    rank = ranks[first], -(proposal.similarity or 0.0), node, proposal.node
+                    candidates.append(_Candidate(*rank, proposal))
                     ranks[first] += 1
             self._proposer.add(len(self._known), place)
             self._known.append((number, node))
         compared, chosen = Counter[int](), list[_Candidate]()
         for candidate in sorted(candidates):
-            first, _ = self._known[candidate.place]
+            first, _ = self._known[candidate.proposal.node]
             if compared[first] < _MAX_COMPARED_IN_RUN:
                 compared[first] += 1
                 chosen.append(candidate)

@@ -22,7 +22,7 @@ from mapper.navigation.traversable import traversable
 from mapper.octree.casting import Caster, depth_limit_of, reach_m
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
-from mapper.octree.moving_objects import remove_moving_objects
+from mapper.octree.moving_objects import MovingObjects, remove_moving_objects
 from mapper.octree.scan_update import ScanUpdate, pack
 from mapper.octree.scan_update_file import CachedUpdate, ScanUpdateFile, ScanUpdateWriter, cache_update
 from mapper.octree.slice import OccupancyGrid, cut_slice
@@ -160,44 +160,21 @@ def fuse_log(
         DataError: The edits leave nothing of the map, or nothing in the height of the slice.
     """
     octree, cloud = OctreeMap(config.octree), CloudBuilder(config.cloud.voxel_m)
-    casters, depth_limit, moved, unreached = _Casters(config.octree), depth_limit_of(config.octree), 0, 0
-
-    def prepare(job: _Job) -> _Fused:
-        return _prepared(job, config, casters.caster)
-
-    if before is not None and (config.octree.attributes or not before.holds_for(config.octree)):
-        before = None  # updates have no colours
-    prepared = ordered_map(prepare, _jobs(source, trajectory, config, before), workers=config.workers)
-    with progress.stage("fuse") as report:
-        for done, fused in enumerate(prepared, start=1):
-            report(done, len(trajectory))
-            if fused.update is None or fused.cached is None:
-                progress.note(f"not fused: {fused.reason}")
-                continue
-            if fused.scan is not None and config.octree.attributes:
-                octree.insert(fused.scan, fused.job.T_world_body)
-            else:
-                octree.merge(fused.update)
-            after.add(fused.cached)
-            moved += fused.job.cached is None
-            unreached += fused.unreached
-            if fused.scan is not None and fused.job.feeds_cloud:
-                scan = fused.scan if depth_limit is None else depth_limit.split(fused.scan)[0]
-                _add_to_cloud(cloud, scan, fused.job.T_world_body)
-            if fused.snapshot is not None:
-                on_snapshot(fused.snapshot)
-    if unreached:
-        progress.note(
-            f"{unreached} points lie farther than {reach_m(config.octree.resolution_m):g} m from the map's "
-            f"origin, beyond the reach of {config.octree.resolution_m:g} m voxels; left out"
-        )
-    if before is not None:
-        progress.note(f"fused again: {moved} of {len(trajectory)} frames, which had moved or were not known")
+    _add_scans(
+        octree,
+        source,
+        trajectory,
+        config,
+        progress=progress,
+        cloud=cloud,
+        on_snapshot=on_snapshot,
+        before=before,
+        after=after,
+    )
     points_world, colors = cloud.points_and_colors()
     moving = np.zeros(len(points_world), np.bool_)
     if config.octree.moving == "removed":
-        with after.reopened() as written:
-            objects = remove_moving_objects(octree, partial(_updates, written, config.workers))
+        objects = _without_moving_objects(octree, config, after)
         moving = objects.contain(points_world)
         progress.note(f"moving objects: {moving.sum()} of {len(moving)} points of the cloud")
     editor = MapEditor(edits, trajectory.positions_world, config.traversable.head_room_m)
@@ -232,6 +209,95 @@ def fuse_log(
     )
 
 
+def fuse_octree(
+    source: Log,
+    trajectory: Trajectory,
+    config: FuseSettings,
+    *,
+    progress: Progress,
+    before: ScanUpdateFile | None,
+    after: ScanUpdateWriter,
+    edits: Edits = _NO_EDITS,
+) -> OctreeMap:
+    """Return the octree of ``fuse_log`` alone; frames whose cached update still holds are not read.
+
+    Raises:
+        DataError: The edits leave nothing of the map.
+    """
+    octree = OctreeMap(config.octree)
+    _add_scans(octree, source, trajectory, config, progress=progress, before=before, after=after)
+    if config.octree.moving == "removed":
+        _without_moving_objects(octree, config, after)
+    editor = MapEditor(edits, trajectory.positions_world, config.traversable.head_room_m)
+    editor.erase(octree)
+    editor.crop(octree)
+    octree.drop_unknown()
+    return octree
+
+
+def _add_scans(
+    octree: OctreeMap,
+    source: Log,
+    trajectory: Trajectory,
+    config: FuseSettings,
+    *,
+    progress: Progress,
+    before: ScanUpdateFile | None,
+    after: ScanUpdateWriter,
+    cloud: CloudBuilder | None = None,
+    on_snapshot: Callable[[Snapshot | ScanSnapshot], None] | None = None,
+) -> None:
+    """Add every frame of the trajectory to the octree, and to the cloud and the log where there are any."""
+    casters, depth_limit, moved, unreached = _Casters(config.octree), depth_limit_of(config.octree), 0, 0
+
+    def prepare(job: _Job) -> _Fused:
+        return _prepared(job, config, casters.caster)
+
+    if before is not None and (config.octree.attributes or not before.holds_for(config.octree)):
+        before = None  # updates have no colours
+    jobs = _jobs(
+        source,
+        trajectory,
+        config,
+        before,
+        cloud_stride=0 if cloud is None else config.cloud.frame_stride,
+        log_stride=0 if on_snapshot is None else config.mcap.image_stride,
+    )
+    prepared = ordered_map(prepare, jobs, workers=config.workers)
+    with progress.stage("fuse") as report:
+        for done, fused in enumerate(prepared, start=1):
+            report(done, len(trajectory))
+            if fused.update is None or fused.cached is None:
+                progress.note(f"not fused: {fused.reason}")
+                continue
+            if fused.scan is not None and config.octree.attributes:
+                octree.insert(fused.scan, fused.job.T_world_body)
+            else:
+                octree.merge(fused.update)
+            after.add(fused.cached)
+            moved += fused.job.cached is None
+            unreached += fused.unreached
+            if fused.scan is not None and cloud is not None and fused.job.feeds_cloud:
+                scan = fused.scan if depth_limit is None else depth_limit.split(fused.scan)[0]
+                _add_to_cloud(cloud, scan, fused.job.T_world_body)
+            if fused.snapshot is not None and on_snapshot is not None:
+                on_snapshot(fused.snapshot)
+    if unreached:
+        progress.note(
+            f"{unreached} points lie farther than {reach_m(config.octree.resolution_m):g} m from the map's "
+            f"origin, beyond the reach of {config.octree.resolution_m:g} m voxels; left out"
+        )
+    if before is not None:
+        progress.note(f"fused again: {moved} of {len(trajectory)} frames, which had moved or were not known")
+
+
+def _without_moving_objects(
+    octree: OctreeMap, config: FuseSettings, written: ScanUpdateWriter
+) -> MovingObjects:
+    with written.reopened() as updates:
+        return remove_moving_objects(octree, partial(_updates, updates, config.workers))
+
+
 def _updates(written: ScanUpdateFile, workers: int) -> Iterator[ScanUpdate]:
     return ordered_map(CachedUpdate.update, written.entries(), workers=workers)
 
@@ -244,10 +310,15 @@ class _Casters(threading.local):
 
 
 def _jobs(
-    source: Log, trajectory: Trajectory, config: FuseSettings, before: ScanUpdateFile | None
+    source: Log,
+    trajectory: Trajectory,
+    config: FuseSettings,
+    before: ScanUpdateFile | None,
+    *,
+    cloud_stride: int,
+    log_stride: int,
 ) -> Iterator[_Job]:
     index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
-    image_stride = config.mcap.image_stride
     for entry in source.entries():
         index = index_of.get(entry.stamp_ns)
         if index is not None:
@@ -261,8 +332,8 @@ def _jobs(
                 T_world_body,
                 STILL if source.sensor == "rgbd" else twist_at(trajectory, index),
                 cached,
-                feeds_cloud=index % config.cloud.frame_stride == 0,
-                feeds_log=image_stride > 0 and index % image_stride == 0,
+                feeds_cloud=cloud_stride > 0 and index % cloud_stride == 0,
+                feeds_log=log_stride > 0 and index % log_stride == 0,
             )
 
 

@@ -1,10 +1,11 @@
-"""Jobs of a merge: cut a run's map into tiles, sum a tile, slice a column of tiles.
+"""Jobs of a merge: fuse a run that has moved, cut its map into tiles, sum a tile, slice a column of tiles.
 
 Each reads files, writes files and returns a few numbers, so it can run on any machine that sees them. A job
 that is run again writes the same files again.
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 
 from mapper.core.config import Config
 from mapper.core.geometry import Transform, inverse
+from mapper.core.trajectory import Trajectory
+from mapper.mapping.fusion import fuse_octree
 from mapper.merging.merged_map import TILES
 from mapper.merging.tiling import Tiling
 from mapper.octree.attributes import UNSET
@@ -24,10 +27,19 @@ from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import read_octree
 from mapper.octree.resampling import blocks_reached, resampled
+from mapper.octree.scan_update_file import ScanUpdateWriter, open_scan_updates
 from mapper.octree.slice import see_band
 from mapper.octree.summing import Overlap
 from mapper.octree.tree import children_in, nodes_in_preorder, words_in_preorder
+from mapper.run.edits_file import edits_text, parse_edits
+from mapper.run.folder import open_run
 from mapper.runtime.atomic import atomic_file, write_bytes
+from mapper.runtime.progress import SILENT
+
+
+def stays_within_m(config: OctreeConfig) -> float:
+    """Return how far the ends of a frame's rays may move before it is fused again: half a voxel."""
+    return 0.5 * config.resolution_m
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +77,13 @@ class Workspace:
     def window(self, tile: int) -> tuple[NDArray[np.int64], tuple[int, int]]:
         """Return the (2,) x and y keys of a tile's first column, and how many rows and columns it has."""
         return self.tiling.first_key(tile)[:2], (self.tiling.voxels, self.tiling.voxels)
+
+
+class FusedRun(Config):
+    """Result of fusing a run again."""
+
+    voxels: int
+    """Known ones."""
 
 
 class SplitRun(Config):
@@ -105,6 +124,42 @@ class SlicedColumn(Config):
 
     known_columns: int
     """Columns of voxels in which anything is known."""
+
+
+def fuse_run(workspace: Workspace, run: int, path: Path, trajectory: Trajectory, octree: Path) -> FusedRun:
+    """Make a run's octree again along other poses, by its own settings and edits; the run stays as it is.
+
+    Frames that have moved by no more than half a voxel keep their update.
+
+    Args:
+        workspace: Where.
+        run: Its place in the list.
+        path: The run.
+        trajectory: Poses in its own world of the frames to fuse.
+        octree: File to write.
+    """
+    built = open_run(path)
+    settings = built.fused_config
+    near = settings.octree.model_copy(update={"stays_within_m": stays_within_m(workspace.config)})
+    config = settings.model_copy(update={"octree": near})
+    before, written = built.scan_updates(), workspace.scratch / f"{run:04d}.updates"
+    written.parent.mkdir(parents=True, exist_ok=True)
+    with (
+        open_scan_updates(before) if before is not None else nullcontext() as known,
+        ScanUpdateWriter(written, near) as updates,
+    ):
+        fused = fuse_octree(
+            built.open_log(),
+            trajectory,
+            config,
+            progress=SILENT,
+            before=known,
+            after=updates,
+            edits=parse_edits(edits_text(path), path),
+        )
+    written.unlink()
+    write_map(octree, fused)
+    return FusedRun(voxels=len(fused))
 
 
 def split_run(workspace: Workspace, run: int, path: Path, T_map_world: Transform | None) -> SplitRun:

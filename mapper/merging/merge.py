@@ -1,7 +1,7 @@
 """Merging: the maps of many runs added up, tile by tile, to one map on disk."""
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -9,12 +9,25 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from mapper.core.errors import ConfigError, RunError
+from mapper.core.errors import ConfigError, MapperError, RunError
 from mapper.core.geometry import apply
 from mapper.export.grid import write_grid
-from mapper.merging.jobs import JoinedTile, SlicedColumn, SplitRun, Workspace, join_tile, split_run
+from mapper.graph.g2o import write_g2o
+from mapper.loops.closure import write_closures
+from mapper.merging.jobs import (
+    FusedRun,
+    JoinedTile,
+    SlicedColumn,
+    SplitRun,
+    Workspace,
+    fuse_run,
+    join_tile,
+    split_run,
+    stays_within_m,
+)
 from mapper.merging.merged_map import (
     MERGED_MAP,
+    RUNS,
     SCRATCH,
     TILES,
     MapManifest,
@@ -24,12 +37,13 @@ from mapper.merging.merged_map import (
     open_map,
 )
 from mapper.merging.octomap_files import write_whole_bt, write_whole_ot
-from mapper.merging.placing import Placed, warnings_about
+from mapper.merging.placing import Placed, Placing, warnings_about
 from mapper.merging.slicing import draw, slice_map
 from mapper.merging.stages import Cost, Stages
 from mapper.merging.tiling import tiling_for
 from mapper.octree.config import OctreeConfig
 from mapper.run import files
+from mapper.run.doubtful_frames import without_doubtful
 from mapper.run.fingerprint import fingerprint
 from mapper.run.manifest import RunWarning
 from mapper.run.warnings import merge_warnings
@@ -37,6 +51,7 @@ from mapper.runtime.atomic import MANIFEST_NAME, atomic_folder
 from mapper.runtime.executor import IN_PROCESS, Workers, make_executor
 from mapper.runtime.progress import SILENT, Progress
 from mapper.runtime.resumable_jobs import JobRunner
+from mapper.sources.trajectory_files import write_tum
 
 DEFAULT_TILE_M = 50.0
 
@@ -67,14 +82,13 @@ class Merged:
 
 
 def merge(
-    placed: Sequence[Placed],
+    placing: Placing,
     out: Path,
     *,
     tile_m: float = DEFAULT_TILE_M,
     workers: Workers = IN_PROCESS,
     progress: Progress = SILENT,
     overwrite: bool = False,
-    notes: Sequence[str] = (),
 ) -> Merged:
     """Add up the maps of runs, tile by tile, as independent evidence (Bayes, prior 0.5).
 
@@ -82,28 +96,34 @@ def merge(
     depend on where or in which order the jobs ran; the order of the runs shows in the last bit of a log-odds.
     A merge that was stopped goes on where it was when it is started again with the same runs.
 
+    A run that a joint graph has bent by more than half a voxel is fused again along its new poses first; the
+    run itself stays as it is.
+
     Args:
-        placed: The runs, and the poses of their worlds.
+        placing: The runs, and the poses of their worlds.
         out: Folder to create; until it is whole it is called ``OUT.partial``.
         tile_m: About how long the edge of a tile is.
         workers: Where the jobs run; those of a Dask cluster must see the same files.
         progress: Receives stages, counts and notes.
         overwrite: Replace a map that is there, once the new one is whole.
-        notes: What else is to be told, first among the manifest's notes: runs that are left out.
 
     Raises:
         ConfigError: The runs do not agree in resolution or sensor model, or the tiles' edge is impossible.
         RunError: OUT is there already, a run comes twice or lacks its map, or a job failed.
     """
+    placed = placing.placed
     config = _common_config(placed)
     tiling = tiling_for(config.resolution_m, tile_m)
+    bent, stiff = _bent(placed, within_m=stays_within_m(config))
     manifest = MapManifest(
         status="merging",
         octree=config,
         slice=placed[0].run.config.slice,
         tile_m=tiling.edge_m,
         floor_z_m=_floor_z_m(placed[0]),
-        runs=tuple(_described(item) for item in placed),
+        runs=_described(placing, fused_again=bent),
+        ties=() if placing.joint is None else placing.joint.ties,
+        left_out=dict(placing.left_out),
     )
     with (
         make_executor(workers) as executor,
@@ -112,12 +132,14 @@ def merge(
         ) as folder,
     ):
         manifest.save(folder)
-        warnings = [*notes, *warnings_about(placed)]
+        warnings = [*placing.notes, *stiff, *warnings_about(placed)]
         for note in warnings:
             progress.note(note)
         workspace = Workspace(folder, folder / SCRATCH, tiling, config)
         stages = Stages(JobRunner(workspace.scratch / "done", progress), executor, progress)
-        split = _split(workspace, stages, placed)
+        _write_poses(folder, placing, manifest)
+        octrees = _fuse(workspace, stages, placed, manifest)
+        split = _split(workspace, stages, placed, octrees)
         joined = _join(workspace, stages, split, follows_ground=manifest.slice.above == "ground")
         has_colors = any(part.has_colors for part in split)
         write_whole_ot(folder / files.OCTREE_OT, workspace, joined, has_colors=has_colors)
@@ -165,13 +187,69 @@ def _common_config(placed: Sequence[Placed]) -> OctreeConfig:
     return first.config.octree.model_copy(update={"attributes": attributes})
 
 
-def _described(item: Placed) -> RunInMap:
-    return RunInMap(
-        path=str(item.run.path.resolve()),
-        fingerprint=fingerprint(item.run.file(files.OCTREE_MAP)),
-        T_map_world=tuple(tuple(row) for row in item.T_map_world.tolist()),
-        placed=item.how,
+def _bent(placed: Sequence[Placed], *, within_m: float) -> tuple[set[int], list[str]]:
+    """Return the numbers of the runs to fuse again, and a line for each that should be and cannot."""
+    again, stiff = set[int](), list[str]()
+    for number, item in enumerate(placed):
+        if item.moved_m <= within_m:
+            continue
+        try:
+            item.run.open_log()
+        except MapperError as error:
+            stiff.append(
+                f"{error}; so {item.run.path} is placed as a rigid body, and bends of up to "
+                f"{item.moved_m:.2g} m stay in its map"
+            )
+        else:
+            again.add(number)
+    return again, stiff
+
+
+def _described(placing: Placing, *, fused_again: Set[int]) -> tuple[RunInMap, ...]:
+    first_nodes = (
+        [None] * len(placing.placed) if placing.joint is None else placing.joint.first_nodes.values()
     )
+    return tuple(
+        RunInMap(
+            path=str(item.run.path.resolve()),
+            fingerprint=fingerprint(item.run.file(files.OCTREE_MAP)),
+            T_map_world=tuple(tuple(row) for row in item.T_map_world.tolist()),
+            placed=item.how,
+            folder=f"{RUNS}/{number:04d}_{item.run.path.resolve().name}",
+            first_node=first_node,
+            moved_m=round(item.moved_m, 6),
+            fused_again=number in fused_again,
+        )
+        for number, (item, first_node) in enumerate(zip(placing.placed, first_nodes, strict=True))
+    )
+
+
+def _write_poses(folder: Path, placing: Placing, manifest: MapManifest) -> None:
+    """Write every run's trajectory in the map, and the joint graph with the loops between runs."""
+    for item, run in zip(placing.placed, manifest.runs, strict=True):
+        (folder / run.folder).mkdir(parents=True, exist_ok=True)
+        write_tum(folder / run.folder / files.TRAJECTORY, item.trajectory_map)
+    if placing.joint is not None:
+        write_g2o(folder / files.GRAPH, placing.joint.graph)
+        write_closures(folder / files.LOOPS, placing.joint.loops)
+
+
+def _fuse(
+    workspace: Workspace, stages: Stages, placed: Sequence[Placed], manifest: MapManifest
+) -> list[Path]:
+    """Fuse the runs that have moved again; return the file of every run's octree."""
+    octrees = [item.run.path.resolve() / files.OCTREE_MAP for item in placed]
+    jobs = {}
+    for number, (item, run) in enumerate(zip(placed, manifest.runs, strict=True)):
+        if run.fused_again and item.bent is not None:
+            octrees[number] = workspace.folder / run.folder / files.OCTREE_MAP
+            poses = without_doubtful(item.bent, item.run.records)
+            jobs[f"{number:04d}"] = partial(
+                fuse_run, workspace, number, item.run.path.resolve(), poses, octrees[number]
+            )
+    if jobs:
+        list(stages.run("fuse", jobs, FusedRun))
+    return octrees
 
 
 def _floor_z_m(first: Placed) -> float:
@@ -191,16 +269,12 @@ def _kept_of(partial: Path, manifest: MapManifest) -> list[str]:
     return [child.name for child in partial.iterdir()] if begun == manifest else []
 
 
-def _split(workspace: Workspace, stages: Stages, placed: Sequence[Placed]) -> list[SplitRun]:
+def _split(
+    workspace: Workspace, stages: Stages, placed: Sequence[Placed], octrees: Sequence[Path]
+) -> list[SplitRun]:
     jobs = {
-        f"{index:04d}": partial(
-            split_run,
-            workspace,
-            index,
-            item.run.path.resolve() / files.OCTREE_MAP,
-            None if item.stays else item.T_map_world,
-        )
-        for index, item in enumerate(placed)
+        f"{index:04d}": partial(split_run, workspace, index, octree, None if item.stays else item.T_map_world)
+        for index, (item, octree) in enumerate(zip(placed, octrees, strict=True))
     }
     done = dict(stages.run("split", jobs, SplitRun))
     return [done[name] for name in jobs]

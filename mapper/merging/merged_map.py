@@ -1,6 +1,7 @@
 """Merged map on disk: its manifest, and the opening of a part of it."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,18 +13,23 @@ import mapper
 from mapper.core.config import Config, drop_unknown
 from mapper.core.errors import RunError
 from mapper.core.geometry import Array
+from mapper.core.trajectory import Trajectory
+from mapper.graph.g2o import read_g2o
+from mapper.graph.model import PoseGraph
+from mapper.merging.joint_graph import Tie
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import read_octree
 from mapper.run import files
 from mapper.run.manifest import is_merged_map
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, partial_of, write_text
+from mapper.sources.trajectory_files import read_tum
 
-TILES, SCRATCH = "tiles", "work"
+TILES, RUNS, SCRATCH = "tiles", "runs", "work"
 MERGED_MAP = FolderKind(
     "a merged map",
     manifest_keys=frozenset({"status", "tile_m", "tiles"}),
-    files=files.names_of("maps", "exported maps") | {TILES, SCRATCH},
+    files=files.names_of("maps", "exported maps") | {files.GRAPH, files.LOOPS, TILES, RUNS, SCRATCH},
     kind="merged map",
 )
 
@@ -41,6 +47,15 @@ class RunInMap(Config):
     """4 × 4."""
     placed: str
     """Source of its pose."""
+    folder: str = ""
+    """Of its files in the map's folder: ``trajectory.tum``, the poses of its frames in the map, and
+    ``map.octree``, if it was fused again."""
+    first_node: int | None = None
+    """Added to the numbers of its nodes in the joint graph; None without one."""
+    moved_m: float = 0.0
+    """Largest distance by which the joint graph has moved any point of its map within its world."""
+    fused_again: bool = False
+    """Whether its map was made again for that."""
     voxels: int = 0
     """Known ones, in its own map."""
     shared_voxels: int = 0
@@ -73,6 +88,10 @@ class MapManifest(Config):
     tile_m: float
     floor_z_m: float
     runs: tuple[RunInMap, ...]
+    ties: tuple[Tie, ...] = ()
+    """What ties the runs in the joint graph."""
+    left_out: Mapping[str, str] = {}
+    """Why each of the other runs that were given is not in the map, by its path."""
     tiles: tuple[Tile, ...] = ()
     voxels: int = 0
     area_km2: float = 0.0
@@ -107,6 +126,17 @@ class MergedMap:
     def file(self, name: str) -> Path:
         """Return the path of one of its files."""
         return self.path / name
+
+    def trajectory(self, run: RunInMap) -> Trajectory | None:
+        """Return the poses of a run's frames in the map; None in a map of before 2026-11-23."""
+        path = self.path / run.folder / files.TRAJECTORY
+        return read_tum(path) if run.folder and path.exists() else None
+
+    @property
+    def graph(self) -> PoseGraph | None:
+        """The pose graph of all runs at its solution; None if they were placed as rigid bodies."""
+        path = self.path / files.GRAPH
+        return read_g2o(path) if path.exists() else None
 
     def tile_path(self, tile: Tile) -> Path:
         """Return the file of a tile."""

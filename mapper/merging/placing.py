@@ -11,6 +11,10 @@ from mapper.core.errors import DataError, RunError
 from mapper.core.geometry import Array, Transform, fit_rigid, inverse, transform
 from mapper.core.rotations import rotation_from_quaternion
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, nearest
+from mapper.core.trajectory import Trajectory
+from mapper.merging.joint_graph import JointGraph
+from mapper.octree.scan_update_file import displacement_m, longest_ray_m
+from mapper.run.doubtful_frames import without_doubtful
 from mapper.run.folder import Run
 from mapper.runtime.regular_files import read_text
 
@@ -26,16 +30,33 @@ class Placed:
         run: The run.
         T_map_world: (4, 4) pose of its world in the map.
         how: Where the pose comes from, in a few words.
+        bent: Its frames' poses in its own world by a joint graph; None keeps those of the run.
     """
 
     run: Run
     T_map_world: Transform
     how: str
+    bent: Trajectory | None = None
 
     @property
     def stays(self) -> bool:
         """Whether its voxels are the map's, so that nothing has to be resampled."""
         return np.array_equal(self.T_map_world, np.eye(4))
+
+    @property
+    def trajectory_map(self) -> Trajectory:
+        """Poses of its frames in the map, doubtful ones too."""
+        return (self.bent or self.run.trajectory).moved(self.T_map_world)
+
+    @property
+    def moved_m(self) -> float:
+        """Bound on how far any point of its own map has moved in its world, metres."""
+        if self.bent is None:
+            return 0.0
+        range_m, run = longest_ray_m(self.run.fused_config.octree), self.run
+        before, after = (without_doubtful(poses, run.records) for poses in (run.trajectory, self.bent))
+        pairs = zip(before.T_world_body, after.T_world_body, strict=True)
+        return max((displacement_m(*pair, range_m=range_m) for pair in pairs), default=0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +67,13 @@ class Placing:
         placed: In the order they were given.
         left_out: Why each of the others is not in the map, by the run's path.
         doubts: What is suspicious about the poses, a line each.
+        joint: The pose graph of all of them; None if they are placed as rigid bodies.
     """
 
     placed: Sequence[Placed]
     left_out: Mapping[str, str] = field(default_factory=dict)
     doubts: Sequence[str] = ()
+    joint: JointGraph | None = None
 
     @property
     def notes(self) -> list[str]:
@@ -149,9 +172,15 @@ def _fit_to_truth(run: Run) -> tuple[Transform, float]:
             f"{run.path}: {np.count_nonzero(near)} poses have a truth within 20 ms, want 3; use --poses"
         )
     T_truth_body, T_world_body = truth.T_world_body[index[near]], trajectory.T_world_body[near]
-    T_truth_world, _ = fit_rigid(_with_axes(T_truth_body), _with_axes(T_world_body))
+    T_truth_world = fit_poses(T_truth_body, T_world_body)
     misses = (T_truth_world @ T_world_body)[:, :3, 3] - T_truth_body[:, :3, 3]
     return T_truth_world, float(np.sqrt((misses**2).sum(axis=1).mean()))
+
+
+def fit_poses(T_a_body: Array, T_b_body: Array) -> Transform:
+    """Return the T_a_b by which (N, 4, 4) poses in a fit those in b best, axes of a metre included."""
+    T_a_b, _ = fit_rigid(_with_axes(T_a_body), _with_axes(T_b_body))
+    return T_a_b
 
 
 def _with_axes(T_a_body: Array) -> Array:

@@ -48,11 +48,13 @@ class SolvedWorlds:
         worlds: Of run 0 and of the runs tied to it.
         refused: A reason for every run that shares places and is not tied to another by them.
         contradicting: Pairs of runs whose shared places were not used, as stronger ones contradict them.
+        used: The shared places by which they lie there, those of a pair together.
     """
 
     worlds: Mapping[int, WorldByPlaces]
     refused: Mapping[int, str]
     contradicting: Sequence[tuple[int, int]]
+    used: Sequence[SharedPlace]
 
 
 def solve_worlds(shared: Sequence[SharedPlace], gate: GateConfig) -> SolvedWorlds:
@@ -82,7 +84,7 @@ def solve_worlds(shared: Sequence[SharedPlace], gate: GateConfig) -> SolvedWorld
     used = [place for pair, places in tied.items() if pair not in contradicting for place in places]
     T_map_worlds = _solved(span.T_map_worlds, used, gate) if used else span.T_map_worlds
     worlds = {number: _judged(number, T_map_worlds, used) for number in sorted(T_map_worlds)}
-    return SolvedWorlds(worlds, refused, contradicting)
+    return SolvedWorlds(worlds, refused, contradicting, used)
 
 
 def _consensus(places: Sequence[SharedPlace], gate: GateConfig) -> tuple[list[SharedPlace], str]:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
-from mapper.core.geometry import apply
 from mapper.export.picture import write_merged
 from mapper.merging.jobs import JoinedTile, SlicedColumn, Workspace, save_ground, slice_column
 from mapper.merging.merged_map import MapManifest
@@ -117,10 +116,7 @@ def draw(path: Path, grid: OccupancyGrid, placed: Sequence[Placed], manifest: Ma
     write_merged(
         path,
         grid=shrunk(grid, _MOST_CELLS),
-        paths_world={
-            item.run.path.name: apply(item.T_map_world, item.run.trajectory.positions_world)
-            for item in placed
-        },
+        paths_world={item.run.path.name: item.trajectory_map.positions_world for item in placed},
         tile_m=manifest.tile_m,
         title=f"{len(placed)} runs merged",
         lines=[manifest.summary],

@@ -147,7 +147,7 @@ class ScanUpdateFile:
         if stamp_ns not in self._heads:
             return False
         head, _ = self._heads[stamp_ns]
-        moved_m = displacement_m(head["T_world_body"], T_world_body, range_m=_longest_ray_m(config))
+        moved_m = displacement_m(head["T_world_body"], T_world_body, range_m=longest_ray_m(config))
         return moved_m <= config.stays_within_m
 
 
@@ -161,7 +161,7 @@ def displacement_m(T_a_body: Transform, T_b_body: Transform, *, range_m: float) 
     return max(bound_m, float(np.finfo(np.float64).tiny))
 
 
-def _longest_ray_m(config: OctreeConfig) -> float:
+def longest_ray_m(config: OctreeConfig) -> float:
     """Return a bound on the length of rays: no pixel of a depth camera is more than 60° off its axis."""
     limit = depth_limit_of(config)
     return config.range_limit_m if limit is None else 2.0 * limit.depth_m

@@ -60,32 +60,44 @@ def load_known_map(path: Path, *, progress: Progress = SILENT) -> KnownMap:
     """
     if not is_merged_map(path):
         run = open_run(path)
-        members = [(run, np.eye(4))]
+        members = [(run, run.graph.T_world_node)]
     else:
-        members = []
-        for member in open_map(path).manifest.runs:
-            run = open_run(Path(member.path))
-            if fingerprint(run.file(files.OCTREE_MAP)) != member.fingerprint:
-                raise RunError(f"{run.path}: changed since it was merged into {path}; merge again")
-            members.append((run, np.array(member.T_map_world)))
+        members = _members(path)
     first, _ = members[0]
     places: dict[int, AnyPlace] = {}
     T_map_node: dict[int, Transform] = {}
-    for run, T_map_world in members:
+    for run, T_map_own in members:
         if detector_of(run.config) != detector_of(first.config):
             raise RunError(
                 f"{run.path}: its features are by another odometry.detector than those of {first.path}; "
                 "localise in one of them"
             )
-        own = run_places(run, progress=progress)
-        for node, place in own.places.items():
+        for node, place in run_places(run, progress=progress).places.items():
             number = len(places)
-            places[number], T_map_node[number] = place, T_map_world @ own.T_map_node[node]
+            places[number], T_map_node[number] = place, T_map_own[node]
     if not places:
         raise RunError(
             f"{path}: no keyframe of it can be recognised; build it with loops.kind=places or scans"
         )
     return KnownMap(path, first.config, KnownPlaces(places, T_map_node))
+
+
+def _members(path: Path) -> list[tuple[Run, dict[int, Transform]]]:
+    """Return the runs of a merged map, with the poses of their nodes in it."""
+    merged, members = open_map(path), []
+    graph = merged.graph
+    for member in merged.manifest.runs:
+        run = open_run(Path(member.path))
+        if fingerprint(run.file(files.OCTREE_MAP)) != member.fingerprint:
+            raise RunError(f"{run.path}: changed since it was merged into {path}; merge again")
+        if graph is None or member.first_node is None:
+            T_map_own = run.graph.moved(np.array(member.T_map_world)).T_world_node
+        else:
+            T_map_own = {
+                node: graph.T_world_node[member.first_node + node] for node in run.graph.T_world_node
+            }
+        members.append((run, T_map_own))
+    return members
 
 
 def sensor_of(places: KnownPlaces[Any]) -> Sensor:

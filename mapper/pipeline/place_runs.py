@@ -1,19 +1,27 @@
 """Placing runs by the places that they share: no common truth or world is needed."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from mapper.core.errors import RunError
+from mapper.core.geometry import inverse
+from mapper.graph.model import PoseGraph
 from mapper.loops.map_constraints import KnownPlaces
-from mapper.loops.shared_places import find_shared_places
-from mapper.merging.placing import Placed, Placing
-from mapper.merging.placing_by_places import solve_worlds
+from mapper.loops.shared_places import SharedPlace, find_shared_places
+from mapper.merging.joint_graph import JointGraph, Tie, solve_jointly
+from mapper.merging.placing import Placed, Placing, fit_poses
+from mapper.merging.placing_by_places import SolvedWorlds, solve_worlds
 from mapper.pipeline.known_map import detector_of, loops_between_days, run_places, sensor_of
 from mapper.run.folder import Run
+from mapper.run.stored_tracking import load_tracking
 from mapper.runtime.progress import SILENT, Progress
 
 _FIRST = "first"
 _UNKNOWN = "no place of it was recognised in the others"
+_REJECTED = "the joint graph contradicts all places that it shares with the others"
 
 
 def place_by_shared_places(runs: Sequence[Run], *, progress: Progress = SILENT) -> Placing:
@@ -34,6 +42,111 @@ def place_by_shared_places(runs: Sequence[Run], *, progress: Progress = SILENT) 
         RunError: Nothing ties any other run to the first, or the first has no places.
         ConfigError: The first run's places cannot be recognised by similarity.
     """
+    found = _recognised(runs, progress)
+    placed = [
+        Placed(
+            runs[number],
+            world.T_map_world,
+            f"by {world.places} places, RMS {world.rms_m:.2g} m" if number else _FIRST,
+        )
+        for number, world in found.solved.worlds.items()
+    ]
+    return Placing(placed, found.left_out(runs), found.doubts(runs))
+
+
+def place_jointly(runs: Sequence[Run], *, progress: Progress = SILENT) -> Placing:
+    """Place runs by one pose graph over all their keyframes, so that each bends where it had drifted.
+
+    The poses of ``place_by_shared_places`` are the first estimate. The loops between runs are those places
+    that agree with it; graduated non-convexity decides over them and over the runs' own loops. The world of
+    the first run is the map's, and its first node is held. Every other world lies where the run's solved
+    keyframes are nearest to where they were in it; what is left is the bend.
+
+    Args:
+        runs: At least one; the first must have places.
+        progress: Receives stages and notes.
+
+    Returns:
+        The first run and those that loops which hold tie to it, and why the others are not.
+
+    Raises:
+        RunError: Nothing ties any other run to the first, or the first has no places.
+        ConfigError: The first run's places cannot be recognised by similarity.
+        GraphError: The joint graph cannot be solved.
+    """
+    found = _recognised(runs, progress)
+    worlds = found.solved.worlds
+    used = set(map(id, found.solved.used))
+    joint = solve_jointly(
+        {number: runs[number].graph for number in worlds},
+        {number: world.T_map_world for number, world in worlds.items()},
+        found.solved.used,
+        [place for place in found.shared if id(place) not in used],
+        runs[0].config.graph,
+    )
+    left_out = found.left_out(runs) | {
+        str(runs[number].path): _REJECTED for number in worlds if number not in joint.first_nodes
+    }
+    doubts = found.doubts(runs)
+    if joint.own_rejected:
+        doubts.append(f"the joint graph rejected {joint.own_rejected} loops that single runs had accepted")
+    ties = joint.ties
+    placed = [_placed(runs[number], number, joint, ties) for number in joint.first_nodes]
+    _refuse_alone(runs, len(placed), left_out)
+    return Placing(placed, left_out, doubts, joint)
+
+
+def _placed(run: Run, number: int, joint: JointGraph, ties: Sequence[Tie]) -> Placed:
+    """Return a run with its world where its solved keyframes lie nearest to where they were in it."""
+    T_map_node, graph = joint.poses_of(number), run.graph
+    T_map_world = np.eye(4)
+    if number:
+        T_map_world = fit_poses(np.array(list(T_map_node.values())), graph.poses)
+    T_world_map = inverse(T_map_world)
+    moved = {node: T_world_map @ T for node, T in T_map_node.items()}
+    solved = load_tracking(run).solved(PoseGraph(moved, graph.stamps_ns, graph.factors), run.loops)
+    held = sum(tie.held for tie in ties if number in (tie.first, tie.second))
+    return Placed(run, T_map_world, f"by {held} loops" if number else _FIRST, solved.trajectory)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Recognised:
+    """Places that runs share, and the poses of their worlds by these.
+
+    Attributes:
+        shared: All that were measured.
+        solved: The poses.
+        unfit: Why some runs cannot be compared with the first, by number.
+    """
+
+    shared: Sequence[SharedPlace]
+    solved: SolvedWorlds
+    unfit: Mapping[int, str]
+
+    def left_out(self, runs: Sequence[Run]) -> dict[str, str]:
+        """Return why each run that is not placed is not, by its path."""
+        reasons = dict.fromkeys(range(len(runs)), _UNKNOWN) | dict(self.solved.refused) | dict(self.unfit)
+        return {
+            str(run.path): reasons[number]
+            for number, run in enumerate(runs)
+            if number not in self.solved.worlds
+        }
+
+    def doubts(self, runs: Sequence[Run]) -> list[str]:
+        """Return what is suspicious about the shared places, a line each."""
+        return [
+            f"{runs[first].path} and {runs[second].path}: the places that they share contradict those that "
+            "they share with other runs, and were not used"
+            for first, second in self.solved.contradicting
+        ]
+
+
+def _recognised(runs: Sequence[Run], progress: Progress) -> _Recognised:
+    """Recognise and measure the runs' keyframes in each other.
+
+    Raises:
+        RunError: Nothing ties any other run to the first, or the first has no places.
+    """
     first, known = runs[0], [run_places(run, progress=progress) for run in runs]
     if not known[0].places:
         raise RunError(
@@ -43,30 +156,19 @@ def place_by_shared_places(runs: Sequence[Run], *, progress: Progress = SILENT) 
     unfit = {number: reason for number in range(len(runs)) if (reason := _unfit(runs, known, number))}
     fit = [KnownPlaces({}, {}) if number in unfit else places for number, places in enumerate(known)]
     shared = find_shared_places(fit, loops, progress=progress)
-    solved = solve_worlds(shared, loops.gate)
-    worlds = solved.worlds
-    reasons = dict.fromkeys(range(len(runs)), _UNKNOWN) | dict(solved.refused) | unfit
-    left_out = {str(run.path): reasons[number] for number, run in enumerate(runs) if number not in worlds}
-    if len(runs) > 1 and len(worlds) == 1:
+    found = _Recognised(shared, solve_worlds(shared, loops.gate), unfit)
+    _refuse_alone(runs, len(found.solved.worlds), found.left_out(runs))
+    return found
+
+
+def _refuse_alone(runs: Sequence[Run], placed: int, left_out: Mapping[str, str]) -> None:
+    """Refuse a first run to which no other is tied."""
+    if len(runs) > 1 and placed == 1:
         why = "; ".join(f"{path}: {reason}" for path, reason in left_out.items())
         raise RunError(
-            f"{first.path}: no other run is tied to it by places that both have seen ({why}); "
+            f"{runs[0].path}: no other run is tied to it by places that both have seen ({why}); "
             "are they of one place? Else give --poses"
         )
-    placed = [
-        Placed(
-            runs[number],
-            world.T_map_world,
-            f"by {world.places} places, RMS {world.rms_m:.2g} m" if number else _FIRST,
-        )
-        for number, world in worlds.items()
-    ]
-    doubts = [
-        f"{runs[first].path} and {runs[second].path}: the places that they share contradict those that they "
-        "share with other runs, and were not used"
-        for first, second in solved.contradicting
-    ]
-    return Placing(placed, left_out, doubts)
 
 
 def _unfit(runs: Sequence[Run], known: Sequence[KnownPlaces[Any]], number: int) -> str:

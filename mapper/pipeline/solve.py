@@ -11,13 +11,11 @@ from mapper.graph.config import GraphConfig
 from mapper.graph.drift import innovations
 from mapper.graph.model import PoseGraph, Solution
 from mapper.graph.optimize import optimize
-from mapper.loops.closure import LoopClosure, apply_solution
+from mapper.loops.closure import MIN_WEIGHT, LoopClosure, apply_solution
 from mapper.run.manifest import Solve
 
 _ROUNDING = 1e-12
 """Largest change of an element of a pose, metres or none, that is rounding."""
-MIN_WEIGHT = 0.5
-"""A loop with less weight in the solution is rejected, and is no factor of the solved graph."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -185,6 +185,14 @@ class Run:
     def __repr__(self) -> str:
         return f"Run({str(self.path)!r})"
 
+    @property
+    def fused_config(self) -> BuildConfig:
+        """Configuration by which its maps were made: its own, with the noise of depth that was measured."""
+        if self.manifest.depth is None:
+            return self.config
+        octree = self.config.octree.model_copy(update={"depth_noise": self.manifest.depth.noise})
+        return self.config.model_copy(update={"octree": octree})
+
     def scan_updates(self) -> Path | None:
         """Return the path of the frames' updates, by its former name too; None where a user deleted it."""
         path = files.scan_updates_path(self.path)

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.merging import jobs as merging_jobs
 from mapper.merging.merge import merge
 from mapper.merging.merged_map import open_map
-from mapper.merging.placing import Placed, as_built, by_poses, by_truth, warnings_about
+from mapper.merging.placing import Placed, Placing, as_built, by_poses, by_truth, warnings_about
 from mapper.octree.config import SliceConfig
 from mapper.octree.grid_file import read_grid
 from mapper.octree.map import OctreeMap
@@ -34,7 +33,10 @@ from mapper.sources.trajectory_files import write_tum
 from tests.support.octree_maps import COLORED, CONFIG, as_dict, mapped, total
 
 BAND = SliceConfig(min_height_m=-0.5, max_height_m=0.8)
-MERGE = partial(merge, tile_m=3.2)
+
+
+def merged_map_of(placed, out, *, tile_m=3.2, **settings):
+    return merge(Placing(placed), out, tile_m=tile_m, **settings)
 
 
 def make_run(path, octree, *, band=BAND, log="sha256:0", T_truth_world=None):
@@ -65,7 +67,7 @@ def runs(maps, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def merged(runs, tmp_path_factory):
-    return MERGE(as_built(runs), tmp_path_factory.mktemp("merged") / "map").map
+    return merged_map_of(as_built(runs), tmp_path_factory.mktemp("merged") / "map").map
 
 
 @pytest.fixture
@@ -88,18 +90,18 @@ def shuffled_jobs(jobs, *workers, **settings):
 def test_the_bytes_are_the_same_for_one_process_two_processes_and_any_order(
     runs, merged, tmp_path, monkeypatch
 ):
-    MERGE(as_built(runs), tmp_path / "two", workers=Workers(2))
+    merged_map_of(as_built(runs), tmp_path / "two", workers=Workers(2))
     assert bytes_of(tmp_path / "two") == bytes_of(merged.path)
 
     monkeypatch.setattr(resumable_jobs, "run_jobs", shuffled_jobs)
     monkeypatch.setattr("mapper.merging.merge.draw", lambda *_: None)
-    MERGE(as_built(runs), tmp_path / "shuffled")
+    merged_map_of(as_built(runs), tmp_path / "shuffled")
     assert bytes_of(tmp_path / "shuffled") == bytes_of(merged.path, but=SUMMARY)
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_dask_cluster_writes_the_same_bytes(runs, merged, tmp_path, dask_scheduler):
-    MERGE(as_built(runs), tmp_path / "map", workers=Workers(scheduler=dask_scheduler))
+    merged_map_of(as_built(runs), tmp_path / "map", workers=Workers(scheduler=dask_scheduler))
 
     assert bytes_of(tmp_path / "map") == bytes_of(merged.path, but=SUMMARY)
 
@@ -114,7 +116,7 @@ def test_the_files_are_those_of_the_maps_added_up_in_memory(maps, tmp_path, conf
     plain = [total([each], config=config)[0] for each in maps]
     runs = [make_run(tmp_path / f"run{i}", each) for i, each in enumerate(plain)]
 
-    found = merge(as_built(runs), tmp_path / "map", tile_m=1.6).map
+    found = merged_map_of(as_built(runs), tmp_path / "map", tile_m=1.6).map
 
     assert (found.path / "map.bt").read_bytes() == (tmp_path / "whole.bt").read_bytes()
     assert (found.path / "map.ot").read_bytes() == (tmp_path / "whole.ot").read_bytes()
@@ -131,7 +133,7 @@ def test_the_slice_is_that_of_the_whole(maps, tmp_path, above):
     band = BAND.model_copy(update={"above": above, "min_cluster_cells": 2})
     runs = [make_run(tmp_path / f"run{i}", each, band=band) for i, each in enumerate(maps[:3])]
 
-    found = MERGE(as_built(runs), tmp_path / "map").map
+    found = merged_map_of(as_built(runs), tmp_path / "map").map
 
     octree, _ = total(maps[:3], config=COLORED)
     grid, expected = read_grid(found.path / "slice.yaml"), cut_slice(octree, band)
@@ -159,7 +161,7 @@ def test_leaves_larger_than_a_tile_are_pruned_across_tiles(tmp_path, config):
     write_bt(tmp_path / "whole.bt", octree)
     write_ot(tmp_path / "whole.ot", octree)
 
-    merge(as_built([run]), tmp_path / "map", tile_m=0.8)
+    merged_map_of(as_built([run]), tmp_path / "map", tile_m=0.8)
 
     assert (tmp_path / "map/map.bt").read_bytes() == (tmp_path / "whole.bt").read_bytes()
     assert (tmp_path / "map/map.ot").read_bytes() == (tmp_path / "whole.ot").read_bytes()
@@ -181,7 +183,7 @@ def test_a_merge_that_was_stopped_goes_on_where_it_was(runs, merged, tmp_path, m
     monkeypatch.setattr("mapper.merging.merge.join_tile", join)
     monkeypatch.setattr(resumable_jobs, "run_jobs", jobs)
     with pytest.raises(RunError, match=r"join \d+: OSError: the disk is gone.*\(and 1 more\).*to go on"):
-        MERGE(as_built(runs), out)
+        merged_map_of(as_built(runs), out)
     assert not out.exists()
     with pytest.raises(RunError, match="not finished"):
         open_map(out)
@@ -192,7 +194,7 @@ def test_a_merge_that_was_stopped_goes_on_where_it_was(runs, merged, tmp_path, m
     joined.extend([0] * 5)
     monkeypatch.setattr("mapper.merging.merge.split_run", print)  # nothing is split again
 
-    MERGE(as_built(runs), out)
+    merged_map_of(as_built(runs), out)
 
     assert joined[5:] == lost
     assert bytes_of(out) == bytes_of(merged.path, but=SUMMARY)
@@ -204,9 +206,9 @@ def test_what_was_left_of_another_merge_is_not_gone_on_with(runs, merged, tmp_pa
     with monkeypatch.context() as patch:
         patch.setattr("mapper.merging.merge.write_whole_bt", None)
         with pytest.raises(TypeError):
-            MERGE(as_built(runs[:2]), out)
+            merged_map_of(as_built(runs[:2]), out)
 
-    MERGE(as_built(runs), out)
+    merged_map_of(as_built(runs), out)
 
     assert bytes_of(out) == bytes_of(merged.path, but=SUMMARY)
 
@@ -243,7 +245,7 @@ def test_runs_are_brought_together_by_their_truths(maps, tmp_path):
     T_map_second = inverse(T_truth_first) @ T_truth_second
     assert placed[0].stays
     np.testing.assert_allclose(placed[1].T_map_world, T_map_second, atol=1e-9)
-    found = MERGE(placed, tmp_path / "map").map
+    found = merged_map_of(placed, tmp_path / "map").map
     moved = resampled(
         maps[1], inverse(placed[1].T_map_world), blocks_reached(maps[1], placed[1].T_map_world), COLORED
     )
@@ -305,23 +307,23 @@ def test_runs_that_do_not_fit_together_are_refused(runs, maps, tmp_path):
     unsure = OctreeMap(COLORED.model_copy(update={"hit_probability": 0.6}))
 
     with pytest.raises(ConfigError, match=r"octree\.resolution_m is 0\.2, but 0\.1 in .*run0.*mapper fuse"):
-        MERGE(as_built([runs[0], make_run(tmp_path / "coarse", coarse)]), tmp_path / "map")
+        merged_map_of(as_built([runs[0], make_run(tmp_path / "coarse", coarse)]), tmp_path / "map")
     with pytest.raises(ConfigError, match=r"octree\.hit_probability is 0\.6, but 0\.7"):
-        MERGE(as_built([runs[0], make_run(tmp_path / "unsure", unsure)]), tmp_path / "map")
+        merged_map_of(as_built([runs[0], make_run(tmp_path / "unsure", unsure)]), tmp_path / "map")
     with pytest.raises(RunError, match="given twice"):
-        MERGE(as_built([runs[0], runs[0]]), tmp_path / "map")
+        merged_map_of(as_built([runs[0], runs[0]]), tmp_path / "map")
     with pytest.raises(RunError, match="nothing is known"):
-        MERGE(as_built([make_run(tmp_path / "empty", OctreeMap(COLORED))]), tmp_path / "map")
+        merged_map_of(as_built([make_run(tmp_path / "empty", OctreeMap(COLORED))]), tmp_path / "map")
     with pytest.raises(RunError, match="has no truth to be placed by"):
         by_truth(runs[:2])
     bare = make_run(tmp_path / "bare", maps[0])
     (bare.path / "map.octree").unlink()
     with pytest.raises(RunError, match=r"has no map\.octree; make it with mapper fuse"):
-        MERGE(as_built([bare]), tmp_path / "map")
+        merged_map_of(as_built([bare]), tmp_path / "map")
     with pytest.raises(RunError, match="run0: is not a merged map, so --overwrite will not replace it"):
-        MERGE(as_built(runs), runs[0].path, overwrite=True)
+        merged_map_of(as_built(runs), runs[0].path, overwrite=True)
     with pytest.raises(ConfigError, match=r"tile edge 0\.1 m"):
-        merge(as_built(runs), tmp_path / "map", tile_m=0.1)
+        merged_map_of(as_built(runs), tmp_path / "map", tile_m=0.1)
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -330,7 +332,7 @@ def test_a_path_is_planned_on_a_merged_map(tmp_path, capsys):
     sides = np.linspace(-1.95, 1.95, 40).astype(np.float32)
     ring = [(x, y, 0.05) for x in sides for y in sides if max(abs(x), abs(y)) > 1.9]
     octree.insert_points(np.array(ring, np.float32), np.array([0.05, 0.05, 0.05]))
-    MERGE(as_built([make_run(tmp_path / "run", octree)]), tmp_path / "map")
+    merged_map_of(as_built([make_run(tmp_path / "run", octree)]), tmp_path / "map")
 
     app(
         ["plan", str(tmp_path / "map"), "--from", "-1", "0", "--to", "1", "0.5", "--radius", "0.1"],
@@ -373,7 +375,7 @@ def test_a_user_is_told_what_to_doubt(runs, maps, merged, tmp_path):
     )
     upside_down = Placed(again, exp(np.array([np.pi, 0.0, 0.0]), np.zeros(3)), "by hand")
 
-    found = MERGE([as_built(runs[1:2])[0], upside_down], tmp_path / "map").map
+    found = merged_map_of([as_built(runs[1:2])[0], upside_down], tmp_path / "map").map
 
     assert found.manifest.notes[:2] == (
         "run1 and again were made from 9 frames that are the same; these count twice",
@@ -391,7 +393,7 @@ def test_the_verb_says_what_it_made(runs, tmp_path, capsys):
     app([*arguments, "--tile-m", "1.6"], standalone_mode=False)
 
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split() == ["run", "placed", "voxels", "known", "before", "walls", "alike"]
+    assert lines[0].split() == ["run", "placed", "bent", "voxels", "known", "before", "walls", "alike"]
     assert lines[2].split()[:3] == ["run1", "as", "built"]
     assert lines[-1] == str(tmp_path / "map")
     assert open_map(tmp_path / "map").manifest.status == "complete"

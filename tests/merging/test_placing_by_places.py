@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import angle_between, exp, inverse
+from mapper.loops.closure import LoopClosure
 from mapper.loops.config import GateConfig
 from mapper.loops.shared_places import SharedPlace
 from mapper.merging.placing_by_places import solve_worlds
@@ -21,6 +22,21 @@ def on_path(along_m):
     return exp(np.array([0.0, 0.0, 0.1 * along_m]), np.array([along_m, 0.2 * along_m, 0.1]))
 
 
+def measured(first, second, T_first_place, T_first_body, T_second_body):
+    """Return a place that two runs share, its keyframe measured at a pose in the first run's world."""
+    loop = LoopClosure(
+        i=0,
+        j=0,
+        stamp_i_ns=0,
+        stamp_j_ns=0,
+        proposed_by="places",
+        verdict="accepted",
+        T_i_j=inverse(T_first_place) @ T_first_body,
+        information=np.eye(6),
+    )
+    return SharedPlace(first, second, T_first_place, T_first_body, T_second_body, loop)
+
+
 def shared(first, second, along_m, *, rng, noise_m=0.01, T_off=None):
     """Return the places of a path that two runs share, measured with noise and moved by T_off."""
     places = []
@@ -30,7 +46,7 @@ def shared(first, second, along_m, *, rng, noise_m=0.01, T_off=None):
         noise = exp(rng.normal(0.0, 0.01, 3), rng.normal(0.0, noise_m, 3))
         T_first_body = inverse(WORLDS[first]) @ (np.eye(4) if T_off is None else T_off) @ T_map_body @ noise
         T_second_body = inverse(WORLDS[second]) @ T_map_body
-        places.append(SharedPlace(first, second, T_first_place, T_first_body, T_second_body))
+        places.append(measured(first, second, T_first_place, T_first_body, T_second_body))
     return places
 
 
@@ -41,7 +57,7 @@ def scattered(first, second, count, rng):
         T_first, T_body, T_second = (
             exp(rng.normal(0.0, 1.0, 3), rng.uniform(-20.0, 20.0, 3)) for _ in range(3)
         )
-        places.append(SharedPlace(first, second, T_first, T_body, T_second))
+        places.append(measured(first, second, T_first, T_body, T_second))
     return places
 
 
@@ -123,9 +139,7 @@ def test_runs_that_are_tied_to_each_other_alone_are_left_out():
 def test_drift_between_distant_places_is_borne():
     rng = np.random.default_rng(5)
     bent = [
-        SharedPlace(
-            0, 1, on_path(k), exp(np.zeros(3), np.array([0.03 * k, 0.0, 0.0])) @ on_path(k), on_path(k)
-        )
+        measured(0, 1, on_path(k), exp(np.zeros(3), np.array([0.03 * k, 0.0, 0.0])) @ on_path(k), on_path(k))
         for k in range(0, 40, 4)
     ]
     worlds = solve_worlds([*bent, *scattered(0, 1, 5, rng)], GATE).worlds

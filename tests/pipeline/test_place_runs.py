@@ -1,20 +1,29 @@
 """Runs of one place that find each other without truth or a common world."""
 
 import json
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from mapper.config.loading import load_config
 from mapper.core.errors import RunError
-from mapper.core.geometry import angle_between, inverse
+from mapper.core.geometry import angle_between, apply, exp, fit_rigid, inverse
+from mapper.core.timebase import nearest
+from mapper.core.trajectory import Trajectory
+from mapper.loops.closure import read_closures
 from mapper.loops.map_constraints import KnownPlaces
 from mapper.loops.scan_context_proposer import ScanPlace
-from mapper.merging.placing import by_truth
+from mapper.merging.merge import merge
+from mapper.merging.placing import Placed, Placing, by_truth
+from mapper.octree.octomap_file import read_octree
 from mapper.pipeline import place_runs
 from mapper.pipeline.build import build
+from mapper.pipeline.fuse import fuse
 from mapper.pipeline.known_map import run_places
-from mapper.pipeline.place_runs import place_by_shared_places
+from mapper.pipeline.place_runs import place_by_shared_places, place_jointly
+from mapper.run.folder import moved_log, open_run
 from mapper.sources import open_source
 from tests.support.command_line import mapper
 from tests.support.desk import MANY_KEYFRAMES, write_log_of_another_flat
@@ -51,6 +60,75 @@ def test_halves_of_a_walk_lie_as_their_truths_do(halves, first):
     T_found, T_true = placing.placed[1].T_map_world, by_truth(runs)[1].T_map_world
     assert np.linalg.norm((inverse(T_true) @ T_found)[:3, 3]) < 0.02
     assert angle_between(T_true[:3, :3], T_found[:3, :3]) < 0.02
+
+
+def files_of(run):
+    return {path.name: path.read_bytes() for path in run.path.iterdir() if path.is_file()}
+
+
+def test_halves_are_joined_by_one_graph(halves, elsewhere, tmp_path):
+    before = [files_of(half) for half in halves]
+    placing = place_jointly([halves[1], elsewhere, halves[0]])
+    assert list(placing.left_out) == [str(elsewhere.path)]
+    found = merge(placing, tmp_path / "map").map
+
+    truth = halves[0].truth
+    for run, placed in zip(found.manifest.runs, placing.placed, strict=True):
+        poses = found.trajectory(run)
+        np.testing.assert_allclose(poses.T_world_body, placed.trajectory_map.T_world_body, atol=1e-6)
+        assert run.fused_again == (placed.moved_m > 0.5 * found.manifest.octree.resolution_m)
+        assert (found.path / run.folder / "map.octree").exists() == run.fused_again
+    apart = [len(run.graph.T_world_node) for run in (halves[1], halves[0])]
+    assert len(found.graph.T_world_node) == sum(apart)
+    joined = [found.trajectory(run) for run in found.manifest.runs]
+    positions = np.concatenate([poses.positions_world for poses in joined])
+    true = np.concatenate(
+        [truth.positions_world[nearest(truth.stamps_ns, poses.stamps_ns)[0]] for poses in joined]
+    )
+    T_true_map, _ = fit_rigid(true, positions)
+    assert np.sqrt(((apply(T_true_map, positions) - true) ** 2).sum(axis=1).mean()) < 0.01
+    (tie,) = found.manifest.ties
+    assert tie.held >= 3
+    held = [loop for loop in read_closures(found.path / "loops.jsonl") if loop.verdict == "accepted"]
+    assert len(held) == tie.held
+    assert all(loop.i < apart[0] <= loop.j for loop in held)
+    assert [files_of(half) for half in halves] == before
+
+
+def test_a_run_that_bends_is_fused_along_its_new_poses(halves, tmp_path):
+    first, second = place_jointly(halves).placed
+    bend = exp(np.array([0.0, 0.0, 0.02]), np.array([0.0, 0.0, 0.2]))
+    poses = second.run.trajectory.T_world_body.copy()
+    poses[len(poses) // 2 :] = bend @ poses[len(poses) // 2 :]
+    bent = replace(second, bent=Trajectory(second.run.trajectory.stamps_ns, poses))
+    assert bent.moved_m > 0.2
+    again = fuse(second.run.open_log(), copied(second.run, tmp_path), second.run.config, trajectory=bent.bent)
+
+    found = merge(Placing([first, bent]), tmp_path / "map").map
+
+    described = found.manifest.runs[1]
+    assert described.fused_again
+    made = read_octree(found.path / described.folder / "map.octree")
+    assert len(made) == pytest.approx(len(again.octree), rel=0.02)  # frames within half a voxel stay
+    centres = again.octree.leaves().centres_world[again.octree.leaves().log_odds > 0.0]
+    assert made.are_near_occupied(centres, max_distance_m=0.051).mean() > 0.99
+    old = second.run.octree.are_near_occupied(centres, max_distance_m=0.051).mean()
+    assert old < 0.97
+
+
+def copied(run, folder):
+    return open_run(shutil.copytree(run.path, folder / run.path.name))
+
+
+def test_a_bent_run_without_its_log_is_placed_as_a_rigid_body(halves, tmp_path):
+    run = copied(halves[1], tmp_path)
+    moved = moved_log(run, tmp_path / "gone")
+    bend = exp(np.zeros(3), np.array([0.0, 0.0, 0.2]))
+    bent = Placed(moved, np.eye(4), "by hand", run.trajectory.moved(bend))
+    found = merge(Placing([Placed(halves[0], np.eye(4), "first"), bent]), tmp_path / "map").map
+    assert not found.manifest.runs[1].fused_again
+    assert "is no longer there" in found.manifest.notes[0]
+    assert "bends of up to 0.2 m stay" in found.manifest.notes[0]
 
 
 def test_a_merge_names_the_run_that_it_leaves_out(halves, elsewhere, tmp_path):
