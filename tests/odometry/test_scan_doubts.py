@@ -13,7 +13,7 @@ from mapper.odometry.scan_to_map.odometry import ScanOdometry
 from mapper.odometry.scan_to_map.pose_search import Answers
 from mapper.odometry.scan_to_map.scan_fit import ScanKeyframe, contradiction, described, fit_of
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan
-from mapper.odometry.scan_to_map.scan_noise import surface_covariance
+from mapper.odometry.scan_to_map.scan_noise import ScanNoise, surface_covariance
 from mapper.odometry.scan_to_map.usual_fit import Shares, UsualFit, jump_between
 from mapper.registration.refining import refine
 from mapper.registration.surfaces import prepared
@@ -275,6 +275,37 @@ def test_the_covariance_covers_what_noise_does():
         squares.append(error @ np.linalg.solve(surface_covariance(fit), error) / 6.0)
 
     assert 0.4 < np.mean(squares) < 2.5
+
+
+def noise_of(T_key_scan, *, noise_m, off_m=0.0):
+    """Return the sigmas of a room's scan, which is held off its place by a shift along x."""
+    key = keyframe(room_scan(0, seed=1, noise_m=noise_m))
+    scan = keyframe(room_scan(1, T_key_scan, seed=2, noise_m=noise_m)).deskewed
+    found = T_key_scan @ exp(np.zeros(3), np.array([off_m, 0.0, 0.0]))
+    fit = fit_of(key, scan, found, max_pair_distance_m=0.5)
+    noise = ScanNoise().of(fit, np.zeros(6), T_key_scan, 0.1, np.zeros((6, 6)))
+    return np.sqrt(np.diag(noise.covariance))
+
+
+def test_a_turn_on_the_spot_is_known_as_well_as_none():
+    still = noise_of(np.eye(4), noise_m=0.01)
+    turned = noise_of(exp(np.array([0.0, 0.0, 0.6]), np.zeros(3)), noise_m=0.01)
+
+    assert turned[:3].max() < 2.0 * still[:3].max()  # the azimuth of a turning sensor has no scale error
+
+
+def test_the_model_error_follows_the_distances_from_surfaces():
+    T_key_scan = exp(np.array([0.0, 0.0, 0.03]), np.array([0.5, 0.1, 0.0]))
+    near, far = (noise_of(T_key_scan, noise_m=noise_m) for noise_m in (0.005, 0.05))
+
+    assert far[3:].min() > 3.0 * near[3:].min()
+
+
+def test_a_pose_off_the_surfaces_is_uncertain_by_as_much():
+    held, right = noise_of(OFF, noise_m=0.01, off_m=0.05), noise_of(OFF, noise_m=0.01)
+
+    assert right[3] < 0.01
+    assert 0.03 < held[3] < 0.1
 
 
 def test_points_are_where_the_truth_puts_them():
