@@ -12,6 +12,7 @@ from mapper.core.errors import DataError
 from mapper.core.frames import Points32
 from mapper.core.geometry import Array, Points, Transform
 from mapper.features.base import Descriptors
+from mapper.runtime.archived import Archivable
 
 if TYPE_CHECKING:
     from mapper.features.hamming import Bits
@@ -20,7 +21,7 @@ _ORB_BYTES = 32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ImageView:
+class ImageView(Archivable):
     """The features of one RGB-D frame with their 3D points.
 
     Attributes:

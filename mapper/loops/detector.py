@@ -23,6 +23,7 @@ from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 from mapper.loops.place_file import AnyPlace
 from mapper.loops.proposers import PoseProposer
 from mapper.odometry.base import FrameResult
+from mapper.runtime.archived import Archived, ArchivedMapping, archived
 
 ViewOf = Callable[[], FrameView]
 
@@ -126,7 +127,7 @@ class KeyframeLoopDetector(Generic[Place]):
         self._consistency = consistency_check(min_agreeing=config.min_agreeing)
         self._gate = DriftGate(config.gate, chain, estimator, consistency_check(min_agreeing=MIN_CONFLICTS))
         self._proposer: Proposer[Place] | None = None
-        self._places: dict[int, Place] = {}
+        self._places: dict[int, Archived[Place]] = {}
         self._preloaded = 0
         self._searches: list[_Search] = []
         self._closures: dict[tuple[int, int], LoopClosure] = {}
@@ -174,7 +175,7 @@ class KeyframeLoopDetector(Generic[Place]):
         for proposal in proposer.propose(node, place, before=self._old_enough(), limit=limit):
             if proposal.proposed_by == "nearby" and proposal.node in self._disconnected:
                 continue
-            known = self._places[proposal.node]
+            known = self._places[proposal.node].data
             closure = self._gate.checked(verify_proposal(proposal, node, known, place, self._verifier))
             self._closures[closure.i, closure.j] = closure
             if closure.verdict == "accepted":
@@ -196,7 +197,7 @@ class KeyframeLoopDetector(Generic[Place]):
 
     def places(self) -> Mapping[int, Place]:
         """Return the places that were kept, those of an earlier session too, by node."""
-        return self._places
+        return ArchivedMapping(self._places)
 
     def _search_from(self, track: FrameResult) -> _Search | None:
         """Return the search to make from here; None where too little has changed since the last."""
@@ -219,7 +220,7 @@ class KeyframeLoopDetector(Generic[Place]):
 
     def _add_place(self, node: int, place: Place) -> None:
         self._proposer_of(place).add(node, place)
-        self._places[node] = place
+        self._places[node] = archived(place)
 
     def _old_enough(self) -> int:
         """Return how many places may be proposed: all but the latest, which are left to the odometry."""

@@ -2,9 +2,12 @@
 
 import io
 import zipfile
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryFile
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +15,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import RunError
 from mapper.features.frame_view import ImageView
 from mapper.loops.scan_context_proposer import ScanPlace
+from mapper.runtime.atomic import writing
 from mapper.runtime.checked_file import CheckedFormat
 
 AnyPlace = ImageView | ScanPlace
@@ -21,19 +25,57 @@ _FORMAT = CheckedFormat(_MAGIC, 1, "delete it, and places are read from the log 
 _IMAGES, _SCANS = b"images", b"scans"
 
 
-def write_places(path: Path, places: Mapping[int, AnyPlace]) -> None:
+def write_places(path: Path, places: Mapping[int, AnyPlace], nodes: Iterable[int] | None = None) -> None:
     """Write places by node, of one sensor; single precision, but for poses. Atomic.
 
-    Pixels keep 1e-4 px and depths 1e-6 of themselves; the points of features follow from them.
+    Pixels keep 1e-4 px and depths 1e-6 of themselves; the points of features follow from them. Each place is
+    asked for once, and none is kept: there may be more than fit into memory.
+
+    Args:
+        path: The file.
+        places: What the nodes are recognised by.
+        nodes: Those to write; None is all.
     """
-    images = {node: place for node, place in places.items() if isinstance(place, ImageView)}
-    scans = {node: place for node, place in places.items() if isinstance(place, ScanPlace)}
-    kind, columns = (_IMAGES, _of_images(images)) if images else (_SCANS, _of_scans(scans))
-    columns["node"] = np.array(list(places), np.int64)
-    columns["stamp_ns"] = np.array([place.stamp_ns for place in places.values()], np.int64)
-    body = io.BytesIO()
-    np.savez_compressed(body, **columns)  # type: ignore[arg-type]
-    _FORMAT.write(path, kind, body.getvalue())
+    with ExitStack() as stack:
+        stack.enter_context(writing(path))
+        table = defaultdict[str, _Column](
+            lambda: _Column(stack.enter_context(TemporaryFile(dir=path.parent)))
+        )
+        kind = _SCANS
+        for node in places if nodes is None else nodes:
+            place = places[node]
+            if isinstance(place, ImageView):
+                kind, columns = _IMAGES, _of_image(place)
+            else:
+                columns = _of_scan(place)
+            columns |= {"node": np.array([node], np.int64), "stamp_ns": np.array([place.stamp_ns], np.int64)}
+            for name, rows in columns.items():
+                table[name].append(rows)
+        body = stack.enter_context(TemporaryFile(dir=path.parent))
+        arrays = {name: column.array() for name, column in table.items()}
+        np.savez_compressed(body, **arrays)  # type: ignore[arg-type]
+        _FORMAT.write_from(path, kind, body)
+
+
+class _Column:
+    """Array on the disk that grows along its first axis."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self._shape: tuple[int, ...] = (0,)
+        self._kind = np.dtype(np.uint8)
+
+    def append(self, rows: NDArray[Any]) -> None:
+        """Append rows, all of one type and shape."""
+        self._file.write(np.ascontiguousarray(rows).data)
+        self._shape, self._kind = (self._shape[0] + len(rows), *rows.shape[1:]), rows.dtype
+
+    def array(self) -> NDArray[Any]:
+        """Return the rows, which are read when they are used."""
+        self._file.flush()
+        if 0 in self._shape:
+            return np.zeros(self._shape, self._kind)
+        return np.memmap(self._file, self._kind, "r", shape=self._shape)
 
 
 def read_places(path: Path) -> dict[int, AnyPlace]:
@@ -58,16 +100,15 @@ def read_places(path: Path) -> dict[int, AnyPlace]:
         raise RunError(f"{path}: no file of places: {error}") from None
 
 
-def _of_images(places: Mapping[int, ImageView]) -> dict[str, NDArray[Any]]:
-    views = list(places.values())
+def _of_image(view: ImageView) -> dict[str, NDArray[Any]]:
     return {
-        "count": np.array([len(view) for view in views], np.int64),
-        "pixels": np.concatenate([view.pixels for view in views]).astype(np.float32),
-        "sigma_px": np.concatenate([view.sigma_px for view in views]).astype(np.float32),
-        "depth_m": np.concatenate([view.points_camera[:, 2] for view in views]).astype(np.float32),
-        "descriptors": np.concatenate([view.descriptors for view in views]),
-        "intrinsics": np.array([view.intrinsics for view in views]),
-        "T_body_camera": np.array([view.T_body_camera for view in views]),
+        "count": np.array([len(view)], np.int64),
+        "pixels": view.pixels.astype(np.float32),
+        "sigma_px": view.sigma_px.astype(np.float32),
+        "depth_m": view.points_camera[:, 2].astype(np.float32),
+        "descriptors": view.descriptors,
+        "intrinsics": view.intrinsics[np.newaxis],
+        "T_body_camera": view.T_body_camera[np.newaxis],
     }
 
 
@@ -93,12 +134,11 @@ def _images(table: Mapping[str, NDArray[Any]]) -> list[ImageView]:
     return views
 
 
-def _of_scans(places: Mapping[int, ScanPlace]) -> dict[str, NDArray[Any]]:
-    scans = list(places.values())
+def _of_scan(scan: ScanPlace) -> dict[str, NDArray[Any]]:
     return {
-        "count": np.array([len(scan.points_body) for scan in scans], np.int64),
-        "points_body": np.concatenate([np.empty((0, 3), np.float32), *(scan.points_body for scan in scans)]),
-        "T_level_body": np.array([scan.T_level_body for scan in scans]).reshape(-1, 4, 4),
+        "count": np.array([len(scan.points_body)], np.int64),
+        "points_body": scan.points_body,
+        "T_level_body": scan.T_level_body[np.newaxis],
     }
 
 

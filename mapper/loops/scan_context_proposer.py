@@ -16,13 +16,14 @@ from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 from mapper.loops.proposers import CombinedProposer, NodePoses, PoseProposer
 from mapper.places.config import ScanContextConfig
 from mapper.places.scan_context import ScanContext, ScanContexts, scan_context
+from mapper.runtime.archived import Archivable
 
 MAX_SIMILAR = 2
 """Largest number of candidates of a loop that are proposed for their similarity; the others, as near."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ScanPlace:
+class ScanPlace(Archivable):
     """Description of a scan, thin enough that ten thousand can be kept.
 
     Attributes:

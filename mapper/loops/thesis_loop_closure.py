@@ -16,6 +16,7 @@ from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 from mapper.loops.proposers import PoseProposer
 from mapper.odometry.base import FrameResult
 from mapper.odometry.sharpest_keyframe import SharpestKeyframes
+from mapper.runtime.archived import Archived, ArchivedMapping, archived
 
 
 class ThesisLoopDetector:
@@ -37,7 +38,8 @@ class ThesisLoopDetector:
         self._sharpest = SharpestKeyframes(config.keyframe_interval)
         self._features: deque[int] = deque(maxlen=config.median_frames)
         self._recent: deque[tuple[int, ImageView]] = deque(maxlen=config.keyframe_interval)
-        self._views: dict[int, ImageView] = {}
+        self._views: dict[int, Archived[ImageView]] = {}
+        self._stamps_ns: list[int] = []
         self._closures: list[LoopClosure] = []
 
     def add(self, node: int, track: FrameResult, view: ViewOf, /) -> None:
@@ -51,7 +53,8 @@ class ThesisLoopDetector:
         keyframe = self._sharpest.add(node, features)
         for recent, recent_view in self._recent:
             if recent == keyframe:
-                self._views[recent] = recent_view
+                self._views[recent] = archived(recent_view)
+                self._stamps_ns.append(recent_view.stamp_ns)
                 self._proposer.add(recent, recent_view)
 
     def closures(self) -> Sequence[LoopClosure]:
@@ -68,15 +71,13 @@ class ThesisLoopDetector:
 
     def places(self) -> Mapping[int, ImageView]:
         """Return the keyframes so far."""
-        return self._views
+        return ArchivedMapping(self._views)
 
     def _search(self, node: int, seen: ImageView) -> None:
-        min_gap_ns = round(self._config.min_gap_s * NS_PER_S)
-        old = bisect_right(
-            [*self._views.values()], seen.stamp_ns - min_gap_ns, key=lambda view: view.stamp_ns
-        )
+        old = bisect_right(self._stamps_ns, seen.stamp_ns - round(self._config.min_gap_s * NS_PER_S))
         for proposal in self._proposer.propose(node, seen, before=old, limit=self._config.max_candidates):
-            closure = verify_proposal(proposal, node, self._views[proposal.node], seen, self._verifier)
+            known = self._views[proposal.node].data
+            closure = verify_proposal(proposal, node, known, seen, self._verifier)
             self._closures.append(closure)
             if closure.verdict == "accepted":
                 self._estimator.close(closure)

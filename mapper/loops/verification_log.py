@@ -7,6 +7,7 @@ from typing import Any
 from mapper.core.errors import FrameError
 from mapper.features.frame_view import FrameView
 from mapper.loops.base import Verification, Verifier
+from mapper.runtime.archived import Archived, archived
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -14,11 +15,11 @@ class LoopSearch:
     """What the search of loops from one node has cost most.
 
     Attributes:
-        place: The node's description; None if no loops were searched from it.
+        place: Reference to the node's description; None if no loops were searched from it.
         found: Result of comparing two places, by their stamps (i, j).
     """
 
-    place: Any = None
+    place: Archived[Any] | None = None
     found: Mapping[tuple[int, int], Verification] = field(default_factory=dict)
 
 
@@ -38,9 +39,11 @@ class VerificationLog:
     def describe(self, seen: FrameView, /) -> Any:
         """Return the description of a keyframe that is kept; see ``Verifier``."""
         if self._repeated is not None:
-            return self._repeated.place
+            assert self._repeated.place is not None
+            return self._repeated.place.data
         assert self._verifier is not None
-        place = self._new.place = self._verifier.describe(seen)
+        place = self._verifier.describe(seen)
+        self._new.place = archived(place)
         return place
 
     def verify(self, i: Any, j: Any) -> Verification:
@@ -70,11 +73,11 @@ class VerificationLog:
         """
         if self._repeated is None or self._repeated.place is None:
             raise FrameError("a frame from which no loop was searched")
-        view: FrameView = self._repeated.place
+        view: FrameView = self._repeated.place.data
         return view
 
 
 @dataclass(slots=True, eq=False)
 class _Search:
-    place: Any = None
+    place: Archived[Any] | None = None
     found: dict[tuple[int, int], Verification] = field(default_factory=dict)

@@ -30,7 +30,7 @@ from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
 from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 from mapper.registration.base import Alignment
 from mapper.registration.isvd import Isvd
-from mapper.runtime.state_pickle import Archivable
+from mapper.runtime.archived import Archivable, Archived, archived
 from mapper.sensing.depth_filter import dif
 from mapper.sensing.depth_noise import feature_depth_m
 
@@ -65,6 +65,19 @@ class TrackedFrame:
     node: int
     observation: IsvdObservation
     T_world_body: Transform
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Keyframe:
+    """A tracked frame that is kept, with what it observed in the archive."""
+
+    node: int
+    observation: Archived[IsvdObservation]
+    T_world_body: Transform
+
+    def loaded(self) -> TrackedFrame:
+        """Return the frame."""
+        return TrackedFrame(self.node, self.observation.data, self.T_world_body)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,7 +131,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         self._recent: deque[TrackedFrame] = deque(
             maxlen=max(config.previous_frames, config.keyframe_interval)
         )
-        self._keyframes: list[TrackedFrame] = []
+        self._keyframes: list[_Keyframe] = []
         self._sharpest = SharpestKeyframes(config.keyframe_interval)
         self._next_node = 0
         self._turn = 0
@@ -230,10 +243,11 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
 
     def _relocalise(self, observation: IsvdObservation) -> list[PoseCandidate]:
         """Return the registration against a keyframe that most pairs agree with; none if all failed."""
-        candidates = self._register(observation, self._keyframes_to_try(), self._config.match)
+        keyframes = (keyframe.loaded() for keyframe in self._keyframes_to_try())
+        candidates = self._register(observation, keyframes, self._config.match)
         return sorted(candidates, key=lambda candidate: -candidate.alignment.pairs)[:1]
 
-    def _keyframes_to_try(self) -> list[TrackedFrame]:
+    def _keyframes_to_try(self) -> list[_Keyframe]:
         """Return the keyframes nearest to the last tracked pose, and some of the others in turn."""
         count = self._config.relocalisation_keyframes
         last_world = self._recent[-1].T_world_body[:3, 3]
@@ -258,7 +272,11 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         self._next_node += 1
         self._recent.append(TrackedFrame(node, observation, T_world_body))
         keyframe = self._sharpest.add(node, len(observation.features))
-        self._keyframes.extend(frame for frame in self._recent if frame.node == keyframe)
+        self._keyframes.extend(
+            _Keyframe(frame.node, archived(frame.observation), frame.T_world_body)
+            for frame in self._recent
+            if frame.node == keyframe
+        )
         nearest = candidates[0].alignment if candidates else None
         factors = tuple(
             BetweenFactor(

@@ -13,7 +13,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.run import files
 from mapper.run.fingerprint import fingerprint
 from mapper.run.manifest import Manifest, library_versions
-from mapper.runtime.atomic import MANIFEST_NAME
+from mapper.runtime.atomic import MANIFEST_NAME, write_text
 from mapper.sources.base import Log
 
 IDENTITY = "identity.json"
@@ -57,6 +57,28 @@ def _code_digest() -> str:
     return digest.hexdigest()[:12]
 
 
+def write_identity(path: Path, identity: Mapping[str, Any]) -> None:
+    """Write what decides the result of a build, with a digest of it; atomic."""
+    write_text(path, json.dumps({**identity, "digest": _digest_of(identity)}, indent=1) + "\n")
+
+
+def _read_identity(path: Path) -> dict[str, Any]:
+    """Return what was written.
+
+    Raises:
+        ValueError: It is torn or damaged.
+        OSError: It cannot be read.
+    """
+    known: dict[str, Any] = json.loads(path.read_bytes())
+    if not isinstance(known, dict) or known.pop("digest", None) != _digest_of(known):
+        raise ValueError(f"{path}: damaged")
+    return known
+
+
+def _digest_of(identity: Mapping[str, Any]) -> str:
+    return _digest(json.dumps(identity).encode())
+
+
 def kept_from_before(partial: Path, identity: Mapping[str, Any], *, fresh: bool) -> tuple[str, ...]:
     """Return the names of what a build can go on from in a folder that an earlier process left.
 
@@ -66,11 +88,10 @@ def kept_from_before(partial: Path, identity: Mapping[str, Any], *, fresh: bool)
     if fresh or not (partial / files.CHECKPOINTS).is_dir():
         return ()
     try:
-        known = json.loads((partial / files.CHECKPOINTS / IDENTITY).read_bytes())
-        differences = _differences(known, identity)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        known = _read_identity(partial / files.CHECKPOINTS / IDENTITY)
+    except (OSError, ValueError):
         return ()  # it was killed before anything else was written, or is damaged
-    if differences:
+    if differences := _differences(known, identity):
         named = ", ".join(differences[:_NAMED]) + (", …" if len(differences) > _NAMED else "")
         raise RunError(
             f"{partial}: an unfinished build with {named}; finish it with the arguments it had, or begin "

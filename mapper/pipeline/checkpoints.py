@@ -2,7 +2,8 @@
 
 They lie in a folder of their own in ``OUT.partial``, and come from three steps:
 
-- while a log is tracked, a journal and the state of the odometry (``tracking_checkpoints``);
+- while a log is tracked, a journal and the state of the odometry (``tracking_checkpoints``). Keyframes'
+  features and scans are records of the journal, which all later states refer to (``mapper.runtime.archive``);
 - the results of tracking and of solving, whole, each of which replaces what came before it;
 - while frames are fused, the file of their updates, with a digest of what of it is on the disk
   (``fuse_checkpoints``).
@@ -11,7 +12,6 @@ What is written is taken in the thread that works, between two frames; another t
 the disk. A disk that is full ends the checkpoints, not the build.
 """
 
-import json
 import shutil
 import time
 from collections.abc import Callable, Mapping
@@ -25,14 +25,16 @@ from typing import Any, Literal, Self, TypeVar
 from pydantic import ValidationError
 
 from mapper.core.errors import DataError, MapperError, WriteError
-from mapper.pipeline.checkpoint_identity import IDENTITY
+from mapper.pipeline.checkpoint_identity import IDENTITY, write_identity
 from mapper.run import files
 from mapper.run.manifest import Manifest, Resumption, Timing, now_text
 from mapper.run.writer import RunWriter
+from mapper.runtime.archive import Archive
+from mapper.runtime.archived import Archived
 from mapper.runtime.atomic import flush_to_disk, write_text
-from mapper.runtime.journal import StateFile, opened_state
+from mapper.runtime.journal import Journal, StateFile, opened_state
 from mapper.runtime.progress import Progress
-from mapper.runtime.state_pickle import dump, load
+from mapper.runtime.state_pickle import dump, dumps, load, loads
 from mapper.runtime.timing import peak_memory_mb
 
 EVERY_S = 4.0
@@ -40,6 +42,7 @@ EVERY_S = 4.0
 _SHARE, _LONGEST_S = 0.015, 9.0
 """A checkpoint that costs more of the CPU time between two waits, but no longer than this."""
 _TIMES = "resumed.json"
+_JOURNAL = "tracking.journal"
 
 Result = TypeVar("Result")
 
@@ -73,6 +76,9 @@ class Checkpoints:
         self._last_s, self._last_cpu_s = time.monotonic(), time.process_time()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
         self._pending: Future[None] | None = None
+        self._written: list[Archived[Any]] = []
+        self.journal = Journal(self.folder / _JOURNAL)
+        self.archive = Archive(self.journal)
         self._try(partial(self._begin, identity))
         with suppress(OSError, ValidationError):  # the history alone, which decides nothing
             known = Timing.model_validate_json((self.folder / _TIMES).read_bytes())
@@ -84,7 +90,7 @@ class Checkpoints:
             return
         shutil.rmtree(self.folder, ignore_errors=True)
         self.folder.mkdir()
-        write_text(path, json.dumps(identity, indent=1) + "\n")
+        write_identity(path, identity)
         run = self.writer.folder
         for written in (path, self.folder, run / files.MANIFEST, run, run.parent):
             flush_to_disk(written)
@@ -97,6 +103,7 @@ class Checkpoints:
     ) -> None:
         self._wait()
         self._thread.shutdown()
+        self.journal.close()
         if isinstance(error, MapperError) and not isinstance(error, WriteError):
             shutil.rmtree(self.folder, ignore_errors=True)  # it would fail again
 
@@ -106,17 +113,20 @@ class Checkpoints:
         The manifest and the times so far belong to it.
         """
         versions, damaged = StateFile(self.folder, step).versions()
+        for path in versions.values():
+            try:
+                state = self.read_state(path)
+            except DataError:
+                damaged += 1
+                continue
+            self.resume(state)
+            self.is_solved = step == "solved"
+            if not self.is_solved:
+                self.resumed_at("solve", 0)
+            known: Result = state["result"]
+            return known
         if damaged:
             self.progress.note(f"what an earlier process has {step} is damaged; it is worked out again")
-        for path in versions.values():
-            with suppress(DataError), opened_state(path) as file:
-                state = load(file)
-                self.resume(state)
-                self.is_solved = step == "solved"
-                if not self.is_solved:
-                    self.resumed_at("solve", 0)
-                known: Result = state["result"]
-                return known
         result = work()
         self._wait()
         if not self.is_off:
@@ -124,21 +134,66 @@ class Checkpoints:
         return result
 
     def _replace_by(self, step: str, result: object) -> None:
-        """Write a result, and delete the checkpoints that led to it."""
-        StateFile(self.folder, step).write(0, partial(dump, self.state(result)))
-        kept = {IDENTITY, _TIMES, f"{step}.0"}
+        """Write a result, and delete the checkpoints that led to it, but for the journal it refers to."""
+        self.taken(StateFile(self.folder, step), 0, result)()
+        kept = {IDENTITY, _TIMES, self.journal.path.name, f"{step}.0"}
         for path in self.folder.iterdir():
             if path.name not in kept:
                 path.unlink()
 
-    def state(self, result: object) -> dict[str, Any]:
-        """Return what is written of a result or of a state on the way to it."""
-        return {
-            "result": result,
+    def taken(
+        self, states: StateFile, number: int, result: object, *, fixed: Mapping[str, object] | None = None
+    ) -> Callable[[], None]:
+        """Copy a result, or a state on the way to it; return what writes it and the journal it refers to.
+
+        Args:
+            states: Where to write it.
+            number: Of its version.
+            result: The result.
+            fixed: Parts of it that are not written, by name.
+        """
+        packed = dumps(result, fixed=fixed, archive=self.archive.place_of)
+        state = {
+            "result": packed,
+            "journal_end": self.journal.end,
             "manifest": self.writer.manifest.model_dump_json(),
             "seconds": self.writer.clock.so_far(),
             "peak_memory_mb": peak_memory_mb(),
         }
+        records, new = self.journal.take(), self.archive.take()
+
+        def write() -> None:
+            self.journal.write(records)
+            states.write(number, partial(dump, state))
+            self._written.extend(new)
+
+        return write
+
+    def read_state(
+        self,
+        path: Path,
+        *,
+        fixed: Mapping[str, object] | None = None,
+        other: Callable[[bytes], object] = lambda _: None,
+    ) -> dict[str, Any]:
+        """Return a state with its result, and leave the journal with what belongs to it.
+
+        Args:
+            path: Its version.
+            fixed: The parts that were not written.
+            other: Takes every record of the journal, in order.
+
+        Raises:
+            DataError: The state or the journal is damaged.
+        """
+        self.archive.forget()
+        with opened_state(path) as file:
+            state: dict[str, Any] = load(file)
+        end = int(state["journal_end"])
+        for _, record in self.journal.records(end):
+            other(record)
+        self.journal.truncate(end)
+        return {**state, "result": loads(state["result"], fixed=fixed, archived=self.archive.at)}
 
     def resume(self, state: Mapping[str, Any]) -> None:
         """Go on from a state's manifest and times."""
@@ -199,6 +254,9 @@ class Checkpoints:
         pending, self._pending = self._pending, None
         if pending is not None:
             self._try(pending.result)
+        written, self._written = self._written, []
+        if not self.is_off:
+            self.archive.release(written)
 
     def _try(self, work: Callable[[], None]) -> None:
         """Do what writes; if that fails, go on without checkpoints, and give back their room."""

@@ -275,9 +275,9 @@ def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: 
 
 def save_places(writer: RunWriter, tracking: TrackingResult) -> None:
     """Write the places of the nodes that are in the graph; none, if no loops were searched."""
-    places = {node: place for node, place in tracking.places.items() if node in tracking.graph.T_world_node}
-    if places:
-        write_places(writer.folder / files.PLACES, places)
+    nodes = [node for node in tracking.places if node in tracking.graph.T_world_node]
+    if nodes:
+        write_places(writer.folder / files.PLACES, tracking.places, nodes)
 
 
 def depth_cautions(source: Log) -> list[RunWarning]:

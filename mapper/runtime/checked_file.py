@@ -1,14 +1,19 @@
 """Binary files whose version and checksum are checked before anything in them is used."""
 
+import io
+import shutil
 import struct
 import zlib
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import BinaryIO
 
 from mapper.core.errors import MapperError
 from mapper.runtime import atomic
 
 _FIXED = struct.Struct("<III")
+_PIECE = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +34,18 @@ class CheckedFormat:
 
     def write(self, path: Path, head: bytes, body: bytes) -> None:
         """Write a header and a body; atomic."""
-        rest = head + body
-        atomic.write_bytes(path, self.magic + _FIXED.pack(self.version, len(head), zlib.crc32(rest)) + rest)
+        self.write_from(path, head, io.BytesIO(body))
+
+    def write_from(self, path: Path, head: bytes, body: BinaryIO) -> None:
+        """Write a header and a body that another file has, which is never in memory as a whole; atomic."""
+        checksum = zlib.crc32(head)
+        body.seek(0)
+        for piece in iter(partial(body.read, _PIECE), b""):
+            checksum = zlib.crc32(piece, checksum)
+        body.seek(0)
+        with atomic.atomic_file(path) as part, part.open("wb") as file:
+            file.write(self.magic + _FIXED.pack(self.version, len(head), checksum) + head)
+            shutil.copyfileobj(body, file, _PIECE)
 
     def split(self, path: Path, data: bytes) -> tuple[bytes, memoryview]:
         """Return header and body of a file's bytes, which begin with the magic.

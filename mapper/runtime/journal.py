@@ -38,6 +38,7 @@ class Journal:
     path: Path
     end: int = 0
     _waiting: list[bytes] = field(default_factory=list)
+    _opened: BinaryIO | None = None
 
     def append(self, record: bytes) -> int:
         """Return the place of a new record, which waits until it is taken and written."""
@@ -62,6 +63,41 @@ class Journal:
         """Leave out what is beyond an end: records that no state knows, and a torn one."""
         os.truncate(self.path, end)
         self.end = end
+
+    def remove(self) -> None:
+        """Delete the file and what waits, and begin anew."""
+        self.close()
+        self._waiting, self.end = [], 0
+        self.path.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Close what ``read`` has opened."""
+        opened, self._opened = self._opened, None
+        if opened is not None:
+            opened.close()
+
+    def open(self) -> BinaryIO:
+        """Return the file, open for ``read``: from now on it can be deleted, and is still read."""
+        self._opened = self._opened or self.path.open("rb", buffering=0)
+        return self._opened
+
+    def read(self, place: int) -> bytes:
+        """Return the record at a place that has been written.
+
+        Raises:
+            DataError: It cannot be read, or is damaged.
+        """
+        try:
+            file = self.open()
+            file.seek(place)
+            head = file.read(_HEAD.size)
+            length, digest = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, b"")
+            record = file.read(min(length, self.end - place))
+        except OSError as error:
+            raise DataError(f"{self.path}: cannot be read: {error.strerror}") from None
+        if _digest(record) != digest:
+            raise DataError(f"{self.path}: damaged at byte {place}")
+        return record
 
     def records(self, end: int) -> Iterator[tuple[int, bytes]]:
         """Yield the place and the bytes of every record before an end.

@@ -16,15 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
+from mapper.runtime.archived import Archivable, Archived, reference_of
 
 _MODULES = ("mapper.", "numpy.", "collections.", "functools.", "pathlib.", "builtins.")
 _BUILTINS = frozenset({"set", "frozenset", "bytearray", "complex", "range", "slice", "object"})
-
-
-class Archivable:
-    """Base of data that never changes once it is made, so that it is written once."""
-
-    __slots__ = ()
 
 
 class Writes(Protocol):
@@ -40,7 +35,7 @@ def dump(
     file: Writes,
     *,
     fixed: Mapping[str, object] | None = None,
-    archive: Callable[[Archivable], int | None] | None = None,
+    archive: Callable[[Archived[Any]], int] | None = None,
 ) -> None:
     """Write a state.
 
@@ -48,13 +43,15 @@ def dump(
         state: What to write.
         file: Takes its bytes.
         fixed: Parts that are not written, by name; ``loads`` is given their equals.
-        archive: Returns where ``Archivable`` data is kept, or None to write it as a part of the state.
+        archive: Returns where data is kept that there is an ``Archived`` of; None makes it a part of the
+            state.
 
     Raises:
         DataError: A part of it cannot be written, as an object of a compiled library.
     """
     try:
-        _Pickler(file, {id(part): name for name, part in (fixed or {}).items()}, archive).dump(state)
+        names = {id(part): name for name, part in (fixed or {}).items()}
+        _Pickler(file, names, archive, state).dump(state)
     except (pickle.PicklingError, TypeError, AttributeError) as error:
         raise DataError(f"a state that cannot be written: {error}") from None
 
@@ -63,7 +60,7 @@ def dumps(
     state: object,
     *,
     fixed: Mapping[str, object] | None = None,
-    archive: Callable[[Archivable], int | None] | None = None,
+    archive: Callable[[Archived[Any]], int] | None = None,
 ) -> bytes:
     """Return the bytes of a state; see ``dump``."""
     file = io.BytesIO()
@@ -75,7 +72,7 @@ def loads(
     data: bytes,
     *,
     fixed: Mapping[str, object] | None = None,
-    archived: Callable[[int], object] | None = None,
+    archived: Callable[[int], Archived[Any]] | None = None,
 ) -> Any:
     """Return the state that ``dumps`` was given; see ``load``."""
     return load(io.BytesIO(data), fixed=fixed, archived=archived)
@@ -85,14 +82,14 @@ def load(
     file: BinaryIO,
     *,
     fixed: Mapping[str, object] | None = None,
-    archived: Callable[[int], object] | None = None,
+    archived: Callable[[int], Archived[Any]] | None = None,
 ) -> Any:
     """Return the state that ``dump`` was given.
 
     Args:
         file: Its bytes; only classes and functions of mapper and of the libraries of arrays are loaded.
         fixed: The parts that were not written, by name.
-        archived: Returns the data that is kept at a place, the same object every time.
+        archived: Returns the reference to the data that is kept at a place.
 
     Raises:
         DataError: The bytes are no state, or one of another version.
@@ -124,17 +121,25 @@ def fixed_parts(root: object, kinds: tuple[type, ...]) -> dict[str, object]:
 
 class _Pickler(pickle.Pickler):
     def __init__(
-        self, file: Writes, fixed: Mapping[int, str], archive: Callable[[Archivable], int | None] | None
+        self,
+        file: Writes,
+        fixed: Mapping[int, str],
+        archive: Callable[[Archived[Any]], int] | None,
+        whole: object,
     ) -> None:
         super().__init__(file, pickle.HIGHEST_PROTOCOL)
         self._fixed = fixed
         self._archive = archive
+        self._whole = whole
 
-    def persistent_id(self, obj: Any) -> str | int | None:
+    def persistent_id(self, obj: Any) -> str | int | tuple[int] | None:
         if (name := self._fixed.get(id(obj))) is not None:
             return name
-        if self._archive is not None and isinstance(obj, Archivable):
-            return self._archive(obj)
+        if self._archive is not None and isinstance(obj, Archived):
+            return (self._archive(obj),)  # else the data itself
+        if self._archive is not None and isinstance(obj, Archivable) and obj is not self._whole:
+            reference = reference_of(obj)
+            return None if reference is None else self._archive(reference)
         return None
 
     def reducer_override(self, obj: Any) -> Any:
@@ -165,7 +170,7 @@ def _strided(
 
 class _Unpickler(pickle.Unpickler):
     def __init__(
-        self, file: BinaryIO, fixed: Mapping[str, object], archived: Callable[[int], object] | None
+        self, file: BinaryIO, fixed: Mapping[str, object], archived: Callable[[int], Archived[Any]] | None
     ) -> None:
         super().__init__(file)
         self._fixed = fixed
@@ -173,7 +178,9 @@ class _Unpickler(pickle.Unpickler):
 
     def persistent_load(self, pid: Any) -> object:
         if isinstance(pid, int) and self._archived is not None:
-            return self._archived(pid)
+            return self._archived(pid).data
+        if isinstance(pid, tuple) and self._archived is not None:
+            return self._archived(*pid)
         if pid in self._fixed:
             return self._fixed[pid]
         raise DataError(f"a state with a part {pid!r} that is not there")

@@ -74,7 +74,7 @@ def test_a_wrong_pose_displaces_the_surfaces(odometry, earlier_depth, offset_m, 
 
 def test_without_older_keyframes_nothing_is_known(odometry, earlier_depth):
     pose = odometry._last
-    origin_ns = odometry._map.keyframes[0].observation.stamp_ns
+    origin_ns = odometry._map.keyframes[0].stamp_ns
     early = replace(pose.observation, stamp_ns=origin_ns + 100_000_000)
     assert not earlier_depth.moved(early, pose.T_camera_world, pose.reference).any()
     assert earlier_depth.displacement(early, pose.T_camera_world, pose.reference).ratio == 0.0

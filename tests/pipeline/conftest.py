@@ -1,5 +1,6 @@
-"""What tests of two sessions share: a run of the first half of a walk, and a log of another flat."""
+"""What tests of pipelines share: halves of runs, builds that were stopped, and logs of other places."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -7,8 +8,12 @@ import pytest
 from mapper.config.loading import load_config
 from mapper.pipeline.build import build
 from mapper.run.folder import Run
+from mapper.runtime.atomic import partial_of
+from mapper.simulation.config import STREET, LidarSensorConfig
+from mapper.simulation.lidar import write_lidar_log
 from mapper.sources import open_source
 from tests.support.desk import MANY_KEYFRAMES, write_log_of_another_flat
+from tests.support.stopped_builds import StopAt, start, stopped
 
 
 @pytest.fixture(scope="session")
@@ -24,3 +29,34 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
     log = tmp_path_factory.mktemp("synthetic") / "elsewhere"
     write_log_of_another_flat(log)
     return log
+
+
+@pytest.fixture(scope="module")
+def half(desk_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A build of the desk log that was stopped at frame 20; tests work on copies."""
+    out = tmp_path_factory.mktemp("half") / "run"
+    stopped(desk_log, out, observer=StopAt(20))
+    return out
+
+
+@pytest.fixture
+def unfinished(half: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    out = tmp_path / "run"
+    shutil.copytree(partial_of(half), partial_of(out))
+    return out
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of twenty scans in a street."""
+    folder = tmp_path_factory.mktemp("logs") / "street"
+    sensor = LidarSensorConfig(rings=24, azimuth_steps=360)
+    write_lidar_log(folder, STREET.model_copy(update={"duration_s": 2.0, "sensor": sensor}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def street_run(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """The run built of it."""
+    return start(street, tmp_path_factory.mktemp("runs") / "street", checkpoint_s=None)

@@ -8,125 +8,34 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
 
 import pytest
 
 from mapper.cli.summary import summary_text
-from mapper.config.loading import load_config
 from mapper.core.errors import RunError, TrackingError
 from mapper.odometry.local_map.odometry import KeyframeOdometry
-from mapper.pipeline.build import build
+from mapper.pipeline.checkpoint_identity import write_identity
 from mapper.places.vocabulary import SHIPPED
-from mapper.run.checks import check_run
 from mapper.run.folder import open_run
 from mapper.run.manifest import read_manifest
-from mapper.run.observers import NullObserver
 from mapper.runtime.atomic import locked, partial_of
 from mapper.runtime.journal import StateFile, opened_state
-from mapper.runtime.progress import Silent
 from mapper.runtime.state_pickle import load
-from mapper.simulation.config import STREET, LidarSensorConfig
-from mapper.simulation.lidar import write_lidar_log
-from mapper.sources import open_source
 from tests.support.command_line import mapper
 from tests.support.desk import REPEATABLE
 from tests.support.files import files_of
 from tests.support.paths import ROOT
-
-CHECKPOINTS = ".checkpoints.part"
-MEASURED = {"manifest.json", "frame_ms.csv"}
-
-
-class Stopped(KeyboardInterrupt):
-    """Ctrl-C at a certain frame."""
-
-
-class StopAt(NullObserver):
-    """Stops a build when it has tracked so many frames."""
-
-    def __init__(self, frames, stop=None):
-        self.left, self.stop = frames, stop
-
-    def on_frame(self, _step):
-        self.left -= 1
-        if not self.left:
-            if self.stop is not None:
-                self.stop()
-            raise Stopped
-
-
-class Stage(Silent):
-    """Keeps notes, and stops a build at a frame of a stage."""
-
-    def __init__(self, name="", frame=0):
-        self.notes, self.name, self.frame = [], name, frame
-
-    @contextmanager
-    def stage(self, name):
-        def report(done, _total):
-            if name == self.name and done == self.frame:
-                raise Stopped
-
-        yield report
-
-    def note(self, message):
-        self.notes.append(message)
-
-
-def start(log, out, *overrides, checkpoint_s=0.0, **arguments):
-    source = open_source(log)
-    config = load_config(None, [REPEATABLE, *overrides], sensor=source.sensor)
-    return build(source, config, out, checkpoint_s=checkpoint_s, **arguments)
-
-
-def stopped(log, out, *overrides, **arguments):
-    """Begin or go on with a build, and stop it."""
-    with pytest.raises(Stopped):
-        start(log, out, *overrides, **arguments)
-    return partial_of(out) / CHECKPOINTS
-
-
-def assert_same(run, wanted):
-    ours, theirs = files_of(run.path), files_of(wanted.path)
-    assert ours.keys() == theirs.keys()
-    for name in ours.keys() - MEASURED:
-        assert ours[name] == theirs[name], name
-    measured = {"timing": wanted.manifest.timing, "files": wanted.manifest.files}
-    assert run.manifest.model_copy(update=measured) == wanted.manifest
-    assert not any(finding.verdict == "failed" for finding in check_run(run.path))
-
-
-def resumed(run):
-    return [(resumption.step, resumption.frame) for resumption in run.manifest.timing.resumed]
-
-
-@pytest.fixture(scope="module")
-def half(desk_log, tmp_path_factory):
-    """A build of the desk log that was stopped at frame 20; tests work on copies."""
-    out = tmp_path_factory.mktemp("half") / "run"
-    stopped(desk_log, out, observer=StopAt(20))
-    return out
-
-
-@pytest.fixture
-def unfinished(half, tmp_path):
-    out = tmp_path / "run"
-    shutil.copytree(partial_of(half), partial_of(out))
-    return out
-
-
-@pytest.fixture(scope="module")
-def street(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("logs") / "street"
-    sensor = LidarSensorConfig(rings=24, azimuth_steps=360)
-    write_lidar_log(folder, STREET.model_copy(update={"duration_s": 2.0, "sensor": sensor}))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def street_run(street, tmp_path_factory):
-    return start(street, tmp_path_factory.mktemp("runs") / "street", checkpoint_s=None)
+from tests.support.stopped_builds import (
+    CHECKPOINTS,
+    Stage,
+    StopAt,
+    Stopped,
+    assert_same,
+    newest,
+    resumed,
+    start,
+    stopped,
+)
 
 
 def test_tracking_goes_on_at_the_frame_where_it_was_stopped(desk_log, desk_run, tmp_path):
@@ -205,7 +114,7 @@ def test_a_solve_is_not_made_twice(desk_log, desk_run, tmp_path, monkeypatch):
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from tests.pipeline.test_resume import StopAt, start
+from tests.support.stopped_builds import StopAt, start
 log, out, frames = sys.argv[1:]
 stop = StopAt(int(frames), lambda: os.kill(os.getpid(), signal.SIGKILL))
 start(Path(log), Path(out), observer=stop)
@@ -219,62 +128,6 @@ def test_a_killed_process_leaves_what_another_goes_on_from(desk_log, desk_run, t
     run = start(desk_log, tmp_path / "run")
     assert_same(run, desk_run)
     assert resumed(run)
-
-
-def damage(path, how):
-    data = bytearray(path.read_bytes())
-    if how == "torn":
-        del data[len(data) // 2 :]
-    else:
-        data[len(data) // 2] ^= 16
-    path.write_bytes(data)
-
-
-def newest(folder):
-    return next(iter(StateFile(folder, "odometry").versions()[0].values()))
-
-
-@pytest.mark.parametrize("how", ["torn", "flipped"])
-def test_a_damaged_checkpoint_leaves_the_one_before_it(desk_log, desk_run, unfinished, how):
-    folder, progress = partial_of(unfinished) / CHECKPOINTS, Stage()
-    damage(newest(folder), how)
-    run = start(desk_log, unfinished, progress=progress)
-    assert "the newest checkpoint is damaged or torn; the one before it is used" in progress.notes
-    assert resumed(run)
-    assert_same(run, desk_run)
-
-
-@pytest.mark.parametrize("what", ["both checkpoints", "journal"])
-def test_damaged_checkpoints_begin_anew_with_a_word(desk_log, desk_run, unfinished, what):
-    folder, progress = partial_of(unfinished) / CHECKPOINTS, Stage()
-    if what == "journal":
-        data = bytearray((folder / "tracking.journal").read_bytes())
-        data[100] ^= 1
-        (folder / "tracking.journal").write_bytes(data)
-    else:
-        for path in folder.glob("odometry.*"):
-            damage(path, "flipped")
-    run = start(desk_log, unfinished, progress=progress)
-    assert "the checkpoints of an earlier process are damaged; tracking begins anew" in progress.notes
-    assert resumed(run) == []
-    assert_same(run, desk_run)
-
-
-def test_a_torn_tail_of_the_journal_costs_nothing(desk_log, desk_run, unfinished):
-    with (partial_of(unfinished) / CHECKPOINTS / "tracking.journal").open("ab") as file:
-        file.write(b"\x20\0\0\0\0\0\0\0half of a record")
-    run = start(desk_log, unfinished)
-    assert resumed(run)
-    assert_same(run, desk_run)
-
-
-def test_a_torn_file_of_updates_is_not_used(desk_log, desk_run, tmp_path):
-    out = tmp_path / "run"
-    stopped(desk_log, out, progress=Stage("fuse", 20))
-    damage(partial_of(out) / "scan_updates.bin", "flipped")
-    run = start(desk_log, out)
-    assert_same(run, desk_run)
-    assert [step for step, _ in resumed(run)] == ["fuse"]
 
 
 def test_other_settings_are_refused_until_it_is_begun_anew(desk_log, unfinished):
@@ -305,17 +158,11 @@ def test_another_log_or_version_is_refused(desk_log, street, unfinished):
         start(street, unfinished)
     path = partial_of(unfinished) / CHECKPOINTS / "identity.json"
     identity = json.loads(path.read_text())
+    del identity["digest"]
     identity["versions"]["numpy"] = "1.0"
-    path.write_text(json.dumps(identity))
+    write_identity(path, identity)
     with pytest.raises(RunError, match=r"an unfinished build with numpy 1\.0, not 2"):
         start(desk_log, unfinished)
-
-
-@pytest.mark.parametrize("left", ["", "{", "[]", '{"config": 3}'])
-def test_checkpoints_without_an_identity_are_not_used(desk_log, unfinished, left):
-    (partial_of(unfinished) / CHECKPOINTS / "identity.json").write_text(left)
-    with pytest.raises(Stopped):
-        start(desk_log, unfinished, observer=StopAt(1))
 
 
 def test_a_full_disk_ends_the_checkpoints_and_not_the_build(desk_log, desk_run, tmp_path, monkeypatch):

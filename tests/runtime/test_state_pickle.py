@@ -8,9 +8,11 @@ import pytest
 
 from mapper.core.errors import DataError
 from mapper.core.frames import PinholeCamera, Scan
+from mapper.loops.scan_context_proposer import ScanPlace
 from mapper.odometry.local_map.growing_table import GrowingTable
 from mapper.odometry.local_map.log_residuals import LogResiduals
-from mapper.runtime.state_pickle import Archivable, dumps, fixed_parts, loads
+from mapper.runtime.archived import Archivable, archived
+from mapper.runtime.state_pickle import dumps, fixed_parts, loads
 
 BASE = np.arange(60.0).reshape(5, 12)
 
@@ -63,18 +65,26 @@ class Clouds(Archivable):
     """Something that never changes."""
 
 
-def test_archived_data_is_written_once_and_stays_one_object():
-    clouds, places = Clouds(), []
+def place(stamp_ns):
+    return ScanPlace(stamp_ns, np.zeros((2, 3), np.float32), np.eye(4))
 
-    def archive(data):
-        assert data is clouds
-        places.append(data)
-        return 42
 
-    data = dumps([clouds, clouds], archive=archive)
-    assert len(places) == 2  # asked for each; the journal knows that it has it
-    known = object()
-    assert loads(data, archived={42: known}.__getitem__) == [known, known]
+def test_archived_data_is_referred_to_and_other_data_is_a_part_of_the_state():
+    known, new, reference = Clouds(), place(3), archived(Clouds())
+    archived(known)
+    places = {id(archived(known)): 42, id(reference): 7}
+
+    data = dumps([known, known, reference, new], archive=lambda asked: places[id(asked)])
+    again = {42: archived(Clouds()), 7: archived(Clouds())}
+    first, second, third, fourth = loads(data, archived=again.__getitem__)
+    assert first is second is again[42].data
+    assert third is again[7]
+    assert fourth.stamp_ns == 3
+
+
+def test_without_an_archive_a_reference_comes_back_with_its_data():
+    copy = loads(dumps(archived(Scan(5, np.zeros((2, 3), np.float32)))))
+    assert copy.data.stamp_ns == 5
 
 
 def test_a_growing_table_comes_back_with_its_rows_and_grows_on():

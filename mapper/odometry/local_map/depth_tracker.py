@@ -158,11 +158,11 @@ class DepthTracker:
         self._keyframes = [
             k
             for k in self._map.latest(last.reference)
-            if keyframes[k].origin == origin and _alike(keyframes[k].observation.depth_cells, cells)
+            if keyframes[k].origin == origin and _alike(self._map.observation(k).depth_cells, cells)
         ]
-        models = [(keyframes[k].observation, keyframes[k].T_camera_world, k) for k in self._keyframes]
+        models = [(self._map.observation(k), keyframes[k].T_camera_world, k) for k in self._keyframes]
         blind = last.doubts or (last.depth is not None and last.depth.unobservable)
-        if not blind and all(earlier is not last.observation for earlier, _, _ in models):
+        if not blind and all(earlier.stamp_ns != last.observation.stamp_ns for earlier, _, _ in models):
             models.append((last.observation, last.T_camera_world, last.reference))
         models = [model for model in models if _alike(model[0].depth_cells, cells)]
         self._surfaces = {

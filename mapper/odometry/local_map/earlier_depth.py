@@ -109,20 +109,23 @@ class EarlierDepth:
         )
         if beside == 0 or same + beside < _MIN_COMPARED_RATIO * len(points):
             return Displacement()
-        since_s = (observation.stamp_ns - keyframe.observation.stamp_ns) / NS_PER_S
+        since_s = (observation.stamp_ns - keyframe.stamp_ns) / NS_PER_S
         return Displacement(beside / (same + beside), distance_m / beside, since_s)
 
     def _earlier(self, observation: ImageObservation, reference: int, *, most: int) -> list[int]:
         """Return keyframes of the same sub-map and camera, each 0.4 s older than the one before."""
         keyframes, cells = self._map.keyframes, observation.depth_cells
+        if cells is None:
+            return []
         apart_ns = round(_APART_S * NS_PER_S)
         origin, latest_ns = keyframes[reference].origin, observation.stamp_ns - apart_ns
         earlier: list[int] = []
         for k in range(reference, origin - 1, -1):
-            there = keyframes[k].observation
-            if there.stamp_ns > latest_ns or keyframes[k].origin != origin or keyframes[k].doubt_m > 0.0:
+            there = keyframes[k]
+            if there.stamp_ns > latest_ns or there.origin != origin or there.doubt_m > 0.0:
                 continue
-            if cells is None or there.depth_cells is None or there.depth_cells.camera != cells.camera:
+            theirs = self._map.observation(k).depth_cells
+            if theirs is None or theirs.camera != cells.camera:
                 continue
             earlier.append(k)
             if len(earlier) == most:
@@ -132,7 +135,7 @@ class EarlierDepth:
 
 
 def _cells_of(landmark_map: LandmarkMap, keyframe: int) -> DepthCells:
-    cells = landmark_map.keyframes[keyframe].observation.depth_cells
+    cells = landmark_map.observation(keyframe).depth_cells
     assert cells is not None
     return cells
 

@@ -1,6 +1,8 @@
 """Observation of one RGB-D frame: features with depth, as arrays for the compiled kernels."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,7 @@ from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.depth_surfaces import DepthCells, depth_cells
 from mapper.odometry.local_map.pixel_motion import depth_velocity, pixel_velocity, row_phase
 from mapper.places.vocabulary import Vocabulary
-from mapper.runtime.state_pickle import Archivable
+from mapper.runtime.archived import Archivable
 from mapper.sensing.config import KINECT_NOISE
 from mapper.sensing.depth_noise import depth_sigma_m, feature_depth_m, feature_depth_sigma_m
 
@@ -49,6 +51,7 @@ class ImageObservation(Archivable):
         sweep_camera: (6,) motion of the camera while the rows were read, in its own axes (rotation,
             translation), that ``measured`` allows for; 0 for a global shutter.
         depth_cells: The depth image, reduced; None if it is not aligned.
+        unswept: The observation without a motion, which this one is made from; None if that is itself.
     """
 
     stamp_ns: int
@@ -67,6 +70,7 @@ class ImageObservation(Archivable):
     T_body_camera: Transform
     sweep_camera: Array
     depth_cells: DepthCells | None = None
+    unswept: "ImageObservation | None" = None
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -75,6 +79,15 @@ class ImageObservation(Archivable):
     def has_depth(self) -> NDArray[np.bool_]:
         """(N,) which features have depth."""
         return ~np.isnan(self.depth_m)
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Return what is written of it: the rest follows from that, to the bit."""
+        if self.unswept is not None:
+            return _swept, (self.unswept, self.sweep_camera)
+        measured = {
+            field.name: getattr(self, field.name) for field in fields(self) if field.name not in _DERIVED
+        }
+        return _unswept, (measured, not np.isnan(self.measured[:, 2]).all())
 
     def swept(self, sweep_camera: Array) -> "ImageObservation":
         """Return the observation with the shift of each row by another motion of the camera taken out."""
@@ -91,6 +104,7 @@ class ImageObservation(Archivable):
             measured=np.column_stack([pixels, disparity_px]),
             points_camera=back_projected(pixels, z, self.intrinsics),
             sweep_camera=sweep_camera,
+            unswept=self if self.unswept is None else self.unswept,
         )
 
     def row_shift(self, pixels: Array, depth_m: Array, sweep_camera: Array | None = None) -> Array:
@@ -103,7 +117,7 @@ class ImageObservation(Archivable):
 
     def view(self) -> ImageView:
         """Return the view for place recognition."""
-        return ImageView(
+        return ObservedView(
             stamp_ns=self.stamp_ns,
             pixels=self.measured[:, :2],
             sigma_px=self.weights[:, 0] ** -0.5,
@@ -111,7 +125,26 @@ class ImageObservation(Archivable):
             points_camera=self.points_camera,
             intrinsics=self.intrinsics[:4],
             T_body_camera=self.T_body_camera,
+            observation=self,
         )
+
+
+_DERIVED = frozenset({"measured", "points_camera", "sweep_camera", "unswept"})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObservedView(ImageView):
+    """View of an observation, which it is made from again after it was written.
+
+    Attributes:
+        observation: The observation.
+    """
+
+    observation: ImageObservation
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Return the observation alone: a keyframe's is in the archive already."""
+        return _view_of, (self.observation,)
 
 
 def observe_image(
@@ -142,9 +175,6 @@ def observe_image(
     intrinsics = np.array(
         [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, config.virtual_baseline_px_m]
     )
-    disparity_px = config.virtual_baseline_px_m / depth_m
-    if not config.depth_residual:
-        disparity_px[:] = np.nan
     bits = pack(features.descriptors[order])
     sigma_px = detector.scale_factor ** octave.astype(np.float64)
     disparity_sigma_px = sigma_px * config.disparity_sigma_px
@@ -157,24 +187,42 @@ def observe_image(
         disparity_sigma_px = np.where(np.isnan(depth_m), disparity_sigma_px, known_px)
     sensor_m = np.hypot(depth_sigma_m(config.depth_noise or KINECT_NOISE, depth_m), _SCALE_ERROR * depth_m)
     sensor_px = np.fmin(config.virtual_baseline_px_m / depth_m**2 * sensor_m, disparity_sigma_px)
+    measured = {
+        "stamp_ns": frame.stamp_ns,
+        "pixels": pixels,
+        "depth_m": depth_m,
+        "octave": octave,
+        "bits": bits,
+        "words": vocabulary.words_of(bits),
+        "weights": np.column_stack([sigma_px, sigma_px, disparity_sigma_px]) ** -2.0,
+        "sensor_weights": np.column_stack([sigma_px, sigma_px, sensor_px]) ** -2.0,
+        "grid": grid,
+        "intrinsics": intrinsics,
+        "size_px": (camera.width_px, camera.height_px),
+        "T_body_camera": frame.T_body_camera,
+        "depth_cells": depth_cells(frame.depth_m, camera) if config.align_depth else None,
+    }
+    return _unswept(measured, config.depth_residual)
+
+
+def _unswept(measured: Mapping[str, Any], has_disparity: bool) -> ImageObservation:
+    """Return the observation of a camera that stands still, with what follows from its measurements."""
+    pixels, depth_m, intrinsics = measured["pixels"], measured["depth_m"], measured["intrinsics"]
+    disparity_px = intrinsics[4] / depth_m if has_disparity else np.full(len(pixels), np.nan)
     return ImageObservation(
-        stamp_ns=frame.stamp_ns,
-        pixels=pixels,
-        depth_m=depth_m,
-        octave=octave,
-        bits=bits,
-        words=vocabulary.words_of(bits),
         measured=np.column_stack([pixels, disparity_px]),
-        weights=np.column_stack([sigma_px, sigma_px, disparity_sigma_px]) ** -2.0,
-        sensor_weights=np.column_stack([sigma_px, sigma_px, sensor_px]) ** -2.0,
         points_camera=back_projected(pixels, depth_m, intrinsics),
-        grid=grid,
-        intrinsics=intrinsics,
-        size_px=(camera.width_px, camera.height_px),
-        T_body_camera=frame.T_body_camera,
         sweep_camera=np.zeros(6),
-        depth_cells=depth_cells(frame.depth_m, camera) if config.align_depth else None,
+        **measured,
     )
+
+
+def _view_of(observation: ImageObservation) -> ImageView:
+    return observation.view()
+
+
+def _swept(unswept: ImageObservation, sweep_camera: Array) -> ImageObservation:
+    return unswept.swept(sweep_camera)
 
 
 def back_projected(pixels: Array, depth_m: Array, intrinsics: Array) -> Points:

@@ -1,7 +1,6 @@
 """Local map: keyframes, landmarks, and the observations of landmarks in keyframes."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +9,12 @@ from mapper.core.geometry import Array, Transform, adjoint, apply, inverse
 from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameter
 from mapper.odometry.local_map.growing_table import GrowingTable
 from mapper.odometry.local_map.image_observation import ImageObservation
+from mapper.odometry.local_map.keyframe import DepthLink, Keyframe, RecentObservations
 from mapper.odometry.local_map.landmark_kernels import count_observers, observations_of
 from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.registration.reprojection import normal_matrix
 from mapper.registration.variance_factor import ResidualStatistics, residual_statistics
+from mapper.runtime.archived import archived
 
 Ids = NDArray[np.int32]
 
@@ -25,46 +26,6 @@ _MIN_FOUND_RATIO = 0.25
 """Young landmarks found in a smaller share of the frames that should show them are removed (ibid., §VI-B)."""
 _BUNDLE_ROUNDS, _BUNDLE_ITERATIONS = 2, 5
 _NEWEST = 3
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DepthLink:
-    """Relative pose of two keyframes from their depth images.
-
-    Attributes:
-        reference: The keyframe that the depth image was aligned to.
-        T_camera_reference: (4, 4) from its camera to the camera of the keyframe that has the link.
-        information: (6, 6) of the latter's tangent (rotation, translation).
-    """
-
-    reference: int
-    T_camera_reference: Transform
-    information: Array
-
-
-@dataclass(slots=True, eq=False)
-class Keyframe:
-    """A frame that stays in the map.
-
-    Attributes:
-        observation: Its features.
-        T_camera_world: (4, 4) current estimate.
-        landmark_of_feature: (N,) int32 landmark of each feature, −1 for none.
-        origin: First keyframe of its sub-map; sub-maps are not connected to each other.
-        twist_camera: (6,) velocity of the camera in its own axes, rad/s and m/s; 0 if it is unknown.
-        depth_link: Pose relative to an earlier keyframe by depth; None if the landmarks were many.
-        doubt_rad: Error of its rotation that speaks against it; 0 if its pose is not doubtful.
-        doubt_m: Error of its translation.
-    """
-
-    observation: ImageObservation
-    T_camera_world: Transform
-    landmark_of_feature: Ids
-    origin: int
-    twist_camera: Array
-    depth_link: DepthLink | None = None
-    doubt_rad: float = 0.0
-    doubt_m: float = 0.0
 
 
 class LandmarkMap:
@@ -98,6 +59,15 @@ class LandmarkMap:
         self.scale_factor = scale_factor
         self._observed_with_s = readout.seconds
         self._first_landmark: list[int] = []
+        self._recent = RecentObservations()
+
+    def observation(self, index: int) -> ImageObservation:
+        """Return what was observed in a keyframe, by the readout time as it is known now.
+
+        Raises:
+            DataError: It is on the disk, and cannot be read.
+        """
+        return self._recent.of(index, self.keyframes[index])
 
     def add_keyframe(
         self,
@@ -148,8 +118,19 @@ class LandmarkMap:
             T_camera_reference = T_camera_world @ inverse(self.keyframes[neighbour].T_camera_world)
             link = DepthLink(neighbour, T_camera_reference, depth_information)
         self.keyframes.append(
-            Keyframe(observation, T_camera_world, landmark_of_feature, origin, twist_camera, link)
+            Keyframe(
+                stamp_ns=observation.stamp_ns,
+                T_body_camera=observation.T_body_camera,
+                unswept=archived(observation if observation.unswept is None else observation.unswept),
+                sweep_camera=observation.sweep_camera,
+                T_camera_world=T_camera_world,
+                landmark_of_feature=landmark_of_feature,
+                origin=origin,
+                twist_camera=twist_camera,
+                depth_link=link,
+            )
         )
+        self._recent.keep(index, observation)
         self._link(index)
         return index
 
@@ -161,7 +142,7 @@ class LandmarkMap:
         ray = self.landmarks["position"][ids] - centre_world
         self.landmarks["observers"][ids] += 1
         self.landmarks["direction"][ids] += ray / np.linalg.norm(ray, axis=1, keepdims=True)
-        observation = keyframe.observation
+        observation = self.observation(index)
         self.landmarks["newest"][ids] = self._observations.append(
             len(features),
             older=self.landmarks["newest"][ids],
@@ -246,7 +227,7 @@ class LandmarkMap:
             self._observations["measured"][observations],
             self._observations["weights"][observations],
         )
-        intrinsics = self.keyframes[index].observation.intrinsics
+        intrinsics = self.observation(index).intrinsics
         links = np.searchsorted(keyframe_ids, linked).astype(np.int32), T_links, link_information
         poses, points, agree = adjust(
             np.array([self.keyframes[k].T_camera_world for k in keyframe_ids]),
@@ -281,9 +262,8 @@ class LandmarkMap:
         by_s = self.readout.seconds - self._observed_with_s
         self._observed_with_s = self.readout.seconds
         for keyframe in self.keyframes:
-            keyframe.observation = keyframe.observation.swept(
-                keyframe.observation.sweep_camera + by_s * keyframe.twist_camera
-            )
+            keyframe.sweep_camera = keyframe.sweep_camera + by_s * keyframe.twist_camera
+        self._recent.clear()
         rows = slice(self._observations.size)
         self._observations["measured"][rows, :2] += by_s * self._observations["slope"][rows]
 
@@ -304,7 +284,14 @@ class LandmarkMap:
             landmarks.append(self.keyframes[keyframes[e]].landmark_of_feature[features[e]])
             self.keyframes[keyframes[e]].landmark_of_feature[features[e]] = -1
         keyframes[observations] = -1
-        np.subtract.at(self.landmarks["observers"], np.array(landmarks, dtype=np.intp), 1)
+        ids = np.array(landmarks, dtype=np.intp)
+        np.subtract.at(self.landmarks["observers"], ids, 1)
+        # Nobody reads them any more: zeros, as four landmarks of five are, make checkpoints small.
+        for name in ("measured", "weights", "slope"):
+            self._observations[name][observations] = 0.0
+        removed = ids[self.landmarks["observers"][ids] == 0]
+        for name in ("position", "direction", "bits", "reach_m"):
+            self.landmarks[name][removed] = 0
 
     def cull(self) -> None:
         """Remove young landmarks that no second keyframe observes or that tracking rarely finds.
@@ -348,7 +335,7 @@ class LandmarkMap:
         shared, _, features = np.intersect1d(
             self.landmarks_of(target), keyframe.landmark_of_feature, return_indices=True
         )
-        observation = keyframe.observation
+        observation = self.observation(source)
         H_camera = 0.5 * normal_matrix(
             keyframe.T_camera_world,
             self.landmarks["position"][shared],
@@ -367,12 +354,13 @@ class LandmarkMap:
         features = np.flatnonzero((ids >= 0) & (self.landmarks["observers"][ids] > 1))
         if len(features) < MIN_SHARED_LANDMARKS:
             return None
+        observation = self.observation(index)
         return residual_statistics(
             keyframe.T_camera_world,
             self.landmarks["position"][ids[features]],
-            keyframe.observation.measured[features],
-            keyframe.observation.weights[features],
-            keyframe.observation.intrinsics,
+            observation.measured[features],
+            observation.weights[features],
+            observation.intrinsics,
         )
 
     def depth_information(self, target: int, source: int) -> Array:
@@ -383,6 +371,6 @@ class LandmarkMap:
         keyframe = self.keyframes[source]
         if keyframe.depth_link is None or keyframe.depth_link.reference != target:
             return np.zeros((6, 6))
-        to_camera = adjoint(inverse(keyframe.observation.T_body_camera))
+        to_camera = adjoint(inverse(keyframe.T_body_camera))
         H_body: Array = to_camera.T @ keyframe.depth_link.information @ to_camera
         return H_body

@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.core.deskew import Twist
 from mapper.core.frames import Frame
-from mapper.core.geometry import Array, Points, Transform, adjoint, inverse
+from mapper.core.geometry import Array, Points, adjoint, inverse
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
@@ -150,13 +150,15 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             return None
         landmarks = last.landmark_of_feature
         previous_px = np.full((len(landmarks), 2), np.nan)
-        for earlier in (self._map.keyframes[last.reference], self._before_last):
-            if earlier is not None and earlier.observation is not last.observation:
-                common, now, then = np.intersect1d(
-                    landmarks, earlier.landmark_of_feature, return_indices=True
-                )
+        keyframe, before = self._map.keyframes[last.reference], self._before_last
+        earlier = [(keyframe.landmark_of_feature, self._map.observation(last.reference))]
+        if before is not None:
+            earlier.append((before.landmark_of_feature, before.observation))
+        for ids, observation in earlier:
+            if observation.stamp_ns != last.observation.stamp_ns:
+                common, now, then = np.intersect1d(landmarks, ids, return_indices=True)
                 now, then = now[common >= 0], then[common >= 0]
-                previous_px[now] = earlier.observation.pixels[then]
+                previous_px[now] = observation.pixels[then]
         return FeatureMatches(self._agreeing, previous_px)
 
     def finish(self) -> Sequence[BetweenFactor]:
@@ -182,11 +184,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         ``shared_by`` factors of j rest largely on the same features. Were these the same, each factor would
         have that share of their information, were they others, all: it has the geometric mean.
         """
-        T_world_i, T_world_j = (
-            _body_pose(keyframe.observation, keyframe.T_camera_world)
-            for keyframe in (self._map.keyframes[i], self._map.keyframes[j])
-        )
-        T_i_j = inverse(T_world_i) @ T_world_j
+        keyframes = self._map.keyframes
+        T_i_j = inverse(keyframes[i].body_pose) @ keyframes[j].body_pose
         information = self._map.information(i, j) + self._map.depth_information(i, j)
         information = self._residuals.honest(information, T_i_j) / math.sqrt(shared_by)
         doubtful = self._map.keyframes[j]
@@ -250,13 +249,11 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         check, last = self._motion_check, self._last
         if check is None or last is None:
             return True
-        keyframes, now = self._map.keyframes, tracked_pose.observation
+        keyframes = self._map.keyframes
         known = keyframes[tracked_pose.reference]
         since = last if known.origin == keyframes[last.reference].origin else known
-        T_begin_end = inverse(_body_pose(since.observation, since.T_camera_world)) @ _body_pose(
-            now, tracked_pose.T_camera_world
-        )
-        if not check.contradiction(T_begin_end, since.observation.stamp_ns, now.stamp_ns):
+        T_begin_end = inverse(since.body_pose) @ tracked_pose.body_pose
+        if not check.contradiction(T_begin_end, since.stamp_ns, tracked_pose.stamp_ns):
             return True
         self._unknown_frames = self._config.max_lost_frames  # another place, so a sub-map may begin at once
         return False
@@ -297,7 +294,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         keyframe.doubt_rad, keyframe.doubt_m = doubt.sigma_rad, doubt.sigma_m
         return replace(
             tracked_pose,
-            observation=keyframe.observation,
+            observation=self._map.observation(index),
             T_camera_world=keyframe.T_camera_world,
             landmark_of_feature=keyframe.landmark_of_feature,
             reference=index,
@@ -312,9 +309,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         links: Sequence[BetweenFactor] = (),
     ) -> FrameResult:
         """Return the result of a frame; a keyframe's landmarks are more than the ``inliers`` that it had."""
-        T_world_body = _body_pose(tracked_pose.observation, tracked_pose.T_camera_world)
+        T_world_body = tracked_pose.body_pose
         node = self._map.keyframes[tracked_pose.reference]
-        T_world_node = _body_pose(node.observation, node.T_camera_world)
         diagnostics = Diagnostics(
             features=len(tracked_pose.observation),
             matches=tracked_pose.matches,
@@ -328,7 +324,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         return FrameResult(
             stamp_ns=tracked_pose.observation.stamp_ns,
             node=tracked_pose.reference,
-            T_node_body=inverse(T_world_node) @ T_world_body,
+            T_node_body=inverse(node.body_pose) @ T_world_body,
             T_world_body=T_world_body,
             is_keyframe=is_keyframe,
             diagnostics=diagnostics,
@@ -339,18 +335,13 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
     def _lost(self, observation: ImageObservation) -> FrameResult:
         self._lost_frames += 1
         last = self._last
-        T_world_body = np.eye(4) if last is None else _body_pose(last.observation, last.T_camera_world)
+        T_world_body = np.eye(4) if last is None else last.body_pose
         return lost_frame(observation.stamp_ns, T_world_body, features=len(observation), residual_unit="px")
 
 
 def _gap_ns(last: TrackedPose, observation: ImageObservation) -> int:
     """Return the time since a tracked frame."""
     return observation.stamp_ns - last.observation.stamp_ns
-
-
-def _body_pose(observation: ImageObservation, T_camera_world: Transform) -> Transform:
-    """Return T_world_body."""
-    return inverse(observation.T_body_camera @ T_camera_world)
 
 
 def _covariance_of(information: Array) -> Array:

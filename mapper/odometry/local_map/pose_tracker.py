@@ -55,6 +55,16 @@ class TrackedPose:
     moving: Ids = field(default_factory=lambda: np.empty(0, np.int32))
 
     @property
+    def stamp_ns(self) -> int:
+        """The frame's stamp."""
+        return self.observation.stamp_ns
+
+    @property
+    def body_pose(self) -> Transform:
+        """(4, 4) T_world_body."""
+        return inverse(self.observation.T_body_camera @ self.T_camera_world)
+
+    @property
     def inliers(self) -> int:
         """Number of features that agree with the pose."""
         return int((self.landmark_of_feature >= 0).sum())

@@ -36,7 +36,7 @@ class Relocalizer:
 
     def add(self, keyframe: int) -> None:
         """Add a keyframe to the index of places."""
-        words = self._map.keyframes[keyframe].observation.words
+        words = self._map.observation(keyframe).words
         self._index.add(keyframe, self._vocabulary.vector(words))
 
     def best_among(
@@ -121,7 +121,7 @@ class Relocalizer:
         ids = keyframe.landmark_of_feature[mapped]
         return self.match_points(
             observation,
-            keyframe.observation.bits[mapped],
+            self._map.observation(k).bits[mapped],
             self._map.landmarks["position"][ids],
             ids,
             reference=k,
@@ -173,9 +173,10 @@ class Relocalizer:
         """Return the features of a frame that match landmarks of a keyframe, and these landmarks."""
         keyframe = self._map.keyframes[k]
         mapped = np.flatnonzero(keyframe.landmark_of_feature >= 0)
+        known = self._map.observation(k)
         pairs = match_by_word(
-            keyframe.observation.bits[mapped],
-            self._nodes(keyframe.observation.words[mapped]),
+            known.bits[mapped],
+            self._nodes(known.words[mapped]),
             observation.bits,
             self._nodes(observation.words),
             max_hamming=MAX_HAMMING,

@@ -1,0 +1,118 @@
+"""Memory, time and checkpoints of tracking against the number of frames, always through new places.
+
+    python -m benchmarks.long_logs rgbd [--frames 2400]
+    python -m benchmarks.long_logs lidar [--frames 3000]
+
+"rgbd" walks through a building that is as large as the log is long, "lidar" drives along a street. Frames are
+simulated in other threads as they are read, so that no log is in memory or on the disk. A row stands for a
+tenth of the frames: resident memory at its end, beyond that before the first frame; CPU milliseconds a frame
+in the thread that tracks, searches loops and takes checkpoints; size of the checkpoints on the disk.
+"""
+
+import argparse
+import os
+import shutil
+import tempfile
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from mapper.config.loading import load_config
+from mapper.pipeline.build import build
+from mapper.run import files
+from mapper.run.observers import NullObserver, Step
+from mapper.runtime.atomic import partial_of
+from mapper.simulation import CameraSimulator
+from mapper.simulation.config import LidarSensorConfig, LidarSynthConfig, SynthConfig
+from mapper.simulation.lidar import LidarSimulator
+from mapper.sources.base import Log
+
+ROWS = 10
+FRAMES_PER_ROOM, SCAN_STEP_M = 50, 0.5
+"""At 10 Hz; a room is 4.4 m across, and has an aisle."""
+MB = 1e6
+
+
+class Enough(KeyboardInterrupt):
+    """All frames are tracked; what follows is of no interest here."""
+
+
+class Meter(NullObserver):
+    """Prints a row for every so many frames that are tracked."""
+
+    def __init__(self, out: Path, frames: int) -> None:
+        self._checkpoints, self._frames = partial_of(out) / files.CHECKPOINTS, frames
+        self._done = self._keyframes = 0
+        self._cpu_s, self._before = time.thread_time(), resident_bytes()
+        print(f"{'frames':>7} {'keyframes':>9} {'memory MB':>9} {'ms/frame':>8} {'checkpoints MB':>14}")
+
+    def on_frame(self, step: Step) -> None:
+        """Count a frame."""
+        self._done += 1
+        self._keyframes += step.track.is_keyframe
+        every = max(1, self._frames // ROWS)
+        if self._done % every == 0:
+            now_s, memory = time.thread_time(), resident_bytes() - self._before
+            ms, self._cpu_s = 1e3 * (now_s - self._cpu_s) / every, now_s
+            on_disk = size_of(self._checkpoints)
+            print(
+                f"{self._done:7d} {self._keyframes:9d} {memory / MB:9.0f} {ms:8.1f} {on_disk / MB:14.1f}",
+                flush=True,
+            )
+        if self._done >= self._frames:
+            raise Enough
+
+
+def resident_bytes() -> int:
+    """Return the resident memory of this process; Linux."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def size_of(folder: Path) -> int:
+    """Return the size of the files in a folder, of which some may vanish."""
+    size = 0
+    for path in folder.glob("*"):
+        with suppress(OSError):
+            size += path.stat().st_size
+    return size
+
+
+def building(frames: int) -> Log:
+    """Return an RGB-D log through a building with so many rooms that none is seen twice."""
+    rooms = max(4, 2 * -(-frames // (2 * FRAMES_PER_ROOM)))
+    config = SynthConfig(
+        rooms=rooms, frame_rate_hz=10.0, width_px=320, height_px=240, texture_px_per_m=64, posters_per_room=6
+    )
+    return CameraSimulator(config).log()
+
+
+def street(frames: int) -> Log:
+    """Return a LiDAR log along a street that does not come back."""
+    sensor = LidarSensorConfig()
+    config = LidarSynthConfig(loop_m=1.1 * SCAN_STEP_M * frames, sensor=sensor)
+    return LidarSimulator(config).log()
+
+
+def main() -> None:
+    """Track one log."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("sensor", choices=("rgbd", "lidar"))
+    parser.add_argument("--frames", type=int, default=None, help="2400 images, 3000 scans")
+    parser.add_argument("--set", action="append", default=[], help="setting of the build")
+    options = parser.parse_args()
+    frames = options.frames or (2400 if options.sensor == "rgbd" else 3000)
+    log = building(frames) if options.sensor == "rgbd" else street(frames)
+    print(f"{log.name}: {frames} of {len(log)} frames")
+    folder = Path(tempfile.mkdtemp(prefix="long_logs_"))
+    try:
+        meter = Meter(folder / "run", min(frames, len(log)))
+        with suppress(Enough):
+            build(log, load_config(None, options.set, sensor=log.sensor), folder / "run", observer=meter)
+    finally:
+        shutil.rmtree(folder)
+
+
+if __name__ == "__main__":
+    main()
