@@ -1,5 +1,7 @@
 """Doubts, repeated search and covariance of the LiDAR odometries."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -306,6 +308,17 @@ def test_a_pose_off_the_surfaces_is_uncertain_by_as_much():
 
     assert right[3] < 0.01
     assert 0.03 < held[3] < 0.1
+
+
+def test_a_motion_that_two_scans_leave_open_is_no_doubt():
+    key, scan = keyframe(room_scan(0, seed=1)), keyframe(room_scan(1, OFF, seed=2)).deskewed
+    fit = fit_of(key, scan, OFF, max_pair_distance_m=0.5)
+    fit = replace(fit, observability=np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0]))
+    noise, open_m = ScanNoise(), np.array([0.012, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+    doubts = [noise.of(fit, open_m, OFF, 0.1, np.zeros((6, 6))).doubts for _ in range(4)]
+
+    assert [bool(doubt) for doubt in doubts] == [False, False, True, True]
 
 
 def test_points_are_where_the_truth_puts_them():
