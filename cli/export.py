@@ -35,16 +35,20 @@ def export(
 ) -> Answer:
     """Write a run's map, cloud, surface, slice, trajectory or graph for other programs, and print its path.
 
+    Of a merged map, octree and grids can be written: octomap, grid, costmap, nav2.
+
     Example: mapper export runs/xyz --as octomap --out xyz.ot, or: mapper export runs/xyz --as mesh
     """
     from mapper.config.loading import overridden
     from mapper.export.exporters import export as export_run
-    from mapper.run.folder import moved_log, open_run
+    from mapper.merging.merged_map import open_map
+    from mapper.run.folder import MapFolder, moved_log, open_run
+    from mapper.run.manifest import is_merged_map
 
     prepare_libraries()
-    built = open_run(run)
+    built: MapFolder = open_map(run) if is_merged_map(run) else open_run(run)
     if log:
-        built = moved_log(built, *log)
+        built = moved_log(open_run(run), *log)
     changes = merged(assignments({"octomap.level": level}), set_)
     config = overridden(built.config, changes) if changes else None
     progress = output.progress()

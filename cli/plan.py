@@ -77,14 +77,13 @@ def plan(
     Example: mapper plan runs/xyz --from 2.1 -0.3 --to 1.9 1.4 --radius 0.15
     """
     from mapper.config.loading import overridden
-    from mapper.core.errors import ConfigError
     from mapper.export.plan import draw_plan, plan_json, write_plan
     from mapper.export.run_maps import storeys_of_run
+    from mapper.merging.floors import storeys_of_map
     from mapper.merging.merged_map import open_map
     from mapper.navigation.config import PlanConfig
     from mapper.navigation.planner import plan_2d, plan_3d
     from mapper.navigation.storey_planner import plan_storeys
-    from mapper.octree.grid_file import stored_grid
     from mapper.octree.octomap_file import read_octree
     from mapper.run import files
     from mapper.run.folder import Run, open_run
@@ -95,13 +94,12 @@ def plan(
     start, goal = (_point(text, name, counts) for text, name in zip((from_, to), _POINT_OPTIONS, strict=True))
     config = overridden(PlanConfig(), assignments({"radius_m": radius, "unknown": unknown, "layer": layer}))
     built = open_map(run) if is_merged_map(run) else open_run(run)
-    if not isinstance(built, Run) and config.layer == "traversable":
-        raise ConfigError(f"{run}: a merged map has no traversable floor; plan with --layer slice, or --3d")
-    grid = stored_grid(built, config.layer)
+    grid = built.traversable if config.layer == "traversable" else built.slice
     if in_3d:
         found = plan_3d(read_octree(built.file(files.OCTREE_OT)), start, goal, config=config)
-    elif has_storeys and isinstance(built, Run):
-        found = plan_storeys(storeys_of_run(built), start, goal, config=config)
+    elif has_storeys:
+        storeys = storeys_of_run(built) if isinstance(built, Run) else storeys_of_map(built)
+        found = plan_storeys(storeys, start, goal, config=config)
     else:
         found = plan_2d(grid, start, goal, config=config)
     if isinstance(built, Run):

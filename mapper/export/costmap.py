@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from mapper.export.grid import write_values
 from mapper.export.palette import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
 from mapper.navigation.costmap import INSCRIBED, LETHAL, NO_INFORMATION, Costmap, inflate
-from mapper.run.folder import Run
+from mapper.run.folder import MapFolder
 from mapper.runtime.atomic import write_bytes
 from mapper.runtime.progress import Progress
 
@@ -18,7 +18,7 @@ _INSCRIBED, _LETHAL, _UNKNOWN = 99, 100, 255
 _PICTURE_PX_PER_CELL = 4
 
 
-def costmap(run: Run, path: Path, _progress: Progress) -> None:
+def costmap(run: MapFolder, path: Path, _progress: Progress) -> None:
     """Write YAML in map_server's mode "raw" with PGM and PNG beside it.
 
     Raises:

@@ -2,20 +2,20 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mapper.core.errors import ConfigError, RunError
 from mapper.runtime.progress import SILENT, Progress
 
 if TYPE_CHECKING:
     from mapper.config.build import BuildConfig
-    from mapper.run.folder import Run
+    from mapper.run.folder import MapFolder
 
-Write = Callable[["Run", Path, Progress], None]
-"""Writes one file of a run atomically; long jobs report progress."""
+Write = Callable[[Any, Path, Progress], None]
+"""Writes one file of a ``Run``, or of any ``MapFolder``, atomically; long jobs report progress."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +30,7 @@ class Exporter:
         endings: What another name may end with.
         beside: Endings of the files that come with it.
         settings: The part of the configuration that it reads, if any.
+        of_merged: Whether a merged map has it, too.
     """
 
     summary: str
@@ -38,6 +39,7 @@ class Exporter:
     endings: tuple[str, ...]
     beside: tuple[str, ...] = ()
     settings: str | None = None
+    of_merged: bool = False
 
     @property
     def write(self) -> Write:
@@ -56,6 +58,7 @@ EXPORTERS = {
         "map.bt",
         (".bt", ".ot"),
         settings="octomap",
+        of_merged=True,
     ),
     "native": Exporter("octree with all attributes", "stored_files:native", "map.octree", (".octree",)),
     "ply": Exporter("coloured cloud", "stored_files:cloud", "cloud.ply", (".ply",)),
@@ -63,7 +66,12 @@ EXPORTERS = {
     "voxel-mesh": Exporter("occupied voxels as cubes", "voxels:cubes", "voxel_mesh.ply", _MESH_ENDINGS),
     "mesh": Exporter("coloured surface", "mesh:surface", "mesh.ply", _MESH_ENDINGS, settings="mesh"),
     "grid": Exporter(
-        "slice for nav2", "stored_files:grid", "slice.yaml", (".yaml", ".yml"), beside=(".pgm", ".png")
+        "slice for nav2",
+        "stored_files:grid",
+        "slice.yaml",
+        (".yaml", ".yml"),
+        beside=(".pgm", ".png"),
+        of_merged=True,
     ),
     "costmap": Exporter(
         "slice inflated for nav2",
@@ -72,8 +80,11 @@ EXPORTERS = {
         (".yaml", ".yml"),
         beside=(".pgm", ".png"),
         settings="costmap",
+        of_merged=True,
     ),
-    "nav2": Exporter("folder for nav2: map, masks, parameters", "nav2:nav2", "", (), settings="costmap"),
+    "nav2": Exporter(
+        "folder for nav2: map, masks, parameters", "nav2:nav2", "", (), settings="costmap", of_merged=True
+    ),
     "tum": Exporter("trajectory as TUM text", "stored_files:tum", "trajectory.tum", (".tum", ".txt")),
     "kitti": Exporter(
         "trajectory as KITTI text", "stored_files:kitti", "trajectory.kitti", (".kitti", ".txt")
@@ -86,7 +97,7 @@ EXPORTERS = {
 
 
 def export(
-    run: "Run",
+    run: "MapFolder",
     kind: str,
     out: Path | None = None,
     *,
@@ -97,7 +108,7 @@ def export(
     """Write one kind of file and return where it is.
 
     Args:
-        run: A finished run.
+        run: A finished run, or a merged map, which has some kinds only.
         kind: A key of ``EXPORTERS``.
         out: The file; None keeps it in the run, under the name that this kind has there.
         config: The run's own configuration with the kind's settings turned.
@@ -111,9 +122,11 @@ def export(
     if kind not in EXPORTERS:
         raise ConfigError(f"no exporter {kind!r}; want one of {', '.join(EXPORTERS)}")
     exporter = EXPORTERS[kind]
+    if not exporter.of_merged:
+        _refuse_merged(run, kind)
     if config is not None:
         _refuse_idle_settings(run, config, kind=kind)
-        run = replace(run, config=config)
+        run = run.with_config(config)
     if out is None:
         if not exporter.file_name:
             raise ConfigError(f"{kind}: is a folder beside the run; name it with --out")
@@ -126,8 +139,16 @@ def export(
     return path
 
 
+def _refuse_merged(run: "MapFolder", kind: str) -> None:
+    from mapper.run.folder import Run
+
+    if not isinstance(run, Run):
+        kinds = ", ".join(name for name, exporter in EXPORTERS.items() if exporter.of_merged)
+        raise ConfigError(f"{run.path}: a merged map has no {kind}, only {kinds}; export its runs one by one")
+
+
 @contextmanager
-def _recording(run: "Run", exporter: Exporter, path: Path) -> Iterator[None]:
+def _recording(run: "MapFolder", exporter: Exporter, path: Path) -> Iterator[None]:
     """Record in the manifest what an export writes into the run; files of the build stay as they are."""
     from mapper.run.files import names_of
 
@@ -138,7 +159,7 @@ def _recording(run: "Run", exporter: Exporter, path: Path) -> Iterator[None]:
         yield
 
 
-def _refuse_idle_settings(run: "Run", config: "BuildConfig", *, kind: str) -> None:
+def _refuse_idle_settings(run: "MapFolder", config: "BuildConfig", *, kind: str) -> None:
     settings = EXPORTERS[kind].settings
     for name in type(config).model_fields:
         if name != settings and getattr(config, name) != getattr(run.config, name):

@@ -11,7 +11,7 @@ from mapper.export.grid import write_grid, write_values
 from mapper.navigation.config import CostmapConfig
 from mapper.navigation.distance_transform import NONE, squares_to_centres
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from mapper.run.folder import Run
+from mapper.run.folder import MapFolder
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text
 from mapper.runtime.progress import Progress
 
@@ -27,7 +27,7 @@ _SLOWEST_PERCENT = 30.0
 """Speed allowed where the robot all but touches an obstacle, of its full speed."""
 
 
-def nav2(run: Run, path: Path, _progress: Progress) -> None:
+def nav2(run: MapFolder, path: Path, _progress: Progress) -> None:
     """Write the folder; it replaces an earlier one.
 
     Raises:

@@ -5,13 +5,13 @@ from pathlib import Path
 
 from mapper.core.errors import RunError
 from mapper.run import files
-from mapper.run.folder import Run
+from mapper.run.folder import MapFolder, Run
 from mapper.runtime.atomic import atomic_file
 from mapper.runtime.progress import Progress
 from mapper.sources.trajectory_files import write_kitti
 
 
-def octomap(run: Run, path: Path, _progress: Progress) -> None:
+def octomap(run: MapFolder, path: Path, _progress: Progress) -> None:
     """Write the octree: free or occupied as ``.bt``, log-odds as ``.ot``; with wider voxels if so configured.
 
     Raises:
@@ -55,7 +55,7 @@ def kitti(run: Run, path: Path, _progress: Progress) -> None:
     write_kitti(path, run.trajectory)
 
 
-def grid(run: Run, path: Path, _progress: Progress) -> None:
+def grid(run: MapFolder, path: Path, _progress: Progress) -> None:
     """Write the slice's YAML with PGM and PNG beside it; the YAML names the PGM, so this is no copy."""
     slice_world = run.slice
     if not _is_same(run.path / f"{files.SLICE}.yaml", path):
@@ -64,7 +64,7 @@ def grid(run: Run, path: Path, _progress: Progress) -> None:
         write_grid(path.parent, path.stem, slice_world)
 
 
-def _copy(run: Run, name: str, path: Path) -> None:
+def _copy(run: MapFolder, name: str, path: Path) -> None:
     source = run.file(name)
     if not source.is_file():
         raise RunError(f"{source}: is missing from the run; build it again")

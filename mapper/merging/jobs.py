@@ -20,9 +20,9 @@ from mapper.merging.merged_map import TILES
 from mapper.merging.tiling import Tiling
 from mapper.octree.attributes import UNSET
 from mapper.octree.color_tree import colored
-from mapper.octree.columns import block_extent
+from mapper.octree.columns import block_extent, occupied_voxels
 from mapper.octree.config import OctreeConfig, SliceConfig
-from mapper.octree.ground_height import GroundHeights, lowest_occupied
+from mapper.octree.ground_height import lowest_occupied
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import read_octree
@@ -35,6 +35,10 @@ from mapper.run.edits_file import edits_text, parse_edits
 from mapper.run.folder import open_run
 from mapper.runtime.atomic import atomic_file, write_bytes
 from mapper.runtime.progress import SILENT
+
+OCCUPIED, LOWEST, BAND, GROUND = "occupied", "lowest", "band", "ground"
+"""Pieces of a tile, or of a column of tiles: the occupied voxels, the lowest of each column, the slice's
+band, and the ground below it."""
 
 
 def stays_within_m(config: OctreeConfig) -> float:
@@ -233,7 +237,8 @@ def join_tile(
     write_bytes(workspace.piece(tile, "bt"), words.astype("<u2", copy=False).tobytes())
     if follows_ground:
         first, shape = workspace.window(tile)
-        _save(workspace.piece(tile, "lowest"), lowest_occupied(octree, first=first, shape=shape))
+        save_array(workspace.piece(tile, LOWEST), lowest_occupied(octree, first=first, shape=shape))
+    save_array(workspace.piece(tile, OCCUPIED), occupied_voxels(octree))
     first, last = block_extent(octree)
     return JoinedTile(
         voxels=len(octree),
@@ -257,33 +262,22 @@ def slice_column(
         workspace: Where.
         tiles: Which, from below.
         config: The band.
-        ground: File of the ground that the band follows; None if it is level.
+        ground: File of the ground below the column of tiles, which the band follows; None if it is level.
         floor_z_m: Height of the floor in the map.
     """
     first, shape = workspace.window(tiles[0])
-    ground_m = None if ground is None else load_ground(ground).under(first=first, shape=shape)
+    ground_m = None if ground is None else np.load(ground)
     seen, known = np.zeros(shape, np.uint8), np.zeros(shape, np.bool_)
     for tile in tiles:
         octree = read_octree(workspace.tile(tile))
         seen |= see_band(octree, config, first=first, shape=shape, ground_m=ground_m, floor_z_m=floor_z_m)
         x, y = (octree.leaves().keys[:, :2] - first).T
         known[y, x] = True
-    _save(workspace.piece(tiles[0], "band"), seen)
+    save_array(workspace.piece(tiles[0], BAND), seen)
     return SlicedColumn(known_columns=int(np.count_nonzero(known)))
 
 
-def save_ground(path: Path, ground: GroundHeights) -> None:
-    """Write the ground for the jobs that follow it."""
-    with atomic_file(path) as part, part.open("wb") as file:
-        np.savez(file, heights_m=ground.heights_m, first=ground.first, columns=ground.columns)
-
-
-def load_ground(path: Path) -> GroundHeights:
-    """Return the ground that ``save_ground`` wrote."""
-    with np.load(path) as arrays:
-        return GroundHeights(arrays["heights_m"], arrays["first"], int(arrays["columns"]))
-
-
-def _save(path: Path, array: NDArray[np.generic]) -> None:
+def save_array(path: Path, array: NDArray[np.generic]) -> None:
+    """Write an array as a ``.npy`` file; atomic."""
     with atomic_file(path) as part, part.open("wb") as file:
         np.save(file, array)

@@ -41,6 +41,7 @@ from mapper.merging.placing import Placed, Placing, warnings_about
 from mapper.merging.slicing import draw, slice_map
 from mapper.merging.stages import Cost, Stages
 from mapper.merging.tiling import tiling_for
+from mapper.navigation.traversable import Storey
 from mapper.octree.config import OctreeConfig
 from mapper.run import files
 from mapper.run.doubtful_frames import without_doubtful
@@ -119,6 +120,8 @@ def merge(
         status="merging",
         octree=config,
         slice=placed[0].run.config.slice,
+        traversable=placed[0].run.config.traversable,
+        costmap=placed[0].run.config.costmap,
         tile_m=tiling.edge_m,
         floor_z_m=_floor_z_m(placed[0]),
         runs=_described(placing, fused_again=bent),
@@ -144,17 +147,19 @@ def merge(
         has_colors = any(part.has_colors for part in split)
         write_whole_ot(folder / files.OCTREE_OT, workspace, joined, has_colors=has_colors)
         write_whole_bt(folder / files.OCTREE_BT, workspace, joined)
-        columns, grid, missing = slice_map(workspace, stages, joined, manifest, placed)
-        for note in missing:
+        sliced = slice_map(workspace, stages, joined, manifest, placed)
+        for note in sliced.missing:
             progress.note(note)
-        manifest = _completed(manifest, workspace, split, joined, columns, [*warnings, *missing])
+        notes = [*warnings, *sliced.missing]
+        manifest = _completed(manifest, workspace, split, joined, sliced.columns, notes)
         apart = [warning.text for run in manifest.runs for warning in _warnings_of(run)]
         for note in apart:
             progress.note(note)
         manifest = manifest.model_copy(update={"notes": (*manifest.notes, *apart)})
-        if grid is not None:
-            write_grid(folder, files.SLICE, grid)
-            draw(folder / files.SUMMARY, grid, placed, manifest)
+        _write_storeys(folder, sliced.storeys)
+        if sliced.grid is not None:
+            write_grid(folder, files.SLICE, sliced.grid)
+            draw(folder / files.SUMMARY, sliced.grid, placed, manifest)
         _clean(workspace, joined)
         manifest.save(folder)
     return Merged(
@@ -258,6 +263,15 @@ def _floor_z_m(first: Placed) -> float:
         return 0.0
     middle = first.run.trajectory.positions_world.mean(axis=0) * [1.0, 1.0, 0.0]
     return float(apply(first.T_map_world, middle[np.newaxis])[0, 2])
+
+
+def _write_storeys(folder: Path, storeys: Sequence[Storey]) -> None:
+    """Write the floor of the storey where the first run begins, and where there are several, that of each."""
+    for storey in storeys:
+        if storey.is_home:
+            write_grid(folder, files.TRAVERSABLE, storey.grid)
+    for number, storey in enumerate(storeys[: files.MOST_STOREYS] if len(storeys) > 1 else ()):
+        write_grid(folder, files.storey(number), storey.grid)
 
 
 def _kept_of(partial: Path, manifest: MapManifest) -> list[str]:

@@ -1,8 +1,9 @@
 """Merged map on disk: its manifest, and the opening of a part of it."""
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -10,6 +11,7 @@ import numpy as np
 from pydantic import ValidationError
 
 import mapper
+from mapper.config.build import BuildConfig
 from mapper.core.config import Config, drop_unknown
 from mapper.core.errors import RunError
 from mapper.core.geometry import Array
@@ -17,9 +19,12 @@ from mapper.core.trajectory import Trajectory
 from mapper.graph.g2o import read_g2o
 from mapper.graph.model import PoseGraph
 from mapper.merging.joint_graph import Tie
+from mapper.navigation.config import CostmapConfig, TraversableConfig
 from mapper.octree.config import OctreeConfig, SliceConfig
+from mapper.octree.grid_file import stored_grid
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import read_octree
+from mapper.octree.slice import OccupancyGrid
 from mapper.run import files
 from mapper.run.manifest import is_merged_map
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, partial_of, write_text
@@ -48,8 +53,8 @@ class RunInMap(Config):
     placed: str
     """Source of its pose."""
     folder: str = ""
-    """Of its files in the map's folder: ``trajectory.tum``, the poses of its frames in the map, and
-    ``map.octree``, if it was fused again."""
+    """Of its files in the map's folder: ``trajectory.tum``, the poses in the map of the frames that its maps
+    are made from, and ``map.octree``, if it was fused again."""
     first_node: int | None = None
     """Added to the numbers of its nodes in the joint graph; None without one."""
     moved_m: float = 0.0
@@ -85,6 +90,9 @@ class MapManifest(Config):
     mapper_version: str = mapper.__version__
     octree: OctreeConfig
     slice: SliceConfig
+    traversable: TraversableConfig = TraversableConfig()
+    costmap: CostmapConfig = CostmapConfig()
+    """Those of the first run, as the slice's."""
     tile_m: float
     floor_z_m: float
     runs: tuple[RunInMap, ...]
@@ -118,19 +126,68 @@ class MergedMap:
     Attributes:
         path: Its folder.
         manifest: Its ``manifest.json``.
+        config: Settings of its maps: those of its first run.
     """
 
     path: Path
     manifest: MapManifest
+    config: BuildConfig
+
+    @property
+    def octree(self) -> OctreeMap:
+        """The whole map, without colours; see ``load`` for a part of it.
+
+        Raises:
+            MapFileError: It cannot be read.
+            MapSizeError: It does not fit into memory.
+        """
+        return read_octree(self.path / files.OCTREE_OT)
+
+    def with_config(self, config: BuildConfig) -> "MergedMap":
+        """Return the same map with other settings, for what is made from its files."""
+        return replace(self, config=config)
+
+    def changing(self, _names: Iterable[str]) -> AbstractContextManager[None]:
+        """Return a context in which its files may be written; no digests are kept of them."""
+        return nullcontext()
 
     def file(self, name: str) -> Path:
         """Return the path of one of its files."""
         return self.path / name
 
-    def trajectory(self, run: RunInMap) -> Trajectory | None:
-        """Return the poses of a run's frames in the map; None in a map of before 2026-11-23."""
+    def trajectory(self, run: RunInMap) -> Trajectory:
+        """Return the poses in the map of the frames that a run's maps are made from.
+
+        Raises:
+            RunError: The map is of before 2026-11-22, or its file is missing.
+        """
         path = self.path / run.folder / files.TRAJECTORY
-        return read_tum(path) if run.folder and path.exists() else None
+        if not path.is_file():
+            raise RunError(f"{self.path}: has no trajectory of {run.path}; merge again")
+        return read_tum(path)
+
+    @property
+    def slice(self) -> OccupancyGrid:
+        """2D navigation map.
+
+        Raises:
+            MapFileError: There is none, as of a map with a tilted run.
+        """
+        return stored_grid(self, files.SLICE)
+
+    @property
+    def traversable(self) -> OccupancyGrid:
+        """Floor that a robot can drive on, of the storey on which the first run begins.
+
+        Raises:
+            RunError: There is none; the manifest's notes say why, unless the map is of before 2026-11-22.
+        """
+        if not (self.path / f"{files.TRAVERSABLE}.yaml").is_file():
+            why = next(
+                (note for note in self.manifest.notes if "no traversable floor" in note), "merge again"
+            )
+            raise RunError(f"{self.path}: has no {files.TRAVERSABLE}.yaml; {why}")
+        return stored_grid(self, files.TRAVERSABLE)
 
     @property
     def graph(self) -> PoseGraph | None:
@@ -181,4 +238,10 @@ def open_map(folder: Path) -> MergedMap:
         ) from None
     except (ValueError, RecursionError) as error:
         raise RunError(f"{folder / MANIFEST_NAME}: not valid JSON: {error}; it is damaged") from None
-    return MergedMap(folder, manifest)
+    config = BuildConfig(
+        octree=manifest.octree,
+        slice=manifest.slice,
+        traversable=manifest.traversable,
+        costmap=manifest.costmap,
+    )
+    return MergedMap(folder, manifest, config)

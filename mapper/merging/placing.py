@@ -15,6 +15,7 @@ from mapper.core.trajectory import Trajectory
 from mapper.merging.joint_graph import JointGraph
 from mapper.octree.scan_update_file import displacement_m, longest_ray_m
 from mapper.run.doubtful_frames import without_doubtful
+from mapper.run.edits_file import edits_text, parse_edits
 from mapper.run.folder import Run
 from mapper.runtime.regular_files import read_text
 
@@ -45,8 +46,8 @@ class Placed:
 
     @property
     def trajectory_map(self) -> Trajectory:
-        """Poses of its frames in the map, doubtful ones too."""
-        return (self.bent or self.run.trajectory).moved(self.T_map_world)
+        """Poses in the map of the frames that its maps are made from."""
+        return without_doubtful(self.bent or self.run.trajectory, self.run.records).moved(self.T_map_world)
 
     @property
     def moved_m(self) -> float:
@@ -131,6 +132,8 @@ def warnings_about(placed: Sequence[Placed]) -> list[str]:
         verdict = item.run.manifest.verdict
         if verdict is not None and verdict.state != "trusted":
             found.append(f"{_name(item.run)} is {verdict.state}: {verdict.sentences[0]}")
+        if blocked := len(parse_edits(edits_text(item.run.path), item.run.path).keepout):
+            found.append(f"{_name(item.run)}: its keep-out regions ({blocked}) are not in a merged map")
     used = [_frames_used(item.run) for item in placed]
     for second, item in enumerate(placed):
         for first, other in enumerate(placed[:second]):

@@ -1,7 +1,7 @@
-"""Slice and picture of a merged map: one raster, joined from those of the columns of tiles."""
+"""Floor, slice and picture of a merged map: one raster, joined from those of the columns of tiles."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,15 +12,52 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.export.picture import write_merged
-from mapper.merging.jobs import JoinedTile, SlicedColumn, Workspace, save_ground, slice_column
+from mapper.merging.floors import MOST_COLUMNS, Extent, floor_over
+from mapper.merging.jobs import (
+    BAND,
+    GROUND,
+    LOWEST,
+    OCCUPIED,
+    JoinedTile,
+    SlicedColumn,
+    Workspace,
+    save_array,
+    slice_column,
+)
 from mapper.merging.merged_map import MapManifest
 from mapper.merging.placing import Placed
 from mapper.merging.stages import Stages
-from mapper.octree.ground_height import NOTHING, ground_from_lowest
-from mapper.octree.slice import OccupancyGrid, grid_of, shrunk
+from mapper.navigation.floor import driven_ground
+from mapper.navigation.traversable import Storey, traversable
+from mapper.octree.ground_height import (
+    NOTHING,
+    DrivenGround,
+    ground_from_lowest,
+    known_floor,
+    lay_on_floor,
+    nearest_heights,
+)
+from mapper.octree.slice import OccupancyGrid, free_path, grid_of, shrunk
 
 _MOST_CELLS = 2000  # more than a page has pixels
 _MAX_TILT = np.cos(np.deg2rad(5.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sliced:
+    """Grids of a merged map.
+
+    Attributes:
+        columns: Results of all columns of tiles.
+        grid: The slice; None if there is none.
+        storeys: The traversable floor, a storey each; none if there is none.
+        missing: Why there is no slice or no floor.
+    """
+
+    columns: Sequence[SlicedColumn]
+    grid: OccupancyGrid | None
+    storeys: Sequence[Storey]
+    missing: Sequence[str]
 
 
 def slice_map(
@@ -29,38 +66,64 @@ def slice_map(
     joined: Mapping[int, JoinedTile],
     manifest: MapManifest,
     placed: Sequence[Placed],
-) -> tuple[list[SlicedColumn], OccupancyGrid | None, list[str]]:
-    """Return the results of all columns of tiles, the slice, and the reason if there is none."""
-    first = np.min([tile.first for tile in joined.values()], axis=0)
-    last = np.max([tile.last for tile in joined.values()], axis=0)
-    shape = int(last[1] - first[1]), int(last[0] - first[0])
-    columns, rows = defaultdict(list), defaultdict(list)
+) -> Sliced:
+    """Find the floor under the runs' paths, and cut the slice above it."""
+    columns: dict[tuple[int, int], list[int]] = defaultdict(list)
     for tile in joined:
         x, y = workspace.window(tile)[0].tolist()
         columns[x, y].append(tile)
-        rows[y].append(tile)
-    ground_path = None
-    if manifest.slice.above == "ground":
-        ground = ground_from_lowest(
-            _Lowest(workspace, rows, first, shape),
-            first=first,
+    is_level = all(item.T_map_world[2, 2] >= _MAX_TILT for item in placed)
+    extent = (
+        np.min([tile.first for tile in joined.values()], axis=0),
+        np.max([tile.last for tile in joined.values()], axis=0),
+    )
+    missing, floor = list[str](), None
+    if not is_level:
+        missing.append("no slice: a run is tilted by more than 5°, so z is not up in the map")
+    elif (cells := int(np.prod(extent[1] - extent[0]))) > MOST_COLUMNS:
+        missing.append(
+            f"no traversable floor: the map's bounding box has {cells / 1e6:.0f} M columns, at most "
+            f"{MOST_COLUMNS / 1e6:.0f} M fit into memory; merge fewer runs, or fuse with larger voxels"
+        )
+    else:
+        floor = floor_over(
+            (np.load(workspace.piece(tile, OCCUPIED)) for tile in joined),
+            extent,
+            manifest.traversable,
+            paths_map=[item.trajectory_map.positions_world for item in placed],
             resolution_m=manifest.octree.resolution_m,
             floor_z_m=manifest.floor_z_m,
         )
-        ground_path = workspace.scratch / "ground.npz"
-        save_ground(ground_path, ground)
+    driven = None if floor is None else driven_ground(floor)
+    first, shape = _raster(extent, driven)
+    if manifest.slice.above == "ground":
+        _save_ground(workspace, columns.values(), first, shape, manifest, driven)
     jobs = {
         workspace.tiling.name_of(tiles[0]): partial(
-            slice_column, workspace, tiles, manifest.slice, ground=ground_path, floor_z_m=manifest.floor_z_m
+            slice_column,
+            workspace,
+            tiles,
+            manifest.slice,
+            ground=workspace.piece(tiles[0], GROUND) if manifest.slice.above == "ground" else None,
+            floor_z_m=manifest.floor_z_m,
         )
         for tiles in columns.values()
     }
     done = [column for _, column in stages.run("slice", jobs, SlicedColumn)]
-    if any(item.T_map_world[2, 2] < _MAX_TILT for item in placed):
-        return done, None, ["no slice: a run is tilted by more than 5°, so z is not up in the map"]
+    if not is_level:
+        return Sliced(done, None, (), missing)
     seen = np.zeros(shape, np.uint8)
     for tiles in columns.values():
-        _over(np.bitwise_or, seen, first, workspace, tiles[0], "band")
+        _over(np.bitwise_or, seen, first, workspace, tiles[0], BAND)
+    if driven is not None:
+        free_path(
+            seen,
+            driven,
+            manifest.slice,
+            resolution_m=manifest.octree.resolution_m,
+            floor_z_m=manifest.floor_z_m,
+        )
+    grid = None
     try:
         grid = grid_of(
             seen,
@@ -70,8 +133,49 @@ def slice_map(
             floor_z_m=manifest.floor_z_m,
         )
     except DataError as error:
-        return done, None, [f"no {error}"]
-    return done, grid, []
+        missing.append(f"no {error}")
+    storeys = () if floor is None else traversable(floor, manifest.traversable)
+    return Sliced(done, grid, storeys, missing)
+
+
+def _raster(extent: Extent, driven: DrivenGround | None) -> tuple[NDArray[np.int64], tuple[int, int]]:
+    """Return the x and y keys of the first column of the map's raster, and its shape."""
+    if driven is not None:
+        return driven.first, (driven.swept.shape[0], driven.swept.shape[1])
+    first, last = extent
+    return first, (int(last[1] - first[1]), int(last[0] - first[0]))
+
+
+def _save_ground(
+    workspace: Workspace,
+    columns: Collection[Sequence[int]],
+    first: NDArray[np.int64],
+    shape: tuple[int, int],
+    manifest: MapManifest,
+    driven: DrivenGround | None,
+) -> None:
+    """Write the ground below every column of tiles; see ``ground_heights``."""
+    rows = defaultdict(list)
+    for tiles in columns:
+        for tile in tiles:
+            rows[int(workspace.window(tile)[0][1])].append(tile)
+    resolution_m, floor = manifest.octree.resolution_m, known_floor(driven)
+    ground = ground_from_lowest(
+        _Lowest(workspace, rows, first, shape),
+        first=first,
+        resolution_m=resolution_m,
+        floor_z_m=manifest.floor_z_m,
+        floor=floor,
+    )
+    nearest = None if floor is None else nearest_heights(floor)
+    for tiles in columns:
+        corner, size = workspace.window(tiles[0])
+        heights_m = ground.under(first=corner, shape=size)
+        if nearest is not None:
+            inside, own = _overlap(corner - first, size, shape)
+            level, distances = nearest
+            lay_on_floor(heights_m[own], level[inside], distances[inside], resolution_m=resolution_m)
+        save_array(workspace.piece(tiles[0], GROUND), heights_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +200,7 @@ class _Lowest:
         voxels = self.workspace.tiling.voxels
         for row in range(y // voxels * voxels, y + len(band), voxels):
             for tile in self.tiles.get(row, ()):
-                _over(np.minimum, band, np.array([x, y]), self.workspace, tile, "lowest")
+                _over(np.minimum, band, np.array([x, y]), self.workspace, tile, LOWEST)
         return band
 
 
@@ -105,10 +209,26 @@ def _over(
 ) -> None:
     """Join a tile's piece into a raster whose first column has these keys."""
     array = np.load(workspace.piece(tile, piece), mmap_mode="r")
-    x, y = workspace.window(tile)[0] - first
-    rows, columns = (slice(max(at, 0), at + size) for at, size in zip((y, x), array.shape, strict=True))
-    into = whole[rows, columns]
-    join(into, array[max(-y, 0) :, max(-x, 0) :][: into.shape[0], : into.shape[1]], out=into)
+    into, own = _overlap(workspace.window(tile)[0] - first, array.shape, whole.shape)
+    join(whole[into], array[own], out=whole[into])
+
+
+def _overlap(
+    corner: NDArray[np.int64], size: tuple[int, ...], shape: tuple[int, ...]
+) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Return the part of a raster that a window covers, in the raster's rows and columns and in its own.
+
+    Args:
+        corner: (2,) x and y of the window's first column in the raster.
+        size: H, W of the window.
+        shape: H, W of the raster.
+    """
+    low = np.maximum(corner[::-1], 0)
+    high = np.maximum(np.minimum(corner[::-1] + size, shape), low)
+    rows, columns = (slice(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))
+    own_low, own_high = low - corner[::-1], high - corner[::-1]
+    own_rows, own_columns = (slice(a, b) for a, b in zip(own_low.tolist(), own_high.tolist(), strict=True))
+    return (rows, columns), (own_rows, own_columns)
 
 
 def draw(path: Path, grid: OccupancyGrid, placed: Sequence[Placed], manifest: MapManifest) -> None:

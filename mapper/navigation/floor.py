@@ -1,5 +1,6 @@
 """Floor that a robot can reach from where it was driven, on every storey: steps, slopes and head room."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ from mapper.navigation.flood import (
     mark_surfaces,
 )
 from mapper.navigation.footprint import with_footprint
-from mapper.navigation.path_ground import PathGround, path_ground
+from mapper.navigation.path_ground import PathGround, joined, path_ground
 from mapper.octree.columns import NOWHERE, Columns, occupied_columns
 from mapper.octree.ground_height import DrivenGround
 from mapper.octree.map import OctreeMap
@@ -50,12 +51,7 @@ class Floor:
 def reachable_floor(
     octree: OctreeMap, config: TraversableConfig, *, positions_world: Points, floor_z_m: float = 0.0
 ) -> Floor:
-    """Return the floor that a robot can reach from the ground under a path.
-
-    A surface is the top of an occupied voxel with head room above it, where unknown voxels count as free.
-    From the ground under the path, steps lead from surface to surface, over gaps in which nothing is known.
-    Surfaces on which the plane through the floor around is too steep are not entered, unless the path led
-    over them. Without a path that tells the ground, all surfaces at the floor's height are where it begins.
+    """Return the floor of a map that a robot can reach from the ground under a path; see ``floor_of``.
 
     Args:
         octree: The map in a world with z up.
@@ -68,15 +64,41 @@ def reachable_floor(
     """
     if not len(octree):
         raise DataError("traversable floor: the map is empty; fuse scans into it first")
-    limits = limits_of(config, octree.resolution_m)
-    # What carried a sensor that looks forward began beside the map.
-    columns = occupied_columns(octree, margin=int(np.ceil(config.footprint_m / octree.resolution_m)))
-    path = path_ground(
-        columns,
-        positions_world,
-        radius_m=config.footprint_m,
-        room_m=config.head_room_m,
-        floor_z_m=floor_z_m,
+    columns = occupied_columns(octree, margin=margin_for(config, octree.resolution_m))
+    return floor_of(columns, config, paths_world=[positions_world], floor_z_m=floor_z_m)
+
+
+def margin_for(config: TraversableConfig, resolution_m: float) -> int:
+    """Return the columns that are needed around a map: what carried a sensor may have begun beside it."""
+    return int(np.ceil(config.footprint_m / resolution_m))
+
+
+def floor_of(
+    columns: Columns, config: TraversableConfig, *, paths_world: Sequence[Points], floor_z_m: float = 0.0
+) -> Floor:
+    """Return the floor that a robot can reach from the ground under some paths.
+
+    A surface is the top of an occupied voxel with head room above it, where unknown voxels count as free.
+    From the ground under the paths, steps lead from surface to surface, over gaps in which nothing is known.
+    Surfaces on which the plane through the floor around is too steep are not entered, unless a path led over
+    them. Without a path that tells the ground, all surfaces at the floor's height are where it begins.
+
+    Args:
+        columns: The map's occupied voxels, with a margin of ``margin_for``; z is up.
+        config: Limits of the robot.
+        paths_world: (N, 3) positions of the sensor in every log, in the order in which it passed.
+        floor_z_m: Height of the floor in the world.
+    """
+    limits = limits_of(config, columns.resolution_m)
+    path = joined(
+        path_ground(
+            columns,
+            positions_world,
+            radius_m=config.footprint_m,
+            room_m=config.head_room_m,
+            floor_z_m=floor_z_m,
+        )
+        for positions_world in paths_world
     )
     columns, driven = with_footprint(columns, path, limits, radius_m=config.footprint_m)
     is_surface = np.zeros(len(columns.tops), np.bool_)
@@ -84,7 +106,7 @@ def reachable_floor(
     is_surface |= driven
     seeds = np.flatnonzero(driven)
     if not len(seeds):
-        floor = floor_z_m / octree.resolution_m
+        floor = floor_z_m / columns.resolution_m
         # A floor at z = 0 lies in the voxel above or in that below.
         seeds = np.flatnonzero(is_surface & (np.abs(columns.tops - floor) <= limits.step))
     column_of = columns.column_of.astype(np.int32)

@@ -1,5 +1,6 @@
 """Ground under a trajectory: where what carried the sensor stood or rolled."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -39,6 +40,19 @@ class PathGround:
 
 
 NO_PATH = PathGround(np.empty((0, 3)), np.empty(0), 0.0)
+
+
+def joined(paths: Iterable[PathGround]) -> PathGround:
+    """Return the ground along several paths, one after the other."""
+    known = [path for path in paths if len(path)]
+    if len(known) <= 1:
+        return known[0] if known else NO_PATH
+    lengths = [len(path) for path in known]
+    return PathGround(
+        np.concatenate([path.points_world for path in known]),
+        np.concatenate([path.sensor_m for path in known]),
+        float(np.average([path.share_seen for path in known], weights=lengths)),
+    )
 
 
 def path_ground(

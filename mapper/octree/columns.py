@@ -77,15 +77,41 @@ def block_extent(octree: OctreeMap) -> tuple[NDArray[np.int64], NDArray[np.int64
 
 def occupied_columns(octree: OctreeMap, *, margin: int = 0) -> Columns:
     """Return the occupied voxels of a map by column, with a margin of so many columns around its blocks."""
-    first, last = block_extent(octree)
-    first, last = np.maximum(first - margin, 0), np.minimum(last + margin, KEY_COUNT)
+    return columns_of(
+        occupied_voxels(octree), block_extent(octree), margin=margin, resolution_m=octree.resolution_m
+    )
+
+
+def occupied_voxels(octree: OctreeMap) -> NDArray[np.int64]:
+    """Return the (N,) occupied voxels of a map, or of a part of one, for ``columns_of``."""
+    voxels: NDArray[np.int64] = _occupied(
+        octree.blocks.codes, octree.blocks.table.values, octree.occupied_log_odds
+    )
+    return voxels
+
+
+def columns_of(
+    voxels: NDArray[np.int64],
+    extent: tuple[NDArray[np.int64], NDArray[np.int64]],
+    *,
+    margin: int,
+    resolution_m: float,
+) -> Columns:
+    """Return voxels by column.
+
+    Args:
+        voxels: (N,) from ``occupied_voxels``, those of all parts of the map; they are sorted in place.
+        extent: From ``block_extent``, of all parts.
+        margin: So many columns are added around it.
+        resolution_m: Edge of a voxel.
+    """
+    first, last = np.maximum(extent[0] - margin, 0), np.minimum(extent[1] + margin, KEY_COUNT)
     width, height = (int(n) for n in last - first)
-    codes, values = octree.blocks.codes, octree.blocks.table.values
-    packed = np.sort(_occupied(codes, values, octree.occupied_log_odds))  # by y, then x, then z
-    columns = ((packed >> 32) - first[1]) * width + (packed >> 16 & KEY_MASK) - first[0]
+    voxels.sort()  # by y, then x, then z
+    columns = ((voxels >> 32) - first[1]) * width + (voxels >> 16 & KEY_MASK) - first[0]
     starts = starts_of(columns, height * width)
-    tops = ((packed & KEY_MASK) + 1 - KEY_ZERO).astype(np.int32)
-    return Columns(starts, tops, (height, width), first, octree.resolution_m)
+    tops = ((voxels & KEY_MASK) + 1 - KEY_ZERO).astype(np.int32)
+    return Columns(starts, tops, (height, width), first, resolution_m)
 
 
 @njit(cache=True, nogil=True)

@@ -107,15 +107,28 @@ def ground_heights(
             is known.
         driven: Floor that was driven on, in the same columns.
     """
-    lowest, cell_m = lowest_occupied(octree, first=first, shape=shape), octree.resolution_m
-    known = None if driven is None or not (driven.heights > NOWHERE).any() else driven.heights
-    ground = ground_from_lowest(lowest, first=first, resolution_m=cell_m, floor_z_m=floor_z_m, floor=known)
+    lowest = lowest_occupied(octree, first=first, shape=shape)
+    known = known_floor(driven)
+    ground = ground_from_lowest(
+        lowest, first=first, resolution_m=octree.resolution_m, floor_z_m=floor_z_m, floor=known
+    )
     heights_m = ground.under(first=first, shape=shape)
     if known is not None:
-        level, distances = nearest_heights(known)
-        beside = distances * cell_m <= _BESIDE_M
-        heights_m[beside] = level[beside] * cell_m
+        lay_on_floor(heights_m, *nearest_heights(known), resolution_m=octree.resolution_m)
     return heights_m
+
+
+def known_floor(driven: DrivenGround | None) -> NDArray[np.int32] | None:
+    """Return the (H, W) heights of driven ground; None where there is none at all."""
+    return None if driven is None or not (driven.heights > NOWHERE).any() else driven.heights
+
+
+def lay_on_floor(
+    heights_m: Array, level: NDArray[np.int32], distances: NDArray[np.float32], *, resolution_m: float
+) -> None:
+    """Set the (H, W) ground within a metre of floor to the nearest floor, from ``nearest_heights``."""
+    beside = distances * resolution_m <= _BESIDE_M
+    heights_m[beside] = level[beside] * resolution_m
 
 
 def nearest_heights(heights: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:

@@ -109,11 +109,23 @@ def cut_slice(
         ground_m = ground_heights(octree, first=first, shape=shape, floor_z_m=floor_z_m, driven=driven)
     seen = see_band(octree, config, first=first, shape=shape, ground_m=ground_m, floor_z_m=floor_z_m)
     if driven is not None:
-        swept = driven.swept
-        if ground_m is None:  # a level band shows one storey
-            swept = swept & (np.abs(driven.heights * octree.resolution_m - floor_z_m) <= config.min_height_m)
-        seen[swept] = _SEEN_FREE
+        free_path(seen, driven, config, resolution_m=octree.resolution_m, floor_z_m=floor_z_m)
     return grid_of(seen, config, first=first, resolution_m=octree.resolution_m, floor_z_m=floor_z_m)
+
+
+def free_path(
+    seen: NDArray[np.uint8],
+    driven: DrivenGround,
+    config: SliceConfig,
+    *,
+    resolution_m: float,
+    floor_z_m: float,
+) -> None:
+    """Flag the columns as free that what carried the sensor passed; of a level band, those of its storey."""
+    swept = driven.swept
+    if config.above == "floor":
+        swept = swept & (np.abs(driven.heights * resolution_m - floor_z_m) <= config.min_height_m)
+    seen[swept] = _SEEN_FREE
 
 
 def see_band(

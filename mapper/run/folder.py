@@ -7,7 +7,7 @@ from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, Self
 
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_run_config
@@ -49,6 +49,47 @@ if TYPE_CHECKING:  # compiled code, which takes longer to load than most files o
 _NAMED = 5
 
 
+class MapFolder(Protocol):
+    """What a run and a merged map have in common: maps, and the settings of what is made from them."""
+
+    @property
+    def path(self) -> Path:
+        """Its folder."""
+        ...
+
+    @property
+    def config(self) -> BuildConfig:
+        """Settings."""
+        ...
+
+    @property
+    def octree(self) -> "OctreeMap":
+        """Occupancy map."""
+        ...
+
+    @property
+    def slice(self) -> "OccupancyGrid":
+        """2D navigation map."""
+        ...
+
+    @property
+    def traversable(self) -> "OccupancyGrid":
+        """Floor that a robot can drive on."""
+        ...
+
+    def file(self, name: str, /) -> Path:
+        """Return the path of one of its files."""
+        ...
+
+    def changing(self, names: Iterable[str], /) -> AbstractContextManager[None]:
+        """Return a context in which files of the folder may be written."""
+        ...
+
+    def with_config(self, config: BuildConfig, /) -> Self:
+        """Return the same map with other settings."""
+        ...
+
+
 @dataclass(frozen=True)
 class Run:
     """A finished run: its folder, whose files are read when they are asked for, each once.
@@ -73,6 +114,10 @@ class Run:
             return self.path / name
         digests = read_manifest(self.path / files.MANIFEST).files  # exports and plans add theirs
         return checked(self.path, name, digests)
+
+    def with_config(self, config: BuildConfig) -> "Run":
+        """Return the same run with other settings, for what is made from its files."""
+        return replace(self, config=config)
 
     def changing(self, names: Iterable[str]) -> AbstractContextManager[None]:
         """Return a context in which files of the run may be written; it records their digests at its end."""

@@ -8,50 +8,23 @@ import numpy as np
 import pytest
 
 from mapper.cli.main import app
-from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, DataError, RunError
 from mapper.core.geometry import exp, inverse
 from mapper.core.trajectory import Trajectory
 from mapper.merging import jobs as merging_jobs
-from mapper.merging.merge import merge
 from mapper.merging.merged_map import open_map
-from mapper.merging.placing import Placed, Placing, as_built, by_poses, by_truth, warnings_about
-from mapper.octree.config import SliceConfig
-from mapper.octree.grid_file import read_grid
+from mapper.merging.placing import Placed, as_built, by_poses, by_truth, warnings_about
 from mapper.octree.map import OctreeMap
-from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import write_bt, write_ot
 from mapper.octree.resampling import blocks_reached, resampled
-from mapper.octree.slice import cut_slice
 from mapper.run.files import SUMMARY
 from mapper.run.folder import open_run
-from mapper.run.manifest import Input, Manifest, Verdict
-from mapper.run.writer import write_run
+from mapper.run.manifest import Verdict
 from mapper.runtime import resumable_jobs
 from mapper.runtime.executor import Workers, run_jobs
 from mapper.sources.trajectory_files import write_tum
+from tests.support.merged_runs import make_run, merged_map_of
 from tests.support.octree_maps import COLORED, CONFIG, as_dict, mapped, total
-
-BAND = SliceConfig(min_height_m=-0.5, max_height_m=0.8)
-
-
-def merged_map_of(placed, out, *, tile_m=3.2, **settings):
-    return merge(Placing(placed), out, tile_m=tile_m, **settings)
-
-
-def make_run(path, octree, *, band=BAND, log="sha256:0", T_truth_world=None):
-    """A run folder with what a merge reads."""
-    config = BuildConfig(octree=octree.config, slice=band)
-    manifest = Manifest(status="building", input=Input(path="/log", kind="tum", fingerprint=log))
-    rng = np.random.default_rng(len(path.name))
-    poses = np.array([exp(rng.normal(0, 0.3, 3), rng.normal(0, 1.0, 3)) for _ in range(9)])
-    trajectory = Trajectory(np.arange(9) * 100_000_000 + 1, poses)
-    with write_run(path, manifest, config, overwrite=True) as writer:
-        write_map(writer.folder / "map.octree", octree)
-        write_tum(writer.folder / "trajectory.tum", trajectory)
-        if T_truth_world is not None:
-            write_tum(writer.folder / "truth.tum", trajectory.moved(T_truth_world))
-    return open_run(path)
 
 
 @pytest.fixture(scope="module")
@@ -125,22 +98,6 @@ def test_the_files_are_those_of_the_maps_added_up_in_memory(maps, tmp_path, conf
     assert len(found.manifest.tiles) > 8
     whole = found.load(np.full(3, -100.0), np.full(3, 100.0))
     assert as_dict(whole) == as_dict(octree)
-
-
-@pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("above", ["floor", "ground"])
-def test_the_slice_is_that_of_the_whole(maps, tmp_path, above):
-    band = BAND.model_copy(update={"above": above, "min_cluster_cells": 2})
-    runs = [make_run(tmp_path / f"run{i}", each, band=band) for i, each in enumerate(maps[:3])]
-
-    found = merged_map_of(as_built(runs), tmp_path / "map").map
-
-    octree, _ = total(maps[:3], config=COLORED)
-    grid, expected = read_grid(found.path / "slice.yaml"), cut_slice(octree, band)
-    np.testing.assert_array_equal(grid.cells, expected.cells)
-    np.testing.assert_allclose(grid.origin_world_m, expected.origin_world_m)
-    columns = {(x, y) for x, y, _ in as_dict(octree)}
-    assert found.manifest.area_km2 == pytest.approx(len(columns) * 0.1**2 / 1e6, rel=1e-6)
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -326,29 +283,6 @@ def test_runs_that_do_not_fit_together_are_refused(runs, maps, tmp_path):
         merged_map_of(as_built(runs), tmp_path / "map", tile_m=0.1)
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_a_path_is_planned_on_a_merged_map(tmp_path, capsys):
-    octree = OctreeMap(CONFIG)
-    sides = np.linspace(-1.95, 1.95, 40).astype(np.float32)
-    ring = [(x, y, 0.05) for x in sides for y in sides if max(abs(x), abs(y)) > 1.9]
-    octree.insert_points(np.array(ring, np.float32), np.array([0.05, 0.05, 0.05]))
-    merged_map_of(as_built([make_run(tmp_path / "run", octree)]), tmp_path / "map")
-
-    app(
-        ["plan", str(tmp_path / "map"), "--from", "-1", "0", "--to", "1", "0.5", "--radius", "0.1"],
-        standalone_mode=False,
-    )
-
-    assert capsys.readouterr().out.startswith("2.06 m in the slice")
-    assert (tmp_path / "map/plan.png").stat().st_size > 10_000
-    assert '"map": "slice"' in (tmp_path / "map/plan.json").read_text()
-    app(
-        ["plan", str(tmp_path / "map"), "--from", "-1 0", "--to", "1 0.5", "--layer", "traversable"],
-        standalone_mode=False,
-    )
-    assert "has no traversable floor" in capsys.readouterr().err
-
-
 def test_a_map_of_an_older_version_is_opened_and_a_damaged_one_refused(merged):
     path = merged.path / "manifest.json"
     before = path.read_text()
@@ -368,6 +302,11 @@ def test_a_map_of_an_older_version_is_opened_and_a_damaged_one_refused(merged):
 def test_a_user_is_told_what_to_doubt(runs, maps, merged, tmp_path):
     assert merged.manifest.notes[0].startswith("every run's world was taken for the map's")
     again = make_run(tmp_path / "again", maps[0], log="sha256:1")
+    (again.path / "edits.toml").write_text("[[keepout]]\nheight_m = [0, 1]\n")
+    assert "again: its keep-out regions (1) are not in a merged map" in warnings_about(
+        [Placed(again, np.eye(4), "by hand")]
+    )
+    (again.path / "edits.toml").unlink()
     verdict = Verdict(state="doubtful", sentences=("its loops are far off",))
     doubted = replace(again, manifest=again.manifest.model_copy(update={"verdict": verdict}))
     assert "again is doubtful: its loops are far off" in warnings_about(

@@ -1,0 +1,64 @@
+"""Floor of a merged map, found over all its tiles from where all its runs drove."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.core.geometry import Points
+from mapper.merging.merged_map import MergedMap
+from mapper.navigation.config import TraversableConfig
+from mapper.navigation.floor import Floor, floor_of, margin_for
+from mapper.navigation.traversable import Storey, traversable
+from mapper.octree.columns import block_extent, columns_of, occupied_voxels
+from mapper.octree.octomap_file import read_octree
+
+MOST_COLUMNS = 1 << 25
+"""More columns in the map's bounding box, and its floor would take more than about 2 GB."""
+
+Extent = tuple[NDArray[np.int64], NDArray[np.int64]]
+"""x and y keys of the first column of any block, and those after the last."""
+
+
+def floor_over(
+    voxels: Iterable[NDArray[np.int64]],
+    extent: Extent,
+    config: TraversableConfig,
+    *,
+    paths_map: Sequence[Points],
+    resolution_m: float,
+    floor_z_m: float,
+) -> Floor:
+    """Return the floor of a map whose occupied voxels are given tile by tile; see ``floor_of``."""
+    columns = columns_of(
+        np.concatenate([np.empty(0, np.int64), *voxels]),
+        extent,
+        margin=margin_for(config, resolution_m),
+        resolution_m=resolution_m,
+    )
+    return floor_of(columns, config, paths_world=paths_map, floor_z_m=floor_z_m)
+
+
+def storeys_of_map(merged: MergedMap) -> tuple[Storey, ...]:
+    """Return the storeys of a merged map's floor, found again from its tiles and its runs' paths.
+
+    Raises:
+        MapFileError: A tile cannot be read.
+        RunError: A run's trajectory is missing.
+    """
+    manifest = merged.manifest
+    voxels, extents = [], []
+    for tile in manifest.tiles:
+        octree = read_octree(merged.tile_path(tile))
+        voxels.append(occupied_voxels(octree))
+        extents.append(block_extent(octree))
+    firsts, lasts = zip(*extents, strict=True)
+    floor = floor_over(
+        voxels,
+        (np.min(firsts, axis=0), np.max(lasts, axis=0)),
+        manifest.traversable,
+        paths_map=[merged.trajectory(run).positions_world for run in manifest.runs],
+        resolution_m=manifest.octree.resolution_m,
+        floor_z_m=manifest.floor_z_m,
+    )
+    return traversable(floor, manifest.traversable)
