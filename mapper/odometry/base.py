@@ -163,6 +163,15 @@ class Odometry(Protocol[Observation]):
         ...
 
 
+@runtime_checkable
+class CalibrationCheck(Protocol):
+    """Odometry that also tells whether the log fits its sensor's calibration."""
+
+    def calibration_doubts(self) -> Sequence[str]:
+        """Return in words what all frames so far contradict."""
+        ...
+
+
 class FrameOdometry(Odometry[Observation], Protocol[Observation]):
     """Odometry from images or scans, which accepts frames that are of no log."""
 

@@ -1,12 +1,13 @@
 """Local map: keyframes, landmarks, and the observations of landmarks in keyframes."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, adjoint, apply, inverse
 from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameter
+from mapper.odometry.local_map.focal_length import Bundle
 from mapper.odometry.local_map.growing_table import GrowingTable
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.keyframe import DepthLink, Keyframe, RecentObservations
@@ -254,6 +255,25 @@ class LandmarkMap:
                 self.keyframes[k].T_camera_world = poses[np.searchsorted(keyframe_ids, k)]
         self.landmarks["position"][landmarks] = points
         self._unlink(observations[~agree])
+
+    def bundle(self, keyframes: Sequence[int]) -> Bundle:
+        """Return keyframes, given in increasing order, with all their observations and landmarks."""
+        landmarks = self.landmarks_of_any(keyframes, except_for=np.empty(0, np.int32))
+        first, observations = observations_of(
+            landmarks, self.landmarks["newest"], self._observations["older"], self._observations["keyframe"]
+        )
+        observed_in = self._observations["keyframe"][observations]
+        among = np.isin(observed_in, keyframes)
+        rows = np.repeat(np.arange(len(landmarks)), np.diff(first))[among]
+        edges = np.column_stack([np.searchsorted(keyframes, observed_in[among]), rows]).astype(np.int32)
+        return Bundle(
+            poses=np.array([self.keyframes[k].T_camera_world for k in keyframes]),
+            points=self.landmarks["position"][landmarks],
+            edges=edges,
+            measured=self._observations["measured"][observations[among]],
+            weights=self._observations["weights"][observations[among]],
+            intrinsics=self.observation(keyframes[-1]).intrinsics,
+        )
 
     def follow_readout(self) -> None:
         """Observe all keyframes' landmarks anew if the readout time has changed."""

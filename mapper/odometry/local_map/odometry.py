@@ -25,6 +25,7 @@ from mapper.odometry.base import (
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.depth_tracker import DepthTracker
 from mapper.odometry.local_map.earlier_depth import EarlierDepth
+from mapper.odometry.local_map.focal_length import WINDOW_KEYFRAMES, FocalLengthCheck
 from mapper.odometry.local_map.frame_doubts import NO_DOUBT, Doubt, FrameDoubts
 from mapper.odometry.local_map.image_observation import ImageObservation, observe_image
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
@@ -82,6 +83,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._decision = KeyframeDecision(config)
         self._doubts = FrameDoubts()
         self._residuals = LogResiduals()
+        self._focal_length = FocalLengthCheck()
         self._agreeing = np.zeros(0, np.bool_)  # features by which the last frame was tracked
         self._lost_frames = 0  # since the last tracked one
         self._unknown_frames = 0  # those of them with enough features to begin a sub-map
@@ -160,6 +162,13 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
                 now, then = now[common >= 0], then[common >= 0]
                 previous_px[now] = observation.pixels[then]
         return FeatureMatches(self._agreeing, previous_px)
+
+    def calibration_doubts(self) -> Sequence[str]:
+        """Return whether the images contradict the focal length that they are said to have."""
+        if not self._map.keyframes:
+            return ()
+        doubt = self._focal_length.contradiction(self._map.observation(0).intrinsics[0])
+        return (doubt,) if doubt else ()
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return a factor from every keyframe to those earlier ones that share most landmarks with it.
@@ -287,6 +296,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._map.refine(index, window=config.bundle_keyframes)
         self._map.follow_readout()
         self._map.cull()
+        self._check_focal_length()
         if (statistics := self._map.residual_statistics(index)) is not None:
             self._residuals.add(statistics)
         self._decision.restart()
@@ -299,6 +309,14 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             landmark_of_feature=keyframe.landmark_of_feature,
             reference=index,
         )
+
+    def _check_focal_length(self) -> None:
+        """Check the newest keyframes of a sub-map together, once there are enough since the last check."""
+        newest = range(len(self._map.keyframes) - WINDOW_KEYFRAMES, len(self._map.keyframes))
+        origins = {self._map.keyframes[k].origin for k in newest if k >= 0}
+        if len(self._map.keyframes) % WINDOW_KEYFRAMES or len(origins) > 1 or self._focal_length.is_complete:
+            return
+        self._focal_length.add(self._map.bundle(newest))
 
     def _result(
         self,
