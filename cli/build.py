@@ -22,8 +22,8 @@ from mapper.cli.options import (
     merged,
     selection,
 )
-from mapper.cli.places import RUNS, name_of, place_of
 from mapper.cli.stepping import Stepping
+from mapper.runtime.result_paths import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
     from mapper.config.build import BuildConfig

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +11,8 @@ from mapper.cli.terminal import escaped
 from mapper.runtime.progress import SILENT, Progress, Report
 
 _SECONDS_BETWEEN_LINES = 10.0
+_FEWEST_DONE = 5
+"""Items, by whose time that of the others is estimated."""
 _MOST_NOTES = 5
 
 
@@ -53,24 +56,26 @@ class Bars(_Notes):
     def stage(self, name: str) -> Iterator[Report]:
         """Show the bar while inside."""
         from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
         columns = (
             TextColumn("{task.description:<7}"),
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn("{task.fields[rate]}"),
-            TimeRemainingColumn(elapsed_when_finished=True),
+            TextColumn("{task.fields[left]}"),
+            TimeElapsedColumn(),
         )
         # Bars are drawn by escape sequences, which text may not have.
         terminal = getattr(sys.stderr, "raw", sys.stderr)
         with Progress(*columns, console=Console(file=terminal)) as bars:
-            task = bars.add_task(name, total=None, rate="")
-            began = time.monotonic()
+            task = bars.add_task(name, total=None, rate="", left="")
+            pace = _Pace()
 
             def report(done: int, total: int) -> None:
-                rate = done / max(time.monotonic() - began, 1e-3)
-                bars.update(task, completed=done, total=total, rate=_rate_text(rate))
+                rate = pace.rate(done)
+                left = _left_text(rate, total - done) if done < total else ""
+                bars.update(task, completed=done, total=total, rate=_rate_text(rate), left=left)
 
             yield report
 
@@ -82,20 +87,43 @@ class Lines(_Notes):
     def stage(self, name: str) -> Iterator[Report]:
         """Print how far it is while inside."""
         began = said = time.monotonic()
-        reached = (0, 0)
+        reached, pace = (0, 0), _Pace()
 
         def report(done: int, total: int) -> None:
             nonlocal said, reached
             reached = done, total
-            now = time.monotonic()
+            now, rate = time.monotonic(), pace.rate(done)
             if now - said > _SECONDS_BETWEEN_LINES and 0 < done < total:
                 said = now
-                rate = done / (now - began)
-                self._show(f"{name}: {done}/{total}, {_rate_text(rate)}, {(total - done) / rate:.0f} s left")
+                told = [f"{done}/{total}", _rate_text(rate), _left_text(rate, total - done)]
+                self._show(f"{name}: {', '.join(text for text in told if text)}")
 
         yield report
         self._show(f"{name}: {reached[0]}/{reached[1]} in {time.monotonic() - began:.1f} s")
 
 
-def _rate_text(per_s: float) -> str:
+class _Pace:
+    """Rate of a stage, over the later half of its time: the first items may wait for compilers and caches."""
+
+    def __init__(self) -> None:
+        self._reports = deque([(time.monotonic(), 0)])
+        self._began = self._reports[0][0]
+
+    def rate(self, done: int) -> float | None:
+        """Return items per second by now; None while too few are done to tell."""
+        now = time.monotonic()
+        self._reports.append((now, done))
+        while self._reports[0][0] < (self._began + now) / 2:
+            self._reports.popleft()
+        then, before = self._reports[0]
+        return (done - before) / max(now - then, 1e-3) if done - before >= _FEWEST_DONE else None
+
+
+def _rate_text(per_s: float | None) -> str:
+    if per_s is None:
+        return ""
     return f"{per_s:.0f}/s" if per_s >= 10.0 else f"{per_s:.1f}/s"
+
+
+def _left_text(per_s: float | None, left: int) -> str:
+    return "" if per_s is None else f"{left / per_s:.0f} s left"

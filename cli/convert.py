@@ -9,7 +9,7 @@ import typer
 from mapper.cli.answer import Answer, Output
 from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import First, Last, Overrides, RequireTruth, Stride, merged, selection
-from mapper.cli.places import LOGS, name_of, place_of
+from mapper.runtime.result_paths import LOGS, name_of, place_of
 
 
 class LogFormat(StrEnum):

@@ -8,8 +8,8 @@ import typer
 from mapper.cli.answer import Answer, Output, record_in
 from mapper.cli.completion import run_folders
 from mapper.cli.environment import prepare_libraries
-from mapper.cli.places import DIFFS, joined_names, place_of
 from mapper.cli.placing import Place, PosesFile, placing_of
+from mapper.runtime.result_paths import DIFFS, joined_names, place_of
 
 if TYPE_CHECKING:
     from mapper.merging.differences import Differences

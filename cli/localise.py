@@ -9,7 +9,7 @@ from mapper.cli.answer import Answer, Output, rows_text
 from mapper.cli.completion import run_folders
 from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import First, Last, Overrides, Stride, merged, selection
-from mapper.cli.places import RUNS, name_of, place_of
+from mapper.runtime.result_paths import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
     from mapper.run.localised import LocalisedManifest

@@ -9,8 +9,8 @@ from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
 from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import workers_for
-from mapper.cli.places import MAPS, joined_names
 from mapper.cli.placing import Place, PosesFile, placing_of
+from mapper.runtime.result_paths import MAPS, joined_names
 
 if TYPE_CHECKING:
     from mapper.merging.merge import Merged

@@ -88,7 +88,7 @@ def _figures(run: "Run") -> "list[Figure]":
             if n
         ),
         ("graph", f"{counts.nodes} nodes, {counts.factors} factors"),
-        ("octree", f"{counts.leaves:,} voxels of {run.config.octree.resolution_m:g} m"),
+        ("octree", f"{counts.voxels_text} of {run.config.octree.resolution_m:g} m"),
         ("cloud", f"{counts.cloud_points:,} points"),
     ]
     fast = [

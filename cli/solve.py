@@ -8,7 +8,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output, rows_text
 from mapper.cli.options import Overrides, assignments, merged
-from mapper.cli.places import RUNS, name_of, place_of
+from mapper.runtime.result_paths import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
     from mapper.export.solved_graph import SolvedGraph

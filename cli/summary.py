@@ -38,7 +38,11 @@ def run_document(run: Run, metrics: Sequence[Metric]) -> dict[str, Any]:
         "factors": counts.factors,
         "loops": _loop_counts(run.loops),
         "metrics": [asdict(metric) for metric in metrics],
-        "octree": {"leaves": counts.leaves, "resolution_m": run.config.octree.resolution_m},
+        "octree": {
+            "leaves": counts.leaves,
+            "occupied": counts.occupied,
+            "resolution_m": run.config.octree.resolution_m,
+        },
         "cloud_points": counts.cloud_points,
         "resumed": timing.resumed,
         "stage_s": timing.stage_s,
@@ -68,7 +72,7 @@ def short_text(run: Run, metrics: Sequence[Metric]) -> str:
         ("frames", f"{counts.frames_text}{logs}"),
         ("loops", f"{counts.loops} of {counts.loop_candidates} candidates hold"),
         ("accuracy", _accuracy_text(metrics)),
-        ("map", f"{counts.leaves} voxels of {run.config.octree.resolution_m:g} m{path}"),
+        ("map", f"{counts.voxels_text} of {run.config.octree.resolution_m:g} m{path}"),
         ("speed", f"{speed}; {timing.total_s:.1f} s and {timing.peak_memory_mb:.0f} MB in all"),
         ("resumed", _resumed_text(timing)),
         ("run", f"{run.path} ({len(run.files())} files, {_size_mb(run.files()):.1f} MB)"),
@@ -93,7 +97,7 @@ def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
         ("loops", _loops_text(run.loops)),
         *((metric.name, _value_text(metric)) for metric in metrics if metric.name.startswith(_SHOWN)),
         *_left_open(run.records),
-        ("octree", f"{counts.leaves} leaves of {run.config.octree.resolution_m:g} m"),
+        ("octree", f"{counts.voxels_text} of {run.config.octree.resolution_m:g} m"),
     ]
     if run.manifest.input.appended:
         rows.insert(0, ("logs", run.manifest.input.title))

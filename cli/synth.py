@@ -10,7 +10,7 @@ import typer
 from mapper.cli.answer import Answer, Output
 from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import assignments, merged
-from mapper.cli.places import LOGS, place_of
+from mapper.runtime.result_paths import LOGS, place_of
 
 Settings = TypeVar("Settings")
 

@@ -9,7 +9,7 @@ from mapper.cli.answer import Answer, Output, verb
 from mapper.cli.environment import prepare_libraries
 from mapper.cli.groups import Verb, VerbGroup
 from mapper.cli.options import assignments, merged
-from mapper.cli.places import name_of, place_of
+from mapper.runtime.result_paths import name_of, place_of
 
 _SEED = 0  # of the draws of k-means++: the same logs give the same bytes
 

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mapper.api.build import build
     from mapper.api.logs import open_log
+    from mapper.api.octree import read_octree
     from mapper.api.register import register
     from mapper.config.loading import load_config
     from mapper.core.errors import MapperError
     from mapper.evaluators.metrics.evaluate import evaluate
     from mapper.octree.map import OctreeMap
-    from mapper.octree.octomap_file import read_octree
     from mapper.run.folder import Run, open_run
 
 __version__ = "0.2.0"
@@ -46,7 +46,7 @@ _HOMES = {
     "load_config": "mapper.config.loading",
     "open_log": "mapper.api.logs",
     "open_run": "mapper.run.folder",
-    "read_octree": "mapper.octree.octomap_file",
+    "read_octree": "mapper.api.octree",
     "register": "mapper.api.register",
 }
 

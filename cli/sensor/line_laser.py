@@ -9,7 +9,7 @@ from mapper.cli.answer import Answer, Output
 from mapper.cli.console import files_text
 from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import assignments
-from mapper.cli.places import RUNS, name_of, place_of
+from mapper.runtime.result_paths import RUNS, name_of, place_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

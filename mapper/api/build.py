@@ -21,6 +21,7 @@ from mapper.run import files
 from mapper.run.folder import Run
 from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.runtime.progress import SILENT, Progress, Report
+from mapper.runtime.result_paths import RUNS, name_of, place_of
 from mapper.sources.base import Log
 
 OwnOdometry = Odometry[Any] | Callable[[Frame], ArrayLike | None] | Trajectory
@@ -40,7 +41,7 @@ _OWN_POSES: Mapping[str, Any] = {
 def build(
     log: Log | AnyPath,
     *,
-    out: AnyPath,
+    out: AnyPath | None = None,
     config: BuildConfig | AnyPath | None = None,
     settings: Settings | None = None,
     odometry: OwnOdometry | None = None,
@@ -53,7 +54,8 @@ def build(
     Args:
         log: A log, or its path; see :func:`open_log`. A log that is opened already is mapped as it is; give
             the ``source`` settings by which it was opened, too, if the run is to find the same frames later.
-        out: Run folder to create; until it is whole it is called ``OUT.partial``.
+        out: Run folder to create; until it is whole it is called ``OUT.partial``. None is ``runs/LOG``, with
+            a number while that is taken.
         config: All settings, or a TOML or JSON file of them; None is what suits the log's sensor.
         settings: Values by dotted name on top, such as ``{"octree.resolution_m": 0.1}``.
         odometry: Your own instead of the toolkit's: an object of the
@@ -80,10 +82,10 @@ def build(
         >>> run.verdict.state
         'trusted'
     """
-    out = Path(out)
     receiver = _receiver(progress)
     if not isinstance(log, Log):
         log = _opened(log, config, settings)
+    out = place_of(None if out is None else Path(out), RUNS / name_of(log.path), overwrite=overwrite)
     own = None
     if isinstance(odometry, Trajectory | Odometry) or odometry is None:
         own = odometry

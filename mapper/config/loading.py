@@ -59,7 +59,7 @@ def load_config(
             _drop_former_settings(tree, path)
         _validated(BuildConfig, _over(DEFAULTS[sensor], tree), str(path))
     _put_all(tree, overrides, settings)
-    where = "overrides" if overrides or settings or path is None else str(path)
+    where = None if overrides or settings or path is None else str(path)
     return _validated(BuildConfig, _over(DEFAULTS[sensor], tree), where)
 
 
@@ -96,7 +96,9 @@ def load_source_config(
         [override for override in overrides if override.startswith("source.")],
         {name: value for name, value in (settings or {}).items() if name.split(".")[0] == "source"},
     )
-    return _validated(BuildConfig, {"source": tree.get("source", {})}, str(path or "overrides")).source
+    return _validated(
+        BuildConfig, {"source": tree.get("source", {})}, None if path is None else str(path)
+    ).source
 
 
 def read_config(path: Path, model: type[AnyConfig]) -> AnyConfig:
@@ -170,7 +172,7 @@ def overridden(
     _put_all(changed, overrides, settings)
     _drop_other_kinds(tree, changed)
     _put_all(tree, overrides, settings)
-    return _validated(type(config), tree, "overrides")
+    return _validated(type(config), tree, None)
 
 
 def _drop_other_kinds(tree: dict[str, Any], changed: Mapping[str, Any]) -> None:
@@ -187,7 +189,7 @@ def _put_all(tree: dict[str, Any], overrides: Sequence[str], settings: Settings 
     for override in overrides:
         dotted, equals, value = override.partition("=")
         if not equals or not dotted:
-            raise ConfigError(f"override {override!r}: want key.path=value")
+            raise ConfigError(f"setting {override!r}: want name=value, such as octree.resolution_m=0.1")
         _put(tree, dotted, value)
     for dotted, value in (settings or {}).items():
         _put(tree, dotted, value)
@@ -206,7 +208,7 @@ def _put(tree: dict[str, Any], dotted: str, value: Any) -> None:
             node[key] = {}
         node = node[key]
         if not isinstance(node, dict):
-            raise ConfigError(f"override {f'{dotted}={value}'!r}: {key} is a value, not a table")
+            raise ConfigError(f"setting {f'{dotted}={value}'!r}: {key} is a value, not a table")
     node[leaf] = os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
@@ -233,17 +235,17 @@ def _kind(member: type[Config]) -> str:
     return str(member.model_fields["kind"].default)
 
 
-def _validated(model: type[AnyConfig], tree: dict[str, Any], where: str) -> AnyConfig:
+def _validated(model: type[AnyConfig], tree: dict[str, Any], where: str | None) -> AnyConfig:
     return checked_config(_with_kinds(tree, model()), model, where)
 
 
-def checked_config(tree: Mapping[str, Any], model: type[AnyConfig], where: str) -> AnyConfig:
+def checked_config(tree: Mapping[str, Any], model: type[AnyConfig], where: str | None) -> AnyConfig:
     """Return a configuration from values that are nested by name.
 
     Args:
         tree: The values.
         model: Kind of the configuration.
-        where: Where the values come from, for messages.
+        where: File that the values come from, for messages; None of a caller's own, which they name.
 
     Raises:
         ConfigError: The model refuses a name or a value.
@@ -251,4 +253,5 @@ def checked_config(tree: Mapping[str, Any], model: type[AnyConfig], where: str) 
     try:
         return model.model_validate(tree)
     except ValidationError as error:
-        raise ConfigError(f"{where}: {refusal(model, error.errors()[0])}") from None
+        refused = refusal(model, error.errors()[0])
+        raise ConfigError(refused if where is None else f"{where}: {refused}") from None

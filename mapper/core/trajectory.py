@@ -1,7 +1,8 @@
 """Trajectory: a body's poses over time."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any, overload
 
 import numpy as np
 
@@ -13,6 +14,9 @@ from mapper.core.timebase import NS_PER_S, Stamps
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
     """Poses of the body in the world, one per stamp.
+
+    ``trajectory[i]`` is one pose, (4, 4); a slice, a mask or an array of increasing indices gives a
+    trajectory. Iterating gives the poses.
 
     Attributes:
         stamps_ns: (N,) int64, strictly increasing nanoseconds.
@@ -41,6 +45,25 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    @overload
+    def __getitem__(self, index: int) -> Transform: ...
+    @overload
+    def __getitem__(self, index: Any) -> "Transform | Trajectory": ...
+    def __getitem__(self, index: Any) -> "Transform | Trajectory":
+        if isinstance(index, int | np.integer):
+            pose: Transform = self.T_world_body[index]
+            return pose
+        return Trajectory(self.stamps_ns[index], self.T_world_body[index])
+
+    def __iter__(self) -> Iterator[Transform]:
+        return iter(self.T_world_body)
+
+    def __repr__(self) -> str:
+        if not len(self):
+            return "Trajectory of no poses"
+        lasted_s = int(self.stamps_ns[-1] - self.stamps_ns[0]) / NS_PER_S
+        return f"Trajectory of {len(self)} poses over {lasted_s:.1f} s and {self.path_length_m:.2f} m"
 
     @property
     def stamps(self) -> Array:

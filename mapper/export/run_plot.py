@@ -51,7 +51,7 @@ def run_html(run: Run) -> str:
         ("frames", counts.frames_text),
         ("keyframes", f"{counts.nodes}, {counts.loops} loops"),
         ("path", f"{run.trajectory.path_length_m:.2f} m"),
-        ("octree", f"{counts.leaves} voxels of {run.config.octree.resolution_m:g} m"),
+        ("octree", f"{counts.voxels_text} of {run.config.octree.resolution_m:g} m"),
     ]
     picture = ""
     if (run.path / files.SUMMARY).is_file():

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from mapper.core.errors import DataError
 from mapper.core.frames import Points32, Scan
@@ -120,6 +121,20 @@ def depth_limit_of(config: OctreeConfig) -> DepthLimit | None:
     if config.depth_noise is None or config.max_range_m is not None:
         return None
     return DepthLimit(config.depth_noise, max_sigma_m=config.resolution_m)
+
+
+def octree_config(config: OctreeConfig | float) -> OctreeConfig:
+    """Return a configuration, or that of OctoMap's sensor model with voxels of an edge, metres.
+
+    Raises:
+        DataError: The edge is no positive number.
+    """
+    if isinstance(config, OctreeConfig):
+        return config
+    try:
+        return OctreeConfig(resolution_m=config)
+    except ValidationError:
+        raise DataError(f"octree: voxels of {config!r} m; want metres > 0, or an OctreeConfig") from None
 
 
 def origin_key(origin: NDArray[np.float32], resolution_m: float) -> NDArray[np.int64]:

@@ -1,5 +1,6 @@
 """The occupancy map: OctoMap's result (Hornung et al. 2013) from sparse blocks and compiled kernels."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -8,13 +9,15 @@ from numpy.typing import ArrayLike, NDArray
 from mapper.core.errors import DataError, MapSizeError
 from mapper.core.frames import Points32, Scan
 from mapper.core.geometry import Array, Points, Transform, apply, point_rows
+from mapper.core.paths import AnyPath
 from mapper.octree import kernels, levels, queries
 from mapper.octree.attributes import NEVER_SEEN, AttributeLayer, ended_blocks
 from mapper.octree.blocks import BlockStore
 from mapper.octree.boxes import BoxCounts, count_boxes
-from mapper.octree.casting import Cast, Caster, depth_limit_of, origin_key
+from mapper.octree.casting import Cast, Caster, depth_limit_of, octree_config
 from mapper.octree.config import OctreeConfig, Parent, SliceConfig
-from mapper.octree.keys import KEY_BITS, KEY_ZERO, codes_of
+from mapper.octree.first_obstacles import first_obstacles
+from mapper.octree.keys import KEY_BITS, codes_of
 from mapper.octree.leaves import Leaves, RayEnds
 from mapper.octree.nearest import Nearest, nearest_occupied
 from mapper.octree.scan_update import ScanUpdate
@@ -28,12 +31,13 @@ if TYPE_CHECKING:
 class OctreeMap:
     """Occupancy octree: log-odds per voxel; an absent voxel is unknown.
 
+    ``OctreeMap(0.1)`` has voxels of 0.1 m and OctoMap's sensor model; :class:`OctreeConfig` has all settings.
     The tree has depth 16; its lowest three levels are stored as dense 8³ blocks. Upper levels are computed
     when a file is written.
     """
 
-    def __init__(self, config: OctreeConfig) -> None:
-        self.config = config
+    def __init__(self, config: OctreeConfig | float) -> None:
+        self.config = config = octree_config(config)
         self.blocks = BlockStore()
         self.attributes = AttributeLayer(self.blocks, config.resolution_m) if config.attributes else None
         self._caster = Caster(config)
@@ -47,6 +51,24 @@ class OctreeMap:
     def __len__(self) -> int:
         """Return the number of known voxels, all at the finest level."""
         return self._known
+
+    def __repr__(self) -> str:
+        occupied = self.count_occupied()
+        return (
+            f"OctreeMap of {self.resolution_m:g} m voxels: {len(self)} known, "
+            f"{occupied} occupied and {len(self) - occupied} free"
+        )
+
+    def count_occupied(self) -> int:
+        """Return how many of the known voxels are occupied; the others are free."""
+        used = self.blocks.table.values[: len(self.blocks.codes)]
+        return int(np.count_nonzero(used >= self.occupied_log_odds))
+
+    def write(self, path: AnyPath) -> None:
+        """Write the map to a file, as its ending says; see :func:`~mapper.octree.writing.write_octree`."""
+        from mapper.octree.writing import write_octree
+
+        write_octree(Path(path), self)
 
     @property
     def memory_bytes(self) -> int:
@@ -226,37 +248,16 @@ class OctreeMap:
     def cast_rays(
         self, origins_world: Points, directions_world: Points, *, max_range_m: float, through_unknown: bool
     ) -> RayEnds:
-        """Return the first occupied voxel along rays, as OctoMap's ``castRay`` does.
-
-        Args:
-            origins_world: (N, 3) metres.
-            directions_world: (N, 3) of any length but zero.
-            max_range_m: Rays end without a hit once a voxel's centre is further away.
-            through_unknown: Pass unknown voxels; otherwise a ray ends, without a hit, in the first.
-
-        Raises:
-            DataError: Shapes differ, a direction is zero or not finite, or an origin has no key.
-        """
-        origins = np.ascontiguousarray(origins_world, dtype=np.float32)
-        directions = np.ascontiguousarray(directions_world, dtype=np.float32)
-        if origins.shape != directions.shape or origins.ndim != 2 or origins.shape[1] != 3:
-            raise DataError(f"octree: rays from {origins.shape} along {directions.shape}, want two (N, 3)")
-        if not np.isfinite(directions).all() or not directions.any(axis=1).all():
-            raise DataError("octree: every ray needs a finite direction other than zero")
-        for corner in (origins.min(axis=0, initial=0.0), origins.max(axis=0, initial=0.0)):
-            origin_key(corner, self.resolution_m)
-        keys, outcomes = queries.first_obstacles(
-            self.blocks.table,
-            origins,
-            directions,
-            self.resolution_m,
-            max_range_m,
-            self.occupied_log_odds,
-            through_unknown,
+        """Return the first occupied voxel along rays; see :mod:`mapper.octree.first_obstacles`."""
+        return first_obstacles(
+            self.blocks,
+            origins_world,
+            directions_world,
+            resolution_m=self.resolution_m,
+            threshold=self.occupied_log_odds,
+            max_range_m=max_range_m,
+            through_unknown=through_unknown,
         )
-        centres_world = (keys - (KEY_ZERO - 0.5)) * self.resolution_m
-        distances_m = np.linalg.norm(centres_world - origins_world, axis=1)
-        return RayEnds(centres_world, distances_m, outcomes == queries.HIT)
 
     def count_boxes(self, lower_world: Points, upper_world: Points) -> BoxCounts:
         """Count the voxels in N boxes between (N, 3) corners, metres; see :mod:`mapper.octree.boxes`."""

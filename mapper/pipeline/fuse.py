@@ -222,6 +222,7 @@ def fuse_into(
     counts = writer.manifest.counts.model_copy(
         update={
             "leaves": len(maps.octree),
+            "occupied": maps.octree.count_occupied(),
             "cloud_points": len(maps.cloud_points_world),
             "dynamic_points": len(maps.dynamic_points_world),
         }

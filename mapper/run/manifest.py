@@ -91,9 +91,18 @@ class Counts(Config):
     """Loop closures that hold."""
     loop_candidates: int = 0
     leaves: int = 0
-    """Known leaves of the octree."""
+    """Known voxels of the octree, free and occupied."""
+    occupied: int | None = None
+    """Occupied ones of them; None in runs of before it was counted."""
     cloud_points: int = 0
     dynamic_points: int = 0
+
+    @property
+    def voxels_text(self) -> str:
+        """How many voxels are known, and occupied."""
+        if self.occupied is None:
+            return f"{self.leaves} known voxels"
+        return f"{self.occupied} occupied and {self.leaves - self.occupied} free voxels"
 
     @property
     def frames_text(self) -> str:

@@ -52,5 +52,7 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
                 wheels, notes = read_wheels(path, config.wheels, sensor=log.sensor)
                 log = replace(log, wheels=wheels, notes=[*log.notes, *notes])
             return selected(log, config)
-    looked_for = "; ".join(import_module(f"mapper.sources.{name}").LOOKED_FOR for name in _FORMATS)
-    raise SourceError(f"{path}: not a log of a known format; looked for {looked_for}")
+    raise SourceError(
+        f"{path}: not a log of a known format (TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood, KITTI, clouds, "
+        ".mcap, .bag, .db3, .mbag); docs/your-sensor.md names the files of each"
+    )

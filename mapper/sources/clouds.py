@@ -9,7 +9,6 @@ from mapper.sources.config import SourceConfig
 from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, is_cloud_name, most_clouds, scan_log
 from mapper.sources.scans import ScanEntry
 
-LOOKED_FOR = "two or more clouds, .bin .pcd .ply .xyz .npy .las .laz, or .txt .csv with a number in the name"
 TRUTH_FILES = ("groundtruth.txt", "poses.txt")
 
 

@@ -17,10 +17,6 @@ from mapper.sources.config import SourceConfig
 from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, most_clouds, scan_log
 from mapper.sources.text import parse_numbers, rows
 
-LOOKED_FOR = (
-    "velodyne/000000.bin, sequences/00/velodyne/000000.bin or velodyne_points/data/0000000000.bin (KITTI)"
-)
-
 _ROUGHLY_RIGID = 1e-3  # calib.txt has 12 digits; anything further off is no rotation
 
 

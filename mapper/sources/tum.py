@@ -26,7 +26,6 @@ from mapper.sources.text import (
 )
 
 DEPTH_UNITS_PER_M = 5000.0
-LOOKED_FOR = "rgb.txt and depth.txt (TUM)"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,6 +16,8 @@ WRONG = {
     "a folder that is no run": lambda folder: mapper.open_run(str(folder)),
     "no octree": lambda folder: mapper.read_octree(f"{folder}/nothing"),
     "a folder as an octree": lambda folder: mapper.read_octree(str(folder)),
+    "voxels of no size": lambda _: mapper.OctreeMap(0),
+    "voxels of a word": lambda _: mapper.OctreeMap("fine"),
     "no configuration": lambda folder: mapper.load_config(f"{folder}/nothing.toml"),
     "an unknown setting": lambda _: mapper.load_config(settings={"octree.resolution": 1}),
     "a word for a number": lambda _: mapper.load_config(settings={"octree.resolution_m": "fine"}),

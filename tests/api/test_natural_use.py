@@ -1,5 +1,8 @@
 """What a new user types, as typed: text for paths, attributes for parts, numpy everywhere."""
 
+import re
+from pathlib import Path
+
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -22,15 +25,16 @@ def test_a_log_is_built(desk_log, desk_run, tmp_path):
         assert (run.path / name).read_bytes() == (desk_run.path / name).read_bytes()
 
 
-def test_a_log_opened_before_is_built_with_a_configuration_loaded_before(desk_log, tmp_path):
+def test_a_log_opened_before_is_built_with_a_configuration_loaded_before(desk_log, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # without a name, a run's is the log's
     lines = []
     run = mapper.build(
         mapper.open_log(desk_log)[:12],
-        out=tmp_path / "run",
         config=mapper.load_config(overrides=["octree.resolution_m=0.1"]),
         settings={"min_tracked_frames": 5},
         progress=lines.append,
     )
+    assert run.path == Path("runs", desk_log.name)
     assert run.octree.resolution_m == 0.1
     assert len(run.trajectory) == 12
     assert "track" in lines
@@ -46,6 +50,20 @@ def test_the_trajectory_is_arrays(run):
     assert run.trajectory is path
 
 
+def test_the_trajectory_is_a_sequence_of_poses(run):
+    path = run.trajectory
+    np.testing.assert_array_equal(path[-1], path.poses[30])
+    np.testing.assert_array_equal(list(path), path.poses)
+    assert [len(path[2:9]), len(path[::5]), len(path[path.positions[:, 2] > -1e9])] == [7, 7, 31]
+    np.testing.assert_array_equal(path[2:9].stamps_ns, path.stamps_ns[2:9])
+    assert re.fullmatch(r"Trajectory of 31 poses over 2\.0 s and [\d.]+ m", repr(path))
+    assert repr(path[:0]) == "Trajectory of no poses"
+    with pytest.raises(IndexError):
+        path[31]
+    with pytest.raises(mapper.MapperError, match="stamps must increase"):
+        path[::-1]
+
+
 def test_the_octree_answers(run):
     octree = run.octree
     states = octree.query(run.trajectory.positions)
@@ -58,6 +76,26 @@ def test_the_octree_answers(run):
     assert octree.slice(0.1, 1.2).grid.shape[0] > 10
     assert mapper.read_octree(str(run.path / "map.ot")).occupied().shape == occupied.shape
     assert isinstance(mapper.read_octree(run.path / "map.bt"), mapper.OctreeMap)
+
+
+def test_an_octree_is_made_filled_shown_and_written(run, tmp_path):
+    octree = mapper.OctreeMap(0.1)
+    octree.insert_points(np.float32([[1.0, 0.0, 0.0], [1.0, 0.5, 0.0]]), np.zeros(3))
+    assert octree.count_occupied() == len(octree.occupied()) == 2
+    free = len(octree) - 2
+    assert repr(octree) == f"OctreeMap of 0.1 m voxels: {len(octree)} known, 2 occupied and {free} free"
+    for ending in ("octree", "ot", "bt"):
+        octree.write(str(tmp_path / f"two.{ending}"))
+        back = mapper.read_octree(tmp_path / f"two.{ending}")
+        np.testing.assert_array_equal(back.occupied(), octree.occupied())
+    with pytest.raises(mapper.MapperError, match=r"two\.txt: want a name that ends in \.octree"):
+        octree.write(tmp_path / "two.txt")
+
+    counts = run.manifest.counts
+    assert repr(mapper.read_octree(str(run.path))) == repr(run.octree)
+    assert run.octree.count_occupied() == counts.occupied == len(run.octree.occupied())
+    free = len(run.octree.free())
+    assert counts.voxels_text == f"{counts.occupied} occupied and {free} free voxels"
 
 
 def test_the_cloud_is_points_and_colours(run):

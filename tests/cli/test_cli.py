@@ -139,7 +139,7 @@ def test_spelled_out_overrides_win(desk_log, tmp_path):
         (["build", "LOG", "--out", "RUN"], "pass --overwrite to replace it"),
         (
             ["build", "LOG", "--out", "run", "--set", "a.b=1"],
-            "mapper: overrides: a: unknown; known are source",
+            "mapper: a: unknown; known are source",
         ),
         (["build", "LOG", "--out", "run", "--last", "4", "--quiet"], "mapper: only 5 frames were read"),
         (["build", "LOG", "--out", "run", "--config", "no.toml"], "mapper: no.toml: cannot be read"),
@@ -159,7 +159,7 @@ def test_spelled_out_overrides_win(desk_log, tmp_path):
         (["export", "RUN", "--as", "ply", "--out", "a.obj"], "mapper: a.obj: ply files end with .ply"),
         (
             ["export", "RUN", "--as", "tum", "--set", "a.b=1"],
-            "mapper: overrides: a: unknown; known are source",
+            "mapper: a: unknown; known are source",
         ),
         (["eval", "nowhere"], "mapper: nowhere: no such run folder"),
         (["eval", "RUN", "--map", "nowhere"], "mapper: nowhere: no such reference for a map"),
@@ -170,9 +170,9 @@ def test_spelled_out_overrides_win(desk_log, tmp_path):
         (["eval", "RUN", "--times", "nowhere"], "mapper: nowhere: --times is for poses in KITTI text"),
         (["eval", "RUN", "--truth", "nowhere"], "mapper: nowhere: cannot be read"),
         (["convert", "nowhere", "--out", "log", "--as", "tum"], "mapper: nowhere: no such file or folder"),
-        (["synth", "log", "--rooms", "5"], "mapper: overrides: rooms: Input should be a multiple of 2"),
-        (["demo", "--out", "LOG", "--set", "workers=x"], "mapper: overrides: workers: Input should be"),
-        (["config", "--set", "odometry.kind=zip"], "mapper: overrides: odometry: Input tag 'zip' found"),
+        (["synth", "log", "--rooms", "5"], "mapper: rooms: Input should be a multiple of 2"),
+        (["demo", "--out", "LOG", "--set", "workers=x"], "mapper: workers: Input should be"),
+        (["config", "--set", "odometry.kind=zip"], "mapper: odometry: Input tag 'zip' found"),
     ],
 )
 def test_a_mistake_is_one_line(run_folder, desk_log, tmp_path, monkeypatch, arguments, message):
@@ -339,6 +339,19 @@ def test_many_notes_become_few_lines(capsys):
     said = capsys.readouterr().err.splitlines()
     assert said[0] == "mapper: skipped: 0"
     assert len(said) == 6
+
+
+def test_the_time_left_is_told_by_the_later_half_of_what_was_done(monkeypatch, capsys):
+    now_s = [100.0]
+    monkeypatch.setattr("mapper.cli.console.time.monotonic", lambda: now_s[0])
+    with Lines().stage("track") as report:
+        for at_s, done in [(130.0, 1), (145.0, 2), *((145.0 + s, 2 + 10 * s) for s in range(1, 61))]:
+            now_s[0] = at_s
+            report(done, 802)
+    said = capsys.readouterr().err.splitlines()
+    assert said[:2] == ["track: 1/802", "track: 2/802"]  # it waits for the compiler
+    assert said[2] == "track: 112/802, 4.3/s, 162 s left"
+    assert said[-2] == "track: 552/802, 10/s, 25 s left"
 
 
 def test_bars_end_full(monkeypatch, capsys):

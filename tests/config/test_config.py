@@ -55,14 +55,14 @@ def test_one_knob_keeps_the_kind_of_the_file_and_its_default_detector(toml):
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("octree.resolution=0.1", "overrides: octree.resolution: unknown; did you mean resolution_m?"),
-        ("octree.resolution_m=-1", "overrides: octree.resolution_m: Input should be greater than 0, not -1"),
+        ("octree.resolution=0.1", "octree.resolution: unknown; did you mean resolution_m?"),
+        ("octree.resolution_m=-1", "octree.resolution_m: Input should be greater than 0, not -1"),
         (
             "odometry.previous_frames=2",
             "odometry.local-map.previous_frames: unknown; odometry.kind=isvd has it",
         ),
         ("odometry.max_deph_m=2", "odometry.local-map.max_deph_m: unknown; did you mean max_depth_m?"),
-        ("resolution_m=0.1", "overrides: resolution_m: unknown; did you mean octree.resolution_m?"),
+        ("resolution_m=0.1", "resolution_m: unknown; did you mean octree.resolution_m?"),
         ("odometry.detector.x=1", "detector.uniform-orb.x: unknown; known are kind, max_features, threshold"),
         (
             "odometry.kind=zip",
@@ -70,8 +70,8 @@ def test_one_knob_keeps_the_kind_of_the_file_and_its_default_detector(toml):
             " 'local-map', 'pnp', 'gicp', 'icp', 'kiss-icp', 'hough-ndt', 'wheels', 'given'",
         ),
         ("workers=many", "unable to parse string as an integer, not many"),
-        ("workers", "override 'workers': want key.path=value"),
-        ("workers.x.y=1", "overrides: workers: Input should be a valid integer"),
+        ("workers", "setting 'workers': want name=value, such as"),
+        ("workers.x.y=1", "workers: Input should be a valid integer"),
     ],
 )
 def test_a_mistake_is_named_in_one_line(override, message):

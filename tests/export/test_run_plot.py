@@ -47,7 +47,7 @@ def test_a_notebook_shows_verdict_and_picture_without_drawing(desk_run, monkeypa
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     html = desk_run._repr_html_()
     assert desk_run.verdict.state in html
-    assert f"{desk_run.manifest.counts.leaves} voxels" in html
+    assert desk_run.manifest.counts.voxels_text in html
     (picture,) = re.findall(r'src="data:image/png;base64,([^"]+)"', html)
     assert base64.b64decode(picture) == (desk_run.path / "summary.png").read_bytes()
     assert not re.search(r"(?:src|href)=[\"'](?!data:)", html)

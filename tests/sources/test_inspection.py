@@ -113,7 +113,7 @@ def test_what_is_no_log_is_refused(tmp_path):
     with pytest.raises(SourceError, match="no such file or folder"):
         inspect_log(tmp_path / "nowhere.mcap", SourceConfig())
     (tmp_path / "empty").mkdir()
-    with pytest.raises(SourceError, match=r"not a log of a known format; .*\.mcap, \.bag"):
+    with pytest.raises(SourceError, match=r"not a log of a known format .*\.mcap, \.bag"):
         inspect_log(tmp_path / "empty", SourceConfig())
 
 

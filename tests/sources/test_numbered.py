@@ -182,5 +182,5 @@ def test_the_nominal_camera_is_assumed_only_for_its_own_size(tmp_path):
 def test_a_tum_folder_that_lost_its_lists_is_not_taken_for_numbered_images(tiny_tum_log):
     log = tiny_tum_log(2)
     (log / "rgb.txt").unlink()
-    with pytest.raises(SourceError, match=r"known format; looked for associations\.txt.*rgb\.txt"):
+    with pytest.raises(SourceError, match=r"known format \(TUM, .*\); docs/your-sensor\.md"):
         open_source(log)

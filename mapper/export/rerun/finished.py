@@ -68,7 +68,7 @@ def in_words(run: Run, *, name: str) -> str:
         ("frames", counts.frames_text),
         ("graph", f"{counts.nodes} nodes, {counts.factors} factors"),
         ("loops", f"{counts.loops} of {counts.loop_candidates} candidates hold"),
-        ("octree", f"{counts.leaves} leaves of {run.config.octree.resolution_m:g} m"),
+        ("octree", f"{counts.voxels_text} of {run.config.octree.resolution_m:g} m"),
         ("odometry", run.config.odometry.kind),
         ("seconds", f"{timing.total_s:.1f}, {timing.real_time_factor:.2f} × real time"),
         ("mapper", manifest.mapper_version),

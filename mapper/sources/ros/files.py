@@ -9,8 +9,6 @@ from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.recording import Recording
 from mapper.sources.ros.source import recording_log
 
-LOOKED_FOR = ".mcap, .bag (ROS 1), .db3 or a folder of them (ROS 2)"
-
 _ENDINGS = (".mcap", ".bag", ".db3")
 _PACKED = ".zstd"
 _IN_FOLDERS = (".mcap", ".db3", _PACKED)

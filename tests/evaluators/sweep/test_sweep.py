@@ -183,7 +183,7 @@ def test_a_key_tells_what_is_built_and_not_what_it_is_called(swept, desk_log, ti
         (
             ["logs = ['LOG']", method("a", "odometry.kind=zip")],
             ConfigError,
-            "sweep.toml: method 'a', configuration 'default': overrides: odometry: Input tag 'zip'",
+            "sweep.toml: method 'a', configuration 'default': odometry: Input tag 'zip'",
         ),
         (
             ["logs = ['LOG']", "[[method]]\nname = 'a'\nconfig = 'no.toml'"],

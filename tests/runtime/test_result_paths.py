@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from mapper.cli.places import joined_names, name_of, place_of
 from mapper.runtime.atomic import locked
+from mapper.runtime.result_paths import joined_names, name_of, place_of
 from tests.support.command_line import mapper
 
 

@@ -1,4 +1,4 @@
-"""Places of results that no option tells: named after the log or run, with a number if that is taken."""
+"""Paths of results that a caller does not name: after the log or run, with a number if that is taken."""
 
 from collections.abc import Sequence
 from itertools import count
