@@ -17,7 +17,7 @@ from mapper.run.folder import Run
 from mapper.run.frame_outcomes import FrameRecord
 from mapper.run.manifest import Counts, Timing
 
-_SHOWN_NOTES = frozenset({"gap", "lost", "doubtful", "skipped", "levelling"})
+_SHOWN_NOTES = frozenset({"gap", "lost", "doubtful", "skipped", "levelling", "shutter"})
 _ATE, _RPE_M, _RPE_RAD, _LENGTH = "ATE RMSE", "RPE translation RMSE", "RPE rotation RMSE", "path length"
 _SHOWN = (_ATE, _RPE_M, _RPE_RAD, _LENGTH, "start-to-end offset")
 

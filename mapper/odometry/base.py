@@ -164,11 +164,15 @@ class Odometry(Protocol[Observation]):
 
 
 @runtime_checkable
-class CalibrationCheck(Protocol):
-    """Odometry that also tells whether the log fits its sensor's calibration."""
+class SensorCheck(Protocol):
+    """Odometry that finds out about the sensor while it tracks."""
+
+    def sensor_notes(self) -> Sequence[str]:
+        """Return what is known about the sensor once the log has ended, a sentence each."""
+        ...
 
     def calibration_doubts(self) -> Sequence[str]:
-        """Return in words what all frames so far contradict."""
+        """Return what in the log contradicts the sensor's calibration, a sentence each."""
         ...
 
 

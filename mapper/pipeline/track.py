@@ -18,7 +18,7 @@ from mapper.loops.detector import LoopDetector
 from mapper.loops.factory import build_loop_detector, build_verifier
 from mapper.loops.place_file import AnyPlace, write_places
 from mapper.loops.verification_log import VerificationLog
-from mapper.odometry.base import CalibrationCheck, FrameResult, Odometry
+from mapper.odometry.base import FrameResult, Odometry, SensorCheck
 from mapper.odometry.factory import build_odometry, odometry_for
 from mapper.pipeline.tracking_checkpoints import FrameCheckpoint, TrackingCheckpoints
 from mapper.run import files
@@ -224,13 +224,15 @@ def track_log(
     graph.add_factors(odometry.finish())
     conflict = wheel_conflict(graph, wheel_factors)
     conflicts = [*detector.notes(), *([conflict] if conflict else [])]
-    calibration_doubts = odometry.calibration_doubts() if isinstance(odometry, CalibrationCheck) else ()
     warnings = [
         *(RunWarning(kind="frozen", sentence=note, weight="doubt") for note in checks.frozen()),
-        *(RunWarning(kind="camera", sentence=doubt, weight="doubt") for doubt in calibration_doubts),
         *(RunWarning(kind="far returns", sentence=note) for note in checks.far_returns()),
         *(RunWarning(kind="conflict", sentence=note, weight="doubt") for note in conflicts),
     ]
+    if isinstance(odometry, SensorCheck):
+        wrong = odometry.calibration_doubts()
+        warnings += [RunWarning(kind="camera", sentence=sentence, weight="doubt") for sentence in wrong]
+        warnings += [RunWarning(kind="shutter", sentence=note) for note in odometry.sensor_notes()]
     for warning in warnings:
         progress.note(warning.sentence)
     graph.add_factors(wheel_factors)

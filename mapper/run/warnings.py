@@ -20,7 +20,7 @@ from mapper.run.results import RunResults
 from mapper.run.timeline import TimeLine, counted, runs_of
 
 FLOOR = "floor"
-INPUT_KINDS = frozenset({"log", "depth", "camera", "frozen", "far returns", "conflict", FLOOR})
+INPUT_KINDS = frozenset({"log", "depth", "camera", "shutter", "frozen", "far returns", "conflict", FLOOR})
 """Kinds that are found while the log is read or fused; a finished run has them in its manifest alone."""
 
 _ORDER: tuple[Weight, ...] = ("break", "doubt", "note")

@@ -7,6 +7,7 @@ import pytest
 
 from mapper.core.geometry import apply, exp, inverse
 from mapper.core.timebase import NS_PER_S
+from mapper.odometry.base import SensorCheck
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameter
@@ -104,9 +105,11 @@ def test_readout_time_is_zero_until_it_is_certain():
     readout = ReadoutTime(None, windows_sharing=10)
     readout.learn(information=1e5, gradient=-1e5 * 0.004)
     assert readout.seconds == 0.0
+    assert readout.sentence == ""
     for _ in range(60):
         readout.learn(information=1e7, gradient=1e7 * (readout.seconds - 0.02))
     assert readout.seconds == pytest.approx(0.02, abs=0.0006)
+    assert "rows are read within 20 ms from the top, as estimated" in readout.sentence
 
 
 def test_given_readout_time_is_kept():
@@ -114,6 +117,18 @@ def test_given_readout_time_is_kept():
     readout.learn(information=1e9, gradient=1e9)
     assert readout.seconds == -0.01
     assert not readout.is_estimated
+    assert readout.sentence == ""  # who gave it knows it
+
+
+def test_what_the_odometry_knows_of_the_shutter_it_tells():
+    odometry = build_frame_odometry(LocalMapConfig())
+    assert isinstance(odometry, SensorCheck)
+    assert odometry.sensor_notes() == []
+    for _ in range(60):
+        odometry._readout.learn(information=1e7, gradient=1e7 * (odometry._readout.seconds + 0.01))
+    assert [note[:64] for note in odometry.sensor_notes()] == [
+        "rolling shutter: rows are read within 10 ms from the bottom, as "
+    ]
 
 
 @pytest.mark.parametrize("gap_s", [0, 2])

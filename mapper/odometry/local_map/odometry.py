@@ -71,6 +71,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._motion_check = motion_check
         self._detector = build_detector(config.detector)
         readout = ReadoutTime(config.readout_s, windows_sharing=config.bundle_keyframes)
+        self._readout = readout
         self._shutter = RollingShutter(readout)
         self._map = LandmarkMap(scale_factor=self._detector.scale_factor, readout=readout)
         self._vocabulary = load_vocabulary(config.vocabulary)
@@ -162,6 +163,10 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
                 now, then = now[common >= 0], then[common >= 0]
                 previous_px[now] = observation.pixels[then]
         return FeatureMatches(self._agreeing, previous_px)
+
+    def sensor_notes(self) -> Sequence[str]:
+        """Return the estimated readout time of the camera's shutter, if it has any."""
+        return [self._readout.sentence] if self._readout.sentence else []
 
     def calibration_doubts(self) -> Sequence[str]:
         """Return whether the images contradict the focal length that they are said to have."""

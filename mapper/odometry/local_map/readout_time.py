@@ -34,6 +34,17 @@ class ReadoutTime:
         self._information = _PRIOR_S**-2
         self._weighted_s = 0.0
 
+    @property
+    def sentence(self) -> str:
+        """The estimate in words; empty if there is none, or all rows are read at once."""
+        if not self.is_estimated or self.seconds == 0.0:
+            return ""
+        begin = "top" if self.seconds > 0.0 else "bottom"
+        return (
+            f"rolling shutter: rows are read within {1e3 * abs(self.seconds):.0f} ms from the {begin}, as "
+            "estimated from the log; odometry.readout_s sets it"
+        )
+
     def learn(self, information: float, gradient: float) -> None:
         """Add a window's measurement.
 
