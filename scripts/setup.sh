@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Makes .venv, installs the project with all its extras, compiles kernels and bytecode; does nothing the second time.
 # usage: bash scripts/setup.sh [--dev]
-#   --dev   adds what the tests need
+#   --dev   adds what the tests need, and axe-core by npm, where that is
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -140,6 +140,12 @@ install() {
   install_missing_libraries
 }
 
+# The pages' tests of accessibility are skipped without it.
+install_axe() {
+  command -v npm >/dev/null || return 0
+  npm install --silent --no-save --prefix "$venv/share/axe" axe-core@4.14.1 >&2 || say "npm could not install axe-core"
+}
+
 # The folder counts as well: an editable install and its scripts name it.
 want=$( (pwd; "$venv/bin/python" --version; cat pyproject.toml scripts/setup.sh) | sha256sum)
 if [ "$(cat "$stamp" 2>/dev/null)" != "$want" ]; then
@@ -151,6 +157,7 @@ if [ "$(cat "$stamp" 2>/dev/null)" != "$want" ]; then
   compile_kernels &
   say "installing its extras [$extra]"
   install "octree-mapper[$extra]"
+  [ "$extra" != dev ] || install_axe
   wait
   printf '%s\n' "$want" >"$stamp"
 elif [ -n "$stale" ]; then

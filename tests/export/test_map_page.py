@@ -1,12 +1,9 @@
 import base64
 import json
 import re
-import time
 import zlib
 from dataclasses import replace
-from itertools import pairwise
 
-import cv2
 import numpy as np
 import pytest
 
@@ -20,8 +17,9 @@ from mapper.loops.closure import LoopClosure
 from mapper.octree.keys import codes_of
 from mapper.octree.octomap_file import read_octree
 from mapper.octree.scan_update_file import open_scan_updates
-from tests.support.chromium import CHROMIUM, MISSING, Page
+from tests.support.chromium import AXE, CHROMIUM, MISSING, NO_AXE
 from tests.support.command_line import invoke
+from tests.support.map_page import MapPage, change
 
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 
@@ -176,112 +174,6 @@ def test_options_that_do_not_go_together_are_refused(page, desk_run, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-class MapPage(Page):
-    """A page with a map, once it is decoded."""
-
-    def __enter__(self):
-        super().__enter__()
-        give_up = time.monotonic() + 60.0
-        while self.state() == "loading":
-            assert time.monotonic() < give_up
-        return self
-
-    def state(self):
-        return self.run("document.querySelector('.map').dataset.state")
-
-    def text(self, name):
-        element = f"document.querySelector('[data-map={name}]')"
-        return self.run(f"(e => e.closest('[hidden]') ? null : e.textContent)({element})")
-
-    def choose(self, name, value):
-        self.run(
-            f"(e => {{ e.value = {value!r}; e.dispatchEvent(new Event('input')); }})"
-            f"(document.querySelector('[data-map={name}]'))"
-        )
-
-    def box(self):
-        """Return where the canvas is, and its size."""
-        box = "document.querySelector('.map canvas').getBoundingClientRect()"
-        return self.run(f"(b => [b.x, b.y, b.width, b.height])({box})")
-
-    def picture(self):
-        """Return the pixels of the map as drawn now."""
-        x, y, width, height = self.box()
-        frame = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
-        before = None
-        for _ in range(40):  # until all points are drawn, and two pictures in a row are the same
-            self.call("Runtime.evaluate", expression=frame, awaitPromise=True)
-            share = self.run("document.querySelector('.map canvas').dataset.share")
-            is_busy = self.run("document.querySelector('.map canvas').ariaBusy") == "true"
-            clip = {"x": x, "y": y, "width": width, "height": height, "scale": 1}
-            data = self.call("Page.captureScreenshot", format="png", clip=clip)["data"]
-            if share == "1" and data == before and not is_busy:
-                break
-            before = data
-            time.sleep(0.2)
-        return cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR).astype(int)
-
-    def tap(self, x, y):
-        self.mouse("mouseMoved", x, y)
-        self.mouse("mousePressed", x, y, clicks=1)
-        self.mouse("mouseReleased", x, y, clicks=1)
-
-    def sought(self, name, wanted):
-        """Move the pointer over the map until a text appears; return where that is."""
-        left, top, width, height = self.box()
-        for y in np.linspace(top + 5, top + height - 5, 50):
-            for x in np.linspace(left + 5, left + width - 5, 70):
-                self.mouse("mouseMoved", x, y)
-                if wanted in (self.text(name) or ""):
-                    return x, y
-        raise AssertionError(f"nothing tells {wanted!r}")
-
-
-def change(before, after):
-    """Return the share of pixels that differ."""
-    return (np.abs(after - before).max(axis=2) > 12).mean()
-
-
-@needs_browser
-def test_a_map_is_orbited_cut_and_coloured(page):
-    with MapPage(page, height_px=800) as browser:
-        assert browser.state() == "ready"
-        first = browser.picture()
-        assert (first.max(axis=2) > 60).mean() > 0.05  # the map is seen
-
-        x, y = browser.centre(".map canvas")
-        browser.mouse("mousePressed", x, y, clicks=1)
-        for step in range(6):
-            browser.call(
-                "Input.dispatchMouseEvent", type="mouseMoved", x=x + 30 * step, y=y, button="left", buttons=1
-            )
-        browser.mouse("mouseReleased", x + 150, y, clicks=1)
-        assert change(first, browser.picture()) > 0.05
-
-        browser.click("[data-map=home]")
-        assert min(change(first, browser.picture()) for _ in range(5)) < 0.01
-
-        browser.choose("cut", "0.5")
-        assert browser.text("cut-value") == "0.50 m"
-        assert browser.run("document.querySelector('[data-map=slice]').checked")
-        cut = browser.picture()
-        assert change(first, cut) > 0.03
-        browser.click("[data-map=slice]")
-        assert change(cut, browser.picture()) > 0.01
-
-        browser.choose("coloring", "height")
-        assert re.fullmatch(r"-?[\d.]+ m", browser.text("legend-low"))
-        browser.choose("points", "voxels")
-        browser.choose("coloring", "hits")
-        assert browser.text("legend-high").endswith("scans")
-        every = browser.picture()
-        browser.choose("until", "0")
-        assert browser.text("until-value") == "0 s"
-        assert change(every, browser.picture()) > 0.01
-        assert browser.complaints == []
-        assert [url for url in browser.asked_for if not url.startswith(("data:", "file://"))] == []
-
-
 @needs_browser
 def test_a_keyframe_tells_its_numbers_and_two_clicks_a_distance(page):
     with MapPage(page, height_px=800) as browser:
@@ -310,17 +202,12 @@ def test_a_keyframe_tells_its_numbers_and_two_clicks_a_distance(page):
 
 
 @needs_browser
-def test_keys_move_the_eye(page):
-    with MapPage(page, height_px=800) as browser:
-        pictures = [browser.picture()]
-        browser.run("document.querySelector('.map canvas').focus()")
-        for code in ("ArrowLeft", "Equal", "KeyW"):
-            browser.call("Input.dispatchKeyEvent", type="keyDown", code=code, key=code)
-            time.sleep(0.3)
-            browser.call("Input.dispatchKeyEvent", type="keyUp", code=code, key=code)
-            pictures.append(browser.picture())
-        for before, after in pairwise(pictures):
-            assert change(before, after) > 0.02
+@pytest.mark.skipif(not AXE.is_file(), reason=NO_AXE)
+@pytest.mark.parametrize("width_px", [1400, 420])
+def test_nothing_bars_a_person_from_the_page(page, width_px):
+    with MapPage(page, width_px=width_px, height_px=800) as browser:
+        browser.click("[data-map=measure]")
+        assert browser.barriers() == []
 
 
 @needs_browser

@@ -14,7 +14,7 @@ from mapper.export.report.page import page_of, write_report
 from mapper.pipeline.build import build
 from mapper.run.folder import open_run
 from mapper.sources import open_source
-from tests.support.chromium import CHROMIUM, MISSING, Page
+from tests.support.chromium import AXE, CHROMIUM, MISSING, NO_AXE, Page
 from tests.support.command_line import invoke
 
 HOSTILE = "</script><img src=x onerror=alert(1)>&\"'"
@@ -183,6 +183,14 @@ def test_it_renders_without_a_complaint_and_within_the_window(page, width_px, tm
         browser.screenshot(tmp_path / "page.png")
         assert browser.complaints == []
         assert [url for url in browser.asked_for if not url.startswith(("data:", "file://"))] == []
+
+
+@needs_browser
+@pytest.mark.skipif(not AXE.is_file(), reason=NO_AXE)
+@pytest.mark.parametrize("width_px", [1400, 420])
+def test_nothing_bars_a_person_from_it(page, width_px):
+    with Page(page, width_px=width_px) as browser:
+        assert browser.barriers() == []
 
 
 @needs_browser

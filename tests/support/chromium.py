@@ -6,11 +6,15 @@ import json
 import os
 import shutil
 import subprocess
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
 CHROMIUM = shutil.which("chromium")
 MISSING = "Debian's chromium is not installed (apt-get install chromium)"
+AXE = Path(sys.prefix, "share/axe/node_modules/axe-core/axe.min.js")
+NO_AXE = f"axe-core is not installed (npm install --no-save --prefix {AXE.parents[2]} axe-core)"
 
 
 class Page:
@@ -99,6 +103,32 @@ class Page:
     def mouse(self, kind: str, x: float, y: float, *, clicks: int = 0) -> None:
         button = "none" if kind == "mouseMoved" else "left"
         self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, clickCount=clicks)
+
+    def touch(self, *steps: Sequence[tuple[float, float]]) -> None:
+        """Put fingers down at the places of the first step, move them to those of the others, lift them."""
+        for kind, fingers in zip(("touchStart", *["touchMove"] * len(steps)), (*steps, ()), strict=True):
+            points = [{"x": x, "y": y, "id": finger} for finger, (x, y) in enumerate(fingers)]
+            self.call("Input.dispatchTouchEvent", type=kind if points else "touchEnd", touchPoints=points)
+
+    def key(self, kind: str, code: str) -> None:
+        self.call("Input.dispatchKeyEvent", type=kind, code=code, key=code)
+
+    def awaited(self, script: str) -> Any:
+        """Return the value of a JavaScript promise."""
+        answer = self.call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
+        assert "exceptionDetails" not in answer, answer["exceptionDetails"]
+        return answer["result"].get("value")
+
+    def barriers(self) -> list[str]:
+        """Return what axe-core calls a serious or critical barrier: each rule, and where it is broken."""
+        self.run(f"{AXE.read_text(encoding='utf-8')}; 0")
+        found = self.awaited("axe.run({resultTypes: ['violations']}).then(({violations}) => violations)")
+        return [
+            f"{one['id']}: {node['html']}"
+            for one in found
+            if one["impact"] in ("serious", "critical")
+            for node in one["nodes"]
+        ]
 
     def centre(self, selector: str) -> tuple[float, float]:
         """Scroll an element into view and return where its centre is."""

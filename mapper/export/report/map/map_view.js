@@ -1,6 +1,7 @@
 // The scene of all runs, drawn when something has changed: over each other, or side by side.
 
 import { Box3, Color, ColorManagement, LinearSRGBColorSpace, PerspectiveCamera, Scene, Vector3, WebGLRenderer } from "three";
+import { Budget } from "mapper/budget";
 import { NEVER } from "mapper/points";
 import { Segments } from "mapper/lines";
 import { Markers } from "mapper/markers";
@@ -9,10 +10,7 @@ import { ratio } from "mapper/screen";
 import { frameAt, loopAt, pointAt, Screen } from "mapper/picking";
 
 const FOV_DEG = 50;
-const SLOW_MS = 40; // a frame that takes longer while the eye moves is drawn with fewer points
-const FAST_MS = 25;
-const LEAST_SHARE = 0.1;
-const COARSE_SHARE = 0.3; // with fewer points than this, pixels are twice as large meanwhile
+const COARSE_SHARE = 0.3; // a motion that begins with fewer points is drawn with pixels twice as large
 const REST_MS = 150; // after a motion all points are drawn again
 const HELD_REST_MS = 600; // the same while the pointer is held down, as the motion may go on
 
@@ -31,7 +29,7 @@ export class MapView {
     this.shown = layers.map(() => true);
     this.state = { points: "cloud", coloring: "height", isBeside: false, cut_m: Infinity, until: NEVER, size: 1 };
     this.hidden = new Set();
-    this.share = 1;
+    this.budget = new Budget();
     for (const one of layers) this.scene.add(one.group);
     this.box = this.#box();
     this.navigation = new Navigation(this.camera, canvas, () => this.#moved());
@@ -112,12 +110,15 @@ export class MapView {
     this.invalidate();
   }
 
+  /** Have it drawn anew; until that is on the screen, the canvas tells no share of the points. */
   invalidate() {
     this.isStale = true;
+    this.canvas.dataset.share = "";
   }
 
   #moved() {
     this.movedAt = performance.now();
+    this.hasMoved = true;
     this.invalidate();
   }
 
@@ -150,20 +151,32 @@ export class MapView {
 
   #tick(now) {
     requestAnimationFrame((next) => this.#tick(next));
-    const elapsed_ms = now - (this.tickedAt ?? now);
+    this.navigation.advance(Math.min(now - (this.tickedAt ?? now), 100) / 1000);
     this.tickedAt = now;
-    this.navigation.advance(Math.min(elapsed_ms, 100) / 1000);
-    const isMoving = now - (this.movedAt ?? -Infinity) < (this.navigation.isHeld ? HELD_REST_MS : REST_MS);
-    if (isMoving && this.wasDrawn) {
-      if (elapsed_ms > SLOW_MS) this.share = Math.max(LEAST_SHARE, this.share * Math.max(0.3, FAST_MS / elapsed_ms));
-      else if (elapsed_ms < FAST_MS) this.share = Math.min(1, this.share * 1.1);
-    }
-    const share = isMoving ? this.share : 1;
-    if (share !== this.drawnShare) this.invalidate();
-    this.wasDrawn = this.isStale;
-    if (!this.isStale) return;
-    this.#sharpen(Math.min(devicePixelRatio, 2) * (share < COARSE_SHARE ? 0.5 : 1));
-    this.#draw(share);
+    const rest_ms = this.navigation.isHeld ? HELD_REST_MS : REST_MS;
+    const isMoving = this.hasMoved || now - (this.movedAt ?? -Infinity) < rest_ms; // a slow frame may outlast the rest
+    if (this.fence && !this.#isFinished(now)) return;
+    if (!isMoving) this.isCoarse = false;
+    else if (!this.wasMoving) this.isCoarse = this.budget.share < COARSE_SHARE;
+    this.wasMoving = isMoving;
+    const share = isMoving ? this.budget.share : 1;
+    if (!this.isStale && (isMoving || share === this.drawnShare)) return;
+    this.hasMoved = false;
+    this.#sharpen(Math.min(devicePixelRatio, 2) * (this.isCoarse ? 0.5 : 1));
+    this.#draw(share, now);
+  }
+
+  /** Return whether the last frame is drawn, and learn how long that took. */
+  #isFinished(now) {
+    const gl = this.renderer.getContext();
+    if (gl.getSyncParameter(this.fence, gl.SYNC_STATUS) !== gl.SIGNALED) return false;
+    gl.deleteSync(this.fence);
+    this.fence = null;
+    const points = this.layers.reduce((sum, one) => sum + one.points[this.state.points].count, 0);
+    if (this.hasShaders) this.budget.learn(this.drawnShare, now - this.drawnAt, points);
+    this.hasShaders = true; // which the first frame has waited for
+    if (!this.isStale) this.canvas.dataset.share = this.drawnShare;
+    return true;
   }
 
   #sharpen(pixels) {
@@ -171,10 +184,10 @@ export class MapView {
     ratio.value = pixels;
   }
 
-  #draw(share) {
+  #draw(share, now) {
     this.isStale = false;
     this.drawnShare = share;
-    this.canvas.dataset.share = share;
+    this.drawnAt = now;
     this.#aspect();
     const { renderer, camera } = this;
     const panes = this.#panes();
@@ -194,6 +207,9 @@ export class MapView {
       renderer.render(this.scene, camera);
       renderer.render(this.tools, camera);
     }
+    const gl = renderer.getContext();
+    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
   }
 
   #fit({ uniforms }, { width, height }, pixels) {
