@@ -213,7 +213,9 @@ def appended(
     first = open_run(onto)
     config = overridden(first.config.model_copy(update={"source": SourceConfig()}), overrides)
     source = open_source(log, config.source)
-    run = append(source, first, config, out, progress=output.progress(), overwrite=overwrite)
+    progress = output.progress()
+    preview = _preview(source, out, progress)
+    run = append(source, first, config, out, progress=progress, observer=preview, overwrite=overwrite)
     return run, evaluate(run.trajectory, run.truth).metrics
 
 

@@ -29,6 +29,7 @@ from mapper.pipeline.track import (
 from mapper.run.edits_file import edits_text, parse_edits, write_edits
 from mapper.run.folder import Run, open_run
 from mapper.run.manifest import Manifest, Timing, library_versions, now_text
+from mapper.run.observers import NULL_OBSERVER, Observer
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
 from mapper.run.warnings import INPUT_KINDS
 from mapper.run.writer import appended_log, write_run
@@ -47,6 +48,7 @@ def append(
     out: Path,
     *,
     progress: Progress = SILENT,
+    observer: Observer = NULL_OBSERVER,
     overwrite: bool = False,
 ) -> Run:
     """Track a log as a later session of a run's place, solve both as one graph, and map them together.
@@ -61,6 +63,7 @@ def append(
             map may have other settings.
         out: Run folder to create.
         progress: Receives stages, counts and notes.
+        observer: Receives every tracked frame of the later log, and the results.
         overwrite: Replace a run that is there, once the new one is whole.
 
     Raises:
@@ -84,7 +87,7 @@ def append(
         with writer.clock.stage("track"):
             session = source.sessions[-1].log
             start = _after(before, first, session, config, progress)
-            tracking = track_log(session, config, progress=progress, start=start)
+            tracking = track_log(session, config, progress=progress, start=start, observer=observer)
         writer.warn([*warnings, *tracking.warnings])
         refuse_a_fragment(tracking, config, sensor=source.sensor)
         _refuse_unconnected(second, run, tracking.loops, known)
@@ -97,7 +100,9 @@ def append(
         save_solved(writer, before.solved(solved.graph, solved.loops).then(later, truth=source.truth))
         writer.update(solve=solved.report)
         write_edits(writer.folder, edits)
-        fuse_into(writer, source, joined, progress, before=run.scan_updates(), edits=wanted)
+        fuse_into(
+            writer, source, joined, progress, observer=observer, before=run.scan_updates(), edits=wanted
+        )
     return open_run(out)
 
 

@@ -15,6 +15,7 @@ from mapper.octree.octomap_file import read_octree
 from mapper.pipeline.append import append
 from mapper.pipeline.fuse import fuse
 from mapper.run.folder import moved_log, open_run
+from mapper.run.observers import NullObserver
 from mapper.sources import open_source
 from mapper.sources.chained import sessions_of
 from mapper.sources.config import SourceConfig
@@ -28,6 +29,19 @@ def joined(first, desk_log):
     out = first.path.with_name("joined")
     mapper("build", desk_log, "--first", 16, "--onto", first.path, "--out", out)
     return open_run(out)
+
+
+class Counting(NullObserver):
+    """Notes what it receives."""
+
+    def __init__(self):
+        self.seen = []
+
+    def on_frame(self, *_):
+        self.seen.append("frame")
+
+    def on_mapped(self, *_):
+        self.seen.append("maps")
 
 
 def test_both_sessions_are_one_run_in_the_first_one_s_world(first, joined):
@@ -138,7 +152,9 @@ def test_loops_can_be_edited_afterwards(first, joined, tmp_path):
 def test_a_third_session_is_appended_to_two(joined, desk_log, tmp_path):
     """The same walk once more: its stamps are taken already, so they are shifted."""
     source = open_source(desk_log, SourceConfig(last_frame=12))
-    three = append(source, joined, overridden(joined.config, ["source.last_frame=12"]), tmp_path / "three")
+    config, observer = overridden(joined.config, ["source.last_frame=12"]), Counting()
+    three = append(source, joined, config, tmp_path / "three", observer=observer)
+    assert observer.seen == [*["frame"] * 13, "maps"]
     assert three.manifest.counts.tracked == 31 + 13
     assert [len(session.log) for session in sessions_of(three.open_log())] == [16, 15, 13]
     assert three.manifest.input.appended[1].shift_ns > 0
