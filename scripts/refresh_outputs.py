@@ -2,9 +2,10 @@
 
     python scripts/refresh_outputs.py --logs DIR [--work DIR] [--page NAME …] [--slow]
 
-DIR holds the logs as shared/data has them: tum_fr1_xyz and kitti_00. Each page gets an emptied folder of its
-own below the work folder, with these logs under the names that pages use. Blocks are those that the tests
-run, and those marked "real logs"; blocks marked "slow", which take many minutes, only with --slow.
+DIR holds the logs as shared/data has them: tum_fr1_xyz, kitti_00, posegraph/sphere2500.g2o. Each page gets
+an emptied folder of its own below the work folder, with these logs under the names that pages use. Blocks
+are those that the tests run, and those marked "real logs"; blocks marked "slow", which take many minutes,
+only with --slow.
 
 A line "…" stays where a page leaves lines out: as many rows before and behind it are shown as before. An
 output of ten lines or fewer, or of which only two rows would be left out, is shown whole. The exit status is
@@ -27,7 +28,11 @@ sys.path.insert(0, str(ROOT))
 
 from tests.support.pages import OMITTED, PAGES, Block, Command, blocks_of, files_of, page_name, row_names  # noqa: E402
 
-LOGS = {"rgbd_dataset_freiburg1_xyz": "tum_fr1_xyz", "kitti_00": "kitti_00"}
+LOGS = {
+    "rgbd_dataset_freiburg1_xyz": "tum_fr1_xyz",
+    "kitti_00": "kitti_00",
+    "sphere2500.g2o": "posegraph/sphere2500.g2o",
+}
 MAPPER = [sys.executable, "-c", "from mapper.cli.main import main; main()"]
 FEWEST_OMITTED = 3
 """Fewer rows are shown instead of being left out."""
@@ -178,7 +183,7 @@ def main() -> int:
     names = [page_name(path) for path in PAGES]
     if unknown := set(arguments.page or ()) - set(names):
         parser.error(f"no page {', '.join(sorted(unknown))}; want one of {', '.join(names)}")
-    if missing := [name for name in LOGS.values() if not (arguments.logs / name).is_dir()]:
+    if missing := [name for name in LOGS.values() if not (arguments.logs / name).exists()]:
         parser.error(f"{arguments.logs}: has no {', '.join(missing)}")
     with tempfile.TemporaryDirectory() as temporary:
         work = (arguments.work or Path(temporary)).resolve()
