@@ -16,17 +16,11 @@ from mapper.graph.model import PoseGraph
 from mapper.loops.factory import build_loop_detector
 from mapper.odometry.base import FrameResult
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
-from mapper.odometry.isvd_odometry import (
-    IsvdObservation,
-    IsvdOdometry,
-    RegisterPair,
-    matched_pairs,
-    shared_points,
-)
+from mapper.odometry.isvd_odometry import IsvdOdometry
+from mapper.odometry.isvd_registration import IsvdObservation, PairRegistration, RegisterPair, matched_pairs
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import TrackingResult, refuse_a_fragment
 from mapper.registration.base import Alignment
-from mapper.registration.isvd import Isvd
 from mapper.sources.base import Log
 
 
@@ -103,9 +97,11 @@ class _SharedDetector:
 
     def comparing(self, config: IsvdOdometryConfig) -> RegisterPair:
         """Return the comparison of an earlier frame with the newest by an odometry's settings."""
-        isvd = Isvd(config.registration)
+        register = PairRegistration(config.registration, by_pixels=config.residual == "pixels")
         how = (
             config.registration,
+            config.residual,
+            config.depth_noise,
             config.depth_filter,
             config.undistort,
             config.whole_pixels,
@@ -118,8 +114,7 @@ class _SharedDetector:
             key = (target.stamp_ns, match, how)
             if key not in self._compared:
                 pairs = self._match(target, source, match)
-                fitted = isvd.fit_weighted(*shared_points(target, source, pairs))
-                self._compared[key] = (*fitted, len(pairs))
+                self._compared[key] = (*register.fit(target, source, pairs), len(pairs))
             return self._compared[key]
 
         return compare

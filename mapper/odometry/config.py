@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from mapper.core.config import Config, Ratio
-from mapper.features.config import DetectorConfig, OrbConfig, SurfConfig, UniformOrbConfig
+from mapper.features.config import DetectorConfig, OrbConfig, UniformOrbConfig
 from mapper.graph.config import WheelNoiseConfig
 from mapper.odometry.scan_to_map.config import (
     GicpOdometryConfig,
@@ -34,23 +34,36 @@ class MatchConfig(Config):
 
 
 class IsvdOdometryConfig(Config):
-    """ISVD: each frame against the MP frames before it (Somlyai, PhD thesis, alg. 7, "ISLAM")."""
+    """ISVD: each frame against MP earlier ones (Somlyai, PhD thesis, alg. 7, "ISLAM").
+
+    The defaults are ours; configs/thesis has the published settings.
+    """
 
     kind: Literal["isvd"] = "isvd"
-    detector: DetectorConfig = SurfConfig()
-    """Features by which frames are matched."""
+    detector: DetectorConfig = UniformOrbConfig()
+    """Features by which frames are matched; SURF, as published, takes longer."""
     match: MatchConfig = MatchConfig()
     """How features of two frames are paired."""
     fallback: MatchConfig = MatchConfig(filter="none", max_ratio=0.95)
     """Matching once ``match`` has led to no motion."""
     registration: IsvdConfig = IsvdConfig()
     """ISVD on the matched points."""
+    earlier: Literal["keyframes", "frames"] = "keyframes"
+    """Earlier frames that each frame is registered against: the frame before and the keyframes whose views
+    are nearest, or the "frames" before it, as published."""
     previous_frames: PositiveInt = 4
     """MP: number of earlier frames that each frame is registered against."""
-    average: Literal["weighted", "mean"] = "weighted"
-    """Average of the MP candidate translations: weighted by eq. 4.1, or plain."""
+    residual: Literal["pixels", "points"] = "pixels"
+    """What the motion minimises: the "pixels" and depths by their noise, beginning with ISVD's motion, or the
+    distances of the "points" alone, as published."""
+    depth_noise: DepthNoiseConfig | None = None
+    """Depth noise of the sensor, as measured by ``mapper sensor depth``; None is a Kinect v1's."""
+    average: Literal["information", "weighted", "mean"] = "information"
+    """Average of the MP candidate poses: by their covariances, or of the translations, weighted by eq. 4.1 or
+    plain."""
     rotation: Literal["nearest", "mean"] = "nearest"
-    """The nearest frame's rotation, or the weighted mean on SO(3); the thesis does not state it."""
+    """With an average of the translations: the nearest frame's rotation, or the weighted mean on SO(3); the
+    thesis does not state it."""
     depth_filter: bool = False
     """DIF (Somlyai, PhD thesis, alg. 4) before back-projection."""
     undistort: bool = True
@@ -61,7 +74,8 @@ class IsvdOdometryConfig(Config):
     max_depth_m: PositiveFloat = 5.0
     """Depth beyond it is not used: a Kinect's error grows with the square of the depth."""
     keyframe_interval: PositiveInt = 20
-    """One keyframe, the sharpest, in this many frames (Somlyai, PhD thesis, §4.1.2)."""
+    """With ``earlier = "frames"``: one keyframe, the sharpest, in this many frames (Somlyai, PhD thesis,
+    §4.1.2), for frames that were lost."""
     relocalisation_keyframes: PositiveInt = 20
     """A lost frame is compared with this many of the nearest keyframes and, in turn, of the others."""
 

@@ -1,20 +1,19 @@
-"""ISVD odometry: each frame registered against the frames before it (Somlyai, PhD thesis, alg. 7)."""
+"""ISVD odometry: each frame registered against several earlier ones (Somlyai, PhD thesis, alg. 7)."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.deskew import Twist
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, PinholeCamera, RgbdFrame
-from mapper.core.geometry import Array, Points, Transform, apply, inverse, mean_rotation, transform
-from mapper.features.base import Detector, Features
+from mapper.core.geometry import Array, Transform, apply, exp, inverse, log, mean_rotation, transform
+from mapper.features.base import Detector
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
-from mapper.features.matching import Pairs, homography_inliers, match_mutual
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
 from mapper.odometry.base import (
@@ -27,35 +26,21 @@ from mapper.odometry.base import (
     lost_frame,
 )
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
+from mapper.odometry.isvd_registration import IsvdObservation, PairRegistration, RegisterPair, matched_pairs
 from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 from mapper.registration.base import Alignment
-from mapper.registration.isvd import Isvd
-from mapper.runtime.archived import Archivable, Archived, archived
+from mapper.runtime.archived import Archived, archived
+from mapper.sensing.config import KINECT_NOISE
 from mapper.sensing.depth_filter import dif
-from mapper.sensing.depth_noise import feature_depth_m
+from mapper.sensing.depth_noise import depth_sigma_m, feature_depth_m
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class IsvdObservation(Archivable):
-    """A frame's features with their 3D points.
-
-    Attributes:
-        stamp_ns: The frame's stamp.
-        features: Features of the image.
-        points_body: (N, 3) metres, body frame; NaN where the depth image has no measurement.
-        camera: Camera of the image.
-        T_body_camera: (4, 4) pose of the camera in the body frame.
-    """
-
-    stamp_ns: int
-    features: Features
-    points_body: Points
-    camera: PinholeCamera
-    T_body_camera: Transform
-
-
-RegisterPair = Callable[[IsvdObservation, IsvdObservation, MatchConfig], tuple[Alignment, float, int]]
-"""Registration of two observations (target, source), as ``register_pair`` with an ISVD bound."""
+_VIRTUAL_BASELINE_PX_M = 40.0
+"""bf: depth z counts as the disparity bf / z (Mur-Artal & Tardós 2017)."""
+_DEPTH_SHARE = 0.01
+"""Error of depths beside the sensor's noise, as a share: its scale, and the slope where a feature lies."""
+_NEW_VIEW, _NEAR_VIEW = 0.15, 0.6
+"""Differences of views: from this on a frame is a keyframe, up to this it is registered against one."""
+_HALF_VIEW_RAD = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,6 +65,10 @@ class _Keyframe:
         return TrackedFrame(self.node, self.observation.data, self.T_world_body)
 
 
+def _kept(frame: TrackedFrame) -> _Keyframe:
+    return _Keyframe(frame.node, archived(frame.observation), frame.T_world_body)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseCandidate:
     """Registration of a new frame against an earlier one.
@@ -87,6 +76,7 @@ class PoseCandidate:
     Attributes:
         earlier: The earlier frame, the target.
         alignment: The motion, earlier ← new.
+        information: (6, 6) of the motion, with the error that its features share.
         weight: Its quality W, 1/m (eq. 4.1).
         matches: Number of matched features, with or without depth.
         T_world_body: (4, 4) pose of the new frame by this registration.
@@ -94,17 +84,18 @@ class PoseCandidate:
 
     earlier: TrackedFrame
     alignment: Alignment
+    information: Array
     weight: float
     matches: int
     T_world_body: Transform
 
 
 class IsvdOdometry(FrameOdometry[IsvdObservation]):
-    """Odometry that registers every frame against the MP frames before it and averages the poses.
+    """Odometry that registers every frame against MP earlier ones and averages the poses.
 
-    Every tracked frame is a node, and every registration that succeeded is a factor. Its information is that
-    of the rigid fit: it takes pairs as independent although consecutive frames share features and depth
-    errors, so it is right in proportion but too large.
+    Every tracked frame is a node, and every registration that succeeded is a factor. The earlier frames are
+    those before it, as published, or the frame before it and the keyframes whose views are nearest, so that
+    the graph has factors across as much time as a view lasts.
     """
 
     def __init__(
@@ -121,13 +112,14 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
             config: Settings.
             detector: Replaces the configured one, so that several odometries on the same frames can share
                 the detection.
-            register: Replaces ``register_pair``, so that they can share registrations as well.
+            register: Replaces the registration, so that they can share registrations as well.
             motion_check: Rules out poses after a gap; None if nothing but the images tells of the motion.
         """
         self._config = config
         self._motion_check = motion_check
         self._detector = detector or build_detector(config.detector)
-        self._register_pair = register or partial(register_pair, Isvd(config.registration))
+        self._registration = PairRegistration(config.registration, by_pixels=config.residual == "pixels")
+        self._register_pair = register or self._registration
         self._recent: deque[TrackedFrame] = deque(
             maxlen=max(config.previous_frames, config.keyframe_interval)
         )
@@ -146,17 +138,38 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         if not isinstance(frame, RgbdFrame):
             raise FrameError(f"frame {frame.stamp_ns}: ISVD odometry needs an image with depth, not a scan")
         features = self._detector.detect(frame.gray)
-        points_body = self._points_body(frame, features)
-        return IsvdObservation(frame.stamp_ns, features, points_body, frame.camera, frame.T_body_camera)
+        config, camera = self._config, frame.camera
+        depth_m = dif(frame.depth_m) if config.depth_filter else frame.depth_m
+        z, _, _ = feature_depth_m(depth_m, features.pixels)
+        z[z > config.max_depth_m] = np.nan
+        pixels = self._undistorted(features.pixels, camera)
+        at = self._undistorted(np.rint(features.pixels), camera) if config.whole_pixels else pixels
+        rays = (at - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
+        sigma_px = self._detector.scale_factor ** features.octave.astype(np.float64)
+        sigma_m = np.hypot(depth_sigma_m(config.depth_noise or KINECT_NOISE, z), _DEPTH_SHARE * z)
+        # Without depth the weight is not used, but it is a factor in sums.
+        disparity_sigma_px = np.where(np.isnan(z), 1.0, _VIRTUAL_BASELINE_PX_M / z**2 * sigma_m)
+        return IsvdObservation(
+            stamp_ns=frame.stamp_ns,
+            features=features,
+            points_body=apply(frame.T_body_camera, np.column_stack([rays * z[:, None], z])),
+            measured=np.column_stack([pixels, _VIRTUAL_BASELINE_PX_M / z]),
+            weights=np.column_stack([sigma_px, sigma_px, disparity_sigma_px]) ** -2.0,
+            intrinsics=np.array(
+                [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, _VIRTUAL_BASELINE_PX_M]
+            ),
+            camera=camera,
+            T_body_camera=frame.T_body_camera,
+        )
 
     def track(self, observation: IsvdObservation) -> FrameResult:
         """Track the next frame, in time order."""
         self._nearest_match = None
         if not self._recent:
             return self._add_node(observation, np.eye(4), [], method="start")
-        recent = list(self._recent)[-self._config.previous_frames :][::-1]
+        earlier = self._earlier()
         for match, method in ((self._config.match, "isvd"), (self._config.fallback, "fallback")):
-            candidates = self._register(observation, recent, match)
+            candidates = self._register(observation, earlier, match)
             if candidates:
                 self._nearest_match = observation, candidates[0], match
                 return self._add_node(observation, self._combine(candidates), candidates, method=method)
@@ -172,7 +185,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         features, camera = observation.features, observation.camera
         return ImageView(
             stamp_ns=observation.stamp_ns,
-            pixels=self._pixels(observation),
+            pixels=observation.measured[:, :2],
             sigma_px=self._detector.scale_factor ** features.octave.astype(np.float64),
             descriptors=features.descriptors,
             points_camera=apply(inverse(observation.T_body_camera), observation.points_body),
@@ -186,29 +199,39 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
             return None
         observation, candidate, match = self._nearest_match
         earlier = candidate.earlier.observation
-        then, now = matched_pairs(earlier, observation, match).T
-        moved = apply(candidate.alignment.T_target_source, observation.points_body[now])
-        miss_m = np.linalg.norm(earlier.points_body[then] - moved, axis=1)
-        agreeing = miss_m <= self._config.registration.agreement_mm / 1e3  # False without depth
-        now, then = now[agreeing], then[agreeing]
+        pairs = matched_pairs(earlier, observation, match)
+        motion = candidate.alignment.T_target_source
+        then, now = pairs[self._registration.agreeing(earlier, observation, pairs, motion)].T
         before_px = np.full((len(observation.features), 2), np.nan)
-        before_px[now] = self._pixels(earlier)[then]
+        before_px[now] = earlier.measured[:, :2][then]
         return FeatureMatches(np.isfinite(before_px[:, 0]), before_px)
 
-    def _pixels(self, observation: IsvdObservation) -> Array:
-        pixels: Array = observation.features.pixels.astype(np.float64)
-        return observation.camera.undistort(pixels) if self._config.undistort else pixels
+    def _undistorted(self, pixels: NDArray[np.float32], camera: PinholeCamera) -> Array:
+        exact: Array = pixels.astype(np.float64)
+        return camera.undistort(exact) if self._config.undistort else exact
 
-    def _points_body(self, frame: RgbdFrame, features: Features) -> Points:
-        config, camera = self._config, frame.camera
-        depth_m = dif(frame.depth_m) if config.depth_filter else frame.depth_m
-        z, _, _ = feature_depth_m(depth_m, features.pixels)
-        z[z > config.max_depth_m] = np.nan
-        pixels = np.rint(features.pixels) if config.whole_pixels else features.pixels
-        if config.undistort:
-            pixels = camera.undistort(pixels)
-        rays = (pixels - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
-        return apply(frame.T_body_camera, np.column_stack([rays * z[:, None], z]))
+    def _earlier(self) -> list[TrackedFrame]:
+        """Return the MP earlier frames to register the next frame against, the one before it first."""
+        count = self._config.previous_frames
+        if self._config.earlier == "frames":
+            return list(self._recent)[-count:][::-1]
+        last = self._recent[-1]
+        keyframes = [keyframe for keyframe in self._keyframes if keyframe.node != last.node]
+        differences = self._view_differences(last, keyframes)
+        nearest = np.argsort(differences, kind="stable")[: count - 1]
+        return [last, *(keyframes[i].loaded() for i in nearest if differences[i] <= _NEAR_VIEW)]
+
+    def _view_differences(self, frame: TrackedFrame, others: Sequence[_Keyframe]) -> Array:
+        """Return (N,) how far views are apart: by shift relative to the depth of the scene, and by turn."""
+        if not others:
+            return np.empty(0)
+        poses = np.array([other.T_world_body for other in others])
+        depth_m = np.nanmedian(_VIRTUAL_BASELINE_PX_M / frame.observation.measured[:, 2])
+        shift = np.linalg.norm(poses[:, :3, 3] - frame.T_world_body[:3, 3], axis=1) / depth_m
+        traces = np.einsum("nij,ij->n", poses[:, :3, :3], frame.T_world_body[:3, :3])
+        turn = np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)) / _HALF_VIEW_RAD
+        difference: Array = shift + turn
+        return difference
 
     def _register(
         self, observation: IsvdObservation, earlier: Iterable[TrackedFrame], match: MatchConfig
@@ -218,8 +241,12 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         for frame in earlier:
             alignment, weight, matches = self._register_pair(frame.observation, observation, match)
             if alignment.converged and self._is_possible(alignment, frame.observation, observation):
-                T_world_body = frame.T_world_body @ alignment.T_target_source
-                candidates.append(PoseCandidate(frame, alignment, weight, matches, T_world_body))
+                T = alignment.T_target_source
+                assert alignment.information is not None  # it converged
+                information = with_model_error(alignment.information, T)
+                candidates.append(
+                    PoseCandidate(frame, alignment, information, weight, matches, frame.T_world_body @ T)
+                )
         return candidates
 
     def _is_possible(self, found: Alignment, earlier: IsvdObservation, now: IsvdObservation) -> bool:
@@ -231,6 +258,15 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
 
     def _combine(self, candidates: Sequence[PoseCandidate]) -> Transform:
         """Return T_world_body; the nearest earlier frame comes first (alg. 7, lines 21–27)."""
+        if self._config.average == "information":
+            first = candidates[0].T_world_body
+            total = np.sum([candidate.information for candidate in candidates], axis=0)
+            pull = np.sum(
+                [c.information @ np.concatenate(log(inverse(first) @ c.T_world_body)) for c in candidates],
+                axis=0,
+            )
+            mean = np.linalg.solve(total, pull)
+            return first @ exp(mean[:3], mean[3:])
         weights = np.array([candidate.weight for candidate in candidates])
         if self._config.average == "mean":
             weights = np.ones(len(candidates))
@@ -270,23 +306,19 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         """Make the frame a node, with a factor from each candidate."""
         node = self._next_node
         self._next_node += 1
-        self._recent.append(TrackedFrame(node, observation, T_world_body))
-        keyframe = self._sharpest.add(node, len(observation.features))
-        self._keyframes.extend(
-            _Keyframe(frame.node, archived(frame.observation), frame.T_world_body)
-            for frame in self._recent
-            if frame.node == keyframe
-        )
+        tracked = TrackedFrame(node, observation, T_world_body)
+        self._recent.append(tracked)
+        if self._config.earlier == "frames":
+            keyframe = self._sharpest.add(node, len(observation.features))
+            self._keyframes.extend(_kept(frame) for frame in self._recent if frame.node == keyframe)
+        elif not (self._view_differences(tracked, self._keyframes) < _NEW_VIEW).any():
+            self._keyframes.append(_kept(tracked))
         nearest = candidates[0].alignment if candidates else None
         factors = tuple(
             BetweenFactor(
-                candidate.earlier.node,
-                node,
-                alignment.T_target_source,
-                with_model_error(alignment.information, alignment.T_target_source),
+                candidate.earlier.node, node, candidate.alignment.T_target_source, candidate.information
             )
             for candidate in candidates
-            if (alignment := candidate.alignment).information is not None
         )
         return FrameResult(
             stamp_ns=observation.stamp_ns,
@@ -305,37 +337,3 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
             factors=factors,
             links=factors,
         )
-
-
-def register_pair(
-    isvd: Isvd, target: IsvdObservation, source: IsvdObservation, match: MatchConfig
-) -> tuple[Alignment, float, int]:
-    """Return the source's alignment to the target, its quality W (eq. 4.1), and the number of matches."""
-    pairs = matched_pairs(target, source, match)
-    return *isvd.fit_weighted(*shared_points(target, source, pairs)), len(pairs)
-
-
-def matched_pairs(target: IsvdObservation, source: IsvdObservation, match: MatchConfig) -> Pairs:
-    """Return the features that two frames share (Somlyai, PhD thesis, alg. 8).
-
-    The ratio test is one of the new frame's features, the source's, as alg. 7 calls match with them first.
-    """
-    pairs = match_mutual(source.features, target.features, max_ratio=match.max_ratio)[:, ::-1]
-    if match.filter == "homography":
-        pairs = pairs[
-            homography_inliers(
-                target.features.pixels[pairs[:, 0]],
-                source.features.pixels[pairs[:, 1]],
-                tolerance_px=match.homography_tolerance_px,
-                iterations=match.homography_iterations,
-                seed=match.seed,
-            )
-        ]
-    return pairs
-
-
-def shared_points(target: IsvdObservation, source: IsvdObservation, pairs: Pairs) -> tuple[Points, Points]:
-    """Return the (M, 3) points of the pairs with depth in both frames, each in its own body frame."""
-    points_target, points_source = target.points_body[pairs[:, 0]], source.points_body[pairs[:, 1]]
-    measured = np.isfinite(points_target[:, 2]) & np.isfinite(points_source[:, 2])
-    return points_target[measured], points_source[measured]

@@ -5,9 +5,9 @@ import time
 from mapper.core.errors import ConfigError
 from mapper.core.frames import Frame, RgbdFrame
 from mapper.odometry.config import IsvdOdometryConfig
-from mapper.odometry.isvd_odometry import IsvdOdometry, matched_pairs, shared_points
+from mapper.odometry.isvd_odometry import IsvdOdometry
+from mapper.odometry.isvd_registration import PairRegistration
 from mapper.registration.base import Alignment
-from mapper.registration.isvd import Isvd
 
 
 def align_images(
@@ -30,9 +30,9 @@ def align_images(
     seen_target = odometry.observe(target)
     detected = time.perf_counter()
     seen_source = odometry.observe(source)
+    register = PairRegistration(config.registration, by_pixels=config.residual == "pixels")
     for match in (config.match, config.fallback):
-        pairs = matched_pairs(seen_target, seen_source, match)
-        alignment = Isvd(config.registration).fit(*shared_points(seen_target, seen_source, pairs))
+        alignment, _, _ = register(seen_target, seen_source, match)
         if alignment.converged:
             break
     return alignment, {"prepare": detected - began, "align": time.perf_counter() - detected}

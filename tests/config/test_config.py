@@ -7,7 +7,7 @@ from mapper.config.build import BuildConfig
 from mapper.config.loading import load_config, load_run_config, overridden
 from mapper.core.config import Config
 from mapper.core.errors import ConfigError, MapperWarning
-from mapper.features.config import SurfConfig
+from mapper.features.config import UniformOrbConfig
 from mapper.octree.config import OctreeConfig
 from mapper.odometry.config import IsvdOdometryConfig, LocalMapConfig
 from mapper.simulation.config import SynthConfig
@@ -49,7 +49,9 @@ def test_one_knob_keeps_the_kind_of_the_file_and_its_default_detector(toml):
         ["odometry.previous_frames=2", "odometry.detector.max_features=500"],
     )
 
-    assert config.odometry == IsvdOdometryConfig(previous_frames=2, detector=SurfConfig(max_features=500))
+    assert config.odometry == IsvdOdometryConfig(
+        previous_frames=2, detector=UniformOrbConfig(max_features=500)
+    )
 
 
 @pytest.mark.parametrize(

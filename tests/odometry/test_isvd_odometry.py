@@ -5,13 +5,16 @@ import pytest
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan
-from mapper.core.geometry import apply, exp, inverse, mean_rotation
+from mapper.core.geometry import apply, exp, inverse, log, mean_rotation
 from mapper.features.base import Features
 from mapper.features.config import OrbConfig
 from mapper.odometry.config import IsvdOdometryConfig
-from mapper.odometry.isvd_odometry import IsvdObservation, IsvdOdometry
+from mapper.odometry.isvd_odometry import IsvdOdometry
+from mapper.odometry.isvd_registration import IsvdObservation
 
 CAMERA = PinholeCamera(640, 480, 500.0, 500.0, 320.0, 240.0)
+BF_PX_M = 40.0
+PUBLISHED = {"earlier": "frames", "residual": "points", "average": "weighted"}
 
 
 class Wall:
@@ -37,7 +40,11 @@ class Wall:
 def observation(stamp_ns, pixels, points, descriptors) -> IsvdObservation:
     zeros = np.zeros(len(pixels), np.float32)
     features = Features(pixels.astype(np.float32), np.zeros(len(pixels), np.int32), zeros, zeros, descriptors)
-    return IsvdObservation(stamp_ns, features, points, CAMERA, np.eye(4))
+    measured = np.column_stack([pixels, BF_PX_M / points[:, 2]])
+    intrinsics = np.array([CAMERA.fx_px, CAMERA.fy_px, CAMERA.cx_px, CAMERA.cy_px, BF_PX_M])
+    return IsvdObservation(
+        stamp_ns, features, points, measured, np.ones((len(pixels), 3)), intrinsics, CAMERA, np.eye(4)
+    )
 
 
 def strangers(stamp_ns: int) -> IsvdObservation:
@@ -60,12 +67,24 @@ def follow(odometry: IsvdOdometry, wall: Wall, poses: list[np.ndarray], *, first
     return [odometry.track(wall.seen_from(T, first + i)) for i, T in enumerate(poses)]
 
 
-@pytest.mark.parametrize("average", ["weighted", "mean"])
-@pytest.mark.parametrize("rotation", ["nearest", "mean"])
-def test_follows_a_path(average, rotation):
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"earlier": "frames"},
+        {"residual": "points"},
+        *(
+            PUBLISHED | {"average": a, "rotation": r}
+            for a in ("weighted", "mean")
+            for r in ("nearest", "mean")
+        ),
+    ],
+    ids=lambda changes: "-".join(changes.values()) or "defaults",
+)
+def test_follows_a_path(changes):
     poses = path(60)
 
-    tracks = follow(IsvdOdometry(config(average=average, rotation=rotation)), Wall(0), poses)
+    tracks = follow(IsvdOdometry(config(**changes)), Wall(0), poses)
 
     assert [track.node for track in tracks] == list(range(60))
     gaps = [
@@ -79,7 +98,8 @@ def test_follows_a_path(average, rotation):
 def test_every_registration_is_a_factor(previous_frames):
     poses = path(10)
 
-    tracks = follow(IsvdOdometry(config(previous_frames=previous_frames)), Wall(1), poses)
+    odometry = IsvdOdometry(config(**PUBLISHED, previous_frames=previous_frames))
+    tracks = follow(odometry, Wall(1), poses)
 
     for n, track in enumerate(tracks):
         assert [factor.i for factor in track.factors] == list(
@@ -90,9 +110,36 @@ def test_every_registration_is_a_factor(previous_frames):
             assert np.allclose(factor.T_i_j, inverse(poses[factor.i]) @ poses[n], atol=0.01)
 
 
+def test_keyframes_connect_a_frame_with_views_that_were_long_ago():
+    """There and back: the way back is registered against the keyframes of the way there."""
+    there = path(20, step_m=0.05)
+    poses = [*there, *there[::-1]]
+
+    tracks = follow(IsvdOdometry(config(previous_frames=3)), Wall(1), poses)
+
+    assert [factor.i for factor in tracks[-1].factors][:2] == [38, 0]
+    assert all(len(track.factors) == 3 for track in tracks[15:])
+    gaps = [factor.j - factor.i for track in tracks for factor in track.factors]
+    assert max(gaps) == 39
+    assert all(
+        np.allclose(factor.T_i_j, inverse(poses[factor.i]) @ poses[factor.j], atol=0.01)
+        for track in tracks
+        for factor in track.factors
+    )
+
+
+def test_far_views_are_no_partners():
+    odometry = IsvdOdometry(config())
+
+    tracks = follow(odometry, Wall(1), path(30, step_m=0.1))
+
+    reach_m = max(np.linalg.norm(factor.T_i_j[:3, 3]) for track in tracks for factor in track.factors)
+    assert 0.2 < reach_m < 1.3  # 0.6 of the wall's 2 m, and a step
+
+
 def test_weighted_mean_is_equation_4_1s():
     wall, poses = Wall(2), path(6)
-    odometry = IsvdOdometry(config(rotation="mean"))
+    odometry = IsvdOdometry(config(**PUBLISHED, rotation="mean"))
     tracks = follow(odometry, wall, poses[:5])
     new = wall.seen_from(poses[5], 5)
     candidates = odometry._register(new, list(odometry._recent)[-4:][::-1], config().match)
@@ -109,6 +156,20 @@ def test_weighted_mean_is_equation_4_1s():
         track.T_world_body[:3, :3],
         mean_rotation([c.T_world_body[:3, :3] for c in candidates], weights),
     )
+
+
+def test_covariances_weigh_the_average():
+    wall, poses = Wall(2), path(6)
+    odometry = IsvdOdometry(config())
+    follow(odometry, wall, poses[:5])
+    new = wall.seen_from(poses[5], 5)
+    candidates = odometry._register(new, odometry._earlier(), config().match)
+
+    T = odometry.track(new).T_world_body
+
+    pulls = [c.information @ np.concatenate(log(inverse(T) @ c.T_world_body)) for c in candidates]
+    assert len(candidates) > 1
+    assert np.linalg.norm(sum(pulls)) < 1e-3 * max(np.linalg.norm(pull) for pull in pulls)
 
 
 def test_a_lost_frame_is_reported_and_adds_no_motion():
