@@ -53,6 +53,11 @@ class _InMap:
         self._known = known
         self._estimator = estimator
 
+    @property
+    def corrections(self) -> int:
+        """How often the poses of new nodes have changed so far; known ones do not move."""
+        return self._estimator.corrections
+
     def pose_of(self, node: int) -> Transform:
         """Return the (4, 4) pose of a known place, or the current estimate of a new node's."""
         T_map_node = self._known.T_map_node.get(node)

@@ -24,6 +24,11 @@ class OnlinePoseEstimator(Protocol):
     A new node's pose follows from the current estimate of the node that it was tracked from.
     """
 
+    @property
+    def corrections(self) -> int:
+        """How often the poses of known nodes have changed so far."""
+        ...
+
     def add(self, node: int, track: FrameResult) -> None:
         """Add a new node, in time order."""
         ...
@@ -47,6 +52,7 @@ class IncrementalPoseEstimator:
     def __init__(self) -> None:
         self._solver = IncrementalSolver()
         self._T_world_node: dict[int, Transform] = {}
+        self.corrections = 0
 
     def preload(self, graph: PoseGraph) -> None:
         """Add an earlier session, solved, before anything else."""
@@ -70,6 +76,7 @@ class IncrementalPoseEstimator:
         if exceeds(miss, _WORTH_SOLVING):
             self._solver.update()
             self._T_world_node = self._solver.poses()
+            self.corrections += 1
 
     def pose_of(self, node: int) -> Transform:
         """Return the (4, 4) current estimate of a node's pose."""
@@ -81,6 +88,7 @@ class ProportionalPoseEstimator:
 
     def __init__(self) -> None:
         self._T_world_node: dict[int, Transform] = {}
+        self.corrections = 0
         self._last: tuple[int, Transform] | None = None
 
     def preload(self, graph: PoseGraph) -> None:
@@ -100,6 +108,7 @@ class ProportionalPoseEstimator:
     def close(self, closure: LoopClosure) -> None:
         """Correct the path by a loop."""
         self._T_world_node = spread(self._T_world_node, closure.factor)
+        self.corrections += 1
 
     def pose_of(self, node: int) -> Transform:
         """Return the (4, 4) current estimate of a node's pose."""

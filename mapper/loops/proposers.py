@@ -9,9 +9,16 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array, Transform
 from mapper.loops.base import Place, Proposal, Proposer
 
+_FIRST_CAPACITY = 256
+
 
 class NodePoses(Protocol):
     """Source of the current estimates of nodes' poses."""
+
+    @property
+    def corrections(self) -> int:
+        """How often the poses of known nodes have changed so far."""
+        ...
 
     def pose_of(self, node: int) -> Transform:
         """Return the (4, 4) current estimate of a node's pose."""
@@ -45,8 +52,10 @@ class PoseProposer(Generic[Place]):
         self._max_angle_rad = max_angle_rad
         self._drift_ratio = drift_ratio
         self._nodes: list[int] = []
-        self._T_body_sensor: list[Transform] = []
-        self._travelled_m: list[float] = []
+        self._T_body_sensor = np.empty((_FIRST_CAPACITY, 4, 4))
+        self._T_world_sensor = np.empty((_FIRST_CAPACITY, 4, 4))
+        self._travelled_m = np.empty(_FIRST_CAPACITY)
+        self._placed, self._corrections = 0, estimator.corrections
 
     def within_reach(self, node: int, seen: Place, /, *, before: int) -> NDArray[np.bool_]:
         """Return which of the first ``before`` places may be nearby, in any viewing direction."""
@@ -64,29 +73,49 @@ class PoseProposer(Generic[Place]):
 
     def add(self, node: int, seen: Place) -> None:
         """Add a place."""
-        travelled_m = 0.0
-        if self._nodes:
+        row, travelled_m = len(self._nodes), 0.0
+        if row:
             step = self._estimator.pose_of(node)[:3, 3] - self._estimator.pose_of(self._nodes[-1])[:3, 3]
-            travelled_m = self._travelled_m[-1] + float(np.linalg.norm(step))
+            travelled_m = self._travelled_m[row - 1] + float(np.linalg.norm(step))
+        if row == len(self._travelled_m):
+            self._T_body_sensor = _doubled(self._T_body_sensor)
+            self._T_world_sensor = _doubled(self._T_world_sensor)
+            self._travelled_m = _doubled(self._travelled_m)
         self._nodes.append(node)
-        self._T_body_sensor.append(self._pose_of_sensor(seen))
-        self._travelled_m.append(travelled_m)
+        self._T_body_sensor[row] = self._pose_of_sensor(seen)
+        self._travelled_m[row] = travelled_m
 
     def _apart(self, node: int, seen: Place, before: int) -> tuple[Array, Array]:
         """Return the distances of the places from a node's, metres, and the angles between their views."""
-        if before == 0:
-            return np.empty(0), np.empty(0)
         T_world_here = self._estimator.pose_of(node) @ self._pose_of_sensor(seen)
-        T_world_body = np.array([self._estimator.pose_of(place) for place in self._nodes[:before]])
-        T_world_place = T_world_body @ np.array(self._T_body_sensor[:before])
+        self._place(before)
+        T_world_place = self._T_world_sensor[:before]
         distance_m = np.linalg.norm(T_world_place[:, :3, 3] - T_world_here[:3, 3], axis=1)
         angle_rad = np.arccos(np.clip(T_world_place[:, :3, 2] @ T_world_here[:3, 2], -1.0, 1.0))
         return distance_m, angle_rad
 
+    def _place(self, before: int) -> None:
+        """Look up the poses of the first places that are not known yet, or have changed."""
+        if self._corrections != self._estimator.corrections:
+            self._placed, self._corrections = 0, self._estimator.corrections
+        if before <= self._placed:
+            return
+        new = slice(self._placed, before)
+        T_world_body = np.array([self._estimator.pose_of(node) for node in self._nodes[new]])
+        self._T_world_sensor[new] = T_world_body @ self._T_body_sensor[new]
+        self._placed = before
+
     def _reach_m(self, before: int) -> Array:
         """Return the largest distance, metres, at which each place counts as nearby."""
-        since_m = np.array([self._travelled_m[-1] - path_m for path_m in self._travelled_m[:before]])
+        if not self._nodes:
+            return np.empty(0)
+        since_m: Array = self._travelled_m[len(self._nodes) - 1] - self._travelled_m[:before]
         return self._max_distance_m + self._drift_ratio * since_m
+
+
+def _doubled(rows: Array) -> Array:
+    """Return rows with room for as many again."""
+    return np.concatenate([rows, np.empty_like(rows)])
 
 
 class CombinedProposer(Generic[Place]):
