@@ -22,6 +22,27 @@ def test_records_come_back_in_order_at_their_places(tmp_path):
     assert list(journal.records(places[1])) == [(0, b"first")]
 
 
+def test_a_record_is_read_at_its_place_while_others_are_appended(tmp_path):
+    journal, places = written(tmp_path / "journal", b"first", b"second" * 1000)
+    assert journal.read(places[1]) == b"second" * 1000
+    place = journal.append(b"third")
+    with pytest.raises(DataError, match=f"damaged at byte {place}"):
+        journal.read(place)  # it waits
+    journal.write(journal.take())
+    assert [journal.read(at) for at in (place, *places)] == [b"third", b"first", b"second" * 1000]
+
+
+def test_a_journal_that_is_removed_begins_anew(tmp_path):
+    journal, _ = written(tmp_path / "journal", b"first")
+    assert journal.read(0) == b"first"
+    journal.append(b"never written")
+    journal.remove()
+    assert not journal.path.exists()
+    assert journal.append(b"new") == 0
+    journal.write(journal.take())
+    assert journal.read(0) == b"new"
+
+
 def test_a_torn_tail_is_cut_off(tmp_path):
     journal, _ = written(tmp_path / "journal", b"first", b"second")
     end = journal.end
