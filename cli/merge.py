@@ -20,10 +20,15 @@ if TYPE_CHECKING:
 def merge(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN…", autocompletion=run_folders, help="Run folders that builds left."),
+        typer.Argument(
+            metavar="[MAP] RUN…",
+            autocompletion=run_folders,
+            help="Run folders that builds left; after a merged map, they are added to it.",
+        ),
     ],
     out: Annotated[
-        Path | None, typer.Option(metavar="MAP", help="Folder to create.  [default: maps/RUN+RUN…]")
+        Path | None,
+        typer.Option(metavar="MAP", help="Folder to create.  [default: maps/RUN+RUN…, or the map itself]"),
     ] = None,
     place: Annotated[
         Place,
@@ -52,19 +57,29 @@ def merge(
 
     With --place auto, runs bend where the others show that they drifted, and their maps are made again there
     from their logs; the run folders stay as they are. A merge that was stopped goes on where it was: give the
-    same command again.
+    same command again. Runs that are added to a map are searched in it, and what they do not reach stays.
 
     Example: mapper merge runs/monday runs/tuesday --out maps/campus --processes 2, or: mapper merge runs/*
     --out maps/city --place truth --scheduler tcp://10.0.0.1:8786
     """
+    from mapper.merging.extending import runs_of
     from mapper.merging.merge import merge as merge_runs
+    from mapper.merging.merged_map import open_map
     from mapper.run.folder import open_run
+    from mapper.run.manifest import is_merged_map
 
     workers = workers_for(processes, scheduler, default=1)
     prepare_libraries()
     progress = output.progress()
-    out = out or MAPS / joined_names(runs)
-    placing = placing_of([open_run(run) for run in runs], place, poses, jointly=True, progress=progress)
+    known = open_map(runs[0]) if is_merged_map(runs[0]) else None
+    if known is None:
+        built, out = [open_run(run) for run in runs], out or MAPS / joined_names(runs)
+    else:
+        built, out = [*runs_of(known), *(open_run(run) for run in runs[1:])], out or known.path
+        overwrite |= out.resolve() == known.path.resolve()
+        if place is Place.BUILT and poses is None and known.graph is not None:
+            place = Place.AUTO
+    placing = placing_of(built, place, poses, jointly=True, known=known, progress=progress)
     merged = merge_runs(
         placing,
         out,
@@ -72,6 +87,7 @@ def merge(
         workers=workers,
         progress=progress,
         overwrite=overwrite,
+        known=known,
     )
     document = {
         "path": merged.map.path,

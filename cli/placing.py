@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, assert_never
 import typer
 
 if TYPE_CHECKING:
+    from mapper.merging.merged_map import MergedMap
     from mapper.merging.placing import Placing
     from mapper.run.folder import Run
     from mapper.runtime.progress import Progress
@@ -30,7 +31,13 @@ PosesFile = Annotated[
 
 
 def placing_of(
-    runs: "Sequence[Run]", place: Place, poses: Path | None, *, jointly: bool, progress: "Progress"
+    runs: "Sequence[Run]",
+    place: Place,
+    poses: Path | None,
+    *,
+    jointly: bool,
+    known: "MergedMap | None" = None,
+    progress: "Progress",
 ) -> "Placing":
     """Return the runs with the poses of their worlds.
 
@@ -39,6 +46,7 @@ def placing_of(
         place: Source of the poses.
         poses: File of them.
         jointly: Whether shared places bend the runs, or place each as a rigid body.
+        known: A map of the first of them, to which the others are added.
         progress: Receives stages and notes.
 
     Raises:
@@ -61,7 +69,9 @@ def placing_of(
         case Place.AUTO:
             from mapper.pipeline.place_runs import place_by_shared_places, place_jointly
 
-            by_places = place_jointly if jointly else place_by_shared_places
-            return by_places(runs, progress=progress)
+            if not jointly:
+                return place_by_shared_places(runs, progress=progress)
+            has_graph = known is not None and known.graph is not None
+            return place_jointly(runs, known=known if has_graph else None, progress=progress)
         case _:
             assert_never(place)

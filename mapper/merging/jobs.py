@@ -4,6 +4,7 @@ Each reads files, writes files and returns a few numbers, so it can run on any m
 that is run again writes the same files again.
 """
 
+import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -166,7 +167,13 @@ def fuse_run(workspace: Workspace, run: int, path: Path, trajectory: Trajectory,
     return FusedRun(voxels=len(fused))
 
 
-def split_run(workspace: Workspace, run: int, path: Path, T_map_world: Transform | None) -> SplitRun:
+def split_run(
+    workspace: Workspace,
+    run: int,
+    path: Path,
+    T_map_world: Transform | None,
+    only: frozenset[int] | None = None,
+) -> SplitRun:
     """Write a run's part of each tile as a file of its own.
 
     Args:
@@ -174,11 +181,12 @@ def split_run(workspace: Workspace, run: int, path: Path, T_map_world: Transform
         run: Its place in the list.
         path: Its map.
         T_map_world: (4, 4) pose of its world in the map; None is the identity.
+        only: Tiles that are wanted; None is all.
     """
     octree = read_octree(path)
     part_bytes: dict[int, int] = {}
     has_colors = False
-    for tile, part in _parts(workspace, octree, T_map_world):
+    for tile, part in _parts(workspace, octree, T_map_world, only):
         write_map(workspace.part(tile, run), part)
         part_bytes[tile] = workspace.part(tile, run).stat().st_size
         has_colors |= part.attributes is not None and part.attributes.has_colors
@@ -186,28 +194,31 @@ def split_run(workspace: Workspace, run: int, path: Path, T_map_world: Transform
 
 
 def _parts(
-    workspace: Workspace, octree: OctreeMap, T_map_world: Transform | None
+    workspace: Workspace, octree: OctreeMap, T_map_world: Transform | None, only: frozenset[int] | None
 ) -> Iterator[tuple[int, OctreeMap]]:
     if T_map_world is None:
         slots = octree.blocks.sorted_slots()
-        for tile, some in _by_tile(workspace.tiling, octree.blocks.codes[slots]):
+        for tile, some in _by_tile(workspace.tiling, octree.blocks.codes[slots], only):
             part = OctreeMap(workspace.config)
             part.add(octree, slots=slots[some])
             yield tile, part
     else:
         codes = blocks_reached(octree, T_map_world)
-        for tile, some in _by_tile(workspace.tiling, codes):
+        for tile, some in _by_tile(workspace.tiling, codes, only):
             part = resampled(octree, inverse(T_map_world), codes[some], workspace.config)
             if len(part):
                 yield tile, part
 
 
-def _by_tile(tiling: Tiling, codes: NDArray[np.int64]) -> Iterator[tuple[int, slice]]:
-    """Yield each tile and the slice of its blocks in increasing codes."""
+def _by_tile(
+    tiling: Tiling, codes: NDArray[np.int64], only: frozenset[int] | None
+) -> Iterator[tuple[int, slice]]:
+    """Yield each wanted tile and the slice of its blocks in increasing codes."""
     tiles, starts = np.unique(tiling.tiles_of(codes), return_index=True)
     ends = np.append(starts, len(codes))[1:]
     for tile, start, end in zip(tiles.tolist(), starts, ends, strict=True):
-        yield tile, slice(start, end)
+        if only is None or tile in only:
+            yield tile, slice(start, end)
 
 
 def join_tile(
@@ -226,6 +237,46 @@ def join_tile(
     overlaps = tuple(octree.add(read_octree(workspace.part(tile, run))) for run in runs)
     octree.clamp()
     write_map(workspace.tile(tile), octree)
+    return _described(workspace, tile, octree, overlaps, has_colors=has_colors, follows_ground=follows_ground)
+
+
+def keep_tile(
+    workspace: Workspace,
+    tile: int,
+    known: Path,
+    overlaps: Sequence[Overlap],
+    *,
+    has_colors: bool,
+    follows_ground: bool,
+) -> JoinedTile:
+    """Take over a tile of an earlier map, and write its pieces of the OctoMap files.
+
+    Args:
+        workspace: Where.
+        tile: Which.
+        known: Its file in that map.
+        overlaps: Of its runs there.
+        has_colors: Whether the map has any.
+        follows_ground: Whether the slice's band does.
+    """
+    with atomic_file(workspace.tile(tile)) as part:
+        shutil.copyfile(known, part)
+    octree = read_octree(workspace.tile(tile))
+    return _described(
+        workspace, tile, octree, tuple(overlaps), has_colors=has_colors, follows_ground=follows_ground
+    )
+
+
+def _described(
+    workspace: Workspace,
+    tile: int,
+    octree: OctreeMap,
+    overlaps: tuple[Overlap, ...],
+    *,
+    has_colors: bool,
+    follows_ground: bool,
+) -> JoinedTile:
+    """Write the pieces of a finished tile."""
     depth = workspace.tiling.depth
     nodes = nodes_in_preorder(octree.blocks, root_depth=depth)
     color = (UNSET, UNSET, UNSET)

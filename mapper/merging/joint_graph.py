@@ -22,7 +22,7 @@ class Tie(Config):
     """Loops between two runs."""
 
     first: int
-    """Place of the earlier run in the list."""
+    """Place of the earlier run in the list of those that are in the graph."""
     second: int
     measured: int
     """Keyframes of the second run that were measured from places of the first."""
@@ -64,9 +64,11 @@ class JointGraph:
     @property
     def ties(self) -> tuple[Tie, ...]:
         """What ties each pair of runs that share places."""
+        place_of = {number: place for place, number in enumerate(self.first_nodes)}
         by_pair: dict[tuple[int, int], list[LoopClosure]] = {}
         for loop in self.loops:
-            by_pair.setdefault((self.run_of(loop.i), self.run_of(loop.j)), []).append(loop)
+            pair = place_of[self.run_of(loop.i)], place_of[self.run_of(loop.j)]
+            by_pair.setdefault(pair, []).append(loop)
         return tuple(_tie(pair, loops) for pair, loops in sorted(by_pair.items()))
 
 

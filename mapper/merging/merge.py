@@ -1,33 +1,30 @@
 """Merging: the maps of many runs added up, tile by tile, to one map on disk."""
 
 import shutil
-from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from pydantic import ValidationError
 
-from mapper.core.errors import ConfigError, MapperError, RunError
+from mapper.core.errors import ConfigError, RunError
 from mapper.core.geometry import apply
 from mapper.export.grid import write_grid
-from mapper.graph.g2o import write_g2o
-from mapper.loops.closure import write_closures
+from mapper.merging.extending import KnownTile, KnownTiles, kept_in, known_tiles
 from mapper.merging.jobs import (
-    FusedRun,
     JoinedTile,
     SlicedColumn,
     SplitRun,
     Workspace,
-    fuse_run,
     join_tile,
+    keep_tile,
     split_run,
     stays_within_m,
 )
 from mapper.merging.merged_map import (
     MERGED_MAP,
-    RUNS,
     SCRATCH,
     TILES,
     MapManifest,
@@ -38,21 +35,19 @@ from mapper.merging.merged_map import (
 )
 from mapper.merging.octomap_files import write_whole_bt, write_whole_ot
 from mapper.merging.placing import Placed, Placing, warnings_about
+from mapper.merging.runs_in_map import described_runs, fuse_runs, runs_to_fuse, write_poses
 from mapper.merging.slicing import draw, slice_map
 from mapper.merging.stages import Cost, Stages
 from mapper.merging.tiling import tiling_for
 from mapper.navigation.traversable import Storey
 from mapper.octree.config import OctreeConfig
 from mapper.run import files
-from mapper.run.doubtful_frames import without_doubtful
-from mapper.run.fingerprint import fingerprint
 from mapper.run.manifest import RunWarning
 from mapper.run.warnings import merge_warnings
 from mapper.runtime.atomic import MANIFEST_NAME, atomic_folder
 from mapper.runtime.executor import IN_PROCESS, Workers, make_executor
 from mapper.runtime.progress import SILENT, Progress
 from mapper.runtime.resumable_jobs import JobRunner
-from mapper.sources.trajectory_files import write_tum
 
 DEFAULT_TILE_M = 50.0
 
@@ -90,6 +85,7 @@ def merge(
     workers: Workers = IN_PROCESS,
     progress: Progress = SILENT,
     overwrite: bool = False,
+    known: MergedMap | None = None,
 ) -> Merged:
     """Add up the maps of runs, tile by tile, as independent evidence (Bayes, prior 0.5).
 
@@ -107,15 +103,19 @@ def merge(
         workers: Where the jobs run; those of a Dask cluster must see the same files.
         progress: Receives stages, counts and notes.
         overwrite: Replace a map that is there, once the new one is whole.
+        known: A map of the first of these runs, to which the others are added. What has not moved in it by
+            more than half a voxel stays, and so do tiles that no other run reaches.
 
     Raises:
         ConfigError: The runs do not agree in resolution or sensor model, or the tiles' edge is impossible.
         RunError: OUT is there already, a run comes twice or lacks its map, or a job failed.
     """
+    config = _common_config(placing.placed)
+    if known is not None:
+        placing = replace(placing, placed=kept_in(known, placing.placed, config))
     placed = placing.placed
-    config = _common_config(placed)
     tiling = tiling_for(config.resolution_m, tile_m)
-    bent, stiff = _bent(placed, within_m=stays_within_m(config))
+    bent, stiff = runs_to_fuse(placed, within_m=stays_within_m(config))
     manifest = MapManifest(
         status="merging",
         octree=config,
@@ -124,7 +124,7 @@ def merge(
         costmap=placed[0].run.config.costmap,
         tile_m=tiling.edge_m,
         floor_z_m=_floor_z_m(placed[0]),
-        runs=_described(placing, fused_again=bent),
+        runs=described_runs(placing, fused_again=bent),
         ties=() if placing.joint is None else placing.joint.ties,
         left_out=dict(placing.left_out),
     )
@@ -140,10 +140,12 @@ def merge(
             progress.note(note)
         workspace = Workspace(folder, folder / SCRATCH, tiling, config)
         stages = Stages(JobRunner(workspace.scratch / "done", progress), executor, progress)
-        _write_poses(folder, placing, manifest)
-        octrees = _fuse(workspace, stages, placed, manifest)
-        split = _split(workspace, stages, placed, octrees)
-        joined = _join(workspace, stages, split, follows_ground=manifest.slice.above == "ground")
+        write_poses(folder, placing, manifest)
+        octrees = fuse_runs(workspace, stages, placed, manifest)
+        tiles = None if known is None else known_tiles(known, placed, manifest, tiling)
+        split, untouched = _split(workspace, stages, placed, octrees, tiles)
+        follows_ground = manifest.slice.above == "ground"
+        joined = _join(workspace, stages, split, untouched, follows_ground=follows_ground)
         has_colors = any(part.has_colors for part in split)
         write_whole_ot(folder / files.OCTREE_OT, workspace, joined, has_colors=has_colors)
         write_whole_bt(folder / files.OCTREE_BT, workspace, joined)
@@ -192,71 +194,6 @@ def _common_config(placed: Sequence[Placed]) -> OctreeConfig:
     return first.config.octree.model_copy(update={"attributes": attributes})
 
 
-def _bent(placed: Sequence[Placed], *, within_m: float) -> tuple[set[int], list[str]]:
-    """Return the numbers of the runs to fuse again, and a line for each that should be and cannot."""
-    again, stiff = set[int](), list[str]()
-    for number, item in enumerate(placed):
-        if item.moved_m <= within_m:
-            continue
-        try:
-            item.run.open_log()
-        except MapperError as error:
-            stiff.append(
-                f"{error}; so {item.run.path} is placed as a rigid body, and bends of up to "
-                f"{item.moved_m:.2g} m stay in its map"
-            )
-        else:
-            again.add(number)
-    return again, stiff
-
-
-def _described(placing: Placing, *, fused_again: Set[int]) -> tuple[RunInMap, ...]:
-    first_nodes = (
-        [None] * len(placing.placed) if placing.joint is None else placing.joint.first_nodes.values()
-    )
-    return tuple(
-        RunInMap(
-            path=str(item.run.path.resolve()),
-            fingerprint=fingerprint(item.run.file(files.OCTREE_MAP)),
-            T_map_world=tuple(tuple(row) for row in item.T_map_world.tolist()),
-            placed=item.how,
-            folder=f"{RUNS}/{number:04d}_{item.run.path.resolve().name}",
-            first_node=first_node,
-            moved_m=round(item.moved_m, 6),
-            fused_again=number in fused_again,
-        )
-        for number, (item, first_node) in enumerate(zip(placing.placed, first_nodes, strict=True))
-    )
-
-
-def _write_poses(folder: Path, placing: Placing, manifest: MapManifest) -> None:
-    """Write every run's trajectory in the map, and the joint graph with the loops between runs."""
-    for item, run in zip(placing.placed, manifest.runs, strict=True):
-        (folder / run.folder).mkdir(parents=True, exist_ok=True)
-        write_tum(folder / run.folder / files.TRAJECTORY, item.trajectory_map)
-    if placing.joint is not None:
-        write_g2o(folder / files.GRAPH, placing.joint.graph)
-        write_closures(folder / files.LOOPS, placing.joint.loops)
-
-
-def _fuse(
-    workspace: Workspace, stages: Stages, placed: Sequence[Placed], manifest: MapManifest
-) -> list[Path]:
-    """Fuse the runs that have moved again; return the file of every run's octree."""
-    octrees = [item.run.path.resolve() / files.OCTREE_MAP for item in placed]
-    jobs = {}
-    for number, (item, run) in enumerate(zip(placed, manifest.runs, strict=True)):
-        if run.fused_again and item.bent is not None:
-            octrees[number] = workspace.folder / run.folder / files.OCTREE_MAP
-            poses = without_doubtful(item.bent, item.run.records)
-            jobs[f"{number:04d}"] = partial(
-                fuse_run, workspace, number, item.run.path.resolve(), poses, octrees[number]
-            )
-    if jobs:
-        list(stages.run("fuse", jobs, FusedRun))
-    return octrees
-
-
 def _floor_z_m(first: Placed) -> float:
     """Return the height in the map of the first run's floor, below the middle of its path."""
     if first.stays:
@@ -284,34 +221,70 @@ def _kept_of(partial: Path, manifest: MapManifest) -> list[str]:
 
 
 def _split(
-    workspace: Workspace, stages: Stages, placed: Sequence[Placed], octrees: Sequence[Path]
-) -> list[SplitRun]:
-    jobs = {
-        f"{index:04d}": partial(split_run, workspace, index, octree, None if item.stays else item.T_map_world)
-        for index, (item, octree) in enumerate(zip(placed, octrees, strict=True))
-    }
-    done = dict(stages.run("split", jobs, SplitRun))
-    return [done[name] for name in jobs]
+    workspace: Workspace,
+    stages: Stages,
+    placed: Sequence[Placed],
+    octrees: Sequence[Path],
+    known: KnownTiles | None,
+) -> tuple[list[SplitRun], Mapping[int, KnownTile]]:
+    """Cut runs into tiles; return what each has in every tile, and the known tiles that nothing new reaches.
+
+    Runs that are kept are cut only where tiles have to be summed again.
+    """
+
+    def jobs(numbers: Iterable[int], only: frozenset[int] | None) -> dict[str, Callable[[], SplitRun]]:
+        return {
+            f"{number:04d}": partial(
+                split_run,
+                workspace,
+                number,
+                octrees[number],
+                None if placed[number].stays else placed[number].T_map_world,
+                only,
+            )
+            for number in numbers
+        }
+
+    kept = set[int]() if known is None else known.kept
+    fresh = [number for number in range(len(placed)) if number not in kept]
+    done = dict(stages.run("split", jobs(fresh, None), SplitRun))
+    if known is None:
+        return [done[f"{number:04d}"] for number in fresh], {}
+    changed = known.changed_by({tile for part in done.values() for tile in part.part_bytes})
+    again = [number for number in sorted(kept) if changed & known.tiles_of(number)]
+    done |= dict(stages.run("split", jobs(again, changed), SplitRun))
+    split = [
+        known.completed(number, done.get(f"{number:04d}"), changed)
+        if number in kept
+        else done[f"{number:04d}"]
+        for number in range(len(placed))
+    ]
+    return split, known.untouched(changed)
 
 
 def _join(
-    workspace: Workspace, stages: Stages, split: Sequence[SplitRun], *, follows_ground: bool
+    workspace: Workspace,
+    stages: Stages,
+    split: Sequence[SplitRun],
+    untouched: Mapping[int, KnownTile],
+    *,
+    follows_ground: bool,
 ) -> dict[int, JoinedTile]:
     """Return the result of every tile, in Morton order."""
     tiles = sorted({tile for part in split for tile in part.part_bytes})
     if not tiles:
         raise RunError("nothing is known in any of the runs' maps; there is nothing to merge")
-    jobs = {
-        workspace.tiling.name_of(tile): partial(
-            join_tile,
-            workspace,
-            tile,
-            [run for run, part in enumerate(split) if tile in part.part_bytes],
-            has_colors=any(part.has_colors for part in split),
-            follows_ground=follows_ground,
+    has_colors = any(part.has_colors for part in split)
+    jobs: dict[str, Callable[[], JoinedTile]] = {}
+    for tile in tiles:
+        if tile in untouched:
+            work = partial(keep_tile, workspace, tile, *untouched[tile])
+        else:
+            runs = [run for run, part in enumerate(split) if tile in part.part_bytes]
+            work = partial(join_tile, workspace, tile, runs)
+        jobs[workspace.tiling.name_of(tile)] = partial(
+            work, has_colors=has_colors, follows_ground=follows_ground
         )
-        for tile in tiles
-    }
     tile_of = dict(zip(jobs, tiles, strict=True))
     done = {}
     for name, joined in stages.run("join", jobs, JoinedTile):
@@ -337,6 +310,7 @@ def _completed(
         run.model_copy(
             update={
                 "voxels": part.voxels,
+                "has_colors": part.has_colors,
                 "shared_voxels": int(shared),
                 "agreement": round(float(both / either), 4) if either else None,
             }
@@ -351,6 +325,7 @@ def _completed(
             upper_m=tuple((lower_m[tile] + workspace.tiling.edge_m).tolist()),
             voxels=result.voxels,
             runs=tuple(runs_of[tile]),
+            overlaps=tuple(tuple(overlap) for overlap in result.overlaps),
         )
         for tile, result in joined.items()
     )

@@ -31,6 +31,8 @@ from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, partial_of, write_t
 from mapper.sources.trajectory_files import read_tum
 
 TILES, RUNS, SCRATCH = "tiles", "runs", "work"
+FUSED = "fused.tum"
+"""File of the poses in a run's own world by which its map was fused again."""
 MERGED_MAP = FolderKind(
     "a merged map",
     manifest_keys=frozenset({"status", "tile_m", "tiles"}),
@@ -54,7 +56,7 @@ class RunInMap(Config):
     """Source of its pose."""
     folder: str = ""
     """Of its files in the map's folder: ``trajectory.tum``, the poses in the map of the frames that its maps
-    are made from, and ``map.octree``, if it was fused again."""
+    are made from, and ``map.octree`` with ``fused.tum``, if it was fused again."""
     first_node: int | None = None
     """Added to the numbers of its nodes in the joint graph; None without one."""
     moved_m: float = 0.0
@@ -63,6 +65,8 @@ class RunInMap(Config):
     """Whether its map was made again for that."""
     voxels: int = 0
     """Known ones, in its own map."""
+    has_colors: bool = False
+    """Whether any of them has one."""
     shared_voxels: int = 0
     """Those that are known in the sum of the runs before it as well."""
     agreement: float | None = None
@@ -80,6 +84,9 @@ class Tile(Config):
     """Known ones."""
     runs: tuple[int, ...]
     """Places in the list of the runs with a known voxel here."""
+    overlaps: tuple[tuple[int, int, int], ...] = ()
+    """Of each of them with the sum of those before it: voxels that are known in both, occupied in both, and
+    occupied in either."""
 
 
 class MapManifest(Config):

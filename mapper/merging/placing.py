@@ -13,6 +13,7 @@ from mapper.core.rotations import rotation_from_quaternion
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.merging.joint_graph import JointGraph
+from mapper.octree.config import OctreeConfig
 from mapper.octree.scan_update_file import displacement_m, longest_ray_m
 from mapper.run.doubtful_frames import without_doubtful
 from mapper.run.edits_file import edits_text, parse_edits
@@ -24,6 +25,23 @@ _LEVER_M = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class InMap:
+    """A run as it lies in a merged map that exists already.
+
+    Attributes:
+        folder: Of its files in that map.
+        trajectory_map: As of ``Placed``: its voxels lie within half a voxel of it.
+        moved_m: As of ``Placed``, when it was merged.
+        fused_again: Whether it was fused again then.
+    """
+
+    folder: Path
+    trajectory_map: Trajectory
+    moved_m: float
+    fused_again: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Placed:
     """A run in the map.
 
@@ -32,12 +50,14 @@ class Placed:
         T_map_world: (4, 4) pose of its world in the map.
         how: Where the pose comes from, in a few words.
         bent: Its frames' poses in its own world by a joint graph; None keeps those of the run.
+        kept: How it lies in the map that runs are added to, where that still holds.
     """
 
     run: Run
     T_map_world: Transform
     how: str
     bent: Trajectory | None = None
+    kept: InMap | None = None
 
     @property
     def stays(self) -> bool:
@@ -47,17 +67,26 @@ class Placed:
     @property
     def trajectory_map(self) -> Trajectory:
         """Poses in the map of the frames that its maps are made from."""
+        if self.kept is not None:
+            return self.kept.trajectory_map
         return without_doubtful(self.bent or self.run.trajectory, self.run.records).moved(self.T_map_world)
 
     @property
     def moved_m(self) -> float:
         """Bound on how far any point of its own map has moved in its world, metres."""
+        if self.kept is not None:
+            return self.kept.moved_m
         if self.bent is None:
             return 0.0
-        range_m, run = longest_ray_m(self.run.fused_config.octree), self.run
-        before, after = (without_doubtful(poses, run.records) for poses in (run.trajectory, self.bent))
-        pairs = zip(before.T_world_body, after.T_world_body, strict=True)
-        return max((displacement_m(*pair, range_m=range_m) for pair in pairs), default=0.0)
+        after = without_doubtful(self.bent, self.run.records)
+        return farthest_m(self.run.tracked_trajectory, after, self.run.fused_config.octree)
+
+
+def farthest_m(before: Trajectory, after: Trajectory, config: OctreeConfig) -> float:
+    """Return a bound on how far any point that frames saw has moved, metres, with their poses."""
+    range_m = longest_ray_m(config)
+    pairs = zip(before.T_world_body, after.T_world_body, strict=True)
+    return max((displacement_m(*pair, range_m=range_m) for pair in pairs), default=0.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,6 +46,10 @@ class Tiling:
         """Return the path down the octree: a digit 0 … 7 for the child taken at each depth."""
         return f"{tile:0{self.depth}o}"
 
+    def tile_named(self, name: str) -> int:
+        """Return the tile of a name."""
+        return int(name, 8)
+
     def first_key(self, tile: int) -> NDArray[np.int64]:
         """Return the (3,) key of a tile's lowest voxel."""
         return np.array([gather.py_func(tile >> axis) << self.levels for axis in range(3)], np.int64)

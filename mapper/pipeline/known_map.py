@@ -17,10 +17,10 @@ from mapper.loops.config import AnyLoops, KeyframeLoopsConfig, PlaceLoopsConfig,
 from mapper.loops.factory import LOOPS_OF, build_verifier
 from mapper.loops.map_constraints import KnownPlaces
 from mapper.loops.place_file import AnyPlace, read_places
+from mapper.merging.extending import runs_of
 from mapper.merging.merged_map import open_map
 from mapper.pipeline.reobserve import reobserve
 from mapper.run import files
-from mapper.run.fingerprint import fingerprint
 from mapper.run.folder import Run, open_run
 from mapper.run.manifest import is_merged_map
 from mapper.runtime.progress import SILENT, Progress
@@ -86,10 +86,7 @@ def _members(path: Path) -> list[tuple[Run, dict[int, Transform]]]:
     """Return the runs of a merged map, with the poses of their nodes in it."""
     merged, members = open_map(path), []
     graph = merged.graph
-    for member in merged.manifest.runs:
-        run = open_run(Path(member.path))
-        if fingerprint(run.file(files.OCTREE_MAP)) != member.fingerprint:
-            raise RunError(f"{run.path}: changed since it was merged into {path}; merge again")
+    for member, run in zip(merged.manifest.runs, runs_of(merged), strict=True):
         if graph is None or member.first_node is None:
             T_map_own = run.graph.moved(np.array(member.T_map_world)).T_world_node
         else:

@@ -1,7 +1,9 @@
 """Placing runs by the places that they share: no common truth or world is needed."""
 
+from bisect import bisect_right
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -9,12 +11,15 @@ import numpy as np
 from mapper.core.errors import RunError
 from mapper.core.geometry import inverse
 from mapper.graph.model import PoseGraph
+from mapper.loops.closure import read_closures
 from mapper.loops.map_constraints import KnownPlaces
-from mapper.loops.shared_places import SharedPlace, find_shared_places
-from mapper.merging.joint_graph import JointGraph, Tie, solve_jointly
+from mapper.loops.shared_places import SharedPlace, find_shared_places, shared_place
+from mapper.merging.joint_graph import JointGraph, solve_jointly
+from mapper.merging.merged_map import MergedMap
 from mapper.merging.placing import Placed, Placing, fit_poses
 from mapper.merging.placing_by_places import SolvedWorlds, solve_worlds
 from mapper.pipeline.known_map import detector_of, loops_between_days, run_places, sensor_of
+from mapper.run import files
 from mapper.run.folder import Run
 from mapper.run.stored_tracking import load_tracking
 from mapper.runtime.progress import SILENT, Progress
@@ -54,7 +59,9 @@ def place_by_shared_places(runs: Sequence[Run], *, progress: Progress = SILENT) 
     return Placing(placed, found.left_out(runs), found.doubts(runs))
 
 
-def place_jointly(runs: Sequence[Run], *, progress: Progress = SILENT) -> Placing:
+def place_jointly(
+    runs: Sequence[Run], *, known: MergedMap | None = None, progress: Progress = SILENT
+) -> Placing:
     """Place runs by one pose graph over all their keyframes, so that each bends where it had drifted.
 
     The poses of ``place_by_shared_places`` are the first estimate. The loops between runs are those places
@@ -64,6 +71,7 @@ def place_jointly(runs: Sequence[Run], *, progress: Progress = SILENT) -> Placin
 
     Args:
         runs: At least one; the first must have places.
+        known: A map of the first of these runs by a joint graph: they are not searched in each other again.
         progress: Receives stages and notes.
 
     Returns:
@@ -74,7 +82,7 @@ def place_jointly(runs: Sequence[Run], *, progress: Progress = SILENT) -> Placin
         ConfigError: The first run's places cannot be recognised by similarity.
         GraphError: The joint graph cannot be solved.
     """
-    found = _recognised(runs, progress)
+    found = _recognised(runs, progress, () if known is None else _measured_in(known, runs), known)
     worlds = found.solved.worlds
     used = set(map(id, found.solved.used))
     joint = solve_jointly(
@@ -90,13 +98,17 @@ def place_jointly(runs: Sequence[Run], *, progress: Progress = SILENT) -> Placin
     doubts = found.doubts(runs)
     if joint.own_rejected:
         doubts.append(f"the joint graph rejected {joint.own_rejected} loops that single runs had accepted")
-    ties = joint.ties
-    placed = [_placed(runs[number], number, joint, ties) for number in joint.first_nodes]
+    held = Counter[int]()
+    for tie in joint.ties:
+        held.update(dict.fromkeys((tie.first, tie.second), tie.held))
+    placed = [
+        _placed(runs[number], number, joint, held[place]) for place, number in enumerate(joint.first_nodes)
+    ]
     _refuse_alone(runs, len(placed), left_out)
     return Placing(placed, left_out, doubts, joint)
 
 
-def _placed(run: Run, number: int, joint: JointGraph, ties: Sequence[Tie]) -> Placed:
+def _placed(run: Run, number: int, joint: JointGraph, held: int) -> Placed:
     """Return a run with its world where its solved keyframes lie nearest to where they were in it."""
     T_map_node, graph = joint.poses_of(number), run.graph
     T_map_world = np.eye(4)
@@ -105,7 +117,6 @@ def _placed(run: Run, number: int, joint: JointGraph, ties: Sequence[Tie]) -> Pl
     T_world_map = inverse(T_map_world)
     moved = {node: T_world_map @ T for node, T in T_map_node.items()}
     solved = load_tracking(run).solved(PoseGraph(moved, graph.stamps_ns, graph.factors), run.loops)
-    held = sum(tie.held for tie in ties if number in (tie.first, tie.second))
     return Placed(run, T_map_world, f"by {held} loops" if number else _FIRST, solved.trajectory)
 
 
@@ -141,8 +152,34 @@ class _Recognised:
         ]
 
 
-def _recognised(runs: Sequence[Run], progress: Progress) -> _Recognised:
-    """Recognise and measure the runs' keyframes in each other.
+def _measured_in(known: MergedMap, runs: Sequence[Run]) -> list[SharedPlace]:
+    """Return the places that were measured between the runs of a map."""
+    first_nodes = [member.first_node or 0 for member in known.manifest.runs]
+    places = []
+    for loop in read_closures(known.path / files.LOOPS):
+        first, second = (bisect_right(first_nodes, node) - 1 for node in (loop.i, loop.j))
+        measured = replace(
+            loop,
+            i=loop.i - first_nodes[first],
+            j=loop.j - first_nodes[second],
+            verdict="accepted",
+            reason="",
+            before=None,
+            after=None,
+            weight=None,
+        )
+        T_worlds = runs[first].graph.T_world_node, runs[second].graph.T_world_node
+        places.append(shared_place(first, second, measured, *T_worlds))
+    return places
+
+
+def _recognised(
+    runs: Sequence[Run],
+    progress: Progress,
+    measured: Sequence[SharedPlace] = (),
+    known_map: MergedMap | None = None,
+) -> _Recognised:
+    """Recognise and measure the runs' keyframes in each other, but for those of a known map.
 
     Raises:
         RunError: Nothing ties any other run to the first, or the first has no places.
@@ -155,7 +192,8 @@ def _recognised(runs: Sequence[Run], progress: Progress) -> _Recognised:
     loops = loops_between_days(first.config.loops, sensor_of(known[0]))
     unfit = {number: reason for number in range(len(runs)) if (reason := _unfit(runs, known, number))}
     fit = [KnownPlaces({}, {}) if number in unfit else places for number, places in enumerate(known)]
-    shared = find_shared_places(fit, loops, progress=progress)
+    searched = 0 if known_map is None else len(known_map.manifest.runs)
+    shared = [*measured, *find_shared_places(fit, loops, searched=searched, progress=progress)]
     found = _Recognised(shared, solve_worlds(shared, loops.gate), unfit)
     _refuse_alone(runs, len(found.solved.worlds), found.left_out(runs))
     return found

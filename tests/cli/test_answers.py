@@ -44,7 +44,7 @@ ANSWERS = {
         ["RUN", "RUN", "--place", "built", "--out", "TMP/diff"],
         "path before after T_before_after placed appeared vanished voxels",
     ),
-    "merge": (["RUN", "--out", "TMP/map"], "path runs summary worker_s shuffle_bytes"),
+    "merge": (["RUN", "--out", "TMP/map"], "path runs ties left_out summary worker_s shuffle_bytes"),
     "solve": (
         ["RUN/graph.g2o", "--out", "TMP/solved"],
         "path graph config nodes edges loops rejected component_sizes error_before error_after iterations "

@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,10 +13,13 @@ from mapper.core.errors import RunError
 from mapper.core.geometry import angle_between, apply, exp, fit_rigid, inverse
 from mapper.core.timebase import nearest
 from mapper.core.trajectory import Trajectory
+from mapper.loops import shared_places
+from mapper.loops.base import verify_proposal
 from mapper.loops.closure import read_closures
 from mapper.loops.map_constraints import KnownPlaces
 from mapper.loops.scan_context_proposer import ScanPlace
 from mapper.merging.merge import merge
+from mapper.merging.merged_map import open_map
 from mapper.merging.placing import Placed, Placing, by_truth
 from mapper.octree.octomap_file import read_octree
 from mapper.pipeline import place_runs
@@ -129,6 +133,33 @@ def test_a_bent_run_without_its_log_is_placed_as_a_rigid_body(halves, tmp_path):
     assert not found.manifest.runs[1].fused_again
     assert "is no longer there" in found.manifest.notes[0]
     assert "bends of up to 0.2 m stay" in found.manifest.notes[0]
+
+
+def test_a_run_is_added_to_a_map_in_place(halves, elsewhere, desk_log, tmp_path, monkeypatch):
+    middle = built(desk_log, tmp_path / "middle", "source.first_frame=3", "source.last_frame=27")
+    out = tmp_path / "map"
+    mapper("merge", *(half.path for half in halves), "--out", out, "--place", "auto", "--quiet")
+    before = open_map(out).manifest
+    compared = []
+
+    def verify(proposal, node, *places):
+        compared.append(places[1].stamp_ns)
+        return verify_proposal(proposal, node, *places)
+
+    monkeypatch.setattr(shared_places, "verify_proposal", verify)
+    result = mapper("merge", out, elsewhere.path, middle.path)
+    assert f"mapper: {elsewhere.path}: left out, " in result.stderr
+
+    found = open_map(out)
+    assert [Path(run.path).name for run in found.manifest.runs] == ["early", "late", "middle"]
+    new = [place.stamp_ns for run in (elsewhere, middle) for place in run_places(run).places.values()]
+    assert compared
+    assert set(compared) <= set(new)  # what the runs of the map share is known
+    first, *others = found.manifest.ties
+    assert (first.first, first.second, first.measured) == (0, 1, before.ties[0].measured)
+    assert {(tie.first, tie.second) for tie in others} == {(0, 2), (1, 2)}
+    apart = [len(run.graph.T_world_node) for run in (*halves, middle)]
+    assert len(found.graph.T_world_node) == sum(apart)
 
 
 def test_a_merge_names_the_run_that_it_leaves_out(halves, elsewhere, tmp_path):
