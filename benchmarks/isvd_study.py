@@ -46,6 +46,8 @@ class Choice:
     first_features: int = 0
     """Use only so many of the strongest; 0 is all."""
     ratio: float = 0.9
+    ratio_of: Literal["new frame", "earlier frame"] = "new frame"
+    """Whose features have to be distinct from the other frame's second best."""
     cross_check: bool = True
     vote: bool = False
     """Keep matches whose change of size and angle most others share, as Emgu CV's example does."""
@@ -90,6 +92,7 @@ EXPERIMENTS: dict[str, list[tuple[str, dict[str, object]]]] = {
         ("SURF, threshold 2000", {"detector": SurfConfig(max_features=5000, threshold=2000.0)}),
     ],
     "ratio": [(f"ratio {value}", {"ratio": value}) for value in (0.6, 0.7, 0.8, 1.0)],
+    "ratio's side": [("ratio of the earlier frame", {"ratio_of": "earlier frame"})],
     "cross-check": [
         ("no cross-check", {"cross_check": False}),
         ("no cross-check, ratio 0.8", {"cross_check": False, "ratio": 0.8}),
@@ -163,12 +166,14 @@ class Candidates:
 
     Attributes:
         pairs: (M, 2) features of the frame and of the earlier one.
-        ratio: (M,) best distance relative to the second best.
+        ratio: (M,) distance relative to that to the feature's second best in the earlier frame.
+        ratio_back: (M,) relative to that of the partner to its second best in the frame.
         mutual: (M,) whether each is the other's best.
     """
 
     pairs: NDArray[np.intp]
     ratio: NDArray[np.float32]
+    ratio_back: NDArray[np.float32]
     mutual: NDArray[np.bool_]
 
 
@@ -228,7 +233,8 @@ def errors_of(prepared: Prepared, choice: Choice, seeds: range) -> Array:
 @cache
 def prepare(path: Path, detector: DetectorConfig, folder: Path | None) -> Prepared:
     """Return a log's features and matches, from the cache if they are there."""
-    name = f"{path.resolve().name}.{digest(detector.model_dump(), digits=12)}.pickle"
+    kind = (detector.model_dump(), [each.name for each in fields(Candidates)])
+    name = f"{path.resolve().name}.{digest(kind, digits=12)}.pickle"
     if folder is not None and (folder / name).exists():
         found: Prepared = pickle.loads((folder / name).read_bytes())
         return found
@@ -288,19 +294,26 @@ def _as_numbers(descriptors: NDArray[np.uint8] | NDArray[np.float32]) -> NDArray
 
 def _candidates(now: NDArray[np.float32], then: NDArray[np.float32]) -> Candidates:
     if len(now) == 0 or len(then) < 2:
-        return Candidates(np.empty((0, 2), np.intp), np.empty(0, np.float32), np.empty(0, np.bool_))
+        none = np.empty(0, np.float32)
+        return Candidates(np.empty((0, 2), np.intp), none, none, np.empty(0, np.bool_))
     squares_now, squares_then = (np.einsum("ij,ij->i", each, each) for each in (now, then))
-    partner, back, ratio = _two_best(now @ then.T, squares_now, squares_then)
+    partner, back, ratio, ratio_back = _two_best(now @ then.T, squares_now, squares_then)
     pairs = np.column_stack([np.arange(len(now)), partner])
-    return Candidates(pairs, ratio, back[partner] == np.arange(len(now)))
+    return Candidates(pairs, ratio, ratio_back, back[partner] == np.arange(len(now)))
 
 
 @njit(cache=True, nogil=True)
 def _two_best(products, squares_now, squares_then):  # type: ignore[no-untyped-def]
-    """Return each row's best column, each column's best row, and the best distance by the second best."""
+    """Return each row's best column, each column's best row, and the distance of each row to its best column.
+
+    The distance is relative to the row's second best column, and to the column's second best row.
+    """
     rows, columns = products.shape
     partner, back = np.zeros(rows, np.intp), np.zeros(columns, np.intp)
-    column_best, ratio = np.full(columns, np.inf, np.float32), np.empty(rows, np.float32)
+    column_best = np.full(columns, np.inf, np.float32)
+    column_second = np.full(columns, np.inf, np.float32)
+    smallest, ratio = np.empty(rows, np.float32), np.empty(rows, np.float32)
+    ratio_back = np.empty(rows, np.float32)
     for i in range(rows):
         best, second = np.float32(np.inf), np.float32(np.inf)
         for j in range(columns):
@@ -311,9 +324,14 @@ def _two_best(products, squares_now, squares_then):  # type: ignore[no-untyped-d
                 else:
                     second = value
             if value < column_best[j]:
-                column_best[j], back[j] = value, i
-        ratio[i] = np.sqrt(max(best, np.float32(0.0)) / max(second, np.float32(1e-12)))
-    return partner, back, ratio
+                column_best[j], column_second[j], back[j] = value, column_best[j], i
+            elif value < column_second[j]:
+                column_second[j] = value
+        smallest[i] = max(best, np.float32(0.0))
+        ratio[i] = np.sqrt(smallest[i] / max(second, np.float32(1e-12)))
+    for i in range(rows):
+        ratio_back[i] = np.sqrt(smallest[i] / max(column_second[partner[i]], np.float32(1e-12)))
+    return partner, back, ratio, ratio_back
 
 
 def _depths_m(depth_m: NDArray[np.float32], pixels: NDArray[np.float32]) -> dict[str, Array]:
@@ -378,7 +396,8 @@ def _points(seen: Seen, intrinsics: tuple[float, ...], choice: Choice) -> Array:
 
 def _matched(prepared: Prepared, n: int, k: int, choice: Choice, seed: int) -> NDArray[np.intp]:
     candidates, now, then = prepared.matches[n, k], prepared.frames[n], prepared.frames[n - k]
-    used = candidates.ratio < choice.ratio
+    ratio = candidates.ratio if choice.ratio_of == "new frame" else candidates.ratio_back
+    used = ratio < choice.ratio
     if choice.cross_check:
         used &= candidates.mutual
     if choice.first_features:
