@@ -100,14 +100,14 @@ class PlaceLoopsConfig(KeyframeLoopsConfig):
 class ScanVerificationConfig(Config):
     """When two scans are of one place."""
 
-    voxel_m: PositiveFloat = 0.75
+    voxel_m: PositiveFloat = 0.5
     """One point is kept per voxel."""
     reach_m: PositiveFloat = 48.0
     """Farther points are dropped."""
     constellation: ConstellationConfig = ConstellationConfig(ground=GroundConfig(cell_m=1.0, voxel_m=0.75))
     """Centres that vote; the points are thin, so a cell of the ground has to be larger."""
     voting: VotingConfig = VotingConfig(angles=120, peaks=10)
-    pair_distances_m: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (2.0, 1.0)
+    pair_distances_m: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (2.0, 0.5)
     """Largest distance between the points of a GICP pair, from coarse to fine."""
     max_iterations: PositiveInt = 20
     """Largest number of iterations at each of these distances."""
@@ -127,9 +127,9 @@ class ScanVerificationConfig(Config):
     min_lead: NonNegativeFloat = 0.07
     """By how much a motion's share that agrees, less the share that contradicts, has to lead that of others:
     where two fit alike, as in a square yard, neither is accepted."""
-    sigma_rad: NonNegativeFloat = 0.002
+    sigma_rad: NonNegativeFloat = 0.001
     """Error of the rotation that all points share: of deskewing, calibration and voxels."""
-    sigma_m: NonNegativeFloat = 0.03
+    sigma_m: NonNegativeFloat = 0.015
     """Error of the translation that all points share."""
 
 

@@ -179,12 +179,12 @@ def test_two_scans_of_one_place_give_their_relative_pose_both_ways(yaw_rad):
         found = verified(a, b)
         assert found.reason == ""
         miss = discrepancy(found.T_i_j, a, b)
-        assert miss.translation_m < 0.1
-        assert miss.rotation_rad < 0.01
+        assert miss.translation_m < 0.05
+        assert miss.rotation_rad < 0.003
         assert 0 < found.inliers <= found.matches
         sigma_m = np.linalg.inv(found.information)[3:, 3:].diagonal() ** 0.5
-        assert (sigma_m > 0.03).all()
-        assert (sigma_m < 0.1).all()
+        assert (sigma_m > 0.015).all()
+        assert (sigma_m < 0.05).all()
 
 
 def test_obstacles_in_free_space_contradict():
