@@ -1,5 +1,6 @@
 """ISVD odometry: each frame registered against several earlier ones (Somlyai, PhD thesis, alg. 7)."""
 
+import math
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -314,9 +315,15 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         elif not (self._view_differences(tracked, self._keyframes) < _NEW_VIEW).any():
             self._keyframes.append(_kept(tracked))
         nearest = candidates[0].alignment if candidates else None
+        # All rest on this frame's features. Were the earlier ones' the same, too, each factor would have its
+        # share of the information, were they others, all: it has the geometric mean.
+        shared_by = math.sqrt(max(len(candidates), 1))
         factors = tuple(
             BetweenFactor(
-                candidate.earlier.node, node, candidate.alignment.T_target_source, candidate.information
+                candidate.earlier.node,
+                node,
+                candidate.alignment.T_target_source,
+                candidate.information / shared_by,
             )
             for candidate in candidates
         )

@@ -137,6 +137,16 @@ def test_far_views_are_no_partners():
     assert 0.2 < reach_m < 1.3  # 0.6 of the wall's 2 m, and a step
 
 
+def test_factors_of_one_frame_share_the_information_of_its_features():
+    one, four = (
+        follow(IsvdOdometry(config(previous_frames=previous, earlier="frames")), Wall(1), path(6))[-1].factors
+        for previous in (1, 4)
+    )
+
+    assert (len(one), len(four)) == (1, 4)
+    np.testing.assert_allclose(four[0].information, one[0].information / 2.0)
+
+
 def test_weighted_mean_is_equation_4_1s():
     wall, poses = Wall(2), path(6)
     odometry = IsvdOdometry(config(**PUBLISHED, rotation="mean"))
