@@ -5,6 +5,7 @@ from mapper.core.errors import GraphError
 from mapper.core.geometry import exp, inverse, transform
 from mapper.graph.config import GraphConfig
 from mapper.graph.incremental import IncrementalSolver
+from mapper.graph.marginals import marginals_of
 from mapper.graph.model import BetweenFactor, PoseGraph, PoseSigmas
 from mapper.graph.optimize import optimize
 
@@ -169,3 +170,26 @@ def test_what_does_not_belong_is_refused():
         solver.add_factors([BetweenFactor(1, 9, np.eye(4), np.eye(6))])
     with pytest.raises(GraphError, match="node 9 is not in the graph"):
         solver.pose_of(9)
+
+
+ABSURD = [np.diag([1e25, 1e-25, 1.0, 1e25, 1e-25, 1.0]), 1e300 * np.eye(6)]
+
+
+@pytest.mark.parametrize("information", ABSURD)
+def test_absurd_information_is_one_line_and_no_exception_of_gtsam(information):
+    solver, graph = IncrementalSolver(), PoseGraph()
+    for node in range(3):
+        solver.add_node(node, np.eye(4))
+        graph.add_node(node, node, np.eye(4))
+    factors = [BetweenFactor(0, 1, np.eye(4), np.eye(6)), BetweenFactor(1, 2, np.eye(4), information)]
+    solver.add_factors(factors)
+    graph.add_factors(factors)
+
+    with pytest.raises(GraphError, match="the growing graph cannot be solved: Indeterminate") as growing:
+        solver.update()
+    with pytest.raises(GraphError, match="covariances of 3 nodes from node 0: Indeterminate") as known:
+        marginals_of(graph)
+    for caught in (growing, known):
+        assert "\n" not in str(caught.value)
+    for T_world_node in optimize(graph, GraphConfig()).T_world_node.values():  # needs no more than damping
+        np.testing.assert_allclose(T_world_node, np.eye(4), atol=1e-9)
