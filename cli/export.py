@@ -41,12 +41,17 @@ def export(
     """
     from mapper.config.loading import overridden
     from mapper.export.exporters import export as export_run
-    from mapper.merging.merged_map import open_map
     from mapper.run.folder import MapFolder, moved_log, open_run
     from mapper.run.manifest import is_merged_map
 
     prepare_libraries()
-    built: MapFolder = open_map(run) if is_merged_map(run) else open_run(run)
+    built: MapFolder
+    if is_merged_map(run):
+        from mapper.merging.merged_map import open_map
+
+        built = open_map(run)
+    else:
+        built = open_run(run)
     if log:
         built = moved_log(open_run(run), *log)
     changes = merged(assignments({"octomap.level": level}), set_)

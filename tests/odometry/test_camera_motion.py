@@ -53,7 +53,9 @@ def motion_of(
         observation, measured=measured, weights=np.ones((len(now), 3)), sensor_weights=np.ones((len(now), 3))
     )
     counts = np.repeat(observers, [len(still), len(moved)])
-    return camera_motion(np.eye(4), points, observation, np.arange(len(points)), counts)
+    return camera_motion(
+        np.eye(4), points, observation, np.arange(len(points)), counts, observation.sensor_weights
+    )
 
 
 def miss_m(motion: CameraMotion) -> float:
@@ -83,7 +85,7 @@ def test_mismatches_are_no_other_motion(observation):
         weights=np.ones((230, 3)),
         sensor_weights=np.ones((230, 3)),
     )
-    motion = camera_motion(np.eye(4), points, mixed, np.arange(230), np.full(230, 2))
+    motion = camera_motion(np.eye(4), points, mixed, np.arange(230), np.full(230, 2), mixed.weights)
     assert miss_m(motion) < 0.01
     assert not motion.moving.any()
     assert not motion.doubts

@@ -78,3 +78,12 @@ def test_without_older_keyframes_nothing_is_known(odometry, earlier_depth):
     early = replace(pose.observation, stamp_ns=origin_ns + 100_000_000)
     assert not earlier_depth.moved(early, pose.T_camera_world, pose.reference).any()
     assert earlier_depth.displacement(early, pose.T_camera_world, pose.reference).ratio == 0.0
+
+
+def test_the_depths_noise_counts_only_while_many_features_have_moved(odometry):
+    observation = odometry._last.observation
+    moved = np.zeros(len(observation), np.bool_)
+    moved[: len(moved) // 30] = True
+    assert observation.weights_among(moved) is observation.weights
+    moved[: len(moved) // 10] = True
+    assert observation.weights_among(moved) is observation.sensor_weights

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Points, Transform
+from mapper.core.geometry import Array, Points, Transform
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.pose_tracker import refined
 from mapper.registration.reprojection import classify
@@ -49,6 +49,7 @@ def camera_motion(
     observation: ImageObservation,
     features: NDArray[np.integer],
     observers: NDArray[np.integer],
+    weights: Array,
 ) -> CameraMotion:
     """Return the pose that established landmarks agree with, unless a wider part of the scene contradicts.
 
@@ -61,16 +62,17 @@ def camera_motion(
         observation: The frame.
         features: (M,) the feature of each point.
         observers: (M,) number of keyframes that observe each point, 0 for those that are no landmarks.
+        weights: (N, 3) inverse variances of the frame's features by which pairs agree.
     """
-    T_found, agree = refined_by_established(T_camera_world, points_world, observation, features, observers)
+    T_found, agree = refined_by_established(
+        T_camera_world, points_world, observation, features, observers, weights
+    )
     only_motion = CameraMotion(T_found, agree, np.zeros(len(features), np.bool_))
     least = max(_LEAST_OTHERS, _LEAST_OTHER_RATIO * len(features))
     if (~agree).sum() < least:
         return only_motion
-    T_other, _ = refined(
-        T_camera_world, points_world[~agree], observation, features[~agree], observation.sensor_weights
-    )
-    agree_other = agreeing(T_other, points_world, observation, features)
+    T_other, _ = refined(T_camera_world, points_world[~agree], observation, features[~agree], weights)
+    agree_other = agreeing(T_other, points_world, observation, features, weights)
     if (agree_other & ~agree).sum() < least:
         return only_motion
     spread_m = _spread_m(points_world[agree & ~agree_other])
@@ -91,6 +93,7 @@ def refined_by_established(
     observation: ImageObservation,
     features: NDArray[np.integer],
     observers: NDArray[np.integer],
+    weights: Array,
 ) -> tuple[Transform, NDArray[np.bool_]]:
     """Return the refined T_camera_world and which pairs agree with it, as established landmarks see it.
 
@@ -105,16 +108,14 @@ def refined_by_established(
             points_world[is_established],
             observation,
             features[is_established],
-            observation.sensor_weights,
+            weights,
         )
         if agree.sum() >= _MIN_KEPT_RATIO * len(agree):
-            agree = agreeing(T_found, points_world, observation, features)
-            T_found, _ = refined(
-                T_found, points_world[agree], observation, features[agree], observation.sensor_weights
-            )
-            return T_found, agreeing(T_found, points_world, observation, features)
-    T_found, _ = refined(T_camera_world, points_world, observation, features, observation.sensor_weights)
-    return T_found, agreeing(T_found, points_world, observation, features)
+            agree = agreeing(T_found, points_world, observation, features, weights)
+            T_found, _ = refined(T_found, points_world[agree], observation, features[agree], weights)
+            return T_found, agreeing(T_found, points_world, observation, features, weights)
+    T_found, _ = refined(T_camera_world, points_world, observation, features, weights)
+    return T_found, agreeing(T_found, points_world, observation, features, weights)
 
 
 def agreeing(
@@ -122,6 +123,7 @@ def agreeing(
     points_world: Points,
     observation: ImageObservation,
     features: NDArray[np.integer],
+    weights: Array,
 ) -> NDArray[np.bool_]:
     """Return (M,) which points lie where their features are, by the 95 % test of χ²."""
     agree = np.empty(len(features), np.bool_)
@@ -129,7 +131,7 @@ def agreeing(
         T_camera_world,
         points_world,
         observation.measured[features],
-        observation.sensor_weights[features],
+        weights[features],
         observation.intrinsics,
         agree,
     )

@@ -8,6 +8,7 @@ import numpy as np
 
 from mapper.core.geometry import Array, Transform, inverse, log
 from mapper.odometry.local_map.earlier_depth import Displacement
+from mapper.odometry.local_map.image_observation import FEW_MOVING
 from mapper.odometry.local_map.pose_tracker import TrackedPose
 
 _MEMORY = 100
@@ -26,8 +27,6 @@ _SUPPORT_AGREEMENT, _SUPPORT_RATIO = 0.85, 2.0
 """A jump is believed if the agreement is at least this share of the usual, and the uncertainty at most this
 multiple, and nothing in view moves by itself: fast motions are real."""
 
-_FEW_MOVING = 0.05
-"""Share of the features below which nothing moves by itself: depths at edges look like it."""
 _MOST_DISPLACED = 0.4
 """When a larger share of the surfaces that two images have in common lies elsewhere, the pose is doubtful: a
 real desk's edges give up to 0.35 under right poses, a passer-by's pose more in every second frame."""
@@ -102,7 +101,7 @@ class FrameDoubts:
         is_supported = (
             agreement >= _SUPPORT_AGREEMENT * usual_agreement
             and sigma_m <= _SUPPORT_RATIO * usual_m
-            and len(tracked_pose.moving) <= _FEW_MOVING * len(tracked_pose.observation)
+            and len(tracked_pose.moving) <= FEW_MOVING * len(tracked_pose.observation)
         )
         if not is_supported:
             phrases += self._jumps(jump, elapsed_s)

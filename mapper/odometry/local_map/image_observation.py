@@ -23,6 +23,8 @@ from mapper.sensing.config import KINECT_NOISE
 from mapper.sensing.depth_noise import depth_sigma_m, feature_depth_m, feature_depth_sigma_m
 
 _MIN_DEPTH_M = 0.05
+FEW_MOVING = 0.05
+"""Share of the features below which nothing moves by itself: depths at edges look like it."""
 _SCALE_ERROR = 0.02
 """Error of depths beside the sensor's noise, as a share: its scale, and the slope where a feature lies."""
 
@@ -88,6 +90,14 @@ class ImageObservation(Archivable):
             field.name: getattr(self, field.name) for field in fields(self) if field.name not in _DERIVED
         }
         return _unswept, (measured, not np.isnan(self.measured[:, 2]).all())
+
+    def weights_among(self, moved: NDArray[np.bool_]) -> Array:
+        """Return the (N, 3) inverse variances that tell which features agree on a motion.
+
+        Args:
+            moved: (N,) features that move by themselves. Among many of them the depth tells still ones apart.
+        """
+        return self.sensor_weights if moved.sum() > FEW_MOVING * len(self) else self.weights
 
     def swept(self, sweep_camera: Array) -> "ImageObservation":
         """Return the observation with the shift of each row by another motion of the camera taken out."""

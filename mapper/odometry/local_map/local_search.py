@@ -95,7 +95,12 @@ class LocalSearch:
         if len(features) < config.min_inliers:
             return None
         T_camera_world, agree = refined_by_established(
-            T_camera_world, landmarks["position"][ids], observation, features, landmarks["observers"][ids]
+            T_camera_world,
+            landmarks["position"][ids],
+            observation,
+            features,
+            landmarks["observers"][ids],
+            observation.weights_among(moved),
         )
         T_camera_world, _ = refined(
             T_camera_world, landmarks["position"][ids[agree]], observation, features[agree]

@@ -66,7 +66,9 @@ class MotionPoseTracker:
         best, other = (a, b) if a.inliers >= b.inliers else (b, a)
         features = np.flatnonzero(other.landmark_of_feature >= 0)
         positions_world = self._map.landmarks["position"][other.landmark_of_feature[features]]
-        agree = agreeing(best.T_camera_world, positions_world, best.observation, features)
+        agree = agreeing(
+            best.T_camera_world, positions_world, best.observation, features, best.observation.weights
+        )
         if len(features) < _RIVAL_RATIO * best.inliers or agree.mean() >= _SAME_RATIO:
             return best
         doubt = f"{len(features)} features show another pose than these {best.inliers}"
@@ -107,6 +109,7 @@ class MotionPoseTracker:
             observation,
             feature[hits],
             np.where(landmark[hits] >= 0, self._map.landmarks["observers"][landmark[hits]], 0),
+            observation.weights_among(moved),
         )
         agree = motion.agree
         if agree.sum() < self._config.min_matches // 2:
