@@ -53,12 +53,13 @@ def test_doubts_are_measured_against_what_is_usual(frames, odometry):
     pose = odometry._last
     step_ns = 33_000_000
 
-    def assess(k, *, moved_m=0.001, agreement=0.95, sigma_m=0.001, displaced=NOT_DISPLACED):
+    def assess(k, *, moved_m=0.001, agreement=0.95, sigma_m=0.001, displaced=NOT_DISPLACED, moving=0):
         now = replace(
             pose,
             observation=replace(pose.observation, stamp_ns=k * step_ns, pixels=pose.observation.pixels + k),
             T_camera_world=exp(np.zeros(3), np.array([moved_m, 0.0, 0.0])) @ pose.T_camera_world,
             agreement=agreement,
+            moving=np.arange(moving),
         )
         last = replace(pose, observation=replace(pose.observation, stamp_ns=(k - 1) * step_ns))
         covariance = np.diag([1e-6] * 3 + [sigma_m**2] * 3)
@@ -74,6 +75,9 @@ def test_doubts_are_measured_against_what_is_usual(frames, odometry):
     doubt = assess(34, displaced=Displacement(0.6, 0.15, 0.4))
     assert doubt.phrases == ("60% of the surfaces lie elsewhere than 0.4 s before",)
     assert doubt.sigma_m == pytest.approx(0.15)
+    assert not assess(35, displaced=Displacement(0.45, 0.15, 0.4)).phrases
+    doubt = assess(36, displaced=Displacement(0.45, 0.15, 0.4), moving=100)
+    assert doubt.phrases == ("45% of the surfaces lie elsewhere than 0.4 s before",)
 
 
 def test_factors_of_a_doubtful_keyframe_tell_less(frames, odometry):
