@@ -102,7 +102,7 @@ def test_a_solve_is_not_made_twice(desk_log, desk_run, tmp_path, monkeypatch):
         stopped(desk_log, out)
     with monkeypatch.context() as patched:
         patched.setattr("mapper.pipeline.build.track_log", None)
-        patched.setattr("mapper.pipeline.build.fuse_into", lambda *_, **__: (_ for _ in ()).throw(Stopped()))
+        patched.setattr("mapper.pipeline.fuse.fuse_into", lambda *_, **__: (_ for _ in ()).throw(Stopped()))
         stopped(desk_log, out)
         patched.setattr("mapper.pipeline.build.solve", None)
         stopped(desk_log, out)
