@@ -7,7 +7,9 @@ is verified does not grow with the number of sessions: at most 300 pairs of plac
 """
 
 import argparse
+from collections.abc import Callable
 from time import process_time
+from typing import TypeVar
 
 import numpy as np
 
@@ -15,6 +17,8 @@ from mapper.places.config import ScanContextConfig
 from mapper.places.index import PlaceIndex
 from mapper.places.scan_context import ScanContexts, scan_context
 from mapper.places.vocabulary import load_vocabulary
+
+Place = TypeVar("Place")
 
 _WORDS_PER_IMAGE = 1000
 _POINTS_PER_SCAN = 4000
@@ -39,43 +43,50 @@ def main() -> None:
 
 
 def _images(steps: list[int], keyframes: int) -> list[tuple[float, float]]:
-    """Return the seconds of all queries, and of one of the last session, after so many sessions."""
+    """Return ``_query_times`` of images."""
     rng, vocabulary = np.random.default_rng(0), load_vocabulary()
-    index, total_s, result = PlaceIndex(vocabulary), 0.0, []
-    for session in range(max(steps)):
-        vectors = [
-            vocabulary.vector(rng.integers(0, vocabulary.words, _WORDS_PER_IMAGE).astype(np.int32))
-            for _ in range(keyframes)
-        ]
-        start_s = process_time()
-        for vector in vectors:
-            index.query(vector, min_similarity=0.32, min_deviations=3.0, limit=_MOST_SIMILAR)
-        spent_s = process_time() - start_s
-        total_s += spent_s
-        for number, vector in enumerate(vectors):
-            index.add(session * keyframes + number, vector)
-        if session + 1 in steps:
-            result.append((total_s, spent_s / keyframes))
-    return result
+    index = PlaceIndex(vocabulary)
+    return _query_times(
+        steps,
+        keyframes,
+        lambda: vocabulary.vector(rng.integers(0, vocabulary.words, _WORDS_PER_IMAGE).astype(np.int32)),
+        lambda vector: index.query(vector, min_similarity=0.32, min_deviations=3.0, limit=_MOST_SIMILAR),
+        index.add,
+    )
 
 
 def _scans(steps: list[int], keyframes: int) -> list[tuple[float, float]]:
-    """Return the same for scans."""
+    """Return ``_query_times`` of scans."""
     rng, config = np.random.default_rng(0), ScanContextConfig()
-    index, total_s, result = ScanContexts(config), 0.0, []
+    spread = np.array([config.reach_m / 2.0, config.reach_m / 2.0, 3.0])
+    index = ScanContexts(config)
+    return _query_times(
+        steps,
+        keyframes,
+        lambda: scan_context(np.abs(rng.normal(0.0, 1.0, (_POINTS_PER_SCAN, 3))) * spread, config),
+        lambda context: index.query(context, np.ones(len(index), np.bool_), limit=_MOST_SIMILAR),
+        index.add,
+    )
+
+
+def _query_times(
+    steps: list[int],
+    keyframes: int,
+    describe: Callable[[], Place],
+    query: Callable[[Place], object],
+    add: Callable[[int, Place], object],
+) -> list[tuple[float, float]]:
+    """Return the seconds of all queries, and of one of the last session, after so many sessions."""
+    total_s, result = 0.0, []
     for session in range(max(steps)):
-        spread = np.array([config.reach_m / 2.0, config.reach_m / 2.0, 3.0])
-        contexts = [
-            scan_context(np.abs(rng.normal(0.0, 1.0, (_POINTS_PER_SCAN, 3))) * spread, config)
-            for _ in range(keyframes)
-        ]
+        places = [describe() for _ in range(keyframes)]
         start_s = process_time()
-        for context in contexts:
-            index.query(context, np.ones(len(index), np.bool_), limit=_MOST_SIMILAR)
+        for place in places:
+            query(place)
         spent_s = process_time() - start_s
         total_s += spent_s
-        for number, context in enumerate(contexts):
-            index.add(session * keyframes + number, context)
+        for number, place in enumerate(places):
+            add(session * keyframes + number, place)
         if session + 1 in steps:
             result.append((total_s, spent_s / keyframes))
     return result
