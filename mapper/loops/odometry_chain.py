@@ -12,6 +12,7 @@ from mapper.graph.model import BetweenFactor
 from mapper.loops.closure import Discrepancy
 from mapper.loops.config import GateConfig
 
+_FIRST_CAPACITY = 1024
 _MAX_STEP_M, _MAX_STEP_RAD = 1.0, 0.5
 """Largest standard deviations of an odometry's step: a motion that surfaces leave open is still predicted."""
 
@@ -74,8 +75,8 @@ class OdometryChain:
 
     def __init__(self) -> None:
         self._edges: dict[int, list[tuple[int, _Edge]]] = {}
-        self._ends_i: list[int] = []
-        self._ends_j: list[int] = []
+        self._component = np.arange(_FIRST_CAPACITY)  # of each node: the number of one in it
+        self._members: dict[int, list[int]] = {}  # of components of more than one node
 
     def add(self, factors: Iterable[BetweenFactor]) -> None:
         """Add factors between nodes."""
@@ -83,20 +84,32 @@ class OdometryChain:
             edge = _edge(factor)
             self._edges.setdefault(factor.i, []).append((factor.j, edge))
             self._edges.setdefault(factor.j, []).append((factor.i, edge))
-            self._ends_i.append(factor.i)
-            self._ends_j.append(factor.j)
+            self._connect(factor.i, factor.j)
+
+    def _connect(self, i: int, j: int) -> None:
+        """Make the components of two nodes one: the smaller takes on the larger one's number."""
+        self._make_room(max(i, j))
+        a, b = int(self._component[i]), int(self._component[j])
+        if a == b:
+            return
+        members_a, members_b = (self._members.pop(of, [of]) for of in (a, b))
+        if len(members_a) < len(members_b):
+            a, members_a, members_b = b, members_b, members_a
+        self._component[members_b] = a
+        members_a += members_b
+        self._members[a] = members_a
+
+    def _make_room(self, node: int) -> None:
+        """Let every node up to this one have a component, its own to begin with."""
+        while (size := len(self._component)) <= node:
+            self._component = np.concatenate([self._component, np.arange(size, 2 * size)])
 
     def connected(self, node: int, others: Sequence[int]) -> NDArray[np.bool_]:
         """Return which of (N,) other nodes a path connects to a node."""
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components  # takes half a second
-
-        ends = np.array([self._ends_i, self._ends_j], np.intp)
-        size = 1 + max(node, *others, int(ends.max(initial=0)))
-        _, labels = connected_components(
-            coo_array((np.ones(ends.shape[1], np.int8), tuple(ends)), shape=(size, size)), directed=False
-        )
-        connected: NDArray[np.bool_] = labels[np.array(others, np.intp)] == labels[node]
+        asked = np.array([node, *others], np.intp)
+        self._make_room(int(asked.max()))
+        component = self._component[asked]
+        connected: NDArray[np.bool_] = component[1:] == component[0]
         return connected
 
     def between(self, a: int, b: int) -> Drift | None:

@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from mapper.core.errors import DataError, RunError
 from mapper.core.geometry import exp, inverse, log, transform
@@ -160,6 +162,18 @@ def test_connected_nodes_are_those_with_a_path():
     assert chain.connected(40, []).tolist() == []
     chain.add([BetweenFactor(21, 2, at(1.0), SURE, "loop")])
     assert chain.connected(0, [3, 20, 21, 40]).tolist() == [True, True, True, False]
+
+
+@pytest.mark.parametrize("edges", [100, 1500, 4000])
+def test_parts_may_grow_together_in_any_order(edges):
+    rng = np.random.default_rng(edges)
+    ends = np.array([rng.choice(3000, 2, replace=False) for _ in range(edges)])
+    chain = OdometryChain()
+    for i, j in ends.tolist():
+        chain.add([BetweenFactor(i, j, at(1.0), SURE)])
+    _, labels = connected_components(coo_array((np.ones(edges), tuple(ends.T)), shape=(3000, 3000)))
+    for node in rng.integers(0, 3000, 20).tolist():
+        assert chain.connected(node, range(3000)).tolist() == (labels == labels[node]).tolist()
 
 
 def test_around_a_node_lie_those_within_reach():
