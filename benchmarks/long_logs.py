@@ -6,7 +6,8 @@
 "rgbd" walks through a building that is as large as the log is long, "lidar" drives along a street. Frames are
 simulated in other threads as they are read, so that no log is in memory or on the disk. A row stands for a
 tenth of the frames: resident memory at its end, beyond that before the first frame; CPU milliseconds a frame
-in the thread that tracks, searches loops and takes checkpoints; size of the checkpoints on the disk.
+in the thread that tracks, searches loops and takes checkpoints; CPU milliseconds a frame for checkpoints, in
+that thread and in the one that writes them; size of the checkpoints on the disk.
 """
 
 import argparse
@@ -16,12 +17,16 @@ import tempfile
 import time
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from mapper.config.loading import load_config
 from mapper.pipeline.build import build
+from mapper.pipeline.tracking_checkpoints import TrackingCheckpoints
 from mapper.run import files
 from mapper.run.observers import NullObserver, Step
+from mapper.runtime.archive import Archive
 from mapper.runtime.atomic import partial_of
+from mapper.runtime.journal import Journal, StateFile
 from mapper.simulation import CameraSimulator
 from mapper.simulation.config import LidarSensorConfig, LidarSynthConfig, SynthConfig
 from mapper.simulation.lidar import LidarSimulator
@@ -37,14 +42,47 @@ class Enough(KeyboardInterrupt):
     """All frames are tracked; what follows is of no interest here."""
 
 
+class Clock:
+    """CPU seconds that functions took in whatever thread called them."""
+
+    def __init__(self, *methods: tuple[type, str]) -> None:
+        self._spent_s = dict.fromkeys(methods, 0.0)
+        for method in methods:
+            self._measure(method)
+
+    def _measure(self, method: tuple[type, str]) -> None:
+        owner, name = method
+        function = getattr(owner, name)
+
+        def measured(*arguments: Any, **settings: Any) -> Any:
+            began_s = time.thread_time()
+            try:
+                return function(*arguments, **settings)
+            finally:
+                self._spent_s[method] += time.thread_time() - began_s
+
+        setattr(owner, name, measured)
+
+    @property
+    def seconds(self) -> float:
+        """Sum over the functions."""
+        return sum(self._spent_s.values())
+
+
 class Meter(NullObserver):
     """Prints a row for every so many frames that are tracked."""
 
     def __init__(self, out: Path, frames: int) -> None:
         self._checkpoints, self._frames = partial_of(out) / files.CHECKPOINTS, frames
         self._done = self._keyframes = 0
-        self._cpu_s, self._before = time.thread_time(), resident_bytes()
-        print(f"{'frames':>7} {'keyframes':>9} {'memory MB':>9} {'ms/frame':>8} {'checkpoints MB':>14}")
+        self._cpu_s, self._checkpoints_s, self._before = time.thread_time(), 0.0, resident_bytes()
+        self._clock = Clock(
+            (TrackingCheckpoints, "add"), (Archive, "release"), (Journal, "write"), (StateFile, "write")
+        )
+        print(
+            f"{'frames':>7} {'keyframes':>9} {'memory MB':>9} {'ms/frame':>8} {'checkpoints: ms/frame':>21} "
+            f"{'MB':>7}"
+        )
 
     def on_frame(self, step: Step) -> None:
         """Count a frame."""
@@ -54,9 +92,11 @@ class Meter(NullObserver):
         if self._done % every == 0:
             now_s, memory = time.thread_time(), resident_bytes() - self._before
             ms, self._cpu_s = 1e3 * (now_s - self._cpu_s) / every, now_s
-            on_disk = size_of(self._checkpoints)
+            spent_s = self._clock.seconds
+            checkpoints_ms, self._checkpoints_s = 1e3 * (spent_s - self._checkpoints_s) / every, spent_s
             print(
-                f"{self._done:7d} {self._keyframes:9d} {memory / MB:9.0f} {ms:8.1f} {on_disk / MB:14.1f}",
+                f"{self._done:7d} {self._keyframes:9d} {memory / MB:9.0f} {ms:8.1f} {checkpoints_ms:21.2f} "
+                f"{size_of(self._checkpoints) / MB:7.1f}",
                 flush=True,
             )
         if self._done >= self._frames:

@@ -5,6 +5,7 @@ path comes back. Each is one record of a journal, which checkpoints refer to.
 """
 
 from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from typing import Any
 
@@ -110,7 +111,7 @@ def unpack(record: bytes) -> bytes:
 
 
 def size_of(data: Any) -> int:
-    """Return the bytes of the arrays in a dataclass and in the dataclasses that it is made of."""
+    """Return the bytes of the arrays in a dataclass, and in the dataclasses and mappings in it."""
     arrays: dict[int, int] = {}
     parts = [data]
     while parts:
@@ -119,4 +120,6 @@ def size_of(data: Any) -> int:
             arrays[id(part)] = part.nbytes
         elif is_dataclass(part):
             parts += [getattr(part, field.name) for field in fields(part)]
+        elif isinstance(part, Mapping):
+            parts += part.values()
     return sum(arrays.values())

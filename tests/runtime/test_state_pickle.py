@@ -9,7 +9,6 @@ import pytest
 from mapper.core.errors import DataError
 from mapper.core.frames import PinholeCamera, Scan
 from mapper.loops.scan_context_proposer import ScanPlace
-from mapper.odometry.local_map.growing_table import GrowingTable
 from mapper.odometry.local_map.log_residuals import LogResiduals
 from mapper.runtime.archived import Archivable, archived
 from mapper.runtime.state_pickle import dumps, fixed_parts, loads
@@ -85,15 +84,6 @@ def test_archived_data_is_referred_to_and_other_data_is_a_part_of_the_state():
 def test_without_an_archive_a_reference_comes_back_with_its_data():
     copy = loads(dumps(archived(Scan(5, np.zeros((2, 3), np.float32)))))
     assert copy.data.stamp_ns == 5
-
-
-def test_a_growing_table_comes_back_with_its_rows_and_grows_on():
-    table = GrowingTable(id=((), np.int32), point=((3,), np.float64))
-    table.append(5, id=np.arange(5), point=1.5)
-    copy = loads(dumps(table))
-    assert len(dumps(table)) < 1000
-    assert copy.append(2, id=7, point=2.0).tolist() == [5, 6]
-    assert copy["id"][: copy.size].tolist() == [0, 1, 2, 3, 4, 7, 7]
 
 
 def test_data_of_mapper_comes_back():

@@ -1,11 +1,11 @@
 """Keyframe of the local map, and what was observed in the last ones that were used."""
 
 from collections import OrderedDict
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, inverse
 from mapper.odometry.local_map.image_observation import ImageObservation
@@ -40,7 +40,6 @@ class Keyframe:
         unswept: Its features, before any motion is taken out.
         sweep_camera: (6,) motion of the camera while the rows were read, as it is known now.
         T_camera_world: (4, 4) current estimate.
-        landmark_of_feature: (N,) int32 landmark of each feature, −1 for none.
         origin: First keyframe of its sub-map; sub-maps are not connected to each other.
         twist_camera: (6,) velocity of the camera in its own axes, rad/s and m/s; 0 if it is unknown.
         depth_link: Pose relative to an earlier keyframe by depth; None if the landmarks were many.
@@ -53,7 +52,6 @@ class Keyframe:
     unswept: Archived[ImageObservation]
     sweep_camera: Array
     T_camera_world: Transform
-    landmark_of_feature: NDArray[np.int32]
     origin: int
     twist_camera: Array
     depth_link: DepthLink | None = None
@@ -64,6 +62,26 @@ class Keyframe:
     def body_pose(self) -> Transform:
         """(4, 4) T_world_body, as it is estimated now."""
         return inverse(self.T_body_camera @ self.T_camera_world)
+
+
+def packed(keyframes: Sequence[Keyframe]) -> dict[str, Any]:
+    """Return keyframes by attributes, those of arrays as one array if that keeps their layout."""
+    columns = {
+        field.name: [getattr(keyframe, field.name) for keyframe in keyframes] for field in fields(Keyframe)
+    }
+    return {
+        name: np.array(column) if column and all(map(_is_plain, column)) else column
+        for name, column in columns.items()
+    }
+
+
+def _is_plain(value: object) -> bool:
+    return isinstance(value, np.ndarray) and value.flags.c_contiguous
+
+
+def unpacked(columns: Mapping[str, Any]) -> list[Keyframe]:
+    """Return the keyframes that ``packed`` was given."""
+    return [Keyframe(*values) for values in zip(*columns.values(), strict=True)]
 
 
 class RecentObservations:

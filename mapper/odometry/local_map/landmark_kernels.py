@@ -4,6 +4,7 @@ import numpy as np
 from numba import njit
 
 from mapper.core.linear import turned
+from mapper.odometry.local_map.paging_kernels import PAGE_BITS, row_of
 
 MIN_DEPTH_M = 0.1
 MIN_VIEW_COSINE = 0.5
@@ -11,74 +12,77 @@ MIN_VIEW_COSINE = 0.5
 
 
 @njit(cache=True, nogil=True)
-def count_observers(landmarks, newest, older, keyframe_of, keyframes):
-    """Return (keyframes,) int64, how many of the landmarks each keyframe observes.
+def count_observers(newest, keyframes, older, keyframe_of, slot_of, used, now):
+    """Return the page that is missing, −1 if none, and (keyframes,) int64 how many landmarks each observes.
 
     Args:
-        landmarks: (M,) int32 ids.
-        newest: (L,) int32: each landmark's newest observation, −1 for none.
-        older: (E,) int32: each observation's predecessor of the same landmark, −1 for none.
-        keyframe_of: (E,) int32, −1 where an observation was removed.
+        newest: (M,) int32: each landmark's newest observation, −1 for none.
         keyframes: Number of keyframes.
+        older: Column of each observation's predecessor of the same landmark, −1 for none.
+        keyframe_of: Column, −1 where an observation was removed.
+        slot_of: As for ``row_of``.
+        used: As for ``row_of``.
+        now: As for ``row_of``.
     """
     counts = np.zeros(keyframes, np.int64)
-    for landmark in landmarks:
-        e = newest[landmark]
+    for e in newest:
         while e >= 0:
-            if keyframe_of[e] >= 0:
-                counts[keyframe_of[e]] += 1
-            e = older[e]
-    return counts
+            row = row_of(e, slot_of, used, now)
+            if row < 0:
+                return e >> PAGE_BITS, counts
+            if keyframe_of[row] >= 0:
+                counts[keyframe_of[row]] += 1
+            e = older[row]
+    return -1, counts
 
 
 @njit(cache=True, nogil=True)
-def observations_of(landmarks, newest, older, keyframe_of):
-    """Return (M + 1,) int32 group starts and (E,) int32 observations, grouped by landmark."""
-    total = 0
-    for landmark in landmarks:
-        e = newest[landmark]
-        while e >= 0:
-            total += keyframe_of[e] >= 0
-            e = older[e]
-    first = np.zeros(len(landmarks) + 1, np.int32)
-    observations = np.empty(total, np.int32)
+def observations_of(newest, older, keyframe_of, slot_of, used, now):
+    """Return the page that is missing, −1 if none, and the observations grouped by landmark.
+
+    They are (M + 1,) int32 group starts and (E,) int32 ids; arguments as for ``count_observers``.
+    """
+    first = np.zeros(len(newest) + 1, np.int32)
+    observations = np.empty(4 * len(newest), np.int32)
     k = 0
-    for m in range(len(landmarks)):
-        e = newest[landmarks[m]]
+    for m in range(len(newest)):
+        e = newest[m]
         while e >= 0:
-            if keyframe_of[e] >= 0:
+            row = row_of(e, slot_of, used, now)
+            if row < 0:
+                return e >> PAGE_BITS, (first, observations)
+            if keyframe_of[row] >= 0:
+                if k == len(observations):
+                    observations = np.concatenate((observations, np.empty_like(observations)))
                 observations[k] = e
                 k += 1
-            e = older[e]
+            e = older[row]
         first[m + 1] = k
-    return first, observations
+    return -1, (first, observations[:k])
 
 
 @njit(cache=True, nogil=True)
-def project_visible(
-    landmarks, positions, directions, reach_m, T_camera_world, intrinsics, size_px, log_scale, octaves
-):
-    """Return the rows of ``landmarks`` that should be visible, their pixels (V, 2) and expected octaves (V,).
+def project_visible(positions, directions, reach_m, T_camera_world, intrinsics, size_px, log_scale, octaves):
+    """Return which landmarks should be visible (V,), their pixels (V, 2) and expected octaves (V,).
 
     Args:
-        landmarks: (M,) int32 ids.
-        positions: (L, 3) metres, world.
-        directions: (L, 3) sums of unit viewing directions, world.
-        reach_m: (L,) distance at which the landmark would be found in octave 0.
+        positions: (M, 3) metres, world.
+        directions: (M, 3) sums of unit viewing directions, world.
+        reach_m: (M,) distance at which the landmark would be found in octave 0.
         T_camera_world: (4, 4).
         intrinsics: (5,) fx, fy, cx, cy, bf.
         size_px: Image width and height.
         log_scale: Natural logarithm of the pyramid's scale factor.
         octaves: Number of the detector's octaves.
     """
-    rows = np.empty(len(landmarks), np.int32)
-    pixels = np.empty((len(landmarks), 2))
-    octave = np.empty(len(landmarks), np.int32)
+    rows = np.empty(len(positions), np.int32)
+    pixels = np.empty((len(positions), 2))
+    octave = np.empty(len(positions), np.int32)
     R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
     centre = -turned(R.T, t)
     n = 0
-    for m in range(len(landmarks)):
-        point = positions[landmarks[m]]
+    for m in range(len(positions)):
+        point = positions[m]
         x = R[0, 0] * point[0] + R[0, 1] * point[1] + R[0, 2] * point[2] + t[0]
         y = R[1, 0] * point[0] + R[1, 1] * point[1] + R[1, 2] * point[2] + t[1]
         z = R[2, 0] * point[0] + R[2, 1] * point[1] + R[2, 2] * point[2] + t[2]
@@ -90,11 +94,11 @@ def project_visible(
             continue
         d0, d1, d2 = point[0] - centre[0], point[1] - centre[1], point[2] - centre[2]
         distance = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
-        s = directions[landmarks[m]]
+        s = directions[m]
         length = np.sqrt(s[0] * s[0] + s[1] * s[1] + s[2] * s[2])
         if d0 * s[0] + d1 * s[1] + d2 * s[2] < MIN_VIEW_COSINE * distance * length:
             continue
-        level = np.ceil(np.log(reach_m[landmarks[m]] / distance) / log_scale - 0.5)
+        level = np.ceil(np.log(reach_m[m] / distance) / log_scale - 0.5)
         rows[n] = m
         pixels[n, 0], pixels[n, 1] = u, v
         octave[n] = min(max(int(level), 0), octaves - 1)

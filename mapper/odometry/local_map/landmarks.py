@@ -1,6 +1,7 @@
 """Local map: keyframes, landmarks, and the observations of landmarks in keyframes."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,10 +9,10 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array, Transform, adjoint, apply, inverse
 from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameter
 from mapper.odometry.local_map.focal_length import Bundle
-from mapper.odometry.local_map.growing_table import GrowingTable
 from mapper.odometry.local_map.image_observation import ImageObservation
-from mapper.odometry.local_map.keyframe import DepthLink, Keyframe, RecentObservations
+from mapper.odometry.local_map.keyframe import DepthLink, Keyframe, RecentObservations, packed, unpacked
 from mapper.odometry.local_map.landmark_kernels import count_observers, observations_of
+from mapper.odometry.local_map.paged_table import PagedTable
 from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.registration.reprojection import normal_matrix
 from mapper.registration.variance_factor import ResidualStatistics, residual_statistics
@@ -33,13 +34,14 @@ class LandmarkMap:
     """Map of keyframes and landmarks, refined together in windows.
 
     A landmark's observations form a linked list, newest first, so that adding one is cheap and compiled code
-    can traverse them without Python objects.
+    can traverse them without Python objects. Every feature of a keyframe has a row among the observations,
+    whether or not it is one of a landmark. What lies far behind is not in memory (``PagedTable``).
     """
 
     def __init__(self, *, scale_factor: float, readout: ReadoutTime) -> None:
         self.readout = readout
         self.keyframes: list[Keyframe] = []
-        self.landmarks = GrowingTable(
+        self.landmarks = PagedTable(
             position=((3,), np.float64),
             direction=((3,), np.float64),
             bits=((4,), np.uint64),
@@ -49,18 +51,33 @@ class LandmarkMap:
             found=((), np.int32),
             observers=((), np.int32),
         )
-        self._observations = GrowingTable(
+        self._observations = PagedTable(
+            landmark=((), np.int32),
             older=((), np.int32),
             keyframe=((), np.int32),
-            feature=((), np.int32),
             measured=((3,), np.float64),
             weights=((3,), np.float64),
             slope=((2,), np.float64),
+            readouts=((), np.int32),
         )
         self.scale_factor = scale_factor
         self._observed_with_s = readout.seconds
-        self._first_landmark: list[int] = []
+        self._readout_steps_s: list[float] = []  # observations tell how many of them they follow
+        self._first_landmark: list[int] = []  # of each keyframe
+        self._first_observation: list[int] = [0]  # of each keyframe, and of the next
         self._recent = RecentObservations()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the keyframes as a few arrays, since there are many."""
+        return {**vars(self), "keyframes": packed(self.keyframes)}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        vars(self).update(state, keyframes=unpacked(state["keyframes"]))
+
+    def step(self) -> None:
+        """Begin with the next frame: what was not used for some of them leaves the memory."""
+        self.landmarks.step()
+        self._observations.step()
 
     def observation(self, index: int) -> ImageObservation:
         """Return what was observed in a keyframe, by the readout time as it is known now.
@@ -125,49 +142,63 @@ class LandmarkMap:
                 unswept=archived(observation if observation.unswept is None else observation.unswept),
                 sweep_camera=observation.sweep_camera,
                 T_camera_world=T_camera_world,
-                landmark_of_feature=landmark_of_feature,
                 origin=origin,
                 twist_camera=twist_camera,
                 depth_link=link,
             )
         )
         self._recent.keep(index, observation)
-        self._link(index)
+        self._observations.append(
+            len(observation),
+            landmark=landmark_of_feature,
+            older=-1,
+            keyframe=-1,
+            measured=0.0,
+            weights=0.0,
+            slope=0.0,
+            readouts=len(self._readout_steps_s),
+        )
+        self._first_observation.append(self._observations.size)
+        self._link(index, landmark_of_feature)
         return index
 
-    def _link(self, index: int) -> None:
+    def _link(self, index: int, landmark_of_feature: Ids) -> None:
         keyframe = self.keyframes[index]
-        features = np.flatnonzero(keyframe.landmark_of_feature >= 0)
-        ids = keyframe.landmark_of_feature[features]
+        features = np.flatnonzero(landmark_of_feature >= 0)
+        ids = landmark_of_feature[features]
         centre_world = inverse(keyframe.T_camera_world)[:3, 3]
         ray = self.landmarks["position"][ids] - centre_world
         self.landmarks["observers"][ids] += 1
         self.landmarks["direction"][ids] += ray / np.linalg.norm(ray, axis=1, keepdims=True)
         observation = self.observation(index)
-        self.landmarks["newest"][ids] = self._observations.append(
-            len(features),
-            older=self.landmarks["newest"][ids],
-            keyframe=index,
-            feature=features,
-            measured=observation.measured[features],
-            weights=observation.weights[features],
-            slope=-observation.row_shift(
-                observation.pixels[features],
-                apply(keyframe.T_camera_world, self.landmarks["position"][ids])[:, 2],
-                keyframe.twist_camera,
-            ),
+        observations = self._first_observation[index] + features
+        self._observations["older"][observations] = self.landmarks["newest"][ids]
+        self._observations["keyframe"][observations] = index
+        self._observations["measured"][observations] = observation.measured[features]
+        self._observations["weights"][observations] = observation.weights[features]
+        self._observations["slope"][observations] = -observation.row_shift(
+            observation.pixels[features],
+            apply(keyframe.T_camera_world, self.landmarks["position"][ids])[:, 2],
+            keyframe.twist_camera,
         )
+        self.landmarks["newest"][ids] = observations
 
     def shared_counts(self, landmarks: Ids) -> NDArray[np.int64]:
         """Return (K,) how many of the landmarks each keyframe observes."""
-        counts: NDArray[np.int64] = count_observers(
-            landmarks,
-            self.landmarks["newest"],
-            self._observations["older"],
-            self._observations["keyframe"],
+        counts: NDArray[np.int64] = self._observations.follow(
+            count_observers,
+            self.landmarks["newest"][landmarks],
             len(self.keyframes),
+            columns=("older", "keyframe"),
         )
         return counts
+
+    def _observations_of(self, landmarks: Ids) -> tuple[Ids, Ids]:
+        """Return (M + 1,) group starts and (E,) observations, grouped by landmark."""
+        grouped: tuple[Ids, Ids] = self._observations.follow(
+            observations_of, self.landmarks["newest"][landmarks], columns=("older", "keyframe")
+        )
+        return grouped
 
     def latest(self, reference: int) -> list[int]:
         """Return a keyframe and then the newest ones, newest first."""
@@ -177,21 +208,33 @@ class LandmarkMap:
     def previous(self, index: int) -> int:
         """Return the keyframe before another one of the same sub-map, of which it is not the first."""
         origin = self.keyframes[index].origin
-        return max(k for k in range(index) if self.keyframes[k].origin == origin)
+        return next(k for k in reversed(range(index)) if self.keyframes[k].origin == origin)
+
+    def landmark_of_feature(self, index: int) -> Ids:
+        """Return the (N,) landmark of each feature of a keyframe, −1 for none."""
+        return self._landmarks_in([index])
 
     def landmarks_of(self, index: int) -> Ids:
         """Return the landmarks that a keyframe observes, in feature order."""
-        ids = self.keyframes[index].landmark_of_feature
+        ids = self._landmarks_in([index])
         return ids[ids >= 0]
 
-    def landmarks_of_any(self, keyframes: Iterable[int], *, except_for: Ids) -> Ids:
+    def landmarks_of_any(self, keyframes: Sequence[int], *, except_for: Ids) -> Ids:
         """Return, in increasing order, the landmarks that any of the keyframes observes."""
-        observed = np.zeros(self.landmarks.size + 1, np.bool_)
-        for k in keyframes:
-            observed[self.keyframes[k].landmark_of_feature] = True  # −1, none, marks the spare last entry
-        observed[-1] = False
-        observed[except_for] = False
-        return np.flatnonzero(observed).astype(np.int32)
+        ids = self._landmarks_in(keyframes)
+        ids = ids[ids >= 0]
+        least = int(ids.min(initial=self.landmarks.size))
+        observed = np.zeros(int(ids.max(initial=least)) + 1 - least, np.bool_)
+        observed[ids - least] = True
+        observed[except_for[(except_for >= least) & (except_for < least + len(observed))] - least] = False
+        return (least + np.flatnonzero(observed)).astype(np.int32)
+
+    def _landmarks_in(self, keyframes: Sequence[int]) -> Ids:
+        """Return the landmark of each feature of some keyframes, one after another, −1 for none."""
+        first = self._first_observation
+        rows = [np.arange(first[k], first[k + 1]) for k in keyframes]
+        ids: Ids = self._observations["landmark"][np.concatenate([np.empty(0, np.intp), *rows])]
+        return ids
 
     def covisible(self, index: int, *, min_shared: int) -> list[tuple[int, int]]:
         """Return (keyframe, shared landmarks) of those that share enough: most first, of equals the newer."""
@@ -213,9 +256,7 @@ class LandmarkMap:
         if not movable:
             return
         landmarks = self.landmarks_of_any(members, except_for=np.empty(0, np.int32))
-        first, observations = observations_of(
-            landmarks, self.landmarks["newest"], self._observations["older"], self._observations["keyframe"]
-        )
+        first, observations = self._observations_of(landmarks)
         linked, T_links, link_information = self._links(movable)
         observed_in = self._observations["keyframe"][observations]
         keyframe_ids = np.unique(np.concatenate([observed_in, linked.ravel(), np.array(movable, np.int32)]))
@@ -224,10 +265,7 @@ class LandmarkMap:
         free[np.searchsorted(keyframe_ids, movable)] = np.arange(len(movable))
         rows = np.repeat(np.arange(len(landmarks)), np.diff(first))
         edges = np.column_stack([local, rows]).astype(np.int32)
-        measured, weights = (
-            self._observations["measured"][observations],
-            self._observations["weights"][observations],
-        )
+        measured, weights = self._measured(observations), self._observations["weights"][observations]
         intrinsics = self.observation(index).intrinsics
         links = np.searchsorted(keyframe_ids, linked).astype(np.int32), T_links, link_information
         poses, points, agree = adjust(
@@ -252,16 +290,14 @@ class LandmarkMap:
             )
         for k, f in zip(keyframe_ids, free, strict=True):
             if f >= 0:
-                self.keyframes[k].T_camera_world = poses[np.searchsorted(keyframe_ids, k)]
+                self.keyframes[k].T_camera_world = poses[np.searchsorted(keyframe_ids, k)].copy()
         self.landmarks["position"][landmarks] = points
         self._unlink(observations[~agree])
 
     def bundle(self, keyframes: Sequence[int]) -> Bundle:
         """Return keyframes, given in increasing order, with all their observations and landmarks."""
         landmarks = self.landmarks_of_any(keyframes, except_for=np.empty(0, np.int32))
-        first, observations = observations_of(
-            landmarks, self.landmarks["newest"], self._observations["older"], self._observations["keyframe"]
-        )
+        first, observations = self._observations_of(landmarks)
         observed_in = self._observations["keyframe"][observations]
         among = np.isin(observed_in, keyframes)
         rows = np.repeat(np.arange(len(landmarks)), np.diff(first))[among]
@@ -270,10 +306,25 @@ class LandmarkMap:
             poses=np.array([self.keyframes[k].T_camera_world for k in keyframes]),
             points=self.landmarks["position"][landmarks],
             edges=edges,
-            measured=self._observations["measured"][observations[among]],
+            measured=self._measured(observations[among]),
             weights=self._observations["weights"][observations[among]],
             intrinsics=self.observation(keyframes[-1]).intrinsics,
         )
+
+    def _measured(self, observations: Ids) -> Array:
+        """Return (E, 3) what was measured, by the readout time as it is known now."""
+        measured: Array = self._observations["measured"][observations]
+        readouts = self._observations["readouts"][observations]
+        since = int(readouts.min(initial=len(self._readout_steps_s)))
+        if since == len(self._readout_steps_s):
+            return measured
+        slope = self._observations["slope"][observations]
+        for step, by_s in enumerate(self._readout_steps_s[since:], start=since):
+            behind = readouts <= step
+            measured[behind, :2] += by_s * slope[behind]
+        self._observations["measured"][observations] = measured
+        self._observations["readouts"][observations] = len(self._readout_steps_s)
+        return measured
 
     def follow_readout(self) -> None:
         """Observe all keyframes' landmarks anew if the readout time has changed."""
@@ -284,8 +335,7 @@ class LandmarkMap:
         for keyframe in self.keyframes:
             keyframe.sweep_camera = keyframe.sweep_camera + by_s * keyframe.twist_camera
         self._recent.clear()
-        rows = slice(self._observations.size)
-        self._observations["measured"][rows, :2] += by_s * self._observations["slope"][rows]
+        self._readout_steps_s.append(by_s)
 
     def _links(self, keyframes: Iterable[int]) -> tuple[Ids, Array, Array]:
         """Return the depth links of some keyframes, as ``adjust`` takes them."""
@@ -298,15 +348,11 @@ class LandmarkMap:
         )
 
     def _unlink(self, observations: Ids) -> None:
-        keyframes, features = self._observations["keyframe"], self._observations["feature"]
-        landmarks = []
-        for e in observations:
-            landmarks.append(self.keyframes[keyframes[e]].landmark_of_feature[features[e]])
-            self.keyframes[keyframes[e]].landmark_of_feature[features[e]] = -1
-        keyframes[observations] = -1
-        ids = np.array(landmarks, dtype=np.intp)
-        np.subtract.at(self.landmarks["observers"], ids, 1)
-        # Nobody reads them any more: zeros, as four landmarks of five are, make checkpoints small.
+        ids, times = np.unique(self._observations["landmark"][observations], return_counts=True)
+        self._observations["landmark"][observations] = -1
+        self._observations["keyframe"][observations] = -1
+        self.landmarks["observers"][ids] -= times.astype(np.int32)
+        # Nobody reads them any more: zeros, as most landmarks become, make checkpoints small.
         for name in ("measured", "weights", "slope"):
             self._observations[name][observations] = 0.0
         removed = ids[self.landmarks["observers"][ids] == 0]
@@ -324,9 +370,7 @@ class LandmarkMap:
         unconfirmed = self.landmarks["observers"][recent] == 1
         found, visible = self.landmarks["found"][recent], self.landmarks["visible"][recent]
         removed = recent[unconfirmed | (found < _MIN_FOUND_RATIO * visible)].astype(np.int32)
-        _, observations = observations_of(
-            removed, self.landmarks["newest"], self._observations["older"], self._observations["keyframe"]
-        )
+        _, observations = self._observations_of(removed)
         self._unlink(observations)
 
     def pose_information(
@@ -353,7 +397,7 @@ class LandmarkMap:
         """
         keyframe = self.keyframes[source]
         shared, _, features = np.intersect1d(
-            self.landmarks_of(target), keyframe.landmark_of_feature, return_indices=True
+            self.landmarks_of(target), self.landmark_of_feature(source), return_indices=True
         )
         observation = self.observation(source)
         H_camera = 0.5 * normal_matrix(
@@ -370,7 +414,7 @@ class LandmarkMap:
     def residual_statistics(self, index: int) -> ResidualStatistics | None:
         """Return the statistics of a keyframe's residuals; None where few landmarks have another observer."""
         keyframe = self.keyframes[index]
-        ids = keyframe.landmark_of_feature
+        ids = self.landmark_of_feature(index)
         features = np.flatnonzero((ids >= 0) & (self.landmarks["observers"][ids] > 1))
         if len(features) < MIN_SHARED_LANDMARKS:
             return None

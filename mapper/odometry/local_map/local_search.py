@@ -64,13 +64,13 @@ class LocalSearch:
         landmark_of_feature = np.where(moved, -1, landmark_of_feature).astype(np.int32)
         matched = landmark_of_feature[landmark_of_feature >= 0]
         counts = self._map.shared_counts(matched)
-        order = [int(k) for k in np.argsort(-counts, kind="stable") if counts[k] > 0] or [reference]
+        observing = np.flatnonzero(counts)
+        order = observing[np.argsort(-counts[observing], kind="stable")].tolist() or [reference]
         nearby = self._map.landmarks_of_any(order[: config.local_keyframes], except_for=matched)
         rows, pixels, octave = project_visible(
-            nearby,
-            landmarks["position"],
-            landmarks["direction"],
-            landmarks["reach_m"],
+            landmarks["position"][nearby],
+            landmarks["direction"][nearby],
+            landmarks["reach_m"][nearby],
             T_camera_world,
             observation.intrinsics,
             np.array(observation.size_px),

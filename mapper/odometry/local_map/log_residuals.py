@@ -1,5 +1,8 @@
 """Residuals of a log's keyframes, which tell how certain its poses are."""
 
+from bisect import insort
+from statistics import median
+
 import numpy as np
 
 from mapper.core.geometry import Array, Transform
@@ -23,16 +26,17 @@ class LogResiduals:
     """
 
     def __init__(self) -> None:
-        self._keyframes: list[ResidualStatistics] = []
+        self._factors: list[float] = []  # of the keyframes, in increasing order, as are the next
+        self._effects: list[float] = []
         self._factor = self._scale = 1.0  # of covariances, and of the model error
 
     def add(self, keyframe: ResidualStatistics) -> None:
         """Add a keyframe's."""
-        self._keyframes.append(keyframe)
-        if len(self._keyframes) >= _FEWEST:
-            self._factor = float(np.median([known.variance_factor for known in self._keyframes]))
-            effect = float(np.median([known.design_effect for known in self._keyframes]))
-            self._scale = float(np.clip((effect - _NONE) / (_WHOLE - _NONE), _LEAST, 1.0))
+        insort(self._factors, float(keyframe.variance_factor))
+        insort(self._effects, float(keyframe.design_effect))
+        if len(self._factors) >= _FEWEST:
+            self._factor = median(self._factors)
+            self._scale = float(np.clip((median(self._effects) - _NONE) / (_WHOLE - _NONE), _LEAST, 1.0))
 
     def honest(self, information: Array, T_i_j: Transform) -> Array:
         """Return the (6, 6) information of a relative pose by what the residuals show.

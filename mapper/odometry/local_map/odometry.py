@@ -99,6 +99,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
 
     def track(self, observation: ImageObservation) -> FrameResult:
         """Track the next frame, in time order."""
+        self._map.step()
         last = self._last
         follows = last is not None and not self._lost_frames and _gap_ns(last, observation) <= STEADY_NS
         if not follows:
@@ -153,10 +154,12 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             return None
         landmarks = last.landmark_of_feature
         previous_px = np.full((len(landmarks), 2), np.nan)
-        keyframe, before = self._map.keyframes[last.reference], self._before_last
-        earlier = [(keyframe.landmark_of_feature, self._map.observation(last.reference))]
+        before = self._before_last
+        earlier = [(self._map.landmark_of_feature(last.reference), self._map.observation(last.reference))]
         if before is not None:
-            earlier.append((before.landmark_of_feature, before.observation))
+            is_keyframe = self._map.keyframes[before.reference].stamp_ns == before.stamp_ns
+            kept = self._map.landmark_of_feature(before.reference)  # refining may have dropped some
+            earlier.append((kept if is_keyframe else before.landmark_of_feature, before.observation))
         for ids, observation in earlier:
             if observation.stamp_ns != last.observation.stamp_ns:
                 common, now, then = np.intersect1d(landmarks, ids, return_indices=True)
@@ -182,6 +185,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         """
         factors = []
         for j, keyframe in enumerate(self._map.keyframes):
+            self._map.step()
             if j == keyframe.origin:
                 continue
             earlier = [(k, shared) for k, shared in self._map.covisible(j, min_shared=1) if k < j]
@@ -311,7 +315,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             tracked_pose,
             observation=self._map.observation(index),
             T_camera_world=keyframe.T_camera_world,
-            landmark_of_feature=keyframe.landmark_of_feature,
+            landmark_of_feature=self._map.landmark_of_feature(index),
             reference=index,
         )
 

@@ -1,6 +1,7 @@
 """Relocaliser: the pose of a frame by descriptors alone, without a prediction, after a jump or a loss."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -12,9 +13,10 @@ from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
 from mapper.odometry.local_map.pose_tracker import MAX_HAMMING, TrackedPose, refined, unmatched
 from mapper.places.index import PlaceIndex
-from mapper.places.vocabulary import Vocabulary
+from mapper.places.vocabulary import Vocabulary, WordVector
 from mapper.places.word_matching import match_by_word
 from mapper.registration.p3p import ransac_p3p
+from mapper.runtime.archived import Archived, archived
 
 _MAX_RATIO = 0.85
 _MATCHING_LEVEL = 2
@@ -33,11 +35,22 @@ class Relocalizer:
         self._search = LocalSearch(config, landmark_map)
         self._vocabulary = vocabulary
         self._index = PlaceIndex(vocabulary)
+        self._vectors: list[Archived[WordVector]] = []
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return all but the index, which follows from the keyframes' words."""
+        return {name: value for name, value in vars(self).items() if name != "_index"}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        vars(self).update(state, _index=PlaceIndex(state["_vocabulary"]))
+        for keyframe, vector in enumerate(self._vectors):
+            self._index.add(keyframe, vector.data)
 
     def add(self, keyframe: int) -> None:
-        """Add a keyframe to the index of places."""
-        words = self._map.observation(keyframe).words
-        self._index.add(keyframe, self._vocabulary.vector(words))
+        """Add the next keyframe to the index of places."""
+        vector = self._vocabulary.vector(self._map.observation(keyframe).words)
+        self._index.add(keyframe, vector)
+        self._vectors.append(archived(vector))
 
     def best_among(
         self,
@@ -116,9 +129,9 @@ class Relocalizer:
         found = self._pose_of(observation, features, points_world, ids, reference=k, method=method)
         if found is not None or not exhaustive:
             return found
-        keyframe = self._map.keyframes[k]
-        mapped = np.flatnonzero(keyframe.landmark_of_feature >= 0)
-        ids = keyframe.landmark_of_feature[mapped]
+        ids = self._map.landmark_of_feature(k)
+        mapped = np.flatnonzero(ids >= 0)
+        ids = ids[mapped]
         return self.match_points(
             observation,
             self._map.observation(k).bits[mapped],
@@ -171,8 +184,8 @@ class Relocalizer:
 
     def _matches(self, k: int, observation: ImageObservation) -> tuple[Ids, Ids]:
         """Return the features of a frame that match landmarks of a keyframe, and these landmarks."""
-        keyframe = self._map.keyframes[k]
-        mapped = np.flatnonzero(keyframe.landmark_of_feature >= 0)
+        ids = self._map.landmark_of_feature(k)
+        mapped = np.flatnonzero(ids >= 0)
         known = self._map.observation(k)
         pairs = match_by_word(
             known.bits[mapped],
@@ -183,7 +196,7 @@ class Relocalizer:
             max_ratio=_MAX_RATIO,
         )
         hits = np.flatnonzero(pairs >= 0)
-        return pairs[hits], keyframe.landmark_of_feature[mapped[hits]]
+        return pairs[hits], ids[mapped[hits]]
 
     def _nodes(self, words: Ids) -> Ids:
         return self._vocabulary.ancestors_of(words, level=_MATCHING_LEVEL)
