@@ -19,6 +19,9 @@ from mapper.core.errors import DataError
 from mapper.runtime.archived import Archivable, Archived, reference_of
 
 _MODULES = ("mapper.", "numpy.", "collections.", "functools.", "pathlib.", "builtins.")
+_ALWAYS_WRITTEN = frozenset(
+    {type(None), bool, int, float, str, bytes, tuple, list, dict, np.ndarray, np.dtype}
+)
 _BUILTINS = frozenset({"set", "frozenset", "bytearray", "complex", "range", "slice", "object"})
 
 
@@ -133,6 +136,8 @@ class _Pickler(pickle.Pickler):
         self._whole = whole
 
     def persistent_id(self, obj: Any) -> str | int | tuple[int] | None:
+        if type(obj) in _ALWAYS_WRITTEN:  # most objects are
+            return None
         if (name := self._fixed.get(id(obj))) is not None:
             return name
         if self._archive is not None and isinstance(obj, Archived):
