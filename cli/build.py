@@ -11,7 +11,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
-from mapper.cli.environment import has_compiled_code, prepare_libraries
+from mapper.cli.environment import has_compiled_code
 from mapper.cli.options import (
     ConfigFile,
     First,
@@ -139,7 +139,6 @@ def built(
     from mapper.run.observers import Observers
     from mapper.sources import open_source
 
-    prepare_libraries()
     source = open_source(log, load_source_config(config_file, overrides))
     config = load_config(config_file, overrides, sensor=source.sensor)
     progress = output.progress(prompts=prompts)
@@ -209,7 +208,6 @@ def appended(
     from mapper.sources import open_source
     from mapper.sources.config import SourceConfig
 
-    prepare_libraries()
     first = open_run(onto)
     config = overridden(first.config.model_copy(update={"source": SourceConfig()}), overrides)
     source = open_source(log, config.source)

@@ -7,7 +7,6 @@ import typer
 
 from mapper.cli.answer import Answer, Output, record_in
 from mapper.cli.console import files_text
-from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import First, Last, Overrides, Stride, assignments, merged, selection
 
 
@@ -46,7 +45,6 @@ def compare(
     from mapper.evaluators.compare.tables import tables_text
     from mapper.sources import open_source
 
-    prepare_libraries()
     given = CompareConfig(methods=tuple(method or ()))
     sugar = [*selection(first, last, stride, None), *assignments({"pairs": pairs, "seed": seed})]
     config = overridden(given, merged(sugar, set_))

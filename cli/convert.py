@@ -7,7 +7,6 @@ from typing import Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output
-from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import First, Last, Overrides, RequireTruth, Stride, merged, selection
 from mapper.runtime.result_paths import LOGS, name_of, place_of
 
@@ -48,7 +47,6 @@ def convert(
     from mapper.sources.reading_checks import ReadingChecks
     from mapper.sources.writers import left_out, write_log
 
-    prepare_libraries()
     source = open_source(
         log, load_source_config(None, merged(selection(first, last, stride, require_truth), set_))
     )

@@ -8,7 +8,6 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.build import built
-from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import Overrides
 
 if TYPE_CHECKING:
@@ -35,7 +34,6 @@ def demo(
     from mapper.simulation import write_tum_log
     from mapper.simulation.config import SynthConfig
 
-    prepare_libraries()
     load_config(None, set_ or ())  # what is wrong with it is better known before the log is made
     log = out / "log"
     scene = overridden(SynthConfig(), [*DEMO_LOG, *assignments({"duration_s": seconds})])

@@ -7,7 +7,6 @@ import typer
 
 from mapper.cli.answer import Answer, Output, record_in
 from mapper.cli.completion import run_folders
-from mapper.cli.environment import prepare_libraries
 from mapper.cli.placing import Place, PosesFile, placing_of
 from mapper.runtime.result_paths import DIFFS, joined_names, place_of
 
@@ -59,7 +58,6 @@ def diff(
     from mapper.merging.differences import differences_of
     from mapper.run.folder import open_run
 
-    prepare_libraries()
     earlier, later = open_run(before), open_run(after)
     progress = output.progress()
     out = place_of(out, DIFFS / joined_names([before, after]), overwrite=overwrite)

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output
-from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import MovedLogs, RunFolder
 
 if TYPE_CHECKING:
@@ -74,7 +73,6 @@ def edit(
         raise ConfigError("a region alone changes nothing: want --erase, --keep or --keepout with it")
     built = open_run(run)
     if kinds or undo:
-        prepare_libraries()
         if log:
             built = moved_log(built, *log)
         source, progress = built.open_log(), output.progress()

@@ -23,10 +23,3 @@ def has_compiled_code() -> bool:
 
     cache = os.environ.get("NUMBA_CACHE_DIR") or Path(mapper.__file__).parent
     return next(Path(cache).rglob("*.nbi"), None) is not None
-
-
-def prepare_libraries() -> None:
-    """Stop OpenCV from starting threads of its own inside ours."""
-    import cv2
-
-    cv2.setNumThreads(1)

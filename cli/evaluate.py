@@ -8,7 +8,6 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
-from mapper.cli.environment import prepare_libraries
 
 if TYPE_CHECKING:
     from mapper.core.timebase import Stamps
@@ -121,7 +120,6 @@ def evaluate(
     from mapper.evaluators.metrics.evaluate import ALIGNED, assess
     from mapper.evaluators.metrics.inputs import estimate_and_truth
 
-    prepare_libraries()
     run, trajectory, known = estimate_and_truth(estimate, truth, times)
     if lengths is not None and known is None:
         raise DataError(f"--lengths {lengths}: relative errors need a truth; tell one with --truth")

@@ -7,7 +7,6 @@ import typer
 
 from mapper.cli.answer import Answer, Output, made
 from mapper.cli.completion import export_kinds
-from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import MovedLogs, Overrides, RunFolder, assignments, merged
 from mapper.export.exporters import EXPORTERS
 
@@ -44,7 +43,6 @@ def export(
     from mapper.run.folder import MapFolder, moved_log, open_run
     from mapper.run.manifest import is_merged_map
 
-    prepare_libraries()
     built: MapFolder
     if is_merged_map(run):
         from mapper.merging.merged_map import open_map

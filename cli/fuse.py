@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output
-from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import MovedLogs, Overrides, RunFolder
 
 
@@ -33,7 +32,6 @@ def fuse(
     from mapper.run.folder import moved_log, open_run
     from mapper.sources.trajectory_files import read_tum
 
-    prepare_libraries()
     built = open_run(run)
     if log:
         built = moved_log(built, *log)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output
-from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import Overrides
 
 if TYPE_CHECKING:
@@ -32,7 +31,6 @@ def inspect(
     from mapper.core.errors import DataError
     from mapper.sources.inspection import inspect_log
 
-    prepare_libraries()
     overrides = set_ or []
     found = inspect_log(log, load_source_config(None, overrides))
     if found.log is None or found.problem is not None:

@@ -7,7 +7,6 @@ import typer
 
 from mapper.cli.answer import Answer, Output, rows_text
 from mapper.cli.completion import run_folders
-from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import First, Last, Overrides, Stride, merged, selection
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 
@@ -58,7 +57,6 @@ def localise(
     from mapper.sources import open_source
     from mapper.sources.config import SourceConfig
 
-    prepare_libraries()
     out = place_of(out, RUNS / f"{name_of(log)}-in-{name_of(in_)}", overwrite=overwrite)
     progress = output.progress()
     known = load_known_map(in_, progress=progress)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mapper.cli.answer import Answer, Output
-from mapper.cli.environment import prepare_libraries
 from mapper.cli.groups import Verb
 from mapper.cli.options import MovedLogs, RunFolder
 
@@ -54,7 +53,6 @@ def loops(
         from mapper.evaluators.metrics.evaluate import evaluate
         from mapper.pipeline.edit_loops import edit_loops
 
-        prepare_libraries()
         if log:
             built = moved_log(built, *log)
         built = edit_loops(

@@ -7,7 +7,6 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.completion import run_folders
-from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import workers_for
 from mapper.cli.placing import Place, PosesFile, placing_of
 from mapper.runtime.result_paths import MAPS, joined_names
@@ -69,7 +68,6 @@ def merge(
     from mapper.run.manifest import is_merged_map
 
     workers = workers_for(processes, scheduler, default=1)
-    prepare_libraries()
     progress = output.progress()
     known = open_map(runs[0]) if is_merged_map(runs[0]) else None
     if known is None:

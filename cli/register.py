@@ -7,7 +7,6 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.console import files_text
-from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import Overrides
 
 if TYPE_CHECKING:
@@ -67,7 +66,6 @@ def register(
     from mapper.registration.guess import parse_guess
     from mapper.runtime.atomic import atomic_folder
 
-    prepare_libraries()
     if rerun is not None:
         _check_not_there(rerun, overwrite=overwrite)
     check_method(method, guess=guess)

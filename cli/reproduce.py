@@ -10,7 +10,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.console import files_text
-from mapper.cli.environment import has_compiled_code, prepare_libraries
+from mapper.cli.environment import has_compiled_code
 from mapper.cli.options import First, Last, workers_for
 
 
@@ -71,7 +71,6 @@ def reproduce(
 
     every_core = os.cpu_count() or 1
     workers = workers_for(processes, scheduler, default=every_core if paper is Paper.THESIS else 1)
-    prepare_libraries()
     request = Request(
         paper=paper.value,
         logs=logs,

@@ -8,7 +8,7 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.console import files_text
-from mapper.cli.environment import has_compiled_code, prepare_libraries
+from mapper.cli.environment import has_compiled_code
 from mapper.cli.options import workers_for
 
 
@@ -44,7 +44,6 @@ def sweep(
     from mapper.evaluators.sweep.tables import summary_text
 
     workers = workers_for(processes, scheduler, default=os.cpu_count() or 1)
-    prepare_libraries()
     progress = output.progress()
     out = out or Path("sweeps") / file.stem
     plan = plan_sweep(file, out)

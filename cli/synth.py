@@ -8,7 +8,6 @@ from typing import Annotated, TypeVar
 import typer
 
 from mapper.cli.answer import Answer, Output
-from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import assignments, merged
 from mapper.runtime.result_paths import LOGS, place_of
 
@@ -142,7 +141,6 @@ def synth(
             | _camera_noise(noise)
         )
         indoors = overridden(start.model_copy(update=carried), merged(assignments(given), set_))
-        prepare_libraries()
         with output.progress().stage("render") as report:
             write_tum_log(out, indoors, on_progress=report)
     else:
@@ -162,7 +160,6 @@ def synth(
             given |= MOVING_OUTDOORS if scene in (None, SceneName.STREET) else PEDESTRIANS
         outdoors = _scene(LIDAR_SCENES, scene or SceneName.STREET, sensor).model_copy(update=carried)
         outdoors = overridden(outdoors, merged(assignments(given), set_))
-        prepare_libraries()
         with output.progress().stage("scan") as report:
             write_lidar_log(out, outdoors, on_progress=report)
     kind = "TUM" if sensor is SensorKind.RGBD else "KITTI"
@@ -180,7 +177,6 @@ def _line_laser(
     if noise is not None:
         given = [*given, f"noise_levels={noise * usual.noise_levels}"]
     config = overridden(usual, merged(given, set_))
-    prepare_libraries()
     write_line_laser_log(out, config, progress=output.progress())
     vehicle = f"--wheelbase {config.wheelbase_m:g} --sensor-x {config.sensor_x_m:g}"
     return Answer(

@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output, verb
-from mapper.cli.environment import prepare_libraries
 from mapper.cli.groups import Verb, VerbGroup
 from mapper.cli.options import assignments, merged
 from mapper.runtime.result_paths import name_of, place_of
@@ -50,7 +49,6 @@ def train(
     out = place_of(out, Path(f"{name_of(logs[0])}.words"), overwrite=overwrite)
     if out.exists() and not overwrite:
         raise VocabularyError(f"{out}: exists already; give --overwrite to replace it")
-    prepare_libraries()
     progress = output.progress()
     sources = [open_source(log) for log in logs]
     images = [bits for source in sources for bits in descriptors_of(source, config, progress=progress)]

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapper.cli.answer import Answer, Output
-from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import First, Last, Overrides, Stride, merged, selection
 
 if TYPE_CHECKING:
@@ -75,7 +74,6 @@ def depth(
     distances_m = _distances(logs, plane_at, fit_plane=fit_plane, keep_tilt=keep_tilt)
     where = None if patch is None else _patch(patch)
     config = load_config(None, merged(selection(first, last, stride, None), set_)).source
-    prepare_libraries()
     sources = [open_source(log, config) for log in logs]
     with nullcontext() if out is None else atomic_folder(out, FOLDER, overwrite=overwrite) as folder:
         study = study_depth(

@@ -7,7 +7,6 @@ import typer
 
 from mapper.cli.answer import Answer, Output
 from mapper.cli.console import files_text
-from mapper.cli.environment import prepare_libraries
 from mapper.cli.options import assignments
 from mapper.runtime.result_paths import RUNS, name_of, place_of
 
@@ -67,7 +66,6 @@ def line_laser(
     from mapper.line_laser.survey import drive, scan_images, sensor_poses
     from mapper.runtime.atomic import atomic_folder
 
-    prepare_libraries()
     out = place_of(out, RUNS / name_of(images), overwrite=overwrite)
     progress = output.progress()
     config = overridden(LineLaserConfig(), set_ or [])
@@ -139,7 +137,6 @@ def calibrate(
         if path.exists() and not overwrite:
             raise RunError(f"{path}: exists already; choose another --out, or pass --overwrite to replace it")
     vehicle = overridden(VehicleConfig(), assignments({"wheelbase_m": wheelbase, "sensor_x_m": sensor_x}))
-    prepare_libraries()
     progress = output.progress()
     config = overridden(LineLaserConfig(), set_ or [])
     seen, size_px, notes = read_shots(shots, config.stripe, progress=progress)
@@ -177,7 +174,6 @@ def accuracy(
     from mapper.line_laser.products import DETECTIONS
     from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text
 
-    prepare_libraries()
     config = overridden(LineLaserConfig(), set_ or [])
     tables = FolderKind(
         "a line laser's accuracy",

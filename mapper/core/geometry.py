@@ -24,10 +24,11 @@ _FARTHEST_M = 1e12
 
 
 def transform(R_a_b: Array, t_a_b: Array) -> Transform:
-    """Return T_a_b from a (3, 3) rotation and a (3,) translation in metres."""
-    T_a_b = np.eye(4)
-    T_a_b[:3, :3] = R_a_b
-    T_a_b[:3, 3] = t_a_b
+    """Return T_a_b from a (3, 3) rotation and a (3,) translation in metres, or (N, 4, 4) from N of both."""
+    T_a_b = np.zeros((*np.shape(R_a_b)[:-2], 4, 4))
+    T_a_b[..., :3, :3] = R_a_b
+    T_a_b[..., :3, 3] = t_a_b
+    T_a_b[..., 3, 3] = 1.0
     return T_a_b
 
 

@@ -1,6 +1,5 @@
 """Line-by-line text files of a log, with errors that name the line, and rows put in time order."""
 
-import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -114,9 +113,17 @@ def time_order(stamps_ns: Stamps, *, what: str) -> tuple[NDArray[np.intp], list[
 
 def pose_from_numbers(numbers: Array) -> Transform | None:
     """Return the pose of x y z qx qy qz qw; None where motion capture wrote no pose (NaN, or no rotation)."""
-    if not np.isfinite(numbers).all() or not 1e-9 <= math.hypot(*numbers[3:]) < _LONGEST_QUATERNION:
-        return None
-    return transform(rotation_from_quaternion(numbers[3:]), numbers[:3])
+    return poses_from_numbers(numbers[None])[0]
+
+
+def poses_from_numbers(numbers: Array) -> list[Transform | None]:
+    """Return the same of each row of (N, 7) numbers."""
+    with np.errstate(over="ignore"):
+        lengths = np.sqrt(np.square(numbers[:, 3:]).sum(axis=1))
+    usable = np.isfinite(numbers).all(axis=1) & (lengths >= 1e-9) & (lengths < _LONGEST_QUATERNION)
+    kept = numbers[usable]
+    poses = iter(transform(rotation_from_quaternion(kept[:, 3:]), kept[:, :3]))
+    return [next(poses) if is_usable else None for is_usable in usable]
 
 
 def truth_from(

@@ -1,17 +1,19 @@
 """Trajectories as TUM and KITTI text."""
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from mapper.core.errors import DataError
-from mapper.core.geometry import Transform, is_rigid, transform
+from mapper.core.geometry import is_rigid, transform
 from mapper.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from mapper.core.timebase import Stamps, ns_from_seconds_text, seconds_text_from_ns
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.atomic import write_text
 from mapper.runtime.regular_files import read_text
+from mapper.sources.text import poses_from_numbers
 
 
 def read_tum(path: Path) -> Trajectory:
@@ -23,24 +25,31 @@ def read_tum(path: Path) -> Trajectory:
         DataError: A line that is not eight finite numbers, a zero quaternion, or stamps that decrease.
     """
     stamps_ns: list[int] = []
-    poses: list[Transform] = []
+    numbers: list[list[float]] = []
+    places: list[str] = []
     for number, words in _rows(path):
+        place = f"{path}:{number}"
         if len(words) != 8:
-            raise DataError(f"{path}:{number}: {len(words)} columns, want 8: stamp tx ty tz qx qy qz qw")
+            raise DataError(f"{place}: {len(words)} columns, want 8: stamp tx ty tz qx qy qz qw")
         try:
-            stamps_ns.append(ns_from_seconds_text(words[0]))
-            values = np.array([float(word) for word in words[1:]])
-            if not np.isfinite(values).all():
-                raise DataError("a number is not finite; remove the line")
-            poses.append(transform(rotation_from_quaternion(values[3:]), values[:3]))
+            stamp_ns, pose = ns_from_seconds_text(words[0]), [float(word) for word in words[1:]]
         except (DataError, ValueError) as error:
-            raise DataError(f"{path}:{number}: {error}") from None
-        if len(stamps_ns) > 1 and stamps_ns[-1] == stamps_ns[-2]:
-            del stamps_ns[-1], poses[-1]
-        elif len(stamps_ns) > 1 and stamps_ns[-1] < stamps_ns[-2]:
-            raise DataError(f"{path}:{number}: stamp {words[0]} comes before the line above; sort the file")
-    if not poses:
+            raise DataError(f"{place}: {error}") from None
+        if not all(map(math.isfinite, pose)):
+            raise DataError(f"{place}: a number is not finite; remove the line")
+        if stamps_ns and stamp_ns < stamps_ns[-1]:
+            raise DataError(f"{place}: stamp {words[0]} comes before the line above; sort the file")
+        if not stamps_ns or stamp_ns > stamps_ns[-1]:
+            stamps_ns.append(stamp_ns)
+            numbers.append(pose)
+            places.append(place)
+    if not stamps_ns:
         raise DataError(f"{path}: no poses; want lines of stamp tx ty tz qx qy qz qw")
+    poses = []
+    for place, pose, T in zip(places, numbers, poses_from_numbers(np.array(numbers)), strict=True):
+        if T is None:
+            raise DataError(f"{place}: quaternion {tuple(pose[3:])} has no direction; want a non-zero xyzw")
+        poses.append(T)
     return Trajectory(np.array(stamps_ns, dtype=np.int64), np.array(poses))
 
 
@@ -64,37 +73,34 @@ def read_kitti(path: Path, stamps_ns: Stamps | None = None) -> Trajectory:
     Raises:
         DataError: A line that is not twelve finite numbers, or another number of stamps than poses.
     """
-    poses: list[Transform] = []
+    numbers: list[list[float]] = []
     for number, words in _rows(path):
         try:
-            values = np.array([float(word) for word in words])
+            row = [float(word) for word in words]
         except ValueError as error:
             raise DataError(f"{path}:{number}: {error}") from None
-        if values.shape != (12,) or not np.isfinite(values).all():
+        if len(row) != 12 or not all(map(math.isfinite, row)):
             raise DataError(f"{path}:{number}: want 12 finite numbers, a row-major 3×4 pose")
-        T = np.vstack([values.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
-        poses.append(T)
-    if not poses:
+        numbers.append(row)
+    if not numbers:
         raise DataError(f"{path}: no poses; want lines of 12 numbers")
-    stamps = np.arange(len(poses), dtype=np.int64) if stamps_ns is None else stamps_ns
-    if len(stamps) != len(poses):
+    stamps = np.arange(len(numbers), dtype=np.int64) if stamps_ns is None else stamps_ns
+    if len(stamps) != len(numbers):
         raise DataError(
-            f"{path}: {len(poses)} poses but {len(stamps)} stamps; the two must pair line by line"
+            f"{path}: {len(numbers)} poses but {len(stamps)} stamps; the two must pair line by line"
         )
-    if not is_rigid(np.array(poses), tolerance=1e-4):
+    rows = np.reshape(numbers, (-1, 3, 4))
+    R, t = rows[..., :3], rows[..., 3]
+    if not is_rigid(transform(R, t), tolerance=1e-4):
         raise DataError(f"{path}: a pose is not a rigid motion; is this really KITTI's pose format?")
-    return Trajectory(stamps, np.array([_orthonormal(T) for T in poses]))
+    orthonormal = rotation_from_quaternion(quaternion_from_rotation(R))  # text of few digits is slightly off
+    return Trajectory(stamps, transform(orthonormal, t))
 
 
 def write_kitti(path: Path, trajectory: Trajectory) -> None:
     """Write one row-major 3×4 matrix a line, with every digit; KITTI text has no stamps."""
     rows = (" ".join(repr(float(v)) for v in T[:3].ravel()) for T in trajectory.T_world_body)
     write_text(path, "\n".join(rows) + "\n")
-
-
-def _orthonormal(T: Transform) -> Transform:
-    """Text with a few digits leaves rotations slightly off SO(3)."""
-    return transform(rotation_from_quaternion(quaternion_from_rotation(T[:3, :3])), T[:3, 3])
 
 
 def _rows(path: Path) -> Iterable[tuple[int, list[str]]]:

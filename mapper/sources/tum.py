@@ -1,5 +1,6 @@
 """TUM RGB-D folders: rgb.txt, depth.txt, groundtruth.txt (Sturm et al. 2012)."""
 
+import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.errors import SourceError
-from mapper.core.geometry import Transform
 from mapper.core.timebase import NS_PER_S, Stamps, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
@@ -18,7 +18,7 @@ from mapper.sources.rgbd import FramePair, find_calibration, rgbd_log, unpaired_
 from mapper.sources.text import (
     parse_numbers,
     parse_stamp,
-    pose_from_numbers,
+    poses_from_numbers,
     read_lines,
     table,
     time_order,
@@ -78,14 +78,14 @@ def read_truth(path: Path) -> tuple[Trajectory | None, list[str]]:
     """
     if not path.is_file():
         return None, []
-    poses: list[tuple[int, Transform | None]] = []
+    stamps_ns, numbers = [], []
     for where, words in table(path, "stamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw"):
-        numbers = parse_numbers(words, where=where)
-        if np.isfinite(numbers[0]):
-            poses.append((parse_stamp(words[0], where=where), pose_from_numbers(numbers[1:])))
-        else:
-            poses.append((0, None))
-    return truth_from(poses, what=path.name)
+        row = parse_numbers(words, where=where)
+        has_stamp = math.isfinite(row[0])
+        stamps_ns.append(parse_stamp(words[0], where=where) if has_stamp else 0)
+        numbers.append(row[1:] if has_stamp else np.full(7, np.nan))
+    poses = poses_from_numbers(np.reshape(numbers, (-1, 7)))
+    return truth_from(list(zip(stamps_ns, poses, strict=True)), what=path.name)
 
 
 def _read_list(folder: Path, name: str, notes: list[str]) -> _ImageList:
