@@ -53,7 +53,7 @@ def evaluate(
         typer.Argument(
             metavar="RUN|TRAJECTORY",
             autocompletion=run_folders,
-            help="Run folder, or TUM or KITTI trajectory.",
+            help="Run folder, merged map, or TUM or KITTI trajectory.",
         ),
     ],
     truth: Annotated[
@@ -113,13 +113,30 @@ def evaluate(
 ) -> Answer:
     """Print ATE, RPE, relative errors and coverage of a path, which loops are right, and what a map is worth.
 
+    Of a merged map: how far its runs agree, and their ATE, each and together, where their truth is known.
+
     Example: mapper eval runs/xyz --align yaw --plot plots, or: mapper eval 00.txt --truth poses/00.txt, or:
     mapper eval runs/flat --map logs/flat --sharpness
     """
     from mapper.core.errors import DataError
     from mapper.evaluators.metrics.evaluate import ALIGNED, assess
     from mapper.evaluators.metrics.inputs import estimate_and_truth
+    from mapper.run.manifest import is_merged_map
 
+    if is_merged_map(estimate):
+        refused = {
+            "--truth": truth,
+            "--times": times,
+            "--log": log,
+            "--lengths": lengths,
+            "--map-world": map_world,
+            "--register": register,
+            "--sharpness": sharpness,
+            "--plot": plot,
+        }
+        for option in (name for name, value in refused.items() if value):
+            raise DataError(f"{estimate}: is a merged map; {option} is for a run: evaluate each by itself")
+        return _of_merged_map(estimate, align, map_, tolerance, format_)
     run, trajectory, known = estimate_and_truth(estimate, truth, times)
     if lengths is not None and known is None:
         raise DataError(f"--lengths {lengths}: relative errors need a truth; tell one with --truth")
@@ -168,6 +185,27 @@ def evaluate(
         if quality is not None and map_ is not None:
             write_map_errors(plot, quality.check, title=f"{name} against {map_.resolve().name}")
     return Answer(document, text)
+
+
+def _of_merged_map(
+    folder: Path, align: Align, reference: Path | None, tolerance: int, format_: Format
+) -> Answer:
+    from mapper.cli.report import distinct_names
+    from mapper.evaluators.metrics.evaluate import Assessment
+    from mapper.evaluators.metrics.map_reference import read_reference
+    from mapper.evaluators.metrics.merged_map import merged_map_metrics, merged_map_quality
+    from mapper.merging.merged_map import open_map
+
+    merged = open_map(folder)
+    names = distinct_names([Path(run.path) for run in merged.manifest.runs])
+    metrics, notes = merged_map_metrics(merged, names, alignment=align.value)
+    if reference is not None:
+        found = read_reference(reference, voxel_m=merged.config.octree.resolution_m)
+        metrics += merged_map_quality(merged, found, voxels=tolerance)
+    text = _text(metrics, Assessment(tuple(metrics)), format_)
+    if notes and format_ in (Format.TEXT, Format.MARKDOWN):
+        text = "\n".join([text, "", *notes])
+    return Answer({"metrics": metrics, "notes": notes}, text)
 
 
 def _needed(run: "Run | None", path: Path, option: str) -> "Run":

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mapper.core.errors import SourceError
 from mapper.core.trajectory import Trajectory
 from mapper.sources.text import parse_stamp, rows
 from mapper.sources.trajectory_files import read_kitti, read_tum
@@ -17,7 +18,10 @@ def is_kitti(path: Path) -> bool:
     Raises:
         SourceError: The file cannot be read.
     """
-    _, words = next(rows(path), (0, []))
+    try:
+        _, words = next(rows(path), (0, []))
+    except SourceError as error:
+        raise SourceError(f"{error}; want poses as TUM or KITTI text") from None
     return len(words) == _KITTI_COLUMNS
 
 

@@ -282,10 +282,7 @@ def open_run(path: AnyPath) -> Run:
             raise RunError(f"{path}: {_not_a_run(path)}")
         raise RunError(f"{path}: no such run folder; make one with mapper build LOG --out {path}")
     if is_merged_map(path):
-        raise RunError(
-            f"{path}: is a merged map, not a run; its {files.OCTREE_BT}, {files.OCTREE_OT} and slice "
-            "are in it"
-        )
+        raise RunError(f"{path}: is a merged map, not a run; mapper eval, export and plan take it")
     if is_localised_log(path):
         raise RunError(
             f"{path}: is a localised log, not a run; the map that it lies in is told in its manifest"

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mapper.core.errors import SourceError
+from mapper.runtime.atomic import MANIFEST_NAME
 from mapper.sources.config import SourceConfig
 
 if TYPE_CHECKING:
@@ -52,6 +53,8 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
                 wheels, notes = read_wheels(path, config.wheels, sensor=log.sensor)
                 log = replace(log, wheels=wheels, notes=[*log.notes, *notes])
             return selected(log, config)
+    if (path / MANIFEST_NAME).is_file():
+        raise SourceError(f"{path}: holds what mapper made, not a log; mapper eval {path} judges it")
     raise SourceError(
         f"{path}: not a log of a known format (TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood, KITTI, clouds, "
         ".mcap, .bag, .db3, .mbag); docs/your-sensor.md names the files of each"

@@ -1,0 +1,86 @@
+"""What each verb that looks or judges answers to a run, a merged map, a log, and to what is none of them."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from mapper.merging.placing import as_built
+from mapper.navigation.distance import distance_2d
+from mapper.octree.grid_file import read_grid
+from mapper.run.folder import open_run
+from tests.support.command_line import invoke
+from tests.support.merged_runs import merged_map_of
+
+KINDS = ("run", "merged map", "log", "file of a run", "foreign folder", "nothing")
+NO_RUN = ("is a log, not a run", "is a file of a run", "is no run folder", "no such run folder")
+MERGED = "is a merged map, not a run; mapper eval, export and plan take it"
+UNKNOWN = "not a log of a known format"
+
+ANSWERS = {
+    "eval": ("ATE RMSE", "walls alike there", NO_RUN[0], "want poses as TUM or KITTI text", *NO_RUN[2:]),
+    "view": ("page.html", MERGED, *NO_RUN),
+    "report": ("page.html", MERGED, *NO_RUN),
+    "export": ("made.ot", "made.ot", *NO_RUN),
+    "plan": ("plan.png", "plan.png", *NO_RUN),
+    "diff": ("appeared", MERGED, *NO_RUN),
+    "doctor": ("octree", MERGED, *NO_RUN),
+    "inspect": (
+        "a run that mapper wrote",
+        "holds what mapper made, not a log",
+        "tum, called",
+        *(UNKNOWN, UNKNOWN, "no such file or folder"),
+    ),
+}
+"""Words of the answer to each kind of input, in the order of ``KINDS``."""
+ANSWERED = {(verb, "run") for verb in ANSWERS if verb != "inspect"} | {
+    ("eval", "merged map"),
+    ("export", "merged map"),
+    ("plan", "merged map"),
+    ("inspect", "log"),
+}
+"""What is no mistake; all else ends with one line and status 1."""
+
+
+@pytest.fixture(scope="module")
+def inputs(desk_run, desk_log, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("inputs")
+    run = shutil.copytree(desk_run.path, folder / "run")
+    again = shutil.copytree(desk_run.path, folder / "again")
+    merged = merged_map_of(as_built([open_run(run), open_run(again)]), folder / "merged").map
+    (folder / "foreign").mkdir()
+    (folder / "foreign" / "notes.txt").write_text("nothing of ours\n")
+    paths = (run, merged.path, desk_log, run / "map.ot", folder / "foreign", folder / "absent")
+    return dict(zip(KINDS, paths, strict=True))
+
+
+@pytest.fixture(scope="module")
+def options(inputs, tmp_path_factory):
+    out = tmp_path_factory.mktemp("made")
+    grid = read_grid(inputs["run"] / "slice.yaml")
+    clearance_m = distance_2d(grid, unknown_blocks=True)
+    row, column = np.unravel_index(np.argmax(clearance_m), clearance_m.shape)
+    point = np.asarray(grid.origin_world_m) + (np.array([column, row]) + 0.5) * grid.resolution_m
+    return {
+        "view": ("--html", "--out", out / "page.html", "--overwrite"),
+        "report": ("--out", out / "page.html", "--overwrite"),
+        "export": ("--as", "octomap", "--out", out / "made.ot", "--overwrite"),
+        "plan": ("--from", *point, "--to", *point, "--radius", 0.05),
+        "diff": (inputs["run"], "--place", "built", "--out", out / "diff", "--overwrite"),
+    }
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("verb", ANSWERS)
+def test_a_verb_answers_to_each_kind_of_input(verb, kind, inputs, options):
+    result = invoke(verb, inputs[kind], *options.get(verb, ()))
+    words = ANSWERS[verb][KINDS.index(kind)]
+    if (verb, kind) in ANSWERED:
+        assert result.exit_code == 0, result.output
+        assert words in result.stdout
+    else:
+        assert result.exit_code == 1
+        assert words in result.stderr
+        assert result.stderr.startswith("mapper: ")
+        assert str(inputs[kind]) in result.stderr
+        assert result.stderr.count("\n") == 1
