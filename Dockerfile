@@ -11,10 +11,10 @@ FROM python:3.12-slim-bookworm
 ARG EXTRAS=""
 RUN --mount=type=bind,from=wheel,source=/wheel,target=/wheel \
     python -m pip install --no-cache-dir --only-binary :all: "$(echo /wheel/*.whl)${EXTRAS}" \
-    && useradd --create-home mapper \
+    && useradd --create-home --uid 1000 mapper \
     && install --directory --owner mapper --mode 0777 /var/cache/mapper /data
 ENV NUMBA_CACHE_DIR=/var/cache/mapper HOME=/tmp MPLCONFIGDIR=/tmp/matplotlib
-USER mapper
+USER 1000
 RUN mapper doctor --warm --quiet && chmod -R a+rwX /var/cache/mapper
 WORKDIR /data
 ENTRYPOINT ["mapper"]

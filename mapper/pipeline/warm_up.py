@@ -16,13 +16,13 @@ from mapper.runtime.executor import Workers, make_executor, run_jobs
 from mapper.runtime.progress import SILENT, Progress, Report
 from mapper.runtime.worker_process import Failure
 
-KERNELS = 151
+KERNELS = 155
 """About how many kernels are compiled, for the progress bar."""
 _POLL_S = 0.5
 
 
 def compile_kernels(*, progress: Progress = SILENT) -> None:
-    """Compile every kernel that builds of RGB-D and LiDAR logs use by default.
+    """Compile every kernel that builds of RGB-D and LiDAR logs, and pages of their runs, use by default.
 
     Two processes, where there are two processors, render and build a second of a synthetic log of each
     sensor. Code that is compiled already is kept. What the builds have imported keeps its bytecode, too.
@@ -68,6 +68,8 @@ def _build_lidar(folder: Path) -> None:
 def _build(folder: Path, name: str, *overrides: str) -> None:
     from mapper.config.loading import load_config
     from mapper.export.exporters import export
+    from mapper.export.report.data import chapter_of
+    from mapper.export.report.map_page import write_map_page
     from mapper.pipeline.build import build
     from mapper.sources import open_source
 
@@ -75,6 +77,7 @@ def _build(folder: Path, name: str, *overrides: str) -> None:
     run = build(source, load_config(None, overrides, sensor=source.sensor), folder / name)
     export(run, "octomap", folder / f"{name}.bt")  # reads map.octree
     export(run, "nav2", folder / f"{name}_nav2")  # inflates the slice
+    write_map_page(folder / f"{name}.html", [chapter_of(run, name, ())])  # coarser levels of the octree
 
 
 @contextmanager
