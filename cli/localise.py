@@ -89,6 +89,8 @@ def _document(manifest: "LocalisedManifest", out: Path) -> dict[str, Any]:
 
 
 def _text(manifest: "LocalisedManifest", out: Path) -> str:
+    from mapper.run.timeline import counted, span_text
+
     counts, verdict = manifest.counts, manifest.verdict
     rows = [
         ("frames", counts.frames_text),
@@ -97,12 +99,8 @@ def _text(manifest: "LocalisedManifest", out: Path) -> str:
     ]
     for stretch in manifest.stretches:
         known = f", known to {stretch.sigma_m:.2g} m (1 σ)" if stretch.sigma_m is not None else ""
-        rows.append(
-            (
-                f"{stretch.begin_s:.1f} … {stretch.end_s:.1f} s",
-                f"{stretch.state}, {stretch.frames} frames, {stretch.constraints} constraints{known}",
-            )
-        )
+        held = f"{counted(stretch.frames, 'frame')}, {stretch.constraints} constraints"
+        rows.append((span_text(stretch.begin_s, stretch.end_s), f"{stretch.state}, {held}{known}"))
     rows.append(("seconds", f"{manifest.timing.total_s:.1f}"))
     rows.append(("in", str(out)))
     if verdict is not None:

@@ -17,6 +17,7 @@ from mapper.odometry.scan_to_map.config import HoughOdometryConfig
 from mapper.pipeline.track import track_log
 from mapper.run.manifest import Trial
 from mapper.run.results import RunResults
+from mapper.run.timeline import span_text
 from mapper.run.verdict import TRACKING_KINDS, verdict_of
 from mapper.run.warnings import find_warnings
 from mapper.run.writer import RunWriter
@@ -87,7 +88,7 @@ def try_settings(
         for done, (setting, other) in enumerate(candidates.items(), start=1):
             tried[setting] = _unplaced(stretch, other)
             report(done, len(candidates))
-    return Trial(where=f"{begin_s:.1f} … {end_s:.1f} s", frames=len(frames), unplaced=own, tried=tried)
+    return Trial(where=span_text(begin_s, end_s), frames=len(frames), unplaced=own, tried=tried)
 
 
 def candidates_for(config: BuildConfig) -> Iterator[tuple[str, BuildConfig]]:

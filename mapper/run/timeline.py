@@ -35,7 +35,7 @@ class TimeLine:
     def place(self, first: int, last: int) -> str:
         """Return between which seconds of the log two frames lie."""
         begin_s, end_s = (self.stamps_ns[[first, last]] - self.stamps_ns[0]) / NS_PER_S
-        return f"{begin_s:.1f} … {end_s:.1f} s"
+        return span_text(begin_s, end_s)
 
     def duration_s(self, first: int, last: int) -> float:
         """Return the seconds between two frames."""
@@ -48,6 +48,12 @@ def runs_of(marked: Sequence[bool]) -> Iterator[tuple[int, int]]:
         indices = [index for index, _ in run]
         if is_marked:
             yield indices[0], indices[-1]
+
+
+def span_text(begin_s: float, end_s: float) -> str:
+    """Return a span of time to a tenth of a second: one number if both ends round to it."""
+    begin, end = f"{begin_s:.1f}", f"{end_s:.1f}"
+    return f"{begin} s" if begin == end else f"{begin} … {end} s"
 
 
 def counted(number: int, what: str) -> str:
