@@ -31,6 +31,7 @@ from mapper.core.errors import MapperError
 from mapper.evaluators.metrics.loops import wrong_loops
 from mapper.evaluators.metrics.silent_failures import check_doubts
 from mapper.evaluators.metrics.trajectory import align, associate, ate
+from mapper.loops.closure import accepted_loops
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import refuse_a_fragment, track_log
@@ -154,7 +155,7 @@ def mapped(log: Log, name: str, overrides: Sequence[str] = ()) -> Row:
     except MapperError as error:
         return replace(row, refused=str(error))
     check = check_doubts(trajectory, records, log.truth)
-    accepted = [loop for loop in tracking.loops if loop.verdict == "accepted"]
+    accepted = accepted_loops(tracking.loops)
     outcomes = [record.outcome for record in records]
     return replace(
         row,

@@ -12,7 +12,7 @@ from typing import Any
 
 from mapper.cli.answer import Answer, rows_text
 from mapper.evaluators.metrics.metric import Metric
-from mapper.loops.closure import LoopClosure
+from mapper.loops.closure import LoopClosure, accepted_loops
 from mapper.run.folder import Run
 from mapper.run.frame_outcomes import FrameRecord
 from mapper.run.manifest import Counts, Timing
@@ -148,7 +148,7 @@ def _accuracy_text(metrics: Sequence[Metric]) -> str:
 
 def _loop_counts(loops: Sequence[LoopClosure]) -> Mapping[str, Any]:
     """Return how many loops hold, how far they moved the path, and why the other candidates do not."""
-    held = [loop for loop in loops if loop.verdict == "accepted"]
+    held = accepted_loops(loops)
     moved = [
         (loop.before.translation_m, loop.after.translation_m) for loop in held if loop.before and loop.after
     ]

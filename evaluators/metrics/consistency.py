@@ -123,7 +123,7 @@ def _relative_covariances(
         BetweenFactor(i, j, inverse(graph.T_world_node[i]) @ graph.T_world_node[j], _NEXT_TO_NOTHING)
         for i, j in sorted(wanted)
     ]
-    return marginals_of(PoseGraph(graph.T_world_node, graph.stamps_ns, [*graph.factors, *asking])).relative
+    return marginals_of(graph.with_factors([*graph.factors, *asking])).relative
 
 
 def _true_pose(truth: Trajectory, stamp_ns: int) -> Transform | None:

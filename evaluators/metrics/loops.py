@@ -9,7 +9,7 @@ from mapper.core.geometry import Array
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.metric import Metric
-from mapper.loops.closure import LoopClosure, discrepancy
+from mapper.loops.closure import LoopClosure, accepted_loops, discrepancy
 
 MAX_ERROR_M, MAX_ERROR_RAD = 0.2, 0.1
 """A loop that is farther from the truth is wrong."""
@@ -29,7 +29,7 @@ def loop_metrics(
         looked_every_m: Distance that a run went between two searches for loops: a loop found from so near
             counts for a keyframe too.
     """
-    accepted = [loop for loop in loops if loop.verdict == "accepted"]
+    accepted = accepted_loops(loops)
     revisits = revisits_of(keyframes_ns, truth)
     along_m = _along(keyframes_ns, truth)
     found_m = along_m[np.isin(keyframes_ns, [loop.stamp_j_ns for loop in accepted])]

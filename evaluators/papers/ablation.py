@@ -13,6 +13,7 @@ from mapper.features.config import DetectorConfig
 from mapper.features.factory import build_detector
 from mapper.features.matching import Pairs
 from mapper.graph.model import PoseGraph
+from mapper.loops.closure import accepted_loops
 from mapper.loops.factory import build_loop_detector
 from mapper.odometry.base import FrameResult
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
@@ -150,7 +151,7 @@ class _VariantRun:
     def result(self) -> VariantResult:
         """Return the poses with the loops' correction."""
         loops = tuple(self._closer.closures())
-        self._graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")
+        self._graph.add_factors(loop.factor for loop in accepted_loops(loops))
         tracking = TrackingResult(tuple(self._tracks), (), self._graph, loops, {})
         try:
             refuse_a_fragment(tracking, self._config, sensor="rgbd")

@@ -43,7 +43,7 @@ class SolvedGraph:
     @property
     def solved(self) -> PoseGraph:
         """The graph with its nodes at the solution; rejected loops are still in it."""
-        return PoseGraph(self.solution.T_world_node, self.graph.stamps_ns, self.graph.factors)
+        return self.graph.with_poses(self.solution.T_world_node)
 
     @property
     def component_sizes(self) -> list[int]:

@@ -24,16 +24,18 @@ def components(graph: PoseGraph) -> list[list[int]]:
     return list(members.values())
 
 
+def component_numbers(graph: PoseGraph) -> dict[int, int]:
+    """Return the number of each node's component, in the order of ``components``."""
+    return {node: number for number, nodes in enumerate(components(graph)) for node in nodes}
+
+
 def align_components(graph: PoseGraph) -> PoseGraph:
     """Return the graph with every component of the odometry moved to where its first factor puts it.
 
     A component begun after a loss starts at the last pose before it, which may be rooms away from the true
     one: too far for a solver to start from.
     """
-    known = PoseGraph(
-        graph.T_world_node, graph.stamps_ns, [f for f in graph.factors if f.origin == "odometry"]
-    )
-    remaining = components(known)
+    remaining = components(graph.with_factors(f for f in graph.factors if f.origin == "odometry"))
     if len(remaining) <= 1:
         return graph
     T_world_node = {node: graph.T_world_node[node] for node in remaining.pop(0)}
@@ -42,8 +44,7 @@ def align_components(graph: PoseGraph) -> PoseGraph:
         nodes, T_new_old = next((n, T) for n, T in [*motions, (remaining[0], np.eye(4))] if T is not None)
         T_world_node |= {node: T_new_old @ graph.T_world_node[node] for node in nodes}
         remaining.remove(nodes)
-    in_order = {node: T_world_node[node] for node in graph.T_world_node}
-    return PoseGraph(in_order, graph.stamps_ns, graph.factors)
+    return graph.with_poses({node: T_world_node[node] for node in graph.T_world_node})
 
 
 def _alignment(

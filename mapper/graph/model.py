@@ -1,6 +1,6 @@
 """Pose graph: nodes, relative-pose factors, and the solution."""
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from dataclasses import dataclass, field
 from operator import mul
 from typing import TYPE_CHECKING, Literal
@@ -129,8 +129,27 @@ class PoseGraph:
 
     def moved(self, T_new_world: Transform) -> "PoseGraph":
         """Return the graph in another world frame; its measurements are the same."""
-        moved = {node: T_new_world @ T for node, T in self.T_world_node.items()}
-        return PoseGraph(moved, self.stamps_ns, self.factors)
+        return self.with_poses({node: T_new_world @ T for node, T in self.T_world_node.items()})
+
+    def with_poses(self, T_world_node: dict[int, Transform]) -> "PoseGraph":
+        """Return the graph with other poses of the same nodes."""
+        return PoseGraph(T_world_node, self.stamps_ns, self.factors)
+
+    def with_factors(self, factors: Iterable[BetweenFactor]) -> "PoseGraph":
+        """Return the graph with these factors in place of its own."""
+        return PoseGraph(self.T_world_node, self.stamps_ns, list(factors))
+
+    def without_loops(self) -> "PoseGraph":
+        """Return the graph with the factors of odometry and wheels alone."""
+        return self.with_factors(factor for factor in self.factors if factor.origin != "loop")
+
+    def part(self, nodes: Container[int]) -> "PoseGraph":
+        """Return the graph of some nodes, with the factors between them."""
+        return PoseGraph(
+            {node: T for node, T in self.T_world_node.items() if node in nodes},
+            {node: stamp_ns for node, stamp_ns in self.stamps_ns.items() if node in nodes},
+            [factor for factor in self.factors if factor.i in nodes and factor.j in nodes],
+        )
 
     def add_factors(self, factors: Iterable[BetweenFactor]) -> None:
         """Add measurements between nodes that exist.

@@ -9,7 +9,7 @@ import numpy as np
 from mapper.core.geometry import Transform, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
-from mapper.graph.components import components
+from mapper.graph.components import component_numbers
 from mapper.graph.config import WheelFactorsConfig, WheelNoiseConfig
 from mapper.graph.gate import Comparison, compare
 from mapper.graph.model import BetweenFactor, Origin, PoseGraph, PoseSigmas
@@ -79,10 +79,7 @@ def wheel_conflict(graph: PoseGraph, driven: Sequence[BetweenFactor]) -> str:
         graph: Nodes at the odometry's estimates, with its factors.
         driven: Wheel factors between them; those between parts that the odometry left unconnected are new.
     """
-    by_odometry = PoseGraph(
-        graph.T_world_node, graph.stamps_ns, [f for f in graph.factors if f.origin == "odometry"]
-    )
-    part_of = {node: part for part, nodes in enumerate(components(by_odometry)) for node in nodes}
+    part_of = component_numbers(graph.with_factors(f for f in graph.factors if f.origin == "odometry"))
     both = [factor for factor in driven if part_of[factor.i] == part_of[factor.j]]
     apart = [
         _apart(inverse(graph.T_world_node[factor.i]) @ graph.T_world_node[factor.j], factor)

@@ -1,6 +1,7 @@
 """Loop closures: every candidate with its measurement and its verdict, and the file of them."""
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -105,6 +106,19 @@ def exceeds(miss: Discrepancy, limit: Discrepancy) -> bool:
     return miss.translation_m > limit.translation_m or miss.rotation_rad > limit.rotation_rad
 
 
+def accepted_loops(loops: Iterable[LoopClosure]) -> list[LoopClosure]:
+    """Return the loops that are constraints of the graph."""
+    return [loop for loop in loops if loop.verdict == "accepted"]
+
+
+def why_none_accepted(loops: Sequence[LoopClosure]) -> str:
+    """Return why no loop of some candidates is accepted: none looked alike, or which steps rejected them."""
+    if not loops:
+        return "nothing in it looks like a known place (min_similarity of loops.places or loops.context)"
+    steps = Counter(loop.reason.split(":")[0] for loop in loops).most_common()
+    return f"{len(loops)} candidates compared, none held: {', '.join(f'{step} {n}' for step, n in steps)}"
+
+
 def apply_solution(
     loops: Sequence[LoopClosure],
     T_world_before: Mapping[int, Transform],
@@ -120,8 +134,7 @@ def apply_solution(
         solution: Of that graph.
         min_weight: A loop that weighs less is rejected.
     """
-    accepted = sum(loop.verdict == "accepted" for loop in loops)
-    weights = iter(solution.weights[len(solution.weights) - accepted :])
+    weights = iter(solution.weights[len(solution.weights) - len(accepted_loops(loops)) :])
     return tuple(
         _apply_solution(loop, next(weights), T_world_before, solution.T_world_node, min_weight)
         if loop.verdict == "accepted" and loop.T_i_j is not None

@@ -12,7 +12,7 @@ from mapper.graph.components import components
 from mapper.graph.config import GraphConfig
 from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
-from mapper.loops.closure import MIN_WEIGHT, LoopClosure, apply_solution
+from mapper.loops.closure import MIN_WEIGHT, LoopClosure, accepted_loops, apply_solution
 from mapper.loops.shared_places import SharedPlace
 
 _DISAGREES = "consensus: disagrees with most places that the two runs share"
@@ -73,7 +73,7 @@ class JointGraph:
 
 
 def _tie(pair: tuple[int, int], loops: Sequence[LoopClosure]) -> Tie:
-    after = [loop.after for loop in loops if loop.verdict == "accepted" and loop.after is not None]
+    after = [loop.after for loop in accepted_loops(loops) if loop.after is not None]
     misses = np.array([(miss.translation_m, miss.rotation_rad) for miss in after]).reshape(-1, 2)
     rms_m, rms_rad = np.sqrt((misses**2).mean(axis=0)).tolist() if len(misses) else (0.0, 0.0)
     return Tie(
@@ -150,12 +150,7 @@ def _connected(joint: JointGraph) -> JointGraph:
         return joint
     apart = {joint.run_of(node) for nodes in others for node in nodes}
     apart.discard(joint.run_of(first[0]))  # a run that has fallen apart itself stays as it was
-    nodes = {node: T for node, T in joint.graph.T_world_node.items() if joint.run_of(node) not in apart}
-    graph = PoseGraph(
-        nodes,
-        {node: joint.graph.stamps_ns[node] for node in nodes},
-        [factor for factor in joint.graph.factors if factor.i in nodes and factor.j in nodes],
-    )
+    nodes = {node for node in joint.graph.T_world_node if joint.run_of(node) not in apart}
     first_nodes = {number: first for number, first in joint.first_nodes.items() if number not in apart}
     loops = [loop for loop in joint.loops if loop.i in nodes and loop.j in nodes]
-    return replace(joint, graph=graph, first_nodes=first_nodes, loops=loops)
+    return replace(joint, graph=joint.graph.part(nodes), first_nodes=first_nodes, loops=loops)

@@ -1,14 +1,12 @@
 """Appending: a second session of the same place, connected to the first by loops and mapped with it."""
 
-from collections import Counter
 from collections.abc import Sequence, Set
 from dataclasses import replace
 from pathlib import Path
 
 from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, LoopError
-from mapper.graph.model import PoseGraph
-from mapper.loops.closure import LoopClosure
+from mapper.loops.closure import LoopClosure, accepted_loops, why_none_accepted
 from mapper.loops.config import KeyframeLoopsConfig
 from mapper.loops.factory import build_keyframe_loop_detector
 from mapper.odometry.factory import odometry_for
@@ -147,20 +145,13 @@ def _after(
     detector.preload(graph, {node: views[stamp_ns] for node, stamp_ns in graph.stamps_ns.items()})
     odometry = odometry_for(config.odometry, session, wheels_beside(session, config))
     offset_odometry = NodeOffset(odometry, first_node=max(graph.T_world_node) + 1)
-    known = [factor for factor in graph.factors if factor.origin != "loop"]
-    return Start(
-        offset_odometry, detector, PoseGraph(graph.T_world_node, graph.stamps_ns, known), before.loops
-    )
+    return Start(offset_odometry, detector, graph.without_loops(), before.loops)
 
 
 def _refuse_unconnected(second: Log, run: Run, loops: Sequence[LoopClosure], known: Set[int]) -> None:
     """Refuse a session of which no loop leads to the known nodes."""
     between = [loop for loop in loops if loop.i in known and loop.j not in known]
-    if any(loop.verdict == "accepted" for loop in between):
+    if accepted_loops(between):
         return
-    if not between:
-        why = "nothing in it looks like a known place (min_similarity of loops.places or loops.context)"
-    else:
-        refused = Counter(loop.reason.split(":")[0] for loop in between).most_common()
-        why = f"{len(between)} candidates compared, none held: {', '.join(f'{by} {n}' for by, n in refused)}"
+    why = why_none_accepted(between)
     raise LoopError(f"{second.path}: no loop connects it to {run.path}; {why}; is it the same place?")

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from mapper.graph.components import components
-from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.pipeline.track import TrackingResult
@@ -39,18 +38,13 @@ def component_of(tracking: TrackingResult, node: int, *, progress: Progress) -> 
         f"{left_out} of {len(tracking.placed)} frames lie in {len(parts) - 1} parts of the path that nothing "
         "connects to the rest; they are left out"
     )
-    graph = tracking.graph
     return replace(
         tracking,
         tracks=tuple(
             track if track.node is None or track.node in kept else disconnected(track)
             for track in tracking.tracks
         ),
-        graph=PoseGraph(
-            {node: T for node, T in graph.T_world_node.items() if node in kept},
-            {node: stamp_ns for node, stamp_ns in graph.stamps_ns.items() if node in kept},
-            [factor for factor in graph.factors if factor.i in kept],
-        ),
+        graph=tracking.graph.part(kept),
         loops=tuple(_refused_unless(loop, kept) for loop in tracking.loops),
     )
 

@@ -11,7 +11,7 @@ from mapper.graph.components import components
 from mapper.graph.model import PoseGraph
 from mapper.graph.odometry_poses import by_odometry
 from mapper.loops.base import Proposal, Verifier, verify_proposal
-from mapper.loops.closure import LoopClosure
+from mapper.loops.closure import LoopClosure, accepted_loops
 from mapper.loops.config import NoLoopsConfig
 from mapper.loops.factory import LOOPS_OF, build_verifier
 from mapper.pipeline.fuse import fuse_changed
@@ -70,9 +70,8 @@ def edit_loops(
     if pairs:
         found = _measured(source, tracked, pairs, run.config)
         loops = [loop for loop in loops if (loop.i, loop.j) not in pairs] + found
-    known = [factor for factor in graph.factors if factor.origin != "loop"]
-    held = [loop.factor for loop in loops if loop.verdict == "accepted"]
-    edited = PoseGraph(by_odometry(graph), graph.stamps_ns, [*known, *held])
+    held = [loop.factor for loop in accepted_loops(loops)]
+    edited = graph.with_poses(by_odometry(graph)).with_factors([*graph.without_loops().factors, *held])
     solved = solve(edited, loops, run.config.graph)
     for loop in solved.loops[len(loops) - len(pairs) :]:
         _refuse_rejected(loop)

@@ -19,7 +19,6 @@ from mapper.export.mcap_log import McapLog
 from mapper.export.picture import write_summary
 from mapper.export.ply import write_ply
 from mapper.export.run_mcap import log_maps, log_results, log_snapshot
-from mapper.graph.model import PoseGraph
 from mapper.mapping.config import Edits
 from mapper.mapping.fusion import Maps, fuse_log
 from mapper.mapping.measured_noise import measure_noise
@@ -141,12 +140,7 @@ def _with_trajectory(run: Run, trajectory: Trajectory) -> StoredTracking:
     graph = tracked.graph
     moved = {node: T_world_body.get(graph.stamps_ns[node], T) for node, T in graph.T_world_node.items()}
     records = [_given(record) if record.stamp_ns in T_world_body else record for record in tracked.records]
-    return replace(
-        tracked,
-        records=records,
-        trajectory=trajectory,
-        graph=PoseGraph(moved, graph.stamps_ns, graph.factors),
-    )
+    return replace(tracked, records=records, trajectory=trajectory, graph=graph.with_poses(moved))
 
 
 def _given(record: FrameRecord) -> FrameRecord:

@@ -9,7 +9,6 @@ import numpy as np
 from mapper.core.geometry import Transform, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.graph.components import components
-from mapper.graph.model import PoseGraph
 from mapper.loops.closure import discrepancy, exceeds
 from mapper.loops.config import GateConfig
 from mapper.loops.odometry_chain import NodePath, allowed
@@ -49,8 +48,7 @@ def without_jumps(
         progress: Receives a note on each cut.
     """
     graph = tracking.graph
-    odometry = [factor for factor in graph.factors if factor.origin != "loop"]
-    for nodes in components(PoseGraph(graph.T_world_node, graph.stamps_ns, odometry)):
+    for nodes in components(graph.without_loops()):
         for last, first in _jumps(_constrained(tracking, sorted(nodes)), gate):
             times_s = [
                 (graph.stamps_ns[node] - tracking.tracks[0].stamp_ns) / NS_PER_S for node in (last, first)
@@ -105,15 +103,15 @@ def _agree(a: _Constrained, b: _Constrained, gate: GateConfig) -> bool:
 def _cut(tracking: TrackingResult, last: int, first: int, map_node: int) -> TrackingResult:
     """Return the result without what connects two nodes along the path."""
     graph = tracking.graph
-    factors = [
+    kept = (
         factor
         for factor in graph.factors
         if factor.i == map_node or max(factor.i, factor.j) <= last or min(factor.i, factor.j) >= first
-    ]
+    )
     begin_ns, end_ns = graph.stamps_ns[last], graph.stamps_ns[first]
     return replace(
         tracking,
-        graph=PoseGraph(graph.T_world_node, graph.stamps_ns, factors),
+        graph=graph.with_factors(kept),
         tracks=tuple(
             disconnected(track) if begin_ns < track.stamp_ns < end_ns else track for track in tracking.tracks
         ),

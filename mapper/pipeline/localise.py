@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import replace
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,11 @@ import numpy as np
 from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, LoopError
 from mapper.export.picture import write_localised
-from mapper.graph.components import components
+from mapper.graph.components import component_numbers, components
 from mapper.graph.config import GraphConfig
-from mapper.graph.model import BetweenFactor, PoseGraph
+from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
-from mapper.loops.closure import Discrepancy, exceeds
+from mapper.loops.closure import Discrepancy, accepted_loops, exceeds, why_none_accepted
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.map_constraints import build_map_constraint_detector
 from mapper.octree.grid_file import read_grid
@@ -136,25 +137,18 @@ def _start(source: Log, known: KnownMap, config: BuildConfig) -> Start:
 
 def _refuse_unplaced(source: Log, known: KnownMap, tracking: TrackingResult) -> None:
     """Refuse a log of which nothing is tied to the map."""
-    if any(loop.verdict == "accepted" for loop in tracking.loops):
+    if accepted_loops(tracking.loops):
         return
-    if not tracking.loops:
-        why = "nothing in it looks like a place of the map (min_similarity of loops.places or loops.context)"
-    else:
-        refused = Counter(loop.reason.split(":")[0] for loop in tracking.loops).most_common()
-        why = (
-            f"{len(tracking.loops)} pairs compared, none held: {', '.join(f'{by} {n}' for by, n in refused)}"
-        )
+    why = why_none_accepted(tracking.loops)
     raise LoopError(f"{source.path}: cannot be placed in {known.path}; {why}; is it the same place?")
 
 
 def _supported(tracking: TrackingResult) -> TrackingResult:
     """Return the result without the constraints of parts that too few tie to the map."""
     graph = tracking.graph
-    odometry = [factor for factor in graph.factors if factor.origin != "loop"]
-    parts = components(PoseGraph(graph.T_world_node, graph.stamps_ns, odometry))
-    part_of = {node: number for number, nodes in enumerate(parts) for node in nodes}
-    tied = Counter(part_of[loop.j] for loop in tracking.loops if loop.verdict == "accepted")
+    odometry = graph.without_loops()
+    part_of = component_numbers(odometry)
+    tied = Counter(part_of[loop.j] for loop in accepted_loops(tracking.loops))
     weak = {part for part, count in tied.items() if count < _LEAST_CONSTRAINTS}
     if not weak:
         return tracking
@@ -169,8 +163,8 @@ def _supported(tracking: TrackingResult) -> TrackingResult:
         else loop
         for loop in tracking.loops
     )
-    factors = [*odometry, *(loop.factor for loop in loops if loop.verdict == "accepted")]
-    return replace(tracking, graph=PoseGraph(graph.T_world_node, graph.stamps_ns, factors), loops=loops)
+    factors = [*odometry.factors, *(loop.factor for loop in accepted_loops(loops))]
+    return replace(tracking, graph=graph.with_factors(factors), loops=loops)
 
 
 def _with_honest_constraints(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
@@ -179,15 +173,16 @@ def _with_honest_constraints(graph: PoseGraph, config: GraphConfig) -> PoseGraph
     Their information is that of the pixels or points and knows nothing of the errors that the map's own poses
     have. Divided by their median χ², over that of consistent measurements, it does.
     """
-    constraints = [factor for factor in graph.factors if factor.origin == "loop"]
-    known = [factor for factor in graph.factors if factor.origin != "loop"]
     exact = config.model_copy(update={"robust": "none"})
     solution = optimize(graph, exact)
-    chi2 = 2.0 * np.array(solution.factor_errors)[[f.origin == "loop" for f in graph.factors]]
+    is_constraint = [factor.origin == "loop" for factor in graph.factors]
+    chi2 = 2.0 * np.array(solution.factor_errors)[is_constraint]
     scale = 1.0 / max(1.0, float(np.median(chi2)) / _MEDIAN_CHI2)
-    scaled = [BetweenFactor(f.i, f.j, f.T_i_j, scale * f.information, f.origin) for f in constraints]
-    graph = PoseGraph(solution.T_world_node, graph.stamps_ns, [*known, *scaled])
-    return PoseGraph(optimize(graph, exact).T_world_node, graph.stamps_ns, graph.factors)
+    constraints = compress(graph.factors, is_constraint)
+    scaled = [replace(factor, information=scale * factor.information) for factor in constraints]
+    graph = graph.with_poses(solution.T_world_node)
+    graph = graph.with_factors([*graph.without_loops().factors, *scaled])
+    return graph.with_poses(optimize(graph, exact).T_world_node)
 
 
 def _doubtful_unless_confirmed(
@@ -200,10 +195,9 @@ def _doubtful_unless_confirmed(
     vain.
     """
     graph, doubts = tracking.graph, dict[int, str]()
-    held = {loop.j for loop in tracking.loops if loop.verdict == "accepted"}
+    held = {loop.j for loop in accepted_loops(tracking.loops)}
     failed = {loop.j for loop in tracking.loops} - held
-    odometry = [factor for factor in graph.factors if factor.origin != "loop"]
-    for nodes in components(PoseGraph(graph.T_world_node, graph.stamps_ns, odometry)):
+    for nodes in components(graph.without_loops()):
         if held.isdisjoint(nodes):
             continue
         in_order = sorted(nodes)
@@ -235,7 +229,7 @@ def _doubtful_unless_confirmed(
 
 
 def _write(writer: RunWriter, source: Log, known: KnownMap, tracking: TrackingResult) -> None:
-    folder, held = writer.folder, [loop for loop in tracking.loops if loop.verdict == "accepted"]
+    folder, held = writer.folder, accepted_loops(tracking.loops)
     stored = from_tracking(tracking, source.truth)
     poses = uncertain_poses(stored.trajectory, stored.graph, stored.records)
     save_frames(writer, stored, nodes=len(stored.graph.T_world_node) - 1)

@@ -10,7 +10,6 @@ import numpy as np
 
 from mapper.core.errors import RunError
 from mapper.core.geometry import inverse
-from mapper.graph.model import PoseGraph
 from mapper.loops.closure import read_closures
 from mapper.loops.map_constraints import KnownPlaces
 from mapper.loops.shared_places import SharedPlace, find_shared_places, shared_place
@@ -116,7 +115,7 @@ def _placed(run: Run, number: int, joint: JointGraph, held: int) -> Placed:
         T_map_world = fit_poses(np.array(list(T_map_node.values())), graph.poses)
     T_world_map = inverse(T_map_world)
     moved = {node: T_world_map @ T for node, T in T_map_node.items()}
-    solved = load_tracking(run).solved(PoseGraph(moved, graph.stamps_ns, graph.factors), run.loops)
+    solved = load_tracking(run).solved(graph.with_poses(moved), run.loops)
     return Placed(run, T_map_world, f"by {held} loops" if number else _FIRST, solved.trajectory)
 
 

@@ -11,7 +11,7 @@ from mapper.graph.config import GraphConfig
 from mapper.graph.drift import innovations
 from mapper.graph.model import PoseGraph, Solution
 from mapper.graph.optimize import optimize
-from mapper.loops.closure import MIN_WEIGHT, LoopClosure, apply_solution
+from mapper.loops.closure import MIN_WEIGHT, LoopClosure, accepted_loops, apply_solution
 from mapper.run.manifest import Solve
 
 _ROUNDING = 1e-12
@@ -47,8 +47,7 @@ def solve(graph: PoseGraph, loops: Sequence[LoopClosure], config: GraphConfig) -
     graph = align_components(graph)
     solution = optimize(graph, config)
     loops = apply_solution(loops, graph.T_world_node, solution, min_weight=MIN_WEIGHT)
-    others = [factor for factor in graph.factors if factor.origin != "loop"]
-    held = [loop for loop in loops if loop.verdict == "accepted"]
+    others, held = graph.without_loops().factors, accepted_loops(loops)
     factors = [loop.factor for loop in held]
     report = Solve(
         error_before=solution.error_before,
@@ -67,7 +66,8 @@ def solve(graph: PoseGraph, loops: Sequence[LoopClosure], config: GraphConfig) -
                 "loop_residual_sigma": float(np.median(np.sqrt(innovations(others, factors)))),
             }
         )
-    return Solved(PoseGraph(_moved(graph, solution), graph.stamps_ns, [*others, *factors]), loops, report)
+    graph = graph.with_poses(_moved(graph, solution)).with_factors([*others, *factors])
+    return Solved(graph, loops, report)
 
 
 def _moved(graph: PoseGraph, solution: Solution) -> dict[int, Transform]:

@@ -13,7 +13,7 @@ from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.features.frame_view import FrameView
 from mapper.graph.model import BetweenFactor, PoseGraph
 from mapper.graph.wheel_factors import WheelMeasurements, wheel_conflict
-from mapper.loops.closure import LoopClosure
+from mapper.loops.closure import LoopClosure, accepted_loops
 from mapper.loops.detector import LoopDetector
 from mapper.loops.factory import build_loop_detector, build_verifier
 from mapper.loops.place_file import AnyPlace, write_places
@@ -237,7 +237,7 @@ def track_log(
         progress.note(warning.sentence)
     graph.add_factors(wheel_factors)
     loops = (*start.loops, *detector.closures())
-    graph.add_factors(loop.factor for loop in loops if loop.verdict == "accepted")
+    graph.add_factors(loop.factor for loop in accepted_loops(loops))
     return TrackingResult(tuple(tracks), tuple(skipped), graph, loops, frame_ms, warnings, detector.places())
 
 

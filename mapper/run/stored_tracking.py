@@ -9,7 +9,7 @@ from mapper.core.geometry import inverse
 from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.graph.g2o import write_g2o
 from mapper.graph.model import PoseGraph
-from mapper.loops.closure import LoopClosure, write_closures
+from mapper.loops.closure import LoopClosure, accepted_loops, write_closures
 from mapper.run import files
 from mapper.run.doubtful_frames import placed_by_neighbours
 from mapper.run.folder import Run
@@ -138,7 +138,7 @@ def save_frames(writer: RunWriter, tracked: StoredTracking, *, nodes: int) -> No
             **{name: outcomes.count(name) for name in ("skipped", "lost", "doubtful", "tracked")},
             "nodes": nodes,
             "factors": len(tracked.graph.factors),
-            "loops": sum(loop.verdict == "accepted" for loop in tracked.loops),
+            "loops": len(accepted_loops(tracked.loops)),
             "loop_candidates": len(tracked.loops),
         }
     )

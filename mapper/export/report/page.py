@@ -20,6 +20,7 @@ from mapper.export.report.data import (
     views_uri,
 )
 from mapper.export.report.map_page import json_element, map_html, map_scripts, map_style
+from mapper.loops.closure import accepted_loops
 from mapper.runtime.atomic import write_text
 
 _CURVES = (
@@ -213,6 +214,5 @@ def _loop_sections(chapters: Sequence[Chapter]) -> Iterator[str]:
 
 def _loops(number: int, chapter: Chapter) -> str:
     loops = chapter.results.loops
-    held = sum(loop.verdict == "accepted" for loop in loops)
-    title = f"{escape(chapter.name)}: {held} of {len(loops)} candidates hold"
+    title = f"{escape(chapter.name)}: {len(accepted_loops(loops))} of {len(loops)} candidates hold"
     return f'<div class="loops" data-of="{number}"><h3>{title}</h3></div>'
