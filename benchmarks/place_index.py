@@ -125,7 +125,7 @@ def compare_matching(vocabulary: Vocabulary, bits: list[Bits]) -> None:
     print(f"{'matching':>10} {'ms':>8} {'faster':>8} {'matches':>8} {'recall':>7} {'same':>6}")
     print(f"{'everywhere':>10} {all_ms:8.3f} {'':8} {total:8}")
     for level in range(1, vocabulary.levels + 1):
-        nodes = [vocabulary.nodes_of(image, level=level) for image in bits]
+        nodes = [vocabulary.ancestors_of(vocabulary.words_of(image), level=level) for image in bits]
         sides = list(zip(bits[::2], nodes[::2], bits[1::2], nodes[1::2], strict=True))
 
         def guided(sides=sides) -> list[np.ndarray]:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array, adjoint, inverse, log
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, nearest
 from mapper.core.trajectory import Trajectory
-from mapper.evaluators.metrics.metric import Metric
 from mapper.run.frame_outcomes import FrameRecord
 
 WRONG_M, WRONG_RAD, WRONG_SIGMAS = 0.2, float(np.deg2rad(5.0)), 5.0
@@ -110,15 +109,6 @@ def check_doubts(
         right=int(right.sum()),
         flagged_right=int((right & flagged[known]).sum()),
     )
-
-
-def doubt_metrics(check: DoubtCheck) -> list[Metric]:
-    """Return the numbers of a check as metrics."""
-    return [
-        Metric("wrong windows", check.wrong, "windows"),
-        Metric("wrong windows without a doubtful or lost frame", check.silent, "windows"),
-        Metric("right frames called doubtful", check.flagged_right, "frames"),
-    ]
 
 
 def _error(poses: Array, T_truth: Array, a: int, b: int) -> tuple[Array, Array]:

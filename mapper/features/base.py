@@ -47,11 +47,6 @@ class Features:
     def __len__(self) -> int:
         return len(self.pixels)
 
-    @property
-    def is_binary(self) -> bool:
-        """Descriptors are bits, compared by Hamming distance."""
-        return self.descriptors.dtype == np.uint8
-
 
 @runtime_checkable
 class Detector(Protocol):

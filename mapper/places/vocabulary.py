@@ -94,13 +94,6 @@ class Vocabulary:
         """Return (N,) the word of each of (N, 4) descriptors."""
         return self.tree.words_of(bits)
 
-    def nodes_of(self, bits: Bits, *, level: int) -> Ids:
-        """Return (N,) the node of each of (N, 4) descriptors, ``level`` steps below the root.
-
-        ``ancestors_of(words, level=level)`` gives the same from known words without another descent.
-        """
-        return self.ancestors_of(self.words_of(bits), level=level)
-
     def ancestors_of(self, words: Ids, *, level: int) -> Ids:
         """Return (N,) the ancestor of each word ``level`` steps below the root."""
         return self.tree.ancestors_of(words, level=level)

@@ -15,7 +15,7 @@ def match_by_word(
 
     Args:
         bits_a: (Na, 4) uint64 descriptors.
-        nodes_a: (Na,) their nodes; see ``Vocabulary.nodes_of``.
+        nodes_a: (Na,) their nodes; see ``Vocabulary.ancestors_of``.
         bits_b: (Nb, 4) uint64 descriptors.
         nodes_b: (Nb,) their nodes, on the same level.
         max_hamming: Largest distance in bits.

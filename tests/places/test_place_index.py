@@ -177,7 +177,7 @@ def test_guided_matches_of_images_agree_with_everywhere_s(two_laps):
     a, b = bits[0], bits[4 + int(distance_m.argmin())]
     everywhere = match_mutual_bits(a, b, *MATCHING.values())
 
-    nodes = (vocabulary.nodes_of(image, level=1) for image in (a, b))
+    nodes = (vocabulary.ancestors_of(vocabulary.words_of(image), level=1) for image in (a, b))
     guided = match_by_word(a, next(nodes), b, next(nodes), **MATCHING)
 
     both = (guided >= 0) & (everywhere >= 0)

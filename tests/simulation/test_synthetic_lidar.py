@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from mapper.core.errors import DataError, SourceError
+from mapper.core.errors import SourceError
 from mapper.core.geometry import angle_between, apply, inverse
 from mapper.simulation.config import (
     COURTYARD,
@@ -19,8 +19,6 @@ from mapper.simulation.lidar import (
     LidarSimulator,
     make_outdoor_scene,
     render_scan,
-    render_sweep,
-    sample_map,
     write_lidar_log,
 )
 from mapper.simulation.lidar.solids import Shape
@@ -186,26 +184,6 @@ def test_the_way_is_as_long_as_told_closes_and_is_free(scene, loop_m, seed):
     height_m = T_world_body[:, 2, 3] - source.scene.ground.height_m(T_world_body[:, :2, 3])
     np.testing.assert_allclose(height_m, 1.7)
     assert source.scene.solids.hulls.signed_distance_m(source.truth.positions_world).min() > 0.5
-
-
-def test_a_sweep_wants_a_pose_for_every_column():
-    scene = make_outdoor_scene(COURTYARD)
-    with pytest.raises(DataError, match=r"sweep: poses \(3, 4, 4\), want one a column"):
-        render_sweep(scene, EXACT, np.tile(np.eye(4), (3, 1, 1)), np.random.default_rng(0))
-
-
-def test_a_dense_map_is_exact_even_and_where_it_was_asked_for():
-    source = LidarSimulator(exact(COURTYARD))
-    T_world_map = source.truth.T_world_body[7]
-    points = sample_map(source.scene, T_world_map, spacing_m=0.3, radius_m=15.0).points_body.astype(float)
-    assert len(points) > 3000
-    assert distances_m(source.scene, apply(T_world_map, points)).max() < 1e-4
-    assert np.linalg.norm(points, axis=1).max() <= 15.0 + 1e-5
-    assert len(np.unique(np.floor(points / 0.3), axis=0)) > 0.99 * len(points)
-    far = T_world_map.copy()
-    far[0, 3] += 1000.0
-    with pytest.raises(DataError, match="no part of the route is within 15"):
-        sample_map(source.scene, far, radius_m=15.0)
 
 
 def test_rings_in_the_wrong_order_are_refused():

@@ -7,7 +7,6 @@ above; its stamp is when it begins, so times are never negative.
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.errors import DataError
 from mapper.core.frames import Points32, Scan
 from mapper.core.geometry import Array, Transform
 from mapper.simulation.config import LidarSensorConfig
@@ -31,45 +30,12 @@ def ray_directions(sensor: LidarSensorConfig) -> Array:
     return np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, up], axis=2)
 
 
-def render_sweep(
-    scene: OutdoorScene,
-    sensor: LidarSensorConfig,
-    T_world_lidar: Array,
-    rng: np.random.Generator,
-    *,
-    stamp_ns: int = 0,
-) -> Scan:
-    """Return the scan of a sensor that moves while it turns: every point as it was seen when it was fired.
-
-    Args:
-        scene: The world.
-        sensor: The LiDAR.
-        T_world_lidar: (A, 4, 4) its pose when each column is fired.
-        rng: This scan's own noise.
-        stamp_ns: When the sweep begins.
-
-    Raises:
-        DataError: Another number of poses than columns.
-    """
-    if T_world_lidar.shape != (sensor.azimuth_steps, 4, 4):
-        raise DataError(
-            f"sweep: poses {T_world_lidar.shape}, want one a column: ({sensor.azimuth_steps}, 4, 4)"
-        )
-    points_lidar, columns, _ = measure(scene, sensor, T_world_lidar, rng)
-    return Scan(stamp_ns, points_lidar, times_s=column_times_s(sensor, columns))
-
-
 def render_scan(
-    scene: OutdoorScene,
-    sensor: LidarSensorConfig,
-    T_world_lidar: Transform,
-    rng: np.random.Generator,
-    *,
-    stamp_ns: int = 0,
+    scene: OutdoorScene, sensor: LidarSensorConfig, T_world_lidar: Transform, rng: np.random.Generator
 ) -> Scan:
     """Return the scan of a sensor that stands still at a (4, 4) pose; its points have no times."""
     poses = np.broadcast_to(T_world_lidar, (sensor.azimuth_steps, 4, 4))
-    return Scan(stamp_ns, measure(scene, sensor, poses, rng)[0])
+    return Scan(0, measure(scene, sensor, poses, rng)[0])
 
 
 def column_times_s(sensor: LidarSensorConfig, columns: NDArray[np.intp]) -> NDArray[np.float32]:

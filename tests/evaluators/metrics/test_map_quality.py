@@ -17,8 +17,8 @@ from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import write_bt
 from mapper.simulation.boxes import Boxes, write_scene
-from mapper.simulation.config import LidarSynthConfig
-from mapper.simulation.lidar import make_outdoor_scene, sample_map
+from mapper.simulation.config import IDEAL_LIDAR, LidarSynthConfig
+from mapper.simulation.lidar import make_outdoor_scene, render_scan
 
 EDGE_M = 0.05
 ROW = np.arange(-1.0, 1.0, 0.02) + 0.01
@@ -137,7 +137,10 @@ def test_what_is_no_reference_is_named(tmp_path):
 def test_points_of_an_outdoor_world_lie_on_its_surfaces(kind):
     config = LidarSynthConfig(scene=kind, loop_m=30.0)
     scene = make_outdoor_scene(config)
-    points = sample_map(scene, np.eye(4), spacing_m=0.8, radius_m=12.0).points_body.astype(np.float64)
+    here = scene.route.points(np.zeros(1))
+    eye = np.array([*here[0], float(scene.ground.height_m(here)[0]) + 2.0])
+    scan = render_scan(scene, IDEAL_LIDAR, transform(np.eye(3), eye), np.random.default_rng(0))
+    points = scan.points_body[::10].astype(np.float64) + eye
     away = scene.ground.normals(points[:, :2])
 
     assert len(points) > 500

@@ -6,7 +6,7 @@ import pytest
 from mapper.core.geometry import exp, inverse
 from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
-from mapper.evaluators.metrics.silent_failures import check_doubts, doubt_metrics
+from mapper.evaluators.metrics.silent_failures import check_doubts
 from mapper.odometry.base import Diagnostics
 from mapper.run.frame_outcomes import FrameRecord
 
@@ -140,8 +140,3 @@ def test_frames_that_the_truth_does_not_cover_are_left_out():
     half = Trajectory(truth.stamps_ns[:25], truth.T_world_body[:25])
     check = check_doubts(walk(jump_at=40, jump_m=0.5), records(), half)
     assert (check.windows, check.wrong, check.right) == (15, 0, 25)
-
-
-def test_the_numbers_are_metrics():
-    check = check_doubts(walk(jump_at=23, jump_m=0.3), records(flagged={5}), walk())
-    assert [metric.value for metric in doubt_metrics(check)] == [10, 10, 1]
