@@ -240,7 +240,6 @@ def _sharpness_of(source: "Log", trajectory: "Trajectory", *, progress: "Progres
 
 
 def _frames_ns(run: "Run | None", log: Path | None, *, used: bool) -> "Stamps | None":
-    import numpy as np
 
     from mapper.config.loading import load_source_config
     from mapper.core.errors import DataError
@@ -249,7 +248,7 @@ def _frames_ns(run: "Run | None", log: Path | None, *, used: bool) -> "Stamps | 
     if run is not None:
         if log is not None and not used:
             raise DataError(f"{log}: --log is for bare trajectories; {run.path} knows the frames of its log")
-        return np.array([record.stamp_ns for record in run.records], dtype=np.int64)
+        return run.frames_ns
     if log is None:
         return None
     return open_source(log, load_source_config(None, [])).stamps_ns

@@ -70,7 +70,7 @@ def _figures(run: "Run") -> "list[Figure]":
     from mapper.export.report.data import Figure
 
     counts, timing, truth, poses = run.manifest.counts, run.manifest.timing, run.truth, run.poses
-    frames_ns = np.array([record.stamp_ns for record in run.records], dtype=np.int64)
+    frames_ns = run.frames_ns
     metrics = list(assess(run.trajectory, truth, frames_ns=frames_ns).metrics)
     if truth is not None:
         metrics += loop_metrics(run.loops, run.keyframes.stamps_ns, truth)

@@ -286,9 +286,7 @@ class MethodRun:
 
 def _truth_during(source: Log, frames_ns: Stamps) -> Trajectory | None:
     """Return the true poses from the first frame to the last; None if there are none."""
-    truth = source.truth
-    if truth is None:
+    if source.truth is None:
         return None
-    first_ns, last_ns = frames_ns[0] - MAX_TRUTH_GAP_NS, frames_ns[-1] + MAX_TRUTH_GAP_NS
-    near = (truth.stamps_ns >= first_ns) & (truth.stamps_ns <= last_ns)
-    return Trajectory(truth.stamps_ns[near], truth.T_world_body[near]) if near.any() else None
+    truth = source.truth.during(frames_ns[0] - MAX_TRUTH_GAP_NS, frames_ns[-1] + MAX_TRUTH_GAP_NS)
+    return truth if len(truth) else None

@@ -10,7 +10,7 @@ from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.graph.marginals import marginals_of
 from mapper.graph.model import BetweenFactor, PoseGraph
-from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.frame_outcomes import FrameRecord, stamps_of
 from mapper.sensing.wheel_kinematics import pose_at
 
 _NEXT_TO_NOTHING = 1e-6 * np.eye(6)
@@ -51,7 +51,7 @@ def window_nees(
         window_s: Length of a window.
         most: Windows to compare, spread over the log.
     """
-    pose_of = dict(zip(trajectory.stamps_ns.tolist(), trajectory.T_world_body, strict=True))
+    pose_of = dict(trajectory.items())
     known = [
         (record, T_true)
         for record in records
@@ -60,7 +60,7 @@ def window_nees(
         and record.stamp_ns in pose_of
         and (T_true := _true_pose(truth, record.stamp_ns)) is not None
     ]
-    stamps_ns = np.array([record.stamp_ns for record, _ in known], dtype=np.int64)
+    stamps_ns = stamps_of(record for record, _ in known)
     ends = np.searchsorted(stamps_ns, stamps_ns + round(window_s * NS_PER_S))
     begins = np.flatnonzero(ends < len(known))
     begins = begins[:: max(1, len(begins) // most)]

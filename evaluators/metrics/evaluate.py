@@ -119,7 +119,7 @@ def evaluate(
         (True, True)
     """
     run, trajectory, known = estimate_and_truth(estimate, truth, times)
-    frames_ns = None if run is None else np.array([record.stamp_ns for record in run.records], np.int64)
+    frames_ns = None if run is None else run.frames_ns
     names = [
         str(one) if isinstance(one, str | os.PathLike) else default
         for one, default in ((estimate, "the estimate"), (truth, "the truth"))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array
+from mapper.core.geometry import Array, distances_along
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.evaluators.metrics.metric import Metric
@@ -60,8 +60,7 @@ def revisits_of(keyframes_ns: Stamps, truth: Trajectory) -> NDArray[np.bool_]:
 def _along(keyframes_ns: Stamps, truth: Trajectory) -> Array:
     """Return (N,) metres of true path up to every keyframe."""
     index, _ = nearest(truth.stamps_ns, keyframes_ns)
-    steps_m = np.linalg.norm(np.diff(truth.positions_world, axis=0), axis=1)
-    along_m: Array = np.concatenate([[0.0], np.cumsum(steps_m)])[index]
+    along_m: Array = distances_along(truth.positions_world)[index]
     return along_m
 
 

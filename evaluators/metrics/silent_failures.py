@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array, adjoint, inverse, log
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, nearest
 from mapper.core.trajectory import Trajectory
-from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.frame_outcomes import FrameRecord, stamps_of
 
 WRONG_M, WRONG_RAD, WRONG_SIGMAS = 0.2, float(np.deg2rad(5.0)), 5.0
 """A relative pose is wrong if it is farther off than either, and than so many of its standard deviations."""
@@ -67,7 +67,7 @@ def check_doubts(
         window_s: Length of a window.
     """
     of_stamp = {stamp_ns: i for i, stamp_ns in enumerate(trajectory.stamps_ns.tolist())}
-    stamps_ns = np.array([record.stamp_ns for record in records], dtype=np.int64)
+    stamps_ns = stamps_of(records)
     placed = np.array([r.stamp_ns in of_stamp and r.node is not None for r in records], dtype=np.bool_)
     flagged = ~placed | np.array([record.outcome != "tracked" for record in records], dtype=np.bool_)
     poses = np.array([trajectory.T_world_body[of_stamp.get(r.stamp_ns, 0)] for r in records]).reshape(

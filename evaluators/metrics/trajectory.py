@@ -7,7 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
-from mapper.core.geometry import Array, Points, Transform, angle_between, fit_rigid, rotation_exp, transform
+from mapper.core.geometry import (
+    Array,
+    Points,
+    Transform,
+    angle_between,
+    distances_along,
+    fit_rigid,
+    rotation_exp,
+    transform,
+)
 from mapper.core.timebase import NS_PER_S, Stamps, nearest
 from mapper.core.trajectory import Trajectory, start_to_end
 
@@ -234,8 +243,7 @@ def progress_of(matched: Matched, unit: DeltaUnit) -> Array:
     if unit == "s":
         elapsed_s: Array = (matched.stamps_ns - matched.stamps_ns[0]) / NS_PER_S
         return elapsed_s
-    steps_m = _lengths(np.diff(matched.T_truth_body[:, :3, 3], axis=0))
-    return np.concatenate([[0.0], np.cumsum(steps_m)])
+    return distances_along(matched.T_truth_body[:, :3, 3])
 
 
 def _steps(

@@ -274,7 +274,7 @@ def _posed(log: Path) -> list[tuple[FrameRef, Transform]]:
     source = open_source(log)
     if source.truth is None or source.sensor != "lidar":
         return []
-    poses = dict(zip(source.truth.stamps_ns.tolist(), source.truth.T_world_body, strict=True))
+    poses = dict(source.truth.items())
     return [(entry, poses[entry.stamp_ns]) for entry in source.entries() if entry.stamp_ns in poses]
 
 

@@ -114,9 +114,7 @@ class ThesisJob:
         """Write both trajectories, the estimate aligned with the truth."""
         T_truth_map = align(associate(estimate, truth), "se3").T_truth_map
         write_tum(self._path(setting), estimate.moved(T_truth_map))
-        first_ns, last_ns = estimate.stamps_ns[0], estimate.stamps_ns[-1]
-        during = (truth.stamps_ns >= first_ns) & (truth.stamps_ns <= last_ns)
-        write_tum(self._path("truth"), Trajectory(truth.stamps_ns[during], truth.T_world_body[during]))
+        write_tum(self._path("truth"), truth.during(estimate.stamps_ns[0], estimate.stamps_ns[-1]))
 
     def _path(self, name: str) -> Path:
         cut = "" if self.cut.is_whole else f".{self.cut.first}-{self.cut.last}"

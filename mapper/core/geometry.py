@@ -63,6 +63,12 @@ def apply(T_a_b: Transform, points_b: Points) -> Points:
     return points_a
 
 
+def distances_along(points: Array) -> Array:
+    """Return (N,) metres from the first of (N, D) points to each, along the straight lines between them."""
+    steps_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps_m)])
+
+
 def skew(v: Array) -> Array:
     """Return the (3, 3) matrix with ``skew(v) @ w == cross(v, w)``."""
     x, y, z = v

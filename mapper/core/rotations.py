@@ -50,6 +50,22 @@ def quaternion_from_rotation(R: Array) -> Array:
     return np.where(q[..., 3:] < 0.0, -q, q)
 
 
+def pose_of_row(row: Array) -> Array:
+    """Return the (4, 4) pose of ``x y z qx qy qz qw``, as files have poses, or (N, 4, 4) of (N, 7).
+
+    Raises:
+        DataError: As ``rotation_from_quaternion``.
+    """
+    T = np.zeros((*row.shape[:-1], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = rotation_from_quaternion(row[..., 3:]), row[..., :3], 1.0
+    return T
+
+
+def row_of_pose(T: Array) -> Array:
+    """Return ``x y z qx qy qz qw`` of a (4, 4) pose, (7,), or (N, 7) of (N, 4, 4)."""
+    return np.concatenate([T[..., :3, 3], quaternion_from_rotation(T[..., :3, :3])], axis=-1)
+
+
 def rotation_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
     """Return Rz(yaw) · Ry(pitch) · Rx(roll) (Somlyai, PhD thesis, eq. 2.24–2.28)."""
     cr, sr = np.cos(roll_rad), np.sin(roll_rad)

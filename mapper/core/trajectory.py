@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Transform, inverse, is_rigid
@@ -49,7 +50,7 @@ class Trajectory:
     @overload
     def __getitem__(self, index: int) -> Transform: ...
     @overload
-    def __getitem__(self, index: Any) -> "Transform | Trajectory": ...
+    def __getitem__(self, index: slice | NDArray[Any]) -> "Trajectory": ...
     def __getitem__(self, index: Any) -> "Transform | Trajectory":
         if isinstance(index, int | np.integer):
             pose: Transform = self.T_world_body[index]
@@ -64,6 +65,14 @@ class Trajectory:
             return "Trajectory of no poses"
         lasted_s = int(self.stamps_ns[-1] - self.stamps_ns[0]) / NS_PER_S
         return f"Trajectory of {len(self)} poses over {lasted_s:.1f} s and {self.path_length_m:.2f} m"
+
+    def items(self) -> Iterator[tuple[int, Transform]]:
+        """Yield the stamp and the (4, 4) pose of every moment."""
+        return zip(self.stamps_ns.tolist(), self.T_world_body, strict=True)
+
+    def during(self, first_ns: int, last_ns: int) -> "Trajectory":
+        """Return the poses from one time to another, both included."""
+        return self[(self.stamps_ns >= first_ns) & (self.stamps_ns <= last_ns)]
 
     @property
     def stamps(self) -> Array:

@@ -154,9 +154,7 @@ def _views(run: Run, octree: OctreeMap, progress: Progress) -> Iterator[_View]:
     """Yield the frames to fuse, read and rectified ahead in threads."""
     trajectory = run.tracked_trajectory
     stride = run.config.mesh.frame_stride
-    T_world_body = dict(
-        zip(trajectory.stamps_ns[::stride].tolist(), trajectory.T_world_body[::stride], strict=True)
-    )
+    T_world_body = dict(trajectory[::stride].items())
     source = run.open_log()
     entries = (entry for entry in source.entries() if entry.stamp_ns in T_world_body)
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, Points
+from mapper.core.geometry import Array, Points, distances_along
 from mapper.core.trajectory import Trajectory
 from mapper.export.grid import grid_image
 from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure, save, scale_bar
@@ -111,7 +111,7 @@ def _draw_doubtful(axes: "Axes", poses: UncertainPoses) -> None:
 
 def _draw_direction(axes: "Axes", positions: Array) -> None:
     """Draw arrows that tell which way a path goes, evenly spread along it."""
-    reached_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions[:, :2], axis=0), axis=1))])
+    reached_m = distances_along(positions[:, :2])
     style = {
         "arrowstyle": "-|>",
         "color": hex_of(ESTIMATE),

@@ -29,16 +29,12 @@ def log_results(log: McapLog, results: RunResults) -> None:
     if results.truth is not None:
         log.trajectory(begin_ns, results.truth, name="truth", color=TRUTH)
     log.factors(begin_ns, results.graph.factors, T_world_node=results.graph.T_world_node)
-    for stamp_ns, T_world_body in zip(
-        results.trajectory.stamps_ns, results.trajectory.T_world_body, strict=True
-    ):
-        log.transform(int(stamp_ns), T_world_body, parent=WORLD, child=BODY)
+    for stamp_ns, T_world_body in results.trajectory.items():
+        log.transform(stamp_ns, T_world_body, parent=WORLD, child=BODY)
     if results.poses is not None:
-        for stamp_ns, T_world_body, covariance in zip(
-            results.poses.trajectory.stamps_ns.tolist(),
-            results.poses.trajectory.T_world_body,
-            results.poses.covariances,
-            strict=True,
+        poses = results.poses
+        for (stamp_ns, T_world_body), covariance in zip(
+            poses.trajectory.items(), poses.covariances, strict=True
         ):
             if np.isfinite(covariance).all():
                 log.pose(stamp_ns, T_world_body, covariance)

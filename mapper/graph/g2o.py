@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import GraphError, MapperError
 from mapper.core.geometry import Array
-from mapper.core.rotations import quaternion_from_rotation, rotation_from_quaternion
+from mapper.core.rotations import pose_of_row, row_of_pose
 from mapper.graph.information import as_gtsam_takes, lifted, swapped, symmetric
 from mapper.graph.model import BetweenFactor, Origin, PoseGraph
 from mapper.runtime.atomic import write_text
@@ -126,12 +126,6 @@ class _Table:
             raise GraphError(f"{path}:{self.lines[int(np.argmax(lines))]}: {why}")
 
 
-def _poses_3d(numbers: Array) -> Array:
-    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = rotation_from_quaternion(numbers[:, 3:]), numbers[:, :3]
-    return poses
-
-
 def _poses_2d(numbers: Array) -> Array:
     poses = np.tile(np.eye(4), (len(numbers), 1, 1))
     cosine, sine = np.cos(numbers[:, 2]), np.sin(numbers[:, 2])
@@ -140,8 +134,8 @@ def _poses_2d(numbers: Array) -> Array:
     return poses
 
 
-_VERTICES = {"VERTEX_SE3:QUAT": _Form(1, 7, _poses_3d), "VERTEX_SE2": _Form(1, 3, _poses_2d)}
-_EDGES = {"EDGE_SE3:QUAT": _Form(2, 7, _poses_3d, 6), "EDGE_SE2": _Form(2, 3, _poses_2d, 3)}
+_VERTICES = {"VERTEX_SE3:QUAT": _Form(1, 7, pose_of_row), "VERTEX_SE2": _Form(1, 3, _poses_2d)}
+_EDGES = {"EDGE_SE3:QUAT": _Form(2, 7, pose_of_row, 6), "EDGE_SE2": _Form(2, 3, _poses_2d, 3)}
 _FORMS = _VERTICES | _EDGES
 
 
@@ -185,7 +179,7 @@ def _in_order(
         numbers = np.array(table.numbers)
         table.refuse(path, ~np.isfinite(numbers), "a number is not finite")
         pose = numbers[:, : form.pose_numbers]
-        if form.poses is _poses_3d:
+        if form.poses is pose_of_row:
             lengths = np.linalg.norm(pose[:, 3:], axis=1)
             table.refuse(path, lengths < _SHORTEST, "its quaternion is zero and has no direction")
         rows += zip(table.lines, table.ids, table.notes, form.poses(pose), strict=True)
@@ -238,8 +232,7 @@ def _origin(note: str, missing: Origin) -> Origin:
 
 def _pose_texts(poses: Array) -> list[str]:
     """Return (N, 4, 4) poses as ``x y z qx qy qz qw``."""
-    numbers = np.concatenate([poses[:, :3, 3], quaternion_from_rotation(poses[:, :3, :3])], axis=1)
-    return [_numbers_text(row) for row in numbers]
+    return [_numbers_text(row) for row in row_of_pose(poses)]
 
 
 def _numbers_text(numbers: Array) -> str:

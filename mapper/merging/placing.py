@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from mapper.core.errors import DataError, RunError
-from mapper.core.geometry import Array, Transform, fit_rigid, inverse, transform
-from mapper.core.rotations import rotation_from_quaternion
+from mapper.core.geometry import Array, Transform, fit_rigid, inverse
+from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.merging.joint_graph import JointGraph
@@ -231,7 +231,7 @@ def _read_poses(path: Path) -> dict[str, Transform]:
             values = np.array([float(word) for word in words])
             if values.shape != (7,) or not np.isfinite(values).all():
                 raise ValueError
-            pose = transform(rotation_from_quaternion(values[3:]), values[:3])
+            pose = pose_of_row(values)
         except (ValueError, DataError):
             raise DataError(f"{path}:{number}: want RUN tx ty tz qx qy qz qw, all but RUN numbers") from None
         if name in poses:

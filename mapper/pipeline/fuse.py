@@ -134,7 +134,7 @@ def carry_times(writer: RunWriter, timing: Timing) -> None:
 def _with_trajectory(run: Run, trajectory: Trajectory) -> StoredTracking:
     """Return what a run keeps, with its trajectory replaced and the nodes of its graph moved along."""
     tracked = load_tracking(run)
-    T_world_body = dict(zip(trajectory.stamps_ns.tolist(), trajectory.T_world_body, strict=True))
+    T_world_body = dict(trajectory.items())
     if T_world_body.keys().isdisjoint(tracked.trajectory.stamps_ns.tolist()):
         raise RunError(f"{run.path}: none of the trajectory's {len(trajectory)} stamps is one of the run's")
     graph = tracked.graph

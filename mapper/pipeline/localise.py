@@ -9,6 +9,8 @@ import numpy as np
 
 from mapper.config.build import BuildConfig
 from mapper.core.errors import ConfigError, LoopError
+from mapper.core.geometry import distances_along
+from mapper.core.timebase import NS_PER_S
 from mapper.export.picture import write_localised
 from mapper.graph.components import component_numbers, components
 from mapper.graph.config import GraphConfig
@@ -202,7 +204,7 @@ def _doubtful_unless_confirmed(
             continue
         in_order = sorted(nodes)
         positions = np.array([graph.T_world_node[node][:3, 3] for node in in_order])
-        path_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
+        path_m = distances_along(positions)
         known = sorted(held.intersection(nodes))
         known_m = path_m[np.searchsorted(in_order, known)]
         begin = max((node for node in failed.intersection(nodes) if node < known[0]), default=-1)
@@ -250,4 +252,4 @@ def _write(writer: RunWriter, source: Log, known: KnownMap, tracking: TrackingRe
         title=f"{source.path.name} in {known.path.name}",
         lines=[counts.frames_text],
     )
-    writer.record_timing(log_s=float(np.ptp(source.stamps_ns)) / 1e9, frames=counts.read)
+    writer.record_timing(log_s=float(np.ptp(source.stamps_ns)) / NS_PER_S, frames=counts.read)

@@ -6,7 +6,7 @@ import numpy as np
 
 from mapper.core.errors import ConfigError
 from mapper.core.geometry import Transform, is_rigid, transform
-from mapper.core.rotations import rotation_from_euler, rotation_from_quaternion
+from mapper.core.rotations import pose_of_row, rotation_from_euler
 
 
 def parse_guess(text: str | None) -> Transform:
@@ -31,7 +31,7 @@ def parse_guess(text: str | None) -> Transform:
             raise ConfigError(f"--guess {text}: the matrix is no rigid motion")
         return T_target_source
     if is_file and len(numbers) in (7, 8):
-        return transform(rotation_from_quaternion(numbers[-4:]), numbers[-7:-4])
+        return pose_of_row(numbers[-7:])
     if len(numbers) == 6:
         return transform(rotation_from_euler(*np.radians(numbers[3:])), numbers[:3])
     raise ConfigError(

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapper.core.geometry import Array, Transform, exp, interpolate, inverse, log, transform
-from mapper.core.rotations import rotation_from_quaternion
+from mapper.core.geometry import Array, Transform, exp, interpolate, inverse, log
+from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.core.trajectory import Trajectory
 from mapper.graph.model import PoseGraph
@@ -26,8 +26,7 @@ def without_doubtful(trajectory: Trajectory, records: Iterable[FrameRecord]) -> 
     doubtful = [record.stamp_ns for record in records if record.outcome == "doubtful"]
     if not doubtful:
         return trajectory
-    kept = ~np.isin(trajectory.stamps_ns, doubtful)
-    return Trajectory(trajectory.stamps_ns[kept], trajectory.T_world_body[kept])
+    return trajectory[~np.isin(trajectory.stamps_ns, doubtful)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,8 +78,7 @@ def estimates_of_doubtful(
     for record in records:
         if record.node is None or record.pose_in_node is None:
             continue
-        position, quaternion = np.split(np.array(record.pose_in_node), [3])
-        T_own = graph.T_world_node[record.node] @ transform(rotation_from_quaternion(quaternion), position)
+        T_own = graph.T_world_node[record.node] @ pose_of_row(np.array(record.pose_in_node))
         own = Estimate(T_own, None if record.sigmas is None else np.square(record.sigmas))
         estimates[record.stamp_ns] = _between(record.stamp_ns, own, tracked, by_motion)
     return estimates

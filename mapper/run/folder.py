@@ -13,6 +13,7 @@ from mapper.config.build import BuildConfig
 from mapper.config.loading import load_run_config
 from mapper.core.errors import MapperError, RunError
 from mapper.core.paths import AnyPath
+from mapper.core.timebase import Stamps
 from mapper.core.trajectory import Trajectory
 from mapper.graph.g2o import read_g2o
 from mapper.graph.model import PoseGraph
@@ -22,7 +23,7 @@ from mapper.run import files
 from mapper.run.digests import changing, checked
 from mapper.run.doubtful_frames import without_doubtful
 from mapper.run.fingerprint import fingerprint
-from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records
+from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records, stamps_of
 from mapper.run.manifest import (
     InputLog,
     Manifest,
@@ -159,6 +160,11 @@ class Run:
     def records(self) -> list[FrameRecord]:
         """Outcome of every frame."""
         return read_records(self.file(files.FRAMES))
+
+    @property
+    def frames_ns(self) -> Stamps:
+        """(N,) stamps of all frames of the log, tracked or not."""
+        return stamps_of(self.records)
 
     @cached_property
     def frame_ms(self) -> dict[int, float]:

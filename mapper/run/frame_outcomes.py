@@ -10,7 +10,8 @@ from typing import Literal, get_args
 import numpy as np
 
 from mapper.core.errors import DataError, RunError
-from mapper.core.rotations import quaternion_from_rotation
+from mapper.core.rotations import row_of_pose
+from mapper.core.timebase import Stamps
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.runtime.atomic import write_text
 from mapper.runtime.regular_files import read_text
@@ -98,6 +99,11 @@ def records_of(tracks: Iterable[FrameResult], skipped: Iterable[Skipped]) -> lis
     return sorted(records, key=lambda record: record.stamp_ns)
 
 
+def stamps_of(records: Iterable[FrameRecord]) -> Stamps:
+    """Return (N,) the stamps of frames."""
+    return np.array([record.stamp_ns for record in records], dtype=np.int64)
+
+
 def write_records(path: Path, records: Iterable[FrameRecord]) -> None:
     """Write CSV with a header; numbers keep every digit."""
     text = io.StringIO()
@@ -169,8 +175,7 @@ def _outcome(track: FrameResult) -> Outcome:
 def _pose_in_node(track: FrameResult) -> tuple[float, ...] | None:
     if _outcome(track) != "doubtful" or track.is_keyframe:
         return None
-    T = track.T_node_body
-    return (*T[:3, 3].tolist(), *quaternion_from_rotation(T[:3, :3]).tolist())
+    return tuple(row_of_pose(track.T_node_body).tolist())
 
 
 def _cells(values: tuple[float, ...] | None, count: int) -> list[str]:

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from mapper.core.errors import GraphError
-from mapper.core.geometry import inverse, log
+from mapper.core.geometry import distances_along, inverse, log
 from mapper.graph.marginals import marginals_of
 from mapper.graph.model import PoseGraph
 from mapper.run.manifest import RunWarning
@@ -38,8 +38,7 @@ def loop_warnings(results: RunResults) -> Iterator[RunWarning]:
     miss_m = float(np.median([miss.translation_m for miss in before]))
     miss_rad = float(np.median([miss.rotation_rad for miss in before]))
     stamps_ns = results.trajectory.stamps_ns
-    steps_m = np.linalg.norm(np.diff(results.trajectory.positions_world, axis=0), axis=1)
-    travelled_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    travelled_m = distances_along(results.trajectory.positions_world)
     ends = np.searchsorted(stamps_ns, [[loop.stamp_i_ns, loop.stamp_j_ns] for loop in held])
     ends = np.minimum(ends, len(stamps_ns) - 1)
     path_m = float(np.median(np.abs(np.diff(travelled_m[ends], axis=1))))

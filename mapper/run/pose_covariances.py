@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, GraphError, RunError
-from mapper.core.geometry import Array, adjoint, inverse, transform
-from mapper.core.rotations import quaternion_from_rotation, rotation_from_quaternion
-from mapper.core.trajectory import Trajectory, trajectory_from
+from mapper.core.geometry import Array, adjoint, inverse
+from mapper.core.rotations import pose_of_row, row_of_pose
+from mapper.core.trajectory import Trajectory
 from mapper.graph.marginals import marginals_of
 from mapper.graph.model import PoseGraph
 from mapper.run.doubtful_frames import estimates_of_doubtful
@@ -90,9 +90,7 @@ def uncertain_poses(
     doubtful = estimates_of_doubtful(trajectory, graph, records)
     covariances = np.full((len(trajectory), 6, 6), np.nan)
     is_doubtful = np.zeros(len(trajectory), np.bool_)
-    for index, (stamp_ns, T_world_body) in enumerate(
-        zip(trajectory.stamps_ns.tolist(), trajectory.T_world_body, strict=True)
-    ):
+    for index, (stamp_ns, T_world_body) in enumerate(trajectory.items()):
         record = record_of.get(stamp_ns)
         if record is None:
             continue
@@ -116,19 +114,15 @@ def write_poses(path: Path, poses: UncertainPoses) -> None:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_COLUMNS)
-    for stamp_ns, T, is_doubtful, covariance in zip(
-        poses.trajectory.stamps_ns.tolist(),
-        poses.trajectory.T_world_body,
-        poses.is_doubtful.tolist(),
-        poses.covariances,
-        strict=True,
+    for (stamp_ns, T), is_doubtful, covariance in zip(
+        poses.trajectory.items(), poses.is_doubtful.tolist(), poses.covariances, strict=True
     ):
         upper = covariance[_UPPER].tolist()
         writer.writerow(
             [
                 stamp_ns,
                 "doubtful" if is_doubtful else "tracked",
-                *map(repr, [*T[:3, 3].tolist(), *quaternion_from_rotation(T[:3, :3]).tolist()]),
+                *map(repr, row_of_pose(T).tolist()),
                 *(f"{value:.9g}" if np.isfinite(value) else "" for value in upper),
             ]
         )
@@ -146,14 +140,9 @@ def read_poses(path: Path) -> UncertainPoses:
     try:
         rows = list(csv.DictReader(io.StringIO(text)))
         covariances = np.empty((len(rows), 6, 6))
-        poses = [[float(row[name]) for name in _POSE] for row in rows]
-        trajectory = trajectory_from(
-            (
-                int(row["stamp_ns"]),
-                transform(rotation_from_quaternion(np.array(pose[3:])), np.array(pose[:3])),
-            )
-            for row, pose in zip(rows, poses, strict=True)
-        )
+        poses = np.array([[float(row[name]) for name in _POSE] for row in rows]).reshape(-1, 7)
+        stamps_ns = np.array([int(row["stamp_ns"]) for row in rows], np.int64)
+        trajectory = Trajectory(stamps_ns, pose_of_row(poses))
         for row, covariance in zip(rows, covariances, strict=True):
             covariance[_UPPER] = [np.nan if row[name] == "" else float(row[name]) for name in _COVARIANCE]
             covariance.T[_UPPER] = covariance[_UPPER]

@@ -60,25 +60,18 @@ class StoredTracking:
                 if (node := node_of.get(stamp_ns)) in T_after_before
                 else T_world_body,
             )
-            for stamp_ns, T_world_body in zip(
-                self.trajectory.stamps_ns.tolist(), self.trajectory.T_world_body, strict=True
-            )
+            for stamp_ns, T_world_body in self.trajectory.items()
         ]
         trajectory = placed_by_neighbours(trajectory_from(moved), graph, self.records)
         return replace(self, trajectory=trajectory, graph=graph, loops=loops)
 
     def then(self, later: "StoredTracking", *, truth: Trajectory | None) -> "StoredTracking":
         """Return this log followed by a later one whose graph and loops hold those of this one already."""
-        poses = [
-            pose
-            for part in (self.trajectory, later.trajectory)
-            for pose in zip(part.stamps_ns.tolist(), part.T_world_body, strict=True)
-        ]
         return StoredTracking(
             records=[*self.records, *later.records],
             skipped=[*self.skipped, *later.skipped],
             frame_ms={**self.frame_ms, **later.frame_ms},
-            trajectory=trajectory_from(poses),
+            trajectory=trajectory_from([*self.trajectory.items(), *later.trajectory.items()]),
             graph=later.graph,
             loops=later.loops,
             truth=truth,

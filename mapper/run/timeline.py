@@ -7,6 +7,7 @@ from itertools import groupby
 import numpy as np
 
 from mapper.core.timebase import NS_PER_S, Stamps
+from mapper.run.frame_outcomes import stamps_of
 from mapper.run.manifest import Manifest
 from mapper.run.results import RunResults
 
@@ -28,7 +29,7 @@ class TimeLine:
     @classmethod
     def of(cls, results: RunResults, manifest: Manifest) -> "TimeLine":
         """Return the stamps of a run's frames."""
-        stamps_ns = np.array([record.stamp_ns for record in results.records], np.int64)
+        stamps_ns = stamps_of(results.records)
         usual_ns = float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0.0
         return cls(stamps_ns, usual_ns, tuple(log.begins_ns for log in manifest.input.appended))
 

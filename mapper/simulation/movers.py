@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from mapper.core.geometry import Array
+from mapper.core.geometry import Array, distances_along
 from mapper.simulation.boxes import Boxes
 from mapper.simulation.builder import ORIGIN, Builder, Faces, Skin
 from mapper.simulation.config import SynthConfig
@@ -102,5 +102,4 @@ def make_movers(config: SynthConfig, scene: Scene, motion: Motion) -> Movers:
 def _lengths(route: Array) -> tuple[Array, Array]:
     """Return the spline's parameters, densely, and the metres walked up to each."""
     parameter = np.linspace(0.0, len(route), _SAMPLES_PER_POINT * len(route) + 1)
-    steps_m = np.linalg.norm(np.diff(closed_spline(route, parameter), axis=0), axis=1)
-    return parameter, np.concatenate([[0.0], np.cumsum(steps_m)])
+    return parameter, distances_along(closed_spline(route, parameter))

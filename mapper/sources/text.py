@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, SourceError
-from mapper.core.geometry import Array, Transform, is_rigid, transform
-from mapper.core.rotations import rotation_from_quaternion
+from mapper.core.geometry import Array, Transform, is_rigid
+from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import Stamps, ns_from_date_text, ns_from_seconds_text
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.regular_files import read_text

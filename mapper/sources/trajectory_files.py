@@ -56,9 +56,8 @@ def read_tum(path: Path) -> Trajectory:
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write TUM text with exact stamps and every digit of the poses."""
     lines = ["# timestamp tx ty tz qx qy qz qw"]
-    quaternions = quaternion_from_rotation(trajectory.T_world_body[:, :3, :3])
-    rows = np.column_stack([trajectory.positions_world, quaternions])
-    for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), rows.tolist(), strict=True):
+    rows = row_of_pose(trajectory.T_world_body).tolist()
+    for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), rows, strict=True):
         lines.append(" ".join([seconds_text_from_ns(stamp_ns), *map(repr, row)]))
     write_text(path, "\n".join(lines) + "\n")
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import PinholeCamera, RgbdFrame
-from mapper.core.rotations import quaternion_from_rotation
+from mapper.core.rotations import row_of_pose
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, nearest, seconds_text_from_ns
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.atomic import new_folder, write_bytes, write_text
@@ -184,7 +184,6 @@ def _pose_words(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> list[
     index, gap_ns = nearest(truth.stamps_ns, stamps_ns)
     words = []
     for i, gap in zip(index, gap_ns, strict=True):
-        T = truth.T_world_body[i]
-        numbers = [*T[:3, 3], *quaternion_from_rotation(T[:3, :3])]
-        words.append([repr(float(n)) for n in numbers] if gap <= MAX_TRUTH_GAP_NS else _NO_POSE)
+        row = row_of_pose(truth.T_world_body[i]).tolist()
+        words.append(list(map(repr, row)) if gap <= MAX_TRUTH_GAP_NS else _NO_POSE)
     return words

@@ -21,6 +21,7 @@ from mapper.octree.keys import KEY_BITS, codes_of, codes_of_blocks
 from mapper.octree.leaves import Leaves
 from mapper.octree.levels import keys_at_depth
 from mapper.octree.map import OctreeMap
+from mapper.run.frame_outcomes import stamps_of
 
 MOST_POINTS = 2_000_000
 """Points and voxels of one page, over all its runs."""
@@ -163,7 +164,7 @@ def _images(chapter: Chapter, snapshots: Sequence[Snapshot]) -> list[tuple[int, 
     if not snapshots:
         return []
     stamps_ns = np.array([snapshot.stamp_ns for snapshot in snapshots])
-    keyframes_ns = np.array([r.stamp_ns for r in chapter.results.records if r.is_keyframe], np.int64)
+    keyframes_ns = stamps_of(record for record in chapter.results.records if record.is_keyframe)
     index, gap_ns = nearest(stamps_ns, keyframes_ns)
     used = np.unique(index[gap_ns <= _MOST_IMAGE_GAP_NS])
     if len(used) > _MOST_IMAGES:

@@ -50,7 +50,7 @@ from mapper.mapping.fusion import Snapshot
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import OctreeMap
 from mapper.octree.slice import OccupancyGrid
-from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.frame_outcomes import FrameRecord, stamps_of
 
 APPLICATION = "mapper"
 BODY = "world/body"
@@ -212,7 +212,7 @@ class RerunLog:
         """Log how every frame went, as curves."""
         if not records:
             return
-        stamps_ns = np.array([record.stamp_ns for record in records])
+        stamps_ns = stamps_of(records)
         for name in ("features", "matches", "inliers", "residual"):
             values = np.array([getattr(record.diagnostics, name) for record in records], np.float64)
             self._columns(f"diagnostics/{name}", stamps_ns, rr.Scalars.columns(scalars=values))

@@ -6,7 +6,7 @@ from typing import assert_never
 
 import numpy as np
 
-from mapper.core.geometry import Array
+from mapper.core.geometry import Array, distances_along
 from mapper.core.rotations import rotation_from_quaternion
 from mapper.core.timebase import NS_PER_S, Stamps
 from mapper.simulation.config import LidarSynthConfig, SynthConfig
@@ -123,8 +123,7 @@ def _round_a_block(config: LidarSynthConfig) -> Route:
 
 def _travelled_m(control: Array) -> Array:
     parameter = np.linspace(0.0, len(control), _SAMPLES_PER_STEP * len(control) + 1)
-    steps_m = np.linalg.norm(np.diff(closed_spline(control, parameter), axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps_m)])
+    return distances_along(closed_spline(control, parameter))
 
 
 def _rounded_rectangle(size_m: tuple[float, float], *, radius_m: float, step_m: float) -> Array:

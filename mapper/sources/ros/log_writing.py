@@ -157,14 +157,14 @@ def _depth_of_files(files: ImageFiles) -> SerializedMessage:
 
 def _truth(source: Log) -> Iterator[SerializedMessage]:
     if source.truth is not None:
-        for stamp_ns, T in zip(source.truth.stamps_ns.tolist(), source.truth.T_world_body, strict=True):
+        for stamp_ns, T in source.truth.items():
             yield pose_message(stamp_ns, TRUTH, T, frame=_WORLD)
 
 
 def _wheels(source: Log) -> Iterator[SerializedMessage]:
     if source.wheels is not None:
         body = _LIDAR_FRAME if source.sensor == "lidar" else _CAMERA_FRAME
-        for stamp_ns, T in zip(source.wheels.stamps_ns.tolist(), source.wheels.T_world_body, strict=True):
+        for stamp_ns, T in source.wheels.items():
             yield odometry_message(stamp_ns, WHEELS, T, frame=_ODOM, child=body)
 
 

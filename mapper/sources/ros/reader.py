@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Sensor
-from mapper.core.rotations import rotation_from_quaternion
+from mapper.core.rotations import pose_of_row
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Accelerations
 from mapper.sources.config import WheelsConfig
@@ -149,9 +149,5 @@ def _trajectory(poses: Sequence[PoseMessage], *, what: str) -> tuple[Trajectory 
         notes.append(f"{what}: {dropped} of {len(poses)} poses are not finite rigid motions; dropped")
     if not usable.any():
         return None, [*notes, f"{what}: no usable pose"]
-    numbers = numbers[usable]
-    T_world_child = np.tile(np.eye(4), (len(numbers), 1, 1))
-    T_world_child[:, :3, :3] = rotation_from_quaternion(numbers[:, 3:])
-    T_world_child[:, :3, 3] = numbers[:, :3]
     stamps_ns = np.array([pose.stamp_ns for pose in poses], dtype=np.int64)[usable]
-    return Trajectory(stamps_ns, T_world_child), notes
+    return Trajectory(stamps_ns, pose_of_row(numbers[usable])), notes
