@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.core.geometry import Array
 from mapper.core.trajectory import Trajectory
-from mapper.export.page import FAINT, LINE, hex_of, save
+from mapper.export.page import FAINT, LINE, fit_to_window, hex_of, save
 from mapper.export.palette import END, START, TRUTH
 from mapper.export.panels import by_logarithm, caption, color_of, draw_boxes, extent, page, panel, widest_axes
 
@@ -55,9 +55,7 @@ def write_paths(
             axes.plot(*seen[0], "o", color=hex_of(START), markersize=4)
             axes.plot(*seen[-1], "s", color=hex_of(END), markersize=4)
         caption(axes, title=f"{name}: {captions[name]}")
-        axes.set_xlim(low[0], high[0])
-        axes.set_ylim(low[1], high[1])
-        axes.set_aspect("equal")
+        fit_to_window(axes, low, high)
     save(figure, path)
 
 

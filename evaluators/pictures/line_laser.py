@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.core.frames import Image
 from mapper.core.geometry import Array
-from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure, save
+from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure, quiet_frame, save
 from mapper.export.palette import ESTIMATE, TRUTH
 from mapper.line_laser.calibration import CalibrationShot, Fit, ahead_m, row_px, up_px
 from mapper.line_laser.config import StripeConfig
@@ -122,9 +122,7 @@ def _law(axes: "Axes", x: Array, y: Array) -> None:
     axes.plot(x, y, color=hex_of(ESTIMATE), linewidth=1.6)
     axes.margins(x=0.14)
     axes.grid(color=LINE, linewidth=0.5, alpha=0.6)
-    axes.tick_params(colors=FAINT, labelsize=8)
-    for spine in axes.spines.values():
-        spine.set_color(LINE)
+    quiet_frame(axes, label_size=8)
 
 
 def _shot(axes: "Axes", x: float, y: float, label: str) -> None:

@@ -10,7 +10,7 @@ from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S
 from mapper.evaluators.metrics.evaluate import Assessment, have_clock
 from mapper.evaluators.metrics.trajectory import Matched
-from mapper.export.page import FAINT, INK, LINE, hex_of, save
+from mapper.export.page import FAINT, INK, LINE, fit_to_window, hex_of, save
 from mapper.export.palette import END, ESTIMATE, START, TRUTH
 from mapper.export.panels import caption, draw_boxes, extent, page, panel, widest_axes
 
@@ -109,9 +109,7 @@ def draw_path(
     axes.plot(*seen[0], "o", color=hex_of(START), markersize=5)
     axes.plot(*seen[-1], "s", color=hex_of(END), markersize=5)
     low, high = extent(np.concatenate([seen, true]))
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(low[1], high[1])
-    axes.set_aspect("equal")
+    fit_to_window(axes, low, high)
     caption(axes, x="m", y="m")
     return colored
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from mapper.core.frames import Points32, Sensor
 from mapper.core.geometry import Array, Transform, apply
-from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure, save
+from mapper.export.page import FAINT, INK, fit_to_window, hex_of, new_figure, quiet_frame, save
 from mapper.export.palette import END, ESTIMATE, TRUTH
 from mapper.registration.config import VOXEL_M
 from mapper.registration.kd_tree import kd_tree
@@ -70,14 +70,10 @@ def write_before_and_after(
             for points, color in ((target, TRUTH), (cloud[~on], ESTIMATE), (cloud[on], END)):
                 right, up = (points @ axes_of.T).T
                 axes.plot(right, up, ",", color=hex_of(color), alpha=0.5)
-            axes.set_xlim(low[0], high[0])
-            axes.set_ylim(low[1], high[1])
-            axes.set_aspect("equal")
+            fit_to_window(axes, low, high)
             share = f", {on.mean():.0%} within {near_m:g} m (dark)" if row == 0 else ""
             axes.set_title(f"{name}, {view}{share}", fontsize=9, color=FAINT)
-            axes.tick_params(labelsize=7, colors=FAINT)
-            for spine in axes.spines.values():
-                spine.set_color(LINE)
+            quiet_frame(axes, label_size=7)
     figure.suptitle(title, fontsize=11, color=INK)
     figure.tight_layout()
     save(figure, path)

@@ -5,6 +5,7 @@ from pathlib import Path
 import foxglove.layouts as fl
 
 from mapper.export.foxglove_messages import WORLD
+from mapper.export.page import hex_of
 from mapper.export.palette import ESTIMATE, PLAN, TRUTH, Rgb
 from mapper.export.run_mcap import BODY
 from mapper.run.folder import Run
@@ -84,7 +85,7 @@ def _map(voxel_m: float) -> fl.ThreeDeePanel:
 
 
 def _line(color: Rgb) -> fl.BaseRendererPosesTopicSettings:
-    ends = ("#{:02x}{:02x}{:02x}ff".format(*color),) * 2
+    ends = (f"{hex_of(color)}ff",) * 2
     return fl.BaseRendererPosesTopicSettings(visible=True, type="line", line_width=0.02, gradient=ends)
 
 

@@ -6,6 +6,7 @@ from importlib import resources
 
 from mapper import __version__
 from mapper.export import palette
+from mapper.export.page import hex_of
 
 _POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline' data:; "
@@ -71,7 +72,7 @@ def _palette_css() -> str:
         "end-on-dark": palette.END_ON_DARK,
         **{f"run{number}": color for number, color in enumerate(palette.RUNS)},
     }
-    rules = " ".join(f"--{name}: #{bytes(color).hex()};" for name, color in named.items())
+    rules = " ".join(f"--{name}: {hex_of(color)};" for name, color in named.items())
     return f":root {{ {rules} }}"
 
 

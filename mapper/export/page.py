@@ -17,7 +17,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-INK = "#{:02x}{:02x}{:02x}".format(*palette.INK)
+
+def hex_of(color: Rgb) -> str:
+    """Return a colour as matplotlib and HTML name it."""
+    return f"#{bytes(color).hex()}"
+
+
+INK = hex_of(palette.INK)
 FAINT = "#6c7280"
 LINE = "#c3c8d0"
 
@@ -41,9 +47,18 @@ def save(figure: "Figure", path: Path) -> None:
         figure.savefig(part, format="png", metadata={"Software": None})
 
 
-def hex_of(color: Rgb) -> str:
-    """Return a colour as matplotlib and HTML name it."""
-    return "#{:02x}{:02x}{:02x}".format(*color)
+def quiet_frame(axes: "Axes", *, label_size: int) -> None:
+    """Draw the frame and the ticks of axes fainter than what they hold."""
+    axes.tick_params(colors=FAINT, labelsize=label_size)
+    for spine in axes.spines.values():
+        spine.set_color(LINE)
+
+
+def fit_to_window(axes: "Axes", low: Array, high: Array) -> None:
+    """Show what lies between two (2,) corners, as long one way as the other."""
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal")
 
 
 def scale_bar(axes: "Axes", low: Array, high: Array, *, color: str) -> None:

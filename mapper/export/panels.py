@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mapper.core.geometry import Array
-from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure
+from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure, quiet_frame
 from mapper.export.palette import Rgb
 
 if TYPE_CHECKING:
@@ -86,9 +86,7 @@ def panel(
             (cell_height_in - below_in - above_in) / height_in,
         )
     )
-    axes.tick_params(colors=FAINT, labelsize=7)
-    for spine in axes.spines.values():
-        spine.set_color(LINE)
+    quiet_frame(axes, label_size=7)
     return axes
 
 

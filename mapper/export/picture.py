@@ -1,6 +1,7 @@
 """Pictures of a run: the trajectory or a path over the slice, and a pose graph."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,17 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array, Points, distances_along
 from mapper.core.trajectory import Trajectory
 from mapper.export.grid import grid_image
-from mapper.export.page import FAINT, INK, LINE, hex_of, new_figure, save, scale_bar
+from mapper.export.page import (
+    FAINT,
+    INK,
+    LINE,
+    fit_to_window,
+    hex_of,
+    new_figure,
+    quiet_frame,
+    save,
+    scale_bar,
+)
 from mapper.export.palette import DOUBTFUL, END, ESTIMATE, FACTORS, PLAN, START, TRUTH, UNKNOWN_CELL, Rgb
 from mapper.export.panels import color_of
 from mapper.export.path_band import SIGMAS, band_image, stretches
@@ -21,7 +32,6 @@ from mapper.run.pose_covariances import UncertainPoses
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _MARGIN_M = 0.3
 _ACCEPTED_WEIGHT = 0.5  # weight from which a factor counts as held
@@ -54,10 +64,10 @@ def write_summary(
         lines: Figures worth knowing, shown below the headline.
         poses: The trajectory with its covariances, if known.
     """
-    low, high = _extent(grid, [path.positions_world for path in (trajectory, truth) if path is not None])
-    figure, axes = _map_page(title, lines, aspect=float(np.divide(*(high - low)[::-1])))
-    draw_summary(axes, grid=grid, trajectory=trajectory, truth=truth, loops_world=loops_world, poses=poses)
-    save(figure, path)
+    with _map_page(path, grid, _positions(trajectory, truth), title, lines) as axes:
+        draw_summary(
+            axes, grid=grid, trajectory=trajectory, truth=truth, loops_world=loops_world, poses=poses
+        )
 
 
 def draw_summary(
@@ -71,21 +81,22 @@ def draw_summary(
 ) -> None:
     """Draw what ``write_summary`` writes on axes in metres, whose limits follow."""
     positions = trajectory.positions_world
-    low, high = _extent(grid, [path.positions_world for path in (trajectory, truth) if path is not None])
-    _draw_over(axes, grid_image(grid), grid)
-    if poses is not None:
-        _draw_band(axes, poses, low, high)
-    if truth is not None:
-        reference = truth.positions_world
-        axes.plot(*reference[:, :2].T, color=hex_of(TRUTH), linewidth=2.6, alpha=0.65, label="truth")
-    axes.plot(*positions[:, :2].T, color=hex_of(ESTIMATE), linewidth=1.3, label="estimate")
-    if poses is not None:
-        _draw_doubtful(axes, poses)
-    _draw_loops(axes, loops_world)
-    _draw_direction(axes, positions)
-    _mark(axes, positions[0], color=START, marker="o", label="start")
-    _mark(axes, positions[-1], color=END, marker="s", label="end")
-    _finish_map(axes, low, high)
+    with _over_grid(axes, grid, _positions(trajectory, truth)) as (low, high):
+        if poses is not None:
+            _draw_band(axes, poses, low, high)
+        if truth is not None:
+            reference = truth.positions_world
+            axes.plot(*reference[:, :2].T, color=hex_of(TRUTH), linewidth=2.6, alpha=0.65, label="truth")
+        axes.plot(*positions[:, :2].T, color=hex_of(ESTIMATE), linewidth=1.3, label="estimate")
+        if poses is not None:
+            _draw_doubtful(axes, poses)
+        _draw_loops(axes, loops_world)
+        _draw_direction(axes, positions)
+        _mark_ends(axes, positions)
+
+
+def _positions(*paths: Trajectory | None) -> list[Array]:
+    return [path.positions_world for path in paths if path is not None]
 
 
 def _draw_band(axes: "Axes", poses: UncertainPoses, low: Array, high: Array) -> None:
@@ -156,20 +167,15 @@ def write_localised(
         lines: Figures worth knowing, shown below the headline.
     """
     positions = poses.trajectory.positions_world
-    low, high = _extent(grid, [positions])
-    figure, axes = _map_page(title, lines, aspect=float(np.divide(*(high - low)[::-1])))
-    _draw_over(axes, grid_image(grid), grid)
     parts = np.split(positions, np.searchsorted(poses.trajectory.stamps_ns, sorted(begins_ns)))
-    for number, part in enumerate(part for part in parts if len(part)):
-        label = "" if number else "estimate"
-        axes.plot(*part[:, :2].T, color=hex_of(ESTIMATE), linewidth=1.3, label=label)
-    _draw_doubtful(axes, poses)
-    label = f"recognised in {len(recognised_world)} keyframes"
-    axes.plot(*recognised_world[:, :2].T, ".", color=hex_of(FACTORS["loop"]), markersize=3.0, label=label)
-    _mark(axes, positions[0], color=START, marker="o", label="start")
-    _mark(axes, positions[-1], color=END, marker="s", label="end")
-    _finish_map(axes, low, high)
-    save(figure, path)
+    with _map_page(path, grid, [positions], title, lines) as axes, _over_grid(axes, grid, [positions]):
+        for number, part in enumerate(part for part in parts if len(part)):
+            label = "" if number else "estimate"
+            axes.plot(*part[:, :2].T, color=hex_of(ESTIMATE), linewidth=1.3, label=label)
+        _draw_doubtful(axes, poses)
+        label = f"recognised in {len(recognised_world)} keyframes"
+        axes.plot(*recognised_world[:, :2].T, ".", color=hex_of(FACTORS["loop"]), markersize=3.0, label=label)
+        _mark_ends(axes, positions)
 
 
 def write_path(
@@ -192,16 +198,11 @@ def write_path(
         lines: Figures worth knowing, shown below the headline.
     """
     ends = waypoints_world[:, :2]
-    low, high = _extent(grid, [ends])
-    figure, axes = _map_page(title, lines, aspect=float(np.divide(*(high - low)[::-1])))
-    _draw_over(axes, grid_image(grid), grid)
-    _draw_over(axes, _swept(grid, ends, radius_m), grid)
-    axes.plot(*ends.T, color=hex_of(PLAN), linewidth=1.6, label=f"path, {2 * radius_m:g} m wide")
-    axes.plot(*ends[1:-1].T, ".", color=hex_of(PLAN), markersize=5)
-    _mark(axes, ends[0], color=START, marker="o", label="start")
-    _mark(axes, ends[-1], color=END, marker="s", label="goal")
-    _finish_map(axes, low, high)
-    save(figure, path)
+    with _map_page(path, grid, [ends], title, lines) as axes, _over_grid(axes, grid, [ends]):
+        _draw_over(axes, _swept(grid, ends, radius_m), grid)
+        axes.plot(*ends.T, color=hex_of(PLAN), linewidth=1.6, label=f"path, {2 * radius_m:g} m wide")
+        axes.plot(*ends[1:-1].T, ".", color=hex_of(PLAN), markersize=5)
+        _mark_ends(axes, ends, end="goal")
 
 
 def write_merged(
@@ -223,17 +224,16 @@ def write_merged(
         title: Headline.
         lines: Figures worth knowing, shown below the headline.
     """
-    low, high = _extent(grid, list(paths_world.values()))
-    figure, axes = _map_page(title, lines, aspect=float(np.divide(*(high - low)[::-1])))
-    _draw_over(axes, grid_image(grid), grid)
-    for draw, (start, end) in zip((axes.axvline, axes.axhline), zip(low, high, strict=True), strict=True):
-        for border_m in np.arange(np.ceil(start / tile_m), np.floor(end / tile_m) + 1) * tile_m:
-            draw(border_m, color=hex_of(PLAN), linewidth=0.5, alpha=0.35)
-    for index, (name, positions) in enumerate(paths_world.items()):
-        label = name if index < _NAMED else None
-        axes.plot(*positions[:, :2].T, color=hex_of(color_of(index)), linewidth=1.4, label=label)
-    _finish_map(axes, low, high)
-    save(figure, path)
+    with (
+        _map_page(path, grid, list(paths_world.values()), title, lines) as axes,
+        _over_grid(axes, grid, list(paths_world.values())) as (low, high),
+    ):
+        for draw, (start, end) in zip((axes.axvline, axes.axhline), zip(low, high, strict=True), strict=True):
+            for border_m in np.arange(np.ceil(start / tile_m), np.floor(end / tile_m) + 1) * tile_m:
+                draw(border_m, color=hex_of(PLAN), linewidth=0.5, alpha=0.35)
+        for index, (name, positions) in enumerate(paths_world.items()):
+            label = name if index < _NAMED else None
+            axes.plot(*positions[:, :2].T, color=hex_of(color_of(index)), linewidth=1.4, label=label)
 
 
 def write_layers(
@@ -253,22 +253,18 @@ def write_layers(
         title: Headline.
         lines: Figures worth knowing, shown below the headline.
     """
-    low, high = _extent(grid, [centres for centres, _ in layers.values()])
-    figure, axes = _map_page(title, lines, aspect=float(np.divide(*(high - low)[::-1])))
-    _draw_over(axes, grid_image(grid), grid)
-    for name, (centres, color) in layers.items():
-        cells = np.unique(np.floor(centres[:, :2] / grid.resolution_m).astype(np.int64), axis=0)
-        corners = (cells - cells.min(axis=0, initial=0))[:, ::-1] if len(cells) else cells
-        image = np.zeros((*(corners.max(axis=0, initial=0) + 1), 4), np.uint8)
-        image[tuple(corners.T)] = (*color, 255)
-        lower = cells.min(axis=0, initial=0) * grid.resolution_m
-        upper = lower + np.array(image.shape[1::-1]) * grid.resolution_m
-        axes.imshow(
-            image, origin="lower", interpolation="nearest", extent=(lower[0], upper[0], lower[1], upper[1])
-        )
-        axes.fill([], [], facecolor=hex_of(color), label=name)
-    _finish_map(axes, low, high)
-    save(figure, path)
+    paths_world = [centres for centres, _ in layers.values()]
+    with _map_page(path, grid, paths_world, title, lines) as axes, _over_grid(axes, grid, paths_world):
+        for name, (centres, color) in layers.items():
+            cells = np.unique(np.floor(centres[:, :2] / grid.resolution_m).astype(np.int64), axis=0)
+            corners = (cells - cells.min(axis=0, initial=0))[:, ::-1] if len(cells) else cells
+            image = np.zeros((*(corners.max(axis=0, initial=0) + 1), 4), np.uint8)
+            image[tuple(corners.T)] = (*color, 255)
+            lower = cells.min(axis=0, initial=0) * grid.resolution_m
+            upper = lower + np.array(image.shape[1::-1]) * grid.resolution_m
+            extent = lower[0], upper[0], lower[1], upper[1]
+            axes.imshow(image, origin="lower", interpolation="nearest", extent=extent)
+            axes.fill([], [], facecolor=hex_of(color), label=name)
 
 
 def _swept(grid: OccupancyGrid, ends: Array, radius_m: float) -> NDArray[np.uint8]:
@@ -287,14 +283,23 @@ def _draw_over(axes: "Axes", image: NDArray[np.uint8], grid: OccupancyGrid) -> N
     axes.imshow(image, origin="lower", interpolation="nearest", extent=(x, x + width_m, y, y + height_m))
 
 
-def _finish_map(axes: "Axes", low: Array, high: Array) -> None:
+@contextmanager
+def _over_grid(
+    axes: "Axes", grid: OccupancyGrid, paths_world: Sequence[Array]
+) -> Iterator[tuple[Array, Array]]:
+    """Draw a grid on axes in metres, what the caller draws over it, a scale and a legend.
+
+    Yields:
+        The lower and upper corner of grid and paths, metres, to which the axes' limits are fitted.
+    """
+    low, high = _extent(grid, paths_world)
+    _draw_over(axes, grid_image(grid), grid)
+    yield low, high
     box = axes.get_window_extent()
     # Limits of the shape of the page: left to fit them itself, matplotlib warns of a map that is higher.
     reach = 0.5 * np.array([box.width, box.height]) * float(np.max((high - low) / [box.width, box.height]))
     lowest, highest = 0.5 * (low + high) - reach, 0.5 * (low + high) + reach
-    axes.set_xlim(lowest[0], highest[0])
-    axes.set_ylim(lowest[1], highest[1])
-    axes.set_aspect("equal")
+    fit_to_window(axes, lowest, highest)
     scale_bar(axes, low, high, color=INK)
     axes.legend(loc="best", fontsize=8, framealpha=0.92, edgecolor=LINE)
 
@@ -345,21 +350,21 @@ def _extent(grid: OccupancyGrid, paths_world: Sequence[Array]) -> tuple[Array, A
     return seen.min(axis=0) - _MARGIN_M, seen.max(axis=0) + _MARGIN_M
 
 
-def _mark(axes: "Axes", position: Array, *, color: Rgb, marker: str, label: str) -> None:
-    axes.plot(
-        position[0],
-        position[1],
-        marker,
-        color=hex_of(color),
-        markersize=8,
-        markeredgecolor="white",
-        markeredgewidth=1.4,
-        label=label,
-    )
+def _mark_ends(axes: "Axes", positions: Array, *, end: str = "end") -> None:
+    """Mark where a path begins and ends."""
+    ends = (positions[0], START, "o", "start"), (positions[-1], END, "s", end)
+    for position, color, marker, label in ends:
+        edge = {"markeredgecolor": "white", "markeredgewidth": 1.4}
+        axes.plot(*position[:2], marker, color=hex_of(color), markersize=8, label=label, **edge)
 
 
-def _map_page(title: str, lines: Sequence[str], *, aspect: float) -> tuple["Figure", "Axes"]:
-    """Return a page with a headline, and axes in metres that fit a map of this height over width."""
+@contextmanager
+def _map_page(
+    path: Path, grid: OccupancyGrid, paths_world: Sequence[Array], title: str, lines: Sequence[str]
+) -> Iterator["Axes"]:
+    """Write a page with a headline and what the caller draws on axes in metres, of a shape that suits."""
+    low, high = _extent(grid, paths_world)
+    aspect = float(np.divide(*(high - low)[::-1]))
     width_in, left_in, right_in, bottom_in = 8.0, 0.65, 0.25, 0.6
     map_width_in = width_in - left_in - right_in
     map_height_in = map_width_in * min(max(aspect, 0.4), 1.3)
@@ -373,7 +378,6 @@ def _map_page(title: str, lines: Sequence[str], *, aspect: float) -> tuple["Figu
     axes.set_facecolor(hex_of(UNKNOWN_CELL))
     axes.set_xlabel("x (m)", color=FAINT, fontsize=9)
     axes.set_ylabel("y (m)", color=FAINT, fontsize=9)
-    axes.tick_params(colors=FAINT, labelsize=8)
-    for spine in axes.spines.values():
-        spine.set_color(LINE)
-    return figure, axes
+    quiet_frame(axes, label_size=8)
+    yield axes
+    save(figure, path)
