@@ -168,17 +168,17 @@ def _preview(source: "Log", out: Path, progress: "Progress") -> "Observer":
 
 def _onlooker(rerun: str | None, *, step: bool, overwrite: bool) -> "Onlooker | None":
     """Return the observer of a build, refusing at once what would fail at its end."""
-    from mapper.core.errors import ConfigError, RunError, ViewerError
+    from mapper.core.errors import ConfigError, ViewerError
 
     if rerun is None:
         if step:
             raise ConfigError("--step: there is nothing to see without --rerun")
         return None
     from mapper.export.rerun.target import check_target
+    from mapper.runtime.atomic import refuse_existing
 
     target = check_target(rerun)
-    if Path(target).exists() and not overwrite:
-        raise RunError(f"{target}: exists already; choose another, or pass --overwrite to replace it")
+    refuse_existing(Path(target), overwrite=overwrite, option="--rerun")
 
     @contextmanager
     def onlooker(source: "Log", config: "BuildConfig") -> "Iterator[Observer]":

@@ -8,6 +8,7 @@ import typer
 from mapper.cli.answer import Answer, Output
 from mapper.cli.console import files_text
 from mapper.cli.options import Overrides
+from mapper.runtime.atomic import refuse_existing
 
 if TYPE_CHECKING:
     from mapper.core.frames import Scan, Sensor
@@ -67,7 +68,9 @@ def register(
     from mapper.runtime.atomic import atomic_folder
 
     if rerun is not None:
-        _check_not_there(rerun, overwrite=overwrite)
+        from mapper.export.rerun.target import check_target
+
+        refuse_existing(Path(check_target(rerun)), overwrite=overwrite, option="--rerun")
     check_method(method, guess=guess)
     T_target_source = parse_guess(guess)
     overrides = set_ or []
@@ -98,14 +101,6 @@ def register(
         error = RegistrationError(f"{source} on {target}: not trusted: {registered.alignment.reason}")
     document = {**registration_record(registered), "target": target, "source": source, "path": out}
     return Answer(document, text, error=error)
-
-
-def _check_not_there(rerun: str, *, overwrite: bool) -> None:
-    from mapper.core.errors import RunError
-    from mapper.export.rerun.target import check_target
-
-    if Path(check_target(rerun)).exists() and not overwrite:
-        raise RunError(f"{rerun}: exists already; choose another, or pass --overwrite to replace it")
 
 
 def _shown(

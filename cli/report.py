@@ -38,13 +38,12 @@ def report(
 
     Example: mapper report runs/xyz runs/xyz-isvd --out report.html
     """
-    from mapper.core.errors import RunError
     from mapper.export.report.data import chapter_of
     from mapper.export.report.page import write_report
     from mapper.run.folder import open_run
+    from mapper.runtime.atomic import refuse_existing
 
-    if out.exists() and not overwrite:
-        raise RunError(f"{out}: exists already; choose another --out, or pass --overwrite to replace it")
+    refuse_existing(out, overwrite=overwrite)
     loaded = [open_run(run) for run in runs]
     names = distinct_names(runs)
     with output.waiting("report"):

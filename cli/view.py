@@ -10,17 +10,16 @@ import typer
 from mapper.cli.answer import Answer, Output, made
 from mapper.cli.options import RunFolders
 from mapper.cli.report import distinct_names
+from mapper.runtime.atomic import refuse_existing
 
 
 def write_page(runs: Sequence[Path], path: Path, *, overwrite: bool) -> Path:
     """Write the map of some runs as a page; return its path."""
-    from mapper.core.errors import RunError
     from mapper.export.report.data import chapter_of
     from mapper.export.report.map_page import write_map_page
     from mapper.run.folder import open_run
 
-    if path.exists() and not overwrite:
-        raise RunError(f"{path}: exists already; choose another --out, or pass --overwrite to replace it")
+    refuse_existing(path, overwrite=overwrite)
     loaded = [open_run(run) for run in runs]
     names = distinct_names(runs)
     write_map_page(path, [chapter_of(run, name, ()) for run, name in zip(loaded, names, strict=True)])
@@ -49,7 +48,7 @@ def view(
 
     Example: mapper view runs/xyz --spawn, or: mapper view runs/xyz --html
     """
-    from mapper.core.errors import ConfigError, RunError
+    from mapper.core.errors import ConfigError
     from mapper.run.files import RERUN
     from mapper.run.folder import open_run
 
@@ -63,8 +62,8 @@ def view(
     if len(runs) > 1:
         raise ConfigError(f"{len(runs)} runs: Rerun shows one; --html shows several")
     (run,) = runs
-    if rrd is not None and rrd.exists() and not overwrite:
-        raise RunError(f"{rrd}: exists already; choose another --rrd, or pass --overwrite to replace it")
+    if rrd is not None:
+        refuse_existing(rrd, overwrite=overwrite, option="--rrd")
     built = open_run(run)
     from mapper.export.rerun.finished import show_run  # needs Rerun, which the page does not
 

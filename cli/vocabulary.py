@@ -8,6 +8,7 @@ import typer
 from mapper.cli.answer import Answer, Output, verb
 from mapper.cli.groups import Verb, VerbGroup
 from mapper.cli.options import assignments, merged
+from mapper.runtime.atomic import refuse_existing
 from mapper.runtime.result_paths import name_of, place_of
 
 _SEED = 0  # of the draws of k-means++: the same logs give the same bytes
@@ -39,7 +40,6 @@ def train(
     import numpy as np
 
     from mapper.config.loading import overridden
-    from mapper.core.errors import VocabularyError
     from mapper.places.config import VocabularyConfig
     from mapper.places.training import train as train_words
     from mapper.places.training_images import descriptors_of
@@ -47,8 +47,7 @@ def train(
 
     config = overridden(VocabularyConfig(), merged(assignments({"frames_per_log": frames}), set_))
     out = place_of(out, Path(f"{name_of(logs[0])}.words"), overwrite=overwrite)
-    if out.exists() and not overwrite:
-        raise VocabularyError(f"{out}: exists already; give --overwrite to replace it")
+    refuse_existing(out, overwrite=overwrite)
     progress = output.progress()
     sources = [open_source(log) for log in logs]
     images = [bits for source in sources for bits in descriptors_of(source, config, progress=progress)]

@@ -127,15 +127,14 @@ def calibrate(
     from mapper.line_laser.calibration import calibration_text
     from mapper.line_laser.config import LineLaserConfig, VehicleConfig
     from mapper.line_laser.files import read_shots
-    from mapper.runtime.atomic import write_text
+    from mapper.runtime.atomic import refuse_existing, write_text
 
     out = place_of(out, Path("line-laser.toml"), overwrite=overwrite)
     picture = out.with_suffix(".png")
     if picture == out:
         raise RunError(f"{out}: the picture's place; want an --out that ends in .toml")
     for path in (out, picture):
-        if path.exists() and not overwrite:
-            raise RunError(f"{path}: exists already; choose another --out, or pass --overwrite to replace it")
+        refuse_existing(path, overwrite=overwrite)
     vehicle = overridden(VehicleConfig(), assignments({"wheelbase_m": wheelbase, "sensor_x_m": sensor_x}))
     progress = output.progress()
     config = overridden(LineLaserConfig(), set_ or [])

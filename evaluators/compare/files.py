@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from mapper.evaluators.pictures.comparison_mcap import write_comparison_log
 from mapper.evaluators.study.engine import CELLS
 from mapper.evaluators.tables.table import column, csv_text
 from mapper.run.manifest import library_versions
-from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text
+from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_json, write_text
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sources.base import Log
 from mapper.sources.trajectory_files import write_tum
@@ -88,7 +87,7 @@ def write_comparison(folder: Path, comparison: Comparison) -> None:
     if comparison.trials:
         write_text(folder / REGISTRATION, csv_text(records["registration"]))
         write_text(folder / TRIALS, csv_text(comparison.trials))
-    _write_json(folder / REPORT, records)
+    write_json(folder / REPORT, records)
     markdown = "\n\n".join([f"# {comparison.log}", *(table.markdown() for table in tables)])
     write_text(folder / TABLES, markdown + "\n")
     for run in comparison.runs:
@@ -96,7 +95,7 @@ def write_comparison(folder: Path, comparison: Comparison) -> None:
             write_tum(folder / TRAJECTORIES / f"{run.method}.tum", run.trajectory)
     _write_pictures(folder, comparison)
     write_comparison_log(folder / MCAP, comparison.runs, truth=comparison.truth, trials=comparison.trials)
-    _write_json(
+    write_json(
         folder / MANIFEST_NAME,
         {
             **_manifest(comparison.path, comparison.config),
@@ -114,10 +113,6 @@ def _manifest(log: Path, config: CompareConfig) -> dict[str, Any]:
         "libraries": library_versions(),
         "config": config.model_dump(mode="json"),
     }
-
-
-def _write_json(path: Path, tree: Mapping[str, Any]) -> None:
-    write_text(path, json.dumps(tree, indent=2, ensure_ascii=False) + "\n")
 
 
 def _write_pictures(folder: Path, comparison: Comparison) -> None:

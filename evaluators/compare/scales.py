@@ -1,14 +1,12 @@
 """Settings of the methods for scans, with their lengths scaled to a log's sensor."""
 
-from typing import Any, TypeVar, get_args
+from typing import Any, get_args
 
-from mapper.core.config import Config
+from mapper.core.config import AnyConfig, with_changes
 from mapper.core.frames import Sensor
 from mapper.odometry.scan_to_map.config import KissOdometryConfig
 from mapper.registration.config import VOXEL_M, RegistrationConfig
 from mapper.registration.hough.config import HoughConfig
-
-AnyConfig = TypeVar("AnyConfig", bound=Config)
 
 _INDOORS = 0.1
 """A depth camera sees 4 m where a LiDAR sees 40."""
@@ -30,13 +28,13 @@ def kiss_icp(sensor: Sensor) -> KissOdometryConfig:
 
 def shrunk(config: AnyConfig, ratio: float) -> AnyConfig:
     """Return settings with every length, at any depth, at a part of its size."""
-    changed: dict[str, Any] = {}
-    for name, value in config:
-        if isinstance(value, Config):
-            changed[name] = shrunk(value, ratio)
-        elif name.endswith("_m"):
-            changed[name] = tuple(ratio * v for v in value) if isinstance(value, tuple) else ratio * value
-    return config.model_copy(update=changed)
+
+    def change(name: str, value: Any) -> Any:
+        if not name.endswith("_m"):
+            return value
+        return tuple(ratio * v for v in value) if isinstance(value, tuple) else ratio * value
+
+    return with_changes(config, change)
 
 
 def _fitted(config: Any, sensor: Sensor) -> Any:

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest
+from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, Stamps, nearest, stretches
 from mapper.evaluators.metrics.metric import Metric
 
 _GAP_INTERVALS = 3.0
@@ -62,8 +62,6 @@ def _pauses_s(frames_ns: Stamps, tracked: NDArray[np.bool_]) -> NDArray[np.float
 
 def _untracked_s(frames_ns: Stamps, tracked: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return how long each run of frames without a pose lasts, from the pose before it to the one after."""
-    edges = np.diff(np.concatenate([[False], ~tracked, [False]]).astype(np.int8))
-    first, beyond = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
-    before, after = np.maximum(first - 1, 0), np.minimum(beyond, len(frames_ns) - 1)
-    lasted_s: NDArray[np.float64] = (frames_ns[after] - frames_ns[before]) / NS_PER_S
+    ends = np.array(stretches(~tracked, beside=1), np.intp).reshape(-1, 2)
+    lasted_s: NDArray[np.float64] = np.diff(frames_ns[ends], axis=1)[:, 0] / NS_PER_S
     return lasted_s

@@ -1,6 +1,5 @@
 """A paper's tables measured again on those of its logs that are at hand; stopped work is resumed."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from mapper.evaluators.papers.model import Reproduction
 from mapper.evaluators.papers.paper import Cut, Paper
 from mapper.evaluators.papers.sequences import Found, find_sequences
 from mapper.evaluators.study.engine import CELLS, run_study
-from mapper.runtime.atomic import resumable_folder, write_text
+from mapper.runtime.atomic import resumable_folder, write_json
 from mapper.runtime.executor import IN_PROCESS, Workers
 from mapper.runtime.progress import SILENT, Progress
 from mapper.runtime.resumable_jobs import Job, JobResult
@@ -91,7 +90,7 @@ def reproduce(
             "logs": str(request.logs.resolve()),
             "cells": {job.label: job.key for job in jobs.values()},
         }
-        write_text(out / PLAN, json.dumps(plan, indent=1, ensure_ascii=False) + "\n")
+        write_json(out / PLAN, plan, indent=1)
         results = run_study(jobs, out / CELLS, workers=workers, progress=progress)
         if all(result.failure for result in results.values()):
             first = next(iter(results.values()))

@@ -1,6 +1,5 @@
 """Files of a depth camera's study: numbers, pictures of its errors, and a configuration for builds."""
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -16,7 +15,7 @@ from mapper.evaluators.tables.table import csv_text
 from mapper.export.page import FAINT, INK, LINE, hex_of, save
 from mapper.export.palette import Rgb
 from mapper.export.panels import caption, page, panel
-from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, write_text
+from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, write_json, write_text
 from mapper.sensing.depth_noise import depth_sigma_m
 
 if TYPE_CHECKING:
@@ -59,7 +58,7 @@ def write_depth_study(folder: Path, study: DepthStudy) -> None:
         "between_m": [fit.low_m, fit.high_m],
         "levels": [asdict(level) for level in study.levels],
     }
-    write_text(folder / MANIFEST_NAME, json.dumps(record, indent=2, ensure_ascii=False) + "\n")
+    write_json(folder / MANIFEST_NAME, record)
 
 
 def _sensor_toml(study: DepthStudy) -> str:

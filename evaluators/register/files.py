@@ -1,6 +1,5 @@
 """A registration as text for a terminal, and as files: aligned cloud, picture, JSON and a recording."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from mapper.evaluators.pictures.registration_mcap import write_registration_log
 from mapper.evaluators.register.registration import Registered, xyz_rpy
 from mapper.export.palette import ESTIMATE
 from mapper.export.ply import write_ply
-from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, write_text
+from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, write_json
 
 ALIGNED, PICTURE, RECORDING = "aligned.ply", "registration.png", "registration.mcap"
 FOLDER = FolderKind(
@@ -97,7 +96,7 @@ def write_registration(
         "source": names[1],
         "config": config.model_dump(mode="json"),
     }
-    write_text(folder / MANIFEST_NAME, json.dumps(record, indent=2, ensure_ascii=False) + "\n")
+    write_json(folder / MANIFEST_NAME, record)
 
 
 def registration_record(registered: Registered) -> dict[str, Any]:

@@ -1,27 +1,22 @@
 """Settings of `mapper sweep`: logs, methods and configurations."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, NonNegativeInt, model_validator
 
-from mapper.core.config import Config
+from mapper.core.config import Config, flattened
 
 
 def _assignments(given: Any) -> Any:
     """Return a table of settings as ``key.path=value``; a list as it is."""
-    return tuple(_flat(given, "")) if isinstance(given, Mapping) else given
-
-
-def _flat(tree: Mapping[str, Any], parent: str) -> Iterator[str]:
-    for name, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{parent}{name}.")
-        elif isinstance(value, list):
-            raise ValueError(f"{parent}{name} is a list; write it into a config file")
-        else:
-            yield f"{parent}{name}={value}"
+    if not isinstance(given, Mapping):
+        return given
+    flat = flattened(given)
+    if lists := [name for name, value in flat.items() if isinstance(value, list)]:
+        raise ValueError(f"{lists[0]} is a list; write it into a config file")
+    return tuple(f"{name}={value}" for name, value in flat.items())
 
 
 Name = Annotated[str, Field(min_length=1, max_length=60, pattern=r"^[^\s/].*$")]

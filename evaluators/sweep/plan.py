@@ -1,6 +1,5 @@
 """Plan of a sweep: a job for every build of logs × methods × configurations × seeds, and its results."""
 
-import json
 import shutil
 from collections.abc import Iterator
 from contextlib import suppress
@@ -21,7 +20,7 @@ from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig, ThesisLoopsCo
 from mapper.odometry.config import IsvdOdometryConfig, KeyframeOdometryConfig
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.run.fingerprint import fingerprint
-from mapper.runtime.atomic import resumable_folder, write_text
+from mapper.runtime.atomic import resumable_folder, write_json
 from mapper.runtime.executor import IN_PROCESS, Workers
 from mapper.runtime.extras import require
 from mapper.runtime.progress import SILENT, Progress
@@ -125,7 +124,7 @@ def run_sweep(
     out = plan.out
     with resumable_folder(out, mark=PLAN):
         shutil.rmtree(out / SCRATCH, ignore_errors=True)  # what a killed sweep left
-        write_text(out / PLAN, json.dumps(_described(plan), indent=1, ensure_ascii=False) + "\n")
+        write_json(out / PLAN, _described(plan), indent=1)
         results = run_study(plan.jobs, out / CELLS, workers=workers, progress=progress)
         with suppress(OSError):
             (out / SCRATCH).rmdir()

@@ -11,6 +11,7 @@ from mapper.api.logs import open_log
 from mapper.api.own_poses import poses_of
 from mapper.config.build import BuildConfig
 from mapper.config.loading import Settings, load_config, overridden
+from mapper.core.config import flattened
 from mapper.core.errors import ConfigError
 from mapper.core.frames import Frame
 from mapper.core.paths import AnyPath
@@ -96,7 +97,7 @@ def build(
             f"odometry: {type(odometry).__name__} is no odometry; want an object with read, track, view, "
             "matches and finish, a function that returns the pose of a frame, or a Trajectory"
         )
-    wanted = {**_first_settings(own, out), **_flat(settings or {})}
+    wanted = {**_first_settings(own, out), **flattened(settings or {})}
     if isinstance(config, BuildConfig):
         resolved = overridden(config, settings=wanted)
     else:
@@ -120,15 +121,6 @@ def _first_settings(own: Odometry[Any] | Trajectory | None, out: Path) -> dict[s
             return {**_OWN_POSES, "odometry.path": out.resolve() / files.ODOMETRY}
         case _:
             return {"odometry.kind": "own", "odometry.name": type(own).__name__}
-
-
-def _flat(settings: Settings, prefix: str = "") -> dict[str, Any]:
-    """Return nested settings by dotted name."""
-    flat: dict[str, Any] = {}
-    for name, value in settings.items():
-        dotted = f"{prefix}{name}"
-        flat |= _flat(value, f"{dotted}.") if isinstance(value, Mapping) else {dotted: value}
-    return flat
 
 
 def _receiver(progress: Progress | Callable[[str], object] | None) -> Progress:

@@ -2,8 +2,8 @@
 
 import json
 import re
-from collections.abc import Sequence
-from typing import Annotated, Any, get_args, get_origin
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
@@ -12,6 +12,9 @@ Ratio = Annotated[float, Field(ge=0.0, le=1.0)]
 
 _BRACKETS = re.compile(r"[\[\](){}]")
 _SQUARE = str.maketrans("()", "[]")
+
+
+AnyConfig = TypeVar("AnyConfig", bound="Config")
 
 
 class Config(BaseModel):
@@ -54,6 +57,24 @@ def _elements(text: str) -> Any:
         return json.loads(text.translate(_SQUARE))
     except ValueError:
         return text
+
+
+def flattened(tree: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """Return nested settings by dotted name."""
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        key = f"{before}{name}"
+        flat |= flattened(value, f"{key}.") if isinstance(value, Mapping) else {key: value}
+    return flat
+
+
+def with_changes(config: AnyConfig, change: Callable[[str, Any], Any]) -> AnyConfig:
+    """Return settings with each value, at any depth, as a function makes it of its name and what it is."""
+    new = {
+        name: with_changes(value, change) if isinstance(value, Config) else change(name, value)
+        for name, value in config
+    }
+    return config.model_copy(update={name: new[name] for name, value in config if new[name] is not value})
 
 
 def drop_unknown(model: type[Config], tree: Any) -> list[str]:

@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mapper.core.errors import DataError
 
@@ -61,6 +61,18 @@ def seconds_text_from_ns(stamp_ns: int) -> str:
     whole, fraction = divmod(abs(int(stamp_ns)), NS_PER_S)
     digits = f"{fraction:09d}"
     return f"{sign}{whole}.{digits[:6]}{digits[6:].rstrip('0')}"
+
+
+def stretches(marked: ArrayLike, *, beside: int = 0) -> list[tuple[int, int]]:
+    """Return the first and the last index of each stretch of frames that are marked.
+
+    Args:
+        marked: (N,) bool.
+        beside: So many frames more on either side, where there are any.
+    """
+    edges = np.diff(np.concatenate([[False], np.asarray(marked, np.bool_), [False]]).astype(np.int8))
+    first, last = np.flatnonzero(edges == 1) - beside, np.flatnonzero(edges == -1) - 1 + beside
+    return list(zip(first.clip(0).tolist(), last.clip(max=len(edges) - 2).tolist(), strict=True))
 
 
 def nearest(stamps_ns: Stamps, wanted_ns: Stamps) -> tuple[NDArray[np.intp], Stamps]:

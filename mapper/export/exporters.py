@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapper.core.errors import ConfigError, RunError
+from mapper.runtime.atomic import refuse_existing
 from mapper.runtime.progress import SILENT, Progress
 
 if TYPE_CHECKING:
@@ -169,8 +170,7 @@ def _refuse_idle_settings(run: "MapFolder", config: "BuildConfig", *, kind: str)
 
 def _refuse_out(path: Path, exporter: Exporter, *, kind: str, overwrite: bool) -> None:
     if not exporter.file_name:
-        if path.exists() and not overwrite:
-            raise RunError(f"{path}: exists already; choose another --out, or pass --overwrite to replace it")
+        refuse_existing(path, overwrite=overwrite)
         return
     if path.suffix.lower() not in exporter.endings:
         raise ConfigError(
@@ -179,5 +179,4 @@ def _refuse_out(path: Path, exporter: Exporter, *, kind: str, overwrite: bool) -
     for file in (path, *(path.with_suffix(ending) for ending in exporter.beside)):
         if file.is_dir():
             raise RunError(f"{file}: is a folder; name a file")
-        if file.exists() and not overwrite:
-            raise RunError(f"{file}: exists already; choose another --out, or pass --overwrite to replace it")
+        refuse_existing(file, overwrite=overwrite)

@@ -1,7 +1,5 @@
 """Uncertainty and doubt of a path in pictures from above: a band around it, and the doubtful stretches."""
 
-from collections.abc import Iterator
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +36,3 @@ def band_image(positions: Array, half_widths_m: Array, *, low: Array, high: Arra
             thickness = max(1, round(radius + float(radii[index - 1])))
             cv2.line(mask, places[index - 1].tolist(), places[index].tolist(), _ALPHA, thickness)
     return np.dstack([np.broadcast_to(np.array(ESTIMATE, np.uint8), (*mask.shape, 3)), mask])
-
-
-def stretches(marked: NDArray[np.bool_]) -> Iterator[slice]:
-    """Yield each run of marked poses, with the pose before it and the one after it."""
-    edges = np.diff(np.concatenate([[False], marked, [False]]).astype(np.int8))
-    for first, beyond in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
-        yield slice(max(int(first) - 1, 0), min(int(beyond) + 1, len(marked)))

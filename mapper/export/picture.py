@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points, distances_along
+from mapper.core.timebase import stretches
 from mapper.core.trajectory import Trajectory
 from mapper.export.grid import grid_image
 from mapper.export.page import (
@@ -25,7 +26,7 @@ from mapper.export.page import (
 )
 from mapper.export.palette import DOUBTFUL, END, ESTIMATE, FACTORS, PLAN, START, TRUTH, UNKNOWN_CELL, Rgb
 from mapper.export.panels import color_of
-from mapper.export.path_band import SIGMAS, band_image, stretches
+from mapper.export.path_band import SIGMAS, band_image
 from mapper.graph.model import PoseGraph, Solution
 from mapper.octree.slice import FREE, OCCUPIED, OccupancyGrid
 from mapper.run.pose_covariances import UncertainPoses
@@ -114,8 +115,8 @@ def _draw_doubtful(axes: "Axes", poses: UncertainPoses) -> None:
     """Draw the stretches whose poses may be wrong over the estimate."""
     count = int(poses.is_doubtful.sum())
     label = f"{count} doubtful frame{'' if count == 1 else 's'}"
-    for stretch in stretches(poses.is_doubtful):
-        ends = poses.trajectory.positions_world[stretch, :2].T
+    for first, last in stretches(poses.is_doubtful, beside=1):
+        ends = poses.trajectory.positions_world[first : last + 1, :2].T
         axes.plot(*ends, ".-", color=hex_of(DOUBTFUL), linewidth=2.6, markersize=4.0, label=label)
         label = ""
 
@@ -354,8 +355,8 @@ def _mark_ends(axes: "Axes", positions: Array, *, end: str = "end") -> None:
     """Mark where a path begins and ends."""
     ends = (positions[0], START, "o", "start"), (positions[-1], END, "s", end)
     for position, color, marker, label in ends:
-        edge = {"markeredgecolor": "white", "markeredgewidth": 1.4}
-        axes.plot(*position[:2], marker, color=hex_of(color), markersize=8, label=label, **edge)
+        (mark,) = axes.plot(*position[:2], marker, color=hex_of(color), markersize=8, label=label)
+        mark.set(markeredgecolor="white", markeredgewidth=1.4)
 
 
 @contextmanager

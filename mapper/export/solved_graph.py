@@ -1,6 +1,5 @@
 """Products of ``mapper solve``: the solved graph alone, or a folder with its path, a picture and a report."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from mapper.graph.components import components
 from mapper.graph.config import GraphConfig
 from mapper.graph.g2o import write_g2o
 from mapper.graph.model import PoseGraph, Solution
-from mapper.runtime.atomic import FolderKind, atomic_folder, write_text
+from mapper.runtime.atomic import FolderKind, atomic_folder, write_json
 from mapper.sources.trajectory_files import write_tum
 
 GRAPH, KEYFRAMES, PICTURE, REPORT = "graph.g2o", "keyframes.tum", "graph.png", "solve.json"
@@ -79,7 +78,7 @@ def write_solved_graph(out: Path, solved: SolvedGraph) -> None:
         poses = ((stamp, solved.solution.T_world_node[node]) for stamp, node in by_time)
         write_tum(folder / KEYFRAMES, trajectory_from(poses))
         write_graph_views(folder / PICTURE, solved.graph, solved.solution, title=solved.path.name)
-        write_text(folder / REPORT, json.dumps(solve_report(solved), indent=2) + "\n")
+        write_json(folder / REPORT, solve_report(solved))
 
 
 def solve_report(solved: SolvedGraph) -> dict[str, object]:

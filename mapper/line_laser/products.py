@@ -1,6 +1,5 @@
 """Output files of a line-laser sensor: ranges, local grids, the map, points and pictures."""
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from mapper.line_laser.calibration import calibration_text
 from mapper.line_laser.config import LineLaserCalibration, LineLaserConfig
 from mapper.line_laser.ranging import LineScan, local_grid
 from mapper.line_laser.survey import Drive
-from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_file, write_bytes, write_text
+from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_file, write_bytes, write_json, write_text
 from mapper.sources.trajectory_files import write_tum
 
 RANGES, LOCAL, MAP, MAP_PICTURE = "ranges.csv", "local", "map", "map_and_path.png"
@@ -66,7 +65,7 @@ def write_scans(
             write_bytes(folder / LOCAL / f"{path.stem}.png", png.tobytes())
     write_text(folder / CALIBRATION, calibration_text(calibration))
     manifest = {"images": len(scans), "config": config.model_dump(mode="json"), "notes": list(notes)}
-    write_text(folder / MANIFEST_NAME, json.dumps(manifest, indent=1, ensure_ascii=False) + "\n")
+    write_json(folder / MANIFEST_NAME, manifest, indent=1)
 
 
 def _lines(image: str, scan: LineScan) -> Iterator[str]:

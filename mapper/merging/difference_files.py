@@ -1,6 +1,5 @@
 """Files of a comparison of two runs: clouds of what changed, a list of it, and a picture."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from mapper.export.ply import write_ply
 from mapper.merging.differences import Cluster, Differences
 from mapper.octree.slice import shrunk
 from mapper.run.folder import Run
-from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text
+from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_json
 
 _PICTURE = "diff.png"
 _FOLDER = FolderKind(
@@ -71,7 +70,7 @@ def write_differences(
                 "in_small_clusters": found.small,
             },
         }
-        write_text(folder / MANIFEST_NAME, json.dumps(record, indent=2) + "\n")
+        write_json(folder / MANIFEST_NAME, record)
 
 
 def summary(found: Differences) -> str:

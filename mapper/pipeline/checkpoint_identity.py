@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from mapper.config.build import BuildConfig
+from mapper.core.config import flattened
 from mapper.core.errors import RunError
 from mapper.core.trajectory import Trajectory
 from mapper.run import files
 from mapper.run.fingerprint import fingerprint
 from mapper.run.manifest import Manifest, library_versions
-from mapper.runtime.atomic import MANIFEST_NAME, write_text
+from mapper.runtime.atomic import MANIFEST_NAME, write_json
 from mapper.sources.base import Log
 
 IDENTITY = "identity.json"
@@ -31,7 +32,7 @@ def identity_of(source: Log, config: BuildConfig, poses: Trajectory | None) -> d
         "poses": "" if poses is None else _digest(poses.stamps_ns.tobytes() + poses.T_world_body.tobytes()),
         "files": {
             name: _digest(path.read_bytes())
-            for name, path in _flat(config.model_dump()).items()
+            for name, path in flattened(config.model_dump()).items()
             if isinstance(path, Path) and path.is_file()
         },
         "versions": {
@@ -59,7 +60,7 @@ def _code_digest() -> str:
 
 def write_identity(path: Path, identity: Mapping[str, Any]) -> None:
     """Write what decides the result of a build, with a digest of it; atomic."""
-    write_text(path, json.dumps({**identity, "digest": _digest_of(identity)}, indent=1) + "\n")
+    write_json(path, {**identity, "digest": _digest_of(identity)}, indent=1)
 
 
 def _read_identity(path: Path) -> dict[str, Any]:
@@ -112,7 +113,7 @@ def _differences(known: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[st
             if before.get(name) != now.get(name)
         ]
         for before, now, mark in (
-            (_flat(known["config"]), _flat(wanted["config"]), "="),
+            (flattened(known["config"]), flattened(wanted["config"]), "="),
             (known["versions"], wanted["versions"], " "),
         )
     )
@@ -122,13 +123,3 @@ def _differences(known: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[st
         *(f"another file of {name}" for name in sorted({name for name, _ in changed})),
         *versions,
     ]
-
-
-def _flat(tree: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{before}{name}.")
-        else:
-            flat[before + name] = value
-    return flat

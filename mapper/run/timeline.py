@@ -1,8 +1,6 @@
 """A log's frames in time, as warnings tell of them."""
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 
 import numpy as np
 
@@ -41,14 +39,6 @@ class TimeLine:
     def duration_s(self, first: int, last: int) -> float:
         """Return the seconds between two frames."""
         return float(self.stamps_ns[last] - self.stamps_ns[first]) / NS_PER_S
-
-
-def runs_of(marked: Sequence[bool]) -> Iterator[tuple[int, int]]:
-    """Yield the first and last index of each run of frames that are marked."""
-    for is_marked, run in groupby(enumerate(marked), key=lambda one: one[1]):
-        indices = [index for index, _ in run]
-        if is_marked:
-            yield indices[0], indices[-1]
 
 
 def span_text(begin_s: float, end_s: float) -> str:

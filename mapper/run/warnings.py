@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from mapper.core.timebase import NS_PER_S
+from mapper.core.timebase import NS_PER_S, stretches
 from mapper.navigation.config import TraversableConfig
 from mapper.run.frame_outcomes import DISCONNECTED, FrameRecord
 from mapper.run.graph_warnings import (
@@ -17,7 +17,7 @@ from mapper.run.graph_warnings import (
 )
 from mapper.run.manifest import Manifest, RunWarning, Weight
 from mapper.run.results import RunResults
-from mapper.run.timeline import TimeLine, counted, runs_of
+from mapper.run.timeline import TimeLine, counted
 
 FLOOR = "floor"
 INPUT_KINDS = frozenset({"log", "depth", "camera", "shutter", "frozen", "far returns", "conflict", FLOOR})
@@ -110,7 +110,7 @@ def _not_localised(records: Sequence[FrameRecord], timeline: TimeLine) -> Iterat
     if not any(is_lost):
         return
     share = sum(is_lost) / len(records)
-    first, last = max(runs_of(is_lost), key=lambda run: timeline.duration_s(*run))
+    first, last = max(stretches(is_lost), key=lambda run: timeline.duration_s(*run))
     yield RunWarning(
         kind="not localised",
         sentence=f"{sum(is_lost)} of {len(records)} frames are not localised, {share:.1%}, for "
@@ -197,8 +197,7 @@ def _lost(records: Sequence[FrameRecord], timeline: TimeLine) -> Iterator[RunWar
     if not lost:
         return
     share = lost / len(records)
-    runs = [(max(first - 1, 0), min(last + 1, len(records) - 1)) for first, last in runs_of(is_lost)]
-    first, last = max(runs, key=lambda run: timeline.duration_s(*run))
+    first, last = max(stretches(is_lost, beside=1), key=lambda run: timeline.duration_s(*run))
     longest_s = timeline.duration_s(first, last)
     is_long = longest_s > _BROKEN_LOST_S and last - first > _BROKEN_LOST_FRAMES
     weight: Weight = "note" if share <= _MAX_LOST_SHARE else "doubt"
@@ -227,7 +226,7 @@ def _doubtful(records: Sequence[FrameRecord], timeline: TimeLine) -> Iterator[Ru
     reasons = Counter(_without_figures(doubt) for record in doubtful for doubt in record.doubts)
     texts = [f"{examples[reason]} ({count})" for reason, count in reasons.most_common(_REASONS)]
     first, last = max(
-        runs_of([record.outcome == "doubtful" for record in records]), key=lambda run: run[1] - run[0]
+        stretches([record.outcome == "doubtful" for record in records]), key=lambda run: run[1] - run[0]
     )
     too_many = len(doubtful) > _FEW_FRAMES and share > _MAX_DOUBTFUL_SHARE
     yield RunWarning(

@@ -130,6 +130,11 @@ def write_text(path: Path, text: str) -> None:
         part.write_text(text, encoding="utf-8")
 
 
+def write_json(path: Path, tree: object, *, indent: int = 2) -> None:
+    """Write JSON atomically."""
+    write_text(path, json.dumps(tree, indent=indent, ensure_ascii=False) + "\n")
+
+
 def write_bytes(path: Path, data: bytes) -> None:
     """Write bytes atomically."""
     with atomic_file(path) as part:
@@ -213,11 +218,20 @@ def resumable_folder(out: Path, *, mark: str) -> Iterator[Path]:
         yield out
 
 
+def refuse_existing(path: Path, *, overwrite: bool, option: str = "--out") -> None:
+    """Refuse to write where something is already.
+
+    Raises:
+        RunError: It is there, and is not to be replaced.
+    """
+    if path.exists() and not overwrite:
+        raise RunError(f"{path}: exists already; choose another {option}, or pass --overwrite to replace it")
+
+
 def _refuse_to_lose(out: Path, kind: FolderKind, *, overwrite: bool, takes_over: bool) -> None:
     if not out.exists():
         return
-    if not overwrite:
-        raise RunError(f"{out}: exists already; choose another --out, or pass --overwrite to replace it")
+    refuse_existing(out, overwrite=overwrite)
     if not kind.wrote(out):
         raise RunError(f"{out}: is not {kind.name}, so --overwrite will not replace it; choose another --out")
     if not takes_over and (foreign := kind.foreign_files(out)):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Points
-from mapper.runtime.atomic import write_text
+from mapper.runtime.atomic import write_json
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +81,7 @@ def write_scene(
     scene: dict[str, Any] = {"config": config, "boxes": boxes.as_json()}
     if moving:
         scene["moving"] = list(moving)
-    write_text(path, json.dumps(scene, indent=1) + "\n")
+    write_json(path, scene, indent=1)
 
 
 def read_scene(path: Path) -> Boxes:

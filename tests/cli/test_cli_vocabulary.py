@@ -37,7 +37,10 @@ def test_an_existing_file_is_replaced_only_when_told(desk_log, tmp_path):
 
     refused = mapper(*train, status=1)
 
-    assert "mine.words: exists already; give --overwrite to replace it" in refused.stderr
+    assert (
+        "mine.words: exists already; choose another --out, or pass --overwrite to replace it"
+        in refused.stderr
+    )
     assert out.read_text() == "precious"
     mapper(*train, "--overwrite", "--quiet")
     assert load_vocabulary(out).words == 16

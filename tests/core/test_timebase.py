@@ -4,7 +4,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapper.core.errors import DataError
-from mapper.core.timebase import nearest, ns_from_date_text, ns_from_seconds_text, seconds_text_from_ns
+from mapper.core.timebase import (
+    nearest,
+    ns_from_date_text,
+    ns_from_seconds_text,
+    seconds_text_from_ns,
+    stretches,
+)
 
 STAMPS = st.integers(-(10**18), 9 * 10**18)
 
@@ -102,3 +108,10 @@ def test_nearest_is_exact_at_the_size_of_the_unix_epoch():
     stamps = 1305031102175304000 + np.array([0, 3, 10])
     index, gap_ns = nearest(stamps, stamps[:1] + 2)
     assert (index.tolist(), gap_ns.tolist()) == ([1], [1])
+
+
+def test_stretches_reach_to_the_frames_beside_them():
+    marked = [True, False, False, True, True, False, True]
+    assert stretches(marked) == [(0, 0), (3, 4), (6, 6)]
+    assert stretches(np.array(marked), beside=1) == [(0, 1), (2, 5), (5, 6)]
+    assert stretches([False] * 5) == stretches([]) == []

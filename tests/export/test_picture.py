@@ -7,7 +7,7 @@ import pytest
 from mapper.core.trajectory import Trajectory
 from mapper.export.cloud_picture import splat, write_cloud_views
 from mapper.export.palette import BACKDROP, DOUBTFUL, ESTIMATE, FACTORS, TRUTH
-from mapper.export.path_band import band_image, stretches
+from mapper.export.path_band import band_image
 from mapper.export.picture import write_summary
 from mapper.mapping.cloud import height_colors
 from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -211,9 +211,3 @@ def test_a_band_is_as_wide_as_told_and_has_gaps():
     assert painted[:, 300].sum() * pixel_m == pytest.approx(1.0, abs=0.03)
     assert painted[:, 645].sum() == 0
     assert set(np.unique(image[:, :, 3])) == {0, 60}
-
-
-def test_stretches_reach_to_the_poses_beside_them():
-    marked = np.array([True, False, False, True, True, False, True])
-    assert list(stretches(marked)) == [slice(0, 2), slice(2, 6), slice(5, 7)]
-    assert list(stretches(np.zeros(5, np.bool_))) == []

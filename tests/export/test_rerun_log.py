@@ -403,7 +403,7 @@ def test_stepping_waits_after_each_frame_until_told_to_run_on(desk_log, tmp_path
             "--step: waits for Enter after each frame, but standard input is no terminal",
         ),
         (["--rerun", "spam"], "rerun target 'spam': want FILE.rrd, spawn, connect or connect:rerun+http"),
-        (["--rerun", "THERE"], "exists already; choose another, or pass --overwrite to replace it"),
+        (["--rerun", "THERE"], "exists already; choose another --rerun, or pass --overwrite to replace it"),
         (["--rerun", "LIVE", "--onto", "RUN"], "not with --onto; look at the new run with mapper view"),
     ],
 )

@@ -9,6 +9,7 @@ from itertools import chain, starmap
 from pathlib import Path
 from typing import Any, get_args
 
+from mapper.core.config import flattened
 from mapper.export.html import document, section
 from mapper.export.report.data import (
     Chapter,
@@ -154,9 +155,11 @@ def _versions(chapter: Chapter) -> dict[str, str]:
 
 
 def _settings(chapters: Sequence[Chapter]) -> str:
-    rows = sorted(
-        _side_by_side(chapters, lambda chapter: dict(_flat(chapter.run.config.model_dump(mode="json"))))
-    )
+    def texts(chapter: Chapter) -> dict[str, str]:
+        values = flattened(chapter.run.config.model_dump(mode="json"))
+        return {name: json.dumps(value, ensure_ascii=False) for name, value in values.items()}
+
+    rows = sorted(_side_by_side(chapters, texts))
     only = " checked" if any(_differs(row) for row in rows) else ""
     return (
         '<div class="controls"><input type="search" id="setting" placeholder="find a setting" '
@@ -164,14 +167,6 @@ def _settings(chapters: Sequence[Chapter]) -> str:
         f"{only}> only what differs</label></div>"
         + _table(["", *_names(chapters)], rows, css="beside settings")
     )
-
-
-def _flat(tree: Any, name: str = "") -> Iterable[tuple[str, str]]:
-    if isinstance(tree, dict) and tree:
-        for key, value in tree.items():
-            yield from _flat(value, f"{name}.{key}" if name else key)
-    else:
-        yield name, json.dumps(tree, ensure_ascii=False)
 
 
 def _pictures(number: int, chapter: Chapter) -> Iterator[str]:

@@ -1,6 +1,5 @@
 """A synthetic drive with a line laser on disk: images, labels, encoders, truth, and shots to calibrate by."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from mapper.line_laser.config import LineLaserSynthConfig
 from mapper.line_laser.files import SHOTS
 from mapper.line_laser.simulation.render import Shot, take
 from mapper.line_laser.simulation.room import Room, curvature_at, lap_m, make_board, make_room
-from mapper.runtime.atomic import new_folder
+from mapper.runtime.atomic import new_folder, write_json
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.wheel_kinematics import driven, pose_at
@@ -68,7 +67,7 @@ def write_line_laser_log(out: Path, config: LineLaserSynthConfig, *, progress: P
         write_tum(folder / "groundtruth.txt", T_world_sensor)
         _write_shots(folder / "shots", config)
         scene = {"config": config.model_dump(mode="json"), "walls_world_m": room.ends_world.tolist()}
-        (folder / "scene.json").write_text(json.dumps(scene, indent=1) + "\n", encoding="utf-8")
+        write_json(folder / "scene.json", scene, indent=1)
 
 
 def sensor_poses(config: LineLaserSynthConfig) -> Trajectory:

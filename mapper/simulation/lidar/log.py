@@ -1,11 +1,10 @@
 """A synthetic LiDAR log on disk: a KITTI folder with exact truth beside it."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
 from mapper.core.timebase import seconds_text_from_ns
-from mapper.runtime.atomic import new_folder
+from mapper.runtime.atomic import new_folder, write_json
 from mapper.runtime.ordered_map import ordered_map
 from mapper.simulation.config import LidarSynthConfig, set_or_first
 from mapper.simulation.lidar.source import LidarSimulator
@@ -55,4 +54,4 @@ def write_lidar_log(
             "ground": simulator.scene.ground.as_json(),
             "solids": simulator.scene.solids.as_json(),
         }
-        (folder / "scene.json").write_text(json.dumps(scene, indent=1) + "\n", encoding="utf-8")
+        write_json(folder / "scene.json", scene, indent=1)
