@@ -122,7 +122,7 @@ def poses_from_numbers(numbers: Array) -> list[Transform | None]:
         lengths = np.sqrt(np.square(numbers[:, 3:]).sum(axis=1))
     usable = np.isfinite(numbers).all(axis=1) & (lengths >= 1e-9) & (lengths < _LONGEST_QUATERNION)
     kept = numbers[usable]
-    poses = iter(transform(rotation_from_quaternion(kept[:, 3:]), kept[:, :3]))
+    poses = iter(pose_of_row(kept))
     return [next(poses) if is_usable else None for is_usable in usable]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import is_rigid, transform
-from mapper.core.rotations import quaternion_from_rotation, rotation_from_quaternion
+from mapper.core.rotations import pose_of_row, row_of_pose
 from mapper.core.timebase import Stamps, ns_from_seconds_text, seconds_text_from_ns
 from mapper.core.trajectory import Trajectory
 from mapper.runtime.atomic import write_text
@@ -90,10 +90,10 @@ def read_kitti(path: Path, stamps_ns: Stamps | None = None) -> Trajectory:
         )
     rows = np.reshape(numbers, (-1, 3, 4))
     R, t = rows[..., :3], rows[..., 3]
-    if not is_rigid(transform(R, t), tolerance=1e-4):
+    T = transform(R, t)
+    if not is_rigid(T, tolerance=1e-4):
         raise DataError(f"{path}: a pose is not a rigid motion; is this really KITTI's pose format?")
-    orthonormal = rotation_from_quaternion(quaternion_from_rotation(R))  # text of few digits is slightly off
-    return Trajectory(stamps, transform(orthonormal, t))
+    return Trajectory(stamps, pose_of_row(row_of_pose(T)))  # text of few digits is slightly off SO(3)
 
 
 def write_kitti(path: Path, trajectory: Trajectory) -> None:
