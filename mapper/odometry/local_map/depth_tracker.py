@@ -35,6 +35,9 @@ _MAX_UNOBSERVED_S = 2.0
 _MAX_GAP_S = 0.5
 """After a longer gap without frames another corner may be in view that looks alike."""
 _LEAST_ELAPSED_S = 0.01
+_FEW_INLIERS_RATIO = 2.0
+"""With more inliers, relative to the fewest, landmarks alone give the pose: depth images show passers-by as
+well, and along a corridor nothing else in them tells how far the camera moved."""
 _MIN_KEPT_RATIO = 0.5
 """When fewer of a pose's landmarks agree once the depth image takes part, one of both is wrong."""
 
@@ -81,7 +84,7 @@ class DepthTracker:
             ``found`` itself if its landmarks are many, or if the depth image disagrees with the keyframes;
             None if there is no pose.
         """
-        if found is not None and found.inliers >= self._config.weak_inliers:
+        if found is not None and found.inliers >= _FEW_INLIERS_RATIO * self._config.min_inliers:
             self._observed_ns, self._is_confirmed = observation.stamp_ns, True
             return found
         if found is None and self._unobserved_s(observation) > _MAX_UNOBSERVED_S:
