@@ -22,7 +22,7 @@ _POLL_S = 0.5
 
 
 def compile_kernels(*, progress: Progress = SILENT) -> None:
-    """Compile every kernel that builds of RGB-D and LiDAR logs, and pages of their runs, use by default.
+    """Compile every kernel that builds of RGB-D and LiDAR logs, and reports of their runs, use by default.
 
     Two processes, where there are two processors, render and build a second of a synthetic log of each
     sensor. Code that is compiled already is kept. What the builds have imported keeps its bytecode, too.
@@ -69,7 +69,7 @@ def _build(folder: Path, name: str, *overrides: str) -> None:
     from mapper.config.loading import load_config
     from mapper.export.exporters import export
     from mapper.export.report.data import chapter_of
-    from mapper.export.report.map_page import write_map_page
+    from mapper.export.report.page import write_report
     from mapper.pipeline.build import build
     from mapper.sources import open_source
 
@@ -77,7 +77,7 @@ def _build(folder: Path, name: str, *overrides: str) -> None:
     run = build(source, load_config(None, overrides, sensor=source.sensor), folder / name)
     export(run, "octomap", folder / f"{name}.bt")  # reads map.octree
     export(run, "nav2", folder / f"{name}_nav2")  # inflates the slice
-    write_map_page(folder / f"{name}.html", [chapter_of(run, name, ())])  # coarser levels of the octree
+    write_report(folder / f"{name}.html", [chapter_of(run, name, ())])  # the octree at coarser levels, too
 
 
 @contextmanager
