@@ -3,7 +3,7 @@
 import numpy as np
 
 from mapper.core.errors import DataError
-from mapper.core.geometry import Array
+from mapper.core.geometry import Array, transform
 
 _GIMBAL_SINE = 1.0 - 1e-12
 
@@ -56,9 +56,7 @@ def pose_of_row(row: Array) -> Array:
     Raises:
         DataError: As ``rotation_from_quaternion``.
     """
-    T = np.zeros((*row.shape[:-1], 4, 4))
-    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = rotation_from_quaternion(row[..., 3:]), row[..., :3], 1.0
-    return T
+    return transform(rotation_from_quaternion(row[..., 3:]), row[..., :3])
 
 
 def row_of_pose(T: Array) -> Array:

@@ -179,4 +179,4 @@ def test_no_file_outgrows_one_sitting():
     for package in (*OURS, "tests"):
         for path in (ROOT / package).rglob("*.py"):
             lines = len(path.read_text().splitlines())
-            assert lines <= 440, f"{path} has {lines} lines; split it by what it says"
+            assert lines <= 420, f"{path} has {lines} lines; split it by what it says"

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, Transform, adjoint, apply, inverse
+from mapper.core.geometry import Array, Transform, apply, inverse
 from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameter
 from mapper.odometry.local_map.focal_length import Bundle
 from mapper.odometry.local_map.image_observation import ImageObservation
@@ -14,14 +14,10 @@ from mapper.odometry.local_map.keyframe import DepthLink, Keyframe, RecentObserv
 from mapper.odometry.local_map.landmark_kernels import count_observers, observations_of
 from mapper.odometry.local_map.paged_table import PagedTable
 from mapper.odometry.local_map.readout_time import ReadoutTime
-from mapper.registration.reprojection import normal_matrix
-from mapper.registration.variance_factor import ResidualStatistics, residual_statistics
 from mapper.runtime.archived import archived
 
 Ids = NDArray[np.int32]
 
-_WEAK_PRIOR = np.diag([1.0] * 3 + [0.01] * 3)
-"""1 rad and 10 m: keeps the information positive definite where few landmarks leave it singular."""
 MIN_SHARED_LANDMARKS = 15
 """Keyframes that share fewer are not covisible (Mur-Artal, Montiel & Tardós 2015, §III-D)."""
 _MIN_FOUND_RATIO = 0.25
@@ -372,69 +368,3 @@ class LandmarkMap:
         removed = recent[unconfirmed | (found < _MIN_FOUND_RATIO * visible)].astype(np.int32)
         _, observations = self._observations_of(removed)
         self._unlink(observations)
-
-    def pose_information(
-        self, observation: ImageObservation, T_camera_world: Transform, landmark_of_feature: Ids
-    ) -> Array:
-        """Return the (6, 6) information of a frame's pose from its landmarks, in the body's tangent."""
-        features = np.flatnonzero(landmark_of_feature >= 0)
-        H_camera = normal_matrix(
-            T_camera_world,
-            self.landmarks["position"][landmark_of_feature[features]],
-            observation.measured[features],
-            observation.weights[features],
-            observation.intrinsics,
-        )
-        to_camera = adjoint(inverse(observation.T_body_camera))
-        information: Array = to_camera.T @ H_camera @ to_camera + _WEAK_PRIOR
-        return information
-
-    def information(self, target: int, source: int) -> Array:
-        """Return the (6, 6) information of the source's pose in the target from shared landmarks.
-
-        The landmarks are taken as fixed in the target. They were measured no better than the source's
-        features, so the information is halved. Tangent of the source's body, (rotation, translation).
-        """
-        keyframe = self.keyframes[source]
-        shared, _, features = np.intersect1d(
-            self.landmarks_of(target), self.landmark_of_feature(source), return_indices=True
-        )
-        observation = self.observation(source)
-        H_camera = 0.5 * normal_matrix(
-            keyframe.T_camera_world,
-            self.landmarks["position"][shared],
-            observation.measured[features],
-            observation.weights[features],
-            observation.intrinsics,
-        )
-        to_camera = adjoint(inverse(observation.T_body_camera))
-        H_body: Array = to_camera.T @ H_camera @ to_camera
-        return H_body + _WEAK_PRIOR
-
-    def residual_statistics(self, index: int) -> ResidualStatistics | None:
-        """Return the statistics of a keyframe's residuals; None where few landmarks have another observer."""
-        keyframe = self.keyframes[index]
-        ids = self.landmark_of_feature(index)
-        features = np.flatnonzero((ids >= 0) & (self.landmarks["observers"][ids] > 1))
-        if len(features) < MIN_SHARED_LANDMARKS:
-            return None
-        observation = self.observation(index)
-        return residual_statistics(
-            keyframe.T_camera_world,
-            self.landmarks["position"][ids[features]],
-            observation.measured[features],
-            observation.weights[features],
-            observation.intrinsics,
-        )
-
-    def depth_information(self, target: int, source: int) -> Array:
-        """Return the (6, 6) information of the source's pose in the target from their depth images.
-
-        Zero if they were not aligned. Tangent of the source's body, (rotation, translation).
-        """
-        keyframe = self.keyframes[source]
-        if keyframe.depth_link is None or keyframe.depth_link.reference != target:
-            return np.zeros((6, 6))
-        to_camera = adjoint(inverse(keyframe.T_body_camera))
-        H_body: Array = to_camera.T @ keyframe.depth_link.information @ to_camera
-        return H_body

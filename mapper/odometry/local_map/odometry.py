@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.core.deskew import Twist
 from mapper.core.frames import Frame
-from mapper.core.geometry import Array, Points, adjoint, inverse
+from mapper.core.geometry import Array, Points, inverse
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
@@ -31,6 +31,11 @@ from mapper.odometry.local_map.image_observation import ImageObservation, observ
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
 from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
 from mapper.odometry.local_map.log_residuals import LogResiduals
+from mapper.odometry.local_map.pose_information import (
+    frame_information,
+    keyframe_residuals,
+    relative_information,
+)
 from mapper.odometry.local_map.pose_tracker import PoseTracker, TrackedPose, predicted, unmatched
 from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.odometry.local_map.relocalizer import Relocalizer
@@ -111,12 +116,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         if follows:
             tracked_pose = self._shutter.refined(tracked_pose, last, self._positions_of(tracked_pose))
         observation = tracked_pose.observation
-        information = self._map.pose_information(
-            observation, tracked_pose.T_camera_world, tracked_pose.landmark_of_feature
-        )
-        if tracked_pose.depth is not None:
-            to_camera = adjoint(inverse(observation.T_body_camera))
-            information += to_camera.T @ tracked_pose.depth.information @ to_camera
+        information = frame_information(self._map, tracked_pose)
         expected = None if self._lost_frames else predicted(observation.stamp_ns, last, self._before_last)
         displaced = self._earlier_depth.displacement(
             observation, tracked_pose.T_camera_world, tracked_pose.reference
@@ -157,9 +157,10 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         before = self._before_last
         earlier = [(self._map.landmark_of_feature(last.reference), self._map.observation(last.reference))]
         if before is not None:
-            is_keyframe = self._map.keyframes[before.reference].stamp_ns == before.stamp_ns
-            kept = self._map.landmark_of_feature(before.reference)  # refining may have dropped some
-            earlier.append((kept if is_keyframe else before.landmark_of_feature, before.observation))
+            ids = before.landmark_of_feature
+            if self._map.keyframes[before.reference].stamp_ns == before.stamp_ns:
+                ids = self._map.landmark_of_feature(before.reference)  # refining may have dropped some
+            earlier.append((ids, before.observation))
         for ids, observation in earlier:
             if observation.stamp_ns != last.observation.stamp_ns:
                 common, now, then = np.intersect1d(landmarks, ids, return_indices=True)
@@ -204,7 +205,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         """
         keyframes = self._map.keyframes
         T_i_j = inverse(keyframes[i].body_pose) @ keyframes[j].body_pose
-        information = self._map.information(i, j) + self._map.depth_information(i, j)
+        information = relative_information(self._map, i, j)
         information = self._residuals.honest(information, T_i_j) / math.sqrt(shared_by)
         doubtful = self._map.keyframes[j]
         if doubtful.doubt_m > 0.0:
@@ -306,7 +307,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._map.follow_readout()
         self._map.cull()
         self._check_focal_length()
-        if (statistics := self._map.residual_statistics(index)) is not None:
+        if (statistics := keyframe_residuals(self._map, index)) is not None:
             self._residuals.add(statistics)
         self._decision.restart()
         keyframe = self._map.keyframes[index]

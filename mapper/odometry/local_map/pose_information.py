@@ -1,0 +1,76 @@
+"""Information of poses in the local map, from landmarks and depth images, in the body's tangent."""
+
+import numpy as np
+
+from mapper.core.geometry import Array, Transform, adjoint, inverse
+from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
+from mapper.odometry.local_map.pose_tracker import TrackedPose
+from mapper.registration.reprojection import normal_matrix
+from mapper.registration.variance_factor import ResidualStatistics, residual_statistics
+
+_WEAK_PRIOR = np.diag([1.0] * 3 + [0.01] * 3)
+"""1 rad and 10 m: keeps the information positive definite where few landmarks leave it singular."""
+
+
+def frame_information(landmark_map: LandmarkMap, tracked_pose: TrackedPose) -> Array:
+    """Return the (6, 6) information of a frame's pose, (rotation, translation), with landmarks as fixed."""
+    observation, ids = tracked_pose.observation, tracked_pose.landmark_of_feature
+    features = np.flatnonzero(ids >= 0)
+    H_camera = normal_matrix(
+        tracked_pose.T_camera_world,
+        landmark_map.landmarks["position"][ids[features]],
+        observation.measured[features],
+        observation.weights[features],
+        observation.intrinsics,
+    )
+    information = _of_body(H_camera, observation.T_body_camera) + _WEAK_PRIOR
+    if tracked_pose.depth is not None:
+        information += _of_body(tracked_pose.depth.information, observation.T_body_camera)
+    return information
+
+
+def relative_information(landmark_map: LandmarkMap, target: int, source: int) -> Array:
+    """Return the (6, 6) information of a keyframe's pose in another one, from landmarks and depth images.
+
+    The shared landmarks are taken as fixed in the target. They were measured no better than the source's
+    features, so their information is halved. Tangent of the source's body, (rotation, translation).
+    """
+    keyframe = landmark_map.keyframes[source]
+    shared, _, features = np.intersect1d(
+        landmark_map.landmarks_of(target), landmark_map.landmark_of_feature(source), return_indices=True
+    )
+    observation = landmark_map.observation(source)
+    H_camera = 0.5 * normal_matrix(
+        keyframe.T_camera_world,
+        landmark_map.landmarks["position"][shared],
+        observation.measured[features],
+        observation.weights[features],
+        observation.intrinsics,
+    )
+    information = _of_body(H_camera, keyframe.T_body_camera) + _WEAK_PRIOR
+    if keyframe.depth_link is not None and keyframe.depth_link.reference == target:
+        information += _of_body(keyframe.depth_link.information, keyframe.T_body_camera)
+    return information
+
+
+def keyframe_residuals(landmark_map: LandmarkMap, index: int) -> ResidualStatistics | None:
+    """Return the statistics of a keyframe's residuals; None where few landmarks have another observer."""
+    ids = landmark_map.landmark_of_feature(index)
+    features = np.flatnonzero((ids >= 0) & (landmark_map.landmarks["observers"][ids] > 1))
+    if len(features) < MIN_SHARED_LANDMARKS:
+        return None
+    observation = landmark_map.observation(index)
+    return residual_statistics(
+        landmark_map.keyframes[index].T_camera_world,
+        landmark_map.landmarks["position"][ids[features]],
+        observation.measured[features],
+        observation.weights[features],
+        observation.intrinsics,
+    )
+
+
+def _of_body(H_camera: Array, T_body_camera: Transform) -> Array:
+    """Return the information of a camera's tangent in its body's."""
+    to_camera = adjoint(inverse(T_body_camera))
+    H_body: Array = to_camera.T @ H_camera @ to_camera
+    return H_body
