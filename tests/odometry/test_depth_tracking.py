@@ -169,3 +169,25 @@ def test_a_hand_before_the_lens_is_no_ground_to_stand_on(source, frames):
     assert set(range(30, len(frames))) <= set(trusted)
     found = trajectory_from((tracks[k].stamp_ns, tracks[k].T_world_body) for k in trusted)
     assert ate_rmse_m(found, source.truth) < 0.01
+
+
+@pytest.mark.parametrize(("landmarks", "method"), [(20, "map+depth"), (40, "map")])
+def test_depth_takes_part_only_where_landmarks_are_few(frames, landmarks, method):
+    """Surfaces can be those of passers-by, who along a corridor alone tell how far the camera moved."""
+    odometry = build_frame_odometry(LocalMapConfig())
+    observations = [odometry.observe(frame) for frame in frames[:4]]
+    for observation in observations[:3]:
+        odometry.track(observation)
+    last, before_last = odometry._last, odometry._before_last
+    found = odometry._tracker.track(observations[3], last, before_last)
+    kept = np.flatnonzero(found.landmark_of_feature >= 0)
+    ids = np.full_like(found.landmark_of_feature, -1)
+    spread = kept[np.linspace(0, len(kept) - 1, landmarks).astype(int)]
+    ids[spread] = found.landmark_of_feature[spread]
+
+    supported = odometry._depth.supported(
+        observations[3], last, before_last, replace(found, landmark_of_feature=ids)
+    )
+
+    assert supported.method == method
+    assert (supported.depth is None) == (method == "map")
