@@ -240,7 +240,6 @@ def _sharpness_of(source: "Log", trajectory: "Trajectory", *, progress: "Progres
 
 
 def _frames_ns(run: "Run | None", log: Path | None, *, used: bool) -> "Stamps | None":
-
     from mapper.config.loading import load_source_config
     from mapper.core.errors import DataError
     from mapper.sources import open_source
