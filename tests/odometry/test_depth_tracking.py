@@ -9,6 +9,7 @@ from mapper.core.geometry import exp, inverse
 from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
+from mapper.odometry.local_map import depth_tracker
 from tests.support.depth_rooms import CORNER, white_frame
 from tests.support.desk_frames import ate_rmse_m
 
@@ -171,9 +172,20 @@ def test_a_hand_before_the_lens_is_no_ground_to_stand_on(source, frames):
     assert ate_rmse_m(found, source.truth) < 0.01
 
 
-@pytest.mark.parametrize(("landmarks", "method"), [(20, "map+depth"), (40, "map")])
-def test_depth_takes_part_only_where_landmarks_are_few(frames, landmarks, method):
-    """Surfaces can be those of passers-by, who along a corridor alone tell how far the camera moved."""
+@pytest.mark.parametrize(
+    ("landmarks", "loose_m", "moving", "method"),
+    [
+        (20, 0.02, 0, "map+depth"),
+        (40, 0.02, 0, "map"),
+        (40, 0.0, 0, "map+depth"),
+        (40, 0.0, 200, "map"),
+    ],
+)
+def test_depth_takes_part_where_landmarks_tell_too_little(
+    frames, monkeypatch, landmarks, loose_m, moving, method
+):
+    """While something moves it does so only where they are few: surfaces can be those of passers-by."""
+    monkeypatch.setattr(depth_tracker, "_LOOSE_M", loose_m)
     odometry = build_frame_odometry(LocalMapConfig())
     observations = [odometry.observe(frame) for frame in frames[:4]]
     for observation in observations[:3]:
@@ -185,9 +197,8 @@ def test_depth_takes_part_only_where_landmarks_are_few(frames, landmarks, method
     spread = kept[np.linspace(0, len(kept) - 1, landmarks).astype(int)]
     ids[spread] = found.landmark_of_feature[spread]
 
-    supported = odometry._depth.supported(
-        observations[3], last, before_last, replace(found, landmark_of_feature=ids)
-    )
+    found = replace(found, landmark_of_feature=ids, moving=np.arange(moving, dtype=np.int32))
+    supported = odometry._depth.supported(observations[3], last, before_last, found)
 
     assert supported.method == method
     assert (supported.depth is None) == (method == "map")

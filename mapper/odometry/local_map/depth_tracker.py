@@ -19,6 +19,7 @@ from mapper.odometry.local_map.earlier_depth import EarlierDepth
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
+from mapper.odometry.local_map.pose_information import covariance_of, frame_information, largest_sigma
 from mapper.odometry.local_map.pose_tracker import TrackedPose, predicted, project, unmatched
 
 _MIN_VISIBLE_RATIO = 0.3
@@ -36,8 +37,9 @@ _MAX_GAP_S = 0.5
 """After a longer gap without frames another corner may be in view that looks alike."""
 _LEAST_ELAPSED_S = 0.01
 _FEW_INLIERS_RATIO = 2.0
-"""With more inliers, relative to the fewest, landmarks alone give the pose: depth images show passers-by as
-well, and along a corridor nothing else in them tells how far the camera moved."""
+"""With fewer inliers, relative to the fewest, depth takes part; with more only where they tell too little."""
+_LOOSE_M = 0.02
+"""Standard deviation of a translation from which landmarks tell too little."""
 _MIN_KEPT_RATIO = 0.5
 """When fewer of a pose's landmarks agree once the depth image takes part, one of both is wrong."""
 
@@ -72,7 +74,7 @@ class DepthTracker:
         before_last: TrackedPose | None,
         found: TrackedPose | None,
     ) -> TrackedPose | None:
-        """Return a frame's pose by landmarks and depth together, where there are few landmarks.
+        """Return a frame's pose by landmarks and depth together, where landmarks tell too little.
 
         Args:
             observation: The frame.
@@ -81,10 +83,10 @@ class DepthTracker:
             found: The pose from landmarks alone; None if they gave none.
 
         Returns:
-            ``found`` itself if its landmarks are many, or if the depth image disagrees with the keyframes;
+            ``found`` itself if its landmarks suffice, or if the depth image disagrees with the keyframes;
             None if there is no pose.
         """
-        if found is not None and found.inliers >= _FEW_INLIERS_RATIO * self._config.min_inliers:
+        if found is not None and self._suffices(found):
             self._observed_ns, self._is_confirmed = observation.stamp_ns, True
             return found
         if found is None and self._unobserved_s(observation) > _MAX_UNOBSERVED_S:
@@ -117,6 +119,19 @@ class DepthTracker:
             return self._by_depth(observation, alignment, reference, gap_s)
         joint = self._aligned(observation, found.T_camera_world, T_predicted, last, found)
         return found if joint is None or not _agrees(joint) else self._by_both(observation, joint, found)
+
+    def _suffices(self, found: TrackedPose) -> bool:
+        """Return whether landmarks alone give a pose: many, or some that tell the translation.
+
+        Where something moves by itself some suffice: depth images show passers-by as well, and along a
+        corridor nothing else in them tells how far the camera moved.
+        """
+        if found.inliers < _FEW_INLIERS_RATIO * self._config.min_inliers:
+            return False
+        if found.inliers >= self._config.weak_inliers or not found.few_move:
+            return True
+        covariance = covariance_of(frame_information(self._map, found))
+        return largest_sigma(covariance[3:, 3:]) <= _LOOSE_M
 
     def _aligned(
         self,

@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.core.geometry import Array, Transform, inverse, log
 from mapper.odometry.local_map.earlier_depth import Displacement
-from mapper.odometry.local_map.image_observation import FEW_MOVING
+from mapper.odometry.local_map.pose_information import largest_sigma
 from mapper.odometry.local_map.pose_tracker import TrackedPose
 
 _MEMORY = 100
@@ -78,7 +78,7 @@ class FrameDoubts:
         """
         stamp_ns = tracked_pose.observation.stamp_ns
         elapsed_s = 1e-9 * (stamp_ns - last.observation.stamp_ns)
-        sigma_rad, sigma_m = (_largest_sigma(covariance[k : k + 3, k : k + 3]) for k in (0, 3))
+        sigma_rad, sigma_m = (largest_sigma(covariance[k : k + 3, k : k + 3]) for k in (0, 3))
         speed = _motion(tracked_pose.T_camera_world, last.T_camera_world)
         jump = (math.nan, math.nan)
         if T_camera_world_predicted is not None:
@@ -99,17 +99,16 @@ class FrameDoubts:
             )
         if agreement < _LOW_AGREEMENT * usual_agreement:
             phrases.append(f"{agreement:.0%} of the matches agree, {usual_agreement:.0%} is usual")
-        few_move = len(tracked_pose.moving) <= FEW_MOVING * len(tracked_pose.observation)
         is_supported = (
             agreement >= _SUPPORT_AGREEMENT * usual_agreement
             and sigma_m <= _SUPPORT_RATIO * usual_m
-            and few_move
+            and tracked_pose.few_move
         )
         if not is_supported:
             phrases += self._jumps(jump, elapsed_s)
         if shown_s > 0.0:
             phrases.append(f"the image has been the same for {shown_s:.2f} s")
-        if displaced.ratio > (_MOST_DISPLACED_STILL if few_move else _MOST_DISPLACED):
+        if displaced.ratio > (_MOST_DISPLACED_STILL if tracked_pose.few_move else _MOST_DISPLACED):
             phrases.append(
                 f"{displaced.ratio:.0%} of the surfaces lie elsewhere than {displaced.since_s:.1f} s before"
             )
@@ -154,10 +153,6 @@ def _motion(T_camera_world: Transform, T_before_world: Transform) -> tuple[float
     """Return the angle and the distance between two poses of the camera."""
     rotation_rad, translation_m = log(T_camera_world @ inverse(T_before_world))
     return float(np.linalg.norm(rotation_rad)), float(np.linalg.norm(translation_m))
-
-
-def _largest_sigma(covariance: Array) -> float:
-    return math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
 
 
 def _is_repeated(tracked_pose: TrackedPose, last: TrackedPose) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.core.deskew import Twist
 from mapper.core.frames import Frame
-from mapper.core.geometry import Array, Points, inverse
+from mapper.core.geometry import Points, inverse
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
@@ -32,6 +32,7 @@ from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
 from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
 from mapper.odometry.local_map.log_residuals import LogResiduals
 from mapper.odometry.local_map.pose_information import (
+    covariance_of,
     frame_information,
     keyframe_residuals,
     relative_information,
@@ -121,7 +122,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         displaced = self._earlier_depth.displacement(
             observation, tracked_pose.T_camera_world, tracked_pose.reference
         )
-        doubt = self._doubts.assess(tracked_pose, _covariance_of(information), last, expected, displaced)
+        doubt = self._doubts.assess(tracked_pose, covariance_of(information), last, expected, displaced)
         # The motion before a gap does not predict the motion after it.
         before_last = None if self._lost_frames else self._last
         self._lost_frames = self._unknown_frames = 0
@@ -141,7 +142,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             information = self._residuals.honest(_OWN_SHARE * information, result.T_node_body)
             if doubt.phrases:
                 information = inflated(information, sigma_rad=doubt.sigma_rad, sigma_m=doubt.sigma_m)
-        return replace(result, doubts=doubt.phrases, covariance=_covariance_of(information))
+        return replace(result, doubts=doubt.phrases, covariance=covariance_of(information))
 
     def view(self, observation: ImageObservation, twist: Twist | None = None, /) -> ImageView:
         """Return the view for place recognition, by the readout time as it is known now."""
@@ -370,7 +371,3 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
 def _gap_ns(last: TrackedPose, observation: ImageObservation) -> int:
     """Return the time since a tracked frame."""
     return observation.stamp_ns - last.observation.stamp_ns
-
-
-def _covariance_of(information: Array) -> Array:
-    return np.asarray(np.linalg.inv(information), np.float64)

@@ -1,5 +1,7 @@
 """Information of poses in the local map, from landmarks and depth images, in the body's tangent."""
 
+import math
+
 import numpy as np
 
 from mapper.core.geometry import Array, Transform, adjoint, inverse
@@ -67,6 +69,16 @@ def keyframe_residuals(landmark_map: LandmarkMap, index: int) -> ResidualStatist
         observation.weights[features],
         observation.intrinsics,
     )
+
+
+def covariance_of(information: Array) -> Array:
+    """Return the covariance of an (N, N) information matrix."""
+    return np.asarray(np.linalg.inv(information), np.float64)
+
+
+def largest_sigma(covariance: Array) -> float:
+    """Return the standard deviation along the axis of an (N, N) covariance where it is largest."""
+    return math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
 
 
 def _of_body(H_camera: Array, T_body_camera: Transform) -> Array:

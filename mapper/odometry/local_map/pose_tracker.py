@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points, Transform, apply, exp, inverse, log
 from mapper.odometry.local_map.depth_alignment import DepthAlignment
-from mapper.odometry.local_map.image_observation import ImageObservation
+from mapper.odometry.local_map.image_observation import FEW_MOVING, ImageObservation
 from mapper.odometry.local_map.landmarks import Ids
 from mapper.registration.reprojection import refine_pose
 
@@ -68,6 +68,11 @@ class TrackedPose:
     def inliers(self) -> int:
         """Number of features that agree with the pose."""
         return int((self.landmark_of_feature >= 0).sum())
+
+    @property
+    def few_move(self) -> bool:
+        """Whether next to no features move by themselves."""
+        return len(self.moving) <= FEW_MOVING * len(self.observation)
 
 
 class PoseTracker(Protocol):
