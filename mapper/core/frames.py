@@ -53,6 +53,11 @@ class PinholeCamera:
         """(3, 3) intrinsic matrix K in pixels."""
         return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
 
+    @property
+    def parameters(self) -> Array:
+        """(9,) fx, fy, cx, cy in pixels and the distortion's coefficients, as compiled code takes them."""
+        return np.array([self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion])
+
     def undistort(self, pixels: NDArray[np.floating]) -> Array:
         """Return the (N, 2) undistorted positions of (N, 2) measured pixels (column, row), in pixels."""
         ideal: Array = np.asarray(pixels, dtype=np.float64)

@@ -53,7 +53,9 @@ def test_doubts_are_measured_against_what_is_usual(frames, odometry):
     pose = odometry._last
     step_ns = 33_000_000
 
-    def assess(k, *, moved_m=0.001, agreement=0.95, sigma_m=0.001, displaced=NOT_DISPLACED, moving=0):
+    def assess(
+        k, *, moved_m=0.001, agreement=0.95, sigma_m=0.001, displaced=NOT_DISPLACED, moving=0, excess=0.0
+    ):
         now = replace(
             pose,
             observation=replace(pose.observation, stamp_ns=k * step_ns, pixels=pose.observation.pixels + k),
@@ -63,7 +65,7 @@ def test_doubts_are_measured_against_what_is_usual(frames, odometry):
         )
         last = replace(pose, observation=replace(pose.observation, stamp_ns=(k - 1) * step_ns))
         covariance = np.diag([1e-6] * 3 + [sigma_m**2] * 3)
-        return doubts.assess(now, covariance, last, pose.T_camera_world, displaced)
+        return doubts.assess(now, covariance, last, pose.T_camera_world, displaced, excess)
 
     assert not any(assess(k).phrases for k in range(1, 30))
     assert not assess(30, moved_m=0.3).phrases
@@ -78,6 +80,11 @@ def test_doubts_are_measured_against_what_is_usual(frames, odometry):
     assert not assess(35, displaced=Displacement(0.45, 0.15, 0.4)).phrases
     doubt = assess(36, displaced=Displacement(0.45, 0.15, 0.4), moving=100)
     assert doubt.phrases == ("45% of the surfaces lie elsewhere than 0.4 s before",)
+    assert not assess(37, moved_m=0.1, excess=3.0).phrases
+    assert not assess(38, excess=7.0).phrases
+    doubt = assess(39, moved_m=0.1, excess=7.0)
+    assert doubt.phrases == ("the image fits the predicted motion better by 7 standard errors",)
+    assert doubt.sigma_m == pytest.approx(0.1, rel=0.01)
 
 
 def test_factors_of_a_doubtful_keyframe_tell_less(frames, odometry):

@@ -146,10 +146,8 @@ def align_depth(
     if len(points) < _MIN_POINTS:
         return None
     sigmas = point_sigmas(cells, points, noise)
-    camera = cells.camera
-    optics = np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, *camera.distortion])
     planes = np.array([surface.planes for surface in surfaces])
-    model = planes, np.array(T_surfaces_world), optics, cells.cell_px
+    model = planes, np.array(T_surfaces_world), cells.camera.parameters, cells.cell_px
     min_share = _min_share(surfaces)
     kept = np.eye(6)
     while True:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from functools import lru_cache
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -43,6 +44,12 @@ class DepthCells:
     def rays(self) -> Array:
         """(R, C, 2) undistorted x/z and y/z of the cells' middles, camera frame."""
         return _rays_of(self.camera, self.cell_px)
+
+    def mean_of(self, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the (R, C) mean in each cell of an image of the same camera."""
+        rows, columns = self.inverse_depth.shape
+        whole = grey[: rows * self.cell_px, : columns * self.cell_px]
+        return np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)
 
     def points(self) -> Points:
         """Return the (N, 3) points of the cells that have a surface, camera frame."""

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, Points, Transform
+from mapper.core.geometry import Points, Transform
 from mapper.core.timebase import NS_PER_S
 from mapper.odometry.local_map.depth_kernels import between, cell_of, place_in_cells
 from mapper.odometry.local_map.depth_surfaces import DepthCells
@@ -81,7 +81,7 @@ class EarlierDepth:
             T_camera_world,
             np.array([_cells_of(self._map, k).inverse_depth for k in earlier]),
             np.array([self._map.keyframes[k].T_camera_world for k in earlier]),
-            _optics(observation.depth_cells),
+            observation.depth_cells.camera.parameters,
             observation.depth_cells.cell_px,
             self._noise,
         )
@@ -103,7 +103,7 @@ class EarlierDepth:
             T_camera_world,
             _cells_of(self._map, earlier[0]).inverse_depth,
             keyframe.T_camera_world,
-            _optics(cells),
+            cells.camera.parameters,
             cells.cell_px,
             self._noise,
         )
@@ -138,12 +138,6 @@ def _cells_of(landmark_map: LandmarkMap, keyframe: int) -> DepthCells:
     cells = landmark_map.observation(keyframe).depth_cells
     assert cells is not None
     return cells
-
-
-def _optics(cells: DepthCells) -> Array:
-    """Return (9,) intrinsics and distortion, as the kernels of depth take them."""
-    camera = cells.camera
-    return np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, *camera.distortion])
 
 
 @njit(cache=True, nogil=True)

@@ -31,6 +31,10 @@ _MOST_DISPLACED, _MOST_DISPLACED_STILL = 0.4, 0.5
 """When a larger share of the surfaces that two images have in common lies elsewhere, the pose is doubtful;
 where few features move, the majority has to. A real desk's edges give up to 0.48 under right poses, a
 passer-by's pose more than 0.4 in every second frame."""
+_MIN_EXCESS, _APART = 4.0, 2.0
+"""When the image fits the predicted motion better than the one found by so many standard errors of the mean
+over its cells, and they are so many times as far apart as usual, what was found may be the motion of
+something else."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +70,7 @@ class FrameDoubts:
         last: TrackedPose,
         T_camera_world_predicted: Transform | None,
         displaced: Displacement,
+        excess_error: float,
     ) -> Doubt:
         """Return the doubts of a frame; the figures of undoubted ones become part of the usual.
 
@@ -75,6 +80,7 @@ class FrameDoubts:
             last: The tracked frame before it.
             T_camera_world_predicted: (4, 4) by constant velocity; None if nothing predicts it.
             displaced: Surfaces that lie elsewhere by this pose than in an earlier frame.
+            excess_error: Photometric error beyond that of the predicted motion, in standard errors.
         """
         stamp_ns = tracked_pose.observation.stamp_ns
         elapsed_s = 1e-9 * (stamp_ns - last.observation.stamp_ns)
@@ -113,6 +119,10 @@ class FrameDoubts:
                 f"{displaced.ratio:.0%} of the surfaces lie elsewhere than {displaced.since_s:.1f} s before"
             )
             sigma_m = max(sigma_m, displaced.distance_m)
+        if excess_error > _MIN_EXCESS and self._exceeds_usual(jump, elapsed_s, _APART):
+            phrases.append(
+                f"the image fits the predicted motion better by {excess_error:.0f} standard errors"
+            )
         if phrases:
             # How far off it may be: as far as the prediction says, or as the camera moves in the time.
             off = [
@@ -126,6 +136,11 @@ class FrameDoubts:
             if T_camera_world_predicted is not None:
                 self._learn(jump_rad_s=jump[0] / elapsed_s, jump_m_s=jump[1] / elapsed_s)
         return NO_DOUBT
+
+    def _exceeds_usual(self, jump: tuple[float, float], elapsed_s: float, ratio: float) -> bool:
+        """Return whether the angle or the distance to the predicted pose is so many times the usual."""
+        usual = (self._usual(name) * elapsed_s for name in ("jump_rad_s", "jump_m_s"))
+        return any(miss > ratio * expected > 0.0 for miss, expected in zip(jump, usual, strict=True))
 
     def _jumps(self, jump: tuple[float, float], elapsed_s: float) -> list[str]:
         usual_rad, usual_m = (self._usual(name) * elapsed_s for name in ("jump_rad_s", "jump_m_s"))

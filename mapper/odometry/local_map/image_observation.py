@@ -53,6 +53,7 @@ class ImageObservation(Archivable):
         sweep_camera: (6,) motion of the camera while the rows were read, in its own axes (rotation,
             translation), that ``measured`` allows for; 0 for a global shutter.
         depth_cells: The depth image, reduced; None if it is not aligned.
+        grey_cells: (R, C) uint8 mean grey level in each of its cells; None without them.
         unswept: The observation without a motion, which this one is made from; None if that is itself.
     """
 
@@ -72,6 +73,7 @@ class ImageObservation(Archivable):
     T_body_camera: Transform
     sweep_camera: Array
     depth_cells: DepthCells | None = None
+    grey_cells: NDArray[np.uint8] | None = None
     unswept: "ImageObservation | None" = None
 
     def __len__(self) -> int:
@@ -197,6 +199,7 @@ def observe_image(
         disparity_sigma_px = np.where(np.isnan(depth_m), disparity_sigma_px, known_px)
     sensor_m = np.hypot(depth_sigma_m(config.depth_noise or KINECT_NOISE, depth_m), _SCALE_ERROR * depth_m)
     sensor_px = np.fmin(config.virtual_baseline_px_m / depth_m**2 * sensor_m, disparity_sigma_px)
+    cells = depth_cells(frame.depth_m, camera) if config.align_depth else None
     measured = {
         "stamp_ns": frame.stamp_ns,
         "pixels": pixels,
@@ -210,7 +213,8 @@ def observe_image(
         "intrinsics": intrinsics,
         "size_px": (camera.width_px, camera.height_px),
         "T_body_camera": frame.T_body_camera,
-        "depth_cells": depth_cells(frame.depth_m, camera) if config.align_depth else None,
+        "depth_cells": cells,
+        "grey_cells": None if cells is None else cells.mean_of(frame.gray),
     }
     return _unswept(measured, config.depth_residual)
 

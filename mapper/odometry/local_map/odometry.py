@@ -31,6 +31,7 @@ from mapper.odometry.local_map.image_observation import ImageObservation, observ
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
 from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
 from mapper.odometry.local_map.log_residuals import LogResiduals
+from mapper.odometry.local_map.photometric_error import excess_error
 from mapper.odometry.local_map.pose_information import (
     covariance_of,
     frame_information,
@@ -122,7 +123,14 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         displaced = self._earlier_depth.displacement(
             observation, tracked_pose.T_camera_world, tracked_pose.reference
         )
-        doubt = self._doubts.assess(tracked_pose, covariance_of(information), last, expected, displaced)
+        doubt = self._doubts.assess(
+            tracked_pose,
+            covariance_of(information),
+            last,
+            expected,
+            displaced,
+            excess_error(tracked_pose, last, expected),
+        )
         # The motion before a gap does not predict the motion after it.
         before_last = None if self._lost_frames else self._last
         self._lost_frames = self._unknown_frames = 0
