@@ -57,8 +57,7 @@ def log_snapshot(log: McapLog, snapshot: Snapshot | ScanSnapshot) -> None:
 
 def log_maps(log: McapLog, maps: Maps, *, stamp_ns: int) -> None:
     """Log the occupied voxels by height, the coloured clouds, the slice and the traversable floor."""
-    leaves = maps.octree.leaves()
-    occupied_world = leaves.centres_world[leaves.log_odds >= maps.octree.occupied_log_odds]
+    occupied_world = maps.octree.occupied()
     log.cloud(stamp_ns, occupied_world, colors=height_colors(occupied_world[:, 2]), name="octree")
     log.cloud(stamp_ns, maps.cloud_points_world, colors=maps.cloud_colors, name="cloud")
     log.cloud(stamp_ns, maps.dynamic_points_world, colors=maps.dynamic_colors, name="dynamic")

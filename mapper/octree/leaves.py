@@ -1,12 +1,18 @@
 """What an octree returns: its known voxels, and the ends of rays cast through it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Points
+from mapper.octree import queries
+from mapper.octree.blocks import BlockStore
 from mapper.octree.keys import KEY_BITS, KEY_ZERO
+
+_CHUNK = 1 << 12
+"""Blocks whose voxels are listed at once: 70 MB at most."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,3 +56,21 @@ class RayEnds:
     centres_world: Points
     distances_m: Array
     hits: NDArray[np.bool_]
+
+
+def known_leaves(store: BlockStore, slots: NDArray[np.int64], resolution_m: float) -> Leaves:
+    """Return the known voxels of some blocks, (B,) by their slots, in that order."""
+    keys, values = queries.known_voxels(store.codes[slots], slots, store.table.values)
+    return Leaves(keys, values, resolution_m)
+
+
+def centres_where(
+    store: BlockStore, resolution_m: float, holds: Callable[[NDArray[np.float32]], NDArray[np.bool_]]
+) -> Points:
+    """Return the (N, 3) centres, metres, of the voxels whose log-odds meet a condition, in Morton order."""
+    slots, parts = store.sorted_slots(), [np.empty((0, 3))]
+    for first in range(0, len(slots), _CHUNK):
+        known = known_leaves(store, slots[first : first + _CHUNK], resolution_m)
+        kept = holds(known.log_odds)
+        parts.append(Leaves(known.keys[kept], known.log_odds[kept], resolution_m).centres_world)
+    return np.concatenate(parts)

@@ -18,7 +18,7 @@ from mapper.octree.casting import Cast, Caster, depth_limit_of, octree_config
 from mapper.octree.config import OctreeConfig, Parent, SliceConfig
 from mapper.octree.first_obstacles import first_obstacles
 from mapper.octree.keys import KEY_BITS, codes_of
-from mapper.octree.leaves import Leaves, RayEnds
+from mapper.octree.leaves import Leaves, RayEnds, centres_where, known_leaves
 from mapper.octree.nearest import Nearest, nearest_occupied
 from mapper.octree.scan_update import ScanUpdate
 from mapper.octree.summing import Overlap, add_blocks
@@ -209,13 +209,11 @@ class OctreeMap:
 
     def occupied(self) -> Points:
         """Return the (N, 3) float64 centres of all occupied voxels, metres, in Morton order."""
-        leaves = self.leaves()
-        return leaves.centres_world[leaves.log_odds >= self.occupied_log_odds]
+        return centres_where(self.blocks, self.resolution_m, lambda odds: odds >= self.occupied_log_odds)
 
     def free(self) -> Points:
         """Return the (N, 3) float64 centres of all free voxels, metres, in Morton order."""
-        leaves = self.leaves()
-        return leaves.centres_world[leaves.log_odds < self.occupied_log_odds]
+        return centres_where(self.blocks, self.resolution_m, lambda odds: odds < self.occupied_log_odds)
 
     def slice(self, z_min: float, z_max: float) -> "OccupancyGrid":
         """Return the 2D map of the voxels with centres between two heights; occupied beats free.
@@ -408,11 +406,7 @@ class OctreeMap:
         if depth != KEY_BITS:
             codes, node_values = levels.nodes_at(self.blocks, depth=depth, parent=parent)
             return Leaves(levels.keys_at_depth(codes), node_values, self.resolution_m, depth)
-        slots = self.blocks.sorted_slots()
-        keys, values = queries.known_voxels(
-            self.blocks.codes[slots], slots, self.blocks.table.values, self._known
-        )
-        return Leaves(keys, values, self.resolution_m)
+        return known_leaves(self.blocks, self.blocks.sorted_slots(), self.resolution_m)
 
 
 def log_odds(probability: float) -> np.float32:

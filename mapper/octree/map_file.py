@@ -8,7 +8,10 @@ the same two for voxels that have any, and these voxels' red, green and blue sum
 """
 
 import json
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -23,6 +26,7 @@ from mapper.octree.blocks import BLOCK_BYTES, check_memory, find_slots
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import BLOCK_VOXELS
 from mapper.octree.map import OctreeMap
+from mapper.runtime.atomic import writing
 from mapper.runtime.checked_file import CheckedFormat
 
 MAGIC = b"\x89mapper-octree\r\n"
@@ -30,27 +34,46 @@ MAGIC = b"\x89mapper-octree\r\n"
 _FORMAT = CheckedFormat(MAGIC, version=1, remedy="update mapper", error=MapFileError)
 _LEVEL = 3  # Zstandard's default
 _MASK_BYTES = BLOCK_VOXELS // 8
+_CHUNK = 1 << 14
+"""Blocks that are copied at once: 32 MB."""
 _COUNTS = ("blocks", "voxels", "attribute_blocks", "attribute_voxels")
 _ATTRIBUTE_BYTES = BLOCK_VOXELS * 28
 """Memory of a block's attributes: three sums of colour, their weight, hits and a stamp per voxel."""
 
 
 def write_map(path: Path, octree: OctreeMap) -> None:
-    """Write a map with its sensor model and all attributes; atomic."""
+    """Write a map with its sensor model and all attributes; atomic.
+
+    Beside the map, this takes a fifth of its memory.
+    """
+    values = octree.blocks.table.values
     slots = octree.blocks.sorted_slots()
-    values = octree.blocks.table.values[slots]
-    known = ~np.isnan(values)
-    columns: list[NDArray[Any]] = [*_block_columns(octree.blocks.codes[slots], known), values[known]]
-    counts = [len(slots), int(np.count_nonzero(known)), 0, 0]
+    chunks = [slots[first : first + _CHUNK] for first in range(0, len(slots), _CHUNK)]
+    bits = [_bits(~np.isnan(values[some])) for some in chunks]
+    counts = [len(slots), int(sum(np.bitwise_count(some).sum(dtype=np.int64) for some in bits)), 0, 0]
+    attributes: list[NDArray[Any]] = []
     if octree.attributes is not None:
-        attribute_columns, counts[2:] = _attribute_columns(octree, octree.attributes)
-        columns += attribute_columns
+        attributes, counts[2:] = _attribute_columns(octree, octree.attributes)
+
+    def columns() -> Iterator[NDArray[Any]]:
+        yield _steps(octree.blocks.codes[slots])
+        yield from bits
+        for some in chunks:
+            held = values[some]
+            yield held[~np.isnan(held)]
+        yield from attributes
+
     header = {"config": octree.config.model_dump(mode="json"), **dict(zip(_COUNTS, counts, strict=True))}
     head = json.dumps(header, sort_keys=True, separators=(",", ":")).encode()
-    plain = b"".join(
-        column.astype(column.dtype.newbyteorder("<"), copy=False).tobytes() for column in columns
-    )
-    _FORMAT.write(path, head, zstandard.ZstdCompressor(level=_LEVEL).compress(plain))
+    with ExitStack() as stack:
+        stack.enter_context(writing(path))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        body = stack.enter_context(TemporaryFile(dir=path.parent))
+        compressor = zstandard.ZstdCompressor(level=_LEVEL)
+        with compressor.stream_writer(body, size=sum(_sizes(counts)), closefd=False) as stream:
+            for column in columns():
+                stream.write(column.astype(column.dtype.newbyteorder("<"), copy=False).data)
+        _FORMAT.write_from(path, head, body)
 
 
 def _attribute_columns(
@@ -60,17 +83,36 @@ def _attribute_columns(
     rows = arrays.rows[slots]
     held = (arrays.hits[rows] > 0) | (arrays.color_weights[rows] > 0)
     sums = arrays.color_sums[rows][held]
-    columns: list[NDArray[Any]] = [*_block_columns(octree.blocks.codes[slots], held)]
+    columns: list[NDArray[Any]] = [_steps(octree.blocks.codes[slots]), _bits(held)]
     columns += [np.ascontiguousarray(sums[:, channel]) for channel in range(3)]
     columns += [array[rows][held] for array in (arrays.color_weights, arrays.hits, arrays.last_seen_ns)]
     return columns, (len(slots), int(np.count_nonzero(held)))
 
 
-def _block_columns(
-    codes: NDArray[np.int64], held: NDArray[np.bool_]
-) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Return steps between (B,) block codes, and the (B, 64) bits of a (B, 512) mask of their voxels."""
-    return np.diff(codes, prepend=np.int64(0)), np.packbits(held, axis=1, bitorder="little")
+def _steps(codes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return steps between (B,) block codes."""
+    return np.diff(codes, prepend=np.int64(0))
+
+
+def _bits(held: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Return the (B, 64) bits of a (B, 512) mask of blocks' voxels."""
+    return np.packbits(held, axis=1, bitorder="little")
+
+
+def _columns(counts: Sequence[int]) -> list[tuple[int, str]]:
+    """Return the length and type of the arrays that a body holds."""
+    blocks, voxels, attribute_blocks, attribute_voxels = counts
+    return [
+        *((blocks, "<i8"), (blocks * _MASK_BYTES, "u1"), (voxels, "<f4")),
+        *((attribute_blocks, "<i8"), (attribute_blocks * _MASK_BYTES, "u1")),
+        *[(attribute_voxels, "<u4")] * 5,
+        (attribute_voxels, "<i8"),
+    ]
+
+
+def _sizes(counts: Sequence[int]) -> list[int]:
+    """Return the bytes of the arrays that a body holds."""
+    return [count * np.dtype(kind).itemsize for count, kind in _columns(counts)]
 
 
 def parse_map(path: Path, data: bytes, config: OctreeConfig | None) -> OctreeMap:
@@ -87,21 +129,12 @@ def parse_map(path: Path, data: bytes, config: OctreeConfig | None) -> OctreeMap
     """
     head, body = _FORMAT.split(path, data)
     counts, own_config = _parse_header(path, head)
-    blocks, voxels, attribute_blocks, attribute_voxels = counts
-    sizes = [
-        *((blocks, "<i8"), (blocks * _MASK_BYTES, "u1"), (voxels, "<f4")),
-        *((attribute_blocks, "<i8"), (attribute_blocks * _MASK_BYTES, "u1")),
-        *[(attribute_voxels, "<u4")] * 5,
-        (attribute_voxels, "<i8"),
-    ]
-    plain_bytes = sum(count * np.dtype(kind).itemsize for count, kind in sizes)
-    check_memory(
-        blocks * BLOCK_BYTES + attribute_blocks * _ATTRIBUTE_BYTES + plain_bytes, f"the map in {path}"
-    )
+    plain_bytes = sum(_sizes(counts))
+    check_memory(counts[0] * BLOCK_BYTES + counts[2] * _ATTRIBUTE_BYTES + plain_bytes, f"the map in {path}")
     plain = _decompressed(path, body, plain_bytes)
     columns: list[NDArray[Any]] = []
     at = 0
-    for count, kind in sizes:
+    for count, kind in _columns(counts):
         columns.append(np.frombuffer(plain, kind, count=count, offset=at))
         at += columns[-1].nbytes
     if config is None:

@@ -17,7 +17,7 @@ from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import KEY_BITS
 from mapper.octree.map import OctreeMap, log_odds
 from mapper.octree.map_file import MAGIC, parse_map
-from mapper.octree.tree import NODE, children_in, nodes_in_preorder, words_in_preorder
+from mapper.octree.tree import NODE, children_in, nodes_in_preorder, preorder_of, words_in_preorder
 from mapper.runtime import atomic
 from mapper.runtime.regular_files import read_regular
 
@@ -45,15 +45,19 @@ class _Header:
 
 def write_ot(path: Path, octree: OctreeMap) -> None:
     """Write all log-odds as an OcTree, pruned, or as a ColorOcTree if the map has colours; atomic."""
-    nodes = nodes_in_preorder(octree.blocks) if len(octree) else np.empty(0, NODE)
-    tree_name = "OcTree"
-    if octree.attributes is not None and octree.attributes.has_colors:
-        nodes, tree_name = colored(nodes, octree.blocks, octree.attributes), "ColorOcTree"
+    pieces: Iterable[NDArray[np.void]] = ()
+    count, tree_name = 0, "OcTree"
+    if len(octree) and octree.attributes is not None and octree.attributes.has_colors:
+        nodes = colored(nodes_in_preorder(octree.blocks), octree.blocks, octree.attributes)
+        pieces, count, tree_name = [nodes], len(nodes), "ColorOcTree"
+    elif len(octree):
+        tree = preorder_of(octree.blocks)
+        pieces, count = tree.pieces(), tree.count
     write_tree(
         path,
-        [nodes],
+        pieces,
         binary=False,
-        node_count=len(nodes),
+        node_count=count,
         resolution_m=octree.resolution_m,
         tree_name=tree_name,
     )

@@ -118,15 +118,18 @@ def first_obstacles(table, origins, directions, resolution_m, max_range_m, thres
 
 
 @njit(cache=True, nogil=True)
-def known_voxels(codes, slots, values, count):
+def known_voxels(codes, slots, values):
     """Return the (K, 3) uint16 keys and (K,) float32 log-odds of blocks' known voxels, in the given order.
 
     Args:
         codes: (B,) int64 Morton codes of the blocks.
         slots: (B,) int64 their rows in ``values``.
         values: (capacity, 512) float32.
-        count: K.
     """
+    count = 0
+    for b in range(len(slots)):
+        for voxel in range(BLOCK_VOXELS):
+            count += values[slots[b], voxel] == values[slots[b], voxel]
     keys = np.empty((count, 3), np.uint16)
     log_odds = np.empty(count, float32)
     k = 0

@@ -6,6 +6,8 @@ In preorder the blocks follow one another in Morton order. So each block's part 
 another, and the few nodes above the blocks are put between them at the end.
 """
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +27,8 @@ _PYRAMID = _TOP + 1
 _WORDS = _PYRAMID - BLOCK_VOXELS
 _STACK = 8 * (BLOCK_DEPTH + 1)
 _FREE, _OCCUPIED, _INNER = 1, 2, 3
+_CHUNK = 1 << 14
+"""Blocks whose nodes are in memory at once: 48 MB at most."""
 
 
 class UpperNodes(NamedTuple):
@@ -43,19 +47,71 @@ class UpperNodes(NamedTuple):
     starts: NDArray[np.int64]
 
 
-def nodes_in_preorder(store: BlockStore, *, root_depth: int = 0) -> NDArray[np.void]:
-    """Return (N,) NODE, the payload of an ``.ot`` file; the store has at least one block.
+@dataclass(frozen=True, slots=True, eq=False)
+class Preorder:
+    """Nodes of a map in preorder, the payload of an ``.ot`` file, made piece by piece.
+
+    Attributes:
+        count: Number of nodes.
+        store: The blocks.
+        slots: (B,) slots of the blocks, in Morton order.
+        upper: The nodes above the blocks; ``starts`` counts every block's nodes, pruned ones included.
+        order: (M,) upper nodes in preorder.
+    """
+
+    count: int
+    store: BlockStore
+    slots: NDArray[np.int64]
+    upper: UpperNodes
+    order: NDArray[np.int64]
+
+    def pieces(self) -> Iterator[NDArray[np.void]]:
+        """Yield the nodes, (N,) NODE at a time."""
+        ends = self._ends()
+        for chunk, (begin, end) in enumerate(zip([0, *ends[:-1]], ends, strict=True)):
+            first = chunk * _CHUNK
+            parts, starts = _block_nodes(self.store, self.slots[first : first + _CHUNK])
+            piece = np.empty(starts[-1] + end - begin, NODE)
+            yield piece[: _assemble_nodes(self.upper, self.order[begin:end], first, parts, starts, piece)]
+
+    def _ends(self) -> list[int]:
+        """Return where in the order the blocks of each chunk but the first begin, and the order's end."""
+        at = np.flatnonzero(self.order < len(self.slots))
+        nexts = np.arange(_CHUNK, len(self.slots), _CHUNK)
+        following = np.searchsorted(self.order[at], nexts)
+        return [*np.append(at, len(self.order))[following].tolist(), len(self.order)]
+
+
+def preorder_of(store: BlockStore, *, root_depth: int = 0) -> Preorder:
+    """Return the nodes of a map, in memory that is a tenth of the map's and 100 MB.
 
     Args:
-        store: The blocks.
+        store: At least one block.
         root_depth: Depth of a node above all blocks that serves as root; it is listed first.
     """
     slots = store.sorted_slots()
+    tops, sizes = np.empty(len(slots), NODE), np.empty(len(slots), np.int64)
+    for first in range(0, len(slots), _CHUNK):
+        parts, starts = _block_nodes(store, slots[first : first + _CHUNK])
+        tops[first : first + _CHUNK], sizes[first : first + _CHUNK] = parts[starts[:-1]], np.diff(starts)
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    upper = upper_nodes(store.codes[slots], tops, starts, levels=BLOCK_DEPTH - root_depth)
+    order = preorder(upper)
+    is_block = order < len(slots)
+    count = int(sizes[order[is_block]].sum() + np.count_nonzero(~is_block))
+    return Preorder(count, store, slots, upper, order)
+
+
+def nodes_in_preorder(store: BlockStore, *, root_depth: int = 0) -> NDArray[np.void]:
+    """Return (N,) NODE, all of ``preorder_of``."""
+    return np.concatenate(list(preorder_of(store, root_depth=root_depth).pieces()))
+
+
+def _block_nodes(store: BlockStore, slots: NDArray[np.int64]) -> tuple[NDArray[np.void], NDArray[np.int64]]:
+    """Return blocks' nodes, each block's in preorder, and the start of each block's."""
     parts, starts = np.empty(len(slots) * _PYRAMID, NODE), np.zeros(len(slots) + 1, np.int64)
     _write_nodes(store.table.values, slots, parts, starts)
-    upper = upper_nodes(store.codes[slots], parts[starts[:-1]], starts, levels=BLOCK_DEPTH - root_depth)
-    payload = np.empty(starts[-1] + len(upper.nodes), NODE)
-    return payload[: _assemble_nodes(upper, parts, payload)]
+    return parts, starts
 
 
 def words_in_preorder(
@@ -246,12 +302,12 @@ def _parents(codes, nodes, offset):
 
 
 @njit(cache=True, nogil=True)
-def _assemble_nodes(upper, parts, payload):
-    """Write all nodes in preorder; return their number."""
+def _assemble_nodes(upper, order, first, parts, starts, payload):
+    """Write nodes in an order, of blocks from a first one on; return their number."""
     blocks, at = len(upper.starts) - 1, 0
-    for node in preorder(upper):
+    for node in order:
         if node < blocks:
-            at = _copy_part(upper, node, parts, payload, at)
+            at = _copy_part(starts, node - first, parts, payload, at)
         else:
             payload[at] = upper.nodes[node]
             at += 1
@@ -265,15 +321,15 @@ def _assemble_words(upper, parts, payload):
     values, masks = np.empty(8, float32), np.empty(8, uint8)
     for node in preorder(upper):
         if node < blocks:
-            at = _copy_part(upper, node, parts, payload, at)
+            at = _copy_part(upper.starts, node, parts, payload, at)
         elif upper.nodes[node].mask:
             at = _write_upper_word(upper, node, payload, at, values, masks)
     return at
 
 
 @njit(cache=True, nogil=True)
-def _copy_part(upper, block, parts, payload, at):
-    for i in range(upper.starts[block], upper.starts[block + 1]):
+def _copy_part(starts, block, parts, payload, at):
+    for i in range(starts[block], starts[block + 1]):
         payload[at] = parts[i]
         at += 1
     return at

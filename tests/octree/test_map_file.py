@@ -34,6 +34,25 @@ def path(tmp_path):
 
 
 @pytest.mark.parametrize("attributes", [False, True])
+def test_a_map_written_some_blocks_at_a_time_is_the_same(attributes, tmp_path, monkeypatch):
+    octree = mapped(attributes=attributes)
+    write_map(tmp_path / "at once.octree", octree)
+    monkeypatch.setattr("mapper.octree.map_file._CHUNK", 5)
+    monkeypatch.setattr("mapper.octree.leaves._CHUNK", 5)
+
+    write_map(tmp_path / "map.octree", octree)
+
+    assert len(octree.blocks) > 5
+    again = read_octree(tmp_path / "map.octree")
+    np.testing.assert_array_equal(again.leaves().log_odds, octree.leaves().log_odds)
+    assert (tmp_path / "map.octree").read_bytes() == (tmp_path / "at once.octree").read_bytes()
+    leaves = octree.leaves()
+    is_occupied = leaves.log_odds >= octree.occupied_log_odds
+    np.testing.assert_array_equal(octree.occupied(), leaves.centres_world[is_occupied])
+    np.testing.assert_array_equal(octree.free(), leaves.centres_world[~is_occupied])
+
+
+@pytest.mark.parametrize("attributes", [False, True])
 def test_everything_comes_back(attributes, tmp_path):
     octree = mapped(attributes=attributes)
     write_map(tmp_path / "map.octree", octree)

@@ -7,8 +7,10 @@ import pytest
 from mapper.core.errors import MapFileError, MapSizeError
 from mapper.octree import blocks
 from mapper.octree.config import OctreeConfig
+from mapper.octree.keys import KEY_BITS
 from mapper.octree.map import OctreeMap, log_odds
 from mapper.octree.octomap_file import read_octree, write_bt, write_ot
+from mapper.octree.tree_reader import TreeLeaves
 from tests.support.octomap_oracle import fr1_xyz_scans, fuse, voxels
 from tests.support.octree_maps import octree_of
 from tests.support.paths import DATA, FR1_XYZ
@@ -49,6 +51,34 @@ def test_files_equal_the_cpp_library_s_byte_for_byte(octree, their_tree, tmp_pat
     assert (tmp_path / "map.ot").read_bytes() == their_tree.write()
     their_tree.read(str(tmp_path / "map.ot"))  # writeBinary destroys log-odds: work on a copy
     assert (tmp_path / "map.bt").read_bytes() == their_tree.writeBinary()
+
+
+@pytest.mark.parametrize("blocks_at_once", [1, 3, 8])
+def test_files_written_some_blocks_at_a_time_are_the_same(octree, blocks_at_once, tmp_path, monkeypatch):
+    write_ot(tmp_path / "at once.ot", octree)
+    monkeypatch.setattr("mapper.octree.tree._CHUNK", blocks_at_once)
+
+    write_ot(tmp_path / "map.ot", octree)
+
+    assert len(octree.blocks) > 8
+    assert (tmp_path / "map.ot").read_bytes() == (tmp_path / "at once.ot").read_bytes()
+
+
+@pytest.mark.parametrize("blocks_at_once", [1, 3, 8])
+@pytest.mark.parametrize("depths", [[11], [12, 13, 16], [13, 11, 16]])
+def test_nodes_pruned_above_blocks_are_written_some_blocks_at_a_time(
+    depths, blocks_at_once, tmp_path, monkeypatch
+):
+    octree = OctreeMap(0.05)
+    codes = np.array([number << 3 * (KEY_BITS - 11) for number in range(len(depths))])
+    octree.restore(TreeLeaves(codes, np.array(depths, np.uint8), np.full(len(depths), OCCUPIED)))
+    write_ot(tmp_path / "at once.ot", octree)
+    monkeypatch.setattr("mapper.octree.tree._CHUNK", blocks_at_once)
+
+    write_ot(tmp_path / "map.ot", octree)
+
+    assert (tmp_path / "map.ot").read_bytes() == (tmp_path / "at once.ot").read_bytes()
+    assert_equal_leaves(read_octree(tmp_path / "map.ot"), octree)
 
 
 @pytest.mark.skipif(not FR1_XYZ.exists(), reason="needs ../shared/data/tum_fr1_xyz")
