@@ -159,7 +159,7 @@ def fuse_log(
     Raises:
         DataError: The edits leave nothing of the map, or nothing in the height of the slice.
     """
-    octree, cloud = OctreeMap(config.octree), CloudBuilder(config.cloud.voxel_m)
+    octree, cloud = OctreeMap(config.octree, folder=after.folder), CloudBuilder(config.cloud.voxel_m)
     _add_scans(
         octree,
         source,
@@ -224,7 +224,7 @@ def fuse_octree(
     Raises:
         DataError: The edits leave nothing of the map.
     """
-    octree = OctreeMap(config.octree)
+    octree = OctreeMap(config.octree, folder=after.folder)
     _add_scans(octree, source, trajectory, config, progress=progress, before=before, after=after)
     if config.octree.moving == "removed":
         _without_moving_objects(octree, config, after)

@@ -47,9 +47,18 @@ class OctreeConfig(Config):
     stays_within_m: NonNegativeFloat = 1e-9
     """Fusing again along another trajectory keeps a frame's cached update if no end of a ray moves further;
     the default tolerates the rounding of poses that were text."""
+    max_memory_mb: PositiveFloat | None = None
+    """Size of the voxels beyond which a build has them in a file in the run's folder: the system keeps in
+    memory what it has room for, and the map is the same. For maps that are larger than memory; tables of
+    their blocks and the 2D maps still have to fit. None is all in memory."""
     moving: Literal["removed", "kept"] = "removed"
     """Whether fusing frees the voxels in which something moved, and keeps surfaces that rays only grazed; see
     ``mapper.octree.moving_objects``. "kept" is OctoMap's map."""
+
+    @property
+    def max_memory_bytes(self) -> float:
+        """Size of the voxels beyond which they are in a file."""
+        return math.inf if self.max_memory_mb is None else 1e6 * self.max_memory_mb
 
     @property
     def range_limit_m(self) -> float:

@@ -36,9 +36,15 @@ class OctreeMap:
     when a file is written.
     """
 
-    def __init__(self, config: OctreeConfig | float) -> None:
+    def __init__(self, config: OctreeConfig | float, *, folder: Path | None = None) -> None:
+        """Start empty.
+
+        Args:
+            config: Settings, or the edge of a voxel.
+            folder: Takes a file with the voxels beyond ``config.max_memory_mb``; None keeps all in memory.
+        """
         self.config = config = octree_config(config)
-        self.blocks = BlockStore()
+        self.blocks = BlockStore(folder=folder, max_memory_bytes=config.max_memory_bytes)
         self.attributes = AttributeLayer(self.blocks, config.resolution_m) if config.attributes else None
         self._caster = Caster(config)
         self._known = 0

@@ -63,7 +63,8 @@ def write_map(path: Path, octree: OctreeMap) -> None:
             yield held[~np.isnan(held)]
         yield from attributes
 
-    header = {"config": octree.config.model_dump(mode="json"), **dict(zip(_COUNTS, counts, strict=True))}
+    config = octree.config.model_dump(mode="json", exclude={"max_memory_mb"})
+    header = {"config": config, **dict(zip(_COUNTS, counts, strict=True))}
     head = json.dumps(header, sort_keys=True, separators=(",", ":")).encode()
     with ExitStack() as stack:
         stack.enter_context(writing(path))

@@ -78,6 +78,11 @@ class ScanUpdateWriter:
         with writing(self._path):
             self._file.close()
 
+    @property
+    def folder(self) -> Path:
+        """Folder of the file."""
+        return self._path.parent
+
     def add(self, frame: CachedUpdate) -> None:
         """Append one frame."""
         head = np.array((frame.stamp_ns, frame.T_world_body, frame.blocks, len(frame.data)), dtype=_HEAD)

@@ -23,7 +23,7 @@ MEMORY_BYTES = 3 << 30
 TIME_LIMIT_S = 60.0
 """Time for one input, of which most take some hundredths of a second."""
 SECOND_LIMIT_S = 600.0
-"""Time for an input that did not end within the first: on a busy machine a process may have waited all along."""
+"""Time for an input that did not end within the first: on a busy machine a process may have waited."""
 
 
 @dataclass(frozen=True)

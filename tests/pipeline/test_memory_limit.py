@@ -1,0 +1,60 @@
+"""A build whose voxels are in a file, beyond a limit, makes the map that it would have made in memory."""
+
+import pytest
+
+from mapper.octree import blocks
+from mapper.pipeline.fuse import fuse
+from mapper.run.folder import open_run
+from mapper.runtime.file_array import FileArray
+from mapper.sources import open_source
+from tests.support.files import files_of
+from tests.support.stopped_builds import MEASURED, Stage, resumed, start, stopped
+
+
+@pytest.fixture
+def grown(monkeypatch):
+    """Numbers of rows to which arrays in files have grown."""
+    rows = []
+
+    class Watched(FileArray):
+        def grown(self, count):
+            rows.append(count)
+            return super().grown(count)
+
+    monkeypatch.setattr(blocks, "FileArray", Watched)
+    return rows
+
+
+def assert_same_map(run, wanted):
+    ours, theirs = files_of(run.path), files_of(wanted.path)
+    assert ours.keys() == theirs.keys()
+    for name in ours.keys() - MEASURED - {"config.json"}:
+        assert ours[name] == theirs[name], name
+
+
+@pytest.mark.parametrize("limit_mb", [0.001, 0.15, 0.18])
+def test_a_build_that_was_stopped_while_fusing_makes_the_same_map(
+    desk_log, desk_run, tmp_path, grown, limit_mb
+):
+    limit = f"octree.max_memory_mb={limit_mb}"
+    stopped(desk_log, tmp_path / "run", limit, progress=Stage("fuse", 20))
+    run = start(desk_log, tmp_path / "run", limit)
+
+    assert max(grown) * blocks.BLOCK_BYTES > 1e6 * limit_mb
+    assert [step for step, _ in resumed(run)] == ["fuse"]
+    assert_same_map(run, desk_run)
+
+
+def test_a_run_is_fused_again_within_a_limit(desk_log, desk_run, street, street_run, tmp_path, grown):
+    for log, wanted in ((desk_log, desk_run), (street, street_run)):
+        grown.clear()
+        run = start(log, tmp_path / log.name)
+        octree = run.config.octree.model_copy(update={"max_memory_mb": 0.1})
+        fuse(open_source(log), run, run.config.model_copy(update={"octree": octree}))
+        assert grown
+        assert_same_map(open_run(run.path), wanted)
+
+
+def test_a_map_below_the_limit_is_in_memory(desk_log, tmp_path, grown):
+    start(desk_log, tmp_path / "run", "octree.max_memory_mb=1000")
+    assert not grown
