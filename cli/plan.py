@@ -85,6 +85,7 @@ def plan(
     from mapper.navigation.planner import plan_2d, plan_3d
     from mapper.navigation.storey_planner import plan_storeys
     from mapper.octree.octomap_file import read_octree
+    from mapper.octree.slice import with_obstacles
     from mapper.run import files
     from mapper.run.folder import Run, open_run
     from mapper.run.manifest import is_merged_map
@@ -94,7 +95,9 @@ def plan(
     start, goal = (_point(text, name, counts) for text, name in zip((from_, to), _POINT_OPTIONS, strict=True))
     config = overridden(PlanConfig(), assignments({"radius_m": radius, "unknown": unknown, "layer": layer}))
     built = open_map(run) if is_merged_map(run) else open_run(run)
-    grid = built.traversable if config.layer == "traversable" else built.slice
+    grid = with_obstacles(built.slice, built.keepout)
+    if config.layer == "traversable":
+        grid = built.traversable
     if in_3d:
         found = plan_3d(read_octree(built.file(files.OCTREE_OT)), start, goal, config=config)
     elif has_storeys:

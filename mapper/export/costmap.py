@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from mapper.export.grid import write_values
 from mapper.export.palette import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
 from mapper.navigation.costmap import INSCRIBED, LETHAL, NO_INFORMATION, Costmap, inflate
+from mapper.octree.slice import with_obstacles
 from mapper.run.folder import MapFolder
 from mapper.runtime.atomic import write_bytes
 from mapper.runtime.progress import Progress
@@ -26,7 +27,7 @@ def costmap(run: MapFolder, path: Path, _progress: Progress) -> None:
     """
     config = run.config.costmap
     inflated = inflate(
-        run.slice,
+        with_obstacles(run.slice, run.keepout),
         robot_radius_m=config.robot_radius_m,
         inflation_radius_m=config.inflation_radius_m,
         cost_scaling=config.cost_scaling,

@@ -22,6 +22,8 @@ from mapper.core.frames import NO_DISTORTION, DepthImage, PinholeCamera, Points3
 from mapper.core.geometry import Transform, inverse
 from mapper.export.mesh_files import Triangles, write_mesh
 from mapper.mapping.cloud import Colors
+from mapper.mapping.config import edits_of
+from mapper.mapping.edits import MapEditor
 from mapper.octree.blocks import check_memory
 from mapper.octree.map import OctreeMap
 from mapper.run.folder import Run
@@ -66,7 +68,8 @@ class _View:
 def surface(run: Run, path: Path, progress: Progress) -> None:
     """Fuse every ``mesh.frame_stride``-th tracked frame of the log and write the surface.
 
-    Depth far from all that is occupied in the run's octree is left out: it is of what moved.
+    Depth far from all that is occupied in the run's octree is left out: it is of what moved. So is what was
+    edited away by hand.
     Memory grows with the surface seen, not with the log.
 
     Raises:
@@ -154,6 +157,7 @@ def _views(run: Run, octree: OctreeMap, progress: Progress) -> Iterator[_View]:
     """Yield the frames to fuse, read and rectified ahead in threads."""
     trajectory = run.tracked_trajectory
     stride = run.config.mesh.frame_stride
+    editor = MapEditor(edits_of(run.manifest.edits), trajectory.positions_world, room_m=0.0)
     T_world_body = dict(trajectory[::stride].items())
     source = run.open_log()
     entries = (entry for entry in source.entries() if entry.stamp_ns in T_world_body)
@@ -166,7 +170,7 @@ def _views(run: Run, octree: OctreeMap, progress: Progress) -> Iterator[_View]:
         if not isinstance(frame, RgbdFrame):
             raise RunError(f"{source.path}: a mesh needs depth images, and this log has none")
         T = T_world_body[entry.stamp_ns]
-        return _rectified(_without_moved(frame, T, octree), T)
+        return _rectified(_as_mapped(frame, T, octree, editor), T)
 
     with progress.stage("mesh") as report:
         for done, view in enumerate(ordered_map(prepare, entries, workers=run.config.workers), start=1):
@@ -192,13 +196,16 @@ def _rectified(frame: RgbdFrame, T_world_body: Transform) -> _View:
     )
 
 
-def _without_moved(frame: RgbdFrame, T_world_body: Transform, octree: OctreeMap) -> RgbdFrame:
-    """Return a frame without the depth that is far from all that is occupied in the octree."""
+def _as_mapped(frame: RgbdFrame, T_world_body: Transform, octree: OctreeMap, editor: MapEditor) -> RgbdFrame:
+    """Return a frame without depth that is edited away, or far from all that is occupied in the octree."""
     measured = (frame.depth_m > 0.0) & np.isfinite(frame.depth_m)
     depth_m = np.where(measured, frame.depth_m, np.float32(0.0))
     points_world = back_project(depth_m, ray_table(frame.camera), T_world_body @ frame.T_body_camera)
     max_distance_m = _NEAR_VOXELS * octree.resolution_m
-    depth_m[measured] *= octree.are_near_occupied(points_world, max_distance_m=max_distance_m)
+    is_mapped = octree.are_near_occupied(points_world, max_distance_m=max_distance_m)
+    if editor.edits.erase or editor.edits.keep:
+        is_mapped &= editor.leave(points_world)
+    depth_m[measured] *= is_mapped
     return replace(frame, depth_m=depth_m)
 
 

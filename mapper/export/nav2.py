@@ -10,7 +10,7 @@ from mapper.core.errors import DataError
 from mapper.export.grid import write_grid, write_values
 from mapper.navigation.config import CostmapConfig
 from mapper.navigation.distance_transform import NONE, squares_to_centres
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, with_obstacles
 from mapper.run.folder import MapFolder
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text
 from mapper.runtime.progress import Progress
@@ -35,7 +35,7 @@ def nav2(run: MapFolder, path: Path, _progress: Progress) -> None:
         RunError: PATH holds something else.
     """
     grid, floor = run.slice, run.traversable
-    keepout = keepout_mask(grid, floor)
+    keepout = with_obstacles(keepout_mask(grid, floor), run.keepout)
     slowed = slowed_percent(grid, keepout, run.config.costmap)
     with atomic_folder(path, FOLDER, overwrite=True) as folder:
         write_text(folder / MANIFEST_NAME, json.dumps({"nav2": 1, "run": str(run.path.resolve())}) + "\n")

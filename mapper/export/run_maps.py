@@ -9,6 +9,8 @@ import numpy as np
 from mapper.core.errors import DataError
 from mapper.core.frames import PinholeCamera
 from mapper.export.run_mcap import BODY, CAMERA
+from mapper.mapping.config import edits_of
+from mapper.mapping.edits import MapEditor
 from mapper.mapping.fusion import Maps, Snapshot
 from mapper.navigation.floor import reachable_floor
 from mapper.navigation.traversable import Storey, traversable
@@ -44,6 +46,7 @@ def maps_of(run: Run) -> Maps:
         grid=run.slice,
         traversable=run.traversable,
         storeys=tuple(_storeys(run)),
+        keepout=run.keepout,
     )
 
 
@@ -53,8 +56,10 @@ def storeys_of_run(run: Run) -> tuple[Storey, ...]:
     Raises:
         MapFileError: The octree cannot be read.
     """
-    config, path = run.config.traversable, load_results(run).tracked
-    return traversable(reachable_floor(run.octree, config, positions_world=path.positions_world), config)
+    config, path_world = run.config.traversable, load_results(run).tracked.positions_world
+    storeys = traversable(reachable_floor(run.octree, config, positions_world=path_world), config)
+    editor = MapEditor(edits_of(run.manifest.edits), path_world, config.head_room_m)
+    return editor.edit_storeys(storeys)[0]
 
 
 def _storeys(run: Run) -> Iterator[OccupancyGrid]:

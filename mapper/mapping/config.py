@@ -151,6 +151,12 @@ class AppliedEdit(Config):
         return f"{self.kind} {', '.join(self.region.lines)}: {self.count} {did}"
 
 
+def edits_of(applied: tuple[AppliedEdit, ...]) -> Edits:
+    """Return the regions of edits that were made."""
+    kinds: tuple[EditKind, ...] = ("erase", "keep", "keepout")
+    return Edits(**{kind: tuple(edit.region for edit in applied if edit.kind == kind) for kind in kinds})
+
+
 class FuseSettings(Protocol):
     """The part of a build's configuration that fusing reads."""
 

@@ -7,14 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
-from mapper.core.geometry import Array, Points
+from mapper.core.frames import Points32
+from mapper.core.geometry import Array, Points, Transform, apply
 from mapper.mapping.config import AppliedEdit, Edits, Region
 from mapper.navigation.traversable import Storey, trimmed
 from mapper.octree.columns import NOWHERE, Columns
 from mapper.octree.ground_height import DrivenGround, nearest_heights
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS, KEY_MASK, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap
-from mapper.octree.slice import OCCUPIED, UNKNOWN
+from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 Mask = NDArray[np.bool_]
 
@@ -25,17 +26,19 @@ _CHUNK = 4096  # blocks worked on at a time: 2 million voxels
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapEditor:
-    """Editor of one run's maps.
+    """Editor of the maps of a run, or of the grids of a map that it was merged into.
 
     Attributes:
         edits: What to do.
-        path_world: (N, 3) where the sensor was, metres.
+        path_world: (N, 3) where the sensor was in the run's world, metres.
         room_m: Height of a robot: floor belongs to a region if any of the space of a robot on it does.
+        T_world_map: (4, 4) pose of the merged map in the run's world; None for the run's own maps.
     """
 
     edits: Edits
     path_world: Points
     room_m: float
+    T_world_map: Transform | None = None
 
     def erase(self, octree: OctreeMap) -> list[AppliedEdit]:
         """Free the occupied voxels whose centres lie in regions to erase."""
@@ -97,6 +100,32 @@ class MapEditor:
         ]
         return tuple(left), done
 
+    def keepout(self, grid: OccupancyGrid, level: NDArray[np.int32]) -> OccupancyGrid | None:
+        """Return where the keep-out regions are, in the cells of a slice; None if there are none.
+
+        Args:
+            grid: The slice.
+            level: (H, W) heights of the floor below it, in voxels above z = 0.
+        """
+        if not self.edits.keepout:
+            return None
+        inside = self._on_floor(self.edits.keepout, _Cells(grid.origin_world_m, level, grid.resolution_m))
+        cells = np.where(inside, OCCUPIED, FREE).astype(np.int8)
+        return OccupancyGrid(cells, grid.origin_world_m, grid.resolution_m)
+
+    def leave(self, points_world: Points | Points32) -> Mask:
+        """Return for each of (N, 3) points, metres, whether nothing that is done in regions takes it away."""
+        left = ~self._contain(self.edits.erase, points_world)
+        return left & self._contain(self.edits.keep, points_world) if self.edits.keep else left
+
+    def _contain(self, regions: tuple[Region, ...], points_world: Points | Points32) -> Mask:
+        inside = np.zeros(len(points_world), np.bool_)
+        for region in regions:
+            low_m, high_m = region.z_range_m
+            in_height = np.flatnonzero((points_world[:, 2] >= low_m) & (points_world[:, 2] <= high_m))
+            inside[in_height] |= covered(region, points_world[in_height, :2], self.path_world)
+        return inside
+
     def _edited_cells(self, storey: Storey) -> tuple[NDArray[np.int8], list[int]]:
         """Return the (H, W) cells of a storey, and how many each keep-out region has blocked."""
         cells, counts = storey.grid.cells.copy(), [0] * len(self.edits.keepout)
@@ -132,13 +161,15 @@ class MapEditor:
 
     def _on_floor(self, regions: tuple[Region, ...], floor: "_Cells") -> Mask:
         """Return the (H, W) mask of the cells on whose floor a robot is in any of the regions."""
-        inside = np.zeros(floor.heights.shape, np.bool_)
-        floor_m = floor.heights * floor.resolution_m
+        points = np.column_stack([floor.centres_world, (floor.heights * floor.resolution_m).ravel()])
+        if self.T_world_map is not None:
+            points = apply(self.T_world_map, points)
+        inside = np.zeros(len(points), np.bool_)
         for region in regions:
             low_m, high_m = region.z_range_m
-            in_height = (floor_m + self.room_m >= low_m) & (floor_m <= high_m)
-            inside |= in_height & covered(region, floor.centres_world, self.path_world).reshape(inside.shape)
-        return inside
+            in_height = (points[:, 2] + self.room_m >= low_m) & (points[:, 2] <= high_m)
+            inside |= in_height & covered(region, points[:, :2], self.path_world)
+        return inside.reshape(floor.heights.shape)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,7 +187,7 @@ class _Cells:
         return self.origin_world_m + (np.column_stack([columns, rows]) + 0.5) * self.resolution_m
 
 
-def covered(region: Region, points_world: Points, path_world: Points) -> Mask:
+def covered(region: Region, points_world: Points | Points32, path_world: Points) -> Mask:
     """Return the (N,) mask of (N, 2) points that lie in a region seen from above.
 
     Args:
@@ -179,7 +210,7 @@ def covered(region: Region, points_world: Points, path_world: Points) -> Mask:
     return inside
 
 
-def _in_polygon(points: Points, corners: Points) -> Mask:
+def _in_polygon(points: Points | Points32, corners: Points) -> Mask:
     """Return the (N,) mask of (N, 2) points from which a ray along x crosses an odd number of sides."""
     inside = np.zeros(len(points), np.bool_)
     x, y = points.T

@@ -25,7 +25,7 @@ from mapper.octree.map import OctreeMap
 from mapper.octree.moving_objects import MovingObjects, remove_moving_objects
 from mapper.octree.scan_update import ScanUpdate, pack
 from mapper.octree.scan_update_file import CachedUpdate, ScanUpdateFile, ScanUpdateWriter, cache_update
-from mapper.octree.slice import OccupancyGrid, cut_slice
+from mapper.octree.slice import OccupancyGrid, cut_slice, floor_below
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import FrameRef, Log
@@ -77,6 +77,7 @@ class Maps:
         grid: The slice through the octree above the floor.
         traversable: The floor that a robot can drive on, of the storey on which the path begins.
         storeys: The same of every storey, the lowest first, where floors lie over each other.
+        keepout: The keep-out regions in the slice's cells; None if there are none.
         has_path: Whether the path tells the height of the floor.
         edits: The edits by hand that are in them.
     """
@@ -89,6 +90,7 @@ class Maps:
     grid: OccupancyGrid
     traversable: OccupancyGrid
     storeys: tuple[OccupancyGrid, ...] = ()
+    keepout: OccupancyGrid | None = None
     has_path: bool = True
     edits: tuple[AppliedEdit, ...] = ()
 
@@ -204,6 +206,7 @@ def fuse_log(
         grid=grid,
         traversable=next(storey.grid for storey in storeys if storey.is_home),
         storeys=tuple(storey.grid for storey in storeys) if len(storeys) > 1 else (),
+        keepout=editor.keepout(grid, floor_below(grid, config.slice, driven=driven)),
         has_path=len(floor.path) > 0,
         edits=made,
     )

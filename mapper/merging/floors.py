@@ -5,8 +5,10 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Points
-from mapper.merging.merged_map import MergedMap
+from mapper.core.geometry import Points, apply, inverse
+from mapper.mapping.config import Edits
+from mapper.mapping.edits import MapEditor
+from mapper.merging.merged_map import MapManifest, MergedMap
 from mapper.navigation.config import TraversableConfig
 from mapper.navigation.floor import Floor, floor_of, margin_for
 from mapper.navigation.traversable import Storey, traversable
@@ -47,6 +49,7 @@ def storeys_of_map(merged: MergedMap) -> tuple[Storey, ...]:
         RunError: A run's trajectory is missing.
     """
     manifest = merged.manifest
+    paths_map = [merged.trajectory(run).positions_world for run in manifest.runs]
     voxels, extents = [], []
     for tile in manifest.tiles:
         octree = read_octree(merged.tile_path(tile))
@@ -57,8 +60,32 @@ def storeys_of_map(merged: MergedMap) -> tuple[Storey, ...]:
         voxels,
         (np.min(firsts, axis=0), np.max(lasts, axis=0)),
         manifest.traversable,
-        paths_map=[merged.trajectory(run).positions_world for run in manifest.runs],
+        paths_map=paths_map,
         resolution_m=manifest.octree.resolution_m,
         floor_z_m=manifest.floor_z_m,
     )
-    return traversable(floor, manifest.traversable)
+    return kept_out(traversable(floor, manifest.traversable), editors_of(manifest, paths_map))
+
+
+def editors_of(manifest: MapManifest, paths_map: Sequence[Points]) -> list[MapEditor]:
+    """Return an editor for each run of a map that has keep-out regions.
+
+    Args:
+        manifest: The map's.
+        paths_map: Of every run, (N, 3) where its sensor was, metres.
+    """
+    editors = []
+    for run, path_map in zip(manifest.runs, paths_map, strict=True):
+        if run.keepout:
+            T_world_map = inverse(np.array(run.T_map_world))
+            path_world = apply(T_world_map, path_map)
+            room_m = manifest.traversable.head_room_m
+            editors.append(MapEditor(Edits(keepout=run.keepout), path_world, room_m, T_world_map))
+    return editors
+
+
+def kept_out(storeys: tuple[Storey, ...], editors: Sequence[MapEditor]) -> tuple[Storey, ...]:
+    """Return the storeys of a floor with the runs' keep-out regions blocked."""
+    for editor in editors:
+        storeys, _ = editor.edit_storeys(storeys)
+    return storeys

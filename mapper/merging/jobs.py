@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mapper.core.config import Config
 from mapper.core.geometry import Transform, inverse
 from mapper.core.trajectory import Trajectory
+from mapper.mapping.config import edits_of
 from mapper.mapping.fusion import fuse_octree
 from mapper.merging.merged_map import TILES
 from mapper.merging.tiling import Tiling
@@ -32,7 +33,6 @@ from mapper.octree.scan_update_file import ScanUpdateWriter, open_scan_updates
 from mapper.octree.slice import see_band
 from mapper.octree.summing import Overlap
 from mapper.octree.tree import children_in, nodes_in_preorder, words_in_preorder
-from mapper.run.edits_file import edits_text, parse_edits
 from mapper.run.folder import open_run
 from mapper.runtime.atomic import atomic_file, write_bytes
 from mapper.runtime.progress import SILENT
@@ -160,7 +160,7 @@ def fuse_run(workspace: Workspace, run: int, path: Path, trajectory: Trajectory,
             progress=SILENT,
             before=known,
             after=updates,
-            edits=parse_edits(edits_text(path), path),
+            edits=edits_of(built.manifest.edits),
         )
     written.unlink()
     write_map(octree, fused)

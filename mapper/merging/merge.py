@@ -161,6 +161,8 @@ def merge(
         _write_storeys(folder, sliced.storeys)
         if sliced.grid is not None:
             write_grid(folder, files.SLICE, sliced.grid)
+            if sliced.keepout is not None:
+                write_grid(folder, files.KEEPOUT, sliced.keepout)
             draw(folder / files.SUMMARY, sliced.grid, placed, manifest)
         _clean(workspace, joined)
         manifest.save(folder)

@@ -18,6 +18,7 @@ from mapper.core.geometry import Array
 from mapper.core.trajectory import Trajectory
 from mapper.graph.g2o import read_g2o
 from mapper.graph.model import PoseGraph
+from mapper.mapping.config import Region
 from mapper.merging.joint_graph import Tie
 from mapper.navigation.config import CostmapConfig, TraversableConfig
 from mapper.octree.config import OctreeConfig, SliceConfig
@@ -67,6 +68,8 @@ class RunInMap(Config):
     """Known ones, in its own map."""
     has_colors: bool = False
     """Whether any of them has one."""
+    keepout: tuple[Region, ...] = ()
+    """Its keep-out regions, in its own world."""
     shared_voxels: int = 0
     """Those that are known in the sum of the runs before it as well."""
     agreement: float | None = None
@@ -195,6 +198,11 @@ class MergedMap:
             )
             raise RunError(f"{self.path}: has no {files.TRAVERSABLE}.yaml; {why}")
         return stored_grid(self, files.TRAVERSABLE)
+
+    @property
+    def keepout(self) -> OccupancyGrid | None:
+        """Keep-out regions of its runs in the slice's cells; None if there are none."""
+        return stored_grid(self, files.KEEPOUT) if (self.path / f"{files.KEEPOUT}.yaml").exists() else None
 
     @property
     def graph(self) -> PoseGraph | None:

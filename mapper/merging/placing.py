@@ -12,9 +12,11 @@ from mapper.core.geometry import Array, Transform, fit_rigid, inverse
 from mapper.core.rotations import pose_of_row
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, nearest
 from mapper.core.trajectory import Trajectory
+from mapper.mapping.config import edits_of
 from mapper.merging.joint_graph import JointGraph
 from mapper.octree.config import OctreeConfig
 from mapper.octree.scan_update_file import displacement_m, longest_ray_m
+from mapper.run import files
 from mapper.run.doubtful_frames import without_doubtful
 from mapper.run.edits_file import edits_text, parse_edits
 from mapper.run.folder import Run
@@ -161,8 +163,11 @@ def warnings_about(placed: Sequence[Placed]) -> list[str]:
         verdict = item.run.manifest.verdict
         if verdict is not None and verdict.state != "trusted":
             found.append(f"{_name(item.run)} is {verdict.state}: {verdict.sentences[0]}")
-        if blocked := len(parse_edits(edits_text(item.run.path), item.run.path).keepout):
-            found.append(f"{_name(item.run)}: its keep-out regions ({blocked}) are not in a merged map")
+        if parse_edits(edits_text(item.run.path), item.run.path) != edits_of(item.run.manifest.edits):
+            found.append(
+                f"{_name(item.run)}: its maps were made before {files.EDITS} was changed and are merged "
+                f"as they are; mapper fuse {item.run.path}, then merge again"
+            )
     used = [_frames_used(item.run) for item in placed]
     for second, item in enumerate(placed):
         for first, other in enumerate(placed[:second]):

@@ -8,6 +8,7 @@ from pathlib import Path
 from mapper.core.errors import MapperError
 from mapper.graph.g2o import write_g2o
 from mapper.loops.closure import write_closures
+from mapper.mapping.config import edits_of
 from mapper.merging.jobs import FusedRun, Workspace, fuse_run
 from mapper.merging.merged_map import FUSED, RUNS, MapManifest, RunInMap
 from mapper.merging.placing import Placed, Placing
@@ -55,6 +56,7 @@ def described_runs(placing: Placing, *, fused_again: Set[int]) -> tuple[RunInMap
             first_node=first_node,
             moved_m=round(item.moved_m, 6),
             fused_again=number in fused_again,
+            keepout=edits_of(item.run.manifest.edits).keepout,
         )
         for number, (item, first_node) in enumerate(zip(placing.placed, first_nodes, strict=True))
     )

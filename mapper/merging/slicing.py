@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.export.picture import write_merged
-from mapper.merging.floors import MOST_COLUMNS, Extent, floor_over
+from mapper.mapping.edits import MapEditor
+from mapper.merging.floors import MOST_COLUMNS, Extent, editors_of, floor_over, kept_out
 from mapper.merging.jobs import (
     BAND,
     GROUND,
@@ -37,7 +38,7 @@ from mapper.octree.ground_height import (
     lay_on_floor,
     nearest_heights,
 )
-from mapper.octree.slice import OccupancyGrid, free_path, grid_of, shrunk
+from mapper.octree.slice import OccupancyGrid, floor_below, free_path, grid_of, shrunk, with_obstacles
 
 _MOST_CELLS = 2000  # more than a page has pixels
 _MAX_TILT = np.cos(np.deg2rad(5.0))
@@ -50,12 +51,14 @@ class Sliced:
     Attributes:
         columns: Results of all columns of tiles.
         grid: The slice; None if there is none.
+        keepout: The runs' keep-out regions in its cells; None if there are none.
         storeys: The traversable floor, a storey each; none if there is none.
         missing: Why there is no slice or no floor.
     """
 
     columns: Sequence[SlicedColumn]
     grid: OccupancyGrid | None
+    keepout: OccupancyGrid | None
     storeys: Sequence[Storey]
     missing: Sequence[str]
 
@@ -111,7 +114,7 @@ def slice_map(
     }
     done = [column for _, column in stages.run("slice", jobs, SlicedColumn)]
     if not is_level:
-        return Sliced(done, None, (), missing)
+        return Sliced(done, None, None, (), missing)
     seen = np.zeros(shape, np.uint8)
     for tiles in columns.values():
         _over(np.bitwise_or, seen, first, workspace, tiles[0], BAND)
@@ -134,8 +137,21 @@ def slice_map(
         )
     except DataError as error:
         missing.append(f"no {error}")
-    storeys = () if floor is None else traversable(floor, manifest.traversable)
-    return Sliced(done, grid, storeys, missing)
+    editors = editors_of(manifest, [item.trajectory_map.positions_world for item in placed])
+    keepout = None if grid is None else _keepout(grid, manifest, driven, editors)
+    storeys = () if floor is None else kept_out(traversable(floor, manifest.traversable), editors)
+    return Sliced(done, grid, keepout, storeys, missing)
+
+
+def _keepout(
+    grid: OccupancyGrid, manifest: MapManifest, driven: DrivenGround | None, editors: Sequence[MapEditor]
+) -> OccupancyGrid | None:
+    """Return where any run's keep-out regions are, in the slice's cells; None if there are none."""
+    if not editors:
+        return None
+    level = floor_below(grid, manifest.slice, floor_z_m=manifest.floor_z_m, driven=driven)
+    first, *others = (editor.keepout(grid, level) for editor in editors)
+    return None if first is None else reduce(with_obstacles, others, first)
 
 
 def _raster(extent: Extent, driven: DrivenGround | None) -> tuple[NDArray[np.int64], tuple[int, int]]:

@@ -13,7 +13,7 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import Array
 from mapper.octree.columns import block_extent
 from mapper.octree.config import SliceConfig
-from mapper.octree.ground_height import DrivenGround, ground_heights
+from mapper.octree.ground_height import DrivenGround, ground_heights, known_floor, nearest_heights
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap
 
@@ -67,6 +67,35 @@ class OccupancyGrid:
             raise DataError(f"grid: origin {self.origin_world_m}, want two finite numbers")
         if not 0.0 < self.resolution_m < np.inf:
             raise DataError(f"grid: resolution {self.resolution_m} m, want > 0")
+
+
+def with_obstacles(grid: OccupancyGrid, others: OccupancyGrid | None) -> OccupancyGrid:
+    """Return a grid with what is occupied in another of the same cells, if there is one, occupied too."""
+    if others is None:
+        return grid
+    cells = np.where(others.cells == OCCUPIED, others.cells, grid.cells)
+    return OccupancyGrid(cells, grid.origin_world_m, grid.resolution_m)
+
+
+def floor_below(
+    grid: OccupancyGrid, config: SliceConfig, *, floor_z_m: float = 0.0, driven: DrivenGround | None = None
+) -> NDArray[np.int32]:
+    """Return the (H, W) heights of the floor below a slice's cells, in voxels above z = 0.
+
+    That of a level band is the floor; below another it is the nearest floor that is connected to the path.
+
+    Args:
+        grid: The slice, from ``cut_slice``.
+        config: As it was cut.
+        floor_z_m: Height of the floor in the world.
+        driven: The ground that was driven on, of the same map; None if none is known.
+    """
+    known = known_floor(driven) if config.above == "ground" else None
+    if driven is None or known is None:
+        return np.full(grid.cells.shape, round(floor_z_m / grid.resolution_m), np.int32)
+    first = np.rint(grid.origin_world_m / grid.resolution_m).astype(np.int64) + KEY_ZERO
+    (x, y), (height, width) = first - driven.first, grid.cells.shape
+    return nearest_heights(known)[0][y : y + height, x : x + width]
 
 
 def shrunk(grid: OccupancyGrid, most_cells: int) -> OccupancyGrid:

@@ -256,6 +256,8 @@ def _write_maps(folder: Path, maps: Maps) -> None:
     write_ply(folder / files.DYNAMIC, maps.dynamic_points_world, maps.dynamic_colors)
     write_grid(folder, files.SLICE, maps.grid)
     write_grid(folder, files.TRAVERSABLE, maps.traversable)
+    if maps.keepout is not None:
+        write_grid(folder, files.KEEPOUT, maps.keepout)
     for number, storey in enumerate(maps.storeys[: files.MOST_STOREYS]):
         write_grid(folder, files.storey(number), storey)
 

@@ -23,6 +23,7 @@ OCTREE_OT = "map.ot"
 OCTREE_MAP = "map.octree"
 SLICE = "slice"
 TRAVERSABLE = "traversable"
+KEEPOUT = "keepout"
 CLOUD = "cloud.ply"
 CLOUD_VIEWS = "cloud.png"
 DYNAMIC = "dynamic.ply"
@@ -94,6 +95,12 @@ RUN_FILES = (
         _grid(TRAVERSABLE),
         "the floor that a robot can drive on, in the same form; where floors lie over each other, that on "
         "which the log begins, and `traversable_0.pgm` and so on, from below, for each",
+        "maps",
+    ),
+    RunFiles(
+        _grid(KEEPOUT),
+        "the keep-out regions over the slice's cells, in the same form, where `edits.toml` has any: occupied "
+        "where a robot is kept out, else free",
         "maps",
     ),
     RunFiles((CLOUD, CLOUD_VIEWS), "the coloured cloud, and two views of it", "maps"),

@@ -78,6 +78,11 @@ class MapFolder(Protocol):
         """Floor that a robot can drive on."""
         ...
 
+    @property
+    def keepout(self) -> "OccupancyGrid | None":
+        """Keep-out regions in the slice's cells; None if there are none."""
+        ...
+
     def file(self, name: str, /) -> Path:
         """Return the path of one of its files."""
         ...
@@ -214,6 +219,13 @@ class Run:
         from mapper.octree.grid_file import stored_grid
 
         return stored_grid(self, files.TRAVERSABLE)
+
+    @cached_property
+    def keepout(self) -> "OccupancyGrid | None":
+        """Keep-out regions in the slice's cells; None if there are none."""
+        from mapper.octree.grid_file import stored_grid
+
+        return stored_grid(self, files.KEEPOUT) if (self.path / f"{files.KEEPOUT}.yaml").exists() else None
 
     def plot(self, axes: "Axes | None" = None) -> "Axes":
         """Draw the path over the slice, seen from above, with loops, uncertainty and the truth if known.

@@ -7,7 +7,7 @@ import pytest
 
 from mapper.octree.grid_file import read_grid
 from mapper.octree.octomap_file import read_octree
-from mapper.octree.slice import OCCUPIED
+from mapper.octree.slice import FREE, OCCUPIED
 from mapper.run.folder import open_run
 from tests.support.command_line import mapper
 from tests.support.files import files_of
@@ -73,7 +73,7 @@ def test_a_file_that_was_written_by_hand_is_read_and_not_refused(run_folder):
     assert "not in the maps yet" not in mapper("edit", run_folder).stdout
 
 
-def test_a_keepout_blocks_the_traversable_floor_alone(run_folder):
+def test_a_keepout_blocks_the_traversable_floor_and_plans_but_not_the_slice(run_folder):
     grid = read_grid(run_folder / "traversable.yaml")
     height, width = grid.cells.shape
     (x, y), edge_m = grid.origin_world_m, 0.05
@@ -88,6 +88,23 @@ def test_a_keepout_blocks_the_traversable_floor_alone(run_folder):
     np.testing.assert_array_equal(after[:, 10:], grid.cells[:, 10:])
     assert width > 10
     assert (run_folder / "slice.pgm").read_bytes() == slice_before
+
+    band, mask = read_grid(run_folder / "slice.yaml"), read_grid(run_folder / "keepout.yaml")
+    np.testing.assert_array_equal(mask.origin_world_m, band.origin_world_m)
+    columns = np.arange(band.cells.shape[1])
+    kept_out = columns < 10 + round((x - band.origin_world_m[0]) / edge_m)
+    kept_out &= columns >= round((x - band.origin_world_m[0]) / edge_m)
+    inside = (mask.cells == OCCUPIED).any(axis=0)
+    np.testing.assert_array_equal(inside, kept_out)
+    lost = np.argwhere((band.cells == FREE) & (mask.cells == OCCUPIED))
+    row, column = lost[0]
+    point = [band.origin_world_m[0] + (column + 0.5) * edge_m, band.origin_world_m[1] + (row + 0.5) * edge_m]
+    told = mapper("plan", run_folder, "--from", *point, "--to", *point, "--radius", 0.01, status=1).stderr
+    assert "start" in told
+
+    mapper("edit", run_folder, "--undo", "--quiet")
+    assert not list(run_folder.glob("keepout.*"))
+    mapper("plan", run_folder, "--from", *point, "--to", *point, "--radius", 0.01)
 
 
 @pytest.mark.parametrize(

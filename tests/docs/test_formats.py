@@ -186,6 +186,7 @@ def test_every_file_of_a_run_is_explained():
     pictures = {
         "slice.png",
         "traversable.png",
+        "keepout.png",
         "costmap.png",
         "summary.png",
         "cloud.png",

@@ -5,7 +5,9 @@ from mapper.config.export import MeshConfig
 from mapper.core.frames import PinholeCamera, RgbdFrame, Scan, ray_table
 from mapper.core.geometry import apply, inverse, transform
 from mapper.core.rotations import rotation_from_euler
-from mapper.export.mesh import _in_order, _rectified, _Volume, _without_moved
+from mapper.export.mesh import _as_mapped, _in_order, _rectified, _Volume
+from mapper.mapping.config import Edits, Region
+from mapper.mapping.edits import MapEditor
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 
@@ -114,8 +116,30 @@ def test_depth_of_what_the_octree_does_not_have_is_left_out():
     depth_m[:20] = np.nan
     passed = RgbdFrame(0, wall.image, depth_m, wall.camera)
 
-    kept_m = _without_moved(passed, T_world_camera, octree).depth_m
+    kept_m = _as_mapped(passed, T_world_camera, octree, editor()).depth_m
 
     expected_m = wall.depth_m.copy()
     expected_m[80:120, 100:200] = expected_m[:20] = 0.0
     np.testing.assert_array_equal(kept_m, expected_m)
+
+
+def editor(**regions):
+    return MapEditor(Edits(**regions), np.zeros((1, 3)), room_m=0.0)
+
+
+@pytest.mark.parametrize("kind", ["erase", "keep"])
+def test_depth_that_was_edited_away_is_left_out(kind):
+    T_world_camera = POSES[1]
+    frame = frame_of_a_plane(T_world_camera, distortion=(0.0, 0.0, 0.0, 0.0, 0.0))
+    octree = OctreeMap(OctreeConfig(resolution_m=0.05))
+    octree.insert(frame.scan(), T_world_camera)
+    rays = np.concatenate([ray_table(frame.camera), np.ones((240, 320, 1))], axis=2).astype(np.float64)
+    x = apply(T_world_camera, (rays * frame.depth_m[..., None]).reshape(-1, 3))[:, 0].reshape(240, 320)
+    region = Region(box_m=((0.1, -9.0, -9.0), (9.0, 9.0, 9.0)))
+
+    kept_m = _as_mapped(frame, T_world_camera, octree, editor(**{kind: (region,)})).depth_m
+
+    sure = np.abs(x - 0.1) > 1e-4
+    left = (x > 0.1) == (kind == "keep")
+    assert 1000 < np.count_nonzero(left) < left.size - 1000
+    np.testing.assert_array_equal(kept_m[sure], np.where(left, frame.depth_m, 0.0)[sure])

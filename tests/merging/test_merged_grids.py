@@ -1,22 +1,26 @@
 """Slice, floor and plans of merged maps: those of the same map in memory, below the paths of all runs."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from mapper.cli.main import app
 from mapper.core.errors import RunError
+from mapper.core.geometry import apply, exp
+from mapper.mapping.config import AppliedEdit, Region
 from mapper.merging.floors import storeys_of_map
-from mapper.merging.placing import as_built
+from mapper.merging.placing import Placed, as_built
 from mapper.navigation.config import TraversableConfig
 from mapper.navigation.floor import driven_ground, floor_of, margin_for
 from mapper.navigation.traversable import traversable
 from mapper.octree.columns import occupied_columns
+from mapper.octree.config import SliceConfig
 from mapper.octree.grid_file import read_grid
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import read_octree
-from mapper.octree.slice import FREE, cut_slice
+from mapper.octree.slice import FREE, OCCUPIED, cut_slice
 from tests.support.command_line import mapper
 from tests.support.floor_scenes import two_storeys
 from tests.support.merged_runs import BAND, ROBOT, make_run, merged_map_of
@@ -132,3 +136,47 @@ def test_a_merged_map_is_driven_on(tmp_path):
     assert read_octree(tmp_path / "coarse.bt").resolution_m == pytest.approx(0.2)
     refused = mapper("export", found.path, "--as", "mesh", status=1)
     assert "a merged map has no mesh, only octomap, grid, costmap, nav2" in refused.stderr
+
+
+def test_keepout_regions_of_a_run_that_is_turned_hold_on_their_storeys(tmp_path):
+    world, robot = two_storeys(), TraversableConfig(max_step_m=0.2, head_room_m=1.8, max_gap_m=0.2)
+    run = make_run(
+        tmp_path / "house",
+        world.octree(0.1),
+        band=SliceConfig(),
+        positions=world.positions(),
+        traversable=robot,
+    )
+    polygon = ((4.0, 4.0), (6.0, 4.0), (6.0, 6.0), (4.0, 6.0))
+    above, below = (
+        Region(box_m=((4.0, 2.0, 3.0), (6.0, 7.0, 4.0))),
+        Region(polygon_m=polygon, height_m=(-1, 1)),
+    )
+    edits = tuple(AppliedEdit(kind="keepout", region=region, count=1) for region in (above, below))
+    edited = replace(run, manifest=run.manifest.model_copy(update={"edits": edits}))
+    T_map_world = exp(np.array([0.0, 0.0, np.pi / 2]), np.array([3.0, -2.0, 0.0]))
+
+    plain = merged_map_of([Placed(run, T_map_world, "by hand")], tmp_path / "plain").map
+    found = merged_map_of([Placed(edited, T_map_world, "by hand")], tmp_path / "map").map
+
+    def cells(folder, stem, x, y):
+        grid = read_grid(folder.path / f"{stem}.yaml")
+        (point,) = apply(T_map_world, np.array([[x, y, 0.0]]))
+        column, row = np.floor((point[:2] - grid.origin_world_m) / grid.resolution_m).astype(int)
+        return grid.cells[row, column]
+
+    assert cells(found, "traversable_0", 5.0, 5.0) == cells(found, "traversable_1", 5.0, 3.0) == OCCUPIED
+    assert cells(found, "traversable_0", 5.0, 3.0) == cells(found, "traversable_1", 7.0, 5.0) == FREE
+    assert cells(plain, "traversable_0", 5.0, 5.0) == cells(plain, "traversable_1", 5.0, 3.0) == FREE
+    assert cells(found, "keepout", 5.0, 5.0) == OCCUPIED != cells(found, "keepout", 5.0, 3.0)
+    np.testing.assert_array_equal(found.slice.cells, plain.slice.cells)
+    assert plain.keepout is None
+
+    (x, y, _), (x_free, y_free, _) = apply(T_map_world, np.array([[5.0, 5.0, 0.0], [8.0, 6.0, 0.0]]))
+    for layer in ("slice", "traversable"):
+        ends = "--from", f"{x_free} {y_free}", "--to", f"{x} {y}", "--radius", "0.15", "--layer", layer
+        mapper("plan", plain.path, *ends)
+        assert "goal" in mapper("plan", found.path, *ends, status=1).stderr
+    mapper("export", found.path, "--as", "nav2", "--out", tmp_path / "nav2")
+    mask, kept_out = read_grid(tmp_path / "nav2/keepout_mask.yaml").cells, found.keepout.cells == OCCUPIED
+    assert (mask[kept_out & (found.slice.cells != OCCUPIED)] == OCCUPIED).all()
