@@ -96,6 +96,24 @@ def test_people_leave_and_ground_walls_and_poles_stay(street):
     assert kept[owner == 0].mean() > 0.98
 
 
+def test_rings_that_lie_more_than_a_voxel_apart_are_of_one_person():
+    sparse, ways_m = rays(ring_step_rad=0.05), [-2.0, -2.0, -1.2, -0.4, 0.4, 1.2] + [None] * 16
+    scans = [
+        scan_of([POLE] if y_m is None else [POLE, person(y_m)], x_m=-0.05 * i, directions=sparse)
+        for i, y_m in enumerate(ways_m)
+    ]
+    octree, updates = fused(scans)
+
+    objects = remove_moving_objects(octree, lambda: updates)
+
+    points = np.concatenate([points for points, _, _ in scans]).astype(np.float64)
+    owner = np.concatenate([owner for _, owner, _ in scans])
+    moving = objects.contain(points)
+    assert moving[(owner == 2) & (points[:, 2] > 0.2)].mean() > 0.98
+    assert not moving[owner == 1].any()
+    assert moving[owner == 0].mean() < 0.001
+
+
 def test_space_where_a_thing_stood_is_free_and_the_floor_below_it_stays(street):
     octree, updates = fused(street)
     assert octree.log_odds_at(np.array([[4.3, -2.0, 1.1]]))[0] > 0.0
