@@ -6,11 +6,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from mapper.octree.blocks import check_memory
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_COUNT, KEY_MASK, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap
 
 Tops = NDArray[np.int32]
 
+_COLUMN_BYTES = 50
+"""Peak memory of floor and slice for each column of the map's bounding box, measured."""
 NOWHERE = -(1 << 30)
 """Height of the floor in a column without any, in voxels."""
 
@@ -104,9 +107,18 @@ def columns_of(
         extent: From ``block_extent``, of all parts.
         margin: So many columns are added around it.
         resolution_m: Edge of a voxel.
+
+    Raises:
+        MapSizeError: The floor of so many columns would not fit into memory.
     """
     first, last = np.maximum(extent[0] - margin, 0), np.minimum(extent[1] + margin, KEY_COUNT)
     width, height = (int(n) for n in last - first)
+    check_memory(
+        width * height * _COLUMN_BYTES,
+        f"a floor of {width * resolution_m:.0f} × {height * resolution_m:.0f} m in cells of "
+        f"{resolution_m:g} m",
+        remedy="raise octree.resolution_m, or map parts of the log",
+    )
     voxels.sort()  # by y, then x, then z
     columns = ((voxels >> 32) - first[1]) * width + (voxels >> 16 & KEY_MASK) - first[0]
     starts = starts_of(columns, height * width)

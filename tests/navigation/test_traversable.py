@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 
-from mapper.core.errors import DataError
+from mapper.core.errors import DataError, MapSizeError
 from mapper.navigation.config import TraversableConfig
 from mapper.navigation.floor import driven_ground, reachable_floor
 from mapper.navigation.traversable import traversable
+from mapper.octree import blocks
 from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import read_octree, write_ot
@@ -186,6 +187,18 @@ def test_the_footprint_is_free_beside_the_map_too():
     for grid in (storey.grid, level):
         assert code_at(grid, -0.2, 0.5) == FREE
         assert code_at(grid, -0.35, 0.5) == UNKNOWN
+
+
+def test_a_floor_too_wide_for_memory_is_refused_before_it_is_made(monkeypatch):
+    octree = OctreeMap(OctreeConfig(resolution_m=0.05))
+    for corner_m in (-1200.0, 1200.0):
+        octree.insert_points(np.full((1, 3), corner_m, np.float32), np.full(3, corner_m))
+    monkeypatch.setattr(blocks.os, "sysconf", lambda name: {"SC_PAGE_SIZE": 1, "SC_PHYS_PAGES": 2**35}[name])
+    wanted = (
+        r"a floor of 240\d × 240\d m in cells of 0\.05 m needs 10\d\.\d GiB and this machine has 32\.0; raise"
+    )
+    with pytest.raises(MapSizeError, match=wanted):
+        reachable_floor(octree, TraversableConfig(), positions_world=NO_PATH)
 
 
 def test_one_storey_is_left_where_all_are_small():
