@@ -51,13 +51,14 @@ def maps_of(run: Run) -> Maps:
 
 
 def storeys_of_run(run: Run) -> tuple[Storey, ...]:
-    """Return the storeys of a run's floor, found again from its octree and its path.
+    """Return the storeys of a run's floor and their links, found again from its octree and its path.
 
     Raises:
         MapFileError: The octree cannot be read.
     """
     config, path_world = run.config.traversable, load_results(run).tracked.positions_world
-    storeys = traversable(reachable_floor(run.octree, config, positions_world=path_world), config)
+    floor = reachable_floor(run.octree, config, positions_world=path_world)
+    storeys = traversable(floor, config, with_links=True)
     editor = MapEditor(edits_of(run.manifest.edits), path_world, config.head_room_m)
     return editor.edit_storeys(storeys)[0]
 

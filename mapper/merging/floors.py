@@ -42,7 +42,7 @@ def floor_over(
 
 
 def storeys_of_map(merged: MergedMap) -> tuple[Storey, ...]:
-    """Return the storeys of a merged map's floor, found again from its tiles and its runs' paths.
+    """Return the storeys of a merged map's floor and their links, found again from tiles and runs' paths.
 
     Raises:
         MapFileError: A tile cannot be read.
@@ -64,7 +64,8 @@ def storeys_of_map(merged: MergedMap) -> tuple[Storey, ...]:
         resolution_m=manifest.octree.resolution_m,
         floor_z_m=manifest.floor_z_m,
     )
-    return kept_out(traversable(floor, manifest.traversable), editors_of(manifest, paths_map))
+    storeys = traversable(floor, manifest.traversable, with_links=True)
+    return kept_out(storeys, editors_of(manifest, paths_map))
 
 
 def editors_of(manifest: MapManifest, paths_map: Sequence[Points]) -> list[MapEditor]:

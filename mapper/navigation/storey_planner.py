@@ -24,11 +24,12 @@ def plan_storeys(
 ) -> Plan:
     """Return a shortest path for a disc over the storeys of a floor; see ``plan_2d``.
 
-    The path changes storeys, the fewest that join the two, where both have the same floor. An end without a
-    height is on the storey where the log begins, or else on the lowest with floor there.
+    The path changes storeys, the fewest that join the two, over the links between them, or else where both
+    have the same floor. An end without a height is on the storey where the log begins, or else on the lowest
+    with floor there.
 
     Args:
-        storeys: From :func:`mapper.navigation.traversable.traversable`.
+        storeys: From :func:`mapper.navigation.traversable.traversable`, with links.
         start_world: (2,) or (3,) metres.
         goal_world: (2,) or (3,) metres.
         config: Radius, and whether unknown cells are blocked.
@@ -43,7 +44,9 @@ def plan_storeys(
     spaces = [space_of(layer(grid), config) for grid in joined]
     ends = [np.append(point[:2], 0.0) for point in (start_world, goal_world)]
     numbers = [_storey_at(storeys, point) for point in (start_world, goal_world)]
-    chain = _chain(spaces, heights, *numbers)
+    is_link = [storey.is_link for storey in storeys]
+    layers = [_with_room(storeys, spaces, *at) for at in zip(numbers, (start_world, goal_world), strict=True)]
+    chain = _chain(spaces, heights, is_link, *layers)
     if not chain:
         raise PlanError(
             f"no ramp or stairs lead from the storey of {point_text(start_world)} to that of "
@@ -57,7 +60,8 @@ def plan_storeys(
     found = shortest_path(np.array(planes), start, (2 * (len(chain) - 1), *goal[1:]))
     if not found.reached:
         raise PlanError(
-            f"no path from {point_text(start_world)} to {point_text(goal_world)} over {len(chain)} storeys "
+            f"no path from {point_text(start_world)} to {point_text(goal_world)} over "
+            f"{len(chain) - sum(is_link[number] for number in chain)} storeys "
             f"for a radius of {config.radius_m:g} m; plan with a smaller radius"
         )
     waypoints, clearance_m = [], np.inf
@@ -77,7 +81,8 @@ def plan_storeys(
         waypoints.append(part_world)
     waypoints_world = np.concatenate(waypoints)
     length_m = float(np.linalg.norm(np.diff(waypoints_world, axis=0), axis=1).sum())
-    return Plan(waypoints_world, length_m, clearance_m, config, storeys=tuple(chain))
+    visited = dict.fromkeys((numbers[0], *(number for number in chain if not is_link[number]), numbers[1]))
+    return Plan(waypoints_world, length_m, clearance_m, config, storeys=tuple(visited))
 
 
 def _aligned(storeys: tuple[Storey, ...]) -> tuple[list[OccupancyGrid], list[NDArray[np.int32]]]:
@@ -101,6 +106,7 @@ def _aligned(storeys: tuple[Storey, ...]) -> tuple[list[OccupancyGrid], list[NDA
 
 def _storey_at(storeys: tuple[Storey, ...], point_world: Array) -> int:
     """Return the storey of a point: that whose floor is nearest to its height, if it has one."""
+    storeys = tuple(storey for storey in storeys if not storey.is_link)  # they come first
     tops = [_top_at(storey, point_world) for storey in storeys]
     home = next(number for number, storey in enumerate(storeys) if storey.is_home)
     if len(point_world) == 2:
@@ -108,6 +114,25 @@ def _storey_at(storeys: tuple[Storey, ...], point_world: Array) -> int:
         return next((number for number in order if tops[number] is not None), home)
     away = [np.inf if top is None else abs(top - float(point_world[2])) for top in tops]
     return int(np.argmin(away)) if np.isfinite(away).any() else home
+
+
+def _with_room(storeys: tuple[Storey, ...], spaces: list[Space], number: int, point_world: Array) -> int:
+    """Return a storey, or where a robot has room on a link alone, as at the storey's end, the link."""
+    top_m = _top_at(storeys[number], point_world)
+    if top_m is None or _has_room(spaces[number], point_world):
+        return number
+    links = (
+        n for n, storey in enumerate(storeys) if storey.is_link and _top_at(storey, point_world) == top_m
+    )
+    return next((link for link in links if _has_room(spaces[link], point_world)), number)
+
+
+def _has_room(space: Space, point_world: Array) -> bool:
+    try:
+        space.cell(np.append(point_world[:2], 0.0), "start")
+    except PlanError:
+        return False
+    return True
 
 
 def _top_at(storey: Storey, point_world: Array) -> float | None:
@@ -127,15 +152,23 @@ def _shared(spaces: list[Space], heights: list[NDArray[np.int32]], one: int, oth
     return mask
 
 
-def _chain(spaces: list[Space], heights: list[NDArray[np.int32]], start: int, goal: int) -> list[int]:
-    """Return the fewest storeys that lead from one to another; none if they are not joined."""
+def _chain(
+    spaces: list[Space], heights: list[NDArray[np.int32]], is_link: list[bool], start: int, goal: int
+) -> list[int]:
+    """Return the fewest storeys, and the links between them, that lead from one to another.
+
+    Storeys that no links join may share floor themselves; an empty list if nothing joins the two.
+    """
     before, queue = {start: start}, deque([start])
-    while queue and goal not in before:
-        here = queue.popleft()
-        for other in range(len(spaces)):
-            if other not in before and _shared(spaces, heights, here, other).any():
-                before[other] = here
-                queue.append(other)
+    for needs_link in (True, False):
+        queue.extend(before if not needs_link else ())
+        while queue and goal not in before:
+            here = queue.popleft()
+            for other in range(len(spaces)):
+                can_join = other not in before and is_link[here] + is_link[other] >= needs_link
+                if can_join and _shared(spaces, heights, here, other).any():
+                    before[other] = here
+                    queue.append(other)
     if goal not in before:
         return []
     chain = [goal]

@@ -1,6 +1,7 @@
 """Storeys of a floor, each with one height a column; ramps and stairs belong to both that they join."""
 
 from heapq import heappop, heappush
+from itertools import combinations
 
 import numpy as np
 from numba import njit
@@ -17,20 +18,23 @@ _OVERLAP_M = 3.0
 _NONE = -1
 
 
-def storeys_of(floor: Floor) -> list[Heights]:
-    """Return the (H, W) heights, in voxels above z = 0, of the floor of every storey, the lowest first.
+def storeys_of(floor: Floor) -> tuple[list[Heights], list[Heights]]:
+    """Return the (H, W) heights, in voxels above z = 0, of every storey's floor, the lowest first; and links.
 
     Where floors lie over each other, each is a storey; every other surface belongs to the storey to which one
     climbs or descends least. A storey goes on for some metres over the ramps and stairs that lead from it, so
     that neighbours share these surfaces. One that is neither as large as a square metre nor under the path is
     left out, unless all are. A floor without any other above is a single storey.
+
+    A link is the floor for some metres to both sides of where two storeys meet. On spiral stairs, a turn of
+    which fills a storey, it is all that joins them.
     """
     columns, reached = floor.columns, floor.reached
     heights = np.full(columns.shape, NOWHERE, np.int32)
     column_of, tops = columns.column_of[reached], columns.tops[reached]
     if not (np.diff(column_of) == 0).any():
         heights.ravel()[column_of] = tops
-        return [heights]
+        return [heights], []
     starts = starts_of(column_of, len(columns.starts) - 1)
     limits, driven = floor.limits, floor.driven[reached]
     storey = np.full(len(tops), _NONE, np.int32)
@@ -49,14 +53,45 @@ def storeys_of(floor: Floor) -> list[Heights]:
         if sizes[number] * cell_m**2 >= _LEAST_AREA_M2 or (driven & (storey == number)).any()
     ] or [int(np.argmax(sizes))]
     kept.sort(key=lambda number: float(np.median(tops[storey == number])))
-    result = []
-    for number in kept:
-        own = storey == number
-        _extend(starts, tops, columns.shape, column_of, limits.step, round(_OVERLAP_M / cell_m), own)
+    reach = round(_OVERLAP_M / cell_m)
+
+    def extended(own: Mask) -> Heights:
+        _extend(starts, tops, columns.shape, column_of, limits.step, reach, own)
         heights = np.full(columns.shape, NOWHERE, np.int32)
         heights.ravel()[column_of[own]] = tops[own]
-        result.append(heights)
-    return result
+        return heights
+
+    around = starts, tops, columns.shape, column_of, limits.step, limits.gap
+    borders = [_border(*around, storey, *pair) for pair in combinations(kept, 2)]
+    links = [extended(border) for border in borders if border.any()]
+    return [extended(storey == number) for number in kept], links
+
+
+@njit(cache=True, nogil=True)
+def _border(
+    starts: Indices,
+    tops: Tops,
+    shape: tuple[int, int],
+    column_of: Indices,
+    step: int,
+    gap: int,
+    storey: NDArray[np.int32],
+    one: int,
+    other: int,
+) -> Mask:
+    """Return the mask of the surfaces of two storeys from which a step, or a gap, leads to the other."""
+    height, width = shape
+    border = np.zeros(len(tops), np.bool_)
+    for n in range(len(tops)):
+        if storey[n] != one:
+            continue
+        row, column = column_of[n] // width, column_of[n] % width
+        for y in range(max(row - gap - 1, 0), min(row + gap + 2, height)):
+            for x in range(max(column - gap - 1, 0), min(column + gap + 2, width)):
+                for m in range(starts[y * width + x], starts[y * width + x + 1]):
+                    if storey[m] == other and abs(tops[m] - tops[n]) <= step:
+                        border[n] = border[m] = True
+    return border
 
 
 @njit(cache=True, nogil=True)

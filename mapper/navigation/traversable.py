@@ -1,6 +1,6 @@
 """Traversable floor of a robot as grids, one a storey: floor, obstacles, drops and steep parts."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -32,14 +32,16 @@ class Storey:
         heights: (H, W) int32 heights of the floor in voxels above z = 0, in the grid's cells; NOWHERE
             where it was not seen.
         is_home: Whether the path begins here.
+        is_link: Whether it is no storey, but where two of them meet.
     """
 
     grid: OccupancyGrid
     heights: Heights
     is_home: bool = True
+    is_link: bool = False
 
 
-def traversable(floor: Floor, config: TraversableConfig) -> tuple[Storey, ...]:
+def traversable(floor: Floor, config: TraversableConfig, *, with_links: bool = False) -> tuple[Storey, ...]:
     """Return every storey of a floor that a robot can reach, the lowest first.
 
     Floor is free, small gaps in it included. A cell is occupied where an obstacle lies between step and head
@@ -49,10 +51,14 @@ def traversable(floor: Floor, config: TraversableConfig) -> tuple[Storey, ...]:
     Args:
         floor: The floor.
         config: The limits by which it was found, and the robot's radius.
+        with_links: Whether the links between storeys follow, by which paths lead from one to another.
     """
-    storeys = storeys_of(floor)
+    storeys, links = storeys_of(floor)
     home = _home(floor, storeys)
-    return tuple(_storey(floor, heights, config, number == home) for number, heights in enumerate(storeys))
+    found = [_storey(floor, heights, config, number == home) for number, heights in enumerate(storeys)]
+    if with_links:
+        found += [replace(_storey(floor, heights, config, False), is_link=True) for heights in links]
+    return tuple(found)
 
 
 def _home(floor: Floor, storeys: list[Heights]) -> int:
@@ -96,7 +102,7 @@ def trimmed(storey: Storey) -> Storey:
     rows, across = (_known(cells, axis) for axis in (1, 0))
     first = np.rint(storey.grid.origin_world_m / resolution_m) + np.array([across.start, rows.start])
     grid = OccupancyGrid(cells[rows, across].copy(), first * resolution_m, resolution_m)
-    return Storey(grid, storey.heights[rows, across].copy(), storey.is_home)
+    return replace(storey, grid=grid, heights=storey.heights[rows, across].copy())
 
 
 def _known(cells: NDArray[np.int8], axis: int) -> slice:
