@@ -81,7 +81,7 @@ class _SharedDetector:
         self._detector = build_detector(config)
         self._gray: Image | None = None
         self._pairs: dict[tuple[int, MatchConfig], Pairs] = {}
-        self._compared: dict[tuple[int, MatchConfig, Hashable], tuple[Alignment, float, int]] = {}
+        self._compared: dict[tuple[int, MatchConfig, Hashable], tuple[Alignment, float, Pairs]] = {}
 
     @property
     def scale_factor(self) -> float:
@@ -111,11 +111,11 @@ class _SharedDetector:
 
         def compare(
             target: IsvdObservation, source: IsvdObservation, match: MatchConfig
-        ) -> tuple[Alignment, float, int]:
+        ) -> tuple[Alignment, float, Pairs]:
             key = (target.stamp_ns, match, how)
             if key not in self._compared:
                 pairs = self._match(target, source, match)
-                self._compared[key] = (*register.fit(target, source, pairs), len(pairs))
+                self._compared[key] = (*register.fit(target, source, pairs), pairs)
             return self._compared[key]
 
         return compare

@@ -73,6 +73,9 @@ class IsvdOdometryConfig(Config):
     thesis, §4.1.1); false puts the depth of that pixel on the feature's own ray."""
     max_depth_m: PositiveFloat = 5.0
     """Depth beyond it is not used: a Kinect's error grows with the square of the depth."""
+    readout_s: float | None = None
+    """Rolling shutter: time from the first row's exposure to the last row's; 0 is a global shutter. None
+    estimates it from the log."""
     keyframe_interval: PositiveInt = 20
     """With ``earlier = "frames"``: one keyframe, the sharpest, in this many frames (Somlyai, PhD thesis,
     §4.1.2), for frames that were lost."""

@@ -12,9 +12,11 @@ from mapper.core.deskew import Twist
 from mapper.core.errors import FrameError
 from mapper.core.frames import Frame, PinholeCamera, RgbdFrame
 from mapper.core.geometry import Array, Transform, apply, exp, inverse, log, mean_rotation, transform
+from mapper.core.timebase import NS_PER_S
 from mapper.features.base import Detector
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
+from mapper.features.matching import Pairs
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
 from mapper.odometry.base import (
@@ -27,7 +29,10 @@ from mapper.odometry.base import (
     lost_frame,
 )
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
-from mapper.odometry.isvd_registration import IsvdObservation, PairRegistration, RegisterPair, matched_pairs
+from mapper.odometry.isvd_readout import readout_in_pair
+from mapper.odometry.isvd_registration import IsvdObservation, PairRegistration, RegisterPair
+from mapper.odometry.local_map.readout_time import ReadoutTime
+from mapper.odometry.local_map.rolling_shutter import RollingShutter
 from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 from mapper.registration.base import Alignment
 from mapper.runtime.archived import Archived, archived
@@ -42,15 +47,26 @@ _DEPTH_SHARE = 0.01
 _NEW_VIEW, _NEAR_VIEW = 0.15, 0.6
 """Differences of views: from this on a frame is a keyframe, up to this it is registered against one."""
 _HALF_VIEW_RAD = 0.5
+_PAIRS_SHARING, _PAIRS_COUNTED = 4, 200
+"""Pairs of images that tell the readout time: a new image is in one, a keyframe in some 20, their geometric
+mean; and how many of them the estimate is from."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedFrame:
-    """A tracked frame: its node, its observation, and T_world_body as estimated when it was tracked."""
+    """A tracked frame.
+
+    Attributes:
+        node: Its node.
+        observation: As its rows were read.
+        T_world_body: (4, 4) as estimated when it was tracked.
+        twist: Velocity of the body in the image.
+    """
 
     node: int
     observation: IsvdObservation
     T_world_body: Transform
+    twist: Twist
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,14 +76,15 @@ class _Keyframe:
     node: int
     observation: Archived[IsvdObservation]
     T_world_body: Transform
+    twist: Twist
 
     def loaded(self) -> TrackedFrame:
         """Return the frame."""
-        return TrackedFrame(self.node, self.observation.data, self.T_world_body)
+        return TrackedFrame(self.node, self.observation.data, self.T_world_body, self.twist)
 
 
 def _kept(frame: TrackedFrame) -> _Keyframe:
-    return _Keyframe(frame.node, archived(frame.observation), frame.T_world_body)
+    return _Keyframe(frame.node, archived(frame.observation), frame.T_world_body, frame.twist)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +96,7 @@ class PoseCandidate:
         alignment: The motion, earlier ← new.
         information: (6, 6) of the motion, with the error that its features share.
         weight: Its quality W, 1/m (eq. 4.1).
-        matches: Number of matched features, with or without depth.
+        pairs: (M, 2) matched features, with or without depth.
         T_world_body: (4, 4) pose of the new frame by this registration.
     """
 
@@ -87,7 +104,7 @@ class PoseCandidate:
     alignment: Alignment
     information: Array
     weight: float
-    matches: int
+    pairs: Pairs
     T_world_body: Transform
 
 
@@ -128,7 +145,11 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         self._sharpest = SharpestKeyframes(config.keyframe_interval)
         self._next_node = 0
         self._turn = 0
-        self._nearest_match: tuple[IsvdObservation, PoseCandidate, MatchConfig] | None = None
+        self._nearest_match: tuple[IsvdObservation, PoseCandidate] | None = None
+        self._readout = ReadoutTime(
+            config.readout_s, windows_sharing=_PAIRS_SHARING, windows_counted=_PAIRS_COUNTED
+        )
+        self._shutter = RollingShutter(self._readout)
 
     def observe(self, frame: Frame) -> IsvdObservation:
         """Return a frame's features with their 3D points. Pure.
@@ -168,21 +189,23 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         self._nearest_match = None
         if not self._recent:
             return self._add_node(observation, np.eye(4), [], method="start")
-        earlier = self._earlier()
+        if not self._follows(observation):
+            self._shutter.restart()  # the motion before a gap is not that in this image
+        corrected, earlier = self._shutter.predicted(observation), self._earlier()
         for match, method in ((self._config.match, "isvd"), (self._config.fallback, "fallback")):
-            candidates = self._register(observation, earlier, match)
+            candidates = self._register(corrected, earlier, match)
             if candidates:
-                self._nearest_match = observation, candidates[0], match
                 return self._add_node(observation, self._combine(candidates), candidates, method=method)
-        candidates = self._relocalise(observation)
+        candidates = self._relocalise(corrected)
         if candidates:
-            self._nearest_match = observation, candidates[0], self._config.match
             return self._add_node(observation, self._combine(candidates), candidates, method="relocalised")
-        last_world = self._recent[-1].T_world_body
-        return lost_frame(observation.stamp_ns, last_world, features=len(observation.features))
+        last = self._recent[-1]
+        return lost_frame(observation.stamp_ns, last.T_world_body, features=len(observation.features))
 
-    def view(self, observation: IsvdObservation, _twist: Twist | None = None, /) -> ImageView:
-        """Return the view for place recognition. Pure."""
+    def view(self, observation: IsvdObservation, twist: Twist | None = None, /) -> ImageView:
+        """Return the view for place recognition, by the readout time as it is known now."""
+        if twist is not None:
+            observation = self._shutter.corrected(observation, twist)
         features, camera = observation.features, observation.camera
         return ImageView(
             stamp_ns=observation.stamp_ns,
@@ -195,17 +218,32 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         )
 
     def matches(self) -> FeatureMatches | None:
-        """Return the matches of the last frame with the nearest earlier one, matched again."""
+        """Return the matches of the last frame with the nearest earlier one."""
         if self._nearest_match is None:
             return None
-        observation, candidate, match = self._nearest_match
-        earlier = candidate.earlier.observation
-        pairs = matched_pairs(earlier, observation, match)
+        observation, candidate = self._nearest_match
+        earlier, pairs = self._corrected(candidate.earlier), candidate.pairs
         motion = candidate.alignment.T_target_source
         then, now = pairs[self._registration.agreeing(earlier, observation, pairs, motion)].T
         before_px = np.full((len(observation.features), 2), np.nan)
         before_px[now] = earlier.measured[:, :2][then]
         return FeatureMatches(np.isfinite(before_px[:, 0]), before_px)
+
+    def sensor_notes(self) -> Sequence[str]:
+        """Return the estimated readout time of the camera's shutter, if it has any."""
+        return [self._readout.sentence] if self._readout.sentence else []
+
+    def calibration_doubts(self) -> Sequence[str]:
+        """Return nothing: pairs of images show no focal length."""
+        return ()
+
+    def _follows(self, observation: IsvdObservation) -> bool:
+        """Return whether a frame is soon after the last tracked one."""
+        return observation.stamp_ns - self._recent[-1].observation.stamp_ns <= STEADY_NS
+
+    def _corrected(self, frame: TrackedFrame) -> IsvdObservation:
+        """Return what a frame observed, by the readout time as it is known now."""
+        return self._shutter.corrected(frame.observation, frame.twist)
 
     def _undistorted(self, pixels: NDArray[np.float32], camera: PinholeCamera) -> Array:
         exact: Array = pixels.astype(np.float64)
@@ -240,13 +278,13 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         """Return the registrations that succeeded, in the order of the earlier frames."""
         candidates = []
         for frame in earlier:
-            alignment, weight, matches = self._register_pair(frame.observation, observation, match)
+            alignment, weight, pairs = self._register_pair(self._corrected(frame), observation, match)
             if alignment.converged and self._is_possible(alignment, frame.observation, observation):
                 T = alignment.T_target_source
                 assert alignment.information is not None  # it converged
                 information = with_model_error(alignment.information, T)
                 candidates.append(
-                    PoseCandidate(frame, alignment, information, weight, matches, frame.T_world_body @ T)
+                    PoseCandidate(frame, alignment, information, weight, pairs, frame.T_world_body @ T)
                 )
         return candidates
 
@@ -304,10 +342,21 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         *,
         method: str,
     ) -> FrameResult:
-        """Make the frame a node, with a factor from each candidate."""
+        """Make the frame a node, with a factor from each candidate.
+
+        Args:
+            observation: As its rows were read.
+            T_world_body: (4, 4) its pose.
+            candidates: Its registrations, the nearest earlier frame's first.
+            method: What found them.
+        """
         node = self._next_node
         self._next_node += 1
-        tracked = TrackedFrame(node, observation, T_world_body)
+        twist = self._follow(observation, T_world_body)
+        tracked = TrackedFrame(node, observation, T_world_body, twist)
+        self._learn(tracked, candidates)
+        if candidates:
+            self._nearest_match = self._corrected(tracked), candidates[0]
         self._recent.append(tracked)
         if self._config.earlier == "frames":
             keyframe = self._sharpest.add(node, len(observation.features))
@@ -335,7 +384,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
             is_keyframe=True,
             diagnostics=Diagnostics(
                 features=len(observation.features),
-                matches=candidates[0].matches if candidates else 0,
+                matches=len(candidates[0].pairs) if candidates else 0,
                 inliers=nearest.pairs if nearest else 0,
                 residual=nearest.inlier_rmse_m if nearest else 0.0,
                 residual_unit="m",
@@ -343,4 +392,29 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
             ),
             factors=factors,
             links=factors,
+            twist=twist,
+        )
+
+    def _follow(self, observation: IsvdObservation, T_world_body: Transform) -> Twist:
+        """Return the velocity of the body in a frame's image, by its pose and that of the frame before."""
+        if self._recent and self._follows(observation):
+            before, T_body_camera = self._recent[-1], observation.T_body_camera
+            T_before_camera = inverse(before.T_world_body @ T_body_camera) @ T_world_body @ T_body_camera
+            elapsed_ns = observation.stamp_ns - before.observation.stamp_ns
+            self._shutter.follow(T_before_camera, elapsed_ns / NS_PER_S)
+        return self._shutter.twist_body(observation)
+
+    def _learn(self, tracked: TrackedFrame, candidates: Sequence[PoseCandidate]) -> None:
+        """Take the readout time from the frame and the nearest keyframe, where the motion was another."""
+        if not self._readout.is_estimated or len(candidates) < 2:
+            return
+        candidate = candidates[1]
+        self._readout.learn(
+            *readout_in_pair(
+                self._corrected(candidate.earlier),
+                self._corrected(tracked),
+                candidate.pairs,
+                candidate.alignment.T_target_source,
+                twists_body=(candidate.earlier.twist, tracked.twist),
+            )
         )

@@ -11,6 +11,7 @@ from mapper.core.geometry import Array, Points, Transform, adjoint, apply, inver
 from mapper.features.base import Features
 from mapper.features.matching import Pairs, homography_inliers, match_mutual
 from mapper.odometry.config import MatchConfig
+from mapper.odometry.local_map.pixel_motion import of_middle_row
 from mapper.registration.base import Alignment, failed
 from mapper.registration.config import IsvdConfig
 from mapper.registration.isvd import Isvd
@@ -47,8 +48,34 @@ class IsvdObservation(Archivable):
     camera: PinholeCamera
     T_body_camera: Transform
 
+    def swept(self, sweep_camera: Array, /) -> "IsvdObservation":
+        """Return the observation as a global shutter would have read it, when the middle row was read.
 
-RegisterPair = Callable[[IsvdObservation, IsvdObservation, MatchConfig], tuple[Alignment, float, int]]
+        Args:
+            sweep_camera: (6,) motion of the camera while the rows were read, in its own axes (rotation,
+                translation); for features as they were read.
+        """
+        if not sweep_camera.any():
+            return self
+        pixels, depth_m = of_middle_row(
+            self.measured[:, :2],
+            self.intrinsics[4] / self.measured[:, 2],
+            self.intrinsics,
+            self.camera.height_px,
+            sweep_camera,
+        )
+        points_camera = apply(inverse(self.T_body_camera), self.points_body)
+        rays = points_camera[:, :2] / points_camera[:, 2:]  # through whole pixels, if it is so set
+        rays += (pixels - self.measured[:, :2]) / self.intrinsics[:2]
+        points_camera = np.column_stack([rays * depth_m[:, np.newaxis], depth_m])
+        return replace(
+            self,
+            measured=np.column_stack([pixels, self.intrinsics[4] / depth_m]),
+            points_body=apply(self.T_body_camera, points_camera),
+        )
+
+
+RegisterPair = Callable[[IsvdObservation, IsvdObservation, MatchConfig], tuple[Alignment, float, Pairs]]
 """Registration of two observations (target, source), as ``PairRegistration``."""
 
 
@@ -68,10 +95,10 @@ class PairRegistration:
 
     def __call__(
         self, target: IsvdObservation, source: IsvdObservation, match: MatchConfig
-    ) -> tuple[Alignment, float, int]:
-        """Return the source's alignment to the target, its quality W (eq. 4.1), and the number of matches."""
+    ) -> tuple[Alignment, float, Pairs]:
+        """Return the source's alignment to the target, its quality W (eq. 4.1), and the matches."""
         pairs = matched_pairs(target, source, match)
-        return *self.fit(target, source, pairs), len(pairs)
+        return *self.fit(target, source, pairs), pairs
 
     def fit(self, target: IsvdObservation, source: IsvdObservation, pairs: Pairs) -> tuple[Alignment, float]:
         """Return the alignment by matched features, and its quality W."""

@@ -84,8 +84,8 @@ def test_a_motion_that_only_the_points_agree_with_is_refused(by_pixels, accepted
     rng = np.random.default_rng(1)
     source.measured[:, :2] += rng.normal(0.0, 40.0, (400, 2))
 
-    alignment, _, matches = PairRegistration(IsvdConfig(), by_pixels=by_pixels)(target, source, NO_FILTER)
+    alignment, _, pairs = PairRegistration(IsvdConfig(), by_pixels=by_pixels)(target, source, NO_FILTER)
 
-    assert matches == 400
+    assert len(pairs) == 400
     assert alignment.converged == accepted
     assert ("agree in the image" in alignment.reason) != accepted

@@ -16,13 +16,12 @@ from mapper.features.hamming import Bits, pack
 from mapper.features.window_matching import FeatureGrid, sort_into_grid
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.depth_surfaces import DepthCells, depth_cells
-from mapper.odometry.local_map.pixel_motion import depth_velocity, pixel_velocity, row_phase
+from mapper.odometry.local_map.pixel_motion import of_middle_row, row_shift
 from mapper.places.vocabulary import Vocabulary
 from mapper.runtime.archived import Archivable
 from mapper.sensing.config import KINECT_NOISE
 from mapper.sensing.depth_noise import depth_sigma_m, feature_depth_m, feature_depth_sigma_m
 
-_MIN_DEPTH_M = 0.05
 FEW_MOVING = 0.05
 """Share of the features below which nothing moves by itself: depths at edges look like it."""
 _SCALE_ERROR = 0.02
@@ -105,11 +104,7 @@ class ImageObservation(Archivable):
         """Return the observation with the shift of each row by another motion of the camera taken out."""
         if not (sweep_camera.any() or self.sweep_camera.any()):
             return self
-        depth_m = np.where(self.has_depth, self.depth_m, _usual(self.depth_m))
-        pixels = self.pixels - self.row_shift(self.pixels, depth_m, sweep_camera)
-        phase = row_phase(self.pixels, self.size_px[1])
-        z = self.depth_m - phase * depth_velocity(self.pixels, depth_m, self.intrinsics, sweep_camera)
-        z = np.maximum(z, 0.5 * self.depth_m)
+        pixels, z = of_middle_row(self.pixels, self.depth_m, self.intrinsics, self.size_px[1], sweep_camera)
         disparity_px = np.where(np.isnan(self.measured[:, 2]), np.nan, self.intrinsics[4] / z)
         return replace(
             self,
@@ -121,11 +116,8 @@ class ImageObservation(Archivable):
 
     def row_shift(self, pixels: Array, depth_m: Array, sweep_camera: Array | None = None) -> Array:
         """Return by how much (N, 2) pixels shift until their row is read, from the middle row on."""
-        depth_m = np.maximum(depth_m, _MIN_DEPTH_M)
         sweep_camera = self.sweep_camera if sweep_camera is None else sweep_camera
-        phase = row_phase(pixels, self.size_px[1])
-        shift: Array = phase[:, np.newaxis] * pixel_velocity(pixels, depth_m, self.intrinsics, sweep_camera)
-        return shift
+        return row_shift(pixels, depth_m, self.intrinsics, self.size_px[1], sweep_camera)
 
     def view(self) -> ImageView:
         """Return the view for place recognition."""
@@ -243,9 +235,3 @@ def back_projected(pixels: Array, depth_m: Array, intrinsics: Array) -> Points:
     """Return the (N, 3) points, camera frame, of undistorted (N, 2) pixels and their depths."""
     rays = (pixels - intrinsics[2:4]) / intrinsics[:2]
     return np.column_stack([rays * depth_m[:, np.newaxis], depth_m])
-
-
-def _usual(depth_m: Array) -> float:
-    """Return the median depth, for features without; 1 m if none has any."""
-    known = depth_m[~np.isnan(depth_m)]
-    return float(np.median(known)) if known.size else 1.0

@@ -3,6 +3,46 @@
 import numpy as np
 from numba import njit
 
+from mapper.core.geometry import Array
+
+_MIN_DEPTH_M = 0.05
+
+
+def row_shift(pixels: Array, depth_m: Array, intrinsics: Array, height_px: int, sweep_camera: Array) -> Array:
+    """Return by how much (N, 2) pixels shift until their row is read, from the middle row on.
+
+    Args:
+        pixels: (N, 2) undistorted.
+        depth_m: (N,) finite.
+        intrinsics: fx, fy, cx, cy in pixels, and more.
+        height_px: Of the image.
+        sweep_camera: (6,) motion of the camera while the rows are read, in its own axes (rotation,
+            translation).
+    """
+    velocity = pixel_velocity(pixels, np.maximum(depth_m, _MIN_DEPTH_M), intrinsics, sweep_camera)
+    shift: Array = row_phase(pixels, height_px)[:, np.newaxis] * velocity
+    return shift
+
+
+def of_middle_row(
+    pixels: Array, depth_m: Array, intrinsics: Array, height_px: int, sweep_camera: Array
+) -> tuple[Array, Array]:
+    """Return (N, 2) pixels and (N,) depths as if all rows had been read when the middle row was.
+
+    Arguments as for ``row_shift``, as they were read; depths may be NaN.
+    """
+    known = _with_usual(depth_m)
+    at_px = pixels - row_shift(pixels, known, intrinsics, height_px, sweep_camera)
+    change_m = row_phase(pixels, height_px) * depth_velocity(pixels, known, intrinsics, sweep_camera)
+    return at_px, np.maximum(depth_m - change_m, 0.5 * depth_m)
+
+
+def _with_usual(depth_m: Array) -> Array:
+    """Return the depths with their median where there is none; 1 m if none has any."""
+    known = depth_m[~np.isnan(depth_m)]
+    usual = float(np.median(known)) if known.size else 1.0
+    return np.where(np.isnan(depth_m), usual, depth_m)
+
 
 @njit(cache=True, nogil=True)
 def pixel_velocity(pixels, depth_m, intrinsics, twist_camera):  # type: ignore[no-untyped-def]

@@ -9,8 +9,6 @@ _MIN_SIGMAS = 5.0
 _STEP_S = 0.0005
 """Smaller changes of the estimate are not applied."""
 _MAX_READOUT_S = 0.04
-_KEPT = 0.95
-"""Share of the information that is kept at each window: later ones have better poses and fewer outliers."""
 
 
 class ReadoutTime:
@@ -21,16 +19,19 @@ class ReadoutTime:
     time is what is sought). The windows overlap, which ``windows_sharing`` allows for.
     """
 
-    def __init__(self, given_s: float | None, *, windows_sharing: int) -> None:
+    def __init__(self, given_s: float | None, *, windows_sharing: int, windows_counted: int = 20) -> None:
         """Start at a given readout time, or at 0 if it is to be estimated.
 
         Args:
             given_s: Seconds; negative if rows are read from the bottom. None estimates it.
             windows_sharing: Number of windows that an observation takes part in.
+            windows_counted: Number of windows that the estimate is from: later ones have better poses and
+                fewer outliers.
         """
         self.seconds = given_s or 0.0
         self.is_estimated = given_s is None
         self._windows_sharing = windows_sharing
+        self._kept = 1.0 - 1.0 / windows_counted
         self._information = _PRIOR_S**-2
         self._weighted_s = 0.0
 
@@ -55,8 +56,9 @@ class ReadoutTime:
         if not self.is_estimated or information <= 0.0:
             return
         share = 1.0 / self._windows_sharing
-        self._information = _KEPT * self._information + (1.0 - _KEPT) * _PRIOR_S**-2 + share * information
-        self._weighted_s = _KEPT * self._weighted_s + share * (information * self.seconds - gradient)
+        kept = self._kept
+        self._information = kept * self._information + (1.0 - kept) * _PRIOR_S**-2 + share * information
+        self._weighted_s = kept * self._weighted_s + share * (information * self.seconds - gradient)
         estimate_s = self._weighted_s / self._information
         if abs(estimate_s) * np.sqrt(self._information) < _MIN_SIGMAS:
             estimate_s = 0.0

@@ -1,15 +1,15 @@
 """Rolling shutter: the rows of an image are exposed in turn, so a moving camera shifts their pixels."""
 
 from dataclasses import replace
+from typing import Protocol, Self, TypeVar
 
 import numpy as np
 from numba import njit
 
 from mapper.core.deskew import Twist
-from mapper.core.geometry import Array, Points, adjoint, inverse, log
+from mapper.core.geometry import Array, Points, Transform, adjoint, inverse, log
 from mapper.core.linear import solve_positive, twist_exp
 from mapper.core.timebase import NS_PER_S
-from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.pose_tracker import TrackedPose
 from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.registration.reprojection import pose_jacobian, projection_jacobian, residual
@@ -21,6 +21,22 @@ _FIRST_SPREAD = np.repeat([0.1, 0.05], 3)
 """Change of velocity (rad/s, m/s) from frame to frame before any is known."""
 _LEAST_SPREAD = np.full(6, 0.01)
 _SPREAD_KEPT = 0.95
+
+
+class ReadByRows(Protocol):
+    """Observation of an image whose rows were read one after the other."""
+
+    @property
+    def T_body_camera(self) -> Transform:  # noqa: N802
+        """(4, 4) pose of the camera in the body frame."""
+        ...
+
+    def swept(self, sweep_camera: Array, /) -> Self:
+        """Return it corrected by the (6,) motion of the camera, in its own axes, while its rows were read."""
+        ...
+
+
+Observed = TypeVar("Observed", bound=ReadByRows)
 
 
 class RollingShutter:
@@ -43,9 +59,20 @@ class RollingShutter:
         self._velocity = None
         self.twist_camera = np.zeros(6)
 
-    def predicted(self, observation: ImageObservation) -> ImageObservation:
+    def predicted(self, observation: Observed) -> Observed:
         """Return an observation corrected by the velocity in the image before."""
         return observation.swept(self._readout.seconds * self.twist_camera)
+
+    def follow(self, T_before_camera: Transform, elapsed_s: float) -> None:
+        """Set the velocity in the last image by the camera's motion (4, 4) since the image before it."""
+        velocity = np.concatenate(log(T_before_camera)) / elapsed_s
+        change = np.zeros(6) if self._velocity is None else velocity - self._velocity
+        self._velocity = velocity
+        squares = np.repeat((change**2).reshape(2, 3).mean(axis=1), 3)
+        self._variance = _SPREAD_KEPT * self._variance + (1.0 - _SPREAD_KEPT) * squares
+        # The velocity is that of half an interval ago: half the last change is expected since, and about as
+        # much is uncertain.
+        self.twist_camera = velocity + 0.5 * change
 
     def refined(self, tracked_pose: TrackedPose, before: TrackedPose, points_world: Points) -> TrackedPose:
         """Return a pose and its observation, corrected by the motion that both the poses and the image show.
@@ -56,16 +83,10 @@ class RollingShutter:
             points_world: (M, 3) landmarks of its inliers, in the order of their features.
         """
         observation = tracked_pose.observation
-        elapsed_s = (observation.stamp_ns - before.observation.stamp_ns) / NS_PER_S
-        moved = log(before.T_camera_world @ inverse(tracked_pose.T_camera_world))
-        velocity = np.concatenate(moved) / elapsed_s
-        change = np.zeros(6) if self._velocity is None else velocity - self._velocity
-        self._velocity = velocity
-        squares = np.repeat((change**2).reshape(2, 3).mean(axis=1), 3)
-        self._variance = _SPREAD_KEPT * self._variance + (1.0 - _SPREAD_KEPT) * squares
-        # The velocity is that of half an interval ago: half the last change is expected since, and about as
-        # much is uncertain.
-        self.twist_camera = velocity + 0.5 * change
+        self.follow(
+            before.T_camera_world @ inverse(tracked_pose.T_camera_world),
+            (observation.stamp_ns - before.observation.stamp_ns) / NS_PER_S,
+        )
         readout_s = self._readout.seconds
         if readout_s == 0.0 or len(points_world) < _MIN_LANDMARKS:
             return tracked_pose
@@ -86,15 +107,22 @@ class RollingShutter:
             tracked_pose, observation=observation.swept(sweep_camera), T_camera_world=T_camera_world
         )
 
-    def twist_body(self, observation: ImageObservation) -> Twist:
+    def twist_body(self, observation: ReadByRows) -> Twist:
         """Return the velocity in the last image, in the body's axes."""
         twist = adjoint(observation.T_body_camera) @ self.twist_camera
         return Twist(twist[:3], twist[3:])
 
-    def corrected(self, observation: ImageObservation, twist_body: Twist) -> ImageObservation:
+    def corrected(self, observation: Observed, twist_body: Twist) -> Observed:
         """Return an observation corrected by a velocity of the body."""
-        twist = np.concatenate([twist_body.rotation_radps, twist_body.translation_mps])
-        return observation.swept(self._readout.seconds * adjoint(inverse(observation.T_body_camera)) @ twist)
+        return observation.swept(self._readout.seconds * camera_twist(twist_body, observation.T_body_camera))
+
+
+def camera_twist(twist_body: Twist, T_body_camera: Transform) -> Array:
+    """Return (6,) a body's velocity as its camera's, in the camera's axes: rotation, translation."""
+    twist: Array = adjoint(inverse(T_body_camera)) @ np.concatenate(
+        [twist_body.rotation_radps, twist_body.translation_mps]
+    )
+    return twist
 
 
 @njit(cache=True, nogil=True)
