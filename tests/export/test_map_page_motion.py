@@ -62,6 +62,20 @@ def test_a_map_is_orbited_cut_and_coloured(page):
 
 
 @needs_browser
+def test_one_frame_shows_the_points_where_the_path_is(page):
+    with MapPage(page, height_px=800) as browser:
+        browser.awaited(
+            'import("mapper/budget").then(({ Budget }) => {'
+            " Budget.prototype.learn = function () { this.share = 1; }; })"
+        )
+        first = browser.picture()
+        for other in ("above", "home") * 2:  # drawn once each, from the second on: all points are drawn at once
+            browser.click(f"[data-map={other}]")
+            seen = browser.picture()
+            assert change(first, seen) > 0.05 if other == "above" else change(first, seen) < 0.01
+
+
+@needs_browser
 def test_keys_move_the_eye(page):
     with MapPage(page, height_px=800) as browser:
         pictures = [browser.picture()]

@@ -117,6 +117,7 @@ export class MapView {
   }
 
   #moved() {
+    this.camera.updateMatrixWorld(); // the points are placed by its inverse before three.js renders
     this.movedAt = performance.now();
     this.hasMoved = true;
     this.invalidate();
