@@ -29,7 +29,9 @@ _OF_COVERAGE = ("path length", "longest gap", "true revisits")
 
 def report(
     runs: RunFolders,
-    out: Annotated[Path, typer.Option(help="HTML file to write.")] = Path("report.html"),
+    out: Annotated[
+        Path | None, typer.Option(help="HTML file to write.  [default: report.html, or with a number]")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
     *,
     output: Output,
@@ -42,7 +44,9 @@ def report(
     from mapper.export.report.page import write_report
     from mapper.run.folder import open_run
     from mapper.runtime.atomic import refuse_existing
+    from mapper.runtime.result_paths import place_of
 
+    out = place_of(out, Path("report.html"), overwrite=overwrite)
     refuse_existing(out, overwrite=overwrite)
     loaded = [open_run(run) for run in runs]
     names = distinct_names(runs)

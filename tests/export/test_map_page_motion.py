@@ -69,7 +69,7 @@ def test_one_frame_shows_the_points_where_the_path_is(page):
             " Budget.prototype.learn = function () { this.share = 1; }; })"
         )
         first = browser.picture()
-        for other in ("above", "home") * 2:  # drawn once each, from the second on: all points are drawn at once
+        for other in ("above", "home") * 2:  # from the second on each is drawn once, with all points
             browser.click(f"[data-map={other}]")
             seen = browser.picture()
             assert change(first, seen) > 0.05 if other == "above" else change(first, seen) < 0.01

@@ -168,6 +168,14 @@ def test_runs_of_one_name_are_told_apart(runs, tmp_path):
     assert names == [str(runs[0].path), str(twin)]
 
 
+def test_pages_without_a_name_are_numbered(runs, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert [invoke("report", run.path).stdout for run in runs] == ["report.html\n", "report-2.html\n"]
+    assert "desk" in (tmp_path / "report.html").read_text()
+    invoke("report", runs[1].path, "--overwrite")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report-2.html", "report.html"]
+
+
 def test_a_page_that_is_there_is_not_replaced_unasked(page, runs):
     again = invoke("report", runs[0].path, "--out", page)
     assert (again.exit_code, "pass --overwrite to replace it" in again.stderr) == (1, True)
@@ -183,6 +191,34 @@ def test_it_renders_without_a_complaint_and_within_the_window(page, width_px, tm
         browser.screenshot(tmp_path / "page.png")
         assert browser.complaints == []
         assert [url for url in browser.asked_for if not url.startswith(("data:", "file://"))] == []
+
+
+@needs_browser
+def test_a_phone_shows_all_of_a_run_s_tables(runs, tmp_path):
+    voxels = Figure("octree", "113024 occupied and 1437075 free voxels of 0.2 m")
+    chapter = chapter_of(runs[0], "desk", [voxels])
+    loops = [
+        replace(loop, verdict="rejected", reason="reprojection: 27 of 68 pairs agree, want 31")
+        for loop in _some_loops(chapter)
+    ]
+    path = tmp_path / "report.html"
+    write_report(path, [replace(chapter, results=replace(chapter.results, loops=loops))])
+    cut = "[...document.querySelectorAll('.scroll')].filter(e => e.scrollWidth > e.clientWidth).length"
+    with Page(path, width_px=420) as browser:
+        browser.run("document.querySelector('details').open = true")
+        assert browser.run("document.querySelectorAll('.scroll').length") >= 4
+        assert browser.run(cut) == 0
+
+
+@needs_browser
+def test_the_map_is_first_and_no_curve_begins_with_what_the_first_frame_lacks(page):
+    with Page(page) as browser:
+        titles = browser.run("[...document.querySelectorAll('h2')].map(e => e.textContent)")
+        assert titles[:4] == ["Map", "Verdict", "Plans and views", "Numbers"]
+        d = "document.querySelector('[data-curve={}] path.line').getAttribute('d')"
+        begins = [browser.run(d.format(key)).split("L")[0] for key in ("features", "matches", "inliers")]
+        left_px = [float(begin[1:].split()[0]) for begin in begins]
+        assert left_px[0] < left_px[1] == left_px[2]  # the first frame has nothing to be matched with
 
 
 @needs_browser

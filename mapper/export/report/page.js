@@ -1,7 +1,7 @@
 "use strict";
 (() => {
   const SVG = "http://www.w3.org/2000/svg";
-  const MARGIN = { left: 52, right: 12, top: 8, bottom: 22 };
+  const MARGIN = { left: 52, right: 18, top: 8, bottom: 22 };
   const CURVE_HEIGHT = 150;
   const ARROW_EVERY_PX = 70; // along a path
   const runs = JSON.parse(document.getElementById("data").textContent);
@@ -111,7 +111,9 @@
       const { t, band_3d_m: band } = runs[run].path;
       return error && { xs: error.t, ys: error.m, band: band && { xs: t, ys: band } };
     }
-    const placed = frames[key].map((value, i) => frames.outcome[i] === "tracked" || frames.outcome[i] === "doubtful" || key === "ms" || key === "features" ? value : null);
+    const isKnown = { ms: () => true, features: () => true }[key]
+      ?? ((i) => ["tracked", "doubtful"].includes(frames.outcome[i]) && frames.matches[i] > 0); // the first has nothing to be matched with
+    const placed = frames[key].map((value, i) => isKnown(i) ? value : null);
     return placed.some((value) => value !== null) ? { xs: frames.t, ys: placed } : null;
   }
 
@@ -224,7 +226,7 @@
     const { doubtful, band_m: band } = run.path, doubted = doubtful.filter(Boolean).length;
     const widest = band ? Math.max(0, ...band.filter((width) => width !== null)) : 0;
     const layers = [
-      { id: "band", label: `2 σ, at most ${short(widest)} m`, color: colorOf(index), on: true, there: widest > 0 },
+      { id: "band", label: `2 σ from above, at most ${short(widest)} m`, color: colorOf(index), on: true, there: widest > 0 },
       { id: "truth", label: "truth", color: "var(--truth)", on: true, there: Boolean(run.truth) },
       { id: "estimate", label: "estimate", color: colorOf(index), on: true, there: true },
       { id: "doubtful", label: `${doubted} doubtful frames`, color: "var(--doubtful)", on: true, there: doubted > 0 },
@@ -243,11 +245,13 @@
     const everything = [least(xs) - margin, most(xs) + margin, least(ys) - margin, most(ys) + margin];
     let [x0, x1, y0, y1] = everything;
     let scale, dot;
-    const toX = (x) => (x - x0) * scale, toY = (y) => (y1 - y) * scale;
+    let left; // of what is drawn, where the height limits its width
+    const toX = (x) => left + (x - x0) * scale, toY = (y) => (y1 - y) * scale;
 
     function draw() {
       const width = Math.max(figure.clientWidth, 200);
       scale = Math.min(width / (x1 - x0), 620 / (y1 - y0));
+      left = (width - (x1 - x0) * scale) / 2;
       const height = (y1 - y0) * scale;
       svg.replaceChildren();
       svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
@@ -269,8 +273,8 @@
       }
       drawDirection();
       const bar = [1000, 500, 200, 100, 50, 20, 10, 5, 2, 1, 0.5, 0.2, 0.1, 0.05, 0.02].find((length) => length <= 0.25 * (x1 - x0)) || 0.01;
-      element(svg, "line", { x1: 8, x2: 8 + bar * scale, y1: height - 8, y2: height - 8, style: "stroke: var(--ink)", "stroke-width": 3 });
-      element(svg, "text", { x: 8, y: height - 14 }, `${bar} m`);
+      element(svg, "line", { x1: left + 8, x2: left + 8 + bar * scale, y1: height - 8, y2: height - 8, style: "stroke: var(--ink)", "stroke-width": 3 });
+      element(svg, "text", { x: left + 8, y: height - 14 }, `${bar} m`);
       dot = element(svg, "circle", { class: "here", r: 5, visibility: "hidden", style: `fill: ${colorOf(index)}; stroke: white; stroke-width: 2` });
     }
 
@@ -323,7 +327,7 @@
     svg.addEventListener("pointerleave", () => follow(null));
     onDrag(svg, (low, high) => {
       const flat = high[1] - low[1] < 5 ? 5 : 0;
-      [x0, x1, y0, y1] = [x0 + low[0] / scale, x0 + high[0] / scale, y1 - (high[1] + flat) / scale, y1 - low[1] / scale];
+      [x0, x1, y0, y1] = [x0 + (low[0] - left) / scale, x0 + (high[0] - left) / scale, y1 - (high[1] + flat) / scale, y1 - low[1] / scale];
       draw();
     });
     svg.addEventListener("dblclick", () => { [x0, x1, y0, y1] = everything; draw(); });
@@ -339,6 +343,8 @@
     ["RMSE, m", (loop) => loop.rmse_m], ["before, m", (loop) => loop.before_m], ["after, m", (loop) => loop.after_m],
     ["weight", (loop) => loop.weight], ["verdict", (loop) => loop.verdict], ["reason", (loop) => loop.reason],
   ];
+  const ON_PHONES = ["i", "j", "inliers", "verdict", "reason"];
+  const widthOf = (title) => ON_PHONES.includes(title) ? "" : "for-width";
 
   function loopsTable(box) {
     const loops = [...runs[Number(box.dataset.of)].loops];
@@ -350,7 +356,7 @@
     const head = element(element(table, "thead"), "tr"), body = element(table, "tbody");
     let sorted = null, rising = true;
     COLUMNS.forEach(([title, valueOf], column) => {
-      element(head, "th", {}, title).addEventListener("click", () => {
+      element(head, "th", { class: widthOf(title) }, title).addEventListener("click", () => {
         rising = sorted === column ? !rising : true;
         sorted = column;
         loops.sort((a, b) => {
@@ -366,9 +372,9 @@
       body.replaceChildren();
       for (const loop of loops.filter((one) => select.value === "all" || one.verdict === select.value)) {
         const row = element(body, "tr", { class: loop.verdict });
-        for (const [, valueOf] of COLUMNS) {
+        for (const [title, valueOf] of COLUMNS) {
           const value = valueOf(loop), isNumber = typeof value !== "string";
-          element(row, "td", isNumber ? { class: "number" } : {}, isNumber ? short(value) : value);
+          element(row, "td", { class: `${isNumber ? "number " : ""}${widthOf(title)}` }, isNumber ? short(value) : value);
         }
       }
     }

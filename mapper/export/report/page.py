@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
 from importlib import resources
-from itertools import chain, starmap
+from itertools import starmap
 from pathlib import Path
 from typing import Any, get_args
 
@@ -55,11 +55,11 @@ def page_of(chapters: Sequence[Chapter]) -> str:
         f"{title} – mapper report",
         header=_header(chapters),
         main=[
-            section("Verdict", _columns(starmap(_verdict, enumerate(chapters)))),
             section("Map", map_html(chapters)),
+            section("Verdict", _columns(starmap(_verdict, enumerate(chapters)))),
             section(
                 "Plans and views",
-                _HINT + _columns(chain.from_iterable(starmap(_pictures, enumerate(chapters)))),
+                _HINT + _columns(one for of in (_plan, _view) for one in starmap(of, enumerate(chapters))),
             ),
             section("Numbers", _numbers(chapters)),
             section("Over time", _curves(chapters)),
@@ -82,7 +82,7 @@ def page_of(chapters: Sequence[Chapter]) -> str:
 def _header(chapters: Sequence[Chapter]) -> str:
     boxes = "".join(
         f'<label class="run run{i % 6}"><input type="checkbox" data-run="{i}" checked> {escape(chapter.name)}'
-        f" <small>{escape(chapter.run.manifest.input.title)}</small></label>"
+        f" <small>{escape(chapter.run.manifest.input.title)}, {chapter.run.verdict.state}</small></label>"
         for i, chapter in enumerate(chapters)
     )
     return f'<h1>mapper report</h1><div class="runs">{boxes}</div>'
@@ -169,12 +169,16 @@ def _settings(chapters: Sequence[Chapter]) -> str:
     )
 
 
-def _pictures(number: int, chapter: Chapter) -> Iterator[str]:
-    """Yield the place of a run's plan, and its cloud from two sides."""
+def _plan(number: int, chapter: Chapter) -> str:
+    """Return the place of a run's plan."""
+    return f'<figure class="plan" data-of="{number}"><figcaption>{escape(chapter.name)}</figcaption></figure>'
+
+
+def _view(number: int, chapter: Chapter) -> str:
+    """Return a run's cloud from two sides."""
     name, uri = escape(chapter.name), views_uri(chapter.run)
-    yield f'<figure class="plan" data-of="{number}"><figcaption>{name}</figcaption></figure>'
     picture = f'<img src="{uri}" alt="{name} from above and from the side">' if uri else "<p>no picture</p>"
-    yield f'<figure class="view" data-of="{number}"><figcaption>{name}</figcaption>{picture}</figure>'
+    return f'<figure class="view" data-of="{number}"><figcaption>{name}</figcaption>{picture}</figure>'
 
 
 def _curves(chapters: Sequence[Chapter]) -> str:
