@@ -43,7 +43,7 @@ def build(
     log: Log | AnyPath,
     *,
     out: AnyPath | None = None,
-    config: BuildConfig | AnyPath | None = None,
+    config: BuildConfig | Settings | AnyPath | None = None,
     settings: Settings | None = None,
     odometry: OwnOdometry | None = None,
     progress: Progress | Callable[[str], object] | None = None,
@@ -57,7 +57,8 @@ def build(
             the ``source`` settings by which it was opened, too, if the run is to find the same frames later.
         out: Run folder to create; until it is whole it is called ``OUT.partial``. None is ``runs/LOG``, with
             a number while that is taken.
-        config: All settings, or a TOML or JSON file of them; None is what suits the log's sensor.
+        config: All settings, or a TOML or JSON file of them, or a mapping of some as ``settings`` takes it;
+            None is what suits the log's sensor.
         settings: Values by dotted name on top, such as ``{"octree.resolution_m": 0.1}``.
         odometry: Your own instead of the toolkit's: an object of the
             :class:`~mapper.odometry.base.Odometry` protocol; or a function that is called with each frame in
@@ -84,6 +85,9 @@ def build(
         'trusted'
     """
     receiver = _receiver(progress)
+    if isinstance(config, Mapping):
+        settings = {**flattened(config), **flattened(settings or {})}
+        config = None
     if not isinstance(log, Log):
         log = _opened(log, config, settings)
     out = place_of(None if out is None else Path(out), RUNS / name_of(log.path), overwrite=overwrite)

@@ -2,14 +2,18 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Transform, inverse, is_rigid
+from mapper.core.plan_axes import plan_axes
 from mapper.core.timebase import NS_PER_S, Stamps
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,6 +107,22 @@ class Trajectory:
     def moved(self, T_new_world: Transform) -> "Trajectory":
         """Return the same motion in another world frame."""
         return Trajectory(self.stamps_ns, T_new_world @ self.T_world_body)
+
+    def plot(self, axes: "Axes | None" = None) -> "Axes":
+        """Draw the path seen from above, with a disc at its start and a square at its end.
+
+        Args:
+            axes: Matplotlib's axes to draw on; None makes a figure of pyplot's.
+
+        Returns:
+            The axes, in metres of the world.
+        """
+        axes = plan_axes(axes)
+        x, y = self.positions_world[:, 0], self.positions_world[:, 1]
+        (line,) = axes.plot(x, y)
+        axes.plot(x[:1], y[:1], "o", color=line.get_color())
+        axes.plot(x[-1:], y[-1:], "s", color=line.get_color())
+        return axes
 
 
 def trajectory_from(poses: Iterable[tuple[int, Transform]]) -> Trajectory:

@@ -4,6 +4,7 @@ import base64
 from html import escape
 from typing import TYPE_CHECKING
 
+from mapper.core.plan_axes import plan_axes
 from mapper.export.html import table
 from mapper.export.picture import draw_summary
 from mapper.run import files
@@ -24,10 +25,7 @@ def plot_run(run: Run, axes: "Axes | None" = None) -> "Axes":
     Returns:
         The axes.
     """
-    if axes is None:
-        import matplotlib.pyplot as plt  # keeps global state, which only a caller without axes wants
-
-        axes = plt.subplots(layout="constrained")[1]
+    axes = plan_axes(axes)
     results = load_results(run)
     draw_summary(
         axes,
@@ -38,8 +36,6 @@ def plot_run(run: Run, axes: "Axes | None" = None) -> "Axes":
         poses=results.poses,
     )
     axes.set_title(run.manifest.input.title)
-    axes.set_xlabel("x (m)")
-    axes.set_ylabel("y (m)")
     return axes
 
 

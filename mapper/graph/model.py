@@ -51,7 +51,7 @@ class BetweenFactor:
     i: int
     j: int
     T_i_j: Transform
-    information: Array
+    information: Array = field(repr=False)
     origin: Origin = "odometry"
 
     def __post_init__(self) -> None:
@@ -74,6 +74,11 @@ class PoseGraph:
     T_world_node: dict[int, Transform] = field(default_factory=dict)
     stamps_ns: dict[int, int] = field(default_factory=dict)
     factors: list[BetweenFactor] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        loops = sum(factor.origin == "loop" for factor in self.factors)
+        nodes, factors = len(self.T_world_node), len(self.factors)
+        return f"PoseGraph of {nodes} nodes and {factors} factors, {loops} of them loops"
 
     @property
     def nodes(self) -> NDArray[np.int64]:

@@ -3,7 +3,7 @@
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -69,7 +69,7 @@ class LoopClosure:
     rmse_m: float | None = None
     residual_px: float | None = None
     T_i_j: Transform | None = None
-    information: Array | None = None
+    information: Array | None = field(default=None, repr=False)
     before: Discrepancy | None = None
     after: Discrepancy | None = None
     weight: float | None = None
@@ -188,17 +188,17 @@ def read_closures(path: Path) -> list[LoopClosure]:
 
 def _fields(closure: LoopClosure) -> dict[str, Any]:
     values: dict[str, Any] = {}
-    for field in fields(closure):
-        value = getattr(closure, field.name)
-        if field.name == "T_i_j":
+    for one in fields(closure):
+        value = getattr(closure, one.name)
+        if one.name == "T_i_j":
             values["translation_m"] = None if value is None else value[:3, 3].tolist()
             values["rotation_xyzw"] = (
                 None if value is None else quaternion_from_rotation(value[:3, :3]).tolist()
             )
         elif isinstance(value, Discrepancy):
-            values[field.name] = asdict(value)
+            values[one.name] = asdict(value)
         else:
-            values[field.name] = value.tolist() if isinstance(value, np.ndarray) else value
+            values[one.name] = value.tolist() if isinstance(value, np.ndarray) else value
     return values
 
 

@@ -15,7 +15,7 @@ from mapper.octree.attributes import NEVER_SEEN, AttributeLayer, ended_blocks
 from mapper.octree.blocks import BlockStore
 from mapper.octree.boxes import BoxCounts, count_boxes
 from mapper.octree.casting import Cast, Caster, depth_limit_of, octree_config
-from mapper.octree.config import OctreeConfig, Parent, SliceConfig
+from mapper.octree.config import OctreeConfig, Parent
 from mapper.octree.first_obstacles import first_obstacles
 from mapper.octree.keys import KEY_BITS, codes_of
 from mapper.octree.leaves import Leaves, RayEnds, centres_where, known_leaves
@@ -221,19 +221,19 @@ class OctreeMap:
         """Return the (N, 3) float64 centres of all free voxels, metres, in Morton order."""
         return centres_where(self.blocks, self.resolution_m, lambda odds: odds < self.occupied_log_odds)
 
-    def slice(self, z_min: float, z_max: float) -> "OccupancyGrid":
+    def slice(self, z_min: float, z_max: float | None = None) -> "OccupancyGrid":
         """Return the 2D map of the voxels with centres between two heights; occupied beats free.
 
         Args:
             z_min: Lower height, metres, world frame.
-            z_max: Upper height.
+            z_max: Upper height; None: the voxels that ``z_min`` lies in.
 
         Raises:
             DataError: No voxel, or none that is known, has its centre there.
         """
-        from mapper.octree.slice import cut_slice
+        from mapper.octree.slice import cut_between
 
-        return cut_slice(self, SliceConfig(min_height_m=z_min, max_height_m=z_max))
+        return cut_between(self, z_min, z_max)
 
     def are_occupied(self, points_world: Points | Points32) -> NDArray[np.bool_]:
         """Return the (N,) mask of the (N, 3) points, metres, that lie in occupied voxels."""

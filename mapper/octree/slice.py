@@ -1,7 +1,7 @@
 """2D navigation map: a horizontal band of the octree projected onto the ground plane."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -11,11 +11,15 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array
+from mapper.core.plan_axes import plan_axes
 from mapper.octree.columns import block_extent
 from mapper.octree.config import SliceConfig
 from mapper.octree.ground_height import DrivenGround, ground_heights, known_floor, nearest_heights
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 """ROS OccupancyGrid codes, ordered so that the maximum over a column is its state."""
@@ -51,6 +55,29 @@ class OccupancyGrid:
     def origin(self) -> Array:
         """(2,) x and y of the lower left corner, metres, world frame: ``origin_world_m``."""
         return self.origin_world_m
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of ``cells``."""
+        rows, columns = self.cells.shape
+        return rows, columns
+
+    def plot(self, axes: "Axes | None" = None) -> "Axes":
+        """Draw the grid: free cells white, occupied ones black, unknown ones grey.
+
+        Args:
+            axes: Matplotlib's axes to draw on; None makes a figure of pyplot's.
+
+        Returns:
+            The axes, in metres of the world.
+        """
+        axes = plan_axes(axes)
+        x, y = self.origin_world_m.tolist()
+        rows, columns = self.shape
+        extent = (x, x + columns * self.resolution_m, y, y + rows * self.resolution_m)
+        shades = np.select([self.cells == FREE, self.cells == OCCUPIED], [1.0, 0.0], 0.8)
+        axes.imshow(shades, cmap="gray", vmin=0.0, vmax=1.0, origin="lower", extent=extent)
+        return axes
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.array(self.cells, dtype=dtype, copy=copy)
@@ -108,6 +135,14 @@ def shrunk(grid: OccupancyGrid, most_cells: int) -> OccupancyGrid:
     rows, columns = (size // factor for size in cells.shape)
     cells = cells.reshape(rows, factor, columns, factor).max(axis=(1, 3))
     return OccupancyGrid(cells, grid.origin_world_m, factor * grid.resolution_m)
+
+
+def cut_between(octree: OctreeMap, z_min: float, z_max: float | None) -> OccupancyGrid:
+    """Return the band between two heights of the world; without the upper one, the voxels at the lower."""
+    if z_max is None:
+        z_min = octree.resolution_m * (z_min // octree.resolution_m)
+        z_max = z_min + octree.resolution_m
+    return cut_slice(octree, SliceConfig(min_height_m=z_min, max_height_m=z_max))
 
 
 def cut_slice(

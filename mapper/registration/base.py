@@ -1,6 +1,6 @@
 """Interface of registration: two scans and a guess in, a motion and its assessment out."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -30,7 +30,7 @@ class Alignment:
     inlier_rmse_m: float
     pairs: int = 0
     reason: str = ""
-    information: Array | None = None
+    information: Array | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if not is_rigid(self.T_target_source):

@@ -34,6 +34,10 @@ def test_a_log_opened_before_is_built_with_a_configuration_loaded_before(desk_lo
         settings={"min_tracked_frames": 5},
         progress=lines.append,
     )
+    again = mapper.build(
+        mapper.open_log(desk_log)[:12], config={"octree.resolution_m": 0.1, "min_tracked_frames": 5}
+    )
+    assert again.config == run.config
     assert run.path == Path("runs", desk_log.name)
     assert run.octree.resolution_m == 0.1
     assert len(run.trajectory) == 12
@@ -113,6 +117,42 @@ def test_the_slice_is_a_grid(run):
     column, row = np.floor((np.array([x, y]) - grid.origin) / grid.resolution).astype(int)
     assert 0 <= row < grid.grid.shape[0]
     assert 0 <= column < grid.grid.shape[1]
+
+
+def test_the_parts_of_a_run_are_drawn_by_themselves(run):
+    import matplotlib.pyplot as plt
+
+    axes = run.slice.plot()
+    assert run.trajectory.plot(axes) is axes
+    np.testing.assert_array_equal(axes.lines[0].get_xydata(), run.trajectory.positions[:, :2])
+    left, right, low, high = axes.images[0].get_extent()
+    assert run.slice.shape == run.slice.grid.shape
+    np.testing.assert_allclose([left, low], run.slice.origin)
+    np.testing.assert_allclose([high - low, right - left], np.array(run.slice.shape) * run.slice.resolution)
+    plt.close(axes.figure)
+    alone = run.trajectory[:0].plot()
+    assert alone.get_xlabel() == "x (m)"
+    plt.close(alone.figure)
+
+
+def test_one_height_of_the_octree_is_the_voxels_there(run):
+    octree = run.octree
+    heights = octree.occupied()[:, 2]
+    centre = heights[len(heights) // 2]
+    layer = octree.slice(float(centre))
+    at = octree.occupied()[np.isclose(heights, centre)]
+    cells = np.floor((at[:, :2] - layer.origin) / layer.resolution).astype(int)
+    assert (layer.grid[cells[:, 1], cells[:, 0]] == 100).all()
+    assert (layer.grid == 100).sum() == len(at)
+
+
+def test_what_a_prompt_shows_is_short(run, desk_log):
+    loops = sum(factor.origin == "loop" for factor in run.graph.factors)
+    nodes, factors = len(run.graph.nodes), len(run.graph.factors)
+    assert repr(run.graph) == f"PoseGraph of {nodes} nodes and {factors} factors, {loops} of them loops"
+    log = mapper.open_log(desk_log)
+    for shown in (run.graph.factors[0], *run.loops[:1], mapper.register(log[1], log[0], method="isvd")):
+        assert "information" not in repr(shown)
 
 
 def test_the_graph_is_gtsam_s_too(run):
