@@ -21,9 +21,14 @@ class LogFormat(StrEnum):
     BAG = "bag"
 
 
+_FILES = (LogFormat.MCAP, LogFormat.BAG)
+
+
 def convert(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Recorded log that mapper build can read.")],
-    as_: Annotated[LogFormat, typer.Option("--as", help="Format to write.")],
+    as_: Annotated[
+        LogFormat | None, typer.Option("--as", help="Format to write.  [default: by the ending of --out]")
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -40,17 +45,25 @@ def convert(
 ) -> Answer:
     """Write a log in another format; image files go over byte for byte where it has room for them.
 
-    Example: mapper convert rgbd_dataset_freiburg1_xyz --as mcap --out xyz.mcap
+    Example: mapper convert rgbd_dataset_freiburg1_xyz --out xyz.mcap
     """
     from mapper.config.loading import load_source_config
+    from mapper.core.errors import ConfigError
     from mapper.sources import open_source
     from mapper.sources.reading_checks import ReadingChecks
     from mapper.sources.writers import left_out, write_log
 
+    if as_ is None:
+        endings = {f".{name}": LogFormat(name) for name in _FILES}
+        as_ = endings.get("" if out is None else out.suffix)
+    if as_ is None:
+        raise ConfigError(
+            f"--as: want one of {', '.join(LogFormat)}; an --out that ends in .mcap or .bag says it, too"
+        )
     source = open_source(
         log, load_source_config(None, merged(selection(first, last, stride, require_truth), set_))
     )
-    ending = f".{as_}" if as_ in (LogFormat.MCAP, LogFormat.BAG) else ""
+    ending = f".{as_}" if as_ in _FILES else ""
     out = place_of(out, LOGS / f"{name_of(log)}{ending}")
     progress = output.progress()
     for note in (*source.notes, *left_out(source, as_.value)):

@@ -18,6 +18,7 @@ from mapper.cli.main import app
 from mapper.cli.summary import short_text
 from mapper.evaluators.metrics.evaluate import assess
 from mapper.run.folder import open_run
+from mapper.sources import open_source
 from mapper.sources.trajectory_files import read_tum
 from tests.support.command_line import HEAVY, mapper
 
@@ -170,6 +171,11 @@ def test_spelled_out_overrides_win(desk_log, tmp_path):
         (["eval", "RUN", "--times", "nowhere"], "mapper: nowhere: --times is for poses in KITTI text"),
         (["eval", "RUN", "--truth", "nowhere"], "mapper: nowhere: cannot be read"),
         (["convert", "nowhere", "--out", "log", "--as", "tum"], "mapper: nowhere: no such file or folder"),
+        (
+            ["convert", "LOG"],
+            "mapper: --as: want one of tum, mbag, kitti, mcap, bag; an --out that ends in .mcap",
+        ),
+        (["convert", "LOG", "--out", "folder"], "mapper: --as: want one of"),
         (["synth", "log", "--rooms", "5"], "mapper: rooms: Input should be a multiple of 2"),
         (["demo", "--out", "LOG", "--set", "workers=x"], "mapper: workers: Input should be"),
         (["config", "--set", "odometry.kind=zip"], "mapper: odometry: Input tag 'zip' found"),
@@ -299,6 +305,14 @@ def test_a_converted_log_gives_the_same_trajectory(run_folder, desk_log, tmp_pat
     ours, theirs = open_run(tmp_path / "run").trajectory, open_run(run_folder).trajectory
     assert ours.stamps_ns.tolist() == theirs.stamps_ns.tolist()
     assert abs(ours.T_world_body - theirs.T_world_body).max() < 1e-12
+
+
+@pytest.mark.parametrize("ending", ["mcap", "bag"])
+def test_the_ending_of_a_converted_log_says_its_format(desk_log, tmp_path, ending):
+    path = tmp_path / f"desk.{ending}"
+    result = mapper("convert", desk_log, "--out", path, "--first", 29)
+    assert result.stdout == f"{path}: 2 frames as {ending}, 0 skipped\n"
+    assert len(open_source(path)) == 2
 
 
 def test_a_synthetic_log_has_the_length_asked_for(tmp_path):
