@@ -5,6 +5,7 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
+from isal import isal_zlib
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
@@ -192,6 +193,16 @@ class RgbdFrame:
         return self.stamp_ns / NS_PER_S
 
     @property
+    def image_checksum(self) -> int | None:
+        """Number by which images differ: a frozen camera's have the same; None of an image of one shade."""
+        return _checksum(self.image)
+
+    @property
+    def depth_checksum(self) -> int | None:
+        """As ``image_checksum``, of the depth image."""
+        return _checksum(self.depth_m)
+
+    @property
     def gray(self) -> Image:
         """(H, W) uint8 luminance."""
         if self.image.ndim == 2:
@@ -242,3 +253,9 @@ Frame = RgbdFrame | Scan
 
 Sensor = Literal["rgbd", "lidar"]
 """Kind of a log's sensor: RGB-D frames whose body is an optical frame, or scans with z roughly up."""
+
+
+def _checksum(image: Image | DepthImage) -> int | None:
+    if (image == image.flat[0]).all():
+        return None
+    return int(isal_zlib.crc32(np.ascontiguousarray(image)))

@@ -5,10 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any, Literal
 
-import numpy as np
-from isal import isal_zlib
-
-from mapper.core.frames import DepthImage, Frame, Image, Scan
+from mapper.core.frames import Frame, Scan
 from mapper.core.timebase import NS_PER_S
 from mapper.sources.base import Log, WrappedEntry
 from mapper.sources.valid_returns import FARTHEST_M
@@ -135,11 +132,4 @@ class _CheckedEntry(WrappedEntry):
 def _reading_of(frame: Frame) -> _Reading:
     if isinstance(frame, Scan):
         return _Reading(far_returns=frame.far_returns)
-    return _Reading(image=_checksum(frame.image), depth=_checksum(frame.depth_m))
-
-
-def _checksum(image: Image | DepthImage) -> int | None:
-    """Return a number by which images differ; None of an image without content: a dark one shows nothing."""
-    if (image == image.flat[0]).all():
-        return None
-    return int(isal_zlib.crc32(np.ascontiguousarray(image)))
+    return _Reading(image=frame.image_checksum, depth=frame.depth_checksum)

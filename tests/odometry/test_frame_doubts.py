@@ -58,7 +58,7 @@ def test_doubts_are_measured_against_what_is_usual(frames, odometry):
     ):
         now = replace(
             pose,
-            observation=replace(pose.observation, stamp_ns=k * step_ns, pixels=pose.observation.pixels + k),
+            observation=replace(pose.observation, stamp_ns=k * step_ns, image_checksum=k),
             T_camera_world=exp(np.zeros(3), np.array([moved_m, 0.0, 0.0])) @ pose.T_camera_world,
             agreement=agreement,
             moving=np.arange(moving),

@@ -51,6 +51,7 @@ class ImageObservation(Archivable):
         T_body_camera: (4, 4) pose of the camera in the body frame.
         sweep_camera: (6,) motion of the camera while the rows were read, in its own axes (rotation,
             translation), that ``measured`` allows for; 0 for a global shutter.
+        image_checksum: Of the image, see :class:`~mapper.core.frames.RgbdFrame`.
         depth_cells: The depth image, reduced; None if it is not aligned.
         grey_cells: (R, C) uint8 mean grey level in each of its cells; None without them.
         unswept: The observation without a motion, which this one is made from; None if that is itself.
@@ -71,6 +72,7 @@ class ImageObservation(Archivable):
     size_px: tuple[int, int]
     T_body_camera: Transform
     sweep_camera: Array
+    image_checksum: int | None
     depth_cells: DepthCells | None = None
     grey_cells: NDArray[np.uint8] | None = None
     unswept: "ImageObservation | None" = None
@@ -205,6 +207,7 @@ def observe_image(
         "intrinsics": intrinsics,
         "size_px": (camera.width_px, camera.height_px),
         "T_body_camera": frame.T_body_camera,
+        "image_checksum": frame.image_checksum,
         "depth_cells": cells,
         "grey_cells": None if cells is None else cells.mean_of(frame.gray),
     }
