@@ -1,5 +1,6 @@
 """Checks of every library: installed, new enough, and right about a tiny job."""
 
+import os
 import re
 import signal
 import subprocess
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from importlib import metadata
 
 from mapper.doctor.finding import Finding
+from mapper.doctor.machine import processors
 from mapper.doctor.system_libraries import apt_line
 from mapper.runtime.extras import DISTRIBUTION, install_line
 
@@ -74,7 +76,7 @@ def look_at_library(name: str, wanted: Requirement = _ANY) -> Finding:
 
 
 def tried(
-    name: str, version: str, command: Sequence[str], *, again: str, patience_s: float = _PATIENCE_S
+    name: str, version: str, command: Sequence[str], *, again: str, patience_s: float | None = None
 ) -> Finding:
     """Run a self-test in a process of its own, and return how it ended.
 
@@ -83,8 +85,10 @@ def tried(
         version: Of the library.
         command: Ends with status 0 if the library works.
         again: How to install the library afresh.
-        patience_s: Longer is a failure.
+        patience_s: Longer is a failure; None: a minute, and more where processes wait for processors.
     """
+    if patience_s is None:
+        patience_s = usual_patience_s()
     began = time.monotonic()
     try:
         ended = subprocess.run(command, capture_output=True, text=True, timeout=patience_s, check=False)
@@ -104,6 +108,13 @@ def tried(
     missing = _MISSING_OBJECT.search(said)
     remedy = again if missing is None else apt_line([missing["object"]])
     return Finding(name, "failed", f"{version}, {said}", remedy)
+
+
+def usual_patience_s() -> float:
+    """Return how long a self-test may take: a minute, times the processes that share a processor."""
+    if not hasattr(os, "getloadavg"):
+        return _PATIENCE_S
+    return _PATIENCE_S * max(1.0, os.getloadavg()[0] / processors())
 
 
 def _after(killer: signal.Signals, again: str) -> str:
