@@ -11,6 +11,8 @@ from numpy.typing import DTypeLike, NDArray
 
 from mapper.runtime.atomic import writing
 
+_CHUNK = 1 << 20
+
 
 class FileArray:
     """Rows of numbers in a file without a name, mapped into memory; it is gone when the process ends."""
@@ -40,7 +42,17 @@ class FileArray:
         """
         size = rows * self._columns * self._kind.itemsize
         with writing(self._folder):
-            # A page of a file with holes that finds no place on the disk would end the process.
-            os.posix_fallocate(self._file.fileno(), 0, size)
+            self._reserve(size)
             mapped = mmap.mmap(self._file.fileno(), size)
         return np.frombuffer(mapped, self._kind).reshape(rows, self._columns)
+
+    def _reserve(self, size: int) -> None:
+        """Give the file so many bytes of the disk: a page that finds no place there would end the process."""
+        reserve = getattr(os, "posix_fallocate", None)  # not on macOS and Windows
+        if reserve is not None:
+            reserve(self._file.fileno(), 0, size)
+            return
+        at = self._file.seek(0, os.SEEK_END)
+        while at < size:
+            at += self._file.write(bytes(min(size - at, _CHUNK)))
+        self._file.flush()

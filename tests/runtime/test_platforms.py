@@ -12,13 +12,14 @@ from mapper.doctor.machine import processors
 from mapper.octree.window import _sparse_zeros
 from mapper.runtime import atomic
 from mapper.runtime.atomic import FolderKind, atomic_folder, flush_to_disk
+from mapper.runtime.file_array import FileArray
 from mapper.runtime.timing import forget_peak_memory, peak_memory_mb
 from tests.support.paths import ROOT
 
 MAC = """
 import ctypes, mmap, os, pathlib, sys
 
-del mmap.MADV_NOHUGEPAGE, os.sched_getaffinity, os.sched_setaffinity, os.posix_fadvise
+del mmap.MADV_NOHUGEPAGE, os.sched_getaffinity, os.sched_setaffinity, os.posix_fadvise, os.posix_fallocate
 is_there = pathlib.Path.exists
 pathlib.Path.exists = lambda path: not str(path).startswith("/proc/") and is_there(path)
 
@@ -68,6 +69,17 @@ def run(code, *arguments):
     return subprocess.run(
         [sys.executable, "-c", code, *arguments], cwd=ROOT, capture_output=True, text=True, check=False
     )
+
+
+def test_an_array_in_a_file_grows_without_reserved_pages(tmp_path, monkeypatch):
+    monkeypatch.delattr(os, "posix_fallocate")
+    array = FileArray(tmp_path, 512, np.float32)
+    array.grown(300)[:] = 1.5
+    rows = array.grown(2000)
+    assert rows.shape == (2000, 512)
+    assert (rows[:300] == 1.5).all()
+    assert not rows[300:].any()
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

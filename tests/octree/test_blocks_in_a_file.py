@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
-from tests.octree.test_memory_limit import digest_of, filled
+from tests.octree.test_blocks_in_a_file import digest_of, filled
 
 filled(OctreeMap(0.1), blocks=10)  # kernels are loaded
 used = 4096 * int(Path("/proc/self/statm").read_text().split()[5])
