@@ -179,6 +179,8 @@ def peer(log: Labelled, method: str, python: Path, scratch: Path) -> tuple[np.nd
     command = [str(python), "-c", _PEER, method, str(data), str(voxel_m), str(found)]
     try:
         subprocess.run(command, check=True, capture_output=True, text=True, timeout=_LIMIT_S)
+    except subprocess.TimeoutExpired:
+        return f"left out: not done in {_LIMIT_S:g} s"
     except (OSError, subprocess.SubprocessError) as error:
         return f"left out: {str(getattr(error, 'stderr', '') or error).strip().splitlines()[-1]}"
     with np.load(found) as result:
