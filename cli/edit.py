@@ -23,7 +23,7 @@ def edit(
         bool, typer.Option("--keep", help="Leave out what lies outside of a region, and of others kept.")
     ] = False,
     keepout: Annotated[
-        bool, typer.Option("--keepout", help="Block the traversable floor in a region.")
+        bool, typer.Option("--keepout", help="Keep robots out of a region: floor, plans and nav2.")
     ] = False,
     box: Annotated[
         _Corners | None,

@@ -95,9 +95,8 @@ def plan(
     start, goal = (_point(text, name, counts) for text, name in zip((from_, to), _POINT_OPTIONS, strict=True))
     config = overridden(PlanConfig(), assignments({"radius_m": radius, "unknown": unknown, "layer": layer}))
     built = open_map(run) if is_merged_map(run) else open_run(run)
-    grid = with_obstacles(built.slice, built.keepout)
-    if config.layer == "traversable":
-        grid = built.traversable
+    on_floor = config.layer == "traversable"
+    grid = built.traversable if on_floor else with_obstacles(built.slice, built.keepout)
     if in_3d:
         found = plan_3d(read_octree(built.file(files.OCTREE_OT)), start, goal, config=config)
     elif has_storeys:

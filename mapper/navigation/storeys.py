@@ -18,7 +18,7 @@ _OVERLAP_M = 3.0
 _NONE = -1
 
 
-def storeys_of(floor: Floor) -> tuple[list[Heights], list[Heights]]:
+def storeys_of(floor: Floor, *, with_links: bool = False) -> tuple[list[Heights], list[Heights]]:
     """Return the (H, W) heights, in voxels above z = 0, of every storey's floor, the lowest first; and links.
 
     Where floors lie over each other, each is a storey; every other surface belongs to the storey to which one
@@ -27,7 +27,7 @@ def storeys_of(floor: Floor) -> tuple[list[Heights], list[Heights]]:
     left out, unless all are. A floor without any other above is a single storey.
 
     A link is the floor for some metres to both sides of where two storeys meet. On spiral stairs, a turn of
-    which fills a storey, it is all that joins them.
+    which fills a storey, it is all that joins them. Without ``with_links`` none is looked for.
     """
     columns, reached = floor.columns, floor.reached
     heights = np.full(columns.shape, NOWHERE, np.int32)
@@ -62,7 +62,8 @@ def storeys_of(floor: Floor) -> tuple[list[Heights], list[Heights]]:
         return heights
 
     around = starts, tops, columns.shape, column_of, limits.step, limits.gap
-    borders = [_border(*around, storey, *pair) for pair in combinations(kept, 2)]
+    pairs = combinations(kept, 2) if with_links else ()
+    borders = [_border(*around, storey, *pair) for pair in pairs]
     links = [extended(border) for border in borders if border.any()]
     return [extended(storey == number) for number in kept], links
 

@@ -53,11 +53,10 @@ def traversable(floor: Floor, config: TraversableConfig, *, with_links: bool = F
         config: The limits by which it was found, and the robot's radius.
         with_links: Whether the links between storeys follow, by which paths lead from one to another.
     """
-    storeys, links = storeys_of(floor)
+    storeys, links = storeys_of(floor, with_links=with_links)
     home = _home(floor, storeys)
     found = [_storey(floor, heights, config, number == home) for number, heights in enumerate(storeys)]
-    if with_links:
-        found += [replace(_storey(floor, heights, config, False), is_link=True) for heights in links]
+    found += [replace(_storey(floor, heights, config, False), is_link=True) for heights in links]
     return tuple(found)
 
 
