@@ -13,9 +13,10 @@ the evidence of a ray is weighed by what the same scan saw around it:
 A voxel with h hits held something that moved if no surface is beside it and it was seen through at least 3
 times and in more than h/2 scans. A sparse sensor seldom observes all voxels around in one scan; for it, 8
 passes and more than 2h are enough. A surface is a voxel that was hit and has a voxel beside it that no
-scan observed: the ground, a wall. Feet and wheels touch the ground, and returns of one ring may lie more than
-a voxel above those of the next: a voxel that was hit within two voxels of a voxel of a moving object that was
-hit too, in 9 of 10 of its hits, belongs to the object; this is repeated once.
+scan observed: the ground, a wall. Feet and wheels touch the ground: a voxel that was hit beside a voxel of
+a moving object that was hit too, in 9 of 10 of its hits, belongs to the object; this is repeated once. As
+rings may lie more than a voxel apart, two voxels from it are near enough for one with at least 3 and more
+than 2h passes; without that, poles beside traffic would go.
 
 What remains of the voxels that were ever hit is occupied, unless its void misses alone outweigh its hits.
 """
@@ -48,7 +49,7 @@ from mapper.octree.scan_update import ScanUpdate
 _LEAST_SEEN_THROUGH, _SEEN_THROUGH_RATIO = 3, 0.5
 _LEAST_PASSES, _PASSES_RATIO = 8, 2.0
 _ATTACHED_RATIO = 0.9
-_ATTACHING_VOXELS, _ATTACHING_ROUNDS = 2, 2
+_ATTACHING_ROUNDS = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,15 +101,21 @@ def remove_moving_objects(octree: OctreeMap, scans: Callable[[], Iterable[ScanUp
     often = (seen_through >= _LEAST_SEEN_THROUGH) & (seen_through > _SEEN_THROUGH_RATIO * hits)
     often |= (passes >= _LEAST_PASSES) & (passes > _PASSES_RATIO * hits)
     moved = often & _gathered(_clear_of_surfaces(octree, ever), ever, count)
+    passed = (passes >= _LEAST_SEEN_THROUGH) & (passes > _PASSES_RATIO * hits)
     for _ in range(_ATTACHING_ROUNDS):
-        removed, beside = _scattered(moved, ever), np.zeros(count, np.int32)
+        removed = _scattered(moved, ever)
+        beside, nearby = np.zeros((2, count), np.int32)
         for scan in scans():
-            hit, slots = words_of(scan.occupied), _slots_of(blocks, scan)
-            near, neighbours = hit & removed[slots], neighbours_of(scan.codes)
-            for _ in range(_ATTACHING_VOXELS):
-                near = dilated(near, neighbours, absent=NONE_SET)
+            hit, slots, neighbours = (
+                words_of(scan.occupied),
+                _slots_of(blocks, scan),
+                neighbours_of(scan.codes),
+            )
+            near = dilated(hit & removed[slots], neighbours, absent=NONE_SET)
             _count_one(hit & near, slots, ever, starts, beside)
-        moved |= beside >= _ATTACHED_RATIO * hits
+            near = dilated(near, neighbours, absent=NONE_SET)
+            _count_one(hit & near, slots, ever, starts, nearby)
+        moved |= (beside >= _ATTACHED_RATIO * hits) | (passed & (nearby >= _ATTACHED_RATIO * hits))
     octree.forget(_decide(blocks.table.values, ever, moved, counts, octree.sensor, octree.occupied_log_odds))
     return MovingObjects(blocks, _scattered(moved, ever), octree.resolution_m)
 
