@@ -300,7 +300,9 @@ def open_run(path: AnyPath) -> Run:
             raise RunError(f"{path}: {_not_a_run(path)}")
         raise RunError(f"{path}: no such run folder; make one with mapper build LOG --out {path}")
     if is_merged_map(path):
-        raise RunError(f"{path}: is a merged map, not a run; mapper eval, export and plan take it")
+        raise RunError(
+            f"{path}: is a merged map, not a run; mapper eval, export and plan take it, summary.png shows it"
+        )
     if is_localised_log(path):
         raise RunError(
             f"{path}: is a localised log, not a run; the map that it lies in is told in its manifest"

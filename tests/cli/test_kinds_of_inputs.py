@@ -14,7 +14,7 @@ from tests.support.merged_runs import merged_map_of
 
 KINDS = ("run", "merged map", "log", "file of a run", "foreign folder", "nothing")
 NO_RUN = ("is a log, not a run", "is a file of a run", "is no run folder", "no such run folder")
-MERGED = "is a merged map, not a run; mapper eval, export and plan take it"
+MERGED = "is a merged map, not a run; mapper eval, export and plan take it, summary.png shows it"
 UNKNOWN = "not a log of a known format"
 
 ANSWERS = {
