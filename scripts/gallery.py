@@ -20,7 +20,7 @@ import cv2
 
 ROOT = Path(__file__).resolve().parents[1]
 MAPPER = [sys.executable, "-c", "from mapper.cli.main import main; main()"]
-OUT = ROOT / "docs" / "gallery"
+PAGE, OUT = ROOT / "docs" / "gallery.md", ROOT / "docs" / "gallery"
 WIDTH_PX = 1000
 QUALITY = 78
 MOST_BYTES = 3_000_000
@@ -143,6 +143,12 @@ def make(entry: Entry, logs: Path, work: Path) -> list[str]:
     return [*lines, ""]
 
 
+def section_of(entry: Entry, page: str) -> list[str]:
+    """Return the lines that a page has about a run; none if it has none."""
+    _, title, rest = page.partition(f"## {entry.title}\n")
+    return [*(title + rest.partition("\n## ")[0]).rstrip().splitlines(), ""] if title else []
+
+
 def write_picture(source: Path, name: str) -> Path:
     """Write a picture of a run, no wider than a page, and return its path."""
     image = cv2.imread(str(source), cv2.IMREAD_COLOR)
@@ -162,7 +168,12 @@ def main() -> int:
     )
     parser.add_argument("--logs", type=Path, required=True, help="folder with the recorded logs")
     parser.add_argument("--work", type=Path, help="folder to work in; a temporary one by default")
-    parser.add_argument("--only", action="append", choices=[entry.name for entry in ENTRIES])
+    parser.add_argument(
+        "--only",
+        action="append",
+        choices=[entry.name for entry in ENTRIES],
+        help="a run to make; the others stay on the page as they are",
+    )
     arguments = parser.parse_args()
     OUT.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as temporary:
@@ -179,11 +190,13 @@ def main() -> int:
         for entry in ENTRIES:
             if arguments.only is None or entry.name in arguments.only:
                 lines += make(entry, arguments.logs, work)
+            else:
+                lines += section_of(entry, PAGE.read_text(encoding="utf-8"))
     size = sum(path.stat().st_size for path in OUT.iterdir())
     if size > MOST_BYTES:
         print(f"{OUT}: {size} bytes, want {MOST_BYTES} at most: lower QUALITY or WIDTH_PX", file=sys.stderr)
         return 1
-    (ROOT / "docs" / "gallery.md").write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
+    PAGE.write_text("\n".join(lines).rstrip() + "\n", encoding="utf-8")
     print(f"docs/gallery.md, {size / 1e6:.2f} MB of pictures")
     return 0
 
