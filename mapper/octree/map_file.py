@@ -44,7 +44,7 @@ _ATTRIBUTE_BYTES = BLOCK_VOXELS * 28
 def write_map(path: Path, octree: OctreeMap) -> None:
     """Write a map with its sensor model and all attributes; atomic.
 
-    Beside the map, this takes a fifth of its memory.
+    Beside the map, this takes a tenth of its memory and 100 MB; attributes are copied as a whole.
     """
     values = octree.blocks.table.values
     slots = octree.blocks.sorted_slots()

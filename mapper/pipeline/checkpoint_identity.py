@@ -20,6 +20,8 @@ from mapper.sources.base import Log
 IDENTITY = "identity.json"
 """File of a folder of checkpoints, written first."""
 _NAMED = 3
+_WITHOUT_EFFECT = {"octree": {"max_memory_mb"}}
+"""Settings that decide nothing: a build that ran out of memory may go on with another limit."""
 
 
 def identity_of(source: Log, config: BuildConfig, poses: Trajectory | None) -> dict[str, Any]:
@@ -28,7 +30,7 @@ def identity_of(source: Log, config: BuildConfig, poses: Trajectory | None) -> d
     return {
         "log": str(source.path.resolve()),
         "fingerprint": fingerprint(source.path),
-        "config": json.loads(config.model_dump_json()),
+        "config": json.loads(config.model_dump_json(exclude=_WITHOUT_EFFECT)),
         "poses": "" if poses is None else _digest(poses.stamps_ns.tobytes() + poses.T_world_body.tobytes()),
         "files": {
             name: _digest(path.read_bytes())

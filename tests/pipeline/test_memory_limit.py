@@ -45,6 +45,19 @@ def test_a_build_that_was_stopped_while_fusing_makes_the_same_map(
     assert_same_map(run, desk_run)
 
 
+@pytest.mark.parametrize("limits", [[], ["octree.max_memory_mb=0.1"]])
+def test_a_build_goes_on_with_another_limit(desk_log, desk_run, tmp_path, grown, limits):
+    stopped(desk_log, tmp_path / "run", *limits, progress=Stage("fuse", 20))
+    grown.clear()
+
+    run = start(desk_log, tmp_path / "run", "octree.max_memory_mb=0.15")
+
+    assert grown
+    assert resumed(run)
+    assert run.config.octree.max_memory_mb == 0.15
+    assert_same_map(run, desk_run)
+
+
 def test_a_run_is_fused_again_within_a_limit(desk_log, desk_run, street, street_run, tmp_path, grown):
     for log, wanted in ((desk_log, desk_run), (street, street_run)):
         grown.clear()
