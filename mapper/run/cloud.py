@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapper.core.errors import FrameError
 from mapper.core.frames import Points32
 from mapper.sources.cloud_files.ply import read_ply
 
@@ -36,7 +37,10 @@ def read_cloud(path: Path) -> Cloud:
     Raises:
         FrameError: The file cannot be read.
     """
-    columns = read_ply(path)
+    try:
+        columns = read_ply(path)
+    except OSError as error:
+        raise FrameError(f"{path}: cannot be read: {error.strerror}") from None
     return Cloud(
         np.column_stack([columns[axis] for axis in ("x", "y", "z")]),
         np.column_stack([columns[channel] for channel in ("red", "green", "blue")]),

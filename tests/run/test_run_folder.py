@@ -4,9 +4,10 @@ import os
 import pytest
 
 from mapper.config.build import BuildConfig
-from mapper.core.errors import DataError, RunError, TrackingError
+from mapper.core.errors import DataError, FrameError, RunError, TrackingError
 from mapper.loops.closure import read_closures
 from mapper.odometry.base import Diagnostics
+from mapper.run.cloud import read_cloud
 from mapper.run.files import RUN
 from mapper.run.fingerprint import fingerprint
 from mapper.run.folder import open_run
@@ -199,3 +200,9 @@ def test_a_fingerprint_follows_names_sizes_and_lists_but_not_the_place(tmp_path)
     assert make("c", listed="2 a.png\n") != first
     assert make("d", image=b"1234") != first
     assert fingerprint(tmp_path / "a" / "rgb" / "a.png") != fingerprint(tmp_path / "d" / "rgb" / "a.png")
+
+
+def test_a_cloud_that_is_a_circle_of_links_is_refused_in_one_line(tmp_path):
+    (tmp_path / "cloud.ply").symlink_to("cloud.ply")
+    with pytest.raises(FrameError, match=r"cloud\.ply: cannot be read: Too many levels of symbolic links"):
+        read_cloud(tmp_path / "cloud.ply")
