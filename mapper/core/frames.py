@@ -170,6 +170,7 @@ class RgbdFrame:
         depth_m: (H, W) float32 depth along the optical axis, metres; 0 is no measurement.
         camera: Intrinsics that hold for both images.
         T_body_camera: (4, 4) pose of the camera in the body frame.
+        depth_delay_s: Time from the image's stamp to the depth image's.
     """
 
     stamp_ns: int
@@ -177,6 +178,7 @@ class RgbdFrame:
     depth_m: DepthImage
     camera: PinholeCamera
     T_body_camera: Transform = field(default_factory=lambda: np.eye(4))
+    depth_delay_s: float = 0.0
 
     def __post_init__(self) -> None:
         want = (self.camera.height_px, self.camera.width_px)

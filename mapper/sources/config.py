@@ -6,6 +6,7 @@ from typing import Self
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from mapper.core.config import Config
+from mapper.core.timebase import NS_PER_S
 
 
 class CameraConfig(Config):
@@ -113,6 +114,9 @@ class SourceConfig(Config):
     max_pair_gap_s: NonNegativeFloat = 0.02
     """Largest time between a colour image and its depth image. More, where the two are not synchronised and
     the camera moves slowly; frames without a partner are left out."""
+    depth_offset_s: float = 0.0
+    """Added to the stamps of depth images before they are paired with colour images: how much later they show
+    the scene than their stamps say. The warning ``camera`` tells it where it was measured."""
     rate_hz: PositiveFloat | None = None
     """Frames per second of numbered files without stamps; None is the format's own (30, Poznań, scans 10)."""
     camera: CameraConfig | None = None
@@ -131,3 +135,8 @@ class SourceConfig(Config):
     """Poses of a LiDAR log, in TUM's or KITTI's text; None looks for groundtruth.txt and poses.txt."""
     cloud_scale: PositiveFloat | None = None
     """Metres per unit of a LiDAR log's files; None is 1, and refuses what looks like millimetres."""
+
+    @property
+    def depth_offset_ns(self) -> int:
+        """``depth_offset_s`` in nanoseconds."""
+        return round(self.depth_offset_s * NS_PER_S)

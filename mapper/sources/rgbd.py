@@ -9,6 +9,7 @@ import numpy as np
 
 from mapper.core.errors import FrameError, SourceError
 from mapper.core.frames import DepthImage, Image, PinholeCamera, RgbdFrame, Scan
+from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Accelerations, ImageFiles, Log
 from mapper.sources.calibration import Calibration, configured
@@ -47,7 +48,8 @@ class RgbdEntry:
         """
         image = self.read_image(colour)
         check_size(image.shape, self.camera, f"{self.files.colour}")
-        return RgbdFrame(self.stamp_ns, image, self._depth_m(), self.camera)
+        delay_s = (self.files.depth_stamp_ns - self.stamp_ns) / NS_PER_S
+        return RgbdFrame(self.stamp_ns, image, self._depth_m(), self.camera, depth_delay_s=delay_s)
 
     def scan(self) -> Scan:
         """Read and decode the depth image alone.

@@ -2,19 +2,18 @@
 
 import math
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mapper.core.errors import SourceError
-from mapper.core.timebase import NS_PER_S, Stamps, nearest
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.calibration import freiburg_camera
 from mapper.sources.config import SourceConfig
 from mapper.sources.listed_files import present, within
-from mapper.sources.rgbd import FramePair, find_calibration, rgbd_log, unpaired_note
+from mapper.sources.pairing import ImageList, pair_images
+from mapper.sources.rgbd import find_calibration, rgbd_log
 from mapper.sources.text import (
     parse_numbers,
     parse_stamp,
@@ -26,12 +25,6 @@ from mapper.sources.text import (
 )
 
 DEPTH_UNITS_PER_M = 5000.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _ImageList:
-    stamps_ns: Stamps
-    paths: list[Path]
 
 
 def recognise(path: Path) -> bool:
@@ -49,7 +42,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     notes: list[str] = []
     colour = _read_list(path, "rgb.txt", notes)
     depth = _read_list(path, "depth.txt", notes)
-    pairs = _paired(colour, depth, max_gap_s=config.max_pair_gap_s, path=path, notes=notes)
+    pairs, pair_notes = pair_images(colour, depth, config, path=path)
     name = _name_of(path)
     calibration, units_per_m = find_calibration(
         path,
@@ -66,7 +59,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         name=name,
         kind="tum",
         truth=truth,
-        notes=[*notes, *truth_notes],
+        notes=[*notes, *pair_notes, *truth_notes],
     )
 
 
@@ -88,7 +81,7 @@ def read_truth(path: Path) -> tuple[Trajectory | None, list[str]]:
     return truth_from(list(zip(stamps_ns, poses, strict=True)), what=path.name)
 
 
-def _read_list(folder: Path, name: str, notes: list[str]) -> _ImageList:
+def _read_list(folder: Path, name: str, notes: list[str]) -> ImageList:
     """Read ``stamp filename`` lines in time order, without the files that do not exist."""
     path = folder / name
     stamps_ns, paths = [], []
@@ -106,30 +99,7 @@ def _read_list(folder: Path, name: str, notes: list[str]) -> _ImageList:
     stamps = np.array([stamps_ns[i] for i in kept], dtype=np.int64)
     order, order_notes = time_order(stamps, what=name)
     notes.extend(order_notes)
-    return _ImageList(stamps[order], [paths[kept[i]] for i in order])
-
-
-def _paired(
-    colour: _ImageList, depth: _ImageList, *, max_gap_s: float, path: Path, notes: list[str]
-) -> list[FramePair]:
-    """Pair each colour image with the nearest depth image, at most ``max_gap_s`` apart."""
-    partner, gap_ns = nearest(depth.stamps_ns, colour.stamps_ns)
-    paired = np.flatnonzero(gap_ns <= round(max_gap_s * NS_PER_S))
-    if len(paired) == 0:
-        raise SourceError(
-            f"{path}: no colour image has a depth image within {max_gap_s * 1e3:g} ms; "
-            f"the closest pair is {int(gap_ns.min()) / NS_PER_S:g} s apart (source.max_pair_gap_s)"
-        )
-    notes += unpaired_note(len(gap_ns) - len(paired), len(gap_ns), max_gap_s=max_gap_s)
-    return [
-        FramePair(
-            stamp_ns=int(colour.stamps_ns[i]),
-            colour=colour.paths[i],
-            depth_stamp_ns=int(depth.stamps_ns[partner[i]]),
-            depth=depth.paths[partner[i]],
-        )
-        for i in paired
-    ]
+    return ImageList(stamps[order], [paths[kept[i]] for i in order])
 
 
 def _name_of(path: Path) -> str:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from mapper.core.geometry import apply, exp
-from mapper.odometry.local_map.focal_length import WINDOW_KEYFRAMES, Bundle, FocalLengthCheck
+from mapper.odometry.local_map.bundle import WINDOW_KEYFRAMES, Bundle
+from mapper.odometry.local_map.focal_length import FocalLengthCheck
 
 INTRINSICS = np.array([525.0, 520.0, 319.5, 239.5, 40.0])
 WINDOWS = 5
@@ -24,7 +25,8 @@ def window(rng, *, true_scale):
                 edges.append((k, p))
                 measured.append(np.array([u, v, bf / z]) + rng.normal(0.0, [0.5, 0.5, 0.2]))
     weights = np.tile([0.5**-2, 0.5**-2, 0.2**-2], (len(edges), 1))
-    arrays = np.array(edges, np.int32), np.array(measured), weights
+    features = np.array(edges)[:, 1]
+    arrays = np.array(edges, np.int32), features, np.array(measured), weights
     return Bundle(np.array(poses), points, *arrays, INTRINSICS)
 
 
@@ -54,8 +56,8 @@ def test_windows_without_common_landmarks_are_left_out():
     lonely = bundle.edges[:, 0] == 0
     check.add(
         Bundle(
-            bundle.poses, bundle.points, bundle.edges[lonely], bundle.measured[lonely],
-            bundle.weights[lonely], INTRINSICS,
+            bundle.poses, bundle.points, bundle.edges[lonely], bundle.features[lonely],
+            bundle.measured[lonely], bundle.weights[lonely], INTRINSICS,
         )
     )  # fmt: skip
     assert check.estimate() == (0.0, np.inf)

@@ -305,7 +305,7 @@ def common_parameter(poses, free, points, first_edge, edges, measured, weights, 
         weights: As for ``adjust``.
         intrinsics: As for ``adjust``.
         active: (E,) edges that take part.
-        slopes: (E, 2) change of the residuals of u and v with the parameter.
+        slopes: (E, 2) change of the residuals of u and v with the parameter, or (E, 3) with that of bf/z.
     """
     cameras = int(free.max()) + 1
     Hcc, bc = np.empty((cameras, 6, 6)), np.empty((cameras, 6))
@@ -324,10 +324,10 @@ def common_parameter(poses, free, points, first_edge, edges, measured, weights, 
         c, p = edges[e, 0], edges[e, 1]
         T = poses[c]
         x, y, z = residual(T, points[p], measured[e], intrinsics, r)
-        projection_jacobian(x, y, z, intrinsics, False, J)
+        projection_jacobian(x, y, z, intrinsics, not np.isnan(measured[e, 2]), J)
         pose_jacobian(x, y, z, J, J_pose)
         f = free[c]
-        for i in range(2):
+        for i in range(slopes.shape[1]):
             ws = weights[e, i] * slopes[e, i]
             information += ws * slopes[e, i]
             gradient += ws * r[i]

@@ -78,6 +78,15 @@ class DepthSurface:
         normals: Array = self.planes[self.cells.inverse_depth > 0.0, :3]
         return normals
 
+    def planes_at(self, pixels: Array) -> Array:
+        """Return the (N, 4) planes at undistorted (N, 2) pixels, 0 where there is none."""
+        raw = self.cells.camera.distort(pixels)
+        column, row = np.floor_divide(np.rint(raw), self.cells.cell_px).T
+        inside = (row >= 0) & (row < self.planes.shape[0]) & (column >= 0) & (column < self.planes.shape[1])
+        found = np.zeros((len(pixels), 4))
+        found[inside] = self.planes[row[inside].astype(np.intp), column[inside].astype(np.intp)]
+        return found
+
 
 def depth_cells(depth_m: DepthImage, camera: PinholeCamera) -> DepthCells:
     """Return a depth image as means over square cells, 80 in a row.

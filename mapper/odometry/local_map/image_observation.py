@@ -54,6 +54,7 @@ class ImageObservation(Archivable):
         image_checksum: Of the image, see :class:`~mapper.core.frames.RgbdFrame`.
         depth_cells: The depth image, reduced; None if it is not aligned.
         grey_cells: (R, C) uint8 mean grey level in each of its cells; None without them.
+        depth_delay_s: Time from the frame's stamp to the depth image's.
         unswept: The observation without a motion, which this one is made from; None if that is itself.
     """
 
@@ -75,6 +76,7 @@ class ImageObservation(Archivable):
     image_checksum: int | None
     depth_cells: DepthCells | None = None
     grey_cells: NDArray[np.uint8] | None = None
+    depth_delay_s: float = 0.0
     unswept: "ImageObservation | None" = None
 
     def __len__(self) -> int:
@@ -210,6 +212,7 @@ def observe_image(
         "image_checksum": frame.image_checksum,
         "depth_cells": cells,
         "grey_cells": None if cells is None else cells.mean_of(frame.gray),
+        "depth_delay_s": frame.depth_delay_s,
     }
     return _unswept(measured, config.depth_residual)
 

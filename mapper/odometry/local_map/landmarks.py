@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.geometry import Array, Transform, apply, inverse
+from mapper.odometry.local_map.bundle import Bundle
 from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameter
-from mapper.odometry.local_map.focal_length import Bundle
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.keyframe import DepthLink, Keyframe, RecentObservations, packed, unpacked
 from mapper.odometry.local_map.landmark_kernels import count_observers, observations_of
@@ -298,10 +298,12 @@ class LandmarkMap:
         among = np.isin(observed_in, keyframes)
         rows = np.repeat(np.arange(len(landmarks)), np.diff(first))[among]
         edges = np.column_stack([np.searchsorted(keyframes, observed_in[among]), rows]).astype(np.int32)
+        first_observation = np.array([self._first_observation[k] for k in keyframes])
         return Bundle(
             poses=np.array([self.keyframes[k].T_camera_world for k in keyframes]),
             points=self.landmarks["position"][landmarks],
             edges=edges,
+            features=observations[among] - first_observation[edges[:, 0]],
             measured=self._measured(observations[among]),
             weights=self._observations["weights"][observations[among]],
             intrinsics=self.observation(keyframes[-1]).intrinsics,

@@ -23,9 +23,11 @@ from mapper.odometry.base import (
     lost_frame,
 )
 from mapper.odometry.config import KeyframeOdometryConfig
+from mapper.odometry.local_map.bundle import WINDOW_KEYFRAMES
+from mapper.odometry.local_map.depth_offset import DepthOffsetCheck
 from mapper.odometry.local_map.depth_tracker import DepthTracker
 from mapper.odometry.local_map.earlier_depth import EarlierDepth
-from mapper.odometry.local_map.focal_length import WINDOW_KEYFRAMES, FocalLengthCheck
+from mapper.odometry.local_map.focal_length import FocalLengthCheck
 from mapper.odometry.local_map.frame_doubts import NO_DOUBT, Doubt, FrameDoubts
 from mapper.odometry.local_map.image_observation import ImageObservation, observe_image
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
@@ -92,6 +94,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._doubts = FrameDoubts()
         self._residuals = LogResiduals()
         self._focal_length = FocalLengthCheck()
+        self._depth_offset = DepthOffsetCheck()
         self._agreeing = np.zeros(0, np.bool_)  # features by which the last frame was tracked
         self._lost_frames = 0  # since the last tracked one
         self._unknown_frames = 0  # those of them with enough features to begin a sub-map
@@ -117,6 +120,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             return self._not_found(observation)
         if follows:
             tracked_pose = self._shutter.refined(tracked_pose, last, self._positions_of(tracked_pose))
+            self._pass_keyframe(tracked_pose, last)
         observation = tracked_pose.observation
         information = frame_information(self._map, tracked_pose)
         expected = None if self._lost_frames else predicted(observation.stamp_ns, last, self._before_last)
@@ -182,11 +186,14 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         return [self._readout.sentence] if self._readout.sentence else []
 
     def calibration_doubts(self) -> Sequence[str]:
-        """Return whether the images contradict the focal length that they are said to have."""
+        """Return what in the images contradicts their focal length, and the stamps of their depth."""
         if not self._map.keyframes:
             return ()
-        doubt = self._focal_length.contradiction(self._map.observation(0).intrinsics[0])
-        return (doubt,) if doubt else ()
+        doubts = (
+            self._focal_length.contradiction(self._map.observation(0).intrinsics[0]),
+            self._depth_offset.contradiction(),
+        )
+        return [doubt for doubt in doubts if doubt]
 
     def finish(self) -> Sequence[BetweenFactor]:
         """Return a factor from every keyframe to those earlier ones that share most landmarks with it.
@@ -315,7 +322,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._map.refine(index, window=config.bundle_keyframes)
         self._map.follow_readout()
         self._map.cull()
-        self._check_focal_length()
+        self._check_calibration()
         if (statistics := keyframe_residuals(self._map, index)) is not None:
             self._residuals.add(statistics)
         self._decision.restart()
@@ -329,13 +336,26 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             reference=index,
         )
 
-    def _check_focal_length(self) -> None:
+    def _pass_keyframe(self, tracked_pose: TrackedPose, last: TrackedPose) -> None:
+        """Learn the velocity of a keyframe from the frame after it."""
+        before = self._before_last
+        if before is not None and self._map.keyframes[last.reference].stamp_ns == last.stamp_ns:
+            around = ((pose.stamp_ns, pose.T_camera_world) for pose in (before, tracked_pose))
+            self._depth_offset.pass_keyframe(last.reference, *around)
+
+    def _check_calibration(self) -> None:
         """Check the newest keyframes of a sub-map together, once there are enough since the last check."""
         newest = range(len(self._map.keyframes) - WINDOW_KEYFRAMES, len(self._map.keyframes))
         origins = {self._map.keyframes[k].origin for k in newest if k >= 0}
-        if len(self._map.keyframes) % WINDOW_KEYFRAMES or len(origins) > 1 or self._focal_length.is_complete:
+        if len(self._map.keyframes) % WINDOW_KEYFRAMES or len(origins) > 1:
             return
-        self._focal_length.add(self._map.bundle(newest))
+        if self._focal_length.is_complete and self._depth_offset.is_complete:
+            return
+        bundle = self._map.bundle(newest)
+        if not self._focal_length.is_complete:
+            self._focal_length.add(bundle)
+        if not self._depth_offset.is_complete:
+            self._depth_offset.add(bundle, newest, [self._map.observation(k) for k in newest])
 
     def _result(
         self,

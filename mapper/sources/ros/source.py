@@ -1,7 +1,7 @@
 """Logs of MCAP files and ROS bags."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mapper.core.errors import SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera, Sensor
@@ -76,6 +76,7 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
             "the camera; leave it out, or choose clouds with source.topics.points=…"
         )
     color, depth = topics.color, topics.depth
+    depth = replace(depth, stamps_ns=depth.stamps_ns + config.depth_offset_ns)
     where = f"{reader.recording.path}"
     i, j, notes = paired(color, depth, max_gap_s=config.max_pair_gap_s, where=where)
     first_color, first_depth = _first_image(reader, color), _first_image(reader, depth)

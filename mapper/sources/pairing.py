@@ -1,0 +1,71 @@
+"""Pairs of colour and depth images that are files, by their stamps."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mapper.core.errors import SourceError
+from mapper.core.timebase import NS_PER_S, Stamps, nearest
+from mapper.sources.config import SourceConfig
+from mapper.sources.rgbd import FramePair, unpaired_note
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageList:
+    """Images of one kind.
+
+    Attributes:
+        stamps_ns: (N,) increasing.
+        paths: Their files.
+    """
+
+    stamps_ns: Stamps
+    paths: list[Path]
+
+
+def pair_images(
+    colour: ImageList, depth: ImageList, config: SourceConfig, *, path: Path
+) -> tuple[list[FramePair], list[str]]:
+    """Return each colour image with the nearest depth image, and a note on those that have none.
+
+    Depth images are ``source.depth_offset_s`` later than their stamps, and at most ``source.max_pair_gap_s``
+    from a colour image.
+
+    Raises:
+        SourceError: Nothing pairs.
+    """
+    max_gap_s, depth_stamps_ns = config.max_pair_gap_s, depth.stamps_ns + config.depth_offset_ns
+    partner, gap_ns = nearest(depth_stamps_ns, colour.stamps_ns)
+    paired = np.flatnonzero(gap_ns <= round(max_gap_s * NS_PER_S))
+    if len(paired) == 0:
+        raise SourceError(
+            f"{path}: no colour image has a depth image within {max_gap_s * 1e3:g} ms; "
+            f"the closest pair is {int(gap_ns.min()) / NS_PER_S:g} s apart (source.max_pair_gap_s)"
+        )
+    pairs = [
+        FramePair(
+            stamp_ns=int(colour.stamps_ns[i]),
+            colour=colour.paths[i],
+            depth_stamp_ns=int(depth_stamps_ns[partner[i]]),
+            depth=depth.paths[partner[i]],
+        )
+        for i in paired
+    ]
+    return pairs, unpaired_note(len(gap_ns) - len(pairs), len(gap_ns), max_gap_s=max_gap_s)
+
+
+def pair_anew(
+    pairs: Sequence[FramePair], config: SourceConfig, *, path: Path
+) -> tuple[Sequence[FramePair], list[str]]:
+    """Return a format's own pairs, or those of other images if ``source.depth_offset_s`` shifts their depth.
+
+    Raises:
+        SourceError: Nothing pairs.
+    """
+    if config.depth_offset_ns == 0:
+        return pairs, []
+    colour = ImageList(np.array([pair.stamp_ns for pair in pairs]), [pair.colour for pair in pairs])
+    stamps_ns, first = np.unique([pair.depth_stamp_ns for pair in pairs], return_index=True)
+    return pair_images(colour, ImageList(stamps_ns, [pairs[i].depth for i in first]), config, path=path)

@@ -1,0 +1,217 @@
+"""The check of the time between colour and depth images."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapper.config.loading import load_config
+from mapper.core.frames import PinholeCamera
+from mapper.core.geometry import apply, exp, inverse, log
+from mapper.core.timebase import NS_PER_S, seconds_text_from_ns
+from mapper.odometry.config import LocalMapConfig
+from mapper.odometry.factory import build_frame_odometry
+from mapper.odometry.local_map.bundle import WINDOW_KEYFRAMES, Bundle
+from mapper.odometry.local_map.depth_offset import DepthOffsetCheck, ShiftedDepth
+from mapper.odometry.local_map.depth_surfaces import depth_cells, surface_of
+from mapper.pipeline.track import track_log
+from mapper.runtime.progress import SILENT
+from mapper.sources import open_source
+from mapper.sources.writers import write_log
+from tests.support.desk_frames import ate_rmse_m, desk_frames, desk_walk
+
+CAMERA = PinholeCamera(320, 240, 262.0, 260.0, 159.5, 119.5)
+INTRINSICS = np.array([262.0, 260.0, 159.5, 119.5, 40.0])
+FRAME_S = 1.0 / 30.0
+NORMALS = np.array([[0.3, 0.1, 1.0], [-0.8, 0.2, 0.6], [0.1, 0.9, 0.4]])
+NORMALS /= np.linalg.norm(NORMALS, axis=1, keepdims=True)
+HEIGHTS_M = np.array([2.5, 1.6, 1.2])
+"""A corner of three walls, n · x = h, in the world."""
+
+
+@pytest.fixture(scope="module")
+def any_observation():
+    return build_frame_odometry(LocalMapConfig()).observe(desk_frames()[0])
+
+
+def inverse_depth(T_camera_world, pixels):
+    """Return 1 / z of the walls at pixels, exactly."""
+    rays = np.column_stack([(pixels - INTRINSICS[2:4]) / INTRINSICS[:2], np.ones(len(pixels))])
+    T_world_camera = inverse(T_camera_world)
+    heights_m = HEIGHTS_M - NORMALS @ T_world_camera[:3, 3]
+    return (rays @ T_world_camera[:3, :3].T @ NORMALS.T / heights_m).max(axis=1)
+
+
+def depth_image(T_camera_world):
+    columns, rows = np.meshgrid(np.arange(CAMERA.width_px), np.arange(CAMERA.height_px))
+    inverses = inverse_depth(T_camera_world, np.column_stack([columns.ravel(), rows.ravel()]))
+    return (1.0 / inverses).astype(np.float32).reshape(CAMERA.height_px, CAMERA.width_px)
+
+
+def observed(any_observation, T_camera_world, pixels, *, depth_delay_s=0.0):
+    """Return an observation of features at pixels whose depth image is taken at a pose."""
+    return replace(
+        any_observation,
+        pixels=pixels,
+        depth_m=np.ones(len(pixels)),
+        intrinsics=INTRINSICS,
+        depth_cells=depth_cells(depth_image(T_camera_world), CAMERA),
+        depth_delay_s=depth_delay_s,
+    )
+
+
+class Walk:
+    """A camera's motion by hand, with changing velocity."""
+
+    def __init__(self, rng, *, constant=False):
+        self.constant = constant
+        self.sizes = np.repeat([0.08, 0.1], 3) * rng.uniform(0.7, 1.3, 6)
+        self.rates = rng.uniform(3.0, 7.0, 6)
+        self.phases = rng.uniform(0.0, 6.0, 6)
+
+    def pose(self, time_s):
+        """Return T_camera_world."""
+        if self.constant:
+            return inverse(exp(np.zeros(3), np.array([0.3, 0.1, 0.2]) * (time_s - 0.7)))
+        twist = self.sizes * np.sin(self.rates * time_s + self.phases)
+        return inverse(exp(twist[:3], twist[3:]))
+
+
+def window(rng, any_observation, walk, *, offset_s, noise=1.0):
+    """Return a bundle of keyframes, what they observe, and where they are."""
+    times_s = 0.15 * np.arange(WINDOW_KEYFRAMES)
+    rays = np.column_stack([rng.uniform(-0.6, 0.6, 150), rng.uniform(-0.45, 0.45, 150), np.ones(150)])
+    pixels = rays[:, :2] * INTRINSICS[:2] + INTRINSICS[2:4]
+    z = 1.0 / inverse_depth(np.eye(4), pixels)
+    points = rays * z[:, np.newaxis]
+    edges, features, measured, observations = [], [], [], []
+    for k, time_s in enumerate(times_s):
+        x, y, z = apply(walk.pose(time_s), points).T
+        pixels = np.column_stack([x / z, y / z]) * INTRINSICS[:2] + INTRINSICS[2:4]
+        T_depth = walk.pose(time_s + offset_s)
+        observations.append(observed(any_observation, T_depth, pixels))
+        in_view = np.flatnonzero((pixels >= 0).all(axis=1) & (pixels <= [319, 239]).all(axis=1))
+        disparities = INTRINSICS[4] * inverse_depth(T_depth, pixels)
+        edges += [(k, p) for p in in_view]
+        features += in_view.tolist()
+        measured += np.column_stack([pixels, disparities])[in_view].tolist()
+    order = np.argsort(np.array(edges)[:, 1], kind="stable")
+    sigma_px = np.array([0.5, 0.5, 0.3])
+    bundle = Bundle(
+        poses=np.array([walk.pose(time_s) for time_s in times_s]),
+        points=points,
+        edges=np.array(edges, np.int32)[order],
+        features=np.array(features)[order],
+        measured=np.array(measured)[order] + rng.normal(0.0, noise * sigma_px, (len(order), 3)),
+        weights=np.tile(sigma_px**-2, (len(order), 1)),
+        intrinsics=INTRINSICS,
+    )
+    return bundle, observations, times_s
+
+
+def checked(any_observation, *, offset_s, delay_s=0.0, windows=4, constant=False):
+    """Return a check that was given windows of keyframes whose depth images are late."""
+    rng = np.random.default_rng(5)
+    check = DepthOffsetCheck()
+    for n in range(windows):
+        walk = Walk(rng, constant=constant)
+        keyframes = range(n * WINDOW_KEYFRAMES, (n + 1) * WINDOW_KEYFRAMES)
+        bundle, observations, times_s = window(rng, any_observation, walk, offset_s=offset_s)
+        for keyframe, time_s in zip(keyframes, times_s, strict=True):
+            around = ((round(t * NS_PER_S), walk.pose(t)) for t in (time_s - FRAME_S, time_s + FRAME_S))
+            check.pass_keyframe(keyframe, *around)
+        check.add(bundle, keyframes, [replace(o, depth_delay_s=delay_s) for o in observations])
+    return check
+
+
+def test_depth_is_taken_where_points_were_when_it_was_measured(any_observation):
+    rng = np.random.default_rng(0)
+    walk, offset_s = Walk(rng), 0.04
+    bundle, observations, times_s = window(rng, any_observation, walk, offset_s=offset_s, noise=0.0)
+    twists = [
+        np.concatenate(log(walk.pose(t) @ inverse(walk.pose(t + offset_s)))) / offset_s for t in times_s
+    ]
+    depth = ShiftedDepth(bundle, observations, [*twists[:-1], None])
+    exact_px = INTRINSICS[4] / bundle.points_camera()[:, 2]
+    before_px, found_px = (depth.corrected(bundle, value).measured[:, 2] for value in (0.0, offset_s))
+    known = ~np.isnan(found_px)
+    assert known.mean() > 0.6
+    assert not known[bundle.edges[:, 0] == WINDOW_KEYFRAMES - 1].any()
+    assert np.nanmedian(np.abs(found_px - exact_px)) < 0.1 * np.nanmedian(np.abs(before_px - exact_px))
+    step_s = 1e-5
+    behind, ahead = (depth.corrected(bundle, offset_s + h).measured[:, 2] for h in (-step_s, step_s))
+    slopes = depth.slopes(bundle, offset_s)[:, 2]
+    assert np.nanmedian(np.abs((ahead - behind) / (2.0 * step_s) - slopes)) < 1e-4 * np.abs(slopes).max()
+
+
+def test_nothing_is_known_without_planes(any_observation):
+    pixels = np.array([[100.0, 100.0], [-5.0, 90.0], [330.0, 90.0], [100.0, 300.0]])
+    observation = observed(any_observation, np.eye(4), pixels)
+    found = surface_of(observation.depth_cells).planes_at(pixels)
+    assert (found[:, 3] > 0.0).tolist() == [True, False, False, False]
+    x, y, z = np.append((pixels[0] - INTRINSICS[2:4]) / INTRINSICS[:2], 1.0)
+    assert found[0, :3] @ [x, y, z] / found[0, 3] == pytest.approx(
+        inverse_depth(np.eye(4), pixels[:1])[0], rel=0.01
+    )
+
+
+@pytest.mark.parametrize("offset_s", [-0.066, -0.033, 0.0, 0.033, 0.066])
+def test_the_offset_is_estimated(any_observation, offset_s):
+    check = checked(any_observation, offset_s=offset_s)
+    found_s, sigma_s = check.estimate()
+    assert sigma_s < 0.003
+    assert abs(found_s - offset_s) < 4.0 * sigma_s + 0.1 * abs(offset_s)
+    doubt = check.contradiction()
+    if offset_s == 0.0:
+        assert doubt == ""
+    else:
+        assert f"add {found_s:.3f} to source.depth_offset_s" in doubt
+        assert ("later" in doubt) == (offset_s > 0.0)
+
+
+def test_an_offset_that_the_stamps_tell_is_none(any_observation):
+    found_s, sigma_s = checked(any_observation, offset_s=0.033, delay_s=0.033).estimate()
+    assert abs(found_s) < 4.0 * sigma_s
+
+
+def test_constant_velocity_hardly_tells_it(any_observation):
+    checks = [checked(any_observation, offset_s=0.033, constant=constant) for constant in (False, True)]
+    sigmas_s = [check.estimate()[1] for check in checks]
+    assert sigmas_s[1] > 5.0 * sigmas_s[0]
+
+
+def test_few_windows_contradict_nothing(any_observation):
+    check = checked(any_observation, offset_s=0.066, windows=2)
+    assert check.estimate() == (0.0, math.inf)
+    assert check.contradiction() == ""
+
+
+def test_a_late_depth_camera_is_told_and_mended(tmp_path):
+    walk = desk_walk()
+    write_log(walk, tmp_path, kind="tum")
+    depth_list = tmp_path / "depth.txt"
+    images = [line.split()[1] for line in depth_list.read_text().splitlines() if not line.startswith("#")]
+    frame_ns = int(walk.stamps_ns[1] - walk.stamps_ns[0])
+    late = [
+        f"{seconds_text_from_ns(int(stamp_ns) - frame_ns)} {image}\n"
+        for stamp_ns, image in zip(walk.stamps_ns[1:], images[1:], strict=True)
+    ]
+    depth_list.write_text("".join(late))
+    doubt, error_m = tracked(tmp_path)
+    assert "ms later than colour images of the same stamps" in doubt
+    offset_s = float(doubt.split("add ")[1].split(" to source.depth_offset_s")[0])
+    assert abs(offset_s - frame_ns / NS_PER_S) < 0.01
+    mended, mended_m = tracked(tmp_path, f"source.depth_offset_s={offset_s}")
+    assert mended == ""
+    assert mended_m < 0.8 * error_m
+
+
+def tracked(folder, *overrides):
+    """Return the warning about the camera, if any, and the ATE."""
+    settings = ["odometry.max_keyframe_gap=1", "loops.kind=none", *overrides]
+    config = load_config(None, settings, sensor="rgbd")
+    source = open_source(folder, config.source)
+    result = track_log(source, config, progress=SILENT)
+    doubts = [warning.sentence for warning in result.warnings if warning.kind == "camera"]
+    return "".join(doubts), ate_rmse_m(result.trajectory(), desk_walk().truth)
