@@ -1,8 +1,8 @@
 """Bundles of a few keyframes by themselves, and parameters of the sensor that are common to them."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,9 @@ from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameter
 
 WINDOW_KEYFRAMES = 10
 """Keyframes that are adjusted by themselves: neighbours outside would hold them to the parameter given."""
-_MIN_OBSERVERS = 3
 _ROUNDS, _ITERATIONS = 2, 10
 _MAX_WINDOWS = 16
+_CONVERGED_SIGMAS = 0.05
 _NO_LINKS = np.empty((0, 2), np.int32), np.empty((0, 4, 4)), np.empty((0, 6, 6))
 
 
@@ -40,10 +40,10 @@ class Bundle:
     weights: Array
     intrinsics: Array
 
-    def of_shared_points(self) -> "Bundle":
-        """Return the bundle without the points that fewer than three keyframes observe."""
+    def of_points_seen_by(self, keyframes: int) -> "Bundle":
+        """Return the bundle without the points that fewer keyframes observe."""
         observers = np.bincount(self.edges[:, 1], minlength=len(self.points))
-        kept = (observers >= _MIN_OBSERVERS)[self.edges[:, 1]]
+        kept = (observers >= keyframes)[self.edges[:, 1]]
         points, rows = np.unique(self.edges[kept, 1], return_inverse=True)
         return replace(
             self,
@@ -62,30 +62,21 @@ class Bundle:
         return points
 
 
-class CommonParameter(Protocol):
-    """Parameter of the sensor that all observations of a bundle share."""
-
-    def corrected(self, bundle: Bundle, value: float, /) -> Bundle:
-        """Return the bundle with measurements or intrinsics that allow for a value of the parameter."""
-        ...
-
-    def slopes(self, bundle: Bundle, value: float, /) -> Array:
-        """Return the (E, 2 or 3) change of the corrected bundle's residuals with the parameter."""
-        ...
+Corrected = Callable[[Bundle, float], tuple[Bundle, Array]]
+"""Returns a bundle with measurements or intrinsics that allow for a value of a parameter, and the (E, 2 or 3)
+change of its residuals with the parameter. The value 0 is what the bundle was measured with."""
 
 
-def estimated(
-    bundle: Bundle, parameter: CommonParameter, *, steps: int, max_step: float
-) -> tuple[float, float]:
-    """Return a parameter's value and its information; both 0 if nothing tells it.
+def estimated(bundle: Bundle, corrected: Corrected, *, steps: int, max_step: float) -> tuple[float, float]:
+    """Return the value of a parameter of the sensor and its information; both 0 if nothing tells it.
 
     It is one more unknown of a bundle adjustment (Triggs et al. 2000, §2.2), whose first keyframe stays where
     it is.
 
     Args:
         bundle: Keyframes that share their points.
-        parameter: What is common to all observations; 0 leaves them as they are.
-        steps: Number of Gauss–Newton steps, each after an adjustment.
+        corrected: How the parameter changes the bundle.
+        steps: Largest number of Gauss–Newton steps, each after an adjustment.
         max_step: Largest change of the parameter at each of them.
     """
     value = information = 0.0
@@ -94,15 +85,17 @@ def estimated(
     first_edge = np.searchsorted(bundle.edges[:, 1], np.arange(len(bundle.points) + 1)).astype(np.int32)
     free = np.arange(-1, len(bundle.poses) - 1, dtype=np.int32)
     for _ in range(steps):
-        at = parameter.corrected(bundle, value)
+        at, slopes = corrected(bundle, value)
         observed = first_edge, at.edges, at.measured, at.weights, at.intrinsics
         poses, points, agree = adjust(at.poses, free, at.points, *observed, _NO_LINKS, _ROUNDS, _ITERATIONS)
         bundle = replace(bundle, poses=poses, points=points)
-        slopes = parameter.slopes(bundle, value)
         information, gradient = common_parameter(poses, free, points, *observed, agree, slopes)
         if information <= 0.0:
             return 0.0, 0.0
-        value += float(np.clip(-gradient / information, -max_step, max_step))
+        step = float(np.clip(-gradient / information, -max_step, max_step))
+        value += step
+        if abs(step) * math.sqrt(information) < _CONVERGED_SIGMAS:
+            break
     return value, information
 
 

@@ -12,8 +12,8 @@ from mapper.odometry.local_map.depth_surfaces import surface_of
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.pixel_motion import depth_velocity, pixel_velocity
 
-_MIN_WINDOWS = 3
-_STEPS, _MAX_STEP_S = 4, 0.05
+_MIN_WINDOWS, _MIN_OBSERVERS = 3, 3
+_STEPS, _MAX_STEP_S = 8, 0.05
 _MIN_OFFSET_S, _MIN_SIGMAS = 0.02, 4.0
 """Images so far apart are still paired, by default."""
 _MAX_APART_S = 0.3
@@ -55,11 +55,11 @@ class DepthOffsetCheck:
 
     def add(self, bundle: Bundle, keyframes: Sequence[int], observed: Sequence[ImageObservation]) -> None:
         """Add a window of keyframes with what was observed in them."""
-        bundle = bundle.of_shared_points()
+        bundle = bundle.of_points_seen_by(_MIN_OBSERVERS)
         twists = [self._twists.get(keyframe) for keyframe in keyframes]
         self._twists.clear()
         depth = ShiftedDepth(bundle, observed, twists)
-        self._offsets_s.add(*estimated(bundle, depth, steps=_STEPS, max_step=_MAX_STEP_S))
+        self._offsets_s.add(*estimated(bundle, depth.corrected, steps=_STEPS, max_step=_MAX_STEP_S))
 
     def estimate(self) -> tuple[float, float]:
         """Return the offset and its standard deviation, seconds, by all windows."""
@@ -98,19 +98,23 @@ class ShiftedDepth:
                 surface = surface_of(observation.depth_cells)
                 self._views.append((edges, pixels, surface, twist, observation.depth_delay_s))
 
-    def corrected(self, bundle: Bundle, offset_s: float, /) -> Bundle:
+    def corrected(self, bundle: Bundle, offset_s: float) -> tuple[Bundle, Array]:
         """Return the bundle with the disparities of points from where they were when depth was measured.
 
         Points that were on no plane then have no depth.
-        """
-        disparity_px, _ = self._disparity(bundle, offset_s)
-        disparity_px[np.isnan(bundle.measured[:, 2])] = np.nan
-        return replace(bundle, measured=np.column_stack([bundle.measured[:, :2], disparity_px]))
 
-    def slopes(self, bundle: Bundle, offset_s: float, /) -> Array:
-        """Return the (E, 3) change of the corrected bundle's residuals with the offset, px/s."""
-        _, slope = self._disparity(bundle, offset_s)
-        return np.column_stack([np.zeros((len(slope), 2)), np.nan_to_num(slope)])
+        Args:
+            bundle: The one of the beginning, perhaps adjusted.
+            offset_s: By how much depth was measured later than its stamps tell.
+
+        Returns:
+            The bundle, and the (E, 3) change of its residuals with the offset, px/s.
+        """
+        disparity_px, slope = self._disparity(bundle, offset_s)
+        disparity_px[np.isnan(bundle.measured[:, 2])] = np.nan
+        measured = np.column_stack([bundle.measured[:, :2], disparity_px])
+        slopes = np.column_stack([np.zeros((len(slope), 2)), np.nan_to_num(slope)])
+        return replace(bundle, measured=measured), slopes
 
     def _disparity(self, bundle: Bundle, offset_s: float) -> tuple[Array, Array]:
         """Return the (E,) corrected disparities and their derivatives; NaN where they are unknown."""

@@ -7,7 +7,7 @@ import numpy as np
 from mapper.core.geometry import Array
 from mapper.odometry.local_map.bundle import Bundle, WindowEstimates, estimated
 
-_MIN_WINDOWS = 4
+_MIN_WINDOWS, _MIN_OBSERVERS = 4, 3
 _STEPS, _MAX_STEP = 2, 0.1
 _MIN_ERROR, _MIN_SIGMAS = 0.03, 4.0
 """Smaller relative errors are usual: lens distortion that is not modelled, and makers' nominal values."""
@@ -30,8 +30,8 @@ class FocalLengthCheck:
 
     def add(self, bundle: Bundle) -> None:
         """Add a window of keyframes."""
-        shared = bundle.of_shared_points()
-        self._errors.add(*estimated(shared, _FocalLengthError(), steps=_STEPS, max_step=_MAX_STEP))
+        seen = bundle.of_points_seen_by(_MIN_OBSERVERS)
+        self._errors.add(*estimated(seen, _stretched, steps=_STEPS, max_step=_MAX_STEP))
 
     def estimate(self) -> tuple[float, float]:
         """Return the relative error of the given focal length and its standard deviation, by all windows."""
@@ -49,13 +49,10 @@ class FocalLengthCheck:
         )
 
 
-class _FocalLengthError:
-    """Relative error of the focal lengths; see ``CommonParameter``."""
-
-    def corrected(self, bundle: Bundle, value: float, /) -> Bundle:
-        scale = 1.0 + value
-        return replace(bundle, intrinsics=bundle.intrinsics * [scale, scale, 1.0, 1.0, 1.0])
-
-    def slopes(self, bundle: Bundle, _value: float, /) -> Array:
-        x, y, z = bundle.points_camera().T
-        return -np.column_stack([bundle.intrinsics[0] * x / z, bundle.intrinsics[1] * y / z])
+def _stretched(bundle: Bundle, error: float) -> tuple[Bundle, Array]:
+    """Return the bundle with other focal lengths, and the slopes of u and v."""
+    x, y, z = bundle.points_camera().T
+    fx_px, fy_px = bundle.intrinsics[:2]
+    scale = 1.0 + error
+    slopes = -np.column_stack([fx_px * x / z, fy_px * y / z])
+    return replace(bundle, intrinsics=bundle.intrinsics * [scale, scale, 1.0, 1.0, 1.0]), slopes
