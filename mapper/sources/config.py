@@ -6,7 +6,6 @@ from typing import Self
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from mapper.core.config import Config
-from mapper.core.timebase import NS_PER_S
 
 
 class CameraConfig(Config):
@@ -135,8 +134,3 @@ class SourceConfig(Config):
     """Poses of a LiDAR log, in TUM's or KITTI's text; None looks for groundtruth.txt and poses.txt."""
     cloud_scale: PositiveFloat | None = None
     """Metres per unit of a LiDAR log's files; None is 1, and refuses what looks like millimetres."""
-
-    @property
-    def depth_offset_ns(self) -> int:
-        """``depth_offset_s`` in nanoseconds."""
-        return round(self.depth_offset_s * NS_PER_S)

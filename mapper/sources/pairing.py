@@ -25,6 +25,11 @@ class ImageList:
     paths: list[Path]
 
 
+def depth_offset_ns(config: SourceConfig) -> int:
+    """Return what is added to the stamps of depth images, nanoseconds."""
+    return round(config.depth_offset_s * NS_PER_S)
+
+
 def pair_images(
     colour: ImageList, depth: ImageList, config: SourceConfig, *, path: Path
 ) -> tuple[list[FramePair], list[str]]:
@@ -36,7 +41,7 @@ def pair_images(
     Raises:
         SourceError: Nothing pairs.
     """
-    max_gap_s, depth_stamps_ns = config.max_pair_gap_s, depth.stamps_ns + config.depth_offset_ns
+    max_gap_s, depth_stamps_ns = config.max_pair_gap_s, depth.stamps_ns + depth_offset_ns(config)
     partner, gap_ns = nearest(depth_stamps_ns, colour.stamps_ns)
     paired = np.flatnonzero(gap_ns <= round(max_gap_s * NS_PER_S))
     if len(paired) == 0:
@@ -64,7 +69,7 @@ def pair_anew(
     Raises:
         SourceError: Nothing pairs.
     """
-    if config.depth_offset_ns == 0:
+    if depth_offset_ns(config) == 0:
         return pairs, []
     colour = ImageList(np.array([pair.stamp_ns for pair in pairs]), [pair.colour for pair in pairs])
     stamps_ns, first = np.unique([pair.depth_stamp_ns for pair in pairs], return_index=True)

@@ -10,6 +10,7 @@ from mapper.sources.base import FrameRef, Log
 from mapper.sources.calibration import Calibration, configured
 from mapper.sources.config import SourceConfig
 from mapper.sources.images import FINE_UNITS_PER_M
+from mapper.sources.pairing import depth_offset_ns
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry
 from mapper.sources.ros.image_messages import MILLIMETRES_PER_M, has_float_depth, size_of
 from mapper.sources.ros.index import Series
@@ -76,7 +77,7 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
             "the camera; leave it out, or choose clouds with source.topics.points=…"
         )
     color, depth = topics.color, topics.depth
-    depth = replace(depth, stamps_ns=depth.stamps_ns + config.depth_offset_ns)
+    depth = replace(depth, stamps_ns=depth.stamps_ns + depth_offset_ns(config))
     where = f"{reader.recording.path}"
     i, j, notes = paired(color, depth, max_gap_s=config.max_pair_gap_s, where=where)
     first_color, first_depth = _first_image(reader, color), _first_image(reader, depth)
