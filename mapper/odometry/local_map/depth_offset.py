@@ -16,6 +16,8 @@ _MIN_WINDOWS, _MIN_OBSERVERS = 3, 3
 _STEPS, _MAX_STEP_S = 8, 0.05
 _MIN_OFFSET_S, _MIN_SIGMAS = 0.02, 4.0
 """Images so far apart are still paired, by default."""
+_MOST_UNKNOWN = 3
+"""Keyframes without a known velocity, as where something moves by itself, of the ten of a window."""
 _MAX_APART_S = 0.3
 """Poses farther apart tell no velocity in between."""
 
@@ -55,9 +57,11 @@ class DepthOffsetCheck:
 
     def add(self, bundle: Bundle, keyframes: Sequence[int], observed: Sequence[ImageObservation]) -> None:
         """Add a window of keyframes with what was observed in them."""
-        bundle = bundle.of_points_seen_by(_MIN_OBSERVERS)
         twists = [self._twists.get(keyframe) for keyframe in keyframes]
         self._twists.clear()
+        if sum(twist is None for twist in twists) > _MOST_UNKNOWN:
+            return
+        bundle = bundle.of_points_seen_by(_MIN_OBSERVERS)
         depth = ShiftedDepth(bundle, observed, twists)
         self._offsets_s.add(*estimated(bundle, depth.corrected, steps=_STEPS, max_step=_MAX_STEP_S))
 

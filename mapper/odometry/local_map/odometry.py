@@ -337,9 +337,11 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         )
 
     def _pass_keyframe(self, tracked_pose: TrackedPose, last: TrackedPose) -> None:
-        """Learn the velocity of a keyframe from the frame after it."""
-        before = self._before_last
-        if before is not None and self._map.keyframes[last.reference].stamp_ns == last.stamp_ns:
+        """Learn the velocity of a keyframe from the frame after it, unless something moves by itself."""
+        before, keyframe = self._before_last, self._map.keyframes[last.reference]
+        if before is None or keyframe.stamp_ns != last.stamp_ns:
+            return
+        if all(pose.few_move for pose in (before, last, tracked_pose)):
             around = ((pose.stamp_ns, pose.T_camera_world) for pose in (before, tracked_pose))
             self._depth_offset.pass_keyframe(last.reference, *around)
 
