@@ -1,6 +1,6 @@
 """Check of the time between colour and depth images: sensors that are not synchronised bend every map."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -55,8 +55,8 @@ class DepthOffsetCheck:
             moved = log(before[1] @ inverse(after[1]))
             self._twists[keyframe] = np.concatenate(moved) / elapsed_s
 
-    def add(self, bundle: Bundle, keyframes: Sequence[int], observed: Sequence[ImageObservation]) -> None:
-        """Add a window of keyframes with what was observed in them."""
+    def add(self, bundle: Bundle, keyframes: Sequence[int], observed: Iterable[ImageObservation]) -> None:
+        """Add a window of keyframes with what was observed in them, which is asked for only if it tells."""
         twists = [self._twists.get(keyframe) for keyframe in keyframes]
         self._twists.clear()
         if sum(twist is None for twist in twists) > _MOST_UNKNOWN:
@@ -85,7 +85,7 @@ class ShiftedDepth:
     """Depth of a bundle's observations at the time of their colour images, where depth was measured later."""
 
     def __init__(
-        self, bundle: Bundle, observed: Sequence[ImageObservation], twists_camera: Sequence[Array | None]
+        self, bundle: Bundle, observed: Iterable[ImageObservation], twists_camera: Sequence[Array | None]
     ) -> None:
         """Fit planes to the depth images.
 

@@ -140,11 +140,11 @@ class FrameDoubts:
 
     def _exceeds_usual(self, jump: tuple[float, float], elapsed_s: float, ratio: float) -> bool:
         """Return whether the angle or the distance to the predicted pose is so many times the usual."""
-        usual = (self._usual(name) * elapsed_s for name in ("jump_rad_s", "jump_m_s"))
+        usual = self._usual_jump(elapsed_s)
         return any(miss > ratio * expected > 0.0 for miss, expected in zip(jump, usual, strict=True))
 
     def _jumps(self, jump: tuple[float, float], elapsed_s: float) -> list[str]:
-        usual_rad, usual_m = (self._usual(name) * elapsed_s for name in ("jump_rad_s", "jump_m_s"))
+        usual_rad, usual_m = self._usual_jump(elapsed_s)
         phrases = []
         if usual_rad and jump[0] > _JUMP_RATIO * usual_rad:
             phrases.append(
@@ -154,6 +154,10 @@ class FrameDoubts:
         if usual_m and jump[1] > _JUMP_RATIO * usual_m:
             phrases.append(f"jump of {jump[1]:.2f} m off the predicted place, {usual_m:.2f} m is usual")
         return phrases
+
+    def _usual_jump(self, elapsed_s: float) -> tuple[float, float]:
+        """Return the usual angle and distance to the predicted pose after a time; 0 while unknown."""
+        return self._usual("jump_rad_s") * elapsed_s, self._usual("jump_m_s") * elapsed_s
 
     def _usual(self, name: str) -> float:
         """Return the median of a figure; 0 while too little is known."""

@@ -357,7 +357,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         if not self._focal_length.is_complete:
             self._focal_length.add(bundle)
         if not self._depth_offset.is_complete:
-            self._depth_offset.add(bundle, newest, [self._map.observation(k) for k in newest])
+            self._depth_offset.add(bundle, newest, map(self._map.observation, newest))
 
     def _result(
         self,
