@@ -14,12 +14,20 @@ from mapper.runtime.atomic import refuse_existing
 
 
 def write_page(runs: Sequence[Path], path: Path, *, overwrite: bool) -> Path:
-    """Write the map of some runs as a page; return its path."""
+    """Write the map of some runs, or a merged map, as a page; return its path."""
     from mapper.export.report.data import chapter_of
     from mapper.export.report.map_page import write_map_page
     from mapper.run.folder import open_run
+    from mapper.run.manifest import is_merged_map
 
     refuse_existing(path, overwrite=overwrite)
+    if len(runs) == 1 and is_merged_map(runs[0]):
+        from mapper.merging.map_page import write_merged_map_page
+        from mapper.merging.merged_map import open_map
+
+        merged = open_map(runs[0])
+        write_merged_map_page(path, merged, distinct_names([Path(run.path) for run in merged.manifest.runs]))
+        return path
     loaded = [open_run(run) for run in runs]
     names = distinct_names(runs)
     write_map_page(path, [chapter_of(run, name, ()) for run, name in zip(loaded, names, strict=True)])
@@ -45,6 +53,8 @@ def view(
     output: Output,
 ) -> Answer:
     """Show a finished run in Rerun or in a browser: path, graph, loops, voxels, cloud, slice, images.
+
+    A merged map is shown in a browser (--html): its voxels, its runs' paths, and the loops between them.
 
     Example: mapper view runs/xyz --spawn, or: mapper view runs/xyz --html
     """

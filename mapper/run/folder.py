@@ -301,7 +301,7 @@ def open_run(path: AnyPath) -> Run:
         raise RunError(f"{path}: no such run folder; make one with mapper build LOG --out {path}")
     if is_merged_map(path):
         raise RunError(
-            f"{path}: is a merged map, not a run; mapper eval, export and plan take it, summary.png shows it"
+            f"{path}: is a merged map, not a run; mapper eval, view --html, export and plan take it"
         )
     if is_localised_log(path):
         raise RunError(

@@ -14,12 +14,12 @@ from tests.support.merged_runs import merged_map_of
 
 KINDS = ("run", "merged map", "log", "file of a run", "foreign folder", "nothing")
 NO_RUN = ("is a log, not a run", "is a file of a run", "is no run folder", "no such run folder")
-MERGED = "is a merged map, not a run; mapper eval, export and plan take it, summary.png shows it"
+MERGED = "is a merged map, not a run; mapper eval, view --html, export and plan take it"
 UNKNOWN = "not a log of a known format"
 
 ANSWERS = {
     "eval": ("ATE RMSE", "walls alike there", NO_RUN[0], "want poses as TUM or KITTI text", *NO_RUN[2:]),
-    "view": ("page.html", MERGED, *NO_RUN),
+    "view": ("page.html", "page.html", *NO_RUN),
     "report": ("page.html", MERGED, *NO_RUN),
     "export": ("made.ot", "made.ot", *NO_RUN),
     "plan": ("plan.png", "plan.png", *NO_RUN),
@@ -35,6 +35,7 @@ ANSWERS = {
 """Words of the answer to each kind of input, in the order of ``KINDS``."""
 ANSWERED = {(verb, "run") for verb in ANSWERS if verb != "inspect"} | {
     ("eval", "merged map"),
+    ("view", "merged map"),
     ("export", "merged map"),
     ("plan", "merged map"),
     ("inspect", "log"),

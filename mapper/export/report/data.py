@@ -14,6 +14,7 @@ from mapper.core.errors import ConfigError, DataError
 from mapper.core.timebase import MAX_TRUTH_GAP_NS, NS_PER_S, nearest
 from mapper.export.grid import grid_image
 from mapper.export.path_band import SIGMAS
+from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure
 from mapper.mapping.thumbnails import encode_jpeg
 from mapper.octree.octomap_file import bt_bytes, read_octree
@@ -86,7 +87,7 @@ def drawn(chapter: Chapter) -> dict[str, Any]:
     """Return the numbers behind a run's curves and plans, ready for JSON; what is not known is None."""
     results = chapter.results
     begin_ns = int(results.trajectory.stamps_ns[0])
-    seconds = _Seconds(begin_ns)
+    seconds = Seconds(begin_ns)
     records = results.records
     return {
         "name": chapter.name,
@@ -100,13 +101,13 @@ def drawn(chapter: Chapter) -> dict[str, Any]:
             "ms": _rounded([results.frame_ms.get(record.stamp_ns, math.nan) for record in records]),
         },
         "residual_unit": residual_unit(results),
-        "path": _path(results.trajectory.stamps_ns, results.trajectory.positions_world, seconds)
+        "path": drawn_path(results.trajectory.stamps_ns, results.trajectory.positions_world, seconds)
         | _uncertainty(results),
         "truth": None
         if results.truth is None
-        else _path(results.truth.stamps_ns, results.truth.positions_world, seconds),
+        else drawn_path(results.truth.stamps_ns, results.truth.positions_world, seconds),
         "error": _errors(results, seconds),
-        "loops": [_loop(loop, results, seconds) for loop in results.loops],
+        "loops": [drawn_loop(loop, results.graph, seconds) for loop in results.loops],
         "slice": _plan(chapter.run.slice),
     }
 
@@ -148,18 +149,22 @@ def views_uri(run: Run) -> str | None:
     return data_uri("jpeg", encode_jpeg(rgb, width_px=_VIEW_PX, quality=_VIEW_QUALITY))
 
 
-class _Seconds:
-    """Turns stamps into seconds since the run's first pose, to the millisecond."""
+class Seconds:
+    """Turns stamps into seconds since a first one, to the millisecond."""
 
     def __init__(self, begin_ns: int) -> None:
         self._begin_ns = begin_ns
 
     def __call__(self, stamps_ns: Sequence[int] | NDArray[np.int64]) -> list[float]:
+        """Return the seconds of some stamps."""
         since_ns = np.asarray(stamps_ns, np.int64) - self._begin_ns
         return [round(float(s), 3) for s in since_ns / NS_PER_S]
 
 
-def _path(stamps_ns: NDArray[np.int64], positions: NDArray[np.float64], seconds: _Seconds) -> dict[str, Any]:
+def drawn_path(
+    stamps_ns: NDArray[np.int64], positions: NDArray[np.float64], seconds: Seconds
+) -> dict[str, Any]:
+    """Return the times and the (N, 3) positions of a path, to the millimetre."""
     x, y, z = ([round(float(value), 3) for value in column] for column in positions.T)
     return {"t": seconds(stamps_ns), "x": x, "y": y, "z": z}
 
@@ -176,7 +181,7 @@ def _uncertainty(results: RunResults) -> dict[str, Any]:
     }
 
 
-def _errors(results: RunResults, seconds: _Seconds) -> dict[str, Any] | None:
+def _errors(results: RunResults, seconds: Seconds) -> dict[str, Any] | None:
     """Return the errors of the estimate against the aligned truth: the terms of the ATE, SE(3)-aligned."""
     if results.truth is None:
         return None
@@ -189,8 +194,9 @@ def _errors(results: RunResults, seconds: _Seconds) -> dict[str, Any] | None:
     }
 
 
-def _loop(loop: LoopClosure, results: RunResults, seconds: _Seconds) -> dict[str, Any]:
-    T_world_node = results.graph.T_world_node
+def drawn_loop(loop: LoopClosure, graph: PoseGraph, seconds: Seconds) -> dict[str, Any]:
+    """Return a loop's numbers, and its ends where the solved graph has both."""
+    T_world_node = graph.T_world_node
     ends = None
     if loop.i in T_world_node and loop.j in T_world_node:
         ends = [[round(float(v), 3) for v in T_world_node[node][:3, 3]] for node in (loop.i, loop.j)]

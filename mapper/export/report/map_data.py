@@ -57,8 +57,7 @@ def map_of(chapter: Chapter, *, runs: int = 1, most_points: int = MOST_POINTS) -
     """
     run, trajectory = chapter.run, chapter.results.trajectory
     octree = run.octree
-    known = octree.leaves()
-    codes = codes_of_blocks(known.keys[known.log_odds >= octree.occupied_log_odds].astype(np.int64))
+    codes = _occupied_codes(octree)
     observed = observations_of(run, codes)
     snapshots = list(snapshots_of(run))
     images = _images(chapter, snapshots)
@@ -78,6 +77,46 @@ def map_of(chapter: Chapter, *, runs: int = 1, most_points: int = MOST_POINTS) -
         most = int(_SPARE * cloud["count"] * max(room, 1) / len(cloud["data"]))
         cloud = _cloud(chapter, octree.resolution_m, observed, most=most, has_colors=bool(snapshots))
     return {"cloud": cloud, **shown}
+
+
+def map_of_octree(octree: OctreeMap, *, highest_m: float) -> dict[str, Any]:
+    """Return a map that has neither a cloud nor frames, ready for JSON: its points are the voxels' centres.
+
+    Args:
+        octree: The map.
+        highest_m: Height of the highest pose in it.
+    """
+    codes = _occupied_codes(octree)
+    voxels = _voxels(codes, octree.resolution_m, None, np.empty(0, np.int64), most=MOST_POINTS // 2)
+    return {
+        "cloud": voxels | {"has_colors": False},
+        "voxels": voxels,
+        "layers": _layers(octree, most_bytes=_MOST_LAYER_BYTES),
+        "is_observed": False,
+        "frames": [],
+        "images": [],
+        "headroom_m": four_digits(highest_m + _HEADROOM_M),
+    }
+
+
+def no_map() -> dict[str, Any]:
+    """Return the map of a path that has none, ready for JSON."""
+    points = pack_points(np.empty((0, 3)), [], step_m=1.0, most=0) | {"edge_m": 1.0}
+    return {
+        "cloud": points | {"has_colors": False},
+        "voxels": points,
+        "layers": None,
+        "is_observed": False,
+        "frames": [],
+        "images": [],
+        "headroom_m": None,
+    }
+
+
+def _occupied_codes(octree: OctreeMap) -> NDArray[np.int64]:
+    """Return the Morton codes of the occupied voxels, increasing."""
+    known = octree.leaves()
+    return codes_of_blocks(known.keys[known.log_odds >= octree.occupied_log_odds].astype(np.int64))
 
 
 def _voxels(

@@ -39,24 +39,36 @@ def write_map_page(path: Path, chapters: Sequence[Chapter]) -> None:
     """
     refuse_same_names(chapters)
     title = " · ".join(chapter.name for chapter in chapters)
-    write_text(
-        path,
-        document(
-            f"{title} – map",
-            header=f"<h1>{escape(title)}</h1>",
-            main=[map_html(chapters, css="map whole")],
-            scripts=[json_element("data", [drawn(chapter) for chapter in chapters]), *map_scripts(chapters)],
-            styles=[map_style()],
-        ),
+    curves = [drawn(chapter) for chapter in chapters]
+    write_text(path, map_page(title, curves, maps_of(chapters), pictures=pictures_of(chapters)))
+
+
+def map_page(
+    title: str, curves: Sequence[dict[str, Any]], maps: Sequence[dict[str, Any]], *, pictures: str
+) -> str:
+    """Return a page that shows maps in 3D, each with its path and its loops.
+
+    Args:
+        title: What is shown.
+        curves: Name, path, truth and loops that belong to each map, see :func:`~.data.drawn`.
+        maps: Points, voxels and layers, see :func:`~.map_data.map_of`.
+        pictures: HTML that takes the maps' place where they cannot be shown.
+    """
+    return document(
+        f"{title} – map",
+        header=f"<h1>{escape(title)}</h1>",
+        main=[map_html([one["name"] for one in curves], pictures, css="map whole")],
+        scripts=[json_element("data", curves), *map_scripts(maps)],
+        styles=[map_style()],
     )
 
 
-def map_html(chapters: Sequence[Chapter], *, css: str = "map") -> str:
+def map_html(names: Sequence[str], pictures: str, *, css: str = "map") -> str:
     """Return the map's place in a page, with its controls; and the pictures that take its place."""
     runs = "".join(
         f'<label><input type="checkbox" data-map-run="{i}" checked> '
-        f'<i style="--of: var(--run{i % 6})"></i>{escape(chapter.name)}</label>'
-        for i, chapter in enumerate(chapters)
+        f'<i style="--of: var(--run{i % 6})"></i>{escape(name)}</label>'
+        for i, name in enumerate(names)
     )
     layers = "".join(
         f'<label><input type="checkbox" data-map-layer="{layer}"{" checked" if is_on else ""}> '
@@ -64,7 +76,6 @@ def map_html(chapters: Sequence[Chapter], *, css: str = "map") -> str:
         for layer, label, color, is_on in _LAYERS
     )
     template = (_folder() / "map.html").read_text(encoding="utf-8")
-    pictures = "".join(_pictures(chapters))
     return (
         template.replace("{css}", css)
         .replace("{runs}", runs)
@@ -73,13 +84,26 @@ def map_html(chapters: Sequence[Chapter], *, css: str = "map") -> str:
     )
 
 
-def map_scripts(chapters: Sequence[Chapter], *, most_points: int = MOST_POINTS) -> Iterator[str]:
+def maps_of(chapters: Sequence[Chapter], *, most_points: int = MOST_POINTS) -> list[dict[str, Any]]:
+    """Return the maps of some runs, which share a page's limits."""
+    return [map_of(chapter, runs=len(chapters), most_points=most_points) for chapter in chapters]
+
+
+def pictures_of(chapters: Sequence[Chapter]) -> str:
+    """Return the runs' pictures of their clouds, for where maps cannot be shown in 3D."""
+    return "".join(
+        f'<img src="{uri}" alt="{escape(chapter.name)} from above and from the side">'
+        for chapter in chapters
+        if (uri := views_uri(chapter.run))
+    )
+
+
+def map_scripts(maps: Sequence[dict[str, Any]]) -> Iterator[str]:
     """Yield the script elements of the map: its data, the modules by their names, and its start.
 
     The page has the paths and loops in a JSON element called ``data``.
     """
     ramp = height_colors(np.linspace(0.0, 1.0, 256), between_m=(0.0, 1.0))
-    maps = [map_of(chapter, runs=len(chapters), most_points=most_points) for chapter in chapters]
     yield json_element("maps", {"ramp": ramp.tolist(), "maps": maps})
     yield f'<script type="importmap">{_safe(json.dumps({"imports": dict(_modules())}))}</script>'
     yield '<script type="module">import "mapper/main";</script>'
@@ -121,10 +145,3 @@ def _address(module: Traversable) -> str:
 
 def _folder() -> Traversable:
     return resources.files("mapper.export.report") / "map"
-
-
-def _pictures(chapters: Sequence[Chapter]) -> Iterator[str]:
-    for chapter in chapters:
-        uri, name = views_uri(chapter.run), escape(chapter.name)
-        if uri:
-            yield f'<img src="{uri}" alt="{name} from above and from the side">'

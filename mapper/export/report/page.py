@@ -20,7 +20,14 @@ from mapper.export.report.data import (
     residual_unit,
     views_uri,
 )
-from mapper.export.report.map_page import json_element, map_html, map_scripts, map_style
+from mapper.export.report.map_page import (
+    json_element,
+    map_html,
+    map_scripts,
+    map_style,
+    maps_of,
+    pictures_of,
+)
 from mapper.loops.closure import accepted_loops
 from mapper.runtime.atomic import write_text
 
@@ -55,7 +62,7 @@ def page_of(chapters: Sequence[Chapter]) -> str:
         f"{title} – mapper report",
         header=_header(chapters),
         main=[
-            section("Map", map_html(chapters)),
+            section("Map", map_html(_names(chapters), pictures_of(chapters))),
             section("Verdict", _columns(starmap(_verdict, enumerate(chapters)))),
             section(
                 "Plans and views",
@@ -72,7 +79,7 @@ def page_of(chapters: Sequence[Chapter]) -> str:
         ],
         scripts=[
             json_element("data", [drawn(chapter) for chapter in chapters]),
-            *map_scripts(chapters, most_points=_MOST_POINTS),
+            *map_scripts(maps_of(chapters, most_points=_MOST_POINTS)),
             f"<script>\n{(ours / 'page.js').read_text(encoding='utf-8')}</script>",
         ],
         styles=[map_style()],

@@ -62,7 +62,8 @@ export class MapView {
     const { points, coloring } = this.state;
     const key = coloring === "time" || coloring === "hits" ? coloring : "height";
     const ranges = this.layers.map((one) => one.ranges(points)[key]);
-    return [Math.min(...ranges.map(([low]) => low)), Math.max(...ranges.map(([, high]) => high))];
+    const low = Math.min(...ranges.map(([low]) => low)), high = Math.max(...ranges.map(([, high]) => high));
+    return low <= high ? [low, high] : [0, 1];
   }
 
   async showLayer(height_m) {

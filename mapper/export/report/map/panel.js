@@ -41,7 +41,7 @@ export class Panel {
       color: view.layers.some(({ map }) => map.cloud.has_colors),
       time: view.layers.every(({ map }) => map.is_observed),
       hits: view.layers.every(({ map }) => map.is_observed),
-      run: view.layers.length > 1,
+      run: view.layers.filter(({ cells }) => cells).length > 1,
     };
     for (const option of [...coloring.options]) if (has[option.value] === false) option.remove();
     coloring.value = has.run ? "run" : has.color ? "color" : "height";
@@ -58,13 +58,14 @@ export class Panel {
 
   #cut() {
     const { view } = this, slider = this.find("cut"), box = this.find("slice"), told = this.find("cut-value");
-    const lows = view.layers.map(({ cells }) => cells.low[2]);
-    const highs = view.layers.map(({ cells }) => cells.low[2] + cells.shape[2] * cells.edge_m);
-    const edge_m = Math.min(...view.layers.map(({ cells }) => cells.edge_m));
+    const cut = view.layers.map(({ cells }) => cells).filter(Boolean);
+    const lows = cut.map(({ low }) => low[2]);
+    const highs = cut.map(({ low, shape, edge_m }) => low[2] + shape[2] * edge_m);
+    const edge_m = Math.min(...cut.map((cells) => cells.edge_m));
     slider.min = Math.min(...lows);
     slider.max = Math.max(...highs);
     slider.step = edge_m;
-    const headroom_m = Math.max(...view.layers.map(({ map }) => map.headroom_m));
+    const headroom_m = Math.max(...view.layers.filter(({ cells }) => cells).map(({ map }) => map.headroom_m));
     slider.value = Math.min(headroom_m, Number(slider.max));
     const change = () => {
       const isWhole = Number(slider.value) >= Number(slider.max) - edge_m / 2, height_m = Number(slider.value);

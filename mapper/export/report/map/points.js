@@ -96,12 +96,12 @@ export class PointSet {
     this.object.geometry.setDrawRange(0, Math.ceil(share * this.count));
   }
 
-  /** Lowest and highest value, all but a few stray ones. */
+  /** Lowest and highest value, all but a few stray ones; of no points the lowest is the higher. */
   spread(read) {
     const values = [], stride = Math.max(1, Math.floor(this.count / 20000));
     for (let i = 0; i < this.count; i += stride) values.push(read(this, i));
     values.sort((a, b) => a - b);
-    if (!values.length) return [0, 1];
+    if (!values.length) return [Infinity, -Infinity];
     return [values[Math.floor(0.02 * (values.length - 1))], values[Math.ceil(0.98 * (values.length - 1))]];
   }
 

@@ -29,8 +29,8 @@ export class RunLayers {
       cloud: new PointSet(decoded.cloud, { edge_m: map.cloud.edge_m, isSquare: false }),
       voxels: new PointSet(decoded.voxels, { edge_m: map.voxels.edge_m, isSquare: true }),
     };
-    this.cells = new Layers(map.layers);
-    this.slice = this.#slice();
+    this.cells = map.layers && new Layers(map.layers); // a run of a merged map has no map of its own
+    this.slice = this.cells && this.#slice();
     this.segments = this.#segments(colors);
     this.loops = {
       accepted: run.loops.filter((loop) => loop.ends && loop.verdict === "accepted"),
@@ -39,7 +39,8 @@ export class RunLayers {
     for (const [id, loops] of Object.entries(this.loops))
       this.segments[id] = new Segments(loops.flatMap((loop) => loop.ends.flat()), { color: new Color(colors[id]), width_px: 2 });
     this.objects = this.#objects(colors);
-    this.group.add(this.points.cloud.object, this.points.voxels.object, this.slice, ...Object.values(this.objects));
+    this.group.add(this.points.cloud.object, this.points.voxels.object, ...Object.values(this.objects));
+    if (this.slice) this.group.add(this.slice);
     const order = ["band", "truth", "rejected", "accepted", "path", "doubtful", "keyframes", "ends"];
     order.forEach((id, i) => this.objects[id]?.traverse((object) => { object.renderOrder = 2 + i; }));
   }
@@ -56,7 +57,7 @@ export class RunLayers {
 
   get duration_s() {
     const { t } = this.run.path;
-    return t[t.length - 1] - t[0];
+    return t.length ? t[t.length - 1] - t[0] : 0;
   }
 
   placeOf(frame, into) {
@@ -66,6 +67,7 @@ export class RunLayers {
 
   /** Show the cells at a height, or none. */
   async showLayer(height_m) {
+    if (!this.cells) return;
     const index = height_m === null ? -1 : this.cells.indexAt(height_m);
     if (index === this.shownLayer) return;
     this.shownLayer = index;
@@ -117,6 +119,7 @@ export class RunLayers {
       const marks = new Markers(placesOf(doubtful), { color: new Color(colors.doubtful), size_px: 11 }).object;
       objects.doubtful = objects.doubtful ? new Group().add(objects.doubtful, marks) : marks;
     }
+    if (last < 0) return objects; // the voxels of a merged map have no path of their own
     objects.ends = new Group().add(
       new Markers([path.x[last], path.y[last], path.z[last]], { color: new Color(colors.end), size_px: 16, isSquare: true }).object,
       new Markers([path.x[0], path.y[0], path.z[0]], { color: new Color(colors.start), size_px: 16 }).object,
