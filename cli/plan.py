@@ -14,7 +14,14 @@ from mapper.cli.groups import Verb
 from mapper.cli.options import assignments
 
 if TYPE_CHECKING:
-    from mapper.core.geometry import Array
+    from collections.abc import Callable
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from mapper.core.geometry import Array, Points
+    from mapper.merging.merged_map import MergedMap
+    from mapper.run.folder import Run
 
 _POINT_OPTIONS = ("--from", "--to")
 
@@ -98,7 +105,8 @@ def plan(
     on_floor = config.layer == "traversable"
     grid = built.traversable if on_floor else with_obstacles(built.slice, built.keepout)
     if in_3d:
-        found = plan_3d(read_octree(built.file(files.OCTREE_OT)), start, goal, config=config)
+        octree = read_octree(built.file(files.OCTREE_OT))
+        found = plan_3d(octree, start, goal, config=config, keep_out=_keep_out(built))
     elif has_storeys:
         storeys = storeys_of_run(built) if isinstance(built, Run) else storeys_of_map(built)
         found = plan_storeys(storeys, start, goal, config=config)
@@ -113,6 +121,20 @@ def plan(
         {"picture": run / files.PLAN_VIEW, **json.loads(plan_json(found))},
         "\n".join([found.summary, *points, str(run / files.PLAN_VIEW)]),
     )
+
+
+def _keep_out(built: "Run | MergedMap") -> "Callable[[Points], NDArray[np.bool_]] | None":
+    """Return what tells of points whether they lie in a keep-out region; None if there are none."""
+    import numpy as np
+
+    from mapper.export.run_maps import editor_of
+    from mapper.merging.floors import editors_of_map
+    from mapper.run.folder import Run
+
+    editors = [editor_of(built)] if isinstance(built, Run) else editors_of_map(built)
+    if not any(editor.edits.keepout for editor in editors):
+        return None
+    return lambda points: np.any([editor.keep_out(points) for editor in editors], axis=0)
 
 
 def _point(text: str, name: str, counts: tuple[int, ...]) -> "Array":

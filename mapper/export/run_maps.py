@@ -50,6 +50,12 @@ def maps_of(run: Run) -> Maps:
     )
 
 
+def editor_of(run: Run) -> MapEditor:
+    """Return the editor of a run's finished maps."""
+    path_world, room_m = load_results(run).tracked.positions_world, run.config.traversable.head_room_m
+    return MapEditor(edits_of(run.manifest.edits), path_world, room_m)
+
+
 def storeys_of_run(run: Run) -> tuple[Storey, ...]:
     """Return the storeys of a run's floor and their links, found again from its octree and its path.
 
@@ -59,8 +65,7 @@ def storeys_of_run(run: Run) -> tuple[Storey, ...]:
     config, path_world = run.config.traversable, load_results(run).tracked.positions_world
     floor = reachable_floor(run.octree, config, positions_world=path_world)
     storeys = traversable(floor, config, with_links=True)
-    editor = MapEditor(edits_of(run.manifest.edits), path_world, config.head_room_m)
-    return editor.edit_storeys(storeys)[0]
+    return editor_of(run).edit_storeys(storeys)[0]
 
 
 def _storeys(run: Run) -> Iterator[OccupancyGrid]:

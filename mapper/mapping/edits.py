@@ -113,6 +113,12 @@ class MapEditor:
         cells = np.where(inside, OCCUPIED, FREE).astype(np.int8)
         return OccupancyGrid(cells, grid.origin_world_m, grid.resolution_m)
 
+    def keep_out(self, points: Points) -> Mask:
+        """Return for each of (N, 3) points, metres, whether it lies in a keep-out region."""
+        return self._contain(
+            self.edits.keepout, points if self.T_world_map is None else apply(self.T_world_map, points)
+        )
+
     def leave(self, points_world: Points | Points32) -> Mask:
         """Return for each of (N, 3) points, metres, whether nothing that is done in regions takes it away."""
         left = ~self._contain(self.edits.erase, points_world)

@@ -49,7 +49,7 @@ def storeys_of_map(merged: MergedMap) -> tuple[Storey, ...]:
         RunError: A run's trajectory is missing.
     """
     manifest = merged.manifest
-    paths_map = [merged.trajectory(run).positions_world for run in manifest.runs]
+    paths_map = _paths(merged)
     voxels, extents = [], []
     for tile in manifest.tiles:
         octree = read_octree(merged.tile_path(tile))
@@ -66,6 +66,21 @@ def storeys_of_map(merged: MergedMap) -> tuple[Storey, ...]:
     )
     storeys = traversable(floor, manifest.traversable, with_links=True)
     return kept_out(storeys, editors_of(manifest, paths_map))
+
+
+def editors_of_map(merged: MergedMap) -> list[MapEditor]:
+    """Return an editor for each run of a merged map that has keep-out regions.
+
+    Raises:
+        RunError: A run's trajectory is missing.
+    """
+    if not any(run.keepout for run in merged.manifest.runs):
+        return []
+    return editors_of(merged.manifest, _paths(merged))
+
+
+def _paths(merged: MergedMap) -> list[Points]:
+    return [merged.trajectory(run).positions_world for run in merged.manifest.runs]
 
 
 def editors_of(manifest: MapManifest, paths_map: Sequence[Points]) -> list[MapEditor]:

@@ -1,5 +1,6 @@
 """Path planner: shortest collision-free paths for a disc on a grid, or for a ball in the octree."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise, product
 
@@ -7,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import PlanError
-from mapper.core.geometry import Array
+from mapper.core.geometry import Array, Points
 from mapper.navigation.config import PlanConfig
 from mapper.navigation.distance import DistanceField, distance_field
 from mapper.navigation.line_of_sight import in_sight, path_length, shortened
 from mapper.navigation.search import Cell, shortest_path
 from mapper.navigation.voxels import LIMIT_BYTES, VoxelGrid, cut_box, known_box, layer
 from mapper.octree.map import OctreeMap
-from mapper.octree.slice import UNKNOWN, OccupancyGrid
+from mapper.octree.slice import OCCUPIED, UNKNOWN, OccupancyGrid
 
 _BYTES_PER_VOXEL = 30  # a distance field's 14, the mask of free voxels, and the search's costs and steps
 _ROUNDING_M = 1e-6
@@ -89,6 +90,7 @@ def plan_3d(
     goal_world: Array,
     *,
     config: PlanConfig,
+    keep_out: Callable[[Points], NDArray[np.bool_]] | None = None,
     limit_bytes: int = LIMIT_BYTES,
 ) -> Plan:
     """Return a shortest path for a ball through the known part of the octree, as :func:`plan_2d` does.
@@ -98,6 +100,7 @@ def plan_3d(
         start_world: (3,) metres.
         goal_world: (3,) metres.
         config: Radius, and whether unknown voxels are blocked.
+        keep_out: Tells of (N, 3) points, metres, which of them are blocked besides.
         limit_bytes: Limit of the working space.
 
     Raises:
@@ -105,7 +108,18 @@ def plan_3d(
         MapSizeError: The known part of the map is too large.
     """
     voxels = cut_box(octree, known_box(octree), bytes_per_voxel=_BYTES_PER_VOXEL, limit_bytes=limit_bytes)
+    if keep_out is not None:
+        _block(voxels, keep_out)
     return _planned(voxels, np.asarray(start_world, np.float64), np.asarray(goal_world, np.float64), config)
+
+
+def _block(voxels: VoxelGrid, keep_out: Callable[[Points], NDArray[np.bool_]]) -> None:
+    """Mark the voxels as occupied whose centres are kept out of, a layer at a time."""
+    for z, states in enumerate(voxels.states):
+        y, x = np.nonzero(states != OCCUPIED)
+        centres = np.column_stack([x, y, np.full(len(x), z)]) + 0.5
+        blocked = keep_out(voxels.corner_world_m + centres * voxels.resolution_m)
+        states[y[blocked], x[blocked]] = OCCUPIED
 
 
 def _planned(voxels: VoxelGrid, start_world: Array, goal_world: Array, config: PlanConfig) -> Plan:

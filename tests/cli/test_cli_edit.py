@@ -101,10 +101,13 @@ def test_a_keepout_blocks_the_traversable_floor_and_plans_but_not_the_slice(run_
     point = [band.origin_world_m[0] + (column + 0.5) * edge_m, band.origin_world_m[1] + (row + 0.5) * edge_m]
     told = mapper("plan", run_folder, "--from", *point, "--to", *point, "--radius", 0.01, status=1).stderr
     assert "start" in told
+    in_space = ("--from", *point, 0.4, "--to", *point, 0.4, "--radius", 0.01, "--unknown", "free")
+    assert "start" in mapper("plan", run_folder, "--3d", *in_space, status=1).stderr
 
     mapper("edit", run_folder, "--undo", "--quiet")
     assert not list(run_folder.glob("keepout.*"))
     mapper("plan", run_folder, "--from", *point, "--to", *point, "--radius", 0.01)
+    mapper("plan", run_folder, "--3d", *in_space)
 
 
 @pytest.mark.parametrize(

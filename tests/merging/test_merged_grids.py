@@ -177,6 +177,9 @@ def test_keepout_regions_of_a_run_that_is_turned_hold_on_their_storeys(tmp_path)
         ends = "--from", f"{x_free} {y_free}", "--to", f"{x} {y}", "--radius", "0.15", "--layer", layer
         mapper("plan", plain.path, *ends)
         assert "goal" in mapper("plan", found.path, *ends, status=1).stderr
+    ends = "--3d", "--from", f"{x_free} {y_free} 0.5", "--to", f"{x} {y} 0.5", "--unknown", "free"
+    mapper("plan", plain.path, *ends, "--radius", "0.15")
+    assert "goal" in mapper("plan", found.path, *ends, "--radius", "0.15", status=1).stderr
     mapper("export", found.path, "--as", "nav2", "--out", tmp_path / "nav2")
     mask, kept_out = read_grid(tmp_path / "nav2/keepout_mask.yaml").cells, found.keepout.cells == OCCUPIED
     assert (mask[kept_out & (found.slice.cells != OCCUPIED)] == OCCUPIED).all()

@@ -224,6 +224,23 @@ def test_in_space_a_ball_flies_over_the_wall(chamber):
     assert over < plan.length_m < 1.1 * over
 
 
+def test_in_space_a_ball_keeps_out_of_regions(chamber):
+    start, goal = np.array([0.4, 0.5, 0.3]), np.array([1.6, 0.5, 0.3])
+
+    def keep_out(points):  # over the wall, but for a passage at high y
+        return (np.abs(points[:, 0] - 1.0) < 0.1) & (points[:, 1] < 0.6)
+
+    plan = plan_3d(chamber, start, goal, config=PlanConfig(radius_m=0.1), keep_out=keep_out)
+    assert plan.waypoints_world[:, 1].max() >= 0.69
+    assert plan.min_clearance_m >= 0.1 - 1e-5
+    with pytest.raises(PlanError, match=r"the start \(0\.400, 0\.500, 0\.300\) lies in an obstacle"):
+        plan_3d(chamber, start, goal, config=PlanConfig(radius_m=0.1), keep_out=lambda p: p[:, 0] < 0.5)
+    with pytest.raises(PlanError, match="no path"):
+        plan_3d(
+            chamber, start, goal, config=PlanConfig(radius_m=0.1), keep_out=lambda p: abs(p[:, 0] - 1.0) < 0.1
+        )
+
+
 def test_a_map_too_large_is_refused(chamber):
     with pytest.raises(MapSizeError, match=r"needs .* GiB of working space"):
         plan_3d(chamber, np.zeros(3), np.ones(3), config=POINT, limit_bytes=1000)
