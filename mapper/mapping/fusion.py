@@ -7,19 +7,20 @@ from functools import partial
 
 import numpy as np
 
-from mapper.core.deskew import STILL, Twist, deskewed, twist_at
 from mapper.core.errors import DataError, FrameError
 from mapper.core.frames import Frame, PinholeCamera, Points32, RgbdFrame, Scan
 from mapper.core.geometry import Transform
 from mapper.core.trajectory import Trajectory
 from mapper.core.voxel_grid import thin
-from mapper.mapping.cloud import CloudBuilder, Colors, height_colors
+from mapper.mapping.cloud import Colors
+from mapper.mapping.cloud_fusion import fuse_clouds
 from mapper.mapping.config import AppliedEdit, Edits, FuseSettings, McapConfig
 from mapper.mapping.edits import MapEditor
+from mapper.mapping.placed_frames import PlacedFrame, placed_frames, within_reach
 from mapper.mapping.thumbnails import encode_jpeg, shrunk_camera
 from mapper.navigation.floor import driven_ground, reachable_floor
 from mapper.navigation.traversable import traversable
-from mapper.octree.casting import Caster, depth_limit_of, reach_m
+from mapper.octree.casting import Caster, reach_m
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.moving_objects import MovingObjects, remove_moving_objects
@@ -28,10 +29,9 @@ from mapper.octree.scan_update_file import CachedUpdate, ScanUpdateFile, ScanUpd
 from mapper.octree.slice import OccupancyGrid, cut_slice, floor_below
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
-from mapper.sources.base import FrameRef, Log
+from mapper.sources.base import Log
 
 _NO_EDITS = Edits()
-_COLOURED_HEIGHTS_M = -1.0, 8.0  # the same in every scan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,20 +100,14 @@ class _Job:
     """A frame to fuse.
 
     Attributes:
-        entry: The frame.
-        T_world_body: (4, 4) its final pose.
-        twist: Its velocity there, for deskewing.
+        frame: The frame.
         cached: Its update from the last time, if that still holds.
-        feeds_cloud: Whether its points are added to the cloud.
-        feeds_log: Whether its image or scan is logged.
+        is_logged: Whether its image or scan is logged.
     """
 
-    entry: FrameRef
-    T_world_body: Transform
-    twist: Twist
+    frame: PlacedFrame
     cached: CachedUpdate | None
-    feeds_cloud: bool
-    feeds_log: bool
+    is_logged: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,24 +155,25 @@ def fuse_log(
     Raises:
         DataError: The edits leave nothing of the map, or nothing in the height of the slice.
     """
-    octree, cloud = OctreeMap(config.octree, folder=after.folder), CloudBuilder(config.cloud.voxel_m)
+    octree = OctreeMap(config.octree, folder=after.folder)
     _add_scans(
         octree,
         source,
         trajectory,
         config,
         progress=progress,
-        cloud=cloud,
         on_snapshot=on_snapshot,
         before=before,
         after=after,
     )
-    points_world, colors = cloud.points_and_colors()
-    moving = np.zeros(len(points_world), np.bool_)
+    objects = None
     if config.octree.moving == "removed":
         objects = _without_moving_objects(octree, config, after)
-        moving = objects.contain(points_world)
-        progress.note(f"moving objects: {moving.sum()} of {len(moving)} points of the cloud")
+    still, moving = fuse_clouds(source, trajectory, config, objects, progress=progress)
+    if objects is not None:
+        progress.note(f"moving objects: {len(moving)} of {len(still) + len(moving)} points of the clouds")
+    points_world, colors = still.points_and_colors()
+    dynamic_points_world, dynamic_colors = moving.points_and_colors()
     editor = MapEditor(edits, trajectory.positions_world, config.traversable.head_room_m)
     known, occupied = len(octree), np.count_nonzero(octree.are_occupied(points_world))
     erased = editor.erase(octree)
@@ -201,8 +196,8 @@ def fuse_log(
         octree=octree,
         cloud_points_world=points_world[kept],
         cloud_colors=colors[kept],
-        dynamic_points_world=points_world[moving],
-        dynamic_colors=colors[moving],
+        dynamic_points_world=dynamic_points_world,
+        dynamic_colors=dynamic_colors,
         grid=grid,
         traversable=next(storey.grid for storey in storeys if storey.is_home),
         storeys=tuple(storey.grid for storey in storeys) if len(storeys) > 1 else (),
@@ -247,11 +242,10 @@ def _add_scans(
     progress: Progress,
     before: ScanUpdateFile | None,
     after: ScanUpdateWriter,
-    cloud: CloudBuilder | None = None,
     on_snapshot: Callable[[Snapshot | ScanSnapshot], None] | None = None,
 ) -> None:
-    """Add every frame of the trajectory to the octree, and to the cloud and the log where there are any."""
-    casters, depth_limit, moved, unreached = _Casters(config.octree), depth_limit_of(config.octree), 0, 0
+    """Add every frame of the trajectory to the octree, and to the log if there is one."""
+    casters, moved, unreached = _Casters(config.octree), 0, 0
 
     def prepare(job: _Job) -> _Fused:
         return _prepared(job, config, casters.caster)
@@ -263,7 +257,6 @@ def _add_scans(
         trajectory,
         config,
         before,
-        cloud_stride=0 if cloud is None else config.cloud.frame_stride,
         log_stride=0 if on_snapshot is None else config.mcap.image_stride,
     )
     prepared = ordered_map(prepare, jobs, workers=config.workers)
@@ -274,15 +267,12 @@ def _add_scans(
                 progress.note(f"not fused: {fused.reason}")
                 continue
             if fused.scan is not None and config.octree.attributes:
-                octree.insert(fused.scan, fused.job.T_world_body)
+                octree.insert(fused.scan, fused.job.frame.T_world_body)
             else:
                 octree.merge(fused.update)
             after.add(fused.cached)
             moved += fused.job.cached is None
             unreached += fused.unreached
-            if fused.scan is not None and cloud is not None and fused.job.feeds_cloud:
-                scan = fused.scan if depth_limit is None else depth_limit.split(fused.scan)[0]
-                _add_to_cloud(cloud, scan, fused.job.T_world_body)
             if fused.snapshot is not None and on_snapshot is not None:
                 on_snapshot(fused.snapshot)
     if unreached:
@@ -318,26 +308,15 @@ def _jobs(
     config: FuseSettings,
     before: ScanUpdateFile | None,
     *,
-    cloud_stride: int,
     log_stride: int,
 ) -> Iterator[_Job]:
-    index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
-    for entry in source.entries():
-        index = index_of.get(entry.stamp_ns)
-        if index is not None:
-            T_world_body, cached = trajectory.T_world_body[index], None
-            if before is not None and (
-                source.sensor == "rgbd" or _neighbours_hold(before, trajectory, index, config.octree)
-            ):
-                cached = before.lookup(entry.stamp_ns, T_world_body, config=config.octree)
-            yield _Job(
-                entry,
-                T_world_body,
-                STILL if source.sensor == "rgbd" else twist_at(trajectory, index),
-                cached,
-                feeds_cloud=cloud_stride > 0 and index % cloud_stride == 0,
-                feeds_log=log_stride > 0 and index % log_stride == 0,
-            )
+    for frame in placed_frames(source, trajectory):
+        cached = None
+        if before is not None and (
+            source.sensor == "rgbd" or _neighbours_hold(before, trajectory, frame.index, config.octree)
+        ):
+            cached = before.lookup(frame.entry.stamp_ns, frame.T_world_body, config=config.octree)
+        yield _Job(frame, cached, is_logged=log_stride > 0 and frame.index % log_stride == 0)
 
 
 def _neighbours_hold(
@@ -353,14 +332,14 @@ def _neighbours_hold(
 
 def _prepared(job: _Job, config: FuseSettings, caster: Caster) -> _Fused:
     """Read and cast one frame as far as needed: images cost most, and cached updates nothing."""
-    scan, snapshot = None, None
+    frame, scan, snapshot = job.frame, None, None
     try:
-        if job.feeds_cloud or job.feeds_log or config.octree.attributes:
-            frame = job.entry.load()
-            scan = deskewed(frame.scan(), job.twist)
-            snapshot = _snapshot(frame, scan, config.mcap) if job.feeds_log else None
+        if job.is_logged or config.octree.attributes:
+            loaded = frame.entry.load()
+            scan = frame.scan_of(loaded)
+            snapshot = _snapshot(loaded, scan, config.mcap) if job.is_logged else None
         elif job.cached is None:
-            scan = deskewed(job.entry.scan(), job.twist)
+            scan = frame.scan_of(frame.entry.scan())
     except FrameError as error:  # readable in the first pass: the log has changed since
         return _Fused(job, reason=str(error))
     if job.cached is not None:
@@ -368,26 +347,12 @@ def _prepared(job: _Job, config: FuseSettings, caster: Caster) -> _Fused:
     assert scan is not None
     unreached = 0
     try:
-        update = pack(caster.cast(scan, job.T_world_body))
+        update = pack(caster.cast(scan, frame.T_world_body))
     except DataError:  # not asked before: looking at every point of every scan would cost more
-        scan, unreached = _within_reach(scan, job.T_world_body, config.octree)
-        update = pack(caster.cast(scan, job.T_world_body))
-    cached = cache_update(job.entry.stamp_ns, job.T_world_body, update)
+        scan, unreached = within_reach(scan, frame.T_world_body, config.octree)
+        update = pack(caster.cast(scan, frame.T_world_body))
+    cached = cache_update(frame.entry.stamp_ns, frame.T_world_body, update)
     return _Fused(job, update, cached, scan, snapshot, unreached=unreached)
-
-
-def _within_reach(scan: Scan, T_world_body: Transform, config: OctreeConfig) -> tuple[Scan, int]:
-    """Return a scan without the points that are too far from the map's origin to have keys, and their number.
-
-    A single return that is damaged, and yet not beyond what a sensor reaches, must not end a build.
-    """
-    points_world = scan.points_body @ T_world_body[:3, :3].T + T_world_body[:3, 3]
-    # Two voxels short of the reach: the octree rounds points to single precision and to voxels' centres.
-    limit_m = reach_m(config.resolution_m) - 2.0 * config.resolution_m
-    kept = np.abs(points_world).max(axis=1) < limit_m
-    colors = None if scan.colors is None else scan.colors[kept]
-    reached = Scan(scan.stamp_ns, scan.points_body[kept], scan.origin_body, colors)
-    return reached, len(kept) - int(kept.sum())
 
 
 def _snapshot(frame: Frame, scan: Scan, config: McapConfig) -> Snapshot | ScanSnapshot:
@@ -399,12 +364,3 @@ def _snapshot(frame: Frame, scan: Scan, config: McapConfig) -> Snapshot | ScanSn
         shrunk_camera(frame.camera, width_px=config.image_width_px),
         frame.T_body_camera,
     )
-
-
-def _add_to_cloud(cloud: CloudBuilder, scan: Scan, T_world_body: Transform) -> None:
-    R, t = T_world_body[:3, :3].astype(np.float32), T_world_body[:3, 3].astype(np.float32)
-    points_world = scan.points_body @ R.T + t
-    colors = scan.colors
-    if colors is None:  # the sensor has no colour: heights are shown by it
-        colors = height_colors(points_world[:, 2], between_m=_COLOURED_HEIGHTS_M)
-    cloud.add(points_world, colors)

@@ -18,6 +18,10 @@ a moving object that was hit too, in 9 of 10 of its hits, belongs to the object;
 rings may lie more than a voxel apart, two voxels from it are near enough for one with at least 3 and more
 than 2h passes; without that, poles beside traffic would go.
 
+Where the foot of an object shares a voxel with the ground, that voxel stays. Its returns are told from the
+ground's scan by scan: those on the ground, at most two voxels below a removed voxel that the same scan hit
+and at most one aside, belong to the object. The cloud is made without them.
+
 What remains of the voxels that were ever hit is occupied, unless its void misses alone outweigh its hits.
 """
 
@@ -31,6 +35,7 @@ from numpy.typing import NDArray
 
 from mapper.core.frames import Points32
 from mapper.core.geometry import Points
+from mapper.core.voxel_index import row_of, voxel_index
 from mapper.octree.bit_planes import (
     ALL_SET,
     NONE_SET,
@@ -42,7 +47,7 @@ from mapper.octree.bit_planes import (
     words_of,
 )
 from mapper.octree.blocks import BlockStore, find_slots
-from mapper.octree.keys import BLOCK_BITS, codes_of
+from mapper.octree.keys import BLOCK_BITS, KEY_COUNT, codes_of, codes_of_blocks, gather
 from mapper.octree.map import OctreeMap
 from mapper.octree.scan_update import ScanUpdate
 
@@ -50,6 +55,7 @@ _LEAST_SEEN_THROUGH, _SEEN_THROUGH_RATIO = 3, 0.5
 _LEAST_PASSES, _PASSES_RATIO = 8, 2.0
 _ATTACHED_RATIO = 0.9
 _ATTACHING_ROUNDS = 2
+_BELOW = np.array([(x, y, -z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (1, 2)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,19 +65,45 @@ class MovingObjects:
     Attributes:
         blocks: The blocks of the map.
         removed: The plane of these voxels, by the blocks' slots.
+        surfaces: The plane of the voxels that were hit and have a voxel beside them that no scan observed.
         resolution_m: Edge of a voxel.
     """
 
     blocks: BlockStore
     removed: Words
+    surfaces: Words
     resolution_m: float
 
     def contain(self, points_world: Points | Points32) -> NDArray[np.bool_]:
         """Return for each of (N, 3) points, metres, whether it lies in such a voxel."""
-        codes = codes_of(np.ascontiguousarray(points_world, np.float64), self.resolution_m)
+        return self._lie_in(self.removed, self._codes_of(points_world))
+
+    def returns_of(self, points_world: Points | Points32) -> NDArray[np.bool_]:
+        """Return for each of one scan's (N, 3) returns, metres, whether it belongs to a moving object.
+
+        It does if it lies in such a voxel, or on the ground below one that the same scan hit: feet share
+        voxels with the ground, which stays.
+        """
+        codes = self._codes_of(points_world)
+        moving = self._lie_in(self.removed, codes)
+        if not moving.any():
+            return moving
+        below = _codes_below(codes[moving])
+        candidates = np.flatnonzero(_are_among(codes, voxel_index(len(below), below)) & ~moving)
+        lowered = points_world[candidates].astype(np.float64) - [0.0, 0.0, self.resolution_m]
+        is_ground = self._lie_in(self.surfaces, codes[candidates])
+        is_ground |= self._lie_in(self.surfaces, self._codes_of(lowered))
+        moving[candidates[is_ground]] = True
+        return moving
+
+    def _codes_of(self, points_world: Points | Points32) -> NDArray[np.int64]:
+        codes: NDArray[np.int64] = codes_of(np.ascontiguousarray(points_world, np.float64), self.resolution_m)
+        return codes
+
+    def _lie_in(self, plane: Words, codes: NDArray[np.int64]) -> NDArray[np.bool_]:
         slots = np.empty(len(codes), np.int64)
         find_slots(self.blocks.table, codes >> (3 * BLOCK_BITS), slots)
-        inside: NDArray[np.bool_] = _set_at(self.removed, slots, codes) & (codes >= 0)
+        inside: NDArray[np.bool_] = _set_at(plane, slots, codes) & (codes >= 0)
         return inside
 
     def __len__(self) -> int:
@@ -100,7 +132,10 @@ def remove_moving_objects(octree: OctreeMap, scans: Callable[[], Iterable[ScanUp
     hits, _, passes, seen_through = counts.T
     often = (seen_through >= _LEAST_SEEN_THROUGH) & (seen_through > _SEEN_THROUGH_RATIO * hits)
     often |= (passes >= _LEAST_PASSES) & (passes > _PASSES_RATIO * hits)
-    moved = often & _gathered(_clear_of_surfaces(octree, ever), ever, count)
+    inside = _inside(octree)
+    surfaces = ever & ~inside
+    beside_surfaces = dilated(surfaces, neighbours_of(blocks.codes), absent=NONE_SET)
+    moved = often & _gathered(inside & ~beside_surfaces, ever, count)
     passed = (passes >= _LEAST_SEEN_THROUGH) & (passes > _PASSES_RATIO * hits)
     for _ in range(_ATTACHING_ROUNDS):
         removed = _scattered(moved, ever)
@@ -117,7 +152,7 @@ def remove_moving_objects(octree: OctreeMap, scans: Callable[[], Iterable[ScanUp
             _count_one(hit & near, slots, ever, starts, nearby)
         moved |= (beside >= _ATTACHED_RATIO * hits) | (passed & (nearby >= _ATTACHED_RATIO * hits))
     octree.forget(_decide(blocks.table.values, ever, moved, counts, octree.sensor, octree.occupied_log_odds))
-    return MovingObjects(blocks, _scattered(moved, ever), octree.resolution_m)
+    return MovingObjects(blocks, _scattered(moved, ever), surfaces, octree.resolution_m)
 
 
 def _evidence(scan: ScanUpdate) -> tuple[Words, Words, Words]:
@@ -134,13 +169,18 @@ def _slots_of(blocks: BlockStore, scan: ScanUpdate) -> NDArray[np.int64]:
     return slots
 
 
-def _clear_of_surfaces(octree: OctreeMap, ever: Words) -> Words:
-    """Return the voxels with nothing unknown and no surface among the voxels around."""
-    neighbours = neighbours_of(octree.blocks.codes)
+def _inside(octree: OctreeMap) -> Words:
+    """Return the voxels with nothing unknown among the voxels around."""
     known: Words = _known(octree.blocks.table.values, len(octree.blocks))
-    inside = known & ~dilated(~known, neighbours, absent=ALL_SET)
-    clear: Words = inside & ~dilated(ever & ~inside, neighbours, absent=NONE_SET)
-    return clear
+    inside: Words = known & ~dilated(~known, neighbours_of(octree.blocks.codes), absent=ALL_SET)
+    return inside
+
+
+def _codes_below(codes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the codes of the voxels up to two below some, and up to one aside of these."""
+    keys = np.column_stack([gather.py_func(np.unique(codes) >> axis) for axis in range(3)])
+    around = (keys[:, np.newaxis] + _BELOW).reshape(-1, 3)
+    return np.unique(codes_of_blocks(around[((around >= 0) & (around < KEY_COUNT)).all(axis=1)]))
 
 
 @njit(cache=True, nogil=True)
@@ -255,6 +295,15 @@ def _decide(values, ever, moved, counts, sensor, occupied_log_odds):
                         values[i, voxel] = min(weighed, sensor.highest)
                 row += 1
     return forgotten
+
+
+@njit(cache=True, nogil=True)
+def _are_among(codes, index):
+    """Return (N,) bool: whether codes are in an index."""
+    flags = np.empty(len(codes), np.bool_)
+    for i in range(len(codes)):
+        flags[i] = row_of(index, codes[i]) >= 0
+    return flags
 
 
 @njit(cache=True, nogil=True)

@@ -96,6 +96,27 @@ def test_people_leave_and_ground_walls_and_poles_stay(street):
     assert kept[owner == 0].mean() > 0.98
 
 
+def test_feet_are_told_from_the_ground_of_the_same_voxel_scan_by_scan(street):
+    octree, updates = fused(street)
+
+    objects = remove_moving_objects(octree, lambda: updates)
+
+    owner = np.concatenate([owner for _, owner, _ in street])
+    points = np.concatenate([points for points, _, _ in street])
+    moving = np.concatenate([objects.returns_of(points) for points, _, _ in street])
+    feet = (owner == 2) & (points[:, 2] < 0.2)
+    assert objects.contain(points)[feet].mean() < 0.2
+    assert moving[feet].mean() > 0.98
+    assert moving[owner == 2].mean() > 0.99
+    np.testing.assert_array_equal(
+        moving[(owner == 1) & (points[:, 2] > 0.4)],
+        objects.contain(points)[(owner == 1) & (points[:, 2] > 0.4)],
+    )
+    assert moving[owner == 0].mean() < 0.005
+    later, *_ = street[-1]
+    assert not objects.returns_of(later).any(), "ground stays in scans without a person"
+
+
 def test_rings_that_lie_more_than_a_voxel_apart_are_of_one_person():
     sparse, ways_m = rays(ring_step_rad=0.05), [-2.0, -2.0, -1.2, -0.4, 0.4, 1.2] + [None] * 16
     scans = [

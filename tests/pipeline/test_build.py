@@ -248,7 +248,7 @@ def test_bad_frames_are_skipped_counted_and_reported(damaged_log, tmp_path):
     assert images[5].name in run.manifest.skipped[0].reason
     assert [record.outcome for record in run.records].count("skipped") == 2
     assert sum(note.startswith("skipped: ") for note in observer.notes) == 2
-    assert observer.reached == {"track": (31, 31), "fuse": (29, 29)}
+    assert observer.reached == {"track": (31, 31), "fuse": (29, 29), "cloud": (3, 3)}
 
 
 def test_a_log_of_few_frames_is_told_from_one_that_is_hard_to_track(desk_log, tmp_path):

@@ -1,0 +1,84 @@
+"""Fusing of the clouds: that of what stands still, and that of what moved."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.core.errors import FrameError
+from mapper.core.frames import Points32
+from mapper.core.trajectory import Trajectory
+from mapper.mapping.cloud import CloudBuilder, Colors, height_colors
+from mapper.mapping.config import FuseSettings
+from mapper.mapping.placed_frames import PlacedFrame, placed_frames, within_reach
+from mapper.octree.casting import depth_limit_of
+from mapper.octree.moving_objects import MovingObjects
+from mapper.runtime.ordered_map import ordered_map
+from mapper.runtime.progress import Progress
+from mapper.sources.base import Log
+
+_COLOURED_HEIGHTS_M = -1.0, 8.0  # the same in every scan
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Returns:
+    """Returns of a frame.
+
+    Attributes:
+        points_world: (N, 3) float32 metres.
+        colors: (N, 3) uint8 RGB.
+        moving: (N,) whether each belongs to something that moves.
+    """
+
+    points_world: Points32
+    colors: Colors
+    moving: NDArray[np.bool_]
+
+
+def fuse_clouds(
+    source: Log,
+    trajectory: Trajectory,
+    config: FuseSettings,
+    objects: MovingObjects | None,
+    *,
+    progress: Progress,
+) -> tuple[CloudBuilder, CloudBuilder]:
+    """Return the clouds of what stands still and of what moved, of every ``cloud.frame_stride``-th frame.
+
+    Frames that cannot be read are left out.
+
+    Args:
+        source: The log that was tracked.
+        trajectory: Final body poses in the levelled world.
+        config: Settings of the maps.
+        objects: What moved; None if that is not asked.
+        progress: Receives progress.
+    """
+    still, moving = CloudBuilder(config.cloud.voxel_m), CloudBuilder(config.cloud.voxel_m)
+    stride = config.cloud.frame_stride
+    frames = [frame for frame in placed_frames(source, trajectory) if frame.index % stride == 0]
+    depth_limit = depth_limit_of(config.octree)
+
+    def read(frame: PlacedFrame) -> _Returns | None:
+        try:
+            scan = frame.scan_of(frame.entry.load())
+        except FrameError:
+            return None
+        scan, _ = within_reach(scan, frame.T_world_body, config.octree)
+        if depth_limit is not None:
+            scan, _ = depth_limit.split(scan)
+        R, t = (part.astype(np.float32) for part in (frame.T_world_body[:3, :3], frame.T_world_body[:3, 3]))
+        points_world, colors = scan.points_body @ R.T + t, scan.colors
+        if colors is None:  # the sensor has no colour: heights are shown by it
+            colors = height_colors(points_world[:, 2], between_m=_COLOURED_HEIGHTS_M)
+        if objects is None:
+            return _Returns(points_world, colors, np.zeros(len(points_world), np.bool_))
+        return _Returns(points_world, colors, objects.returns_of(points_world))
+
+    with progress.stage("cloud") as report:
+        for done, returns in enumerate(ordered_map(read, frames, workers=config.workers), start=1):
+            report(done, len(frames))
+            if returns is not None:
+                still.add(returns.points_world[~returns.moving], returns.colors[~returns.moving])
+                moving.add(returns.points_world[returns.moving], returns.colors[returns.moving])
+    return still, moving

@@ -1,0 +1,59 @@
+"""Frames of a log at their final poses, read as the maps take them."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapper.core.deskew import STILL, Twist, deskewed, twist_at
+from mapper.core.frames import Frame, Scan
+from mapper.core.geometry import Transform
+from mapper.core.trajectory import Trajectory
+from mapper.octree.casting import reach_m
+from mapper.octree.config import OctreeConfig
+from mapper.sources.base import FrameRef, Log
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedFrame:
+    """A frame at its final pose.
+
+    Attributes:
+        entry: The frame.
+        index: Of its pose in the trajectory.
+        T_world_body: (4, 4) its final pose.
+        twist: Its velocity there, for deskewing.
+    """
+
+    entry: FrameRef
+    index: int
+    T_world_body: Transform
+    twist: Twist
+
+    def scan_of(self, frame: Frame) -> Scan:
+        """Return the loaded frame as a scan, deskewed."""
+        return deskewed(frame.scan(), self.twist)
+
+
+def placed_frames(source: Log, trajectory: Trajectory) -> Iterator[PlacedFrame]:
+    """Yield the frames of a log that have a pose, in the log's order."""
+    index_of = {int(stamp_ns): index for index, stamp_ns in enumerate(trajectory.stamps_ns)}
+    for entry in source.entries():
+        index = index_of.get(entry.stamp_ns)
+        if index is not None:
+            twist = STILL if source.sensor == "rgbd" else twist_at(trajectory, index)
+            yield PlacedFrame(entry, index, trajectory.T_world_body[index], twist)
+
+
+def within_reach(scan: Scan, T_world_body: Transform, config: OctreeConfig) -> tuple[Scan, int]:
+    """Return a scan without the points that are too far from the map's origin to have keys, and their number.
+
+    A single return that is damaged, and yet not beyond what a sensor reaches, must not end a build.
+    """
+    points_world = scan.points_body @ T_world_body[:3, :3].T + T_world_body[:3, 3]
+    # Two voxels short of the reach: the octree rounds points to single precision and to voxels' centres.
+    limit_m = reach_m(config.resolution_m) - 2.0 * config.resolution_m
+    kept = np.abs(points_world).max(axis=1) < limit_m
+    colors = None if scan.colors is None else scan.colors[kept]
+    reached = Scan(scan.stamp_ns, scan.points_body[kept], scan.origin_body, colors)
+    return reached, len(kept) - int(kept.sum())
