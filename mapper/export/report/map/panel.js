@@ -27,6 +27,7 @@ export class Panel {
   #runs() {
     const { view } = this, { layers } = view;
     this.find("runs").hidden = layers.length < 2;
+    this.find("beside").hidden = layers.filter(({ cells }) => cells).length < 2;
     for (const box of this.root.querySelectorAll("[data-map-run]"))
       box.addEventListener("change", () => {
         view.shown[Number(box.dataset.mapRun)] = box.checked;

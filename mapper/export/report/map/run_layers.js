@@ -113,7 +113,8 @@ export class RunLayers {
     const { path } = this.run, last = path.x.length - 1;
     const placesOf = (frames) => frames.flatMap(({ pose }) => [path.x[pose], path.y[pose], path.z[pose]]);
     const objects = Object.fromEntries(Object.entries(this.segments).map(([id, { object }]) => [id, object]));
-    objects.keyframes = new Markers(placesOf(this.frames.filter((frame) => frame.node !== null)), { color: new Color(colors.run), size_px: 7 }).object;
+    const keyframes = this.frames.filter((frame) => frame.node !== null);
+    if (keyframes.length) objects.keyframes = new Markers(placesOf(keyframes), { color: new Color(colors.run), size_px: 7 }).object;
     const doubtful = this.frames.filter((frame) => path.doubtful[frame.pose]);
     if (doubtful.length) {
       const marks = new Markers(placesOf(doubtful), { color: new Color(colors.doubtful), size_px: 11 }).object;
