@@ -16,7 +16,7 @@ from mapper.runtime.executor import Workers, make_executor, run_jobs
 from mapper.runtime.progress import SILENT, Progress, Report
 from mapper.runtime.worker_process import Failure
 
-KERNELS = 155
+KERNELS = 162
 """About how many kernels are compiled, for the progress bar."""
 _POLL_S = 0.5
 
@@ -41,11 +41,14 @@ def compile_kernels(*, progress: Progress = SILENT) -> None:
 
 def _build_rgbd(folder: Path) -> None:
     from mapper.features.hamming import match_mutual_bits, pack
+    from mapper.mapping.thumbnails import encode_jpeg
     from mapper.registration.config import IsvdConfig
     from mapper.registration.isvd import Isvd
     from mapper.simulation import write_tum_log
     from mapper.simulation.config import SynthConfig
+    from mapper.sources.jpeg_entropy import check_entropy
 
+    check_entropy(encode_jpeg(np.zeros((8, 8, 3), np.uint8), width_px=8, quality=90))  # the log has PNGs
     bits = pack(np.zeros((2, 32), np.uint8))  # matching and ISVD of loop closures, which a second has none of
     match_mutual_bits(bits, bits, 50, 0.8)
     points = np.random.default_rng(0).normal(size=(100, 3))
