@@ -94,11 +94,13 @@ def check_entropy(data: bytes) -> None:
                 continue
             (length,) = struct.unpack_from(">H", data, at)
             body, at = data[at + 2 : at + length], at + length
+            if at > len(data):
+                return
             if marker == _SOS:
                 at = _check_scan(data, at, body, headers)
             elif not _set_headers(headers, marker, body):
                 return
-    except (IndexError, KeyError, struct.error):
+    except (IndexError, KeyError, ValueError, struct.error):
         return  # headers that mean something to the decoder alone
 
 

@@ -240,6 +240,20 @@ def test_noise_in_a_scan_is_refused_but_a_progressive_one_is_the_decoders(progre
             check_entropy(harmed)
 
 
+@pytest.mark.parametrize(
+    "data",
+    [
+        WHOLE["grey"].replace(b"\xff\xda\x00", b"\xff\xda\xff"),
+        b"\xff\xd8" + scan([], b"no component, no frame") + WHOLE["grey"][2:],
+    ],
+    ids=["a scan's header longer than the file", "a scan of nothing"],
+)
+def test_impossible_headers_are_the_decoders(data):
+    check_entropy(data)
+    with pytest.raises(DataError, match="JPEG"):
+        jpeg.decode(data, colour=True)
+
+
 @settings(max_examples=300, deadline=None)
 @given(st.data())
 def test_damaged_headers_are_refused_or_taken(data):
