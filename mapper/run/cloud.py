@@ -9,7 +9,11 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import FrameError
 from mapper.core.frames import Points32
+from mapper.sources.cloud_files.parsing import Columns
 from mapper.sources.cloud_files.ply import read_ply
+
+_FARTHEST_M = 1e9
+"""Farther than any octree reaches: sums and squares of such coordinates overflow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,13 +39,23 @@ def read_cloud(path: Path) -> Cloud:
     """Return the cloud of a PLY file with colours.
 
     Raises:
-        FrameError: The file cannot be read.
+        FrameError: The file cannot be read, or is not as a run's clouds are.
     """
     try:
         columns = read_ply(path)
     except OSError as error:
         raise FrameError(f"{path}: cannot be read: {error.strerror}") from None
-    return Cloud(
-        np.column_stack([columns[axis] for axis in ("x", "y", "z")]),
-        np.column_stack([columns[channel] for channel in ("red", "green", "blue")]),
-    )
+    points = _columns(columns, ("x", "y", "z"), np.float32, path)
+    if not -_FARTHEST_M <= points.min(initial=0.0) <= points.max(initial=0.0) <= _FARTHEST_M:
+        first = np.flatnonzero(~(np.abs(points) <= _FARTHEST_M).all(axis=1))[0]
+        raise FrameError(f"{path}: point {first} is at {points[first]}, want finite metres")
+    return Cloud(points, _columns(columns, ("red", "green", "blue"), np.uint8, path))
+
+
+def _columns(
+    columns: Columns, names: tuple[str, ...], kind: type[np.float32 | np.uint8], path: Path
+) -> NDArray[Any]:
+    for name in names:
+        if name not in columns or not np.can_cast(columns[name].dtype, kind, "equiv"):
+            raise FrameError(f"{path}: no property {name} of {np.dtype(kind)}, as a run's clouds have")
+    return np.column_stack([columns[name] for name in names]).astype(kind, copy=False)

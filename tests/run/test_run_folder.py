@@ -1,10 +1,12 @@
 import fcntl
 import os
 
+import numpy as np
 import pytest
 
 from mapper.config.build import BuildConfig
 from mapper.core.errors import DataError, FrameError, RunError, TrackingError
+from mapper.export.ply import write_ply
 from mapper.loops.closure import read_closures
 from mapper.odometry.base import Diagnostics
 from mapper.run.cloud import read_cloud
@@ -206,3 +208,31 @@ def test_a_cloud_that_is_a_circle_of_links_is_refused_in_one_line(tmp_path):
     (tmp_path / "cloud.ply").symlink_to("cloud.ply")
     with pytest.raises(FrameError, match=r"cloud\.ply: cannot be read: Too many levels of symbolic links"):
         read_cloud(tmp_path / "cloud.ply")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        (
+            np.float32(2.5).tobytes(),
+            np.float32(np.nan).tobytes(),
+            r"point 1 is at \[nan +4\. +5\. *\], want finite",
+        ),
+        (
+            np.float32(2.5).tobytes(),
+            np.float32(3e38).tobytes(),
+            r"point 1 is at \[3\.e\+38 .*\], want finite",
+        ),
+        (b"float y", b"float w", "no property y of float32"),
+        (b"float y", b"int y", "no property y of float32"),
+        (b"uchar green", b"char green", "no property green of uint8"),
+    ],
+)
+def test_a_cloud_that_no_run_writes_is_refused(tmp_path, old, new, complaint):
+    path = tmp_path / "cloud.ply"
+    points = np.array([[0, 1, 2], [2.5, 4, 5]], np.float32)
+    write_ply(path, points, np.full((2, 3), 7, np.uint8))
+    np.testing.assert_array_equal(read_cloud(path).points, points)
+    path.write_bytes(path.read_bytes().replace(old, new))
+    with pytest.raises(FrameError, match=rf"cloud\.ply: {complaint}"):
+        read_cloud(path)
