@@ -3,7 +3,6 @@
 import math
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,6 @@ from mapper.core.timebase import NS_PER_S
 from mapper.features.base import Detector
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
-from mapper.features.matching import Pairs
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import with_model_error
 from mapper.odometry.base import (
@@ -29,13 +27,14 @@ from mapper.odometry.base import (
     lost_frame,
 )
 from mapper.odometry.config import IsvdOdometryConfig, MatchConfig
+from mapper.odometry.isvd_frames import Keyframe, PoseCandidate, TrackedFrame, kept
 from mapper.odometry.isvd_readout import readout_in_pair
 from mapper.odometry.isvd_registration import IsvdObservation, PairRegistration, RegisterPair
 from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.odometry.local_map.rolling_shutter import RollingShutter
+from mapper.odometry.registration_errors import RegistrationErrors
 from mapper.odometry.sharpest_keyframe import SharpestKeyframes
 from mapper.registration.base import Alignment
-from mapper.runtime.archived import Archived, archived
 from mapper.sensing.config import KINECT_NOISE
 from mapper.sensing.depth_filter import dif
 from mapper.sensing.depth_noise import depth_sigma_m, feature_depth_m
@@ -50,62 +49,6 @@ _HALF_VIEW_RAD = 0.5
 _PAIRS_SHARING, _PAIRS_COUNTED = 4, 200
 """Pairs of images that tell the readout time: a new image is in one, a keyframe in some 20, their geometric
 mean; and how many of them the estimate is from."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TrackedFrame:
-    """A tracked frame.
-
-    Attributes:
-        node: Its node.
-        observation: As its rows were read.
-        T_world_body: (4, 4) as estimated when it was tracked.
-        twist: Velocity of the body in the image.
-    """
-
-    node: int
-    observation: IsvdObservation
-    T_world_body: Transform
-    twist: Twist
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Keyframe:
-    """A tracked frame that is kept, with what it observed in the archive."""
-
-    node: int
-    observation: Archived[IsvdObservation]
-    T_world_body: Transform
-    twist: Twist
-
-    def loaded(self) -> TrackedFrame:
-        """Return the frame."""
-        return TrackedFrame(self.node, self.observation.data, self.T_world_body, self.twist)
-
-
-def _kept(frame: TrackedFrame) -> _Keyframe:
-    return _Keyframe(frame.node, archived(frame.observation), frame.T_world_body, frame.twist)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseCandidate:
-    """Registration of a new frame against an earlier one.
-
-    Attributes:
-        earlier: The earlier frame, the target.
-        alignment: The motion, earlier ← new.
-        information: (6, 6) of the motion, with the error that its features share.
-        weight: Its quality W, 1/m (eq. 4.1).
-        pairs: (M, 2) matched features, with or without depth.
-        T_world_body: (4, 4) pose of the new frame by this registration.
-    """
-
-    earlier: TrackedFrame
-    alignment: Alignment
-    information: Array
-    weight: float
-    pairs: Pairs
-    T_world_body: Transform
 
 
 class IsvdOdometry(FrameOdometry[IsvdObservation]):
@@ -141,7 +84,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         self._recent: deque[TrackedFrame] = deque(
             maxlen=max(config.previous_frames, config.keyframe_interval)
         )
-        self._keyframes: list[_Keyframe] = []
+        self._keyframes: list[Keyframe] = []
         self._sharpest = SharpestKeyframes(config.keyframe_interval)
         self._next_node = 0
         self._turn = 0
@@ -150,6 +93,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
             config.readout_s, windows_sharing=_PAIRS_SHARING, windows_counted=_PAIRS_COUNTED
         )
         self._shutter = RollingShutter(self._readout)
+        self._errors = RegistrationErrors()
 
     def observe(self, frame: Frame) -> IsvdObservation:
         """Return a frame's features with their 3D points. Pure.
@@ -260,7 +204,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         nearest = np.argsort(differences, kind="stable")[: count - 1]
         return [last, *(keyframes[i].loaded() for i in nearest if differences[i] <= _NEAR_VIEW)]
 
-    def _view_differences(self, frame: TrackedFrame, others: Sequence[_Keyframe]) -> Array:
+    def _view_differences(self, frame: TrackedFrame, others: Sequence[Keyframe]) -> Array:
         """Return (N,) how far views are apart: by shift relative to the depth of the scene, and by turn."""
         if not others:
             return np.empty(0)
@@ -322,7 +266,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         candidates = self._register(observation, keyframes, self._config.match)
         return sorted(candidates, key=lambda candidate: -candidate.alignment.pairs)[:1]
 
-    def _keyframes_to_try(self) -> list[_Keyframe]:
+    def _keyframes_to_try(self) -> list[Keyframe]:
         """Return the keyframes nearest to the last tracked pose, and some of the others in turn."""
         count = self._config.relocalisation_keyframes
         last_world = self._recent[-1].T_world_body[:3, 3]
@@ -360,10 +304,11 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
         self._recent.append(tracked)
         if self._config.earlier == "frames":
             keyframe = self._sharpest.add(node, len(observation.features))
-            self._keyframes.extend(_kept(frame) for frame in self._recent if frame.node == keyframe)
+            self._keyframes.extend(kept(frame) for frame in self._recent if frame.node == keyframe)
         elif not (self._view_differences(tracked, self._keyframes) < _NEW_VIEW).any():
-            self._keyframes.append(_kept(tracked))
+            self._keyframes.append(kept(tracked))
         nearest = candidates[0].alignment if candidates else None
+        self._errors.add(observation.stamp_ns, candidates)
         # All rest on this frame's features. Were the earlier ones' the same, too, each factor would have its
         # share of the information, were they others, all: it has the geometric mean.
         shared_by = math.sqrt(max(len(candidates), 1))
@@ -372,7 +317,7 @@ class IsvdOdometry(FrameOdometry[IsvdObservation]):
                 candidate.earlier.node,
                 node,
                 candidate.alignment.T_target_source,
-                candidate.information / shared_by,
+                self._errors.honest(candidate) / shared_by,
             )
             for candidate in candidates
         )

@@ -152,7 +152,8 @@ class PairRegistration:
             return failed(f"{count} of {among} pairs agree in the image")
         seen = T_camera_target, points[agree], measured[agree], weights[agree], source.intrinsics
         # The target's points were measured no better than the source's pixels, so the information is halved.
-        information = 0.5 * normal_matrix(*seen) / residual_statistics(*seen).variance_factor
+        residuals = residual_statistics(*seen)
+        information = 0.5 * normal_matrix(*seen) / residuals.variance_factor
         to_camera = adjoint(inverse(source.T_body_camera))
         T_target_source = inverse(source.T_body_camera @ T_camera_target)
         points_target, points_source = shared_points(target, source, pairs)
@@ -164,6 +165,7 @@ class PairRegistration:
             inlier_rmse_m=float(np.sqrt((miss_m**2).mean())) if len(miss_m) else 0.0,
             pairs=count,
             information=to_camera.T @ information @ to_camera,
+            residuals=residuals,
         )
 
 

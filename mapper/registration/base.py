@@ -1,13 +1,18 @@
 """Interface of registration: two scans and a guess in, a motion and its assessment out."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from mapper.core.errors import DataError
 from mapper.core.frames import Scan
 from mapper.core.geometry import Array, Transform, is_rigid
+
+if TYPE_CHECKING:
+    from mapper.registration.variance_factor import ResidualStatistics
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,6 +27,7 @@ class Alignment:
         pairs: How many pairs agree.
         reason: Why it did not converge; empty when it did.
         information: (6, 6) Fisher information of the source's tangent (rotation, translation), where known.
+        residuals: Statistics of the residuals that the information rests on, where known.
     """
 
     T_target_source: Transform
@@ -31,6 +37,7 @@ class Alignment:
     pairs: int = 0
     reason: str = ""
     information: Array | None = field(default=None, repr=False)
+    residuals: ResidualStatistics | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if not is_rigid(self.T_target_source):

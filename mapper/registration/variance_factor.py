@@ -1,6 +1,6 @@
 """Variance factor of a pose from features: how far residuals are from independent ones of known size."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -20,10 +20,14 @@ class ResidualStatistics:
             weights say.
         design_effect: By how much residuals that agree within a cell of the image carry less information than
             independent ones (Kish 1965, §5.4); about 1 if they are independent.
+        cell_scores: (12, 6) sums of the residuals' gradients in each cell, whitened, relative to what
+            independent ones amount to: their squares add up to about the design effect. None of too few
+            residuals.
     """
 
     variance: float
     design_effect: float
+    cell_scores: Array | None = field(default=None, repr=False, compare=False)
 
     @property
     def variance_factor(self) -> float:
@@ -60,4 +64,6 @@ def residual_statistics(
     np.add.at(sums, cell_of, gradients)
     covariance = np.linalg.inv(normal_matrix(T_camera_world, points, measured, weights, intrinsics))
     together, alone = (float(np.einsum("na,ab,nb->", g, covariance, g)) for g in (sums, gradients))
-    return ResidualStatistics(variance, together * len(cells) / (len(cells) - 1) / alone)
+    scores_of_cells = np.zeros((_COLUMNS * _ROWS, 6))
+    scores_of_cells[cells] = sums @ np.linalg.cholesky(0.5 * (covariance + covariance.T)) / np.sqrt(alone)
+    return ResidualStatistics(variance, together * len(cells) / (len(cells) - 1) / alone, scores_of_cells)
