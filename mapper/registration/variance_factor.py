@@ -36,7 +36,13 @@ class ResidualStatistics:
 
 
 def residual_statistics(
-    T_camera_world: Transform, points: Points, measured: Array, weights: Array, intrinsics: Array
+    T_camera_world: Transform,
+    points: Points,
+    measured: Array,
+    weights: Array,
+    intrinsics: Array,
+    *,
+    redundancy: Array | None = None,
 ) -> ResidualStatistics:
     """Return the statistics of a pose's residuals.
 
@@ -49,10 +55,13 @@ def residual_statistics(
         measured: (N, 3) u, v, bf/z in pixels; NaN in the third column without depth.
         weights: (N, 3) inverse variances of the three, px⁻².
         intrinsics: (5,) fx, fy, cx, cy, bf.
+        redundancy: (N,) share of its own error that a measurement leaves in its residual (Baarda 1968): less
+            than 1 where it took part in finding the point. None for points found without these measurements.
     """
     gradients, squares = scores(T_camera_world, points, measured, weights, intrinsics)
-    freedom = int(np.isfinite(measured).sum()) - 6
-    if freedom <= 0:
+    counted = np.isfinite(measured).sum(axis=1)
+    freedom = float(counted.sum() if redundancy is None else redundancy @ counted) - 6.0
+    if freedom <= 0.0:
         return ResidualStatistics(1.0, 1.0)
     variance = float(squares.sum()) / freedom
     share = measured[:, :2] / (2.0 * intrinsics[2:4])

@@ -58,3 +58,17 @@ def test_too_few_features_are_taken_as_they_are():
         ).variance_factor
         == 1.0
     )
+
+
+def test_points_found_with_the_measurements_leave_less_of_the_error_in_residuals():
+    """Points are the mean of two images, so a half of each error's variance is in a residual."""
+    rng = np.random.default_rng(6)
+    pixels, z = rng.uniform([20, 20], [620, 460], (400, 2)), rng.uniform(1.0, 3.0, 400)
+    seen = np.column_stack([pixels, INTRINSICS[4] / z])[None] + rng.normal(0.0, 0.7, (2, 400, 3))
+    u, v, disparity = seen.mean(axis=0).T
+    points = np.column_stack([(u - 319.5) / 525.0, (v - 239.5) / 525.0, np.ones(400)])
+    points *= INTRINSICS[4] / disparity[:, None]
+    known = np.eye(4), points, seen[0], np.ones((400, 3)), INTRINSICS
+    shares = np.full(400, 0.5)
+    assert residual_statistics(*known).variance == pytest.approx(0.5 * 0.7**2, rel=0.1)
+    assert residual_statistics(*known, redundancy=shares).variance == pytest.approx(0.7**2, rel=0.1)

@@ -58,7 +58,8 @@ def relative_information(landmark_map: LandmarkMap, target: int, source: int) ->
 def keyframe_residuals(landmark_map: LandmarkMap, index: int) -> ResidualStatistics | None:
     """Return the statistics of a keyframe's residuals; None where few landmarks have another observer."""
     ids = landmark_map.landmark_of_feature(index)
-    features = np.flatnonzero((ids >= 0) & (landmark_map.landmarks["observers"][ids] > 1))
+    observers = landmark_map.landmarks["observers"][ids]
+    features = np.flatnonzero((ids >= 0) & (observers > 1))
     if len(features) < MIN_SHARED_LANDMARKS:
         return None
     observation = landmark_map.observation(index)
@@ -68,6 +69,7 @@ def keyframe_residuals(landmark_map: LandmarkMap, index: int) -> ResidualStatist
         observation.measured[features],
         observation.weights[features],
         observation.intrinsics,
+        redundancy=1.0 - 1.0 / observers[features],  # a landmark is the mean of what its observers saw
     )
 
 
