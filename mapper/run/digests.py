@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -77,13 +78,24 @@ def checked(folder: Path, name: str, digests: Mapping[str, FileDigest]) -> Path:
     """Return the path of a run's file after comparing it with its digest; without one it is not compared.
 
     Raises:
-        RunError: It is missing, or is not as it was written.
+        RunError: It is missing, or is not as it was written, or is no regular file.
     """
     if name in digests:
         path = folder / name
         if fault := fault_of(path, digests[name], most_hashed_bytes=MOST_HASHED_BYTES):
             raise RunError(f"{path}: {fault}; {files.remedy_for(name, folder)}")
-    return folder / name
+    return regular(folder / name)
+
+
+def regular(path: Path) -> Path:
+    """Return the path of a run's file, which may be missing.
+
+    Raises:
+        RunError: It is a pipe or a device, of which nothing may ever come, or a folder.
+    """
+    if path.exists() and not path.is_file():
+        raise RunError(f"{path}: no regular file")
+    return path
 
 
 def fault_of(path: Path, wanted: FileDigest, *, most_hashed_bytes: int | None = None) -> str:
@@ -95,7 +107,10 @@ def fault_of(path: Path, wanted: FileDigest, *, most_hashed_bytes: int | None = 
         most_hashed_bytes: A larger file is compared by its size alone; None hashes any.
     """
     try:
-        size_bytes = path.stat().st_size
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            return "is no regular file"
+        size_bytes = status.st_size
         if size_bytes != wanted.size_bytes:
             return f"has {size_bytes} bytes, was written with {wanted.size_bytes}"
         if most_hashed_bytes is not None and size_bytes > most_hashed_bytes:

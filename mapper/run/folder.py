@@ -20,7 +20,7 @@ from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure, read_closures
 from mapper.odometry.config import GivenOdometryConfig
 from mapper.run import files
-from mapper.run.digests import changing, checked
+from mapper.run.digests import changing, checked, regular
 from mapper.run.doubtful_frames import without_doubtful
 from mapper.run.fingerprint import fingerprint
 from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records, stamps_of
@@ -114,10 +114,10 @@ class Run:
         """Return the path of one of its files, after comparing it with what the manifest tells of it.
 
         Raises:
-            RunError: It is missing, or is not as it was written.
+            RunError: It is missing, or is not as it was written, or is no regular file.
         """
         if not self.manifest.files:
-            return self.path / name
+            return regular(self.path / name)
         digests = read_manifest(self.path / files.MANIFEST).files  # exports and plans add theirs
         return checked(self.path, name, digests)
 

@@ -1,5 +1,8 @@
 import hashlib
+import json
+import os
 import shutil
+import threading
 from dataclasses import replace
 
 import pytest
@@ -65,6 +68,27 @@ def test_a_file_that_was_cut_is_not_read(run, name):
     cut(run.path / name)
     with pytest.raises(RunError, match=rf"{name}: has \d+ bytes, was written with \d+; "):
         READERS[name](replace(run))  # without what was read before
+
+
+@pytest.mark.parametrize("digests_known", [True, False])
+@pytest.mark.parametrize("name", READERS)
+def test_a_pipe_is_no_file_of_a_run(run, name, digests_known):
+    if not digests_known:
+        manifest = json.loads((run.path / "manifest.json").read_text())
+        (run.path / "manifest.json").write_text(json.dumps(manifest | {"files": {}}))
+        run = open_run(run.path)
+    path = run.path / name
+    path.unlink()
+    os.mkfifo(path)
+    writer = threading.Thread(target=lambda: path.open("wb").close())  # who opens it does not wait for ever
+    writer.start()
+    try:
+        with pytest.raises(RunError, match=rf"{name}: (is )?no regular file"):
+            READERS[name](run)
+    finally:
+        reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+        writer.join()
+        os.close(reader)
 
 
 @pytest.mark.parametrize("name", ["trajectory.tum", "poses.csv", "frames.csv"])
