@@ -3,9 +3,16 @@
 import re
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from mapper.core.errors import SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
 from mapper.sources.config import CameraConfig
+
+_CHECKED = 17
+"""Columns and rows of the pixels whose distortion is taken out to check a calibration."""
+_MOST_MOVED = 1000
+"""Sides of the image, beyond which a pixel without its distortion is nowhere: the search for it diverged."""
 
 _Distortion = tuple[float, float, float, float, float]
 
@@ -43,7 +50,7 @@ class Calibration:
         """Return the camera of images of this size.
 
         Raises:
-            SourceError: The calibration holds for another size.
+            SourceError: The calibration holds for another size, or its distortion has no inverse.
         """
         if self.size_px not in (None, (width_px, height_px)):
             width, height = self.size_px or (0, 0)
@@ -52,7 +59,13 @@ class Calibration:
                 "give theirs in a calibration.toml beside the log"
             )
         numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px)
-        return PinholeCamera(width_px, height_px, *numbers, distortion=self.distortion)
+        camera = PinholeCamera(width_px, height_px, *numbers, distortion=self.distortion)
+        grid = np.meshgrid(np.linspace(0, width_px - 1, _CHECKED), np.linspace(0, height_px - 1, _CHECKED))
+        moved = np.abs(camera.undistort(np.stack(grid, axis=2).reshape(-1, 2)))
+        if not (moved <= _MOST_MOVED * max(width_px, height_px)).all():
+            numbers_text = ", ".join(f"{number:g}" for number in self.distortion)
+            raise SourceError(f"{self.origin}: distortion {numbers_text} cannot be taken out of the images")
+        return camera
 
 
 def configured(camera: CameraConfig | None) -> Calibration | None:

@@ -136,6 +136,17 @@ def test_another_image_size_is_refused(tmp_path):
         read_calibration(path).camera(width_px=320, height_px=240)
 
 
+@pytest.mark.parametrize("number", ["-1e308", "1e100", "50.0"])
+def test_a_distortion_without_an_inverse_is_refused(tmp_path, number):
+    path = tmp_path / "calibration.toml"
+    path.write_text(OURS.replace("[0.26, -0.95, -0.005, 0.0026, 1.16]", f"[0.0, 0.0, 0.0, {number}, 0.0]"))
+    calibration = read_calibration(path)
+    with pytest.raises(
+        SourceError, match=r"calibration\.toml: distortion 0, 0, 0, .*, 0 cannot be taken out"
+    ):
+        calibration.camera(width_px=640, height_px=480)
+
+
 @pytest.mark.parametrize(
     ("name", "camera"),
     [
