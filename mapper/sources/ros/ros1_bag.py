@@ -148,6 +148,8 @@ def _unpack(stored: bytes) -> memoryview:
 
 def _record_at(file: BinaryIO, at: int, size: int) -> tuple[_Fields, int, int]:
     """Return the header of a file's record at a byte, and start and length of its data."""
+    if at > size:
+        raise DataError("a record that begins after the file")
     file.seek(at)
     (header_length,) = _LENGTH.unpack(file.read(_LENGTH.size).ljust(_LENGTH.size, b"\xff"))
     start = at + _LENGTH.size + header_length + _LENGTH.size

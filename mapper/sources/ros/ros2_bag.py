@@ -28,7 +28,8 @@ class DatabaseRecording:
                 _check_tables(database)
                 rows = database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
         except (sqlite3.Error, UnicodeDecodeError, DataError) as error:  # SQLite's text may be damaged too
-            raise SourceError(f"{path}: not a .db3 file that rosbag2 wrote: {error}") from None
+            reason = " ".join(str(error).split())  # it may quote the table's definition
+            raise SourceError(f"{path}: not a .db3 file that rosbag2 wrote: {reason}") from None
         self._topics = {
             number: Topic(*texts) for number, *texts in rows if all(isinstance(text, str) for text in texts)
         }

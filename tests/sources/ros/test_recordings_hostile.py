@@ -130,6 +130,17 @@ def test_a_bag_s_index_that_names_a_chunk_twice_is_not_used(tmp_path):
     assert [bytes(message.data) for message in open_bag(path).messages()] == expected
 
 
+@pytest.mark.parametrize("at", [1 << 40, (1 << 63) - 1, 1 << 63, (1 << 64) - 1])
+def test_a_bag_s_index_that_points_far_beyond_the_file_is_not_used(tmp_path, at):
+    path = write(tmp_path / "log.bag", shots(6))
+    expected = [bytes(message.data) for message in open_bag(path).messages()]
+    data = path.read_bytes()
+    last = last_record(data)
+    place = data.index(b"chunk_pos=", last) + len(b"chunk_pos=")
+    path.write_bytes(data[:place] + struct.pack("<Q", at) + data[place + 8 :])
+    assert [bytes(message.data) for message in open_bag(path).messages()] == expected
+
+
 def last_record(data: bytes) -> int:
     """Return where the last record of a bag begins, which is about one of its chunks."""
     at = last = len(b"#ROSBAG V2.0\n")
@@ -175,6 +186,14 @@ def test_a_database_whose_rows_are_computed_is_refused(tmp_path, change, why):
     path = changed_database(tmp_path, change)
     with pytest.raises(SourceError, match=rf"log\.db3: not a \.db3 file that rosbag2 wrote: {why}"):
         open_source(path)
+
+
+def test_a_database_whose_definition_is_no_text_is_refused_in_one_line(tmp_path):
+    path = write(tmp_path / "log", shots(3)) / "log.db3"
+    path.write_bytes(path.read_bytes().replace(b"name TEXT", b"name T\xff\xffT"))
+    with pytest.raises(SourceError, match=r"log\.db3: not a \.db3 file .*: Could not decode") as refused:
+        open_source(path)
+    assert "\n" not in str(refused.value)
 
 
 def test_a_topic_whose_name_is_no_text_is_left_out(tmp_path):
