@@ -149,6 +149,11 @@ def flush_to_disk(path: Path) -> None:
     try:
         with writing(path):
             os.fsync(handle)
+    except OSError as error:
+        if (
+            error.errno != errno.EINVAL
+        ):  # it is on no disk, as the files of /proc, or its file system has no flush
+            raise
     finally:
         os.close(handle)
 

@@ -10,6 +10,7 @@ from mapper.runtime.atomic import (
     FolderKind,
     atomic_file,
     atomic_folder,
+    flush_to_disk,
     new_folder,
     partial_of,
     write_bytes,
@@ -170,3 +171,18 @@ def test_a_folder_is_replaced_where_names_cannot_be_exchanged(tmp_path, monkeypa
     make_map(tmp_path / "map", "new", overwrite=True)
     assert (tmp_path / "map/map.bt").read_text() == "new"
     assert names_in(tmp_path) == ["map"]
+
+
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.EIO])
+def test_what_is_on_no_disk_needs_no_flush_and_a_failing_disk_is_told(monkeypatch, tmp_path, number):
+    def fail(_handle):
+        raise OSError(number, "it is so")
+
+    path = tmp_path / "a.txt"
+    write_text(path, "text")
+    monkeypatch.setattr(atomic.os, "fsync", fail)
+    if number == errno.EINVAL:  # what the files of /proc, and folders on some network's disks, answer
+        flush_to_disk(path)
+    else:
+        with pytest.raises(WriteError, match=r"a\.txt: cannot be written: it is so"):
+            flush_to_disk(path)
