@@ -150,9 +150,7 @@ def flush_to_disk(path: Path) -> None:
         with writing(path):
             os.fsync(handle)
     except OSError as error:
-        if (
-            error.errno != errno.EINVAL
-        ):  # it is on no disk, as the files of /proc, or its file system has no flush
+        if error.errno != errno.EINVAL:  # as of /proc's files, which are on no disk
             raise
     finally:
         os.close(handle)

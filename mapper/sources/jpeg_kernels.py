@@ -87,9 +87,8 @@ def _unstuffed(data: NDArray[np.uint8], at: int, coded: NDArray[np.uint8]) -> tu
         coded[size] = value
         if value == 0xFF:
             behind = at + 1
-            while (
-                behind < data.size and data[behind] == 0xFF
-            ):  # a marker, or a value, may follow more than one
+            # A marker, or a value, may follow more than one.
+            while behind < data.size and data[behind] == 0xFF:
                 behind += 1
             if behind == data.size or data[behind] != 0:
                 return size, behind - 1
