@@ -1,7 +1,11 @@
 """Errors of a log's registrations, which tell how certain its poses are."""
 
 import math
+from bisect import insort
 from collections.abc import Sequence
+from statistics import median
+
+import numpy as np
 
 from mapper.core.geometry import Array
 from mapper.core.timebase import NS_PER_S
@@ -26,6 +30,7 @@ class RegistrationErrors:
 
     def __init__(self) -> None:
         self._residuals = LogResiduals()
+        self._scales: list[float] = []  # of the frames, in increasing order
         self._sums: dict[int, Array] = {}  # of the cells' scores, by the node registered against
         self._stamp_ns = 0
         self._own, self._repeated = float(_COUNTED), 0.5 * (_USUAL - 1.0) * _COUNTED
@@ -39,9 +44,13 @@ class RegistrationErrors:
         """Add the registrations of the next frame."""
         kept = math.exp((self._stamp_ns - stamp_ns) / (_MEMORY_S * NS_PER_S))
         self._stamp_ns, before, self._sums = stamp_ns, self._sums, {}
-        found = [of.alignment.residuals for of in candidates if of.alignment.residuals is not None]
+        found = [
+            (of.alignment.residuals.design_effect, n)
+            for n, of in enumerate(candidates)
+            if of.alignment.residuals is not None
+        ]
         if found:
-            self._residuals.add(sorted(found, key=lambda of: of.design_effect)[len(found) // 2])
+            self._add(candidates[sorted(found)[len(found) // 2][1]])
         for candidate in candidates:
             residuals, node = candidate.alignment.residuals, candidate.earlier.node
             if residuals is None or residuals.cell_scores is None:
@@ -55,10 +64,22 @@ class RegistrationErrors:
                 self._sums[node] = scores + earlier
 
     def honest(self, candidate: PoseCandidate) -> Array:
-        """Return the (6, 6) information of a registration by what the residuals show."""
-        alignment = candidate.alignment
-        if alignment.residuals is None:
+        """Return the (6, 6) information of a registration by what the log's residuals show.
+
+        All registrations are scaled alike. What their weights are relative to each other decides the path,
+        and one that rests on something that moves has residuals of its own.
+        """
+        if candidate.alignment.residuals is None:
             return candidate.information
+        return candidate.information / (median(self._scales) * self.repetition)
+
+    def _add(self, candidate: PoseCandidate) -> None:
+        """Add a frame's registration: its residuals, and by how much they scale its covariance."""
+        alignment = candidate.alignment
+        assert alignment.residuals is not None
         assert alignment.information is not None  # it converged
+        self._residuals.add(alignment.residuals)
         by_weights = alignment.information * alignment.residuals.variance_factor
-        return self._residuals.honest(by_weights, alignment.T_target_source) / self.repetition
+        shown = self._residuals.honest(by_weights, alignment.T_target_source)
+        (_, before), (_, after) = np.linalg.slogdet(candidate.information), np.linalg.slogdet(shown)
+        insort(self._scales, math.exp((before - after) / len(shown)))

@@ -1,5 +1,6 @@
 """Information of registrations by how far frames repeat the errors of those before."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -67,10 +68,21 @@ def test_repeated_errors_lower_the_information():
     same = independent(1)[0]
     for n in range(100):
         errors.add(n * FRAME_NS, [candidate(same)])
-    found = errors.honest(candidate(same))
+    found = errors.honest(candidate(same)) * errors.repetition
+    shown = with_model_error(INFORMATION, T_EARLIER_NEW, scale=0.125)
+    assert np.linalg.slogdet(found)[1] == pytest.approx(np.linalg.slogdet(shown)[1])
+
+
+def test_registrations_keep_their_weights_relative_to_each_other():
+    errors = RegistrationErrors()
+    one, other = candidate(independent(1)[0]), candidate(independent(2)[1], node=1)
+    other = replace(other, information=np.diag([1e4, 1e5, 1e6, 1e3, 1e4, 1e5]))  # of things that move
+    errors.add(0, [one, other])
     np.testing.assert_allclose(
-        found * errors.repetition, with_model_error(INFORMATION, T_EARLIER_NEW, scale=0.125), rtol=1e-9
+        errors.honest(one) / errors.honest(one)[0, 0], one.information / one.information[0, 0]
     )
+    ratio = errors.honest(one)[0, 0] / errors.honest(other)[0, 0]
+    assert ratio == pytest.approx(one.information[0, 0] / other.information[0, 0])
 
 
 def test_registrations_without_residuals_count_as_they_are():
