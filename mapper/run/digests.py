@@ -88,12 +88,12 @@ def checked(folder: Path, name: str, digests: Mapping[str, FileDigest]) -> Path:
 
 
 def regular(path: Path) -> Path:
-    """Return the path of a run's file, which may be missing.
+    """Return the path of something in a run's folder, which may be missing, or a folder of the user's.
 
     Raises:
-        RunError: It is a pipe or a device, of which nothing may ever come, or a folder.
+        RunError: It is a pipe or a device, of which nothing may ever come.
     """
-    if path.exists() and not path.is_file():
+    if path.exists() and not path.is_file() and not path.is_dir():
         raise RunError(f"{path}: no regular file")
     return path
 
