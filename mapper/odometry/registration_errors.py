@@ -3,7 +3,6 @@
 import math
 from bisect import insort
 from collections.abc import Sequence
-from statistics import median
 
 import numpy as np
 
@@ -71,7 +70,13 @@ class RegistrationErrors:
         """
         if candidate.alignment.residuals is None:
             return candidate.information
-        return candidate.information / (median(self._scales) * self.repetition)
+        return candidate.information / (self._usual_scale * self.repetition)
+
+    @property
+    def _usual_scale(self) -> float:
+        """Median of the frames' scales; the list is in order, so that long logs need no sorting."""
+        count = len(self._scales)
+        return 0.5 * (self._scales[(count - 1) // 2] + self._scales[count // 2])
 
     def _add(self, candidate: PoseCandidate) -> None:
         """Add a frame's registration: its residuals, and by how much they scale its covariance."""
