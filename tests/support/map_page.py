@@ -56,13 +56,17 @@ class MapPage(Page):
         self.mouse("mouseReleased", x, y, clicks=1)
 
     def sought(self, name, wanted):
-        """Move the pointer over the map until a text appears; return where that is."""
+        """Move the pointer from the middle of the map outwards until a text appears; return where that is."""
         left, top, width, height = self.box()
-        for y in np.linspace(top + 5, top + height - 5, 50):
-            for x in np.linspace(left + 5, left + width - 5, 70):
-                self.mouse("mouseMoved", x, y)
-                if wanted in (self.text(name) or ""):
-                    return x, y
+        x, y = np.meshgrid(
+            np.linspace(left + 5, left + width - 5, 70), np.linspace(top + 5, top + height - 5, 50)
+        )
+        places = np.column_stack([x.ravel(), y.ravel()])
+        from_middle = np.linalg.norm(places - [left + width / 2, top + height / 2], axis=1)
+        for x, y in places[np.argsort(from_middle, kind="stable")].tolist():
+            self.mouse("mouseMoved", x, y)
+            if wanted in (self.text(name) or ""):
+                return x, y
         raise AssertionError(f"nothing tells {wanted!r}")
 
 
