@@ -62,10 +62,10 @@ def storeys_of_run(run: Run) -> tuple[Storey, ...]:
     Raises:
         MapFileError: The octree cannot be read.
     """
-    config, path_world = run.config.traversable, load_results(run).tracked.positions_world
-    floor = reachable_floor(run.octree, config, positions_world=path_world)
+    config, editor = run.config.traversable, editor_of(run)
+    floor = reachable_floor(run.octree, config, positions_world=editor.path_world)
     storeys = traversable(floor, config, with_links=True)
-    return editor_of(run).edit_storeys(storeys)[0]
+    return editor.edit_storeys(storeys)[0]
 
 
 def _storeys(run: Run) -> Iterator[OccupancyGrid]:
