@@ -29,9 +29,17 @@ def write_merged_map_page(path: AnyPath, merged: MergedMap, names: list[str]) ->
     paths = [_path_of(merged, k, name) for k, name in enumerate(names)]
     highest_m = max((max(one["path"]["z"], default=0.0) for one in paths), default=0.0)
     maps = [map_of_octree(merged.octree, highest_m=highest_m), *(no_map() for _ in paths)]
-    picture = data_uri("png", merged.file(files.SUMMARY).read_bytes())
-    pictures = f'<img src="{picture}" alt="{escape(title)} from above, with the paths of its runs">'
-    write_text(Path(path), map_page(title, [_of_the_map(merged, title), *paths], maps, pictures=pictures))
+    curves = [_of_the_map(merged, title), *paths]
+    write_text(Path(path), map_page(title, curves, maps, pictures=_picture(merged, title)))
+
+
+def _picture(merged: MergedMap, title: str) -> str:
+    """Return the map's picture as HTML; empty if it has none, as a map without a slice."""
+    path = merged.file(files.SUMMARY)
+    if not path.is_file():
+        return ""
+    picture = data_uri("png", path.read_bytes())
+    return f'<img src="{picture}" alt="{escape(title)} from above, with the paths of its runs">'
 
 
 def _of_the_map(merged: MergedMap, name: str) -> dict[str, Any]:

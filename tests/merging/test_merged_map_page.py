@@ -61,6 +61,18 @@ def test_the_page_holds_the_voxels_once_and_each_runs_path_in_the_map(merged, pa
     assert (loop["ends"], loop["verdict"]) == ([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]], "rejected")
 
 
+def test_a_map_without_a_slice_has_a_page_without_a_picture(merged, page, tmp_path):
+    summary = merged.file(files.SUMMARY)
+    drawn = summary.rename(tmp_path / "summary.png")
+    try:
+        write_merged_map_page(tmp_path / "town.html", merged, ["a", "b"])
+    finally:
+        drawn.rename(summary)
+    assert element(tmp_path / "town.html", "maps") == element(page, "maps")
+    assert 'alt="town from above' in page.read_text()
+    assert 'alt="town from above' not in (tmp_path / "town.html").read_text()
+
+
 @pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 def test_the_browser_shows_map_paths_and_why_a_loop_was_refused(page):
     with MapPage(page, height_px=800) as browser:
