@@ -57,6 +57,11 @@ export class MapView {
     this.invalidate();
   }
 
+  /** Layers that have a map of their own; a run of a merged map has none. */
+  get mapped() {
+    return this.layers.filter(({ cells }) => cells);
+  }
+
   /** Lowest and highest value of the colouring, over all runs. */
   range() {
     const { points, coloring } = this.state;

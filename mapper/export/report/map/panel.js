@@ -27,7 +27,7 @@ export class Panel {
   #runs() {
     const { view } = this, { layers } = view;
     this.find("runs").hidden = layers.length < 2;
-    this.find("beside").hidden = layers.filter(({ cells }) => cells).length < 2;
+    this.find("beside").hidden = view.mapped.length < 2;
     for (const box of this.root.querySelectorAll("[data-map-run]"))
       box.addEventListener("change", () => {
         view.shown[Number(box.dataset.mapRun)] = box.checked;
@@ -42,7 +42,7 @@ export class Panel {
       color: view.layers.some(({ map }) => map.cloud.has_colors),
       time: view.layers.every(({ map }) => map.is_observed),
       hits: view.layers.every(({ map }) => map.is_observed),
-      run: view.layers.filter(({ cells }) => cells).length > 1,
+      run: view.mapped.length > 1,
     };
     for (const option of [...coloring.options]) if (has[option.value] === false) option.remove();
     coloring.value = has.run ? "run" : has.color ? "color" : "height";
@@ -59,14 +59,14 @@ export class Panel {
 
   #cut() {
     const { view } = this, slider = this.find("cut"), box = this.find("slice"), told = this.find("cut-value");
-    const cut = view.layers.map(({ cells }) => cells).filter(Boolean);
+    const cut = view.mapped.map(({ cells }) => cells);
     const lows = cut.map(({ low }) => low[2]);
     const highs = cut.map(({ low, shape, edge_m }) => low[2] + shape[2] * edge_m);
     const edge_m = Math.min(...cut.map((cells) => cells.edge_m));
     slider.min = Math.min(...lows);
     slider.max = Math.max(...highs);
     slider.step = edge_m;
-    const headroom_m = Math.max(...view.layers.filter(({ cells }) => cells).map(({ map }) => map.headroom_m));
+    const headroom_m = Math.max(...view.mapped.map(({ map }) => map.headroom_m));
     slider.value = Math.min(headroom_m, Number(slider.max));
     const change = () => {
       const isWhole = Number(slider.value) >= Number(slider.max) - edge_m / 2, height_m = Number(slider.value);
