@@ -6,6 +6,7 @@ import pytest
 
 from mapper.core.errors import DataError
 from mapper.features.base import Features
+from mapper.features.hamming import match_mutual_bits, pack
 from mapper.features.matching import homography_inliers, match_mutual
 
 
@@ -43,6 +44,18 @@ def test_bits_match_like_the_definition(width, max_ratio):
 
     assert pairs.tolist() == brute_force(distances, max_ratio)
     assert max_ratio < 0.9 or len(pairs) > 3
+
+
+@pytest.mark.parametrize(("max_ratio", "max_hamming"), [(0.95, 256), (0.99, 104)])
+def test_packed_bits_match_like_the_definition_up_to_a_distance(max_ratio, max_hamming):
+    a, b = random_bits(0, 90), random_bits(1, 70)
+    distances = np.unpackbits(a[:, None] ^ b[None], axis=2).sum(axis=2).astype(float)
+    wanted = [(i, j) for i, j in brute_force(distances, max_ratio) if distances[i, j] <= max_hamming]
+
+    partner = match_mutual_bits(pack(a), pack(b), max_hamming, max_ratio)
+
+    assert [(i, j) for i, j in enumerate(partner.tolist()) if j >= 0] == wanted
+    assert len(wanted) > 3
 
 
 @pytest.mark.parametrize("max_ratio", [0.8, 0.95, 1.0])
