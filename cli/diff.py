@@ -57,11 +57,12 @@ def diff(
     from mapper.merging.difference_files import summary, write_differences
     from mapper.merging.differences import differences_of
     from mapper.run.folder import open_run
+    from mapper.runtime.executor import IN_PROCESS
 
     earlier, later = open_run(before), open_run(after)
     progress = output.progress()
     out = place_of(out, DIFFS / joined_names([before, after]), overwrite=overwrite)
-    placing = placing_of([earlier, later], place, poses, jointly=False, progress=progress)
+    placing = placing_of([earlier, later], place, poses, jointly=False, workers=IN_PROCESS, progress=progress)
     found = differences_of(*placing.placed, tolerance_m=tolerance_m, min_voxels=min_voxels)
     placed = placing.placed[-1].how
     write_differences(out, found, earlier, later, placed=placed, overwrite=overwrite)

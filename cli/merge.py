@@ -77,7 +77,7 @@ def merge(
         overwrite |= out.resolve() == known.path.resolve()
         if place is Place.BUILT and poses is None and known.graph is not None:
             place = Place.AUTO
-    placing = placing_of(built, place, poses, jointly=True, known=known, progress=progress)
+    placing = placing_of(built, place, poses, jointly=True, known=known, workers=workers, progress=progress)
     merged = merge_runs(
         placing,
         out,

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from mapper.merging.merged_map import MergedMap
     from mapper.merging.placing import Placing
     from mapper.run.folder import Run
+    from mapper.runtime.executor import Workers
     from mapper.runtime.progress import Progress
 
 
@@ -37,6 +38,7 @@ def placing_of(
     *,
     jointly: bool,
     known: "MergedMap | None" = None,
+    workers: "Workers",
     progress: "Progress",
 ) -> "Placing":
     """Return the runs with the poses of their worlds.
@@ -47,6 +49,7 @@ def placing_of(
         poses: File of them.
         jointly: Whether shared places bend the runs, or place each as a rigid body.
         known: A map of the first of them, to which the others are added.
+        workers: Where places are compared.
         progress: Receives stages and notes.
 
     Raises:
@@ -70,8 +73,8 @@ def placing_of(
             from mapper.pipeline.place_runs import place_by_shared_places, place_jointly
 
             if not jointly:
-                return place_by_shared_places(runs, progress=progress)
-            has_graph = known is not None and known.graph is not None
-            return place_jointly(runs, known=known if has_graph else None, progress=progress)
+                return place_by_shared_places(runs, workers=workers, progress=progress)
+            known = known if known is not None and known.graph is not None else None
+            return place_jointly(runs, known=known, workers=workers, progress=progress)
         case _:
             assert_never(place)

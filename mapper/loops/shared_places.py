@@ -1,19 +1,29 @@
 """Places that several runs share: keyframes of one run recognised and measured in another."""
 
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Generic, NamedTuple
 
 import numpy as np
 
+from mapper.core.errors import RunError
 from mapper.core.geometry import Transform
-from mapper.loops.base import Place, Proposal, Proposer, Verifier, verify_proposal
+from mapper.loops.base import Place, Proposal, Proposer, verify_proposal
 from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy, exceeds
-from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
+from mapper.loops.config import (
+    ImageVerificationConfig,
+    PlaceLoopsConfig,
+    ScanLoopsConfig,
+    ScanVerificationConfig,
+)
 from mapper.loops.factory import build_similarity_proposer, build_verifier
 from mapper.loops.map_constraints import KnownPlaces
+from mapper.loops.place_file import AnyPlace
+from mapper.runtime.executor import IN_PROCESS, Workers, make_executor, run_jobs
 from mapper.runtime.progress import SILENT, Progress
+from mapper.runtime.worker_process import Failure
 
 _MOST_SIMILAR = 12
 """Places that are proposed for a keyframe, of all earlier runs."""
@@ -62,6 +72,7 @@ def find_shared_places(
     config: PlaceLoopsConfig | ScanLoopsConfig,
     *,
     searched: int = 0,
+    workers: Workers = IN_PROCESS,
     progress: Progress = SILENT,
 ) -> list[SharedPlace]:
     """Return the places of runs that were recognised in earlier ones, as measured: some may be false.
@@ -73,25 +84,82 @@ def find_shared_places(
         runs: Their places, each in its own world; one run may have none.
         config: How places are proposed and verified.
         searched: So many of the first runs are not searched in each other: what they share is known.
-        progress: Receives how many runs are done.
+        workers: Where pairs are verified, a job for any two runs.
+        progress: Receives how many runs are searched, and how many pairs of runs verified.
 
     Raises:
-        ConfigError: The places cannot be recognised by similarity.
+        ConfigError: The places cannot be recognised by similarity, or the scheduler does not answer.
+        RunError: A job failed twice.
     """
     first = next((place for run in runs for place in run.places.values()), None)
     if first is None:
         return []
-    search = _Search(
-        config,
-        build_similarity_proposer(config, first, most=_MOST_SIMILAR),
-        build_verifier(config.verification),
-    )
-    found = list[SharedPlace]()
+    search = _Search(config, build_similarity_proposer(config, first, most=_MOST_SIMILAR))
+    pairs = list[_Pair]()
     with progress.stage("places") as report:
         for number, run in enumerate(runs):
-            found += search.add(run, is_searched=number >= searched)
+            pairs += search.add(run, is_searched=number >= searched)
             report(number + 1, len(runs))
-    return found
+    loops = _verified(pairs, runs, config, workers, progress)
+    T_map_nodes = [run.T_map_node for run in runs]
+    return [
+        shared_place(pair.first, pair.second, loop, T_map_nodes[pair.first], T_map_nodes[pair.second])
+        for pair, loop in zip(pairs, loops, strict=True)
+        if loop.verdict == "accepted"
+    ]
+
+
+class _Pair(NamedTuple):
+    """A keyframe of a run, and a place of an earlier one with which it is compared.
+
+    Attributes:
+        first: Number of the earlier run.
+        second: Number of the run.
+        proposal: Of the place.
+        node: Of the keyframe.
+    """
+
+    first: int
+    second: int
+    proposal: Proposal
+    node: int
+
+
+def _verified(
+    pairs: Sequence[_Pair],
+    runs: Sequence[KnownPlaces[Any]],
+    config: PlaceLoopsConfig | ScanLoopsConfig,
+    workers: Workers,
+    progress: Progress,
+) -> list[LoopClosure]:
+    """Return the loop closure of every pair, accepted or rejected."""
+    by_runs = defaultdict[tuple[int, int], list[int]](list)
+    for number, pair in enumerate(pairs):
+        by_runs[pair.first, pair.second].append(number)
+    numbers, jobs = list(by_runs.values()), list[Callable[[], list[LoopClosure]]]()
+    for (first, second), some in by_runs.items():
+        compared = [
+            (pair.proposal, pair.node, runs[first].places[pair.proposal.node], runs[second].places[pair.node])
+            for pair in map(pairs.__getitem__, some)
+        ]
+        jobs.append(partial(_verify_all, config.verification, compared))
+    loops = dict[int, LoopClosure]()
+    with make_executor(workers, jobs=len(jobs)) as executor, progress.stage("compare") as report:
+        for done, (job, found) in enumerate(run_jobs(jobs, executor), start=1):
+            if isinstance(found, Failure):
+                raise RunError(f"places could not be compared: {found.reason}")
+            loops |= zip(numbers[job], found, strict=True)
+            report(done, len(jobs))
+    return [loops[number] for number in range(len(pairs))]
+
+
+def _verify_all(
+    config: ImageVerificationConfig | ScanVerificationConfig,
+    compared: Sequence[tuple[Proposal, int, AnyPlace, AnyPlace]],
+) -> list[LoopClosure]:
+    """Return the loop closures of keyframes with places, given as for ``verify_proposal``."""
+    verifier = build_verifier(config)
+    return [verify_proposal(proposal, node, i, j, verifier) for proposal, node, i, j in compared]
 
 
 class _Candidate(NamedTuple):
@@ -116,34 +184,16 @@ class _Candidate(NamedTuple):
 class _Search(Generic[Place]):
     """The places of the runs so far, in which those of the next are searched."""
 
-    def __init__(
-        self,
-        config: PlaceLoopsConfig | ScanLoopsConfig,
-        proposer: Proposer[Place],
-        verifier: Verifier[Place],
-    ) -> None:
+    def __init__(self, config: PlaceLoopsConfig | ScanLoopsConfig, proposer: Proposer[Place]) -> None:
         self._config = config
         self._proposer = proposer
-        self._verifier = verifier
-        self._runs: list[KnownPlaces[Place]] = []
+        self._runs = 0
         self._known: list[tuple[int, int]] = []
 
-    def add(self, run: KnownPlaces[Place], *, is_searched: bool) -> Iterator[SharedPlace]:
-        """Add a run; if it is searched, yield its keyframes that were measured from earlier runs' places."""
-        number, candidates = len(self._runs), self._candidates(run, is_searched=is_searched)
-        self._runs.append(run)
-        for candidate in candidates:
-            node = candidate.node
-            first, place = self._known[candidate.proposal.node]
-            earlier = self._runs[first]
-            proposal = replace(candidate.proposal, node=place)
-            loop = verify_proposal(proposal, node, earlier.places[place], run.places[node], self._verifier)
-            if loop.verdict == "accepted":
-                yield shared_place(first, number, loop, earlier.T_map_node, run.T_map_node)
-
-    def _candidates(self, run: KnownPlaces[Place], *, is_searched: bool) -> list[_Candidate]:
-        """Return the pairs of places to be compared, and add the run's places."""
-        before, number, last = len(self._known), len(self._runs), None
+    def add(self, run: KnownPlaces[Place], *, is_searched: bool) -> list[_Pair]:
+        """Add a run's places; if it is searched, return the pairs to be compared, the likeliest first."""
+        before, number, last = len(self._known), self._runs, None
+        self._runs += 1
         candidates = list[_Candidate]()
         for node, place in run.places.items():
             if is_searched and (last is None or self._has_moved(run.T_map_node, last, node)):
@@ -156,12 +206,12 @@ class _Search(Generic[Place]):
                     ranks[first] += 1
             self._proposer.add(len(self._known), place)
             self._known.append((number, node))
-        compared, chosen = Counter[int](), list[_Candidate]()
+        compared, chosen = Counter[int](), list[_Pair]()
         for candidate in sorted(candidates):
-            first, _ = self._known[candidate.proposal.node]
+            first, known = self._known[candidate.proposal.node]
             if compared[first] < _MAX_COMPARED_IN_RUN:
                 compared[first] += 1
-                chosen.append(candidate)
+                chosen.append(_Pair(first, number, replace(candidate.proposal, node=known), candidate.node))
         return chosen[:_MAX_COMPARED]
 
     def _has_moved(self, T_map_node: Mapping[int, Transform], last: int, node: int) -> bool:

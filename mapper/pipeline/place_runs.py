@@ -21,6 +21,7 @@ from mapper.pipeline.known_map import detector_of, loops_between_days, run_place
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.run.stored_tracking import load_tracking
+from mapper.runtime.executor import IN_PROCESS, Workers
 from mapper.runtime.progress import SILENT, Progress
 
 _FIRST = "first"
@@ -28,7 +29,9 @@ _UNKNOWN = "no place of it was recognised in the others"
 _REJECTED = "the joint graph contradicts all places that it shares with the others"
 
 
-def place_by_shared_places(runs: Sequence[Run], *, progress: Progress = SILENT) -> Placing:
+def place_by_shared_places(
+    runs: Sequence[Run], *, workers: Workers = IN_PROCESS, progress: Progress = SILENT
+) -> Placing:
     """Place runs in the world of the first by the places that they share, over other runs where need be.
 
     The runs' keyframes are recognised in each other as a log's are in a finished map; their own maps stay as
@@ -37,6 +40,7 @@ def place_by_shared_places(runs: Sequence[Run], *, progress: Progress = SILENT) 
     Args:
         runs: At least one; the first must have places. A run of before places were stored has them observed
             again from its log.
+        workers: Where places are compared.
         progress: Receives stages and notes.
 
     Returns:
@@ -46,7 +50,7 @@ def place_by_shared_places(runs: Sequence[Run], *, progress: Progress = SILENT) 
         RunError: Nothing ties any other run to the first, or the first has no places.
         ConfigError: The first run's places cannot be recognised by similarity.
     """
-    found = _recognised(runs, progress)
+    found = _recognised(runs, workers, progress)
     placed = [
         Placed(
             runs[number],
@@ -59,7 +63,11 @@ def place_by_shared_places(runs: Sequence[Run], *, progress: Progress = SILENT) 
 
 
 def place_jointly(
-    runs: Sequence[Run], *, known: MergedMap | None = None, progress: Progress = SILENT
+    runs: Sequence[Run],
+    *,
+    known: MergedMap | None = None,
+    workers: Workers = IN_PROCESS,
+    progress: Progress = SILENT,
 ) -> Placing:
     """Place runs by one pose graph over all their keyframes, so that each bends where it had drifted.
 
@@ -71,6 +79,7 @@ def place_jointly(
     Args:
         runs: At least one; the first must have places.
         known: A map of the first of these runs by a joint graph: they are not searched in each other again.
+        workers: Where places are compared.
         progress: Receives stages and notes.
 
     Returns:
@@ -81,7 +90,7 @@ def place_jointly(
         ConfigError: The first run's places cannot be recognised by similarity.
         GraphError: The joint graph cannot be solved.
     """
-    found = _recognised(runs, progress, () if known is None else _measured_in(known, runs), known)
+    found = _recognised(runs, workers, progress, () if known is None else _measured_in(known, runs), known)
     worlds = found.solved.worlds
     used = set(map(id, found.solved.used))
     joint = solve_jointly(
@@ -174,6 +183,7 @@ def _measured_in(known: MergedMap, runs: Sequence[Run]) -> list[SharedPlace]:
 
 def _recognised(
     runs: Sequence[Run],
+    workers: Workers,
     progress: Progress,
     measured: Sequence[SharedPlace] = (),
     known_map: MergedMap | None = None,
@@ -192,7 +202,8 @@ def _recognised(
     unfit = {number: reason for number in range(len(runs)) if (reason := _unfit(runs, known, number))}
     fit = [KnownPlaces({}, {}) if number in unfit else places for number, places in enumerate(known)]
     searched = 0 if known_map is None else len(known_map.manifest.runs)
-    shared = [*measured, *find_shared_places(fit, loops, searched=searched, progress=progress)]
+    new = find_shared_places(fit, loops, searched=searched, workers=workers, progress=progress)
+    shared = [*measured, *new]
     found = _Recognised(shared, solve_worlds(shared, loops.gate), unfit)
     _refuse_alone(runs, len(found.solved.worlds), found.left_out(runs))
     return found

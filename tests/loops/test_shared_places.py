@@ -8,6 +8,7 @@ from mapper.loops.config import ScanLoopsConfig
 from mapper.loops.factory import build_verifier
 from mapper.loops.map_constraints import KnownPlaces
 from mapper.loops.shared_places import find_shared_places
+from mapper.runtime.executor import Workers
 from tests.support.street_scans import on_street, street, view
 
 CONFIG = ScanLoopsConfig()
@@ -39,6 +40,20 @@ def test_the_way_back_has_the_same_places(first):
         miss = inverse(place.T_first_body) @ inverse(T_world_street) @ place.T_second_body
         assert np.linalg.norm(miss[:3, 3]) < 0.3
         assert np.linalg.norm((inverse(place.T_first_place) @ place.T_first_body)[:3, 3]) < 30.0
+
+
+def test_other_processes_measure_the_same(first):
+    runs = [first, drive(1, 14, 54), drive(1, 4, 30, back=True)]
+    here, elsewhere = (find_shared_places(runs, CONFIG, workers=Workers(count)) for count in (1, 2))
+    assert {(place.first, place.second) for place in here} == {(0, 1), (0, 2), (1, 2)}
+    assert [(place.first, place.second, place.loop.i, place.loop.j) for place in here] == [
+        (place.first, place.second, place.loop.i, place.loop.j) for place in elsewhere
+    ]
+    assert all(
+        np.array_equal(a.T_first_body, b.T_first_body)
+        and np.array_equal(a.loop.information, b.loop.information)
+        for a, b in zip(here, elsewhere, strict=True)
+    )
 
 
 def test_other_streets_and_runs_without_places_share_none(first):
