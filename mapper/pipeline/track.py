@@ -156,32 +156,8 @@ def track_log(
     behind the frames that they know, which the observer does not receive.
     """
     start = start or first_session(source, config)
-    odometry, detector, before = start.odometry, start.detector, start.graph
-    graph = PoseGraph(dict(before.T_world_node), dict(before.stamps_ns), list(before.factors))
-    tracks: list[FrameResult] = []
-    skipped: list[Skipped] = []
-    frame_ms: dict[int, float] = {}
-    wheels = wheels_beside(source, config)
-    wheel_factors: list[BetweenFactor] = []
-
-    def observe(entry: FrameRef) -> tuple[FrameRef, Any, float]:
-        began = time.perf_counter()
-        try:
-            observation = odometry.read(entry)
-        except FrameError as error:
-            observation = Skipped(entry.stamp_ns, str(error))
-        return entry, observation, time.perf_counter() - began
-
-    def take_in(track: FrameResult, view: Callable[[], FrameView]) -> None:
-        if track.is_keyframe and track.node is not None:
-            graph.add_node(track.node, track.stamp_ns, track.T_world_body)
-            driven = wheels.link(track.node, track.stamp_ns)
-            detector.add(track.node, replace(track, links=(*track.links, *driven)), view)
-            wheel_factors.extend(driven)
-        graph.add_factors(track.factors)
-        tracks.append(track)
-
-    checks = ReadingChecks(source)
+    odometry, checks = start.odometry, ReadingChecks(source)
+    first_pass = _FirstPass(start, wheels_beside(source, config))
     searches = start.searches or VerificationLog(None)
     known: Sequence[FrameCheckpoint] = ()
     if checkpoints is not None:
@@ -189,56 +165,115 @@ def track_log(
         odometry, known = state.odometry, state.frames
     for frame in known:
         if isinstance(frame.result, Skipped):
-            skipped.append(frame.result)
+            first_pass.skipped.append(frame.result)
             continue
         searches.repeat(frame.search)
-        take_in(frame.result, searches.view)
-        frame_ms[frame.result.stamp_ns] = frame.frame_ms
+        first_pass.add(frame.result, searches.view)
+        first_pass.frame_ms[frame.result.stamp_ns] = frame.frame_ms
     searches.repeat(None)
     entries = map(checks.log.entry_at, range(len(known), len(source)))
-    observations = ordered_map(observe, entries, workers=config.workers)
+    observations = ordered_map(partial(_observe, odometry), entries, workers=config.workers)
     with progress.stage("track") as report:
         for done, (entry, observation, observed_s) in enumerate(observations, start=len(known) + 1):
             report(done, len(source))
             ms, result = 0.0, observation
             if isinstance(observation, Skipped):
-                skipped.append(observation)
+                first_pass.skipped.append(observation)
                 progress.note(f"skipped: {observation.reason}")
             else:
                 began = time.perf_counter()
                 result = odometry.track(observation)
                 view = partial(odometry.view, observation, result.twist)
-                take_in(result, view)
-                ms = frame_ms[result.stamp_ns] = 1e3 * (observed_s + time.perf_counter() - began)
-                observer.on_frame(Step(entry, result, view, odometry.matches, detector))
+                first_pass.add(result, view)
+                ms = 1e3 * (observed_s + time.perf_counter() - began)
+                first_pass.frame_ms[result.stamp_ns] = ms
+                observer.on_frame(Step(entry, result, view, odometry.matches, start.detector))
             search = searches.take()
             if checkpoints is not None:
                 checkpoints.add(FrameCheckpoint(result, search, ms, checks.reading(done - 1)), odometry)
-    doubts = checks.doubts()
-    tracks = [
-        replace(track, doubts=track.doubts or tuple(doubts.get(track.stamp_ns, ())))
-        if track.node is not None
-        else track
-        for track in tracks
-    ]
-    graph.add_factors(odometry.finish())
-    conflict = wheel_conflict(graph, wheel_factors)
-    conflicts = [*detector.notes(), *([conflict] if conflict else [])]
-    warnings = [
-        *(RunWarning(kind="frozen", sentence=note, weight="doubt") for note in checks.frozen()),
-        *(RunWarning(kind="far returns", sentence=note) for note in checks.far_returns()),
-        *(RunWarning(kind="conflict", sentence=note, weight="doubt") for note in conflicts),
-    ]
-    if isinstance(odometry, SensorCheck):
-        wrong = odometry.calibration_doubts()
-        warnings += [RunWarning(kind="camera", sentence=sentence, weight="doubt") for sentence in wrong]
-        warnings += [RunWarning(kind="shutter", sentence=note) for note in odometry.sensor_notes()]
-    for warning in warnings:
-        progress.note(warning.sentence)
-    graph.add_factors(wheel_factors)
-    loops = (*start.loops, *detector.closures())
-    graph.add_factors(loop.factor for loop in accepted_loops(loops))
-    return TrackingResult(tuple(tracks), tuple(skipped), graph, loops, frame_ms, warnings, detector.places())
+    return first_pass.result(odometry, checks, progress)
+
+
+def _observe(odometry: Odometry[Any], entry: FrameRef) -> tuple[FrameRef, Any, float]:
+    """Return a frame with what odometry needs of it, or why it is skipped, and the seconds that took."""
+    began = time.perf_counter()
+    try:
+        observation = odometry.read(entry)
+    except FrameError as error:
+        observation = Skipped(entry.stamp_ns, str(error))
+    return entry, observation, time.perf_counter() - began
+
+
+class _FirstPass:
+    """First pass over a log, as far as it has come.
+
+    Attributes:
+        skipped: The frames that could not be read.
+        frame_ms: Wall milliseconds that each frame took, by stamp.
+    """
+
+    def __init__(self, start: Start, wheels: WheelMeasurements) -> None:
+        """Begin behind earlier sessions.
+
+        Args:
+            start: Graph, loops and loop detector of these.
+            wheels: Measurements beside the odometry.
+        """
+        before = start.graph
+        self.skipped: list[Skipped] = []
+        self.frame_ms: dict[int, float] = {}
+        self._start = start
+        self._graph = PoseGraph(dict(before.T_world_node), dict(before.stamps_ns), list(before.factors))
+        self._tracks: list[FrameResult] = []
+        self._wheels = wheels
+        self._wheel_factors: list[BetweenFactor] = []
+
+    def add(self, track: FrameResult, view: Callable[[], FrameView]) -> None:
+        """Add a tracked frame; loops are searched from keyframes, whose views are made where needed."""
+        if track.is_keyframe and track.node is not None:
+            self._graph.add_node(track.node, track.stamp_ns, track.T_world_body)
+            driven = self._wheels.link(track.node, track.stamp_ns)
+            self._start.detector.add(track.node, replace(track, links=(*track.links, *driven)), view)
+            self._wheel_factors.extend(driven)
+        self._graph.add_factors(track.factors)
+        self._tracks.append(track)
+
+    def result(self, odometry: Odometry[Any], checks: ReadingChecks, progress: Progress) -> TrackingResult:
+        """Return the result of all frames; nothing is added afterwards."""
+        detector, doubts = self._start.detector, checks.doubts()
+        tracks = [
+            replace(track, doubts=track.doubts or tuple(doubts.get(track.stamp_ns, ())))
+            if track.node is not None
+            else track
+            for track in self._tracks
+        ]
+        self._graph.add_factors(odometry.finish())
+        conflict = wheel_conflict(self._graph, self._wheel_factors)
+        warnings = [
+            *(RunWarning(kind="frozen", sentence=note, weight="doubt") for note in checks.frozen()),
+            *(RunWarning(kind="far returns", sentence=note) for note in checks.far_returns()),
+            *(RunWarning(kind="conflict", sentence=note, weight="doubt") for note in detector.notes()),
+        ]
+        if conflict:
+            warnings.append(RunWarning(kind="conflict", sentence=conflict, weight="doubt"))
+        if isinstance(odometry, SensorCheck):
+            wrong = odometry.calibration_doubts()
+            warnings += [RunWarning(kind="camera", sentence=sentence, weight="doubt") for sentence in wrong]
+            warnings += [RunWarning(kind="shutter", sentence=note) for note in odometry.sensor_notes()]
+        for warning in warnings:
+            progress.note(warning.sentence)
+        self._graph.add_factors(self._wheel_factors)
+        loops = (*self._start.loops, *detector.closures())
+        self._graph.add_factors(loop.factor for loop in accepted_loops(loops))
+        return TrackingResult(
+            tuple(tracks),
+            tuple(self.skipped),
+            self._graph,
+            loops,
+            self.frame_ms,
+            warnings,
+            detector.places(),
+        )
 
 
 def wheels_beside(source: Log, config: BuildConfig) -> WheelMeasurements:
