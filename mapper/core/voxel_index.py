@@ -54,6 +54,17 @@ def cell_key(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def cell_of(key):  # type: ignore[no-untyped-def]
+    """Return the three coordinates of a cell, counted in cells, by its key."""
+    upper = 64 - AXIS_BITS
+    return (
+        (key << (upper - 2 * AXIS_BITS)) >> upper,
+        (key << (upper - AXIS_BITS)) >> upper,
+        (key << upper) >> upper,
+    )
+
+
+@njit(cache=True, nogil=True)
 def _slot_of(index, key):  # type: ignore[no-untyped-def]
     """Return the number of the table's entry with a key's row, or of the vacant one where it belongs."""
     mask = len(index.rows) - 1

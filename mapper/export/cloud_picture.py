@@ -11,7 +11,7 @@ from mapper.core.geometry import Array
 from mapper.core.trajectory import Trajectory
 from mapper.export.page import LINE, hex_of, new_figure, save, scale_bar
 from mapper.export.palette import BACKDROP, END, ESTIMATE, START
-from mapper.mapping.cloud import height_colors
+from mapper.mapping.cloud import height_colors, thinned_to_view
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,6 +48,7 @@ def write_cloud_views(
         has_colors: Whether the sensor saw the colours; if not, points are coloured by their height.
     """
     positions = trajectory.positions_world
+    points, colors = thinned_to_view(points, colors)
     below = points[:, 2] <= positions[:, 2].max() + _HEADROOM_M
     if below.any():
         points, colors = points[below], colors[below]

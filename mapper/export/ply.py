@@ -10,6 +10,7 @@ from mapper.core.frames import Points32
 from mapper.runtime.atomic import atomic_file
 
 _VERTEX = np.dtype([("position", "<f4", 3), ("color", "u1", 3)])
+_CHUNK = 1 << 20  # vertices written at once
 _TRIANGLE = np.dtype([("corners", "u1"), ("vertices", "<i4", 3)])
 
 
@@ -45,10 +46,12 @@ def write_ply(
         header += [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
     with atomic_file(path) as part, part.open("wb") as file:
         file.write("\n".join([*header, "end_header\n"]).encode("ascii"))
-        vertices = np.empty(len(points), _VERTEX)
-        vertices["position"] = points
-        vertices["color"] = colors
-        vertices.tofile(file)
+        for first in range(0, len(points), _CHUNK):
+            some = slice(first, first + _CHUNK)
+            vertices = np.empty(len(points[some]), _VERTEX)
+            vertices["position"] = points[some]
+            vertices["color"] = colors[some]
+            vertices.tofile(file)
         if triangles is not None:
             faces = np.full(len(triangles), 3, _TRIANGLE)
             faces["vertices"] = triangles

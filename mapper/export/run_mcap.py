@@ -10,7 +10,7 @@ from mapper.export.foxglove_messages import WORLD
 from mapper.export.mcap_log import McapLog
 from mapper.export.palette import TRUTH
 from mapper.loops.closure import Discrepancy, LoopClosure
-from mapper.mapping.cloud import height_colors
+from mapper.mapping.cloud import height_colors, thinned_to_view
 from mapper.mapping.fusion import Maps, ScanSnapshot, Snapshot
 from mapper.run.frame_outcomes import FrameRecord
 from mapper.run.results import RunResults
@@ -58,9 +58,13 @@ def log_snapshot(log: McapLog, snapshot: Snapshot | ScanSnapshot) -> None:
 def log_maps(log: McapLog, maps: Maps, *, stamp_ns: int) -> None:
     """Log the occupied voxels by height, the coloured clouds, the slice and the traversable floor."""
     occupied_world = maps.octree.occupied()
-    log.cloud(stamp_ns, occupied_world, colors=height_colors(occupied_world[:, 2]), name="octree")
-    log.cloud(stamp_ns, maps.cloud_points_world, colors=maps.cloud_colors, name="cloud")
-    log.cloud(stamp_ns, maps.dynamic_points_world, colors=maps.dynamic_colors, name="dynamic")
+    for name, points_world, colors in (
+        ("octree", occupied_world, height_colors(occupied_world[:, 2])),
+        ("cloud", maps.cloud_points_world, maps.cloud_colors),
+        ("dynamic", maps.dynamic_points_world, maps.dynamic_colors),
+    ):
+        shown_world, colors_shown = thinned_to_view(points_world, colors)
+        log.cloud(stamp_ns, shown_world, colors=colors_shown, name=name)
     log.grid(stamp_ns, maps.grid)
     log.grid(stamp_ns, maps.traversable, name="traversable")
     for number, storey in enumerate(maps.storeys):

@@ -1,5 +1,7 @@
 """Coloured cloud: one averaged point per voxel, in memory that grows with the scene, not with the log."""
 
+from typing import Any, TypeVar
+
 import cv2
 import numpy as np
 from numba import njit
@@ -7,21 +9,27 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.frames import Points32
-from mapper.core.voxel_index import AXIS_BITS, cell_key, claim_row, voxel_index
+from mapper.core.voxel_index import AXIS_BITS, cell_key, cell_of, claim_row, voxel_index
+
+Real = TypeVar("Real", bound="np.floating[Any]")
 
 Colors = NDArray[np.uint8]
 """(N, 3) uint8 RGB."""
 
+MOST_TO_VIEW = 5_000_000
+"""Largest number of points of a cloud that is made to be looked at."""
+
 _HALF_SPAN = 1 << (AXIS_BITS - 1)  # voxels on either side of the world's origin
 _BATCH = 1 << 16  # points added at once: bounds the memory reserved ahead of need
 _LOWEST_LEVEL = 30.0  # of 255: where the palette of heights begins
-_SUMS = 7  # x, y, z, red, green, blue, count
+_GROWTH = 1.25
 
 
 class CloudBuilder:
     """Builder of a cloud whose points are the mean position and mean colour of the points in each voxel.
 
-    Memory is about 72 bytes a voxel and does not depend on the number of points added.
+    Memory is about 60 bytes a voxel and does not depend on the number of points added: positions are summed
+    as offsets from the voxel's centre, for which single precision does.
     """
 
     def __init__(self, voxel_m: float) -> None:
@@ -37,7 +45,8 @@ class CloudBuilder:
             raise DataError(f"cloud: voxel of {voxel_m} m; want a finite edge > 0")
         self.voxel_m = voxel_m
         self._size = 0
-        self._sums = np.empty((_BATCH, _SUMS))
+        self._offsets = np.zeros((_BATCH, 3), np.float32)  # sums, in voxels
+        self._counts = np.zeros((_BATCH, 4), np.uint32)  # sums of red, green and blue, and number of points
         self._index = voxel_index(_BATCH)
 
     def __len__(self) -> int:
@@ -75,41 +84,62 @@ class CloudBuilder:
                 colors[batch],
                 1.0 / self.voxel_m,
                 self._index,
-                self._sums,
+                self._offsets,
+                self._counts,
                 self._size,
             )
 
     def points_and_colors(self) -> tuple[Points32, Colors]:
         """Return (M, 3) float32 mean positions and (M, 3) uint8 mean colours, in order of first points."""
-        sums = self._sums[: self._size]
-        means = sums[:, :6] / sums[:, 6:]
-        return means[:, :3].astype(np.float32), np.rint(means[:, 3:]).astype(np.uint8)
+        points, colors = np.empty((self._size, 3), np.float32), np.empty((self._size, 3), np.uint8)
+        _fill_means(self._index.keys, self._offsets, self._counts, self.voxel_m, points, colors)
+        return points, colors
 
     def _reserve(self, more: int) -> None:
         need = self._size + more
-        if need > len(self._sums):
-            spare = max(need, 3 * len(self._sums) // 2) - len(self._sums)
-            self._sums = np.concatenate([self._sums, np.empty((spare, _SUMS))])
-            self._index = voxel_index(len(self._sums), self._index.keys[: self._size])
+        if need > len(self._offsets):
+            rows = max(need, int(_GROWTH * len(self._offsets)))
+            for sums in (self._offsets, self._counts):
+                sums.resize((rows, sums.shape[1]), refcheck=False)  # a copy would need both at once
+            self._index = voxel_index(rows, self._index.keys[: self._size])
 
 
 @njit(cache=True, nogil=True)
-def _fold(points, colors, voxels_per_m, index, sums, size):  # type: ignore[no-untyped-def]
+def _fold(points, colors, voxels_per_m, index, offsets, counts, size):  # type: ignore[no-untyped-def]
     """Add each point to its voxel's sums; return the number of voxels."""
     last_key, voxel = np.int64(-1), np.int64(-1)
     for i in range(len(points)):
-        key = cell_key(points[i, 0] * voxels_per_m, points[i, 1] * voxels_per_m, points[i, 2] * voxels_per_m)
+        x, y, z = points[i, 0] * voxels_per_m, points[i, 1] * voxels_per_m, points[i, 2] * voxels_per_m
+        key = cell_key(x, y, z)
         if key != last_key:  # neighbouring pixels mostly share a voxel, and queries of the index cost most
             voxel = claim_row(index, key, size)
             if voxel == size:
-                sums[size] = 0.0
                 size += 1
             last_key = key
-        for axis in range(3):
-            sums[voxel, axis] += points[i, axis]
-            sums[voxel, 3 + axis] += colors[i, axis]
-        sums[voxel, 6] += 1.0
+        offsets[voxel, 0] += x - np.floor(x) - 0.5
+        offsets[voxel, 1] += y - np.floor(y) - 0.5
+        offsets[voxel, 2] += z - np.floor(z) - 0.5
+        for channel in range(3):
+            counts[voxel, channel] += colors[i, channel]
+        counts[voxel, 3] += 1
     return size
+
+
+@njit(cache=True, nogil=True)
+def _fill_means(keys, offsets, counts, voxel_m, points, colors):  # type: ignore[no-untyped-def]
+    """Fill in the mean position and colour of each voxel."""
+    for row in range(len(points)):
+        count = float(counts[row, 3])
+        cell = cell_of(keys[row])
+        for axis in range(3):
+            points[row, axis] = (cell[axis] + 0.5 + offsets[row, axis] / count) * voxel_m
+            colors[row, axis] = np.rint(counts[row, axis] / count)
+
+
+def thinned_to_view(points: NDArray[Real], colors: Colors) -> tuple[NDArray[Real], Colors]:
+    """Return every n-th of (N, 3) points and their colours, so few that a viewer or a picture shows them."""
+    step = -(-len(points) // MOST_TO_VIEW) or 1
+    return points[::step], colors[::step]
 
 
 def height_colors(

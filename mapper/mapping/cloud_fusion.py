@@ -42,8 +42,10 @@ def fuse_clouds(
     objects: MovingObjects | None,
     *,
     progress: Progress,
-) -> tuple[CloudBuilder, CloudBuilder]:
-    """Return the clouds of what stands still and of what moved, of every ``cloud.frame_stride``-th frame.
+) -> tuple[tuple[Points32, Colors], tuple[Points32, Colors]]:
+    """Return the points and colours of what stands still and of what moved.
+
+    Every ``cloud.frame_stride``-th frame adds its points.
 
     Frames that cannot be read are left out.
 
@@ -81,4 +83,4 @@ def fuse_clouds(
             if returns is not None:
                 still.add(returns.points_world[~returns.moving], returns.colors[~returns.moving])
                 moving.add(returns.points_world[returns.moving], returns.colors[returns.moving])
-    return still, moving
+    return still.points_and_colors(), moving.points_and_colors()

@@ -169,11 +169,12 @@ def fuse_log(
     objects = None
     if config.octree.moving == "removed":
         objects = _without_moving_objects(octree, config, after)
-    still, moving = fuse_clouds(source, trajectory, config, objects, progress=progress)
+    (points_world, colors), (dynamic_points_world, dynamic_colors) = fuse_clouds(
+        source, trajectory, config, objects, progress=progress
+    )
     if objects is not None:
-        progress.note(f"moving objects: {len(moving)} of {len(still) + len(moving)} points of the clouds")
-    points_world, colors = still.points_and_colors()
-    dynamic_points_world, dynamic_colors = moving.points_and_colors()
+        moved, points = len(dynamic_points_world), len(points_world) + len(dynamic_points_world)
+        progress.note(f"moving objects: {moved} of {points} points of the clouds")
     editor = MapEditor(edits, trajectory.positions_world, config.traversable.head_room_m)
     known, occupied = len(octree), np.count_nonzero(octree.are_occupied(points_world))
     erased = editor.erase(octree)

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from mapper.core.errors import DataError
-from mapper.mapping.cloud import CloudBuilder
+from mapper.mapping import cloud
+from mapper.mapping.cloud import CloudBuilder, thinned_to_view
 
 
 def random_cloud(n, *, seed=0, extent_m=2.0):
@@ -86,3 +87,27 @@ def test_refuses_unequal_shapes_and_senseless_voxels():
         CloudBuilder(0.1).add(points, colors[:9])
     with pytest.raises(DataError, match=r"0\.0 m; want"):
         CloudBuilder(0.0)
+
+
+def test_many_points_in_a_voxel_and_far_from_the_origin_keep_their_mean():
+    center_m = np.array([-5000.0, 3000.0, 10.0])
+    points, colors = random_cloud(300_000, extent_m=0.009)
+    builder = CloudBuilder(0.02)
+    for _ in range(4):
+        builder.add((points + center_m + 0.01).astype(np.float32), colors)
+
+    got_points, got_colors = builder.points_and_colors()
+    assert len(builder) == 1
+    np.testing.assert_allclose(got_points[0], center_m + 0.01, atol=5e-4)  # single precision there
+    np.testing.assert_array_equal(got_colors[0], np.rint(colors.mean(axis=0)))
+
+
+def test_a_cloud_is_thinned_only_beyond_what_can_be_viewed(monkeypatch):
+    points, colors = random_cloud(1000)
+    monkeypatch.setattr(cloud, "MOST_TO_VIEW", 1000)
+    assert thinned_to_view(points, colors)[0].tobytes() == points.tobytes()
+    monkeypatch.setattr(cloud, "MOST_TO_VIEW", 300)
+    few, their_colors = thinned_to_view(points, colors)
+    assert len(few) == len(their_colors) == 250
+    assert (few == points[::4]).all()
+    assert len(thinned_to_view(points[:0], colors[:0])[0]) == 0
