@@ -32,7 +32,10 @@ class IncrementalSolver:
         """Drop the solution: everything waits."""
         import gtsam
 
-        self._isam = gtsam.ISAM2()
+        parameters = gtsam.ISAM2Params()
+        # Cholesky's check of pivots takes chains of some thousand nodes for indeterminate.
+        parameters.setFactorization("QR")
+        self._isam = gtsam.ISAM2(parameters)
         self._solved: set[int] = set()
         self._anchored: set[int] = set()
         self._used = 0
