@@ -10,8 +10,12 @@ the evidence of a ray is weighed by what the same scan saw around it:
 - A miss *passes* if none of these 26 voxels was hit in the same scan: noise of the range and errors of the
   pose move a hit by no more (their d_s). A voxel is *seen through* by a miss that is void and passes.
 
-A voxel with h hits held something that moved if no surface is beside it and it was seen through at least 3
-times and in more than h/2 scans. A sparse sensor seldom observes all voxels around in one scan; for it, 8
+What moves is away for a time without a break, while rays that miss a thin thing, such as a pole or a chair's
+leg, lie between rays that hit it. So misses are counted in the longest stretch of scans that do not hit the
+voxel; what precedes the first hit and what follows the last are one stretch.
+
+A voxel with h hits held something that moved if no surface is beside it and it was seen through at least
+3 times and in more than h/2 scans. A sparse sensor seldom observes all voxels around in one scan; for it, 8
 passes and more than 2h are enough. A surface is a voxel that was hit and has a voxel beside it that no
 scan observed: the ground, a wall. Feet and wheels touch the ground: a voxel that was hit beside a voxel of
 a moving object that was hit too, in 9 of 10 of its hits, belongs to the object; this is repeated once. As
@@ -55,6 +59,7 @@ _LEAST_SEEN_THROUGH, _SEEN_THROUGH_RATIO = 3, 0.5
 _LEAST_PASSES, _PASSES_RATIO = 8, 2.0
 _ATTACHED_RATIO = 0.9
 _ATTACHING_ROUNDS = 2
+_LONGEST, _FIRST, _NOW = range(3)  # stretches of scans without a hit
 _BELOW = np.array([(x, y, -z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (1, 2)])
 
 
@@ -114,22 +119,19 @@ class MovingObjects:
 def remove_moving_objects(octree: OctreeMap, scans: Callable[[], Iterable[ScanUpdate]]) -> MovingObjects:
     """Free the voxels of an octree in which something moved, and keep those of grazed surfaces.
 
-    A voxel that was never passed becomes unknown. Memory: about 24 bytes a voxel that was ever hit, and a few
+    A voxel that was never passed becomes unknown. Memory: about 40 bytes a voxel that was ever hit, and a few
     bits for every other.
 
     Args:
         octree: The map of all scans; changed in place.
-        scans: Returns the map's scans, in any order; it is called four times.
+        scans: Returns the map's scans, in the order of time; it is called more than once.
     """
     blocks = octree.blocks
     ever = np.zeros((len(blocks), WORDS), np.uint64)
     for scan in scans():
         _mark(words_of(scan.occupied), _slots_of(blocks, scan), ever)
     starts, count = _number(ever)
-    counts = np.zeros((count, 4), np.int32)  # hits, voids, passes, seen through
-    for scan in scans():
-        _count(*_evidence(scan), _slots_of(blocks, scan), ever, starts, counts)
-    hits, _, passes, seen_through = counts.T
+    hits, voids, passes, seen_through = _counted(blocks, scans(), ever, starts, count)
     often = (seen_through >= _LEAST_SEEN_THROUGH) & (seen_through > _SEEN_THROUGH_RATIO * hits)
     often |= (passes >= _LEAST_PASSES) & (passes > _PASSES_RATIO * hits)
     inside = _inside(octree)
@@ -151,7 +153,11 @@ def remove_moving_objects(octree: OctreeMap, scans: Callable[[], Iterable[ScanUp
             near = dilated(near, neighbours, absent=NONE_SET)
             _count_one(hit & near, slots, ever, starts, nearby)
         moved |= (beside >= _ATTACHED_RATIO * hits) | (passed & (nearby >= _ATTACHED_RATIO * hits))
-    octree.forget(_decide(blocks.table.values, ever, moved, counts, octree.sensor, octree.occupied_log_odds))
+    octree.forget(
+        _decide(
+            blocks.table.values, ever, moved, hits, voids, passes, octree.sensor, octree.occupied_log_odds
+        )
+    )
     return MovingObjects(blocks, _scattered(moved, ever), surfaces, octree.resolution_m)
 
 
@@ -161,6 +167,21 @@ def _evidence(scan: ScanUpdate) -> tuple[Words, Words, Words]:
     neighbours = neighbours_of(scan.codes)
     void = free & ~dilated(~(free | hit), neighbours, absent=ALL_SET)
     return hit, void, free & ~dilated(hit, neighbours, absent=NONE_SET)
+
+
+def _counted(
+    blocks: BlockStore,
+    scans: Iterable[ScanUpdate],
+    ever: Words,
+    starts: NDArray[np.int64],
+    count: int,
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+    """Return (count,) hits and voids, and passes and those seen through in the longest stretch."""
+    counts, misses = np.zeros((count, 2), np.int32), np.zeros((count, 3, 2), np.int32)
+    for scan in scans:
+        _count(*_evidence(scan), _slots_of(blocks, scan), ever, starts, counts, misses)
+    around = misses[:, _FIRST] + misses[:, _NOW]
+    return *counts.T, *np.maximum(misses[:, _LONGEST], around, out=around).T
 
 
 def _slots_of(blocks: BlockStore, scan: ScanUpdate) -> NDArray[np.int64]:
@@ -215,8 +236,8 @@ def _number(ever):
 
 
 @njit(cache=True, nogil=True)
-def _count(hit, void, passed, slots, ever, starts, counts):
-    """Add one scan to the counts of the voxels that were ever hit."""
+def _count(hit, void, passed, slots, ever, starts, counts, misses):
+    """Add one scan to the counts, and to the stretches of misses, of the voxels that were ever hit."""
     for i in range(len(slots)):
         for k in range(WORDS):
             own = ever[slots[i], k]
@@ -224,14 +245,22 @@ def _count(hit, void, passed, slots, ever, starts, counts):
                 continue
             row = starts[slots[i], k]
             for bit in range(WORD_BITS):
-                if (own >> uint64(bit)) & uint64(1):
-                    is_void = int64((void[i, k] >> uint64(bit)) & uint64(1))
-                    is_passed = int64((passed[i, k] >> uint64(bit)) & uint64(1))
-                    counts[row, 0] += int64((hit[i, k] >> uint64(bit)) & uint64(1))
-                    counts[row, 1] += is_void
-                    counts[row, 2] += is_passed
-                    counts[row, 3] += is_void & is_passed
-                    row += 1
+                if not (own >> uint64(bit)) & uint64(1):
+                    continue
+                is_void = int64((void[i, k] >> uint64(bit)) & uint64(1))
+                is_passed = int64((passed[i, k] >> uint64(bit)) & uint64(1))
+                if (hit[i, k] >> uint64(bit)) & uint64(1):
+                    for kind in range(2):
+                        ended = misses[row, _NOW, kind]
+                        if counts[row, 0] == 0:
+                            misses[row, _FIRST, kind] = ended
+                        misses[row, _LONGEST, kind] = max(misses[row, _LONGEST, kind], ended)
+                        misses[row, _NOW, kind] = 0
+                    counts[row, 0] += 1
+                counts[row, 1] += is_void
+                misses[row, _NOW, 0] += is_passed
+                misses[row, _NOW, 1] += is_void & is_passed
+                row += 1
 
 
 @njit(cache=True, nogil=True)
@@ -275,7 +304,7 @@ def _scattered(flags, ever):
 
 
 @njit(cache=True, nogil=True)
-def _decide(values, ever, moved, counts, sensor, occupied_log_odds):
+def _decide(values, ever, moved, hits, voids, passes, sensor, occupied_log_odds):
     """Write the log-odds of all voxels that were ever hit; return how many became unknown."""
     row, forgotten = 0, 0
     for i in range(len(ever)):
@@ -284,13 +313,13 @@ def _decide(values, ever, moved, counts, sensor, occupied_log_odds):
                 if not (ever[i, k] >> uint64(bit)) & uint64(1):
                     continue
                 voxel = k * WORD_BITS + bit
-                if moved[row] and counts[row, 2] > 0:
+                if moved[row] and passes[row] > 0:
                     values[i, voxel] = sensor.lowest
                 elif moved[row]:
                     values[i, voxel] = np.nan
                     forgotten += 1
                 elif values[i, voxel] < occupied_log_odds:
-                    weighed = float32(counts[row, 0]) * sensor.hit + float32(counts[row, 1]) * sensor.miss
+                    weighed = float32(hits[row]) * sensor.hit + float32(voids[row]) * sensor.miss
                     if weighed >= occupied_log_odds:
                         values[i, voxel] = min(weighed, sensor.highest)
                 row += 1
