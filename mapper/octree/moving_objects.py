@@ -15,12 +15,13 @@ leg, lie between rays that hit it. So misses are counted in the longest stretch 
 voxel; what precedes the first hit and what follows the last are one stretch.
 
 A voxel with h hits held something that moved if no surface is beside it and it was seen through at least
-3 times and in more than h/2 scans. A sparse sensor seldom observes all voxels around in one scan; for it, 8
+twice and in more than h/2 scans. A sparse sensor seldom observes all voxels around in one scan; for it, 8
 passes and more than 2h are enough. A surface is a voxel that was hit and has a voxel beside it that no
 scan observed: the ground, a wall. Feet and wheels touch the ground: a voxel that was hit beside a voxel of
 a moving object that was hit too, in 9 of 10 of its hits, belongs to the object; this is repeated once. As
 rings may lie more than a voxel apart, two voxels from it are near enough for one with at least 3 and more
-than 2h passes; without that, poles beside traffic would go.
+than 2h passes; without that, poles beside traffic would go. Where a log begins or ends, much of an object was
+never seen through: up to 0.4 m away, what was so near in all of its hits belongs to it, too.
 
 Where the foot of an object shares a voxel with the ground, that voxel stays. Its returns are told from the
 ground's scan by scan: those on the ground, at most two voxels below a removed voxel that the same scan hit
@@ -31,6 +32,7 @@ What remains of the voxels that were ever hit is occupied, unless its void misse
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
 from numba import njit
@@ -55,10 +57,11 @@ from mapper.octree.keys import BLOCK_BITS, KEY_COUNT, codes_of, codes_of_blocks,
 from mapper.octree.map import OctreeMap
 from mapper.octree.scan_update import ScanUpdate
 
-_LEAST_SEEN_THROUGH, _SEEN_THROUGH_RATIO = 3, 0.5
+_LEAST_SEEN_THROUGH, _SEEN_THROUGH_RATIO = 2, 0.5
 _LEAST_PASSES, _PASSES_RATIO = 8, 2.0
-_ATTACHED_RATIO = 0.9
-_ATTACHING_ROUNDS = 2
+_LEAST_PASSES_NEARBY = 3
+_ATTACHED_RATIO, _ATTACHED_ROUNDS = 0.9, 2
+_ATTACHED_M = 0.4
 _LONGEST, _FIRST, _NOW = range(3)  # stretches of scans without a hit
 _BELOW = np.array([(x, y, -z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (1, 2)])
 
@@ -138,21 +141,26 @@ def remove_moving_objects(octree: OctreeMap, scans: Callable[[], Iterable[ScanUp
     surfaces = ever & ~inside
     beside_surfaces = dilated(surfaces, neighbours_of(blocks.codes), absent=NONE_SET)
     moved = often & _gathered(inside & ~beside_surfaces, ever, count)
-    passed = (passes >= _LEAST_SEEN_THROUGH) & (passes > _PASSES_RATIO * hits)
-    for _ in range(_ATTACHING_ROUNDS):
+    passed = (passes >= _LEAST_PASSES_NEARBY) & (passes > _PASSES_RATIO * hits)
+    beside, nearby = np.zeros((2, count), np.int32)
+    counted = np.zeros_like(ever)
+    for done in range(max(_ATTACHED_ROUNDS, ceil(_ATTACHED_M / octree.resolution_m))):
         removed = _scattered(moved, ever)
-        beside, nearby = np.zeros((2, count), np.int32)
         for scan in scans():
-            hit, slots, neighbours = (
-                words_of(scan.occupied),
-                _slots_of(blocks, scan),
-                neighbours_of(scan.codes),
-            )
-            near = dilated(hit & removed[slots], neighbours, absent=NONE_SET)
-            _count_one(hit & near, slots, ever, starts, beside)
-            near = dilated(near, neighbours, absent=NONE_SET)
-            _count_one(hit & near, slots, ever, starts, nearby)
-        moved |= (beside >= _ATTACHED_RATIO * hits) | (passed & (nearby >= _ATTACHED_RATIO * hits))
+            hit, slots = words_of(scan.occupied), _slots_of(blocks, scan)
+            near, before = hit & removed[slots], hit & counted[slots]
+            if np.array_equal(near, before):
+                continue
+            neighbours = neighbours_of(scan.codes)
+            for counts in (beside, nearby):
+                near, before = (dilated(plane, neighbours, absent=NONE_SET) for plane in (near, before))
+                _count_one(hit & near & ~before, slots, ever, starts, counts)
+        counted = removed
+        least = hits * (_ATTACHED_RATIO if done < _ATTACHED_ROUNDS else 1.0)
+        attached = (beside >= least) | (passed & (nearby >= least))
+        if not (attached & ~moved).any():
+            break
+        moved |= attached
     octree.forget(
         _decide(
             blocks.table.values, ever, moved, hits, voids, passes, octree.sensor, octree.occupied_log_odds

@@ -50,8 +50,8 @@ def scan_of(boxes, *, x_m=0.0, directions=DENSE, reach_m=12.0):
     return (origin + directions[seen] * ranges_m[seen, None]).astype(np.float32), owner[seen], origin
 
 
-def fused(scans):
-    octree, caster = OctreeMap(CONFIG), Caster(CONFIG)
+def fused(scans, config=CONFIG):
+    octree, caster = OctreeMap(config), Caster(config)
     updates = []
     for points, _, origin in scans:
         T_world_body = np.eye(4)
@@ -156,6 +156,22 @@ def test_a_post_that_is_thinner_than_the_rays_are_apart_stays():
 
     points = np.concatenate([points[owner == 1] for points, owner, _ in scans])
     assert not objects.contain(points).any()
+
+
+def test_what_is_beside_a_voxel_that_was_seen_through_leaves_with_it():
+    box = (4.3, -2.0, GROUND_M), (4.6, -1.0, 1.6)
+    beside = DENSE[np.arctan2(DENSE[:, 1], DENSE[:, 0]) < -0.26]  # past y = -1.2 m at the box
+    scans = [scan_of([box], x_m=-0.05 * i) for i in range(3)]
+    scans += [scan_of([], x_m=-0.05 * i, directions=beside) for i in range(3, 12)]
+    octree, updates = fused(scans, CONFIG.model_copy(update={"resolution_m": 0.1}))
+
+    objects = remove_moving_objects(octree, lambda: updates)
+
+    points = np.concatenate([points for points, _, _ in scans])
+    owner = np.concatenate([owner for _, owner, _ in scans])
+    moving, above = objects.contain(points), points[:, 2] > 0.3
+    assert moving[(owner == 1) & above].mean() > 0.95
+    assert moving[owner == 0].mean() < 0.001
 
 
 def test_space_where_a_thing_stood_is_free_and_the_floor_below_it_stays(street):
