@@ -176,6 +176,15 @@ class SensorCheck(Protocol):
         ...
 
 
+@runtime_checkable
+class HindsightOdometry(Protocol):
+    """Odometry to which later frames tell what earlier ones did not show."""
+
+    def in_hindsight(self, result: FrameResult, /) -> FrameResult:
+        """Return the result of a frame with what later ones say against it, once the log has ended."""
+        ...
+
+
 class FrameOdometry(Odometry[Observation], Protocol[Observation]):
     """Odometry from images or scans, which accepts frames that are of no log."""
 

@@ -18,7 +18,7 @@ from mapper.loops.detector import LoopDetector
 from mapper.loops.factory import build_loop_detector, build_verifier
 from mapper.loops.place_file import AnyPlace, write_places
 from mapper.loops.verification_log import VerificationLog
-from mapper.odometry.base import FrameResult, Odometry, SensorCheck
+from mapper.odometry.base import FrameResult, HindsightOdometry, Odometry, SensorCheck
 from mapper.odometry.factory import build_odometry, odometry_for
 from mapper.pipeline.tracking_checkpoints import FrameCheckpoint, TrackingCheckpoints
 from mapper.run import files
@@ -240,12 +240,14 @@ class _FirstPass:
 
     def result(self, odometry: Odometry[Any], checks: ReadingChecks, progress: Progress) -> TrackingResult:
         """Return the result of all frames; nothing is added afterwards."""
-        detector, doubts = self._start.detector, checks.doubts()
+        detector, doubts, tracks = self._start.detector, checks.doubts(), self._tracks
+        if isinstance(odometry, HindsightOdometry):
+            tracks = [odometry.in_hindsight(track) for track in tracks]
         tracks = [
             replace(track, doubts=track.doubts or tuple(doubts.get(track.stamp_ns, ())))
             if track.node is not None
             else track
-            for track in self._tracks
+            for track in tracks
         ]
         self._graph.add_factors(odometry.finish())
         conflict = wheel_conflict(self._graph, self._wheel_factors)

@@ -5,12 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapper.config.loading import load_config
 from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import exp
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
+from mapper.odometry.local_map.displaced_surfaces import NO_DOUBT, DisplacedSurfaces, Doubt
 from mapper.odometry.local_map.earlier_depth import Displacement
 from mapper.odometry.local_map.frame_doubts import FrameDoubts
+from mapper.pipeline.track import track_log
+from mapper.runtime.progress import SILENT
 
 NOT_DISPLACED = Displacement()
 
@@ -78,13 +82,56 @@ def test_doubts_are_measured_against_what_is_usual(frames, odometry):
     assert doubt.phrases == ("60% of the surfaces lie elsewhere than 0.4 s before",)
     assert doubt.sigma_m == pytest.approx(0.15)
     assert not assess(35, displaced=Displacement(0.45, 0.15, 0.4)).phrases
-    doubt = assess(36, displaced=Displacement(0.45, 0.15, 0.4), moving=100)
-    assert doubt.phrases == ("45% of the surfaces lie elsewhere than 0.4 s before",)
     assert not assess(37, moved_m=0.1, excess=3.0).phrases
     assert not assess(38, excess=7.0).phrases
     doubt = assess(39, moved_m=0.1, excess=7.0)
     assert doubt.phrases == ("the image fits the predicted motion better by 7 standard errors",)
     assert doubt.sigma_m == pytest.approx(0.1, rel=0.01)
+
+
+def test_where_much_moves_the_farther_surfaces_decide_also_of_frames_shortly_before(frames, odometry):
+    surfaces = DisplacedSurfaces()
+    track(frames[:2], odometry)
+    pose = odometry._last
+
+    def doubt(time_s, *, moving, ratio=0.0, far_ratio=0.0):
+        now = replace(
+            pose,
+            observation=replace(pose.observation, stamp_ns=round(time_s * 1e9)),
+            moving=np.arange(moving * len(pose.observation)),
+        )
+        return surfaces.speak_against(now, Displacement(ratio, 0.15, 0.4, far_ratio))
+
+    assert not doubt(1.0, moving=0.0, ratio=0.3, far_ratio=0.6)
+    assert not doubt(2.5, moving=0.0, ratio=0.3, far_ratio=0.6)
+    assert not doubt(2.6, moving=0.0, ratio=0.3, far_ratio=0.1)
+    assert not surfaces.doubt_of_earlier(2_500_000_000).phrases
+    assert not doubt(4.0, moving=0.4, ratio=0.6, far_ratio=0.1)
+    assert doubt(4.1, moving=0.0, ratio=0.3, far_ratio=0.6).startswith("60% of the farther surfaces")
+
+    earlier = surfaces.doubt_of_earlier(2_500_000_000)
+    assert earlier.phrases == ("60% of the farther surfaces lie elsewhere than 0.4 s before",)
+    assert earlier.sigma_m == 0.15
+    assert not any(surfaces.doubt_of_earlier(ns).phrases for ns in (1_000_000_000, 2_600_000_000))
+
+
+def test_what_later_frames_say_against_a_frame_is_in_its_result_and_its_factors(source, monkeypatch):
+    config = load_config(None, ["loops.kind=none"], sensor="rgbd")
+    before = track_log(source, config, progress=SILENT)
+    keyframe = next(track for track in before.tracks if track.node == 1)
+    monkeypatch.setattr(
+        FrameDoubts,
+        "in_hindsight",
+        lambda _, ns: Doubt(("elsewhere",), 0.0, 0.3) if ns == keyframe.stamp_ns else NO_DOUBT,
+    )
+    after = track_log(source, config, progress=SILENT)
+
+    assert [track.stamp_ns for track in after.tracks if track.doubts] == [keyframe.stamp_ns]
+    doubtful = next(track for track in after.tracks if track.doubts)
+    added = np.diag(doubtful.covariance - keyframe.covariance)
+    assert added == pytest.approx([0.0] * 3 + [0.09] * 3, abs=1e-9)
+    factor = next(factor for factor in after.graph.factors if factor.j == 1)
+    assert np.sqrt(np.linalg.inv(factor.information)[3, 3]) == pytest.approx(0.3, rel=0.01)
 
 
 def test_factors_of_a_doubtful_keyframe_tell_less(frames, odometry):

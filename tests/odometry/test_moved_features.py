@@ -72,6 +72,17 @@ def test_a_wrong_pose_displaces_the_surfaces(odometry, earlier_depth, offset_m, 
         assert found.since_s >= 0.4
 
 
+def test_what_moves_near_by_does_not_displace_the_farther_surfaces(odometry, earlier_depth, frames):
+    pose, frame = odometry._last, frames[NOW]
+    moved_m = np.where(frame.depth_m < np.nanmedian(frame.depth_m), frame.depth_m - 0.2, frame.depth_m)
+    moved = odometry.observe(
+        RgbdFrame(frame.stamp_ns, frame.image, moved_m, frame.camera, frame.T_body_camera)
+    )
+    found = earlier_depth.displacement(moved, pose.T_camera_world, pose.reference)
+    assert found.ratio > 0.3
+    assert found.far_ratio < 0.1
+
+
 def test_without_older_keyframes_nothing_is_known(odometry, earlier_depth):
     pose = odometry._last
     origin_ns = odometry._map.keyframes[0].stamp_ns

@@ -42,11 +42,13 @@ class Displacement:
         ratio: Share of the points on the same surfaces or beside them.
         distance_m: Their mean distance along the earlier rays; 0 if there are none.
         since_s: Age of the earlier image.
+        far_ratio: Share of the farther half of the compared points.
     """
 
     ratio: float = 0.0
     distance_m: float = 0.0
     since_s: float = 0.0
+    far_ratio: float = 0.0
 
 
 class EarlierDepth:
@@ -98,7 +100,7 @@ class EarlierDepth:
             return Displacement()
         keyframe, cells = self._map.keyframes[earlier[0]], observation.depth_cells
         points = cells.points()
-        same, beside, distance_m = _apart(
+        compared, beside_m = _apart(
             points,
             T_camera_world,
             _cells_of(self._map, earlier[0]).inverse_depth,
@@ -107,10 +109,16 @@ class EarlierDepth:
             cells.cell_px,
             self._noise,
         )
-        if beside == 0 or same + beside < _MIN_COMPARED_RATIO * len(points):
+        is_beside = beside_m > 0.0
+        if not is_beside.any() or len(compared) < _MIN_COMPARED_RATIO * len(points):
             return Displacement()
-        since_s = (observation.stamp_ns - keyframe.stamp_ns) / NS_PER_S
-        return Displacement(beside / (same + beside), distance_m / beside, since_s)
+        depths_m = points[compared, 2]
+        return Displacement(
+            float(is_beside.mean()),
+            float(beside_m[is_beside].mean()),
+            (observation.stamp_ns - keyframe.stamp_ns) / NS_PER_S,
+            float(is_beside[depths_m >= np.median(depths_m)].mean()),
+        )
 
     def _earlier(self, observation: ImageObservation, reference: int, *, most: int) -> list[int]:
         """Return keyframes of the same sub-map and camera, each 0.4 s older than the one before."""
@@ -171,14 +179,15 @@ def _in_free_space(  # type: ignore[no-untyped-def]
 def _apart(  # type: ignore[no-untyped-def]
     points, T_camera_world, inverse_depth, T_keyframe_world, optics, cell_px, noise
 ):
-    """Return how many points lie on a keyframe's surfaces, how many beside them, and the latter's distances.
+    """Return (M,) which points lie on a keyframe's surfaces or beside them, and how far beside; 0 is on them.
 
     The inverse depth of a plane is linear in the image, so it is interpolated between the cells' middles.
     """
     T = between(T_keyframe_world, T_camera_world)
     rows, columns = inverse_depth.shape
-    same = beside = 0
-    distance_m = 0.0
+    compared = np.empty(len(points), np.intp)
+    beside_m = np.zeros(len(points))
+    count = 0
     for n in range(len(points)):
         down, across, z = place_in_cells(T, points[n], optics, cell_px)
         down, across = down - 0.5, across - 0.5  # from the first cell's middle
@@ -194,9 +203,10 @@ def _apart(  # type: ignore[no-untyped-def]
         upper, lower = (1.0 - t) * a + t * b, (1.0 - t) * c + t * d
         apart = abs(z - 1.0 / ((1.0 - s) * upper + s * lower))
         sigma_m = noise[0] + z * (noise[1] + z * noise[2])
-        if apart <= _SAME_M + _SAME_RATIO * z + _SAME_SIGMAS * sigma_m:
-            same += 1
-        elif apart <= _ELSEWHERE_M:
-            beside += 1
-            distance_m += apart
-    return same, beside, distance_m
+        if apart > _ELSEWHERE_M:
+            continue
+        if apart > _SAME_M + _SAME_RATIO * z + _SAME_SIGMAS * sigma_m:
+            beside_m[count] = apart
+        compared[count] = n
+        count += 1
+    return compared[:count], beside_m[:count]

@@ -2,11 +2,11 @@
 
 import math
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
 from mapper.core.geometry import Array, Transform, inverse, log
+from mapper.odometry.local_map.displaced_surfaces import NO_DOUBT, DisplacedSurfaces, Doubt
 from mapper.odometry.local_map.earlier_depth import Displacement
 from mapper.odometry.local_map.pose_information import largest_sigma
 from mapper.odometry.local_map.pose_tracker import TrackedPose
@@ -26,33 +26,10 @@ right poses is 3 to 6."""
 _SUPPORT_AGREEMENT, _SUPPORT_RATIO = 0.85, 2.0
 """A jump is believed if the agreement is at least this share of the usual, and the uncertainty at most this
 multiple, and nothing in view moves by itself: fast motions are real."""
-
-_MOST_DISPLACED, _MOST_DISPLACED_STILL = 0.4, 0.5
-"""When a larger share of the surfaces that two images have in common lies elsewhere, the pose is doubtful;
-where few features move, the majority has to. A real desk's edges give up to 0.48 under right poses, a
-passer-by's pose more than 0.4 in every second frame."""
 _MIN_EXCESS, _APART = 4.0, 2.0
 """When the image fits the predicted motion better than the one found by so many standard errors of the mean
 over its cells, and they are so many times as far apart as usual, what was found may be the motion of
 something else."""
-
-
-@dataclass(frozen=True, slots=True)
-class Doubt:
-    """What speaks against a pose.
-
-    Attributes:
-        phrases: One for each reason; empty if nothing does.
-        sigma_rad: Error of the rotation that the reasons suggest, along each axis.
-        sigma_m: Error of the translation.
-    """
-
-    phrases: tuple[str, ...] = ()
-    sigma_rad: float = 0.0
-    sigma_m: float = 0.0
-
-
-NO_DOUBT = Doubt()
 
 
 class FrameDoubts:
@@ -61,6 +38,7 @@ class FrameDoubts:
     def __init__(self) -> None:
         names = ("sigma_m", "agreement", "jump_rad_s", "jump_m_s", "speed_rad_s", "speed_m_s")
         self._figures: dict[str, deque[float]] = {name: deque(maxlen=_MEMORY) for name in names}
+        self._surfaces = DisplacedSurfaces()
         self._shown_since_ns = 0
 
     def assess(
@@ -115,10 +93,8 @@ class FrameDoubts:
             phrases += self._jumps(jump, elapsed_s)
         if shown_s > 0.0:
             phrases.append(f"the image has been the same for {shown_s:.2f} s")
-        if displaced.ratio > (_MOST_DISPLACED_STILL if tracked_pose.few_move else _MOST_DISPLACED):
-            phrases.append(
-                f"{displaced.ratio:.0%} of the surfaces lie elsewhere than {displaced.since_s:.1f} s before"
-            )
+        if elsewhere := self._surfaces.speak_against(tracked_pose, displaced):
+            phrases.append(elsewhere)
             sigma_m = max(sigma_m, displaced.distance_m)
         if excess_error > _MIN_EXCESS and self._exceeds_usual(jump, elapsed_s, _APART):
             phrases.append(
@@ -137,6 +113,10 @@ class FrameDoubts:
             if T_camera_world_predicted is not None:
                 self._learn(jump_rad_s=jump[0] / elapsed_s, jump_m_s=jump[1] / elapsed_s)
         return NO_DOUBT
+
+    def in_hindsight(self, stamp_ns: int) -> Doubt:
+        """Return what later frames say against an earlier one."""
+        return self._surfaces.doubt_of_earlier(stamp_ns)
 
     def _exceeds_usual(self, jump: tuple[float, float], elapsed_s: float, ratio: float) -> bool:
         """Return whether the angle or the distance to the predicted pose is so many times the usual."""

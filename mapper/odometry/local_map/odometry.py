@@ -26,9 +26,10 @@ from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.bundle import WINDOW_KEYFRAMES
 from mapper.odometry.local_map.depth_offset import DepthOffsetCheck
 from mapper.odometry.local_map.depth_tracker import DepthTracker
+from mapper.odometry.local_map.displaced_surfaces import NO_DOUBT, Doubt
 from mapper.odometry.local_map.earlier_depth import EarlierDepth
 from mapper.odometry.local_map.focal_length import FocalLengthCheck
-from mapper.odometry.local_map.frame_doubts import NO_DOUBT, Doubt, FrameDoubts
+from mapper.odometry.local_map.frame_doubts import FrameDoubts
 from mapper.odometry.local_map.image_observation import ImageObservation, observe_image
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
 from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
@@ -195,6 +196,14 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         )
         return [doubt for doubt in doubts if doubt]
 
+    def in_hindsight(self, result: FrameResult) -> FrameResult:
+        """Return the result of an earlier frame with what later ones say against it."""
+        doubt = self._doubts.in_hindsight(result.stamp_ns)
+        if not doubt.phrases or result.covariance is None:
+            return result
+        covariance = result.covariance + np.diag([doubt.sigma_rad**2] * 3 + [doubt.sigma_m**2] * 3)
+        return replace(result, doubts=(*result.doubts, *doubt.phrases), covariance=covariance)
+
     def finish(self) -> Sequence[BetweenFactor]:
         """Return a factor from every keyframe to those earlier ones that share most landmarks with it.
 
@@ -203,6 +212,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         factors = []
         for j, keyframe in enumerate(self._map.keyframes):
             self._map.step()
+            keyframe.doubt_m = max(keyframe.doubt_m, self._doubts.in_hindsight(keyframe.stamp_ns).sigma_m)
             if j == keyframe.origin:
                 continue
             earlier = [(k, shared) for k, shared in self._map.covisible(j, min_shared=1) if k < j]

@@ -1,0 +1,85 @@
+"""Doubts by surfaces that lie elsewhere than before, of which other ones count while something moves."""
+
+from collections import deque
+from dataclasses import dataclass
+
+from mapper.core.timebase import NS_PER_S
+from mapper.odometry.local_map.earlier_depth import Displacement
+from mapper.odometry.local_map.image_observation import FEW_MOVING
+from mapper.odometry.local_map.pose_tracker import TrackedPose
+
+_MOST, _MOST_FAR = 0.5, 0.2
+"""When a larger share of the surfaces that two images have in common lies elsewhere, the pose is doubtful: a
+real desk's edges give up to 0.48 under right poses. Where much moves the farther half decides: under right
+poses one frame in a hundred has more than 0.2 there, under a passer-by's every second one."""
+_AROUND_NS = 2 * NS_PER_S
+"""Time in which much moves: whoever leads the camera seems to stand still meanwhile."""
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """What speaks against a pose.
+
+    Attributes:
+        phrases: One for each reason; empty if nothing does.
+        sigma_rad: Error of the rotation that the reasons suggest, along each axis.
+        sigma_m: Error of the translation.
+    """
+
+    phrases: tuple[str, ...] = ()
+    sigma_rad: float = 0.0
+    sigma_m: float = 0.0
+
+
+NO_DOUBT = Doubt()
+
+
+@dataclass(slots=True)
+class _Frame:
+    stamp_ns: int
+    moving_ratio: float
+    displaced: Displacement
+    among_movers: bool = False
+
+
+class DisplacedSurfaces:
+    """Test whether surfaces lie where they lay, by the frames of two seconds.
+
+    Where much moves, whoever walks by lies elsewhere himself and is nearer than the walls, so that the
+    farther half of the surfaces tells wrong poses better, and right ones are doubted less.
+    """
+
+    def __init__(self) -> None:
+        self._earlier: dict[int, Displacement] = {}  # that speak against frames, as much moved after them
+        self._frames: deque[_Frame] = deque()
+
+    def speak_against(self, tracked_pose: TrackedPose, displaced: Displacement) -> str:
+        """Return that surfaces lie elsewhere by the next frame's pose; empty if they may."""
+        moving_ratio = len(tracked_pose.moving) / max(len(tracked_pose.observation), 1)
+        frame = _Frame(tracked_pose.stamp_ns, moving_ratio, displaced)
+        self._frames.append(frame)
+        while self._frames[0].stamp_ns < frame.stamp_ns - _AROUND_NS:
+            self._frames.popleft()
+        if sum(there.moving_ratio for there in self._frames) > FEW_MOVING * len(self._frames):
+            for there in self._frames:
+                if not there.among_movers and there.displaced.far_ratio > _MOST_FAR and there is not frame:
+                    self._earlier[there.stamp_ns] = there.displaced
+                there.among_movers = True
+        if frame.among_movers:
+            return _far_phrase(displaced) if displaced.far_ratio > _MOST_FAR else ""
+        return _phrase(displaced.ratio, "", displaced) if displaced.ratio > _MOST else ""
+
+    def doubt_of_earlier(self, stamp_ns: int) -> Doubt:
+        """Return what later frames say against an earlier one."""
+        displaced = self._earlier.get(stamp_ns)
+        if displaced is None:
+            return NO_DOUBT
+        return Doubt((_far_phrase(displaced),), 0.0, displaced.distance_m)
+
+
+def _far_phrase(displaced: Displacement) -> str:
+    return _phrase(displaced.far_ratio, "farther ", displaced)
+
+
+def _phrase(ratio: float, which: str, displaced: Displacement) -> str:
+    return f"{ratio:.0%} of the {which}surfaces lie elsewhere than {displaced.since_s:.1f} s before"
