@@ -9,7 +9,7 @@ import pytest
 from mapper.core.deskew import Twist, deskewed
 from mapper.core.errors import FrameError
 from mapper.core.frames import Scan
-from mapper.core.geometry import angle_between, exp, inverse
+from mapper.core.geometry import adjoint, angle_between, exp, inverse
 from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.scan_to_map.config import (
     GicpOdometryConfig,
@@ -17,6 +17,7 @@ from mapper.odometry.scan_to_map.config import (
     IcpOdometryConfig,
     KissOdometryConfig,
 )
+from mapper.odometry.scan_to_map.pose_search import PoseSearch
 from mapper.simulation.config import STREET, LidarSensorConfig
 from mapper.simulation.lidar import LidarSimulator
 
@@ -108,6 +109,23 @@ def test_keyframes_are_connected_in_a_chain(config):
     poses = {track.node: track.T_world_body for track in keyframes}
     for track in tracks:
         np.testing.assert_allclose(poses[track.node] @ track.T_node_body, track.T_world_body, atol=1e-9)
+
+
+def test_a_keyframe_that_was_compared_with_an_older_one_is_as_uncertain_as_both(monkeypatch):
+    find = PoseSearch.find
+
+    def by_an_older_one(self, deskewed, keyframes, *arguments):
+        return find(self, deskewed, list(keyframes)[1:] or keyframes, *arguments)
+
+    monkeypatch.setattr(PoseSearch, "find", by_an_older_one)
+    keyframes = [track for track in tracked(GicpOdometryConfig(), scans()[:12]) if track.is_keyframe]
+
+    before, track = keyframes[-2:]
+    (factor,) = track.factors
+    assert factor.i == before.node - 1
+    Ad = adjoint(inverse(track.T_world_body) @ before.T_world_body)
+    expected = np.linalg.inv(factor.information) + Ad @ before.covariance @ Ad.T
+    np.testing.assert_allclose(track.covariance, expected, rtol=1e-6, atol=1e-12)
 
 
 def test_motion_during_the_sweep_is_undone():
