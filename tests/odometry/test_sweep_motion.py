@@ -87,6 +87,20 @@ def test_the_expected_velocity_goes_on_as_it_changed():
     np.testing.assert_allclose(np.diag(covariance), [0.75 + 0.25] * 3 + [0.25] * 3)
 
 
+def test_the_rotation_changes_as_much_after_it_was_measured():
+    changes = []
+    for measured in (None, (STILL, np.eye(6))):
+        motion = MotionModel(0, np.eye(4))
+        for k in range(1, 12):
+            T_world_body = exp(np.array([0.0, 0.0, 0.2 * (k % 2)]), np.zeros(3))
+            motion.follow(k * 500_000_000, T_world_body, measured=measured if k == 11 else None)
+        changes.append(motion.turning_change(6_000_000_000))
+
+    assert changes[0] > 0.3
+    assert changes[1] >= 0.9 * changes[0]
+    assert MotionModel(0, np.eye(4)).turning_change(500_000_000) is None
+
+
 def yaw_rad(k):
     """Return the heading of a sensor that looks to and fro, and begins to do so suddenly, by scan."""
     return 0.02 * k if k < 8 else 0.16 + 1.2 * (1.0 - np.cos(0.9 * (k - 8)))

@@ -67,6 +67,15 @@ class MotionModel:
             float(np.hypot(translation * time_s2, _LEAST_M + _LEAST_SHARE * moved)),
         )
 
+    def turning_change(self, time_ns: int) -> float | None:
+        """Return what the rotation rate may change until a time, rad/s; None before enough is known.
+
+        A rate that was measured at the last scan makes the next pose better known, and the next rate not.
+        """
+        if len(self._errors) < _FEWEST_ERRORS:
+            return None
+        return max(float(self.velocity_sigmas(time_ns)[0]), float(self._median[0]) * self.elapsed_s(time_ns))
+
     def acceleration(self, time_ns: int, T_world_body: Transform, twist: Twist) -> float:
         """Return the angular acceleration to a velocity at a pose, at least the usual one, rad/s²."""
         usual, elapsed_s = float(self._median[0]), self.elapsed_s(time_ns)

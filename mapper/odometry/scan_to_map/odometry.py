@@ -93,7 +93,8 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         """
         motion, time_ns = self._motion, _time_ns(observation)
         deskewed, sigmas = observation.deskew(motion.twist), motion.velocity_sigmas(time_ns)
-        if motion.spread(time_ns) is None or observation.displacement(float(sigmas[0])) <= _NEGLIGIBLE:
+        change_radps = motion.turning_change(time_ns)
+        if change_radps is None or observation.displacement(change_radps) <= _NEGLIGIBLE:
             found = self._find_pose(deskewed, time_ns)
             if found is None:
                 return None
