@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+
+import numpy as np
 
 from mapper.core.errors import GraphError
 from mapper.core.geometry import Transform, inverse, is_rigid
@@ -11,6 +13,10 @@ from mapper.graph.model import BetweenFactor
 from mapper.graph.terms import Kernel, anchor, between, poses_of, values_of
 
 _HUBER = Kernel("huber", GraphConfig().robust_width)
+
+
+_LARGEST_RATIO = 1e16
+"""Of information that double precision can still add up."""
 
 
 class IncrementalSolver:
@@ -26,6 +32,7 @@ class IncrementalSolver:
         self._factors: list[BetweenFactor] = []
         self._component: dict[int, int] = {}
         self._members: dict[int, list[int]] = {}
+        self._factorization = "CHOLESKY"
         self._restart()
 
     def _restart(self) -> None:
@@ -33,8 +40,7 @@ class IncrementalSolver:
         import gtsam
 
         parameters = gtsam.ISAM2Params()
-        # Cholesky's check of pivots takes chains of some thousand nodes for indeterminate.
-        parameters.setFactorization("QR")
+        parameters.setFactorization(self._factorization)
         self._isam = gtsam.ISAM2(parameters)
         self._solved: set[int] = set()
         self._anchored: set[int] = set()
@@ -94,6 +100,11 @@ class IncrementalSolver:
             if any(factor.origin == "loop" for factor in waiting):
                 self._isam.update()  # a loop moves poses farther than one linearisation holds
         except RuntimeError as error:  # how GTSAM's C++ exceptions arrive, several lines long
+            if self._factorization == "CHOLESKY" and _are_commensurable(self._factors):
+                self._factorization = "QR"  # Cholesky takes chains of a thousand nodes for indeterminate
+                self._restart()
+                self.update()
+                return
             raise GraphError(f"the growing graph cannot be solved: {' '.join(str(error).split())}") from None
         self._solved |= connected.keys()
         self._used = len(self._factors)
@@ -141,3 +152,9 @@ class IncrementalSolver:
         else:
             T_fitting_world = T_world_node[factor.j] @ inverse(T_world_node[factor.i] @ factor.T_i_j)
         self._T_world_node |= {node: T_fitting_world @ T_world_node[node] for node in joining}
+
+
+def _are_commensurable(factors: Sequence[BetweenFactor]) -> bool:
+    """Return whether rounding leaves something of the least information beside the largest."""
+    eigenvalues = np.linalg.eigvalsh([factor.information for factor in factors])
+    return bool(eigenvalues.max() < _LARGEST_RATIO * eigenvalues.min())
