@@ -178,7 +178,7 @@ class SensorCheck(Protocol):
 
 @runtime_checkable
 class HindsightOdometry(Protocol):
-    """Odometry to which later frames tell what earlier ones did not show."""
+    """Odometry whose later frames may cast doubt on earlier ones."""
 
     def in_hindsight(self, result: FrameResult, /) -> FrameResult:
         """Return the result of a frame with what later ones say against it, once the log has ended."""

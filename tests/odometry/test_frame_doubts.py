@@ -10,7 +10,8 @@ from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import exp
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
-from mapper.odometry.local_map.displaced_surfaces import NO_DOUBT, DisplacedSurfaces, Doubt
+from mapper.odometry.local_map.displaced_surfaces import DisplacedSurfaces
+from mapper.odometry.local_map.doubt import NO_DOUBT, Doubt
 from mapper.odometry.local_map.earlier_depth import Displacement
 from mapper.odometry.local_map.frame_doubts import FrameDoubts
 from mapper.pipeline.track import track_log

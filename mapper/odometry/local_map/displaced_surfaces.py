@@ -1,9 +1,10 @@
-"""Doubts by surfaces that lie elsewhere than before, of which other ones count while something moves."""
+"""Test of poses by surfaces that lie elsewhere than in earlier depth images."""
 
 from collections import deque
 from dataclasses import dataclass
 
 from mapper.core.timebase import NS_PER_S
+from mapper.odometry.local_map.doubt import NO_DOUBT, Doubt
 from mapper.odometry.local_map.earlier_depth import Displacement
 from mapper.odometry.local_map.image_observation import FEW_MOVING
 from mapper.odometry.local_map.pose_tracker import TrackedPose
@@ -13,25 +14,8 @@ _MOST, _MOST_FAR = 0.5, 0.2
 real desk's edges give up to 0.48 under right poses. Where much moves the farther half decides: under right
 poses one frame in a hundred has more than 0.2 there, under a passer-by's every second one."""
 _AROUND_NS = 2 * NS_PER_S
-"""Time in which much moves: whoever leads the camera seems to stand still meanwhile."""
-
-
-@dataclass(frozen=True, slots=True)
-class Doubt:
-    """What speaks against a pose.
-
-    Attributes:
-        phrases: One for each reason; empty if nothing does.
-        sigma_rad: Error of the rotation that the reasons suggest, along each axis.
-        sigma_m: Error of the translation.
-    """
-
-    phrases: tuple[str, ...] = ()
-    sigma_rad: float = 0.0
-    sigma_m: float = 0.0
-
-
-NO_DOUBT = Doubt()
+"""Time around a frame in which moving features count: someone who walks ahead of the camera does not seem to
+move while they are followed."""
 
 
 @dataclass(slots=True)
@@ -43,10 +27,10 @@ class _Frame:
 
 
 class DisplacedSurfaces:
-    """Test whether surfaces lie where they lay, by the frames of two seconds.
+    """Test whether surfaces lie where they were in an earlier depth image.
 
-    Where much moves, whoever walks by lies elsewhere himself and is nearer than the walls, so that the
-    farther half of the surfaces tells wrong poses better, and right ones are doubted less.
+    While much moves, only the farther half of the surfaces is tested: people who pass are nearer than the
+    walls, and lie elsewhere under right poses.
     """
 
     def __init__(self) -> None:

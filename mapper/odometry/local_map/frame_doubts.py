@@ -6,7 +6,8 @@ from collections import deque
 import numpy as np
 
 from mapper.core.geometry import Array, Transform, inverse, log
-from mapper.odometry.local_map.displaced_surfaces import NO_DOUBT, DisplacedSurfaces, Doubt
+from mapper.odometry.local_map.displaced_surfaces import DisplacedSurfaces
+from mapper.odometry.local_map.doubt import NO_DOUBT, Doubt
 from mapper.odometry.local_map.earlier_depth import Displacement
 from mapper.odometry.local_map.pose_information import largest_sigma
 from mapper.odometry.local_map.pose_tracker import TrackedPose

@@ -26,7 +26,7 @@ from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.bundle import WINDOW_KEYFRAMES
 from mapper.odometry.local_map.depth_offset import DepthOffsetCheck
 from mapper.odometry.local_map.depth_tracker import DepthTracker
-from mapper.odometry.local_map.displaced_surfaces import NO_DOUBT, Doubt
+from mapper.odometry.local_map.doubt import NO_DOUBT, Doubt
 from mapper.odometry.local_map.earlier_depth import EarlierDepth
 from mapper.odometry.local_map.focal_length import FocalLengthCheck
 from mapper.odometry.local_map.frame_doubts import FrameDoubts

@@ -1,0 +1,21 @@
+"""Doubt about a tracked pose."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """What speaks against a pose.
+
+    Attributes:
+        phrases: One for each reason; empty if nothing does.
+        sigma_rad: Error of the rotation that the reasons suggest, along each axis.
+        sigma_m: Error of the translation.
+    """
+
+    phrases: tuple[str, ...] = ()
+    sigma_rad: float = 0.0
+    sigma_m: float = 0.0
+
+
+NO_DOUBT = Doubt()
