@@ -1,5 +1,6 @@
 """Free space: what stands where earlier images saw through has moved, and a wrong pose displaces surfaces."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -59,6 +60,23 @@ def test_a_visitor_gives_no_landmarks_and_no_support(odometry, frames):
     pose = odometry._last
     inside = (np.abs(pose.observation.pixels / size_px - 0.5) < 0.16).all(axis=1)
     assert (pose.landmark_of_feature[inside & pose.observation.has_depth] >= 0).mean() < 0.1
+
+
+def test_a_visitor_is_not_in_the_view_for_loops(odometry, frames):
+    visited = odometry.observe(with_visitor(frames[NOW + 1]))
+    before = odometry.view(visited)
+    assert len(before) == len(visited)  # before it is tracked nothing is known to move
+    odometry.track(visited)
+    moving = odometry._last.moving
+    assert len(moving) > 20
+
+    seen = odometry.view(visited)
+    assert np.array_equal(seen.pixels, np.delete(before.pixels, moving, axis=0))
+    assert np.array_equal(seen.bits, np.delete(before.bits, moving, axis=0))
+    assert len(seen.points_camera) == len(seen.sigma_px) == len(seen)
+    written = pickle.loads(pickle.dumps(seen))
+    assert np.array_equal(written.pixels, seen.pixels)
+    assert np.array_equal(written.bits, seen.bits)
 
 
 @pytest.mark.parametrize(("offset_m", "displaced"), [(0.0, False), (0.2, True)])

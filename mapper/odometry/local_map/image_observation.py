@@ -27,6 +27,8 @@ FEW_MOVING = 0.05
 _SCALE_ERROR = 0.02
 """Error of depths beside the sensor's noise, as a share: its scale, and the slope where a feature lies."""
 
+_NONE = np.empty(0, np.int32)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageObservation(Archivable):
@@ -123,17 +125,19 @@ class ImageObservation(Archivable):
         sweep_camera = self.sweep_camera if sweep_camera is None else sweep_camera
         return row_shift(pixels, depth_m, self.intrinsics, self.size_px[1], sweep_camera)
 
-    def view(self) -> ImageView:
-        """Return the view for place recognition."""
+    def view(self, moving: NDArray[np.int32] = _NONE) -> ImageView:
+        """Return the view for place recognition, without the (M,) features that move by themselves."""
+        still = np.delete(np.arange(len(self)), moving)
         return ObservedView(
             stamp_ns=self.stamp_ns,
-            pixels=self.measured[:, :2],
-            sigma_px=self.weights[:, 0] ** -0.5,
-            descriptors=self.bits.view(np.uint8).reshape(len(self), 32),
-            points_camera=self.points_camera,
+            pixels=self.measured[still, :2],
+            sigma_px=self.weights[still, 0] ** -0.5,
+            descriptors=self.bits[still].view(np.uint8).reshape(-1, 32),
+            points_camera=self.points_camera[still],
             intrinsics=self.intrinsics[:4],
             T_body_camera=self.T_body_camera,
             observation=self,
+            moving=moving,
         )
 
 
@@ -146,13 +150,15 @@ class ObservedView(ImageView):
 
     Attributes:
         observation: The observation.
+        moving: (M,) int32 features of it that are not in the view.
     """
 
     observation: ImageObservation
+    moving: NDArray[np.int32]
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Return the observation alone: a keyframe's is in the archive already."""
-        return _view_of, (self.observation,)
+        """Return what it is made from: a keyframe's observation is in the archive already."""
+        return _view_of, (self.observation, self.moving)
 
 
 def observe_image(
@@ -229,8 +235,8 @@ def _unswept(measured: Mapping[str, Any], has_disparity: bool) -> ImageObservati
     )
 
 
-def _view_of(observation: ImageObservation) -> ImageView:
-    return observation.view()
+def _view_of(observation: ImageObservation, moving: NDArray[np.int32]) -> ImageView:
+    return observation.view(moving)
 
 
 def _swept(unswept: ImageObservation, sweep_camera: Array) -> ImageObservation:

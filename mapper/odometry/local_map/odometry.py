@@ -158,8 +158,16 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         return replace(result, doubts=doubt.phrases, covariance=covariance_of(information))
 
     def view(self, observation: ImageObservation, twist: Twist | None = None, /) -> ImageView:
-        """Return the view for place recognition, by the readout time as it is known now."""
-        return (observation if twist is None else self._shutter.corrected(observation, twist)).view()
+        """Return the view for place recognition, by the readout time as it is known now.
+
+        What moves by itself in the last tracked frame is left out of its view: two images of one person show
+        that person's motion.
+        """
+        swept = observation if twist is None else self._shutter.corrected(observation, twist)
+        last = self._last
+        if last is None or last.stamp_ns != observation.stamp_ns or last.few_move:
+            return swept.view()
+        return swept.view(last.moving)
 
     def matches(self) -> FeatureMatches | None:
         """Return the features matched to landmarks, and these landmarks' pixels in an earlier frame."""
