@@ -24,6 +24,7 @@ from mapper.odometry.base import (
 )
 from mapper.odometry.config import KeyframeOdometryConfig
 from mapper.odometry.local_map.bundle import WINDOW_KEYFRAMES
+from mapper.odometry.local_map.depth_bias import DepthBiasCheck
 from mapper.odometry.local_map.depth_offset import DepthOffsetCheck
 from mapper.odometry.local_map.depth_tracker import DepthTracker
 from mapper.odometry.local_map.doubt import NO_DOUBT, Doubt
@@ -96,6 +97,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._residuals = LogResiduals()
         self._focal_length = FocalLengthCheck()
         self._depth_offset = DepthOffsetCheck()
+        self._depth_bias = DepthBiasCheck()
         self._agreeing = np.zeros(0, np.bool_)  # features by which the last frame was tracked
         self._lost_frames = 0  # since the last tracked one
         self._unknown_frames = 0  # those of them with enough features to begin a sub-map
@@ -195,12 +197,13 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         return [self._readout.sentence] if self._readout.sentence else []
 
     def calibration_doubts(self) -> Sequence[str]:
-        """Return what in the images contradicts their focal length, and the stamps of their depth."""
+        """Return what in the images contradicts their focal length, or their depth and its stamps."""
         if not self._map.keyframes:
             return ()
         doubts = (
             self._focal_length.contradiction(self._map.observation(0).intrinsics[0]),
             self._depth_offset.contradiction(),
+            self._depth_bias.contradiction(),
         )
         return [doubt for doubt in doubts if doubt]
 
@@ -369,11 +372,13 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         origins = {self._map.keyframes[k].origin for k in newest if k >= 0}
         if len(self._map.keyframes) % WINDOW_KEYFRAMES or len(origins) > 1:
             return
-        if self._focal_length.is_complete and self._depth_offset.is_complete:
+        if self._focal_length.is_complete and self._depth_offset.is_complete and self._depth_bias.is_complete:
             return
         bundle = self._map.bundle(newest)
         if not self._focal_length.is_complete:
             self._focal_length.add(bundle)
+        if not self._depth_bias.is_complete:
+            self._depth_bias.add(bundle)
         if not self._depth_offset.is_complete:
             self._depth_offset.add(bundle, newest, map(self._map.observation, newest))
 
