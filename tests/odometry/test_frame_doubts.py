@@ -1,6 +1,7 @@
 """Doubts of RGB-D frames: what is right is not doubted, and what may be wrong says why and by how much."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import exp
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
+from mapper.odometry.local_map.depth_alignment import DepthAlignment
 from mapper.odometry.local_map.displaced_surfaces import DisplacedSurfaces
 from mapper.odometry.local_map.doubt import NO_DOUBT, Doubt
 from mapper.odometry.local_map.earlier_depth import Displacement
@@ -88,6 +90,35 @@ def test_doubts_are_measured_against_what_is_usual(frames, odometry):
     doubt = assess(39, moved_m=0.1, excess=7.0)
     assert doubt.phrases == ("the image fits the predicted motion better by 7 standard errors",)
     assert doubt.sigma_m == pytest.approx(0.1, rel=0.01)
+
+
+def test_a_jump_of_a_pose_by_depth_is_doubted_unless_a_motion_was_predicted_alone(frames, odometry):
+    """A wall that errors of its depth bend shows a motion along it that is none."""
+    doubts = FrameDoubts()
+    track(frames[:2], odometry)
+    pose = odometry._last
+    observed, blind = (Mock(spec=DepthAlignment, unobservable=text) for text in ("", "translation along x"))
+
+    def assess(k, *, depth=observed, last_depth=observed, moved_m=0.001):
+        poses = [
+            replace(
+                pose,
+                observation=replace(pose.observation, stamp_ns=at * 33_000_000, image_checksum=at),
+                T_camera_world=exp(np.zeros(3), np.array([x, 0.0, 0.0])) @ pose.T_camera_world,
+                depth=alignment,
+            )
+            for at, x, alignment in ((k, moved_m, depth), (k - 1, 0.0, last_depth))
+        ]
+        covariance = np.diag([1e-6] * 6)
+        return doubts.assess(poses[0], covariance, poses[1], pose.T_camera_world, NOT_DISPLACED, 0.0)
+
+    assert not any(assess(k).phrases for k in range(1, 30))
+    assert not assess(30, moved_m=0.005).phrases
+    assert not assess(31, moved_m=0.3, depth=blind).phrases
+    assert not assess(32, moved_m=0.3, last_depth=blind).phrases
+    doubt = assess(33, moved_m=0.3)
+    assert doubt.phrases == ("jump of 0.30 m off the predicted place, 0.00 m is usual",)
+    assert doubt.sigma_m == pytest.approx(0.3, rel=0.01)
 
 
 def test_where_much_moves_the_farther_surfaces_decide_also_of_frames_shortly_before(frames, odometry):

@@ -75,7 +75,14 @@ class FrameDoubts:
 
         phrases = list(tracked_pose.doubts)
         if tracked_pose.depth is not None:  # landmarks were few, so what is usual of them says nothing
-            return Doubt(tuple(phrases), sigma_rad, sigma_m) if phrases else NO_DOUBT
+            if _is_blind(tracked_pose) or _is_blind(last):  # a motion that is predicted alone predicts none
+                return Doubt(tuple(phrases), sigma_rad, sigma_m) if phrases else NO_DOUBT
+            if jumps := self._jumps(jump, elapsed_s):
+                return Doubt((*phrases, *jumps), max(jump[0], sigma_rad), max(jump[1], sigma_m))
+            if phrases:
+                return Doubt(tuple(phrases), sigma_rad, sigma_m)
+            self._learn_motion(speed, jump, elapsed_s)
+            return NO_DOUBT
         usual_m, usual_agreement = self._usual("sigma_m"), self._usual("agreement")
         agreement = tracked_pose.agreement
         if sigma_m > max(_LOOSE_M, _LOOSE_RATIO * usual_m):
@@ -109,10 +116,7 @@ class FrameDoubts:
             ]
             return Doubt(tuple(phrases), max(off[0], sigma_rad), max(off[1], sigma_m))
         self._learn(sigma_m=sigma_m, agreement=agreement)
-        if elapsed_s > 0.0:
-            self._learn(speed_rad_s=speed[0] / elapsed_s, speed_m_s=speed[1] / elapsed_s)
-            if T_camera_world_predicted is not None:
-                self._learn(jump_rad_s=jump[0] / elapsed_s, jump_m_s=jump[1] / elapsed_s)
+        self._learn_motion(speed, jump, elapsed_s)
         return NO_DOUBT
 
     def in_hindsight(self, stamp_ns: int) -> Doubt:
@@ -145,9 +149,20 @@ class FrameDoubts:
         figures = self._figures[name]
         return float(np.median(figures)) if len(figures) >= _FEWEST else 0.0
 
+    def _learn_motion(self, speed: tuple[float, float], jump: tuple[float, float], elapsed_s: float) -> None:
+        if elapsed_s > 0.0:
+            self._learn(speed_rad_s=speed[0] / elapsed_s, speed_m_s=speed[1] / elapsed_s)
+            if not math.isnan(jump[0]):
+                self._learn(jump_rad_s=jump[0] / elapsed_s, jump_m_s=jump[1] / elapsed_s)
+
     def _learn(self, **figures: float) -> None:
         for name, figure in figures.items():
             self._figures[name].append(figure)
+
+
+def _is_blind(tracked_pose: TrackedPose) -> bool:
+    """Return whether a part of the motion is predicted alone."""
+    return tracked_pose.depth is not None and bool(tracked_pose.depth.unobservable)
 
 
 def _motion(T_camera_world: Transform, T_before_world: Transform) -> tuple[float, float]:
