@@ -23,13 +23,10 @@ from mapper.odometry.base import (
     lost_frame,
 )
 from mapper.odometry.config import KeyframeOdometryConfig
-from mapper.odometry.local_map.bundle import WINDOW_KEYFRAMES
-from mapper.odometry.local_map.depth_bias import DepthBiasCheck
-from mapper.odometry.local_map.depth_offset import DepthOffsetCheck
+from mapper.odometry.local_map.calibration_checks import CalibrationChecks
 from mapper.odometry.local_map.depth_tracker import DepthTracker
 from mapper.odometry.local_map.doubt import NO_DOUBT, Doubt
 from mapper.odometry.local_map.earlier_depth import EarlierDepth
-from mapper.odometry.local_map.focal_length import FocalLengthCheck
 from mapper.odometry.local_map.frame_doubts import FrameDoubts
 from mapper.odometry.local_map.image_observation import ImageObservation, observe_image
 from mapper.odometry.local_map.keyframe_decision import KeyframeDecision
@@ -95,9 +92,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._decision = KeyframeDecision(config)
         self._doubts = FrameDoubts()
         self._residuals = LogResiduals()
-        self._focal_length = FocalLengthCheck()
-        self._depth_offset = DepthOffsetCheck()
-        self._depth_bias = DepthBiasCheck()
+        self._calibration = CalibrationChecks(self._map)
         self._agreeing = np.zeros(0, np.bool_)  # features by which the last frame was tracked
         self._lost_frames = 0  # since the last tracked one
         self._unknown_frames = 0  # those of them with enough features to begin a sub-map
@@ -123,7 +118,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             return self._not_found(observation)
         if follows:
             tracked_pose = self._shutter.refined(tracked_pose, last, self._positions_of(tracked_pose))
-            self._pass_keyframe(tracked_pose, last)
+            self._calibration.pass_frame(self._before_last, last, tracked_pose)
         observation = tracked_pose.observation
         information = frame_information(self._map, tracked_pose)
         expected = None if self._lost_frames else predicted(observation.stamp_ns, last, self._before_last)
@@ -198,14 +193,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
 
     def calibration_doubts(self) -> Sequence[str]:
         """Return what in the images contradicts their focal length, or their depth and its stamps."""
-        if not self._map.keyframes:
-            return ()
-        doubts = (
-            self._focal_length.contradiction(self._map.observation(0).intrinsics[0]),
-            self._depth_offset.contradiction(),
-            self._depth_bias.contradiction(),
-        )
-        return [doubt for doubt in doubts if doubt]
+        return self._calibration.contradictions()
 
     def in_hindsight(self, result: FrameResult) -> FrameResult:
         """Return the result of an earlier frame with what later ones say against it."""
@@ -343,7 +331,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._map.refine(index, window=config.bundle_keyframes)
         self._map.follow_readout()
         self._map.cull()
-        self._check_calibration()
+        self._calibration.pass_keyframe()
         if (statistics := keyframe_residuals(self._map, index)) is not None:
             self._residuals.add(statistics)
         self._decision.restart()
@@ -356,31 +344,6 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             landmark_of_feature=self._map.landmark_of_feature(index),
             reference=index,
         )
-
-    def _pass_keyframe(self, tracked_pose: TrackedPose, last: TrackedPose) -> None:
-        """Learn the velocity of a keyframe from the frame after it, unless something moves by itself."""
-        before, keyframe = self._before_last, self._map.keyframes[last.reference]
-        if before is None or keyframe.stamp_ns != last.stamp_ns:
-            return
-        if all(pose.few_move for pose in (before, last, tracked_pose)):
-            around = ((pose.stamp_ns, pose.T_camera_world) for pose in (before, tracked_pose))
-            self._depth_offset.pass_keyframe(last.reference, *around)
-
-    def _check_calibration(self) -> None:
-        """Check the newest keyframes of a sub-map together, once there are enough since the last check."""
-        newest = range(len(self._map.keyframes) - WINDOW_KEYFRAMES, len(self._map.keyframes))
-        origins = {self._map.keyframes[k].origin for k in newest if k >= 0}
-        if len(self._map.keyframes) % WINDOW_KEYFRAMES or len(origins) > 1:
-            return
-        if self._focal_length.is_complete and self._depth_offset.is_complete and self._depth_bias.is_complete:
-            return
-        bundle = self._map.bundle(newest)
-        if not self._focal_length.is_complete:
-            self._focal_length.add(bundle)
-        if not self._depth_bias.is_complete:
-            self._depth_bias.add(bundle)
-        if not self._depth_offset.is_complete:
-            self._depth_offset.add(bundle, newest, map(self._map.observation, newest))
 
     def _result(
         self,
