@@ -214,3 +214,16 @@ def test_isvd_stays_lost_rather_than_in_another_room(frames):
     )
     assert all(track.node is not None for track in fooled)
     assert all(track.node is None for track in warned[len(before) :])
+
+
+def test_where_nothing_predicts_the_motion_a_place_is_recognised_before_depth_is_aligned(frames, monkeypatch):
+    odometry = build_frame_odometry(LocalMapConfig())
+    known = tracked(frames[seconds(0.0, 1.0)], odometry)
+    monkeypatch.setattr(odometry._tracker, "track", lambda *_: None)
+    gap_ns = 800_000_000  # longer than ten frames
+    again = replace(frames[len(known) - 2], stamp_ns=known[-1].stamp_ns + gap_ns)
+    found = odometry.track(odometry.observe(again))
+    assert found.diagnostics.method == "relocalised"
+    assert not found.doubts
+    difference = inverse(known[-2].T_world_body) @ found.T_world_body
+    assert np.linalg.norm(difference[:3, 3]) < 0.02

@@ -264,7 +264,10 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         """Track from the last frame; if that fails, or it was lost, relocalise among similar keyframes."""
         if self._lost_frames == 0:
             tracked_pose = self._tracker.track(observation, last, self._before_last)
-            tracked_pose = self._depth.supported(observation, last, self._before_last, tracked_pose)
+            expected = predicted(observation.stamp_ns, last, self._before_last)
+            # Without a prediction depth may lead into a wrong minimum, so keyframes are recognised first.
+            if tracked_pose is not None or expected is not None:
+                tracked_pose = self._depth.supported(observation, last, self._before_last, tracked_pose)
             if tracked_pose is not None and (
                 self._is_steady(tracked_pose, last) or self._is_possible(tracked_pose)
             ):
