@@ -14,6 +14,8 @@ from mapper.registration.kd_tree import KdTree, kd_tree, neighbours_of
 
 _NEIGHBOURS = 10
 _FEWEST_NEIGHBOURS = 5
+_BESIDE = 3
+"""So many other points lie within a point's spacing."""
 _VOXELS_ACROSS = 2**20  # within, positions in voxels are exact to a millionth of one
 _LINE = 1e-12
 """Least squared length of a normal before it is normalised, relative to the spread's; points on a line have
@@ -26,12 +28,14 @@ class Prepared:
 
     Attributes:
         normals: (N, 3) unit normals towards the origin; zero where there are too few neighbours.
+        spacing_m: (N,) distance of the third nearest other point; infinity where there are too few.
         voxel_m: Edge of the voxels, metres.
         neighbours: Number of points that each normal is fitted to.
         tree: Search tree of the points; None without points.
     """
 
     normals: Array
+    spacing_m: Array
     voxel_m: float
     neighbours: int
     tree: KdTree | None
@@ -60,7 +64,7 @@ def prepared(points: Points32 | Points, *, voxel_m: float, neighbours: int = _NE
         DataError: A point lies more than 2²⁰ voxels from the origin.
     """
     if len(points) == 0:
-        return Prepared(np.empty((0, 3)), voxel_m, neighbours, None)
+        return Prepared(np.empty((0, 3)), np.empty(0), voxel_m, neighbours, None)
     farthest_m, limit_m = float(np.abs(points).max()), _VOXELS_ACROSS * voxel_m
     if farthest_m >= limit_m:
         raise DataError(
@@ -68,15 +72,18 @@ def prepared(points: Points32 | Points, *, voxel_m: float, neighbours: int = _NE
             f"{voxel_m} m voxels; move the cloud to the origin or enlarge voxel_m"
         )
     tree = kd_tree(voxel_means(points, voxel_m))
-    return Prepared(_normals(tree, min(neighbours, len(tree.points))), voxel_m, neighbours, tree)
+    normals, spacing_m = _surroundings(tree, min(neighbours, len(tree.points)))
+    return Prepared(normals, spacing_m, voxel_m, neighbours, tree)
 
 
-def _normals(tree: KdTree, neighbours: int) -> Array:
-    normals = np.zeros_like(tree.points)
+def _surroundings(tree: KdTree, neighbours: int) -> tuple[Array, Array]:
+    """Return the normals and the spacing of a tree's points."""
+    normals, spacing_m = np.zeros_like(tree.points), np.full(len(tree.points), np.inf)
     if neighbours >= _FEWEST_NEIGHBOURS:
-        about, _ = neighbours_of(tree.points, tree.axes, tree.cuts, tree.points, neighbours)
+        about, squared = neighbours_of(tree.points, tree.axes, tree.cuts, tree.points, neighbours)
         _fit_normals(tree.points, about, normals)
-    return normals
+        spacing_m = np.sqrt(squared[:, _BESIDE])
+    return normals, spacing_m
 
 
 @njit(cache=True, nogil=True)

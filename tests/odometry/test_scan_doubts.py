@@ -209,6 +209,32 @@ def test_the_spread_of_predictions_is_the_logs_own():
     assert "0.30 m" in jump_between(np.eye(4), far, spread).text
 
 
+def dusty_scan(stamp_ns, T_world_body=None, *, seed, one_in):
+    """Return a scan of the room of which one return in so many is from dust in the air."""
+    scan = room_scan(stamp_ns, T_world_body, seed=seed, points=30000)
+    rng = np.random.default_rng(1000 + seed)
+    dust = rng.choice(len(scan.points_body), len(scan.points_body) // one_in, replace=False)
+    points = scan.points_body.copy()
+    points[dust] *= rng.uniform(0.2, 0.9, (len(dust), 1)).astype(np.float32)
+    return Scan(stamp_ns, points)
+
+
+def test_dust_does_not_contradict_a_right_pose_and_a_wrong_one_is_still_contradicted():
+    key = keyframe(dusty_scan(0, seed=1, one_in=200))
+    other = keyframe(dusty_scan(0, OFF, seed=2, one_in=200))
+    assert contradiction(key, other.description, OFF) < 0.006
+    assert contradiction(key, other.description, np.eye(4)) > 0.03
+
+
+def test_a_dusty_log_is_tracked_without_doubt():
+    odometry = ScanOdometry(INDOOR, GicpMatcher(INDOOR))
+    poses = [exp(np.array([0.0, 0.0, 0.02 * k]), np.array([0.05 * k, 0.0, 0.0])) for k in range(5)]
+    scans = [dusty_scan(round(1e8) * k, T, seed=k, one_in=70) for k, T in enumerate(poses)]
+    tracks = [odometry.track(odometry.observe(scan)) for scan in scans]
+    assert not any(track.doubts for track in tracks)
+    assert np.linalg.norm(tracks[-1].T_world_body[:3, 3] - poses[-1][:3, 3]) < 0.02
+
+
 def test_a_wrong_pose_contradicts_free_space():
     here, there = room_scan(0, seed=1, points=30000), room_scan(1, OFF, seed=2, points=30000)
     key, description = keyframe(here), described(keyframe(there).deskewed)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import small_gicp
+from scipy.spatial import cKDTree
 
 from mapper.core.errors import DataError
 from mapper.registration.surfaces import prepared
@@ -57,3 +58,11 @@ def test_an_empty_cloud_is_near_nothing():
 def test_points_beyond_exact_voxels_are_refused():
     with pytest.raises(DataError, match=r"900000 m is beyond 209715 m"):
         prepared(np.full((30, 3), 9e5, np.float32), voxel_m=0.2)
+
+
+def test_the_spacing_is_the_distance_of_the_third_nearest_other_point():
+    rng = np.random.default_rng(3)
+    cloud = prepared(rng.uniform(-5.0, 5.0, (400, 3)), voxel_m=VOXEL_M)
+    distances_m, _ = cKDTree(cloud.points).query(cloud.points, 4)
+    assert np.allclose(cloud.spacing_m, distances_m[:, 3])
+    assert np.isinf(prepared(np.eye(3), voxel_m=VOXEL_M).spacing_m).all()

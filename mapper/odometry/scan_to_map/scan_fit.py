@@ -18,6 +18,8 @@ _SURFACE_VOXELS = 0.33  # a point this near to a surface agrees with it
 _DIRECTION_RAD = 0.0175  # of the range images: one degree
 _MARGIN_M = 0.2
 _CHECKED_POINTS = 2000
+_SPACED_VOXELS, _SPACED_PIXELS = 2.0, 2.0
+"""Points farther apart are of no surface: rain, dust and ghosts stand where rays pass, under any pose."""
 _GRAZING = 0.01  # least sine of the angle between a ray and a surface
 _PIXELS = 1.5  # a ray that is compared with a point is off by up to so many
 _SMALL_SHARE = 0.03
@@ -93,17 +95,21 @@ def described(deskewed: DeskewedScan) -> ScanDescription:
 
 
 def _checked(deskewed: DeskewedScan) -> Points32:
-    """Return the points for the free-space check, each where a ray off by some pixels hits its surface.
+    """Return the points of surfaces for the free-space check, each where a ray off by some pixels hits.
 
     Seen at a grazing angle, ground and walls are passed by the neighbouring rays.
     """
     prepared, origin = deskewed.prepared, deskewed.scan.origin_body
     step = max(1, -(-len(prepared.points) // _CHECKED_POINTS))
     rays = prepared.points[::step] - origin
+    ranges_m = np.linalg.norm(rays, axis=1)
+    apart_m = np.maximum(_SPACED_VOXELS * prepared.voxel_m, _SPACED_PIXELS * _DIRECTION_RAD * ranges_m)
+    is_surface = prepared.spacing_m[::step] <= apart_m
     facing = np.abs(np.einsum("ni,ni->n", prepared.normals[::step], rays))
-    sine = np.clip(facing / np.maximum(np.linalg.norm(rays, axis=1), _MARGIN_M), _GRAZING, 1.0)
+    sine = np.clip(facing / np.maximum(ranges_m, _MARGIN_M), _GRAZING, 1.0)
     beyond = _PIXELS * _DIRECTION_RAD * np.sqrt(1.0 - sine**2) / sine
-    return np.ascontiguousarray((origin + rays * (1.0 + beyond[:, None])).astype(np.float32))
+    hit = origin + rays * (1.0 + beyond[:, None])
+    return np.ascontiguousarray(hit[is_surface].astype(np.float32))
 
 
 def fit_of(
