@@ -24,8 +24,8 @@ ROOM = np.array([[-4.0, 4.0], [-3.0, 3.0], [-1.2, 1.6]])
 OFF = exp(np.array([0.0, 0.0, np.radians(15.0)]), np.array([0.5, 0.3, 0.0]))
 
 
-def room_scan(stamp_ns, T_world_body=None, *, seed=0, points=6000, noise_m=0.02):
-    """Return what is seen of a room with a pillar and a cupboard, rays from the body through them."""
+def room_scan(stamp_ns, T_world_body=None, *, seed=0, points=6000, noise_m=0.02, more=()):
+    """Return what is seen of a room with a pillar, a cupboard and more boxes, by rays from the body."""
     rng = np.random.default_rng(seed)
     T_world_body = np.eye(4) if T_world_body is None else T_world_body
     pillar = np.array([[1.2, 1.8], [0.8, 1.5], [-1.2, 1.6]])
@@ -34,7 +34,7 @@ def room_scan(stamp_ns, T_world_body=None, *, seed=0, points=6000, noise_m=0.02)
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     rays, origin = directions @ T_world_body[:3, :3].T, T_world_body[:3, 3]
     ranges = np.full(points, np.inf)
-    for number, box in enumerate((ROOM, pillar, cupboard)):
+    for number, box in enumerate((ROOM, pillar, cupboard, *more)):
         with np.errstate(divide="ignore"):
             ends = (box.T[:, None, :] - origin) / rays
         enter, leave = ends.min(axis=0).max(axis=1), ends.max(axis=0).min(axis=1)
@@ -154,6 +154,25 @@ def test_a_strange_scan_is_not_tracked_and_does_not_enter_the_map():
     assert odd.node is None or odd.doubts
     assert after.doubts == ()
     assert np.linalg.norm(after.T_world_body[:3, 3]) < 0.02
+
+
+def test_tracking_goes_on_from_a_doubtful_keyframe_that_the_next_scan_fits():
+    config = INDOOR.model_copy(update={"keyframe_distance_m": 0.2})
+    odometry = ScanOdometry(config, GicpMatcher(config))
+    crates = (
+        np.array([[-2.5, -1.2], [0.6, 2.0], [-1.2, 1.0]]),
+        np.array([[-1.0, 0.8], [-1.8, -0.8], [-1.2, 1.6]]),
+    )
+    poses = [exp(np.array([0.0, 0.0, 0.01 * k]), np.array([0.25 * (k - 6), 0.0, 0.0])) for k in range(12)]
+    tracks = []
+    for k, pose in enumerate(poses):
+        scan = room_scan(k * 500_000_000, pose, seed=k, points=20000, more=crates if k >= 8 else ())
+        tracks.append(odometry.track(odometry.observe(scan)))
+
+    assert [bool(track.doubts) for track in tracks] == [k == 8 for k in range(12)]
+    assert tracks[9].factors[0].i == tracks[8].node
+    miss = inverse(inverse(poses[0]) @ poses[-1]) @ tracks[-1].T_world_body
+    assert np.linalg.norm(miss[:3, 3]) < 0.05
 
 
 def test_what_a_tunnel_does_not_show_is_predicted_and_doubted():

@@ -131,21 +131,41 @@ class PoseSearch:
             return replace(candidate, shares=replace(candidate.shares, contradicting=share))
 
         candidates = [] if best is None else [compared(best)]
-        answers = Answers(deskewed.prepared.voxel_m, [c.T_world_middle for c in candidates])
+        keys = [keyframes[0]]
+        if doubtful is not None and not any(map(self.fits, candidates)):
+            keys.append(doubtful)
+            on_doubtful = assessed(T_world_near, doubtful, "map")
+            candidates += [] if on_doubtful is None else [compared(on_doubtful)]
+        # A pose that does not fit the keyframes may fit the doubtful one, so each has answers of its own.
+        answers = {
+            is_doubtful: Answers(
+                deskewed.prepared.voxel_m,
+                [c.T_world_middle for c in candidates if (c.keyframe is doubtful) == is_doubtful],
+            )
+            for is_doubtful in (False, True)
+        }
+
+        def enough() -> PoseCandidate | None:
+            """Return the best pose so far if no other has to be tried."""
+            best = _best(candidates)
+            is_enough = best is not None and self._is_enough(best, answers[best.keyframe is doubtful])
+            return best if is_enough else None
+
+        if (found := enough()) is not None:
+            return found
         for way in (self._nearby, self._globally):
             if way == self._globally and any(map(self.fits, candidates)):
                 break
-            for key in (keyframes[0], doubtful) if doubtful is not None else (keyframes[0],):
+            for key in keys:
                 for guess, T_world_middle, method in way(deskewed, key, last, motion, T_world_predicted):
                     if T_world_middle is None:
                         continue
-                    if answers.add(T_world_middle, guess):
-                        found = assessed(T_world_middle, key, method)
-                        if found is not None:
-                            candidates.append(compared(found))
-                    best = _best(candidates)
-                    if best is not None and self._is_enough(best, answers):
-                        return best
+                    if answers[key is doubtful].add(T_world_middle, guess):
+                        candidate = assessed(T_world_middle, key, method)
+                        if candidate is not None:
+                            candidates.append(compared(candidate))
+                    if (found := enough()) is not None:
+                        return found
         return _best(candidates)
 
     def _preferred(self, one: PoseCandidate | None, other: PoseCandidate | None) -> PoseCandidate | None:
