@@ -1,9 +1,9 @@
 """Which part of a log is used, and what the log does not tell by itself."""
 
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Self
 
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from mapper.core.config import Config
 
@@ -116,9 +116,6 @@ class SourceConfig(Config):
     depth_offset_s: float = 0.0
     """Added to the stamps of depth images before they are paired with colour images: how much later they show
     the scene than their stamps say. The warning ``camera`` tells it where it was measured."""
-    inverse_depth_offset_per_m: Annotated[float, Field(ge=-0.1, le=0.1)] = 0.0
-    """Added to the inverse of every measured depth, 1/m: a constant error of a depth camera's disparity makes
-    depths wrong by a share that grows with them. The warning ``camera`` tells it where it was measured."""
     rate_hz: PositiveFloat | None = None
     """Frames per second of numbered files without stamps; None is the format's own (30, Poznań, scans 10)."""
     camera: CameraConfig | None = None

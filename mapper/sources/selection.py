@@ -9,21 +9,17 @@ from mapper.core.errors import SourceError
 from mapper.core.timebase import NS_PER_S, nearest
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
-from mapper.sources.depth_correction import with_corrected_depth
 from mapper.sources.vehicle import without_vehicle
 
 
 def selected(log: Log, config: SourceConfig) -> Log:
     """Return the frames ``first_frame`` … ``last_frame`` by ``stride``, with truth where it is required.
 
-    Returns of the sensor's own vehicle are left out of them, and depth is corrected.
+    Returns of the sensor's own vehicle are left out of them.
 
     Raises:
-        SourceError: Nothing is left, truth is required of a log that has none, or depth is to be corrected
-            of one without depth images.
+        SourceError: Nothing is left, or truth is required of a log that has none.
     """
-    if config.inverse_depth_offset_per_m != 0.0:
-        log = with_corrected_depth(log, config.inverse_depth_offset_per_m)
     if config.body.clears:
         log = without_vehicle(log, config.body)
     total = len(log)

@@ -192,7 +192,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         return [self._readout.sentence] if self._readout.sentence else []
 
     def calibration_doubts(self) -> Sequence[str]:
-        """Return what in the images contradicts their focal length, or their depth and its stamps."""
+        """Return what in the images contradicts their focal length, and the stamps of their depth."""
         return self._calibration.contradictions()
 
     def in_hindsight(self, result: FrameResult) -> FrameResult:
