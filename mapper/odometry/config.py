@@ -137,6 +137,8 @@ class KeyframeOdometryConfig(Config):
     """Seed of P3P's samples."""
     align_depth: bool = False
     """Where an image has few landmarks, its depth image is aligned to those of the keyframes."""
+    triangulate: bool = False
+    """Features without depth become landmarks where two keyframes show them from apart."""
     min_agreement_ratio: Ratio = 0.3
     """A pose that a smaller share of the matches agrees with is refused: repeated structure gave 0.28."""
     relocalisation_keyframes: PositiveInt = 5
@@ -150,6 +152,9 @@ class LocalMapConfig(KeyframeOdometryConfig):
     align_depth: bool = True
     """Where an image has few landmarks, its depth image is aligned to those of the keyframes; false where
     depth is unreliable."""
+    triangulate: bool = True
+    """Features without depth, as beyond the sensor's range, become landmarks where two keyframes show them
+    from apart; false uses features with depth alone."""
     search_px: PositiveFloat = 15.0
     """Search radius around the predicted pixel in the finest octave, doubled once when too little matches;
     raise it for fast motion."""

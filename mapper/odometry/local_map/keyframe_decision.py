@@ -1,6 +1,7 @@
 """Keyframe decision of the local map: by the inliers of a frame's pose."""
 
 from mapper.odometry.config import KeyframeOdometryConfig
+from mapper.odometry.local_map.landmarks import LandmarkMap
 from mapper.odometry.local_map.pose_tracker import TrackedPose
 
 _MIN_GAP = 4
@@ -15,8 +16,9 @@ _YOUNG_SHARE = 2.0 / 3.0
 class KeyframeDecision:
     """Decision whether a tracked frame becomes a keyframe (after Mur-Artal & Tardós 2017, §III-E)."""
 
-    def __init__(self, config: KeyframeOdometryConfig) -> None:
+    def __init__(self, config: KeyframeOdometryConfig, landmark_map: LandmarkMap) -> None:
         self._config = config
+        self._map = landmark_map
         self.restart()
 
     def restart(self) -> None:
@@ -46,7 +48,9 @@ class KeyframeDecision:
         young = self._frames < _MIN_GAP and inliers >= config.weak_inliers
         share = _YOUNG_SHARE if young else 1.0
         # Landmarks at one edge of the image constrain the pose badly, however many they are.
-        mapped_ratio = inliers / max(int(tracked_pose.observation.has_depth.sum()), 1)
+        ids = tracked_pose.landmark_of_feature
+        triangulated = (ids >= 0) & (self._map.landmarks["ray_sigma_m"][ids] > 0.0)
+        mapped_ratio = inliers / max(int((tracked_pose.observation.has_depth | triangulated).sum()), 1)
         # Unless the map is searched, features without a landmark are not new.
         is_new = mapped_ratio < config.mapped_ratio and (config.local_keyframes > 0 or not young)
         return is_new or kept_ratio < share * config.keyframe_ratio

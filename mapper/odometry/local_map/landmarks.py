@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, Transform, apply, inverse
+from mapper.core.geometry import Array, Points, Transform, apply, inverse
 from mapper.odometry.local_map.bundle import Bundle
 from mapper.odometry.local_map.bundle_adjustment import adjust, common_parameter
 from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.keyframe import DepthLink, Keyframe, RecentObservations, packed, unpacked
 from mapper.odometry.local_map.landmark_kernels import count_observers, observations_of
 from mapper.odometry.local_map.paged_table import PagedTable
+from mapper.odometry.local_map.ray_uncertainty import updated_ray_sigma_m
 from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.runtime.archived import archived
 
@@ -24,6 +25,7 @@ _MIN_FOUND_RATIO = 0.25
 """Young landmarks found in a smaller share of the frames that should show them are removed (ibid., §VI-B)."""
 _BUNDLE_ROUNDS, _BUNDLE_ITERATIONS = 2, 5
 _NEWEST = 3
+_NEVER_LINKED = -2
 
 
 class LandmarkMap:
@@ -46,6 +48,7 @@ class LandmarkMap:
             visible=((), np.int32),
             found=((), np.int32),
             observers=((), np.int32),
+            ray_sigma_m=((), np.float64),
         )
         self._observations = PagedTable(
             landmark=((), np.int32),
@@ -111,21 +114,6 @@ class LandmarkMap:
         """
         index = len(self.keyframes)
         self._first_landmark.append(self.landmarks.size)
-        landmark_of_feature = landmark_of_feature.copy()
-        features = np.flatnonzero(new)
-        points_world = apply(inverse(T_camera_world), observation.points_camera[features])
-        landmark_of_feature[features] = self.landmarks.append(
-            len(features),
-            position=points_world,
-            direction=0.0,
-            bits=observation.bits[features],
-            reach_m=np.linalg.norm(observation.points_camera[features], axis=1)
-            * self.scale_factor ** observation.octave[features],
-            newest=-1,
-            visible=1,
-            found=1,
-            observers=0,
-        )
         origin = index if neighbour is None else self.keyframes[neighbour].origin
         link = None
         if neighbour is not None and depth_information is not None:
@@ -146,8 +134,8 @@ class LandmarkMap:
         self._recent.keep(index, observation)
         self._observations.append(
             len(observation),
-            landmark=landmark_of_feature,
-            older=-1,
+            landmark=-1,
+            older=_NEVER_LINKED,
             keyframe=-1,
             measured=0.0,
             weights=0.0,
@@ -155,19 +143,60 @@ class LandmarkMap:
             readouts=len(self._readout_steps_s),
         )
         self._first_observation.append(self._observations.size)
-        self._link(index, landmark_of_feature)
+        known = np.flatnonzero(landmark_of_feature >= 0)
+        self._link(index, known, landmark_of_feature[known])
+        features = np.flatnonzero(new)
+        points_world = apply(inverse(T_camera_world), observation.points_camera[features])
+        self.add_landmarks(points_world, [(index, features)])
         return index
 
-    def _link(self, index: int, landmark_of_feature: Ids) -> None:
+    def add_landmarks(
+        self,
+        points_world: Points,
+        observed: Sequence[tuple[int, NDArray[np.integer]]],
+        ray_sigma_m: Array | float = 0.0,
+    ) -> None:
+        """Create landmarks from features that are none's yet.
+
+        Args:
+            points_world: (M, 3) metres.
+            observed: Keyframes, and the (M,) features by which each observes them. The last keyframe's
+                descriptors become the landmarks'.
+            ray_sigma_m: (M,) standard deviation along the rays; 0 where depth was measured.
+        """
+        index, features = observed[-1]
+        observation = self.observation(index)
+        distance_m = np.linalg.norm(apply(self.keyframes[index].T_camera_world, points_world), axis=1)
+        ids = self.landmarks.append(
+            len(points_world),
+            position=points_world,
+            direction=0.0,
+            bits=observation.bits[features],
+            reach_m=distance_m * self.scale_factor ** observation.octave[features],
+            newest=-1,
+            visible=1,
+            found=1,
+            observers=0,
+            ray_sigma_m=ray_sigma_m,
+        )
+        for keyframe, features in observed:
+            self._link(keyframe, features, ids)
+
+    def never_linked(self, index: int) -> NDArray[np.intp]:
+        """Return a keyframe's features that were never a landmark's: lists may lead through the others."""
+        rows = np.arange(self._first_observation[index], self._first_observation[index + 1])
+        return np.flatnonzero(self._observations["older"][rows] == _NEVER_LINKED)
+
+    def _link(self, index: int, features: NDArray[np.integer], ids: Ids) -> None:
+        """Add observations by features of a keyframe to the lists of their landmarks."""
         keyframe = self.keyframes[index]
-        features = np.flatnonzero(landmark_of_feature >= 0)
-        ids = landmark_of_feature[features]
         centre_world = inverse(keyframe.T_camera_world)[:3, 3]
         ray = self.landmarks["position"][ids] - centre_world
         self.landmarks["observers"][ids] += 1
         self.landmarks["direction"][ids] += ray / np.linalg.norm(ray, axis=1, keepdims=True)
         observation = self.observation(index)
         observations = self._first_observation[index] + features
+        self._observations["landmark"][observations] = ids
         self._observations["older"][observations] = self.landmarks["newest"][ids]
         self._observations["keyframe"][observations] = index
         self._observations["measured"][observations] = observation.measured[features]
@@ -288,6 +317,11 @@ class LandmarkMap:
             if f >= 0:
                 self.keyframes[k].T_camera_world = poses[np.searchsorted(keyframe_ids, k)].copy()
         self.landmarks["position"][landmarks] = points
+        self.landmarks["ray_sigma_m"][landmarks] = updated_ray_sigma_m(
+            self.landmarks["ray_sigma_m"][landmarks],
+            self.landmarks["direction"][landmarks],
+            *(poses, points, edges[agree], measured[agree], weights[agree], intrinsics),
+        )
         self._unlink(observations[~agree])
 
     def bundle(self, keyframes: Sequence[int]) -> Bundle:
@@ -358,14 +392,16 @@ class LandmarkMap:
             self.landmarks[name][removed] = 0
 
     def cull(self) -> None:
-        """Remove young landmarks that no second keyframe observes or that tracking rarely finds.
+        """Remove young landmarks that no further keyframe observes or that tracking rarely finds.
 
-        Two keyframes after its creation a landmark must have a second observer; mismatches and depth errors
-        at object edges rarely get one (Mur-Artal, Montiel & Tardós 2015, §VI-B).
+        Two keyframes after its creation a landmark must have another observer than the one that it was made
+        from, or the two if it was triangulated; mismatches and depth errors at object edges rarely get one
+        (Mur-Artal, Montiel & Tardós 2015, §VI-B).
         """
         index = len(self.keyframes) - 1
         recent = np.arange(self._first_landmark[max(index - 3, 0)], self._first_landmark[max(index - 1, 0)])
-        unconfirmed = self.landmarks["observers"][recent] == 1
+        created_by = 1 + (self.landmarks["ray_sigma_m"][recent] > 0.0)
+        unconfirmed = self.landmarks["observers"][recent] <= created_by
         found, visible = self.landmarks["found"][recent], self.landmarks["visible"][recent]
         removed = recent[unconfirmed | (found < _MIN_FOUND_RATIO * visible)].astype(np.int32)
         _, observations = self._observations_of(removed)

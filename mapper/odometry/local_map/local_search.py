@@ -15,6 +15,7 @@ from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmark_kernels import project_visible
 from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
 from mapper.odometry.local_map.pose_tracker import MAX_HAMMING, TrackedPose, refined, rms_px
+from mapper.odometry.local_map.triangulation import weights_with_landmarks
 
 _MAX_RATIO = 0.8
 _CHANCE = 0.02
@@ -94,16 +95,21 @@ class LocalSearch:
         ids = landmark_of_feature[features]
         if len(features) < config.min_inliers:
             return None
+        found = T_camera_world, observation, features, ids
         T_camera_world, agree = refined_by_established(
             T_camera_world,
             landmarks["position"][ids],
             observation,
             features,
             landmarks["observers"][ids],
-            observation.weights_among(moved),
+            weights_with_landmarks(self._map, *found, observation.weights_among(moved)),
         )
         T_camera_world, _ = refined(
-            T_camera_world, landmarks["position"][ids[agree]], observation, features[agree]
+            T_camera_world,
+            landmarks["position"][ids[agree]],
+            observation,
+            features[agree],
+            weights_with_landmarks(self._map, *found, observation.weights),
         )
         if agree.sum() < max(config.min_inliers, least_by_chance(len(visible) + len(matched))):
             return None

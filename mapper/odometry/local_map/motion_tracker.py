@@ -14,6 +14,7 @@ from mapper.odometry.local_map.landmarks import Ids, LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
 from mapper.odometry.local_map.pose_tracker import TrackedPose, predicted, project, unmatched
 from mapper.odometry.local_map.relocalizer import Relocalizer
+from mapper.odometry.local_map.triangulation import weights_with_landmarks
 
 _MAX_RATIO = 0.9
 _LEAST_STILL_RATIO = 0.2
@@ -109,7 +110,14 @@ class MotionPoseTracker:
             observation,
             feature[hits],
             np.where(landmark[hits] >= 0, self._map.landmarks["observers"][landmark[hits]], 0),
-            observation.weights_among(moved),
+            weights_with_landmarks(
+                self._map,
+                T_camera_world,
+                observation,
+                feature[hits],
+                landmark[hits],
+                observation.weights_among(moved),
+            ),
         )
         agree = motion.agree
         if agree.sum() < self._config.min_matches // 2:

@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.core.deskew import Twist
 from mapper.core.frames import Frame
-from mapper.core.geometry import Points, inverse
+from mapper.core.geometry import Array, Points, inverse
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
@@ -43,6 +43,7 @@ from mapper.odometry.local_map.pose_tracker import PoseTracker, TrackedPose, pre
 from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.odometry.local_map.relocalizer import Relocalizer
 from mapper.odometry.local_map.rolling_shutter import RollingShutter
+from mapper.odometry.local_map.triangulation import add_triangulated, weights_with_landmarks
 from mapper.places.vocabulary import load_vocabulary
 
 _MIN_START_FEATURES = 100
@@ -89,7 +90,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._before_last: TrackedPose | None = None
         self._depth = DepthTracker(config, self._map)
         self._earlier_depth = EarlierDepth(self._map, config.depth_noise)
-        self._decision = KeyframeDecision(config)
+        self._decision = KeyframeDecision(config, self._map)
         self._doubts = FrameDoubts()
         self._residuals = LogResiduals()
         self._calibration = CalibrationChecks(self._map)
@@ -117,7 +118,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         if last is None or tracked_pose is None:
             return self._not_found(observation)
         if follows:
-            tracked_pose = self._shutter.refined(tracked_pose, last, self._positions_of(tracked_pose))
+            tracked_pose = self._shutter.refined(tracked_pose, last, *self._landmarks_of(tracked_pose))
             self._calibration.pass_frame(self._before_last, last, tracked_pose)
         observation = tracked_pose.observation
         information = frame_information(self._map, tracked_pose)
@@ -305,11 +306,19 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._unknown_frames = self._config.max_lost_frames  # another place, so a sub-map may begin at once
         return False
 
-    def _positions_of(self, tracked_pose: TrackedPose) -> Points:
-        """Return the (M, 3) landmarks of a pose's inliers, in the order of their features."""
-        ids = tracked_pose.landmark_of_feature
-        positions_world: Points = self._map.landmarks["position"][ids[ids >= 0]]
-        return positions_world
+    def _landmarks_of(self, tracked_pose: TrackedPose) -> tuple[Points, Array]:
+        """Return the (M, 3) landmarks of a pose's inliers, in the order of their features, and weights."""
+        observation, ids = tracked_pose.observation, tracked_pose.landmark_of_feature
+        features = np.flatnonzero(ids >= 0)
+        weights = weights_with_landmarks(
+            self._map,
+            tracked_pose.T_camera_world,
+            observation,
+            features,
+            ids[features],
+            observation.weights,
+        )
+        return self._map.landmarks["position"][ids[features]], weights[features]
 
     def _add_keyframe(
         self, tracked_pose: TrackedPose, *, neighbour: int | None, doubt: Doubt = NO_DOUBT
@@ -330,6 +339,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             twist_camera=self._shutter.twist_camera,
             depth_information=None if tracked_pose.depth is None else tracked_pose.depth.information,
         )
+        if config.triangulate:
+            add_triangulated(self._map, index, except_for=tracked_pose.moving)
         self._relocalizer.add(index)
         self._map.refine(index, window=config.bundle_keyframes)
         self._map.follow_readout()

@@ -7,6 +7,7 @@ import numpy as np
 from mapper.core.geometry import Array, Transform, adjoint, inverse
 from mapper.odometry.local_map.landmarks import MIN_SHARED_LANDMARKS, LandmarkMap
 from mapper.odometry.local_map.pose_tracker import TrackedPose
+from mapper.odometry.local_map.triangulation import weights_with_landmarks
 from mapper.registration.reprojection import normal_matrix
 from mapper.registration.variance_factor import ResidualStatistics, residual_statistics
 
@@ -17,12 +18,15 @@ _WEAK_PRIOR = np.diag([1.0] * 3 + [0.01] * 3)
 def frame_information(landmark_map: LandmarkMap, tracked_pose: TrackedPose) -> Array:
     """Return the (6, 6) information of a frame's pose, (rotation, translation), with landmarks as fixed."""
     observation, ids = tracked_pose.observation, tracked_pose.landmark_of_feature
-    features = np.flatnonzero(ids >= 0)
+    T_camera_world, features = tracked_pose.T_camera_world, np.flatnonzero(ids >= 0)
+    weights = weights_with_landmarks(
+        landmark_map, T_camera_world, observation, features, ids[features], observation.weights
+    )
     H_camera = normal_matrix(
-        tracked_pose.T_camera_world,
+        T_camera_world,
         landmark_map.landmarks["position"][ids[features]],
         observation.measured[features],
-        observation.weights[features],
+        weights[features],
         observation.intrinsics,
     )
     information = _of_body(H_camera, observation.T_body_camera) + _WEAK_PRIOR
@@ -42,11 +46,14 @@ def relative_information(landmark_map: LandmarkMap, target: int, source: int) ->
         landmark_map.landmarks_of(target), landmark_map.landmark_of_feature(source), return_indices=True
     )
     observation = landmark_map.observation(source)
+    weights = weights_with_landmarks(
+        landmark_map, keyframe.T_camera_world, observation, features, shared, observation.weights
+    )
     H_camera = 0.5 * normal_matrix(
         keyframe.T_camera_world,
         landmark_map.landmarks["position"][shared],
         observation.measured[features],
-        observation.weights[features],
+        weights[features],
         observation.intrinsics,
     )
     information = _of_body(H_camera, keyframe.T_body_camera) + _WEAK_PRIOR

@@ -74,13 +74,16 @@ class RollingShutter:
         # much is uncertain.
         self.twist_camera = velocity + 0.5 * change
 
-    def refined(self, tracked_pose: TrackedPose, before: TrackedPose, points_world: Points) -> TrackedPose:
+    def refined(
+        self, tracked_pose: TrackedPose, before: TrackedPose, points_world: Points, weights: Array
+    ) -> TrackedPose:
         """Return a pose and its observation, corrected by the motion that both the poses and the image show.
 
         Args:
             tracked_pose: Of an image corrected as predicted.
             before: Of the image before it.
             points_world: (M, 3) landmarks of its inliers, in the order of their features.
+            weights: (M, 3) inverse variances of their pixels and disparities.
         """
         observation = tracked_pose.observation
         self.follow(
@@ -98,7 +101,7 @@ class RollingShutter:
             (readout_s * sigma) ** -2.0,
             points_world,
             np.column_stack([observation.pixels[features], observation.measured[features, 2]]),
-            observation.weights[features],
+            weights,
             observation.intrinsics,
             observation.size_px[1],
         )
