@@ -5,7 +5,7 @@
 
 Logs are made once by `mapper synth` and kept in CACHE. With DATA also `tum_fr1_xyz`, `kitti_00` and
 `mulran_kaist03` in it are mapped, at several strides. Each log is tracked, searched for loops and solved with
-the default settings; no map is made.
+the default settings, and doubtful frames are placed as in a run; no map is made.
 
 `ATE` RMSE of what is placed, SE(3)-aligned, in metres; `path` is the truth's. `tracked`, `doubtful` and
 `lost` frames. `f/r` is the share of right frames that are called doubtful. `wrong`: windows of 1 s whose
@@ -35,6 +35,7 @@ from mapper.loops.closure import accepted_loops
 from mapper.pipeline.components import largest_component
 from mapper.pipeline.solve import solve
 from mapper.pipeline.track import refuse_a_fragment, track_log
+from mapper.run.doubtful_frames import placed_by_neighbours
 from mapper.run.frame_outcomes import records_of
 from mapper.runtime.progress import SILENT
 from mapper.sources import open_source
@@ -150,7 +151,7 @@ def mapped(log: Log, name: str, overrides: Sequence[str] = ()) -> Row:
         tracking = largest_component(tracking, progress=SILENT)
         seconds = time.perf_counter() - began
         trajectory, records = tracking.trajectory(), records_of(tracking.tracks, tracking.skipped)
-        matched = associate(trajectory, log.truth)
+        matched = associate(placed_by_neighbours(trajectory, tracking.graph, records), log.truth)
         rmse_m = ate(align(matched, "se3").moved(matched)).rmse
     except MapperError as error:
         return replace(row, refused=str(error))

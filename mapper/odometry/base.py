@@ -105,6 +105,9 @@ class FeatureMatches:
     previous_px: Array
 
 
+REPEATED = "repeated"
+"""``Diagnostics.method`` of a frame whose image is that of the frame before: nothing shows its pose."""
+
 STEADY_NS = NS_PER_S
 """After a longer gap the frame before says little about where this one was taken."""
 

@@ -9,6 +9,7 @@ import pytest
 from mapper.config.loading import load_config
 from mapper.core.frames import RgbdFrame
 from mapper.core.geometry import exp
+from mapper.odometry.base import REPEATED
 from mapper.odometry.config import LocalMapConfig
 from mapper.odometry.factory import build_frame_odometry
 from mapper.odometry.local_map.depth_alignment import DepthAlignment
@@ -47,6 +48,7 @@ def test_a_frozen_camera_is_doubted_until_it_moves_again(frames, odometry):
     doubtful = [i for i, step in enumerate(tracks) if any("same" in doubt for doubt in step.doubts)]
     assert doubtful == list(range(30, 36))
     assert not any(tracks[i].is_keyframe for i in doubtful)
+    assert [i for i, step in enumerate(tracks) if step.diagnostics.method == REPEATED] == doubtful
     assert all(step.covariance is not None for step in tracks[30:36])
     sigmas_m = [np.sqrt(tracks[i].covariance[3, 3]) for i in doubtful]
     assert sigmas_m == sorted(sigmas_m)
@@ -119,6 +121,25 @@ def test_a_jump_of_a_pose_by_depth_is_doubted_unless_a_motion_was_predicted_alon
     doubt = assess(33, moved_m=0.3)
     assert doubt.phrases == ("jump of 0.30 m off the predicted place, 0.00 m is usual",)
     assert doubt.sigma_m == pytest.approx(0.3, rel=0.01)
+    assert not doubt.repeats
+
+
+def test_a_frozen_camera_before_white_walls_is_doubted(frames, odometry):
+    track(frames[:2], odometry)
+    depth = Mock(spec=DepthAlignment, unobservable="translation along x")
+    last, now = (
+        replace(
+            odometry._last,
+            observation=replace(odometry._last.observation, stamp_ns=at, image_checksum=1),
+            depth=depth,
+        )
+        for at in (0, 200_000_000)
+    )
+    doubts, covariance = FrameDoubts(), np.diag([1e-6] * 6)
+    doubts.assess(last, covariance, odometry._before_last, None, NOT_DISPLACED, 0.0)
+    doubt = doubts.assess(now, covariance, last, None, NOT_DISPLACED, 0.0)
+    assert doubt.phrases == ("the image has been the same for 0.20 s",)
+    assert doubt.repeats
 
 
 def test_where_much_moves_the_farther_surfaces_decide_also_of_frames_shortly_before(frames, odometry):

@@ -11,11 +11,13 @@ class Doubt:
         phrases: One for each reason; empty if nothing does.
         sigma_rad: Error of the rotation that the reasons suggest, along each axis.
         sigma_m: Error of the translation.
+        repeats: The image is that of the frame before, so that it does not show the pose.
     """
 
     phrases: tuple[str, ...] = ()
     sigma_rad: float = 0.0
     sigma_m: float = 0.0
+    repeats: bool = False
 
 
 NO_DOUBT = Doubt()

@@ -65,7 +65,7 @@ class FrameDoubts:
         elapsed_s = 1e-9 * (stamp_ns - last.observation.stamp_ns)
         sigma_rad, sigma_m = (largest_sigma(covariance[k : k + 3, k : k + 3]) for k in (0, 3))
         speed = _motion(tracked_pose.T_camera_world, last.T_camera_world)
-        jump = (math.nan, math.nan)
+        jump = (-math.inf, -math.inf)
         if T_camera_world_predicted is not None:
             jump = _motion(tracked_pose.T_camera_world, T_camera_world_predicted)
         checksum = tracked_pose.observation.image_checksum
@@ -74,11 +74,16 @@ class FrameDoubts:
         shown_s = 1e-9 * (stamp_ns - self._shown_since_ns)
 
         phrases = list(tracked_pose.doubts)
+        off_rad, off_m = max(jump[0], sigma_rad), max(jump[1], sigma_m)
+        if shown_s > 0.0:
+            moved_rad, moved_m = (self._usual(name) * shown_s for name in ("speed_rad_s", "speed_m_s"))
+            phrases.append(f"the image has been the same for {shown_s:.2f} s")
+            return Doubt(tuple(phrases), max(moved_rad, off_rad), max(moved_m, off_m), repeats=True)
         if tracked_pose.depth is not None:  # landmarks were few, so what is usual of them says nothing
             if _is_blind(tracked_pose) or _is_blind(last):  # a motion that is predicted alone predicts none
                 return Doubt(tuple(phrases), sigma_rad, sigma_m) if phrases else NO_DOUBT
             if jumps := self._jumps(jump, elapsed_s):
-                return Doubt((*phrases, *jumps), max(jump[0], sigma_rad), max(jump[1], sigma_m))
+                return Doubt((*phrases, *jumps), off_rad, off_m)
             if phrases:
                 return Doubt(tuple(phrases), sigma_rad, sigma_m)
             self._learn_motion(speed, jump, elapsed_s)
@@ -99,8 +104,6 @@ class FrameDoubts:
         )
         if not is_supported:
             phrases += self._jumps(jump, elapsed_s)
-        if shown_s > 0.0:
-            phrases.append(f"the image has been the same for {shown_s:.2f} s")
         if elsewhere := self._surfaces.speak_against(tracked_pose, displaced):
             phrases.append(elsewhere)
             sigma_m = max(sigma_m, displaced.distance_m)
@@ -109,12 +112,7 @@ class FrameDoubts:
                 f"the image fits the predicted motion better by {excess_error:.0f} standard errors"
             )
         if phrases:
-            # How far off it may be: as far as the prediction says, or as the camera moves in the time.
-            off = [
-                max(abs(miss) if math.isfinite(miss) else 0.0, self._usual(name) * shown_s)
-                for miss, name in zip(jump, ("speed_rad_s", "speed_m_s"), strict=True)
-            ]
-            return Doubt(tuple(phrases), max(off[0], sigma_rad), max(off[1], sigma_m))
+            return Doubt(tuple(phrases), off_rad, max(off_m, sigma_m))
         self._learn(sigma_m=sigma_m, agreement=agreement)
         self._learn_motion(speed, jump, elapsed_s)
         return NO_DOUBT
@@ -152,7 +150,7 @@ class FrameDoubts:
     def _learn_motion(self, speed: tuple[float, float], jump: tuple[float, float], elapsed_s: float) -> None:
         if elapsed_s > 0.0:
             self._learn(speed_rad_s=speed[0] / elapsed_s, speed_m_s=speed[1] / elapsed_s)
-            if not math.isnan(jump[0]):
+            if math.isfinite(jump[0]):
                 self._learn(jump_rad_s=jump[0] / elapsed_s, jump_m_s=jump[1] / elapsed_s)
 
     def _learn(self, **figures: float) -> None:

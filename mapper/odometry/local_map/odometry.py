@@ -14,6 +14,7 @@ from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
 from mapper.graph.noise import inflated
 from mapper.odometry.base import (
+    REPEATED,
     STEADY_NS,
     Diagnostics,
     FeatureMatches,
@@ -139,7 +140,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._lost_frames = self._unknown_frames = 0
         reference, inliers = tracked_pose.reference, tracked_pose.inliers
         is_keyframe = self._decision.is_due(tracked_pose)
-        if doubt.phrases and tracked_pose.inliers >= self._config.weak_inliers:
+        if doubt.repeats or (doubt.phrases and tracked_pose.inliers >= self._config.weak_inliers):
             is_keyframe = False  # tracking goes on without it
         self._agreeing = tracked_pose.landmark_of_feature >= 0
         if is_keyframe:
@@ -153,6 +154,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             information = self._residuals.honest(_OWN_SHARE * information, result.T_node_body)
             if doubt.phrases:
                 information = inflated(information, sigma_rad=doubt.sigma_rad, sigma_m=doubt.sigma_m)
+        if doubt.repeats:
+            result = replace(result, diagnostics=replace(result.diagnostics, method=REPEATED))
         return replace(result, doubts=doubt.phrases, covariance=covariance_of(information))
 
     def view(self, observation: ImageObservation, twist: Twist | None = None, /) -> ImageView:
