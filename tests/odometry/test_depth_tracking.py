@@ -190,15 +190,16 @@ def test_depth_takes_part_where_landmarks_tell_too_little(
     observations = [odometry.observe(frame) for frame in frames[:4]]
     for observation in observations[:3]:
         odometry.track(observation)
-    last, before_last = odometry._last, odometry._before_last
-    found = odometry._tracker.track(observations[3], last, before_last)
+    last = odometry._last
+    T_predicted = odometry._velocity.predicted(observations[3].stamp_ns, last)
+    found = odometry._tracker.track(observations[3], last, T_predicted)
     kept = np.flatnonzero(found.landmark_of_feature >= 0)
     ids = np.full_like(found.landmark_of_feature, -1)
     spread = kept[np.linspace(0, len(kept) - 1, landmarks).astype(int)]
     ids[spread] = found.landmark_of_feature[spread]
 
     found = replace(found, landmark_of_feature=ids, moving=np.arange(moving, dtype=np.int32))
-    supported = odometry._depth.supported(observations[3], last, before_last, found)
+    supported = odometry._depth.supported(observations[3], last, T_predicted, found)
 
     assert supported.method == method
     assert (supported.depth is None) == (method == "map")

@@ -20,7 +20,7 @@ from mapper.odometry.local_map.image_observation import ImageObservation
 from mapper.odometry.local_map.landmarks import LandmarkMap
 from mapper.odometry.local_map.local_search import LocalSearch
 from mapper.odometry.local_map.pose_information import covariance_of, frame_information, largest_sigma
-from mapper.odometry.local_map.pose_tracker import TrackedPose, predicted, project, unmatched
+from mapper.odometry.local_map.pose_tracker import TrackedPose, project, unmatched
 
 _MIN_VISIBLE_RATIO = 0.3
 _MIN_WEAKEST_RATIO = 0.5
@@ -71,7 +71,7 @@ class DepthTracker:
         self,
         observation: ImageObservation,
         last: TrackedPose,
-        before_last: TrackedPose | None,
+        T_predicted: Transform | None,
         found: TrackedPose | None,
     ) -> TrackedPose | None:
         """Return a frame's pose by landmarks and depth together, where landmarks tell too little.
@@ -79,7 +79,7 @@ class DepthTracker:
         Args:
             observation: The frame.
             last: The last frame that was tracked.
-            before_last: The one before it, if it predicts the motion.
+            T_predicted: (4, 4) predicted T_camera_world; None if nothing predicts it.
             found: The pose from landmarks alone; None if they gave none.
 
         Returns:
@@ -91,9 +91,10 @@ class DepthTracker:
             return found
         if found is None and self._unobserved_s(observation) > _MAX_UNOBSERVED_S:
             return None
-        T_predicted = predicted(observation.stamp_ns, last, before_last)
+        unpredicted_s = 0.0
         if T_predicted is None:
             T_predicted = last.T_camera_world
+            unpredicted_s = (observation.stamp_ns - last.observation.stamp_ns) / NS_PER_S
         starts = [T_predicted] if found is None else [found.T_camera_world, T_predicted]
         for T_camera_world in starts:
             alignment = self._aligned(observation, T_camera_world, T_predicted, last, found)
@@ -115,8 +116,7 @@ class DepthTracker:
             method="depth+map",
         )
         if found is None:
-            gap_s = 0.0 if before_last else (observation.stamp_ns - last.observation.stamp_ns) / NS_PER_S
-            return self._by_depth(observation, alignment, reference, gap_s)
+            return self._by_depth(observation, alignment, reference, unpredicted_s)
         joint = self._aligned(observation, found.T_camera_world, T_predicted, last, found)
         return found if joint is None or not _agrees(joint) else self._by_both(observation, joint, found)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from mapper.core.deskew import Twist
 from mapper.core.frames import Frame
-from mapper.core.geometry import Array, Points, inverse
+from mapper.core.geometry import Array, Points, Transform, inverse
 from mapper.features.factory import build_detector
 from mapper.features.frame_view import ImageView
 from mapper.graph.model import BetweenFactor
@@ -40,11 +40,12 @@ from mapper.odometry.local_map.pose_information import (
     keyframe_residuals,
     relative_information,
 )
-from mapper.odometry.local_map.pose_tracker import PoseTracker, TrackedPose, predicted, unmatched
+from mapper.odometry.local_map.pose_tracker import PoseTracker, TrackedPose, unmatched
 from mapper.odometry.local_map.readout_time import ReadoutTime
 from mapper.odometry.local_map.relocalizer import Relocalizer
 from mapper.odometry.local_map.rolling_shutter import RollingShutter
 from mapper.odometry.local_map.triangulation import add_triangulated, weights_with_landmarks
+from mapper.odometry.local_map.velocity_filter import VelocityFilter
 from mapper.places.vocabulary import load_vocabulary
 
 _MIN_START_FEATURES = 100
@@ -89,6 +90,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._tracker = make_tracker(self._map, self._relocalizer)
         self._last: TrackedPose | None = None
         self._before_last: TrackedPose | None = None
+        self._velocity = VelocityFilter()
         self._depth = DepthTracker(config, self._map)
         self._earlier_depth = EarlierDepth(self._map, config.depth_noise)
         self._decision = KeyframeDecision(config, self._map)
@@ -115,7 +117,8 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         if not follows:
             self._shutter.restart()  # the motion before a gap is not that in this image
         observation = self._shutter.predicted(observation)
-        tracked_pose = None if last is None else self._find_pose(observation, last)
+        expected = None if last is None else self._velocity.predicted(observation.stamp_ns, last)
+        tracked_pose = None if last is None else self._find_pose(observation, last, expected)
         if last is None or tracked_pose is None:
             return self._not_found(observation)
         if follows:
@@ -123,20 +126,22 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             self._calibration.pass_frame(self._before_last, last, tracked_pose)
         observation = tracked_pose.observation
         information = frame_information(self._map, tracked_pose)
-        expected = None if self._lost_frames else predicted(observation.stamp_ns, last, self._before_last)
         displaced = self._earlier_depth.displacement(
             observation, tracked_pose.T_camera_world, tracked_pose.reference
         )
+        covariance = covariance_of(information)
         doubt = self._doubts.assess(
             tracked_pose,
-            covariance_of(information),
+            covariance,
             last,
             expected,
             displaced,
             excess_error(tracked_pose, last, expected),
         )
         # The motion before a gap does not predict the motion after it.
-        before_last = None if self._lost_frames else self._last
+        before_last = None if self._lost_frames else last
+        if before_last is not None:
+            self._velocity.add(tracked_pose, covariance, last, is_doubtful=bool(doubt.phrases))
         self._lost_frames = self._unknown_frames = 0
         reference, inliers = tracked_pose.reference, tracked_pose.inliers
         is_keyframe = self._decision.is_due(tracked_pose)
@@ -260,18 +265,20 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         self._lost_frames = self._unknown_frames = 0
         self._shutter.restart()
         self._agreeing = np.zeros(len(observation), np.bool_)
+        self._velocity.restart()
         self._before_last, self._last = None, self._add_keyframe(start, neighbour=None)
         self._depth.began(observation)
         return self._result(self._last, inliers=0, is_keyframe=True)
 
-    def _find_pose(self, observation: ImageObservation, last: TrackedPose) -> TrackedPose | None:
+    def _find_pose(
+        self, observation: ImageObservation, last: TrackedPose, expected: Transform | None
+    ) -> TrackedPose | None:
         """Track from the last frame; if that fails, or it was lost, relocalise among similar keyframes."""
         if self._lost_frames == 0:
-            tracked_pose = self._tracker.track(observation, last, self._before_last)
-            expected = predicted(observation.stamp_ns, last, self._before_last)
+            tracked_pose = self._tracker.track(observation, last, expected)
             # Without a prediction depth may lead into a wrong minimum, so keyframes are recognised first.
             if tracked_pose is not None or expected is not None:
-                tracked_pose = self._depth.supported(observation, last, self._before_last, tracked_pose)
+                tracked_pose = self._depth.supported(observation, last, expected, tracked_pose)
             if tracked_pose is not None and (
                 self._is_steady(tracked_pose, last) or self._is_possible(tracked_pose)
             ):
@@ -396,6 +403,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
 
     def _lost(self, observation: ImageObservation) -> FrameResult:
         self._lost_frames += 1
+        self._velocity.restart()
         last = self._last
         T_world_body = np.eye(4) if last is None else last.body_pose
         return lost_frame(observation.stamp_ns, T_world_body, features=len(observation), residual_unit="px")

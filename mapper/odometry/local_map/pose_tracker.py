@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, Points, Transform, apply, exp, inverse, log
+from mapper.core.geometry import Array, Points, Transform, apply, inverse
 from mapper.odometry.local_map.depth_alignment import DepthAlignment
 from mapper.odometry.local_map.image_observation import FEW_MOVING, ImageObservation
 from mapper.odometry.local_map.landmarks import Ids
@@ -16,8 +16,6 @@ from mapper.registration.reprojection import refine_pose
 MAX_HAMMING = 64
 """Descriptors that differ in more of their 256 bits do not match."""
 
-_MAX_PREDICTED_STEPS = 10.0
-"""Over longer gaps, in frame intervals, constant velocity predicts worse than no motion."""
 _LM_ROUNDS, _LM_ITERATIONS = 3, 8
 
 
@@ -79,28 +77,18 @@ class PoseTracker(Protocol):
     """Method that finds the pose of a frame while the frame before it was tracked."""
 
     def track(
-        self, observation: ImageObservation, last: TrackedPose, before_last: TrackedPose | None, /
+        self, observation: ImageObservation, last: TrackedPose, T_predicted: Transform | None, /
     ) -> TrackedPose | None:
-        """Return the pose of a frame, given those of the two frames before it; None if it is not found."""
+        """Return the pose of a frame, given that of the frame before it; None if it is not found.
+
+        ``T_predicted`` is the predicted (4, 4) T_camera_world, None if nothing predicts it.
+        """
         ...
 
 
 def unmatched(observation: ImageObservation) -> Ids:
     """Return (N,) landmark −1, which is none, for every feature."""
     return np.full(len(observation), -1, np.int32)
-
-
-def predicted(stamp_ns: int, last: TrackedPose, before_last: TrackedPose | None) -> Transform | None:
-    """Return T_camera_world under constant velocity, also across dropped frames; None if nothing tells it."""
-    if before_last is None:
-        return None
-    t0, t1 = before_last.observation.stamp_ns, last.observation.stamp_ns
-    steps = (stamp_ns - t1) / (t1 - t0)
-    if steps > _MAX_PREDICTED_STEPS:
-        return None
-    rotation_rad, translation_m = log(last.T_camera_world @ inverse(before_last.T_camera_world))
-    T_camera_world: Transform = exp(steps * rotation_rad, steps * translation_m) @ last.T_camera_world
-    return T_camera_world
 
 
 def project(T_camera_world: Transform, points_world: Points, intrinsics: Array) -> Array:
