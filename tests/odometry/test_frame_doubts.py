@@ -92,6 +92,7 @@ def test_doubts_are_measured_against_what_is_usual(frames, odometry):
     doubt = assess(39, moved_m=0.1, excess=7.0)
     assert doubt.phrases == ("the image fits the predicted motion better by 7 standard errors",)
     assert doubt.sigma_m == pytest.approx(0.1, rel=0.01)
+    assert not assess(40, moved_m=0.01, excess=7.0).phrases
 
 
 def test_a_jump_of_a_pose_by_depth_is_doubted_unless_a_motion_was_predicted_alone(frames, odometry):

@@ -19,6 +19,8 @@ _FEWEST = 10
 _LOOSE_M = 0.025
 """A translation this uncertain is doubtful where the usual is far better: 1 % of a view 2 to 3 m deep."""
 _LOOSE_RATIO = 4.0
+_LOOSE_RAD = 0.01
+"""Turn that moves what is 2.5 m away by as much."""
 _LOW_AGREEMENT = 0.5
 """Share of the usual agreement below which a pose is doubtful, however many features agree."""
 _JUMP_RATIO = 8.0
@@ -30,7 +32,7 @@ multiple, and nothing in view moves by itself: fast motions are real."""
 _MIN_EXCESS, _APART = 4.0, 2.0
 """When the image fits the predicted motion better than the one found by so many standard errors of the mean
 over its cells, and they are so many times as far apart as usual, what was found may be the motion of
-something else."""
+something else; unless they are less apart than a translation or a turn is uncertain that is not doubtful."""
 
 
 class FrameDoubts:
@@ -107,7 +109,8 @@ class FrameDoubts:
         if elsewhere := self._surfaces.speak_against(tracked_pose, displaced):
             phrases.append(elsewhere)
             sigma_m = max(sigma_m, displaced.distance_m)
-        if excess_error > _MIN_EXCESS and self._exceeds_usual(jump, elapsed_s, _APART):
+        is_apart = jump[0] > _LOOSE_RAD or jump[1] > _LOOSE_M
+        if excess_error > _MIN_EXCESS and is_apart and self._exceeds_usual(jump, elapsed_s, _APART):
             phrases.append(
                 f"the image fits the predicted motion better by {excess_error:.0f} standard errors"
             )
