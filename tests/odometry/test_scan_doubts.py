@@ -293,6 +293,20 @@ def test_a_few_bushes_in_a_field_show_a_motion_of_more_than_a_voxel(moved_m, is_
     assert (fit.observability.min() >= 1.0) == is_shown
 
 
+@pytest.mark.parametrize("moved_m", [0.3, 0.7, 1.0, 1.5])
+def test_rings_on_the_ground_that_the_sensor_moved_on_agree(moved_m):
+    key = keyframe(field_scan(0.0), voxel_m=0.4)
+    scan = keyframe(field_scan(moved_m), voxel_m=0.4).deskewed
+
+    right, above = (
+        fit_of(key, scan, exp(np.zeros(3), np.array([moved_m, 0.0, off_m])), max_pair_distance_m=0.5)
+        for off_m in (0.0, 0.3)
+    )
+
+    assert right.agreement > 0.7
+    assert above.agreement < 0.1
+
+
 def test_a_prediction_fills_only_what_surfaces_do_not_show():
     key = keyframe(tunnel_scan(0, 30.0, seed=1), voxel_m=0.4)
     scan = keyframe(tunnel_scan(1, 31.0, seed=2), voxel_m=0.4).deskewed

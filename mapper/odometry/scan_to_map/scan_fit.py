@@ -15,6 +15,9 @@ from mapper.registration.free_space import FreeSpaceCheck, ScanDescription, rang
 
 _MIN_PAIRS = 20
 _SURFACE_VOXELS = 0.33  # a point this near to a surface agrees with it
+_ALONG = 3.0
+"""Pair distances within which a partner tells whether a point lies on a surface: a ring on the ground is as
+far from the keyframe's as the sensor moved, up to two pair distances before the next keyframe."""
 _DIRECTION_RAD = 0.0175  # of the range images: one degree
 _MARGIN_M = 0.2
 _CHECKED_POINTS = 2000
@@ -65,7 +68,8 @@ class ScanFit:
     Attributes:
         overlap: Share of the points with a partner in range.
         rmse_m: Root mean square distance of these pairs.
-        agreement: Share that lies on the surfaces, of those that face the direction where the least does.
+        agreement: Share that lies on the surfaces, of those that face the direction where the least does; its
+            partners may lie farther along them than those of pairs.
         contradicting: Share of the points in space that the keyframe's rays passed.
         rows: (M, 6) Jacobian of the pairs' distances from the keyframe's surfaces by the scan's tangent.
         residuals_m: (M,) these distances.
@@ -137,10 +141,10 @@ def fit_of(
     near = np.flatnonzero(distances_m <= max_pair_distance_m)
     if len(near) < _MIN_PAIRS:
         return None
-    partners, points = indices[near], source.points[near]
-    normals_key = target.normals[partners]
-    residuals_m = np.einsum("ni,ni->n", normals_key, points_key[near] - target.points[partners])
-    normals = normals_key @ T_key_scan[:3, :3]
+    normals_key = target.normals[indices]
+    off_m = np.einsum("ni,ni->n", normals_key, points_key - target.points[indices])
+    points, residuals_m = source.points[near], off_m[near]
+    normals = normals_key[near] @ T_key_scan[:3, :3]
     own = source.normals[near]
     own = own * np.sign(np.einsum("ni,ni->n", own, normals))[:, None]
     rows = np.hstack([np.cross(points, normals), normals])
@@ -148,8 +152,8 @@ def fit_of(
     shown = np.einsum("ni,nj->ij", rows, own_rows)
     if np.trace(shown[3:, 3:]) <= 0.0:
         return None
-    agree = np.zeros(len(source.points), dtype=bool)
-    agree[near] = (np.abs(residuals_m) <= _SURFACE_VOXELS * source.voxel_m) & normals.any(axis=1)
+    agree = (distances_m <= _ALONG * max_pair_distance_m) & normals_key.any(axis=1)
+    agree &= np.abs(off_m) <= _SURFACE_VOXELS * source.voxel_m
     agreement, _ = weakest_direction(source.normals, agree)
     counts = FreeSpaceCheck(_MARGIN_M).count(keyframe.description, _checked(deskewed), T_key_scan)
     degeneracy = degeneracy_of(0.5 * (shown + shown.T), points=source.points, min_share=_SMALL_SHARE)
