@@ -61,10 +61,15 @@ def refined_motion(
     kind: Refiner,
     pair_distances_m: Sequence[float],
     max_iterations: int = 40,
+    max_points: int | None = None,
 ) -> Transform | str:
-    """Return the motion of ``refine`` without its assessment, or why there is none; arguments as there."""
+    """Return the motion of ``refine`` without its assessment, or why there is none; arguments as there.
+
+    With ``max_points`` fewer than twice as many of the source's points are used, at equal steps.
+    """
+    step = 1 if max_points is None else max(1, len(source.points) // max_points)
     for distance_m in pair_distances_m:
-        found = _descended(target, source, T_target_source, kind, distance_m, max_iterations)
+        found = _descended(target, source, T_target_source, kind, distance_m, max_iterations, step)
         if isinstance(found, str):
             return found
         T_target_source = found
@@ -72,7 +77,13 @@ def refined_motion(
 
 
 def _descended(
-    target: Prepared, source: Prepared, T: Transform, kind: Refiner, distance_m: float, max_iterations: int
+    target: Prepared,
+    source: Prepared,
+    T: Transform,
+    kind: Refiner,
+    distance_m: float,
+    max_iterations: int,
+    step: int = 1,
 ) -> Transform | str:
     if min(len(target.points), len(source.points)) < _MIN_PAIRS or target.tree is None:
         return (
@@ -84,8 +95,8 @@ def _descended(
         target.tree.axes,
         target.tree.cuts,
         target.normals,
-        source.points,
-        source.normals,
+        np.ascontiguousarray(source.points[::step]),
+        np.ascontiguousarray(source.normals[::step]),
         T,
         _DISTANCES[kind],
         distance_m,

@@ -5,7 +5,7 @@ import pytest
 import small_gicp
 
 from mapper.core.geometry import apply, exp, inverse
-from mapper.registration.refining import measured, refine
+from mapper.registration.refining import measured, refine, refined_motion
 from mapper.registration.surfaces import prepared
 
 VOXEL_M = 0.2
@@ -40,6 +40,21 @@ def test_a_known_motion_is_found_between_different_samples_of_the_same_walls(kin
     assert np.linalg.norm(miss[:3, 3]) < (0.03 if kind == "icp" else 0.003)
     assert found.inlier_ratio > 0.99
     assert found.inlier_rmse_m < VOXEL_M
+
+
+def test_a_tenth_of_the_points_finds_the_same_motion():
+    rng = np.random.default_rng(1)
+    target = prepared(walls(rng, tilt_rad=0.5), voxel_m=VOXEL_M)
+    source = prepared(moved(walls(rng, tilt_rad=0.5), MOTION), voxel_m=VOXEL_M)
+
+    by_all, by_few = (
+        refined_motion(
+            target, source, np.eye(4), kind="plane-icp", pair_distances_m=(0.6,), max_points=max_points
+        )
+        for max_points in (None, len(source.points) // 10)
+    )
+
+    assert 0.0 < np.linalg.norm((inverse(by_all) @ by_few)[:3, 3]) < 0.005
 
 
 @pytest.mark.parametrize("kind", KINDS)

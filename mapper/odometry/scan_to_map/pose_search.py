@@ -18,6 +18,7 @@ from mapper.registration.refining import refined_motion
 
 _TURNS_RAD = (0.3, -0.3, 0.6, -0.6, 1.0, -1.0)  # about the vertical, from the predicted pose
 _PAIR_DISTANCES = (4.0, 2.0, 1.0)  # of a scan to the last keyframe or scan, in largest pair distances
+_MAX_POINTS = 2500  # of the scan; fewer than twice as many are used
 _CONTRADICTION_WEIGHT = 15.0
 _ALIKE = 0.1  # scores nearer than this do not decide
 _GOOD = 0.75  # a score of this part of the usual one ends the search
@@ -268,13 +269,14 @@ class PoseSearch:
         for guess, T_world_guess in enumerate((T_world_predicted, *turned, motion.T_world_last)):
             if self._matcher.uses_guess and guess > 0:  # from the predicted pose it was the first try
                 yield guess, self._matcher.match(deskewed, T_world_guess, reach="near"), "turned"
-            for key in (keyframe, last) if last is not None else (keyframe,):
+            for key in dict.fromkeys((keyframe, keyframe if last is None else last)):
                 T_key_scan = refined_motion(
                     key.deskewed.prepared,
                     deskewed.prepared,
                     inverse(key.T_world_middle) @ T_world_guess,
                     kind="plane-icp",
                     pair_distances_m=[k * self._config.max_pair_distance_m for k in _PAIR_DISTANCES],
+                    max_points=_MAX_POINTS,
                 )
                 if not isinstance(T_key_scan, str):
                     T_world_found = key.T_world_middle @ T_key_scan
