@@ -12,7 +12,7 @@ from mapper.odometry.scan_to_map.gicp import GicpMatcher
 from mapper.odometry.scan_to_map.motion_model import MotionModel, Spread
 from mapper.odometry.scan_to_map.observed_part import observed_part
 from mapper.odometry.scan_to_map.odometry import ScanOdometry
-from mapper.odometry.scan_to_map.pose_search import Answers
+from mapper.odometry.scan_to_map.pose_search import Answers, PoseCandidate, PoseSearch
 from mapper.odometry.scan_to_map.scan_fit import ScanKeyframe, contradiction, described, fit_of
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan
 from mapper.odometry.scan_to_map.scan_noise import ScanNoise, surface_covariance
@@ -367,6 +367,22 @@ def test_a_pose_off_the_surfaces_is_uncertain_by_as_much():
 
     assert right[3] < 0.01
     assert 0.03 < held[3] < 0.1
+
+
+@pytest.mark.parametrize("is_shown", [False, True])
+def test_a_direction_that_disagrees_is_a_doubt_where_the_motion_was_predicted(is_shown):
+    key, scan = keyframe(room_scan(0, seed=1)), keyframe(room_scan(1, OFF, seed=2)).deskewed
+    fit = fit_of(key, scan, OFF, max_pair_distance_m=0.5)
+    fit = replace(fit, observability=np.array([float(is_shown), 1.0, 1.0, 1.0, 1.0, 1.0]))
+    search = PoseSearch(GicpOdometryConfig(), GicpMatcher(GicpOdometryConfig()))
+    for _ in range(6):
+        search.usual.add(Shares(1.0, 0.9, 0.0))
+
+    doubts = search.doubts(
+        PoseCandidate(key, OFF, fit, Shares(1.0, 0.3, 0.0), jump_between(OFF, OFF, None), np.zeros(6), "map")
+    )
+
+    assert doubts == (() if is_shown else ("30% agree in the weakest direction, 90% is usual",))
 
 
 def test_a_motion_that_two_scans_leave_open_is_no_doubt():

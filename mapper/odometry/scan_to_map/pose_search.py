@@ -222,7 +222,8 @@ class PoseSearch:
     def doubts(self, candidate: PoseCandidate) -> tuple[str, ...]:
         """Return what speaks against a pose, a phrase each; empty if it is believed.
 
-        Little overlap alone is a new room, and a jump alone a sudden turn.
+        Little overlap alone is a new room, and a jump alone a sudden turn. A direction that disagrees alone
+        is a doubt where part of the motion was predicted.
         """
         if self._config.usual_ratio == 0.0:
             return ()
@@ -233,7 +234,8 @@ class PoseSearch:
         if not usual.is_known:
             little = disagrees = False
         is_alone = not contradicts and little + disagrees + jumps < 2
-        if is_alone and not (jumps and candidate.method == "rescued"):
+        tells_alone = (jumps and candidate.method == "rescued") or (disagrees and not candidate.is_measured)
+        if is_alone and not tells_alone:
             return ()
         phrases = []
         if little:
