@@ -349,7 +349,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
             twist_camera=self._shutter.twist_camera,
             depth_information=None if tracked_pose.depth is None else tracked_pose.depth.information,
         )
-        if config.triangulate:
+        if config.triangulate and tracked_pose.few_move:  # without depth nothing tells what moves
             add_triangulated(self._map, index, except_for=tracked_pose.moving)
         self._relocalizer.add(index)
         self._map.refine(index, window=config.bundle_keyframes)

@@ -16,7 +16,7 @@ from mapper.registration.reprojection import CHI2_2DOF
 
 _CHI2_1DOF = 3.841
 """95 % quantile of χ²: of a distance to an epipolar line."""
-_ENOUGH_DEPTH = 0.75
+_ENOUGH_DEPTH = 0.5
 """Share of an image's features from which on those with depth suffice: most others then lie at edges, where
 what is seen changes with the view."""
 _MOST_KEYFRAMES = 10
