@@ -33,7 +33,9 @@ def ns_from_seconds_text(text: str) -> int:
     if not seconds.is_finite():
         raise DataError(f"stamp {text!r} is not finite")
     if not -_LARGEST_S <= seconds <= _LARGEST_S:
-        raise DataError(f"stamp {text!r} lies more than 292 years from zero, which 64 bits cannot hold")
+        raise DataError(
+            f"stamp {text!r} lies more than 292 years from zero, which 64 bits cannot hold; want seconds"
+        )
     return int(seconds * NS_PER_S)
 
 

@@ -3,6 +3,7 @@
 Matplotlib is driven through its objects: pyplot would keep global state and pick a GUI backend.
 """
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,7 +43,9 @@ def new_figure(width_in: float, height_in: float, *, background: Rgb = (255, 255
 
 def save(figure: "Figure", path: Path) -> None:
     """Write a page as PNG, atomically."""
-    with atomic_file(path) as part:
+    with atomic_file(path) as part, warnings.catch_warnings():
+        # A log's name may have characters that the font has not: they are drawn as boxes.
+        warnings.filterwarnings("ignore", message="Glyph", category=UserWarning)
         # Matplotlib would sign with its version: the same run must give the same bytes.
         figure.savefig(part, format="png", metadata={"Software": None})
 

@@ -298,10 +298,13 @@ def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: 
         raise TrackingError(
             f"none of {len(tracking.skipped)} frames could be read; the first: {tracking.skipped[0].reason}"
         )
+    unread = ""
+    if tracking.skipped:
+        unread = f"; {len(tracking.skipped)} could not be read, the first: {tracking.skipped[0].reason}"
     if tracked == read:
         raise TrackingError(
-            f"only {read} frames were read, want at least {enough:.0f} (min_tracked_frames); "
-            "give more of the log"
+            f"only {read} {'frame was' if read == 1 else 'frames were'} read, want at least {enough:.0f} "
+            f"(min_tracked_frames); give more of the log{unread}"
         )
     hint = _HINTS[config.odometry.kind if config.odometry.kind in _BY_POSES else sensor]
     doubtful = len(tracking.placed) - tracked
@@ -310,7 +313,7 @@ def refuse_a_fragment(tracking: TrackingResult, config: BuildConfig, *, sensor: 
         found += f", {doubtful} more are doubtful"
     raise TrackingError(
         f"{found}, want at least {enough:.0f}; {hint} "
-        "(min_tracked_frames and min_tracked_ratio set the limit)"
+        f"(min_tracked_frames and min_tracked_ratio set the limit){unread}"
     )
 
 

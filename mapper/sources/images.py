@@ -118,7 +118,10 @@ def check_size(shape: tuple[int, ...], camera: PinholeCamera, where: str) -> Non
     """
     want = (camera.height_px, camera.width_px)
     if shape[:2] != want:
-        raise FrameError(f"{where}: {shape[1]}×{shape[0]} px, but the log has {want[1]}×{want[0]}")
+        raise FrameError(
+            f"{where}: {shape[1]}×{shape[0]} px, but the log has {want[1]}×{want[0]}; "
+            "want one size, colour and depth registered to it"
+        )
 
 
 def scan_of(depth_m: DepthImage, camera: PinholeCamera, *, stamp_ns: int) -> Scan:

@@ -6,6 +6,7 @@ import pytest
 
 from mapper.core.trajectory import Trajectory
 from mapper.export.cloud_picture import splat, write_cloud_views
+from mapper.export.page import new_figure, save
 from mapper.export.palette import BACKDROP, DOUBTFUL, ESTIMATE, FACTORS, TRUTH
 from mapper.export.path_band import band_image
 from mapper.export.picture import write_summary
@@ -211,3 +212,11 @@ def test_a_band_is_as_wide_as_told_and_has_gaps():
     assert painted[:, 300].sum() * pixel_m == pytest.approx(1.0, abs=0.03)
     assert painted[:, 645].sum() == 0
     assert set(np.unique(image[:, :, 3])) == {0, 60}
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_name_that_the_font_has_no_letters_for_is_no_warning(tmp_path):
+    figure = new_figure(2.0, 1.0)
+    figure.text(0.1, 0.5, "日本")
+    save(figure, tmp_path / "name.png")
+    assert cv2.imread(str(tmp_path / "name.png")) is not None

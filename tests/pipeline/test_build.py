@@ -257,6 +257,14 @@ def test_a_log_of_few_frames_is_told_from_one_that_is_hard_to_track(desk_log, tm
         build(open_source(desk_log, config.source), config, tmp_path / "run")
 
 
+def test_a_log_of_few_frames_says_how_many_could_not_be_read(damaged_log, tmp_path):
+    images = sorted((damaged_log / "rgb").iterdir())
+    images[5].write_bytes(b"")
+    config = load_config(None, ["source.last_frame=6"])
+    with pytest.raises(TrackingError, match=r"; 1 could not be read, the first: .*" + images[5].name):
+        build(open_source(damaged_log, config.source), config, tmp_path / "run")
+
+
 def test_a_log_without_texture_and_depth_ends_in_an_error_and_leaves_what_there_is(damaged_log, tmp_path):
     for image in (damaged_log / "rgb").iterdir():
         image.write_bytes(_black_png())

@@ -11,6 +11,9 @@ from mapper.sources.cloud_files.parsing import MIN_POINTS, Column, Columns, refu
 
 RECORD_BYTES = 16
 
+_LEAST_INTENSITY, _MAX_NEGATIVE_RATIO = -1.0, 0.01
+"""Records of three or five numbers read as four have coordinates for intensities. Some sensors' programs
+write a time before the end of the sweep there, in seconds."""
 _HEADER_LINES = 100
 _HEAD_BYTES = 1 << 16
 _MAX_CLASS = 1000
@@ -23,7 +26,7 @@ def read_bin(path: Path) -> Columns:
     """Read KITTI's records of float32 x y z intensity (Geiger et al. 2013).
 
     Raises:
-        FrameError: The file is not a whole number of records.
+        FrameError: The file is not a whole number of records, or of other ones.
     """
     size = path.stat().st_size
     if size % RECORD_BYTES:
@@ -32,6 +35,12 @@ def read_bin(path: Path) -> Columns:
             "copy it again if it was cut, else save it as .npy or .pcd"
         )
     records = np.fromfile(path, dtype="<f4").reshape(-1, RECORD_BYTES // 4)
+    negative = int((records[:, 3] < _LEAST_INTENSITY).sum())
+    if negative > _MAX_NEGATIVE_RATIO * len(records):
+        raise FrameError(
+            f"{path}: intensity is below {_LEAST_INTENSITY:g} in {negative} of {len(records)} records of "
+            "float32 x y z intensity, so these are others, perhaps of x y z alone; save it as .npy or .pcd"
+        )
     return _xyz(records)
 
 
