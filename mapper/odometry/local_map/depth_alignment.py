@@ -8,6 +8,7 @@ that one of them does not observe is decided by the other.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import mean
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,18 +146,84 @@ def align_depth(
     """
     if len(points) < _MIN_POINTS:
         return None
-    sigmas = point_sigmas(cells, points, noise)
-    planes = np.array([surface.planes for surface in surfaces])
-    model = planes, np.array(T_surfaces_world), cells.camera.parameters, cells.cell_px
-    min_share = _min_share(surfaces)
+    model = _PlaneModel(
+        points,
+        point_sigmas(cells, points, noise),
+        np.array([surface.planes for surface in surfaces]),
+        np.array(T_surfaces_world),
+        cells.camera.parameters,
+        cells.cell_px,
+    )
+    minimum = _minimum(model, _min_share(surfaces), T_camera_world, T_prior, prior, landmarks)
+    if minimum is None:
+        return None
+    T_found, is_inlier, fit, degeneracy = minimum
+    agrees, contradicts = fit.verdict == 1, fit.verdict == -1
+    pairs, seen = int(fit.agreeing.sum()), int((fit.verdict != 0).sum())
+    scale = max(fit.squares / pairs, _LEAST_SCALE**2)
+    plane_counts = np.maximum((model.planes[..., 3] > 0.0).sum(axis=(1, 2)), 1)
+    return DepthAlignment(
+        T_camera_world=T_found,
+        information=projected(fit.information / scale, degeneracy) + prior,
+        is_landmark_inlier=is_inlier,
+        points=seen,
+        agreeing=fit.agreeing[:keyframes],
+        overlap=float((fit.agreeing / plane_counts)[:keyframes].max()),
+        agreeing_ratio=float(agrees.sum()) / seen,
+        weakest_ratio=_weakest(fit.facing, fit.facing_agreeing),
+        contradicting_ratio=max(
+            float(contradicts.sum()) / seen, _seen_through_ratio(T_found, cells, model, noise or KINECT_NOISE)
+        ),
+        visible_ratio=seen / len(points),
+        rmse_m=float(np.sqrt(fit.squares_m / pairs)),
+        unobservable=_unobserved(degeneracy, _known_by(landmarks, is_inlier, T_found)),
+        observes_next=observes_all(surface_of(cells)) if degeneracy.unobservable_count else True,
+    )
+
+
+class _PlaneModel(NamedTuple):
+    """Points of a depth image and planes of keyframes, as the kernels take them."""
+
+    points: Points
+    sigmas: Array
+    planes: Array
+    T_surfaces_world: Array
+    optics: Array
+    cell_px: int
+
+
+class _PlaneFit(NamedTuple):
+    """What ``compare`` returns."""
+
+    verdict: NDArray[np.int8]
+    agreeing: NDArray[np.int64]
+    unit_information: Array
+    information: Array
+    facing: Array
+    facing_agreeing: Array
+    squares: float
+    squares_m: float
+
+
+def _minimum(
+    model: _PlaneModel,
+    min_share: float,
+    T_camera_world: Transform,
+    T_prior: Transform,
+    prior: Array,
+    landmarks: Landmarks,
+) -> tuple[Transform, NDArray[np.bool_], _PlaneFit, Degeneracy] | None:
+    """Return the pose, which landmarks agree with it, its fit, and the motions that planes do not observe.
+
+    None where too few points have a partner. Where planes leave a motion open it is found once more, and
+    planes do not decide that motion then.
+    """
     kept = np.eye(6)
     while True:
         T_found, is_inlier = descend(
             T_camera_world,
             T_prior,
             prior,
-            points,
-            sigmas,
             *model,
             kept,
             np.array(_GATES_M),
@@ -169,49 +236,43 @@ def align_depth(
         )
         if not is_rigid(T_found):
             return None
-        verdict, agreeing, unit, information, facing, facing_agreeing, squares, squares_m = compare(
-            T_found, points, sigmas, *model
-        )
-        if (verdict == 1).sum() < _MIN_POINTS:
+        fit = _PlaneFit(*compare(T_found, *model))
+        agrees = fit.verdict == 1
+        if agrees.sum() < _MIN_POINTS:
             return None
-        degeneracy = degeneracy_of(unit, points=points[verdict == 1], min_share=min_share)
+        degeneracy = degeneracy_of(fit.unit_information, points=model.points[agrees], min_share=min_share)
         if degeneracy.unobservable_count == 0 or kept.trace() < 6.0:
-            break
+            return T_found, is_inlier, fit, degeneracy
         kept = _observable(degeneracy)
-    pairs = int(agreeing.sum())
-    scale = max(squares / pairs, _LEAST_SCALE**2)
-    seen = int((verdict != 0).sum())
-    sigma_m = noise or KINECT_NOISE
-    through, seen_back = seen_through(
-        T_found,
+
+
+def _seen_through_ratio(
+    T_camera_world: Transform, cells: DepthCells, model: _PlaneModel, noise: DepthNoiseConfig
+) -> float:
+    """Return the share of the keyframes' planes that the depth image sees through."""
+    through, seen = seen_through(
+        T_camera_world,
         cells.inverse_depth,
-        planes,
+        model.planes,
         cells.rays,
-        *model[1:],
-        np.array([sigma_m.constant_m, sigma_m.linear, sigma_m.quadratic_per_m]),
+        model.T_surfaces_world,
+        model.optics,
+        model.cell_px,
+        np.array([noise.constant_m, noise.linear, noise.quadratic_per_m]),
     )
-    known = 0.5 * normal_matrix(  # halved, as landmarks were measured no better than the frame
-        T_found,
+    return float(through / max(seen, 1))
+
+
+def _known_by(landmarks: Landmarks, is_inlier: NDArray[np.bool_], T_camera_world: Transform) -> Array:
+    """Return the (6, 6) information of landmarks that agree, halved: they were measured no better."""
+    known: Array = 0.5 * normal_matrix(
+        T_camera_world,
         landmarks.positions[is_inlier],
         landmarks.measured[is_inlier],
         landmarks.weights[is_inlier],
         landmarks.intrinsics,
     )
-    return DepthAlignment(
-        T_found,
-        projected(information / scale, degeneracy) + prior,
-        is_inlier,
-        seen,
-        agreeing[:keyframes],
-        float((agreeing / np.maximum((planes[..., 3] > 0.0).sum(axis=(1, 2)), 1))[:keyframes].max()),
-        float((verdict == 1).sum()) / seen,
-        _weakest(facing, facing_agreeing),
-        max(float((verdict == -1).sum()) / seen, through / max(seen_back, 1)),
-        seen / len(points),
-        float(np.sqrt(squares_m / pairs)),
-        _unobserved(degeneracy, known),
-        observes_all(surface_of(cells)) if degeneracy.unobservable_count else True,
-    )
+    return known
 
 
 def observes_all(surface: DepthSurface) -> bool:
