@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
+from mapper.core.geometry import Points
 from mapper.export.picture import write_merged
 from mapper.mapping.edits import MapEditor
 from mapper.merging.floors import MOST_COLUMNS, Extent, editors_of, floor_over, kept_out
@@ -28,7 +29,7 @@ from mapper.merging.jobs import (
 from mapper.merging.merged_map import MapManifest
 from mapper.merging.placing import Placed
 from mapper.merging.stages import Stages
-from mapper.navigation.floor import driven_ground
+from mapper.navigation.floor import Floor, driven_ground
 from mapper.navigation.traversable import Storey, traversable
 from mapper.octree.ground_height import (
     NOTHING,
@@ -75,32 +76,75 @@ def slice_map(
     for tile in joined:
         x, y = workspace.window(tile)[0].tolist()
         columns[x, y].append(tile)
-    is_level = all(item.T_map_world[2, 2] >= _MAX_TILT for item in placed)
     extent = (
         np.min([tile.first for tile in joined.values()], axis=0),
         np.max([tile.last for tile in joined.values()], axis=0),
     )
-    missing, floor = list[str](), None
-    if not is_level:
-        missing.append("no slice: a run is tilted by more than 5°, so z is not up in the map")
-    elif (cells := int(np.prod(extent[1] - extent[0]))) > MOST_COLUMNS:
-        missing.append(
-            f"no traversable floor: the map's bounding box has {cells / 1e6:.0f} M columns, at most "
-            f"{MOST_COLUMNS / 1e6:.0f} M fit into memory; merge fewer runs, or fuse with larger voxels"
-        )
-    else:
-        floor = floor_over(
-            (np.load(workspace.piece(tile, OCCUPIED)) for tile in joined),
-            extent,
-            manifest.traversable,
-            paths_map=[item.trajectory_map.positions_world for item in placed],
-            resolution_m=manifest.octree.resolution_m,
-            floor_z_m=manifest.floor_z_m,
-        )
+    paths_map = [item.trajectory_map.positions_world for item in placed]
+    missing = _why_no_floor(extent, placed)
+    floor = None if missing else _floor(workspace, joined, extent, manifest, paths_map)
     driven = None if floor is None else driven_ground(floor)
     first, shape = _raster(extent, driven)
     if manifest.slice.above == "ground":
         _save_ground(workspace, columns.values(), first, shape, manifest, driven)
+    done = _sliced_columns(workspace, stages, columns.values(), manifest)
+    if not _is_level(placed):
+        return Sliced(done, None, None, (), missing)
+    seen = np.zeros(shape, np.uint8)
+    for tiles in columns.values():
+        _over(np.bitwise_or, seen, first, workspace, tiles[0], BAND)
+    heights = {"resolution_m": manifest.octree.resolution_m, "floor_z_m": manifest.floor_z_m}
+    if driven is not None:
+        free_path(seen, driven, manifest.slice, **heights)
+    grid = None
+    try:
+        grid = grid_of(seen, manifest.slice, first=first, **heights)
+    except DataError as error:
+        missing.append(f"no {error}")
+    editors = editors_of(manifest, paths_map)
+    keepout = None if grid is None else _keepout(grid, manifest, driven, editors)
+    storeys = () if floor is None else kept_out(traversable(floor, manifest.traversable), editors)
+    return Sliced(done, grid, keepout, storeys, missing)
+
+
+def _is_level(placed: Sequence[Placed]) -> bool:
+    return all(item.T_map_world[2, 2] >= _MAX_TILT for item in placed)
+
+
+def _why_no_floor(extent: Extent, placed: Sequence[Placed]) -> list[str]:
+    """Return why no floor can be found; empty if one can."""
+    if not _is_level(placed):
+        return ["no slice: a run is tilted by more than 5°, so z is not up in the map"]
+    cells = int(np.prod(extent[1] - extent[0]))
+    if cells > MOST_COLUMNS:
+        return [
+            f"no traversable floor: the map's bounding box has {cells / 1e6:.0f} M columns, at most "
+            f"{MOST_COLUMNS / 1e6:.0f} M fit into memory; merge fewer runs, or fuse with larger voxels"
+        ]
+    return []
+
+
+def _floor(
+    workspace: Workspace,
+    joined: Mapping[int, JoinedTile],
+    extent: Extent,
+    manifest: MapManifest,
+    paths_map: Sequence[Points],
+) -> Floor:
+    return floor_over(
+        (np.load(workspace.piece(tile, OCCUPIED)) for tile in joined),
+        extent,
+        manifest.traversable,
+        paths_map=paths_map,
+        resolution_m=manifest.octree.resolution_m,
+        floor_z_m=manifest.floor_z_m,
+    )
+
+
+def _sliced_columns(
+    workspace: Workspace, stages: Stages, columns: Collection[Sequence[int]], manifest: MapManifest
+) -> list[SlicedColumn]:
+    """Slice every column of tiles, several at once."""
     jobs = {
         workspace.tiling.name_of(tiles[0]): partial(
             slice_column,
@@ -110,37 +154,9 @@ def slice_map(
             ground=workspace.piece(tiles[0], GROUND) if manifest.slice.above == "ground" else None,
             floor_z_m=manifest.floor_z_m,
         )
-        for tiles in columns.values()
+        for tiles in columns
     }
-    done = [column for _, column in stages.run("slice", jobs, SlicedColumn)]
-    if not is_level:
-        return Sliced(done, None, None, (), missing)
-    seen = np.zeros(shape, np.uint8)
-    for tiles in columns.values():
-        _over(np.bitwise_or, seen, first, workspace, tiles[0], BAND)
-    if driven is not None:
-        free_path(
-            seen,
-            driven,
-            manifest.slice,
-            resolution_m=manifest.octree.resolution_m,
-            floor_z_m=manifest.floor_z_m,
-        )
-    grid = None
-    try:
-        grid = grid_of(
-            seen,
-            manifest.slice,
-            first=first,
-            resolution_m=manifest.octree.resolution_m,
-            floor_z_m=manifest.floor_z_m,
-        )
-    except DataError as error:
-        missing.append(f"no {error}")
-    editors = editors_of(manifest, [item.trajectory_map.positions_world for item in placed])
-    keepout = None if grid is None else _keepout(grid, manifest, driven, editors)
-    storeys = () if floor is None else kept_out(traversable(floor, manifest.traversable), editors)
-    return Sliced(done, grid, keepout, storeys, missing)
+    return [column for _, column in stages.run("slice", jobs, SlicedColumn)]
 
 
 def _keepout(
