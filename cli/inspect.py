@@ -33,16 +33,25 @@ def inspect(
 
     overrides = set_ or []
     found = inspect_log(log, load_source_config(None, overrides))
-    if found.log is None or found.problem is not None:
-        plan = f"nothing: {found.problem}"
-    else:
+    problem, plan = found.problem, ""
+    if found.log is not None:
         config = load_config(None, overrides, sensor=found.log.sensor)
+        problem = problem or _too_few(found.log.frames.count, config.min_tracked_frames)
         plan = (
             f"{found.log.sensor} frames, odometry {config.odometry.kind}, loops {config.loops.kind}, "
             f"octree of {config.octree.resolution_m:g} m"
         )
-    error = None if found.problem is None else DataError(f"nothing can be mapped: {found.problem}")
-    return Answer({**dataclasses.asdict(found), "build": plan}, "\n".join(_lines(found, plan)), error=error)
+    if problem is not None:
+        plan = f"nothing: {problem}"
+    answer = {**dataclasses.asdict(found), "problem": problem, "build": plan}
+    error = None if problem is None else DataError(f"nothing can be mapped: {problem}")
+    return Answer(answer, "\n".join(_lines(found, plan)), error=error)
+
+
+def _too_few(frames: int, least: int) -> str | None:
+    if frames >= least:
+        return None
+    return f"number of frames: {frames}, want at least {least} (min_tracked_frames); give more of the log"
 
 
 def _lines(found: "Inspection", plan: str) -> Iterator[str]:

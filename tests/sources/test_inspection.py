@@ -74,17 +74,17 @@ def test_a_run_of_our_own_is_recognised(tmp_path):
 
 
 def test_the_verb_prints_a_table_and_json(tmp_path):
-    log = write(tmp_path / "log.mcap", shots(6))
+    log = write(tmp_path / "log.mcap", shots(10))
     text = printed(log)
     for words in (
         "mcap, called log",
-        "6: 0.2 s at 30.0 Hz, no gaps",
+        "10: 0.3 s at 30.0 Hz, no gaps",
         "rgbd frames, odometry local-map",
         "sensor_msgs/msg/Image",
     ):
         assert words in text
     facts = json.loads(printed(log, "--json"))
-    assert facts["log"]["frames"]["count"] == 6
+    assert facts["log"]["frames"]["count"] == 10
     assert facts["topics"][2]["name"] == COLOR
     assert facts["build"].startswith("rgbd frames, odometry local-map")
     assert "choose others" not in printed(
@@ -107,6 +107,13 @@ def test_the_exit_status_is_1_where_nothing_can_be_mapped(tmp_path, tiny_tum_log
     assert "frames        3: " in text
     assert "mapper build  nothing: no frame can be read: " in text
     assert "empty file" in text
+
+
+def test_a_log_of_too_few_frames_cannot_be_mapped(tiny_tum_log):
+    log = tiny_tum_log(3)
+    assert "nothing: number of frames: 3, want at least 10 (min_tracked_frames)" in printed(log, status=1)
+    assert printed(log, "--set", "min_tracked_frames=3").count("nothing") == 0
+    assert json.loads(printed(log, "--json", status=1))["problem"].startswith("number of frames: 3")
 
 
 def test_what_is_no_log_is_refused(tmp_path):
