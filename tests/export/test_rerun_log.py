@@ -20,6 +20,7 @@ from mapper.export.rerun.live import LiveRerun
 from mapper.export.rerun.recording import recorded
 from mapper.export.rerun.target import check_target, streaming
 from mapper.export.run_maps import maps_of, snapshots_of
+from mapper.mapping import cloud
 from mapper.odometry.base import Diagnostics, FrameResult
 from mapper.pipeline.build import build
 from mapper.run.folder import open_run
@@ -89,6 +90,13 @@ def test_the_paths_are_the_run_s(run, told):
     np.testing.assert_allclose(estimate, run.trajectory.positions_world, atol=1e-6)
     truth = told.one("/world/path/truth", "LineStrips3D:strips")[0]
     assert np.linalg.norm(truth[0] - estimate[0]) < 0.05  # laid over the estimate, in its own world
+
+
+def test_a_cloud_too_large_to_view_is_thinned(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(cloud, "MOST_TO_VIEW", 1000)
+    show_run(run, str(tmp_path / "few.rrd"))
+    points = Told(tmp_path / "few.rrd").one("/world/map/cloud", "Points3D:positions")
+    assert 500 < len(points) <= 1000 < len(run.cloud.points)
 
 
 def test_the_body_has_a_pose_at_every_exact_stamp(run, told):

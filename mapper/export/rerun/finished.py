@@ -7,6 +7,7 @@ import numpy as np
 from mapper.core.geometry import Array
 from mapper.export.rerun.recording import RerunLog, recorded
 from mapper.export.run_maps import maps_of, snapshots_of
+from mapper.mapping.cloud import thinned_to_view
 from mapper.mapping.fusion import Maps
 from mapper.run.folder import Run
 from mapper.run.results import RunResults, load_results
@@ -41,7 +42,7 @@ def log_run(log: RerunLog, results: RunResults, maps: Maps) -> None:
     log.loops(results.loops, results.graph.T_world_node)
     log.times(results.frame_ms)
     log.voxels(maps.octree)
-    log.cloud(maps.cloud_points_world, maps.cloud_colors)
+    log.cloud(*thinned_to_view(maps.cloud_points_world, maps.cloud_colors))
     log.grid("slice", maps.grid)
     log.grid("traversable", maps.traversable)
     for number, storey in enumerate(maps.storeys):
