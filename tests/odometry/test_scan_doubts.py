@@ -9,6 +9,7 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import angle_between, apply, exp, inverse, log
 from mapper.odometry.scan_to_map.config import GicpOdometryConfig
 from mapper.odometry.scan_to_map.gicp import GicpMatcher
+from mapper.odometry.scan_to_map.keyframe_tree import KeyframeTree
 from mapper.odometry.scan_to_map.motion_model import MotionModel, Spread
 from mapper.odometry.scan_to_map.observed_part import observed_part
 from mapper.odometry.scan_to_map.odometry import ScanOdometry
@@ -400,3 +401,14 @@ def test_points_are_where_the_truth_puts_them():
     here, there = room_scan(0, seed=1, noise_m=0.0), room_scan(1, OFF, seed=2, noise_m=0.0)
     _, distances_m = keyframe(here).deskewed.prepared.nearest(apply(OFF, there.points_body))
     assert np.median(distances_m) < 0.1
+
+
+def test_covariances_of_keyframes_are_those_of_the_factors_between_them():
+    tree = KeyframeTree(100)
+    between = [
+        tree.add(node, parent, np.eye(4), np.eye(6))[0, 0] for node, parent in enumerate([0, 0, 1, 3], 1)
+    ]
+    assert between == [1.0, 2.0, 3.0, 1.0]
+    for node in range(5, 100):  # by turns on two branches
+        covariance = tree.add(node, node - 2, np.eye(4), np.eye(6))
+    assert covariance[0, 0] <= 100.0

@@ -14,6 +14,7 @@ from mapper.graph.model import BetweenFactor
 from mapper.odometry.base import Diagnostics, FrameOdometry, FrameResult, lost_frame
 from mapper.odometry.keyframe_distance import is_far
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
+from mapper.odometry.scan_to_map.keyframe_tree import KeyframeTree
 from mapper.odometry.scan_to_map.motion_model import MotionModel
 from mapper.odometry.scan_to_map.pose_search import PoseCandidate, PoseSearch
 from mapper.odometry.scan_to_map.scan_fit import ScanKeyframe
@@ -50,7 +51,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         self._noise = ScanNoise()
         self._motion = MotionModel(0, np.eye(4))
         self._keyframes: deque[ScanKeyframe] = deque(maxlen=_KEYFRAMES)  # the newest first
-        self._steps: deque[_Step] = deque(maxlen=2 * _KEYFRAMES)  # between all keyframes, doubtful ones too
+        self._tree = KeyframeTree(4 * _KEYFRAMES)  # of all keyframes, doubtful ones too
         self._doubtful: ScanKeyframe | None = None
         self._last: ScanKeyframe | None = None
         self._first: ScanObservation | None = None
@@ -210,8 +211,7 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             self._noise.restart()
             information = np.linalg.inv(covariance)
             factors = (BetweenFactor(keyframe.node, node, T_key_body, 0.5 * (information + information.T)),)
-            covariance = covariance + self._since(keyframe.node, T_world_body)
-            self._steps.append(_Step(node, T_world_body, covariance))
+            covariance = self._tree.add(node, keyframe.node, T_world_body, covariance)
             if fits:
                 self._keyframes.appendleft(scan)
             else:
@@ -239,15 +239,6 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             doubts=(*doubts, *noise.doubts),
             covariance=covariance,
         )
-
-    def _since(self, node: int, T_world_body: Transform) -> Array:
-        """Return the covariance of the newest keyframe relative to another one, in the tangent of a body."""
-        total = np.zeros((6, 6))
-        for step in self._steps:
-            if step.node > node:
-                Ad = adjoint(inverse(T_world_body) @ step.T_world_body)
-                total += Ad @ step.covariance @ Ad.T
-        return total
 
     def _sweep_doubts(self, observation: ScanObservation, velocity_covariance: Array) -> tuple[str, ...]:
         """Return that the points of a sweep may be displaced, if they may."""
@@ -301,18 +292,9 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
             ScanKeyframe(self._next_node, deskewed, T_world_middle, T_world_body, covariance)
         )
         self._doubtful = self._last = None
-        self._steps.clear()
+        self._tree.clear()
         self._next_node += 1
         return self._keyframes[0].node
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Step:
-    """A keyframe with the (6, 6) covariance of its pose relative to the keyframe before it."""
-
-    node: int
-    T_world_body: Transform
-    covariance: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
