@@ -11,12 +11,12 @@ from mapper.odometry.scan_to_map.config import GicpOdometryConfig
 from mapper.odometry.scan_to_map.gicp import GicpMatcher
 from mapper.odometry.scan_to_map.keyframe_tree import KeyframeTree
 from mapper.odometry.scan_to_map.motion_model import MotionModel, Spread
-from mapper.odometry.scan_to_map.observed_part import observed_part
+from mapper.odometry.scan_to_map.observed_part import MEASURED, Blend, observed_part
 from mapper.odometry.scan_to_map.odometry import ScanOdometry
 from mapper.odometry.scan_to_map.pose_search import Answers, PoseCandidate, PoseSearch
 from mapper.odometry.scan_to_map.scan_fit import ScanKeyframe, contradiction, described, fit_of
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan
-from mapper.odometry.scan_to_map.scan_noise import ScanNoise, surface_covariance
+from mapper.odometry.scan_to_map.scan_noise import PredictedPart, ScanNoise, surface_covariance
 from mapper.odometry.scan_to_map.usual_fit import Shares, UsualFit, jump_between
 from mapper.registration.refining import refine
 from mapper.registration.surfaces import prepared
@@ -315,12 +315,12 @@ def test_a_prediction_fills_only_what_surfaces_do_not_show():
     predicted = exp(np.zeros(3), np.array([1.0, 0.3, 0.0]))
     fit = fit_of(key, scan, found, max_pair_distance_m=0.5)
 
-    pose, open_m = observed_part(fit, predicted, found, Spread(0.001, 0.05), voxel_m=0.4)
+    pose, blend = observed_part(fit, predicted, found, Spread(0.001, 0.05), voxel_m=0.4)
     near, _ = observed_part(fit, predicted, found, Spread(0.5, 2.0), voxel_m=0.4)
 
     assert fit.unobservable.startswith("translation along x")
     np.testing.assert_allclose(pose[:3, 3], [1.0, 0.02, 0.0], atol=0.02)
-    assert open_m.max() == pytest.approx(0.05, rel=0.3)
+    assert blend.open_m.max() == pytest.approx(0.05, rel=0.3)
     assert near[0, 3] > 2.5  # where predictions are bad, an uncertain measurement is better
 
 
@@ -345,7 +345,7 @@ def noise_of(T_key_scan, *, noise_m, off_m=0.0):
     scan = keyframe(room_scan(1, T_key_scan, seed=2, noise_m=noise_m)).deskewed
     found = T_key_scan @ exp(np.zeros(3), np.array([off_m, 0.0, 0.0]))
     fit = fit_of(key, scan, found, max_pair_distance_m=0.5)
-    noise = ScanNoise().of(fit, np.zeros(6), T_key_scan, 0.1, np.zeros((6, 6)))
+    noise = ScanNoise().of(fit, MEASURED, T_key_scan, T_key_scan, 0.1, np.zeros((6, 6)))
     return np.sqrt(np.diag(noise.covariance))
 
 
@@ -380,21 +380,50 @@ def test_a_direction_that_disagrees_is_a_doubt_where_the_motion_was_predicted(is
         search.usual.add(Shares(1.0, 0.9, 0.0))
 
     doubts = search.doubts(
-        PoseCandidate(key, OFF, fit, Shares(1.0, 0.3, 0.0), jump_between(OFF, OFF, None), np.zeros(6), "map")
+        PoseCandidate(key, OFF, fit, Shares(1.0, 0.3, 0.0), jump_between(OFF, OFF, None), MEASURED, "map")
     )
 
     assert doubts == (() if is_shown else ("30% agree in the weakest direction, 90% is usual",))
 
 
-def test_a_motion_that_two_scans_leave_open_is_no_doubt():
+@pytest.mark.parametrize(("motion", "sigma"), [(3, 0.015), (2, 0.0066)])
+def test_a_motion_that_two_scans_leave_open_is_no_doubt(motion, sigma):
+    doubts = doubts_of_blends(motion, sigma, gains=[0.0] * 4)
+    assert [bool(doubt) for doubt in doubts] == [False, False, True, True]
+
+
+def test_a_motion_that_is_half_seen_is_no_doubt_however_long():
+    assert not any(doubts_of_blends(3, 0.015, gains=[0.5] * 100))
+
+
+def test_the_error_of_a_prediction_grows_as_that_of_random_accelerations_does():
+    """Poses that constant velocity predicts from themselves, with a new error each time."""
+    errors = np.random.default_rng(1).normal(0.0, 0.01, (4000, 20))
+    positions = np.cumsum(np.cumsum(errors, axis=1), axis=1)
+    part, variance = PredictedPart(), np.zeros(6)
+    variance[3] = 0.01**2
+    for k in range(20):
+        covariance, _ = part.add(blend_of(3, 0.0, variance), np.eye(4), 0.1)
+        assert np.sqrt(covariance[3, 3]) == pytest.approx(positions[:, k].std(), rel=0.05)
+
+
+def blend_of(motion, gain, variances):
+    gains = np.ones(6)
+    gains[motion] = gain
+    return Blend(np.diag(gains), np.zeros((6, 6)), np.diag(variances), np.sqrt(variances))
+
+
+def doubts_of_blends(motion, sigma, *, gains):
+    """Return the doubts of scans 0.1 s apart that show one motion by a gain, predicted to a sigma."""
     key, scan = keyframe(room_scan(0, seed=1)), keyframe(room_scan(1, OFF, seed=2)).deskewed
     fit = fit_of(key, scan, OFF, max_pair_distance_m=0.5)
     fit = replace(fit, observability=np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.0]))
-    noise, open_m = ScanNoise(), np.array([0.012, 0.0, 0.0, 0.0, 0.0, 0.0])
-
-    doubts = [noise.of(fit, open_m, OFF, 0.1, np.zeros((6, 6))).doubts for _ in range(4)]
-
-    assert [bool(doubt) for doubt in doubts] == [False, False, True, True]
+    noise, variances = ScanNoise(), np.zeros(6)
+    variances[motion] = sigma**2
+    return [
+        noise.of(fit, blend_of(motion, gain, variances), OFF, np.eye(4), 0.1, np.zeros((6, 6))).doubts
+        for gain in gains
+    ]
 
 
 def test_points_are_where_the_truth_puts_them():

@@ -1,5 +1,7 @@
 """Pose of which each motion is measured where surfaces show it, and predicted where they do not."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from mapper.core.geometry import Array, Transform, exp, inverse, log
@@ -11,6 +13,28 @@ _MOST_SIGMAS = 3.0
 _UNKNOWN_PARTS = 0.1  # share of the extent by which a prediction is off before any could be compared
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Blend:
+    """How a pose was made of a found and of a predicted one; all are of its tangent.
+
+    Attributes:
+        gain: (6, 6) what is taken of the found pose's difference from the predicted one.
+        found: (6, 6) covariance that errors of unshown motions of the found pose bring with that.
+        predicted: (6, 6) covariance of a pose predicted from known ones.
+        open_m: (6,) standard deviation of each of the fit's motions beyond that of what was measured: how far
+            it displaces the points, metres.
+    """
+
+    gain: Array
+    found: Array
+    predicted: Array
+    open_m: Array
+
+
+MEASURED = Blend(np.eye(6), np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6))
+"""Of a pose that is all measured."""
+
+
 def observed_part(
     fit: ScanFit,
     T_world_predicted: Transform,
@@ -18,7 +42,7 @@ def observed_part(
     spread: Spread | None,
     *,
     voxel_m: float,
-) -> tuple[Transform, Array]:
+) -> tuple[Transform, Blend]:
     """Return the found pose with its unobserved motions as predicted (Zhang, Kaess & Singh 2016, §IV).
 
     Unlike there a motion that is not shown is not dropped at once: it is weighed against the prediction with
@@ -32,23 +56,27 @@ def observed_part(
         voxel_m: Of the scan.
 
     Returns:
-        (4, 4) pose, and (6,) standard deviation of each of the fit's motions beyond that of what was
-        measured: how far it displaces the points, metres.
+        (4, 4) pose, and what it was made of.
     """
     shown = fit.observability
     if shown.min() >= 1.0:
-        return T_world_found, np.zeros(6)
+        return T_world_found, MEASURED
     motions, found_m = fit.degeneracy.motions, _UNSHOWN_VOXELS * voxel_m
     to_motions = np.linalg.inv(motions.T)
     if spread is None:
         predicted_m = np.full(6, _UNKNOWN_PARTS * fit.degeneracy.extent_m)
+        predicted = motions.T @ np.diag(predicted_m**2) @ motions
     else:
         each = np.array([spread.rotation_rad] * 3 + [spread.translation_m] * 3)
         predicted_m = np.linalg.norm(to_motions * each, axis=1)
+        predicted = np.diag(each**2)
     corrections_m = to_motions @ np.concatenate(log(inverse(T_world_predicted) @ T_world_found))
     gains = predicted_m**2 / (predicted_m**2 + found_m**2)
     gains[np.abs(corrections_m) > _MOST_SIGMAS * np.hypot(predicted_m, found_m)] = 0.0
     weights = shown + (1.0 - shown) * gains
     kept = motions.T @ (weights * corrections_m)
+    unshown_m = (1.0 - shown) * gains * found_m
+    gain = motions.T @ np.diag(weights) @ to_motions
     open_m = (1.0 - shown) * np.sqrt(1.0 - gains) * predicted_m
-    return T_world_predicted @ exp(kept[:3], kept[3:]), open_m
+    blend = Blend(gain, motions.T @ np.diag(unshown_m**2) @ motions, predicted, open_m)
+    return T_world_predicted @ exp(kept[:3], kept[3:]), blend

@@ -172,8 +172,9 @@ class ScanOdometry(FrameOdometry[ScanObservation]):
         Ad = adjoint(inverse(T_key_scan))
         noise = self._noise.of(
             found.fit,
-            found.open_m,
+            found.blend,
             T_key_scan,
+            inverse(self._motion.T_world_last) @ found.T_world_middle,
             self._motion.elapsed_s(time_ns),
             at_stamp + Ad @ keyframe.covariance_at_stamp @ Ad.T,
         )

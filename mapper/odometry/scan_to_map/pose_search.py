@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapper.core.geometry import Array, Transform, angle_between, exp, inverse
+from mapper.core.geometry import Transform, angle_between, exp, inverse
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.odometry.scan_to_map.motion_model import MotionModel
-from mapper.odometry.scan_to_map.observed_part import observed_part
+from mapper.odometry.scan_to_map.observed_part import MEASURED, Blend, observed_part
 from mapper.odometry.scan_to_map.scan_fit import ScanFit, ScanKeyframe, contradiction, described, fit_of
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan, ScanMatcher
 from mapper.odometry.scan_to_map.usual_fit import Jump, Shares, UsualFit, jump_between
@@ -36,7 +36,7 @@ class PoseCandidate:
         fit: On that keyframe.
         shares: What of it is compared with the usual.
         jump: From the predicted pose.
-        open_m: (6,) errors of the motions that were predicted instead of measured.
+        blend: Of what was found and what was predicted.
         method: Step that found it.
     """
 
@@ -45,7 +45,7 @@ class PoseCandidate:
     fit: ScanFit
     shares: Shares
     jump: Jump
-    open_m: Array
+    blend: Blend
     method: str
 
     @property
@@ -106,12 +106,12 @@ class PoseSearch:
             if fit is None:
                 return None
             shares = Shares(fit.overlap, fit.agreement, fit.contradicting)
-            T_world_middle, open_m = found, np.zeros(6)
+            T_world_middle, blend = found, MEASURED
             if not is_believed:
                 voxel_m = deskewed.prepared.voxel_m
-                T_world_middle, open_m = observed_part(fit, T_world_predicted, found, spread, voxel_m=voxel_m)
+                T_world_middle, blend = observed_part(fit, T_world_predicted, found, spread, voxel_m=voxel_m)
             jump = jump_between(T_world_predicted, T_world_middle, spread)
-            return PoseCandidate(key, T_world_middle, fit, shares, jump, open_m, method)
+            return PoseCandidate(key, T_world_middle, fit, shares, jump, blend, method)
 
         T_world_begin = T_world_predicted if T_world_guess is None else T_world_guess
         T_world_near = self._matcher.match(deskewed, T_world_begin, reach="near")

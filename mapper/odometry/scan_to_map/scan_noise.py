@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Array, Transform
+from mapper.core.geometry import Array, Transform, adjoint, inverse
+from mapper.odometry.scan_to_map.observed_part import Blend
 from mapper.odometry.scan_to_map.scan_fit import ScanFit
 from mapper.odometry.scan_to_map.usual_fit import Jump
 
@@ -21,9 +22,10 @@ _MODEL_RAD_M, _MODEL_M_M, _MODEL_SHARE_M = 0.02, 0.08, 0.28
 of rotation, of translation and of the share of the way. KITTI's scans lie 25 mm off surfaces, and their poses
 7 mm on a metre, an error of 0.2° of the beams' elevations; synthetic ones lie 6 mm off, and are exact."""
 _DOUBTFUL_RAD, _DOUBTFUL_M = 0.1, 0.5
-_TRUSTED_MPS, _TRUSTED_M = 0.1, 0.05
-"""A prediction is doubtful when it may be off by more than both: single scans of stairs leave turns open by
-2 cm, and are right."""
+_TRUSTED_RADPS, _TRUSTED_MPS = 0.044, 0.1
+_TRUSTED_RAD, _TRUSTED_M = 0.022, 0.05
+"""A prediction is doubtful when its rotation or its translation may be off by more than both: single scans of
+stairs leave turns open by 2 cm, and are right. 1.25 degrees and 5 cm are a quarter of what is wrong."""
 _SHORTEST_S = 0.01
 
 
@@ -103,6 +105,7 @@ class ScanNoise:
     def __init__(self) -> None:
         self._unseen = 0  # scans in a row that left a motion open
         self._steps = 0.0
+        self._since_seen = PredictedPart()
 
     def restart(self) -> None:
         """Begin at a new keyframe."""
@@ -111,8 +114,9 @@ class ScanNoise:
     def of(
         self,
         fit: ScanFit,
-        open_m: Array,
+        blend: Blend,
         T_key_scan: Transform,
+        T_last_scan: Transform,
         elapsed_s: float,
         at_stamps: Array,
     ) -> PoseNoise:
@@ -120,8 +124,9 @@ class ScanNoise:
 
         Args:
             fit: On the keyframe.
-            open_m: (6,) errors of its motions that were predicted instead of measured.
+            blend: Of what was found and what was predicted.
             T_key_scan: (4, 4) the pose relative to the keyframe.
+            T_last_scan: (4, 4) relative to the scan before.
             elapsed_s: Since the scan before.
             at_stamps: (6, 6) covariance of the motion from the stamps to the middles of both sweeps.
         """
@@ -130,17 +135,52 @@ class ScanNoise:
         least_rad = _LEAST_RAD + _MODEL_RAD_M * off_m
         least_m = np.hypot(_LEAST_M + _MODEL_M_M * off_m, _MODEL_SHARE_M * off_m * moved_m)
         covariance = covariance + np.diag(np.square([least_rad] * 3 + [least_m] * 3)) + at_stamps
+        unseen, step = self._since_seen.add(blend, T_last_scan, elapsed_s)
         if fit.observability.min() >= 1.0:
             self._unseen = 0
             return PoseNoise(covariance)
         self._unseen += 1
         self._steps += self._unseen
         motions = fit.degeneracy.motions
-        added_m = np.minimum(open_m * self._steps, fit.degeneracy.extent_m)
+        added_m = np.minimum(blend.open_m * self._steps, fit.degeneracy.extent_m)
         predicted = np.einsum("ki,k,kj->ij", motions, added_m**2, motions)
-        rate_mps = float(open_m.max()) * self._unseen / max(elapsed_s, _SHORTEST_S)
+        rates = _largest(step) / max(elapsed_s, _SHORTEST_S)
+        (sigma_rad, sigma_m), (rate_radps, rate_mps) = _largest(unseen), rates
         doubts: tuple[str, ...] = ()
-        if rate_mps > _TRUSTED_MPS and added_m.max() > _TRUSTED_M:
+        turns = rate_radps > _TRUSTED_RADPS and sigma_rad > _TRUSTED_RAD
+        if turns or (rate_mps > _TRUSTED_MPS and sigma_m > _TRUSTED_M):
             name = fit.unobservable or "a motion"
-            doubts = (f"{name} is not seen but predicted, to ±{rate_mps:.2f} m a second",)
+            known = f"±{rate_mps:.2f} m and {np.degrees(rate_radps):.1f}° a second"
+            doubts = (f"{name} is not seen but predicted, to {known}",)
         return PoseNoise(covariance + predicted, doubts)
+
+
+class PredictedPart:
+    """Covariance of a pose of which motions are predicted, by adding the last step to the last pose.
+
+    The errors of both are followed together, since these motions were last seen: those that stay unseen go on
+    with the error of the velocity, and those that are partly seen are corrected.
+    """
+
+    def __init__(self) -> None:
+        self._covariance = np.zeros((12, 12))  # of the pose and of the last step, scan's tangent
+        self._elapsed_s = 0.0
+
+    def add(self, blend: Blend, T_last_scan: Transform, elapsed_s: float) -> tuple[Array, Array]:
+        """Add a scan; return the (6, 6) covariances of its pose and of its step.
+
+        pose' = (1 − gain) (pose + step) + gain found, and step' = pose' − pose.
+        """
+        Ad = adjoint(inverse(T_last_scan))
+        kept = np.eye(6) - blend.gain
+        ratio = elapsed_s / self._elapsed_s if self._elapsed_s > 0.0 else 1.0
+        change = np.block([[kept @ Ad, ratio * kept @ Ad], [kept @ Ad - Ad, ratio * kept @ Ad]])
+        added = kept @ blend.predicted @ kept.T + blend.found
+        self._covariance = change @ self._covariance @ change.T + np.tile(added, (2, 2))
+        self._elapsed_s = elapsed_s
+        return self._covariance[:6, :6].copy(), self._covariance[6:, 6:].copy()
+
+
+def _largest(covariance: Array) -> Array:
+    """Return the largest standard deviation of a (6, 6) covariance's rotation and of its translation."""
+    return np.sqrt([np.linalg.eigvalsh(covariance[part, part])[-1] for part in (slice(3), slice(3, 6))])
