@@ -386,14 +386,14 @@ def test_a_direction_that_disagrees_is_a_doubt_where_the_motion_was_predicted(is
     assert doubts == (() if is_shown else ("30% agree in the weakest direction, 90% is usual",))
 
 
-@pytest.mark.parametrize(("motion", "sigma"), [(3, 0.015), (2, 0.0066)])
+@pytest.mark.parametrize(("motion", "sigma"), [(3, 0.03), (2, 0.0132)])
 def test_a_motion_that_two_scans_leave_open_is_no_doubt(motion, sigma):
     doubts = doubts_of_blends(motion, sigma, gains=[0.0] * 4)
     assert [bool(doubt) for doubt in doubts] == [False, False, True, True]
 
 
 def test_a_motion_that_is_half_seen_is_no_doubt_however_long():
-    assert not any(doubts_of_blends(3, 0.015, gains=[0.5] * 100))
+    assert not any(doubts_of_blends(3, 0.03, gains=[0.5] * 100))
 
 
 def test_the_error_of_a_prediction_grows_as_that_of_random_accelerations_does():
