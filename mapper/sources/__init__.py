@@ -33,6 +33,7 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
         SourceError: Nothing is there, no format fits, the log is malformed, nothing of it is selected, or it
             has no frame such as is to be its body.
     """
+    from mapper.sources.scan_folder import most_clouds
     from mapper.sources.selection import selected
     from mapper.sources.wheel_files import read_wheels
 
@@ -55,7 +56,9 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
             return selected(log, config)
     if (path / MANIFEST_NAME).is_file():
         raise SourceError(f"{path}: holds what mapper made, not a log; mapper eval {path} judges it")
+    one_cloud = "; of clouds it has one, want two or more" if most_clouds(path) == 1 else ""
     raise SourceError(
         f"{path}: not a log of a known format (TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood, KITTI, clouds, "
         ".mcap, .bag, .db3, .mbag); docs/your-sensor.md names the files of each"
+        f"{one_cloud}"
     )
