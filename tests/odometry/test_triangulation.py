@@ -183,3 +183,25 @@ def test_a_triangulated_landmark_counts_less_the_farther_it_is_seen_from_aside(n
     assert np.array_equal(aside[measured], observation.weights[measured])
     assert (aside[features, 0] < observation.weights[features, 0]).all()
     assert np.median(aside[features, 0] / here[features, 0]) < 0.7
+
+
+def test_triangulated_landmarks_do_not_outvote_features_that_measure_the_scale(near_sighted):
+    odometry, _ = near_sighted
+    landmark_map = odometry._map
+    index = len(landmark_map.keyframes) - 1
+    observation, ids = landmark_map.observation(index), landmark_map.landmark_of_feature(index)
+    is_triangulated = landmark_map.landmarks["ray_sigma_m"][ids] > 0.0
+    triangulated_ones = np.flatnonzero((ids >= 0) & is_triangulated)
+    measured = np.flatnonzero((ids >= 0) & ~is_triangulated & observation.has_depth)
+    assert len(measured) >= 20
+
+    def added_variances(features):
+        T = exp(np.zeros(3), np.array([0.3, 0.0, 0.0])) @ landmark_map.keyframes[index].T_camera_world
+        weights = weights_with_landmarks(
+            landmark_map, T, observation, features, ids[features], observation.weights
+        )
+        return (1.0 / weights - 1.0 / observation.weights)[triangulated_ones, 0]
+
+    alone = added_variances(np.concatenate([triangulated_ones, measured[:19]]))
+    beside = added_variances(np.concatenate([triangulated_ones, measured]))
+    assert (beside > 0.2 * len(triangulated_ones) * alone).all()

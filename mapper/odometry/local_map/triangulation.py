@@ -21,8 +21,13 @@ _ENOUGH_DEPTH = 0.5
 what is seen changes with the view."""
 _MOST_KEYFRAMES = 10
 _MAX_RATIO = 0.8
-_MAX_DEPTH_ERROR = 0.2
-"""Standard deviation of a triangulated depth, as a share of it: with less parallax it tells little."""
+_MAX_DEPTH_ERROR = 0.5
+"""Standard deviation of a triangulated depth, as a share of it: with less parallax it tells little. A limit
+that many points are near to keeps those that noise has brought closer, and the scale shrinks."""
+_ENOUGH_MEASURED = 20
+"""Matched features with measured depth that give a pose its scale."""
+_SHARED = 0.5
+"""Part of the variance of triangulated landmarks that they share, as an error of scale."""
 
 
 def add_triangulated(landmark_map: LandmarkMap, index: int, *, except_for: Ids) -> None:
@@ -61,6 +66,10 @@ def weights_with_landmarks(
 ) -> Array:
     """Return a frame's (N, 3) weights where the uncertainty of triangulated landmarks is added to its own.
 
+    Triangulated landmarks can share an error of scale. Where enough features measure the scale, the variances
+    along the rays are multiplied as if that part of them were common to all: as many as they are, they do not
+    outvote those.
+
     Args:
         landmark_map: The map.
         T_camera_world: (4, 4) approximate pose of the frame.
@@ -73,11 +82,15 @@ def weights_with_landmarks(
     uncertain = np.flatnonzero((landmarks >= 0) & (sigma_m > 0.0))
     if not len(uncertain):
         return weights
+    is_measured = (landmarks >= 0) & (sigma_m == 0.0) & observation.has_depth[features]
+    is_scaled = is_measured.sum() >= _ENOUGH_MEASURED
     ids, features = landmarks[uncertain], features[uncertain]
     position, direction = landmark_map.landmarks["position"][ids], landmark_map.landmarks["direction"][ids]
     slope = ray_slope(T_camera_world, position, direction, observation.intrinsics)
     weights = weights.copy()
-    weights[features] = 1.0 / (1.0 / weights[features] + (slope * sigma_m[uncertain, np.newaxis]) ** 2)
+    common = 1.0 + _SHARED * (len(uncertain) - 1) if is_scaled else 1.0
+    variances = common * (slope * sigma_m[uncertain, np.newaxis]) ** 2
+    weights[features] = 1.0 / (1.0 / weights[features] + variances)
     return weights
 
 

@@ -87,7 +87,7 @@ def _check_range(points: Points32, *, path: Path, is_scaled: bool) -> None:
     if not is_scaled:
         raise FrameError(
             f"{path}: 5 % of the points are farther than {range_m:.0f} m, which looks like millimetres; "
-            "--set source.cloud_scale=0.001, or 1 if these are metres"
+            "--set source.cloud_scale=0.001, or 1 if these are metres, 0.01 if centimetres"
         )
 
 
