@@ -115,6 +115,23 @@ def test_what_a_wall_does_not_show_is_told():
             assert np.linalg.norm(error[:3, 3]) < 0.02
 
 
+def test_the_second_frame_of_a_map_is_doubtful_where_depth_does_not_show_all():
+    """Nothing predicts its motion yet: that the camera stood still would be a guess."""
+    sideways = FACING_Y @ exp(np.array([0.0, 0.8, 0.0]), np.zeros(3))
+    sideways[0, 3] = 1.3
+    poses = [sideways @ exp(np.zeros(3), np.array([0.03 * k, 0.0, 0.0])) for k in range(3)]
+    frames = walk(poses, (2.5, 1.5, 0.5))
+    for frame in frames[1:]:
+        frame.depth_m[:, :70] = 0.0  # the end wall
+
+    tracks, _ = track(frames)
+
+    assert tracks[0].node is not None
+    assert all("translation along" in doubt for step in tracks[1:] for doubt in step.doubts)
+    assert all(step.doubts for step in tracks[1:])
+    assert np.linalg.eigvalsh(tracks[1].covariance)[-1] > 0.1**2
+
+
 def test_a_blind_stretch_leaves_a_factor_that_is_as_uncertain():
     """From one corner along a bare wall to the other: how far along is a guess, and the graph knows."""
     turn = [*np.linspace(0.8, 0.0, 9), *[0.0] * 9, *np.linspace(0.0, -0.8, 9), *[-0.8] * 6]

@@ -1,6 +1,6 @@
 """Tracking by depth where an image has little texture: the second leg of the local map's odometry."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,8 +27,9 @@ _MIN_WEAKEST_RATIO = 0.5
 """A wrong pose can have most points on the floor or on one wall, so every direction of the normals counts."""
 _MAX_CONTRADICTING_RATIO = 0.3
 """A real desk's many edges give 0.2 under a right pose, a hand that comes before the lens 0.8."""
-_SPEED_SIGMA = 0.5
-"""Metres and radians per second by which a predicted motion may err: one sigma for a camera in a hand."""
+_SPEED_SIGMA, _UNKNOWN_SPEED_SIGMA = 0.5, 2.0
+"""Metres and radians per second by which a motion may err that is predicted, and one that nothing predicts:
+one sigma for a camera in a hand."""
 _SURE_S = 0.1
 """So long a prediction is trusted: it errs by 5 cm."""
 _MAX_UNOBSERVED_S = 2.0
@@ -42,6 +43,23 @@ _LOOSE_M = 0.02
 """Standard deviation of a translation from which landmarks tell too little."""
 _MIN_KEPT_RATIO = 0.5
 """When fewer of a pose's landmarks agree once the depth image takes part, one of both is wrong."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Prediction:
+    """Pose that is expected of a frame.
+
+    Attributes:
+        T_camera_world: (4, 4).
+        speed_sigma: Metres and radians per second by which the motion to it may err.
+        sure_s: So long it is trusted where nothing shows the motion.
+        gap_s: Time since the motion was last known; 0 if it is.
+    """
+
+    T_camera_world: Transform
+    speed_sigma: float
+    sure_s: float
+    gap_s: float
 
 
 class DepthTracker:
@@ -91,13 +109,14 @@ class DepthTracker:
             return found
         if found is None and self._unobserved_s(observation) > _MAX_UNOBSERVED_S:
             return None
-        unpredicted_s = 0.0
         if T_predicted is None:
-            T_predicted = last.T_camera_world
-            unpredicted_s = (observation.stamp_ns - last.observation.stamp_ns) / NS_PER_S
-        starts = [T_predicted] if found is None else [found.T_camera_world, T_predicted]
-        for T_camera_world in starts:
-            alignment = self._aligned(observation, T_camera_world, T_predicted, last, found)
+            gap_s = (observation.stamp_ns - last.observation.stamp_ns) / NS_PER_S
+            predicted = _Prediction(last.T_camera_world, _UNKNOWN_SPEED_SIGMA, 0.0, gap_s)
+        else:
+            predicted = _Prediction(T_predicted, _SPEED_SIGMA, _SURE_S, 0.0)
+        starts = [] if found is None else [found.T_camera_world]
+        for T_camera_world in (*starts, predicted.T_camera_world):
+            alignment = self._aligned(observation, T_camera_world, predicted, last, found)
             if alignment is not None and _agrees(alignment):
                 break
         else:
@@ -105,7 +124,7 @@ class DepthTracker:
                 self._observed_ns = observation.stamp_ns
             return found
         if found is not None:
-            return self._by_both(observation, alignment, found)
+            return self._by_both(observation, alignment, found, predicted)
         reference = self._keyframes[int(np.argmax(alignment.agreeing))]
         found = self._search.refine(
             observation,
@@ -116,9 +135,11 @@ class DepthTracker:
             method="depth+map",
         )
         if found is None:
-            return self._by_depth(observation, alignment, reference, unpredicted_s)
-        joint = self._aligned(observation, found.T_camera_world, T_predicted, last, found)
-        return found if joint is None or not _agrees(joint) else self._by_both(observation, joint, found)
+            return self._by_depth(observation, alignment, reference, predicted)
+        joint = self._aligned(observation, found.T_camera_world, predicted, last, found)
+        if joint is None or not _agrees(joint):
+            return found
+        return self._by_both(observation, joint, found, predicted)
 
     def _suffices(self, found: TrackedPose) -> bool:
         """Return whether landmarks alone give a pose: many, or some that tell the translation.
@@ -137,7 +158,7 @@ class DepthTracker:
         self,
         observation: ImageObservation,
         T_camera_world: Transform,
-        T_predicted: Transform,
+        predicted: _Prediction,
         last: TrackedPose,
         found: TrackedPose | None,
     ) -> DepthAlignment | None:
@@ -156,8 +177,8 @@ class DepthTracker:
             T_surfaces_world,
             keyframes=len(self._keyframes),
             T_camera_world=T_camera_world,
-            T_prior=T_predicted,
-            prior=np.eye(6) / (_SPEED_SIGMA * unsure_s) ** 2,
+            T_prior=predicted.T_camera_world,
+            prior=np.eye(6) / (predicted.speed_sigma * unsure_s) ** 2,
             landmarks=Landmarks(
                 self._map.landmarks["position"][ids[features]],
                 observation.measured[features],
@@ -202,16 +223,20 @@ class DepthTracker:
         return replace(surface, planes=planes)
 
     def _by_depth(
-        self, observation: ImageObservation, alignment: DepthAlignment, reference: int, gap_s: float
+        self,
+        observation: ImageObservation,
+        alignment: DepthAlignment,
+        reference: int,
+        predicted: _Prediction,
     ) -> TrackedPose:
-        """Return the pose of an alignment without landmarks, ``gap_s`` after the motion was last known."""
+        """Return the pose of an alignment without landmarks."""
         expected = min(self._visible(alignment.T_camera_world, reference, observation), len(observation))
-        doubts = self._doubts(observation, alignment)
+        doubts = self._doubts(observation, alignment, predicted)
         if not self._is_confirmed and expected >= 2 * self._config.min_inliers:
             # What moves with the camera, such as a hand before the lens, agrees with itself.
             doubts = (*doubts, f"{expected} features, but none where the depth image has them")
-        if gap_s > _MAX_GAP_S:
-            doubts = (*doubts, f"found by depth alone after {gap_s:.1f} s")
+        if predicted.gap_s > _MAX_GAP_S:
+            doubts = (*doubts, f"found by depth alone after {predicted.gap_s:.1f} s")
         return TrackedPose(
             observation,
             alignment.T_camera_world,
@@ -227,7 +252,11 @@ class DepthTracker:
         )
 
     def _by_both(
-        self, observation: ImageObservation, alignment: DepthAlignment, found: TrackedPose
+        self,
+        observation: ImageObservation,
+        alignment: DepthAlignment,
+        found: TrackedPose,
+        predicted: _Prediction,
     ) -> TrackedPose:
         """Return the pose of an alignment with landmarks, unless most of these contradict it."""
         agree = int(alignment.is_landmark_inlier.sum())
@@ -243,16 +272,18 @@ class DepthTracker:
             landmark_of_feature=landmark_of_feature,
             method=found.method if "depth" in found.method else f"{found.method}+depth",
             depth=alignment,
-            doubts=(*found.doubts, *self._doubts(observation, alignment)),
+            doubts=(*found.doubts, *self._doubts(observation, alignment, predicted)),
         )
 
-    def _doubts(self, observation: ImageObservation, alignment: DepthAlignment) -> tuple[str, ...]:
+    def _doubts(
+        self, observation: ImageObservation, alignment: DepthAlignment, predicted: _Prediction
+    ) -> tuple[str, ...]:
         """Return which motions were not observed and for how long, and take note when all were."""
         if not alignment.unobservable:
             self._observed_ns = observation.stamp_ns
             return ()
         unobserved_s = self._unobserved_s(observation)
-        if unobserved_s <= _SURE_S:
+        if unobserved_s <= predicted.sure_s:
             return ()
         return (f"neither depth nor features show {alignment.unobservable} for {unobserved_s:.1f} s",)
 
