@@ -23,11 +23,15 @@ CALIBRATION = "\n".join(
 )
 
 
+def records_of(i):
+    rng = np.random.default_rng(i)
+    return np.column_stack((rng.normal(0.0, 10.0, (100, 3)), rng.uniform(0.0, 1.0, 100))).astype(np.float32)
+
+
 def scans(folder, numbers=range(N)):
     (folder / "velodyne").mkdir(parents=True)
     for i in numbers:
-        records = np.random.default_rng(i).normal(0.0, 10.0, (100, 4)).astype(np.float32)
-        records.tofile(folder / f"velodyne/{i:06d}.bin")
+        records_of(i).tofile(folder / f"velodyne/{i:06d}.bin")
     return folder
 
 
@@ -50,8 +54,7 @@ def test_poses_without_a_calibration_are_the_lidars(tmp_path):
     ]
     np.testing.assert_allclose(source.truth.T_world_body, T_WORLD_LIDAR, atol=1e-12)
     assert source.truth.stamps_ns.tolist() == stamps_of(source)
-    records = np.random.default_rng(0).normal(0.0, 10.0, (100, 4)).astype(np.float32)
-    np.testing.assert_array_equal(next(source.entries()).load().points_body, records[:, :3])
+    np.testing.assert_array_equal(next(source.entries()).load().points_body, records_of(0)[:, :3])
 
 
 def test_poses_with_a_calibration_are_the_cameras(tmp_path):
