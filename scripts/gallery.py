@@ -50,10 +50,10 @@ class Entry:
 ENTRIES = (
     Entry(
         "xyz",
-        "A desk, by hand",
-        "TUM fr1/xyz: 26 s of a Kinect moved to and fro before a desk.",
+        "A desk, hand-held",
+        "TUM fr1/xyz: 26 s from a Kinect moved back and forth in front of a desk.",
         ("build rgbd_dataset_freiburg1_xyz --out runs/xyz",),
-        {"cloud.png": "the coloured cloud", "summary.png": "the path over the slice, beside its truth"},
+        {"cloud.png": "the coloured cloud", "summary.png": "the path over the slice, with its truth"},
         ("tum_fr1_xyz", "rgbd_dataset_freiburg1_xyz"),
     ),
     Entry(
@@ -61,7 +61,7 @@ ENTRIES = (
         "A street, 16 sweeps",
         "KITTI odometry 00, scans 0 to 15: 12 m of a Velodyne HDL-64 on a car.",
         ("build kitti_00 --out runs/kitti",),
-        {"cloud.png": "the cloud", "slice.png": "the slice: free is white, unknown grey"},
+        {"cloud.png": "the cloud", "slice.png": "the slice; white is free, grey unknown"},
         ("kitti_00", "kitti_00"),
     ),
     Entry(
@@ -69,13 +69,13 @@ ENTRIES = (
         "A campus road",
         "MulRan KAIST03: 21 keyframes of an Ouster OS1-64 over 24 m.",
         ("build mulran_kaist03 --out runs/kaist",),
-        {"cloud.png": "the cloud", "traversable.png": "the floor that a robot reaches"},
+        {"cloud.png": "the cloud", "traversable.png": "the floor that a robot can reach"},
         ("mulran_kaist03", "mulran_kaist03"),
     ),
     Entry(
         "flat",
         "A flat",
-        "A synthetic walk through a flat with a Kinect's noise; its truth is exact.",
+        "A synthetic walk through a flat with a Kinect's noise and exact truth.",
         (
             "synth logs/flat --seed 3",
             "build logs/flat --out runs/flat",
@@ -83,30 +83,30 @@ ENTRIES = (
         {
             "cloud.png": "the coloured cloud",
             "slice.png": "the slice: what stands 0.1 to 1.2 m above the floor",
-            "traversable.png": "the floor that a robot reaches",
+            "traversable.png": "the floor that a robot can reach",
         },
     ),
     Entry(
         "block",
         "Round a block of streets",
-        "A synthetic LiDAR drive, swept in motion, with cars, cyclists and pedestrians, who are in no map.",
+        "A synthetic LiDAR drive, scanned in motion, with cars, cyclists and pedestrians, which are in no map.",
         (
             "synth logs/block --sensor lidar --moving --rings 32 --seed 2 --seconds 20",
             "build logs/block --out runs/block",
         ),
-        {"cloud.png": "the cloud", "summary.png": "the path over the slice, beside its truth"},
+        {"cloud.png": "the cloud", "summary.png": "the path over the slice, with its truth"},
     ),
     Entry(
         "stairs",
         "Storeys",
-        "A synthetic LiDAR carried up a staircase: one traversable floor for each storey.",
+        "A synthetic LiDAR carried up a staircase: one traversable floor per storey.",
         (
             "synth logs/stairs --sensor lidar --scene staircase --rings 32",
             "build logs/stairs --out runs/stairs --config configs/lidar_indoor.toml",
         ),
         {
             "cloud.png": "the cloud, from above and from the side",
-            "traversable.png": "the storey on which it begins",
+            "traversable.png": "the storey on which the log begins",
         },
     ),
 )
@@ -184,7 +184,7 @@ def main() -> int:
         lines = [
             "# Gallery",
             "",
-            "Made by `python scripts/gallery.py --logs DIR`; every run can be made again.",
+            "Made by `python scripts/gallery.py --logs DIR`; the commands below make each run again.",
             "",
         ]
         for entry in ENTRIES:
