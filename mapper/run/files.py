@@ -72,12 +72,12 @@ RUN_FILES = (
     ),
     RunFiles(
         (POSES,),
-        "the same poses, outcome and covariance of each: upper triangle, in the body's tangent (rotation, "
-        "translation), the first node fixed",
+        "the same poses with the outcome and covariance of each: upper triangle, in the body's tangent "
+        "(rotation, translation), the first node fixed",
         "tracking",
     ),
-    RunFiles((TRUTH,), "the log's own truth, in its own frame, where there is any", "tracking"),
-    RunFiles((ODOMETRY,), "the poses of a caller's own odometry, where the build was given some", "tracking"),
+    RunFiles((TRUTH,), "the log's own truth, in its own frame, if there is any", "tracking"),
+    RunFiles((ODOMETRY,), "the poses of a caller's own odometry, if the build was given one", "tracking"),
     RunFiles((GRAPH,), "the pose graph at its solution", "tracking"),
     RunFiles(
         (LOOPS,),
@@ -87,30 +87,31 @@ RUN_FILES = (
     RunFiles((OCTREE_BT, OCTREE_OT), "the octree, as OctoMap's C++ library reads it", "maps"),
     RunFiles(
         (OCTREE_MAP,),
-        "the octree with all that it knows, compressed: `mapper.octree.octomap_file.read_octree`",
+        "the octree with all its data, compressed: `mapper.octree.octomap_file.read_octree`",
         "maps",
     ),
     RunFiles(_grid(SLICE), "the 2D map for ROS map_server and nav2, and a picture of it", "maps"),
     RunFiles(
         _grid(TRAVERSABLE),
-        "the floor that a robot can drive on, in the same form; where floors lie over each other, that on "
-        "which the log begins, and `traversable_0.pgm` and so on, from below, for each",
+        "the floor that a robot can drive on, in the same form; where floors lie above each other, the one"
+        " on which the log begins, and `traversable_0.pgm` and so on, from below, for each",
         "maps",
     ),
     RunFiles(
         _grid(KEEPOUT),
-        "the keep-out regions over the slice's cells, in the same form, where `edits.toml` has any: occupied "
-        "where a robot is kept out, else free",
+        "the keep-out regions over the slice's cells, in the same form, if `edits.toml` has any: occupied "
+        "where a robot is kept out, otherwise free",
         "maps",
     ),
     RunFiles((CLOUD, CLOUD_VIEWS), "the coloured cloud, and two views of it", "maps"),
     RunFiles((DYNAMIC,), "the coloured points of what moved, which are in no map", "maps"),
     RunFiles((MCAP,), "all of it over time, for Foxglove and Rerun", "maps"),
-    RunFiles((RERUN,), "the same arranged in Rerun, once `mapper view` was asked", "exported maps"),
+    RunFiles((RERUN,), "the same arranged for Rerun, written by `mapper view`", "exported maps"),
     RunFiles((SUMMARY,), "the trajectory over the slice, with the truth", "maps"),
     RunFiles(
         (SCAN_UPDATES,),
-        "the voxels that each frame updated, so that fusing again along new poses reads only what moved",
+        "the voxels that each frame updated, so that fusing again along new poses reads only frames that "
+        "moved",
         "maps",
     ),
     RunFiles(
@@ -126,21 +127,21 @@ RUN_FILES = (
     ),
     RunFiles(
         (EDITS,),
-        "regions of the map that `mapper edit` or you erased, kept or blocked; every fuse does it again",
+        "regions of the map that `mapper edit` or you erased, kept or blocked; every fuse applies them again",
         "user",
     ),
-    RunFiles((CONFIG,), "every setting as it was used; `mapper build --config` takes it back", "maps"),
+    RunFiles((CONFIG,), "every setting as it was used; `mapper build --config` accepts it", "maps"),
     RunFiles(
         (MANIFEST,),
         "the verdict and all warnings, versions, the input's fingerprint, counts, seconds, memory, how the "
         "run ended, and size and SHA-256 of every other file",
         "maps",
     ),
-    RunFiles((KITTI,), "the trajectory as KITTI text, once `mapper export --as kitti` was asked", "poses"),
-    RunFiles((MESH,), "a coloured surface, once `mapper export --as mesh` was asked", "poses"),
+    RunFiles((KITTI,), "the trajectory as KITTI text, written by `mapper export --as kitti`", "poses"),
+    RunFiles((MESH,), "a coloured surface, written by `mapper export --as mesh`", "poses"),
     RunFiles((VOXELS, VOXEL_MESH), "the octree's occupied voxels as points and as cubes", "exported maps"),
     RunFiles(_grid(COSTMAP), "the slice inflated for nav2", "exported maps"),
-    RunFiles((FOXGLOVE_LAYOUT,), "an arrangement of `run.mcap` for Foxglove", "exported maps"),
+    RunFiles((FOXGLOVE_LAYOUT,), "a layout of `run.mcap` for Foxglove", "exported maps"),
     RunFiles((PLAN, PLAN_VIEW), "the last path that `mapper plan` found", "exported maps"),
 )
 
