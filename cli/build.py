@@ -63,20 +63,20 @@ def build(
         ),
     ] = None,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace OUT, once the new run is whole.")
+        bool, typer.Option("--overwrite", help="Replace OUT, once the new run is complete.")
     ] = False,
     fresh: Annotated[
-        bool, typer.Option("--fresh", help="Begin anew; else a build that was stopped goes on where it was.")
+        bool, typer.Option("--fresh", help="Start again; otherwise a stopped build is resumed.")
     ] = False,
     rerun: Annotated[
         str | None,
-        typer.Option(
-            metavar="FILE.rrd|spawn|connect[:URL]", help="Show the build in Rerun while it goes on."
-        ),
+        typer.Option(metavar="FILE.rrd|spawn|connect[:URL]", help="Show the build in Rerun while it runs."),
     ] = None,
     strict: Annotated[
         bool,
-        typer.Option("--strict", help="Exit with status 1 if the run is not trusted; it is written whole."),
+        typer.Option(
+            "--strict", help="Exit with status 1 if the run is not trusted; it is written in any case."
+        ),
     ] = False,
     step: Annotated[
         bool, typer.Option("--step", help="With --rerun: wait for Enter after each frame.")

@@ -14,28 +14,26 @@ def compare(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Recorded log that mapper build can read.")],
     method: Annotated[
         list[str] | None,
-        typer.Option(
-            "--method", help="Method to compare; may be given again. Omit for all that fit the log."
-        ),
+        typer.Option("--method", help="Method to compare; repeatable. Omit for all that fit the log."),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder to create.")] = Path("compare"),
     pairs: Annotated[
         int | None, typer.Option(help="Pairs of frames to register; 0 for odometry alone.  [default: 30]")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Of the errors of the guesses.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the guesses' errors.")] = None,
     first: First = None,
     last: Last = None,
     stride: Stride = None,
     set_: Overrides = None,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace OUT, once the new comparison is whole.")
+        bool, typer.Option("--overwrite", help="Replace OUT, once the new comparison is complete.")
     ] = False,
     *,
     output: Output,
 ) -> Answer:
-    """Run every method over the same frames, as odometry and on pairs with guesses that are off.
+    """Run every method over the same frames, as odometry and on pairs of frames with wrong guesses.
 
-    A comparison that was stopped goes on after its last finished method: give the same command again.
+    If a comparison was stopped, the same command resumes it after the last finished method.
 
     Example: mapper compare rgbd_dataset_freiburg1_xyz --method isvd --method gicp --out runs/compared
     """

@@ -43,7 +43,7 @@ def convert(
     *,
     output: Output,
 ) -> Answer:
-    """Write a log in another format; image files go over byte for byte where it has room for them.
+    """Write a log in another format; image files are copied byte for byte where possible.
 
     Example: mapper convert rgbd_dataset_freiburg1_xyz --out xyz.mcap
     """

@@ -1,4 +1,4 @@
-"""``mapper demo``: the embedded log, made and mapped."""
+"""``mapper demo``: a synthetic log, made and mapped."""
 
 import json
 from pathlib import Path

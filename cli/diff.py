@@ -41,7 +41,7 @@ def diff(
     poses: PosesFile = None,
     tolerance_m: Annotated[
         float | None,
-        typer.Option(help="Surfaces this near are the same, metres.  [default: two voxels]"),
+        typer.Option(help="Surfaces closer than this are the same, metres.  [default: two voxels]"),
     ] = None,
     min_voxels: Annotated[int, typer.Option(help="Smaller clusters are counted, not listed.", min=1)] = 8,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace FOLDER.")] = False,
@@ -50,7 +50,7 @@ def diff(
 ) -> Answer:
     """Compare the maps of two runs: what appeared, what vanished, and what was not seen again.
 
-    Only space that both runs looked at is compared. FOLDER gets a list, a picture, and a cloud of each kind.
+    Only space that both runs have measured is compared. FOLDER gets a list, a picture and clouds.
 
     Example: mapper diff runs/monday runs/tuesday --out diffs/tuesday
     """

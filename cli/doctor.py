@@ -1,4 +1,4 @@
-"""``mapper doctor``: is this machine fit for the job, or a run undamaged, and what to do if not."""
+"""``mapper doctor``: checks of the machine, or of a run's files, and what to do if one fails."""
 
 import sys
 from pathlib import Path
@@ -32,18 +32,21 @@ def doctor(
         list[str] | None,
         typer.Option(
             metavar="FILE",
-            help="Record a map that you edited, such as slice.pgm, as it is now; fusing makes it anew. "
+            help="Accept a map that you edited, such as slice.pgm, as it is now; fusing overwrites it. "
             "Repeatable.",
         ),
     ] = None,
     warm: Annotated[
         bool,
-        typer.Option("--warm", help="Compile the kernels now, so that the first build need not; a minute."),
+        typer.Option(
+            "--warm",
+            help="Compile the kernels now, so that the first build does not have to; takes a minute.",
+        ),
     ] = False,
     *,
     output: Output,
 ) -> Answer:
-    """Check the machine, try every library in a process of its own, and print what to do.
+    """Check the machine, try every library in a separate process, and print what to do.
 
     With RUN, compare all its files with the sizes and digests in its manifest instead; with --warm, compile
     the kernels, and keep the bytecode of what builds import. The exit status is 1 if anything failed.

@@ -20,7 +20,7 @@ def edit(
         bool, typer.Option("--erase", help="Free what is occupied in a region; its points leave the cloud.")
     ] = False,
     keep: Annotated[
-        bool, typer.Option("--keep", help="Leave out what lies outside of a region, and of others kept.")
+        bool, typer.Option("--keep", help="Leave out what lies outside this and other kept regions.")
     ] = False,
     keepout: Annotated[
         bool, typer.Option("--keepout", help="Keep robots out of a region: floor, plans and nav2.")
@@ -33,12 +33,13 @@ def edit(
         tuple[float, float] | None, typer.Option(metavar="LOW HIGH", help="Region: between two heights.")
     ] = None,
     radius: Annotated[
-        float | None, typer.Option(help="Region: this near to the sensor's path, seen from above.")
+        float | None, typer.Option(help="Region: within this distance of the sensor's path, seen from above.")
     ] = None,
     polygon: Annotated[
-        str | None, typer.Option(metavar='"X,Y X,Y X,Y…"', help="Region: inside of corners in order.")
+        str | None,
+        typer.Option(metavar='"X,Y X,Y X,Y…"', help="Region: inside the polygon of these corners."),
     ] = None,
-    undo: Annotated[bool, typer.Option("--undo", help="Take the last edit back.")] = False,
+    undo: Annotated[bool, typer.Option("--undo", help="Undo the last edit.")] = False,
     list_: Annotated[  # noqa: ARG001 - says what is done anyway
         bool, typer.Option("--list", help="Print the edits; the default without other options.")
     ] = False,
@@ -46,9 +47,9 @@ def edit(
     *,
     output: Output,
 ) -> Answer:
-    """Erase, keep or block a region of a map, where all given conditions hold, and make the maps again.
+    """Erase, keep or block the region of a map where all given conditions hold, and make the maps again.
 
-    Edits are kept in RUN/edits.toml, which can be changed by hand, and hold in every later fuse. Coordinates
+    Edits are kept in RUN/edits.toml, which can be changed by hand, and apply to every later fuse. Coordinates
     are those of slice.yaml and cloud.ply.
 
     Example: mapper edit runs/xyz --erase --box 2.1 0.3 0.1 2.9 1.05 1.5

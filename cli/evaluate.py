@@ -60,16 +60,19 @@ def evaluate(
         Path | None, typer.Option(help="TUM or KITTI trajectory of the truth; omit for the run's own.")
     ] = None,
     times: Annotated[
-        Path | None, typer.Option(help="Seconds, one a line, of poses in KITTI text; else they pair by line.")
+        Path | None,
+        typer.Option(
+            help="Times in seconds, one per line, of poses in KITTI text; otherwise poses are paired by line."
+        ),
     ] = None,
     log: Annotated[
         Path | None,
         typer.Option(
-            help="Log of a bare trajectory, to tell which frames have a pose; with --sharpness, a moved one."
+            help="Log of a bare trajectory, to see which frames have a pose; with --sharpness, the moved log."
         ),
     ] = None,
     align: Annotated[
-        Align, typer.Option(help="How the estimate is laid over the truth; yaw is for worlds with z up.")
+        Align, typer.Option(help="How the estimate is aligned with the truth; yaw is for worlds with z up.")
     ] = Align.SE3,
     lengths: Annotated[
         str | None,
@@ -80,26 +83,29 @@ def evaluate(
         typer.Option(
             "--map",
             metavar="REFERENCE",
-            help="Hold the run's map against a cloud, an octree, another run or a synthetic log.",
+            help="Compare the run's map with a cloud, an octree, another run or a synthetic log.",
         ),
     ] = None,
     map_world: Annotated[
         World | None,
-        typer.Option(
-            help="World that REFERENCE lies in; omit for truth with synthetic logs, map with others."
-        ),
+        typer.Option(help="World of REFERENCE; omit for truth with synthetic logs, map with others."),
     ] = None,
     register: Annotated[
         bool, typer.Option("--register", help="Register REFERENCE to the run's cloud before it is compared.")
     ] = False,
     tolerance: Annotated[
         int,
-        typer.Option(metavar="VOXELS", min=0, max=10, help="How far surfaces of the two maps may be apart."),
+        typer.Option(
+            metavar="VOXELS",
+            min=0,
+            max=10,
+            help="Largest distance between matching surfaces of the two maps.",
+        ),
     ] = _TOLERANCE,
     sharpness: Annotated[
-        bool, typer.Option("--sharpness", help="Tell how thick walls are where the log's scans overlap.")
+        bool, typer.Option("--sharpness", help="Measure how thick walls are where the log's scans overlap.")
     ] = False,
-    plot: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder to draw the errors into.")] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for plots of the errors.")] = None,
     format_: Annotated[
         Format,
         typer.Option(
@@ -111,9 +117,9 @@ def evaluate(
     *,
     output: Output,
 ) -> Answer:
-    """Print ATE, RPE, relative errors and coverage of a path, which loops are right, and what a map is worth.
+    """Print ATE, RPE, relative errors and coverage of a path, which loops are right, and how good a map is.
 
-    Of a merged map: how far its runs agree, and their ATE, each and together, where their truth is known.
+    For a merged map: how well its runs agree, and their ATE, each and together, if their truth is known.
 
     Example: mapper eval runs/xyz --align yaw --plot plots, or: mapper eval 00.txt --truth poses/00.txt, or:
     mapper eval runs/flat --map logs/flat --sharpness

@@ -25,7 +25,7 @@ def export(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
     level: Annotated[
         int | None,
-        typer.Option(help="With --as octomap: levels of the tree to leave away; each doubles the voxels."),
+        typer.Option(help="With --as octomap: levels of the tree to drop; each doubles the voxel size."),
     ] = None,
     set_: Overrides = None,
     log: MovedLogs = None,
@@ -34,7 +34,7 @@ def export(
 ) -> Answer:
     """Write a run's map, cloud, surface, slice, trajectory or graph for other programs, and print its path.
 
-    Of a merged map, octree and grids can be written: octomap, grid, costmap, nav2.
+    For a merged map: octomap, grid, costmap, nav2.
 
     Example: mapper export runs/xyz --as octomap --out xyz.ot, or: mapper export runs/xyz --as mesh
     """

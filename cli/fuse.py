@@ -1,4 +1,4 @@
-"""``mapper fuse``: a run's maps again, without tracking again."""
+"""``mapper fuse``: a run's maps made again, without tracking."""
 
 from pathlib import Path
 from typing import Annotated
@@ -21,7 +21,7 @@ def fuse(
 ) -> Answer:
     """Make a run's maps again, for instance finer or with another slice, without tracking again.
 
-    Octree, slice, cloud and MCAP settings can change; the old maps stay until the new ones are whole.
+    Octree, slice, cloud and MCAP settings can change; the old maps stay until the new ones are complete.
 
     Example: mapper fuse runs/xyz --set octree.resolution_m=0.1 --set slice.max_height_m=1.8
     """

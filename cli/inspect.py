@@ -1,4 +1,4 @@
-"""``mapper inspect``: what is in a log, and what mapper build would make of it."""
+"""``mapper inspect``: what is in a log, and what mapper build would do with it."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,7 +19,7 @@ def inspect(
     *,
     output: Output,  # noqa: ARG001
 ) -> Answer:
-    """Tell what is in a log: topics, rates, gaps, calibration, truth, and what mapper build would do with it.
+    """Show what is in a log: topics, rates, gaps, calibration, truth, and what mapper build would do.
 
     Exit status 1 means that nothing can be mapped.
 

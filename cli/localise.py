@@ -15,14 +15,16 @@ if TYPE_CHECKING:
 
 
 def localise(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="Recorded log, of the map's kind of sensor.")],
+    log: Annotated[
+        Path, typer.Argument(metavar="LOG", help="Recorded log, from the same kind of sensor as the map.")
+    ],
     in_: Annotated[
         Path,
         typer.Option(
             "--in",
             metavar="RUN",
             autocompletion=run_folders,
-            help="Finished run, or merged map; it stays as it is.",
+            help="Finished run, or merged map; it is not changed.",
         ),
     ],
     out: Annotated[
@@ -33,18 +35,18 @@ def localise(
     last: Last = None,
     stride: Stride = None,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace OUT, once the new folder is whole.")
+        bool, typer.Option("--overwrite", help="Replace OUT, once the new folder is complete.")
     ] = False,
     strict: Annotated[
         bool,
         typer.Option(
-            "--strict", help="Exit with status 1 if the result is not trusted; it is written whole."
+            "--strict", help="Exit with status 1 if the result is not trusted; it is written in any case."
         ),
     ] = False,
     *,
     output: Output,
 ) -> Answer:
-    """Place a new log in a finished map: its trajectory in the map's frame, and which of it is trusted.
+    """Place a new log in a finished map: its trajectory in the map's frame, and which parts are trusted.
 
     A log of another place is refused, with exit status 1.
 

@@ -32,16 +32,16 @@ def loops(
     list_: Annotated[
         bool, typer.Option("--list", help="Print every candidate; the default without other options.")
     ] = False,
-    accepted: Annotated[bool, typer.Option("--accepted", help="Print only those that hold.")] = False,
+    accepted: Annotated[bool, typer.Option("--accepted", help="Print only accepted loops.")] = False,
     add: Annotated[
-        list[str] | None, typer.Option(metavar="I J", help="Tie two nodes that show one place.")
+        list[str] | None, typer.Option(metavar="I J", help="Add a loop between two nodes at the same place.")
     ] = None,
-    remove: Annotated[list[str] | None, typer.Option(metavar="I J", help="Take a loop back.")] = None,
+    remove: Annotated[list[str] | None, typer.Option(metavar="I J", help="Remove a loop.")] = None,
     log: MovedLogs = None,
     *,
     output: Output,
 ) -> Answer:
-    """List a run's loop candidates, or add and remove loops by hand: solved and fused again, not tracked.
+    """List a run's loop candidates, or add and remove loops by hand; then solve and fuse without tracking.
 
     Example: mapper loops runs/xyz, or: mapper loops runs/xyz --add 3 71 --remove 17 40
     """

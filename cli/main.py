@@ -121,8 +121,8 @@ _VERBS: dict[str, list[tuple[str, Callable[..., Answer], type[Verb], str]]] = {
     ],
     "judge": [
         ("eval", evaluate, Verb, "Measure the errors of a path and a map"),
-        ("diff", diff, Verb, "Tell what changed between two runs"),
-        ("inspect", inspect, Verb, "Tell what is in a log, and whether it can be mapped"),
+        ("diff", diff, Verb, "Show what changed between two runs"),
+        ("inspect", inspect, Verb, "Show what is in a log, and whether it can be mapped"),
         ("doctor", doctor, Verb, "Check this machine, or the files of a run"),
     ],
     "edit": [
@@ -155,7 +155,7 @@ app = typer.Typer(
 for _panel, _members in _VERBS.items():
     for _name, _function, _class, _short in _members:
         app.command(_name, cls=_class, short_help=_short, rich_help_panel=_panel)(verb(_function))
-app.add_typer(sensor, name="sensor", short_help="Measure what a sensor is worth", rich_help_panel="study")
+app.add_typer(sensor, name="sensor", short_help="Measure a sensor's errors", rich_help_panel="study")
 app.add_typer(
     vocabulary, name="vocabulary", short_help="Train and show visual words", rich_help_panel="tools"
 )
@@ -169,7 +169,9 @@ def start(
         bool, typer.Option("--install-completion", help="Complete verbs, runs, settings … by Tab.")
     ] = False,
     show: Annotated[bool, typer.Option("--show-completion", help="Print the script that completes.")] = False,
-    shell: Annotated[Shell | None, typer.Option(help="Of these two; omit for the shell that calls.")] = None,
+    shell: Annotated[
+        Shell | None, typer.Option(help="Shell for these two; omit for the current one.")
+    ] = None,
 ) -> None:
     """Map recorded RGB-D and LiDAR logs: trajectory, pose graph, octree, 2D slice and MCAP log."""
     if version:

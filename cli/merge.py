@@ -22,7 +22,7 @@ def merge(
         typer.Argument(
             metavar="[MAP] RUN…",
             autocompletion=run_folders,
-            help="Run folders that builds left; after a merged map, they are added to it.",
+            help="Run folders; after a merged map, they are added to it.",
         ),
     ],
     out: Annotated[
@@ -39,7 +39,7 @@ def merge(
     ] = Place.BUILT,
     poses: PosesFile = None,
     tile_m: Annotated[
-        float, typer.Option(help="About how long a tile's edge is: a power of two in voxels.")
+        float, typer.Option(help="Approximate edge of a tile; a power of two in voxels.")
     ] = 50.0,
     processes: Annotated[
         int | None, typer.Option(help="Workers on this machine.  [default: 1]", show_default=False)
@@ -48,15 +48,15 @@ def merge(
         str | None,
         typer.Option(metavar="tcp://HOST:PORT", help="Dask scheduler whose workers see the same files."),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a map that is there.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing map.")] = False,
     *,
     output: Output,
 ) -> Answer:
-    """Add up the octrees of many runs tile by tile, out of core: map.bt, map.ot, the slice, and the tiles.
+    """Add up the octrees of many runs tile by tile, out of core: map.bt, map.ot, the slice and the tiles.
 
-    With --place auto, runs bend where the others show that they drifted, and their maps are made again there
-    from their logs; the run folders stay as they are. A merge that was stopped goes on where it was: give the
-    same command again. Runs that are added to a map are searched in it, and what they do not reach stays.
+    With --place auto, runs bend where the others show that they drifted, and are fused again there from their
+    logs; the run folders do not change. If a merge was stopped, the same command resumes it. Runs that are
+    added to a map are searched in it, and tiles whose runs are unchanged stay.
 
     Example: mapper merge runs/monday runs/tuesday --out maps/campus --processes 2, or: mapper merge runs/*
     --out maps/city --place truth --scheduler tcp://10.0.0.1:8786

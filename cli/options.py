@@ -26,11 +26,11 @@ Overrides = Annotated[
 ]
 RunFolder = Annotated[
     Path,
-    typer.Argument(metavar="RUN", autocompletion=run_folders, help="Run folder that a build left."),
+    typer.Argument(metavar="RUN", autocompletion=run_folders, help="Run folder of a finished build."),
 ]
 RunFolders = Annotated[
     list[Path],
-    typer.Argument(metavar="RUN...", autocompletion=run_folders, help="Run folders that builds left."),
+    typer.Argument(metavar="RUN...", autocompletion=run_folders, help="Run folders of finished builds."),
 ]
 SettingKey = Annotated[
     str | None,
@@ -43,7 +43,8 @@ SettingKey = Annotated[
 MovedLogs = Annotated[
     list[Path] | None,
     typer.Option(
-        "--log", help="Where the log lies now, if it has moved since the build; of several, each in its turn."
+        "--log",
+        help="Path of the log, if it has moved since the build; for several logs, once each in order.",
     ),
 ]
 First = Annotated[int | None, typer.Option("--first", help="Index of the first frame to use.")]

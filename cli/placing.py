@@ -26,7 +26,7 @@ class Place(StrEnum):
 PosesFile = Annotated[
     Path | None,
     typer.Option(
-        "--poses", help="File of the worlds' poses in the map: a line RUN tx ty tz qx qy qz qw for each."
+        "--poses", help="File of the worlds' poses in the map, one line per run: RUN tx ty tz qx qy qz qw."
     ),
 ]
 

@@ -59,18 +59,16 @@ class WithPoints(Verb):
 def plan(
     run: Annotated[
         Path,
-        typer.Argument(
-            metavar="RUN", autocompletion=run_folders, help="Run folder that a build left, or a merged map."
-        ),
+        typer.Argument(metavar="RUN", autocompletion=run_folders, help="Run folder, or a merged map."),
     ],
-    from_: Annotated[str, typer.Option("--from", metavar="X Y [Z]", help="Where it starts, metres.")],
-    to: Annotated[str, typer.Option("--to", metavar="X Y [Z]", help="Where it goes, metres.")],
+    from_: Annotated[str, typer.Option("--from", metavar="X Y [Z]", help="Start, metres.")],
+    to: Annotated[str, typer.Option("--to", metavar="X Y [Z]", help="Goal, metres.")],
     in_3d: Annotated[
-        bool, typer.Option("--3d", help="Plan for a ball in the octree; the points have a height then.")
+        bool, typer.Option("--3d", help="Plan for a ball in the octree; points then have a height.")
     ] = False,
     radius: Annotated[float | None, typer.Option(help="Radius of the robot, metres.  [default: 0.2]")] = None,
     unknown: Annotated[
-        Unknown | None, typer.Option(help="What unknown space counts as.  [default: blocked]")
+        Unknown | None, typer.Option(help="How to treat unknown space.  [default: blocked]")
     ] = None,
     layer: Annotated[Layer | None, typer.Option(help="Grid for a path in 2D.  [default: slice]")] = None,
     *,
@@ -78,7 +76,7 @@ def plan(
 ) -> Answer:
     """Plan the shortest collision-free path, and draw it into the run: plan.json, plan.png, run.mcap.
 
-    Where floors lie over each other (--layer traversable), a third number tells the storey of a point. A
+    Where floors lie above each other (--layer traversable), a third number gives the storey of a point. A
     merged map has no run.mcap to draw it into.
 
     Example: mapper plan runs/xyz --from 2.1 -0.3 --to 1.9 1.4 --radius 0.15

@@ -49,7 +49,7 @@ def register(
     *,
     output: Output,  # noqa: ARG001
 ) -> Answer:
-    """Register two clouds; the exit status is 1 when the answer is not to be trusted.
+    """Register two clouds; the exit status is 1 if the result is not to be trusted.
 
     Example: mapper register scan_10.bin scan_00.bin --method hough-gicp --out registered
     """

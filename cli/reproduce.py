@@ -1,4 +1,4 @@
-"""``mapper reproduce``: the papers' tables measured again, ours beside theirs."""
+"""``mapper reproduce``: the papers' tables measured again, our figures beside theirs."""
 
 import os
 from collections.abc import Sequence
@@ -27,20 +27,20 @@ def reproduce(
     logs: Annotated[Path, typer.Option(help="Folder with the paper's logs, under their usual names.")],
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder for tables and pictures; gone on with if it is there.  [default: PAPER]"),
+        typer.Option(help="Folder for tables and pictures; resumed if it exists.  [default: PAPER]"),
     ] = None,
     log: Annotated[
         list[str] | None,
-        typer.Option("--log", metavar="NAME=PATH", help="Where a log of another name lies: fr1/xyz=PATH."),
+        typer.Option("--log", metavar="NAME=PATH", help="Path of a log that has another name: fr1/xyz=PATH."),
     ] = None,
     tables: Annotated[
         str | None,
         typer.Option(
-            help="Only these, e.g. 5.1,5.2; thesis has detectors, too. Another choice is measured anew."
+            help="Only these, e.g. 5.1,5.2; thesis has detectors, too. Another choice is measured again."
         ),
     ] = None,
     seeds: Annotated[
-        int, typer.Option(help="Draws of all that is random; median and spread are over them.")
+        int, typer.Option(help="Draws of everything random; median and spread are over them.")
     ] = 3,
     first: First = None,
     last: Last = None,
@@ -57,9 +57,9 @@ def reproduce(
     *,
     output: Output,
 ) -> Answer:
-    """Measure a paper's tables again on those of its logs that are there, and print ours beside theirs.
+    """Measure a paper's tables again on the logs available, and print our figures beside theirs.
 
-    What is finished is kept in OUT, so the same command goes on where it was killed.
+    Finished results are kept in OUT, so if killed, the same command resumes.
 
     Example: mapper reproduce thesis --logs logs --tables 5.1,5.2 --out runs/thesis
     """

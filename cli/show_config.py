@@ -1,4 +1,4 @@
-"""``mapper config``: every setting with its value, and what it means."""
+"""``mapper config``: every setting with its value and meaning."""
 
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
@@ -26,7 +26,7 @@ def show_config(
     key: SettingKey = None,
     config: ConfigFile = None,
     set_: Overrides = None,
-    sensor: Annotated[SensorName, typer.Option(help="Whose defaults to begin with.")] = SensorName.RGBD,
+    sensor: Annotated[SensorName, typer.Option(help="Sensor whose defaults are used.")] = SensorName.RGBD,
     docs: Annotated[bool, typer.Option("--docs", help="Explain every setting.")] = False,
     *,
     output: Output,  # noqa: ARG001

@@ -44,14 +44,16 @@ def solve(
     ] = None,
     robust: Annotated[
         RobustKernel | None,
-        typer.Option(help="Doubt the loops; in files of others, edges between ids that are not neighbours."),
+        typer.Option(
+            help="Outlier rejection of loops; in other programs' files, edges between non-consecutive ids."
+        ),
     ] = None,
-    initial: Annotated[Initial | None, typer.Option(help="Where the solver begins.  [default: auto]")] = None,
+    initial: Annotated[Initial | None, typer.Option(help="Initial poses.  [default: auto]")] = None,
     set_: Overrides = None,
     *,
     output: Output,
 ) -> Answer:
-    """Solve a pose graph, each connected component on its own, and say what it cost before and after.
+    """Solve a pose graph, each connected component separately, and print its cost before and after.
 
     Example: mapper solve sphere2500.g2o --out solved, or: mapper solve city.g2o --out city2.g2o --robust dcs
     """

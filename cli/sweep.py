@@ -1,4 +1,4 @@
-"""``mapper sweep``: many logs by many methods and configurations."""
+"""``mapper sweep``: many logs, methods and configurations."""
 
 import os
 from pathlib import Path
@@ -24,18 +24,18 @@ def sweep(
         ),
     ] = None,
     processes: Annotated[
-        int | None, typer.Option(help="Builds at a time, a core each; omit for one on every core.")
+        int | None, typer.Option(help="Builds at a time, one core each; omit for one on every core.")
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="tcp://HOST:PORT", help="Let the workers of this Dask scheduler build instead."),
+        typer.Option(metavar="tcp://HOST:PORT", help="Build on the workers of this Dask scheduler instead."),
     ] = None,
     *,
     output: Output,
 ) -> Answer:
-    """Build every log by every method in every configuration, and set the results side by side.
+    """Build every log with every method in every configuration, and compare the results.
 
-    The same command goes on where a sweep was interrupted or killed, and tries again what failed.
+    If a sweep was interrupted or killed, the same command resumes it, and retries what failed.
 
     Example: mapper sweep sweep.toml --out sweeps/first --processes 4
     """

@@ -52,7 +52,7 @@ def synth(
     rooms: Annotated[int | None, typer.Option(help="rgbd: rooms of the flat, an even number from 4.")] = None,
     plane_at: Annotated[
         float | None,
-        typer.Option(metavar="METRES", help="rgbd: stand still before a bare wall so far away."),
+        typer.Option(metavar="METRES", help="rgbd: stand still at this distance from a bare wall."),
     ] = None,
     scene: Annotated[
         SceneName | None,
@@ -61,9 +61,9 @@ def synth(
             "lidar: street, courtyard, field, tunnel, staircase or flat."
         ),
     ] = None,
-    rings: Annotated[int | None, typer.Option(help="lidar: beams, one above the other.")] = None,
+    rings: Annotated[int | None, typer.Option(help="lidar: number of beams, one above the other.")] = None,
     wheels: Annotated[
-        bool, typer.Option("--wheels", help="Wheels carry the sensor; wheels.txt holds their odometry.")
+        bool, typer.Option("--wheels", help="The sensor is on wheels; wheels.txt has their odometry.")
     ] = False,
     moving: Annotated[
         bool,
@@ -71,15 +71,15 @@ def synth(
             "--moving", help="rgbd: people and boxes cross the view; lidar: cars, cyclists and pedestrians."
         ),
     ] = False,
-    noise: Annotated[float | None, typer.Option(help="Times the sensor's noise; 0 is exact.")] = None,
+    noise: Annotated[float | None, typer.Option(help="Factor on the sensor's noise; 0 is exact.")] = None,
     uncalibrated: Annotated[
         bool,
         typer.Option(
             "--uncalibrated",
-            help="rgbd: rolling shutter, late depth, lens and depth errors that no calibration mentions.",
+            help="rgbd: rolling shutter, late depth, lens and depth errors that are not in the calibration.",
         ),
     ] = False,
-    seed: Annotated[int | None, typer.Option(help="Another scene, another way through it.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Another scene and another path through it.")] = None,
     set_: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY.PATH=VALUE", help="Change any setting of the scene or sensor."),
@@ -87,7 +87,7 @@ def synth(
     *,
     output: Output,
 ) -> Answer:
-    """Ray-cast a walk through rooms, or a LiDAR's way through streets or stairs, as a log with exact truth.
+    """Ray-cast a walk through rooms, or a LiDAR's path through streets or stairs, as a log with exact truth.
 
     Example: mapper synth logs/spin --path spin --seconds 10 --set sensor.exposure_s=0.01, or: mapper synth
     logs/yard --sensor lidar --scene courtyard --rings 16

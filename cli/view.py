@@ -46,7 +46,7 @@ def view(
     spawn: Annotated[bool, typer.Option("--spawn", help="Open a viewer and show the run there.")] = False,
     connect: Annotated[
         str | None,
-        typer.Option(metavar="URL", help="Show the run in a viewer that runs: rerun+http://HOST:9876/proxy."),
+        typer.Option(metavar="URL", help="Show the run in a running viewer: rerun+http://HOST:9876/proxy."),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the --rrd file or OUT.")] = False,
     *,

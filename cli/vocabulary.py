@@ -1,4 +1,4 @@
-"""``mapper vocabulary``: visual words made from logs, and what a file of them holds."""
+"""``mapper vocabulary``: visual words trained on logs, and the content of such a file."""
 
 from pathlib import Path
 from typing import Annotated
@@ -24,7 +24,7 @@ vocabulary = typer.Typer(
 def train(
     logs: Annotated[list[Path], typer.Argument(metavar="LOG", help="Logs that mapper build can read.")],
     out: Annotated[Path | None, typer.Option(help="Vocabulary file to create.  [default: LOG.words]")] = None,
-    frames: Annotated[int | None, typer.Option(help="Frames to use of each log.")] = None,
+    frames: Annotated[int | None, typer.Option(help="Number of frames used of each log.")] = None,
     set_: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY.PATH=VALUE", help="branching, levels, detector.max_features, …"),
@@ -70,7 +70,7 @@ def show(
     *,
     output: Output,  # noqa: ARG001
 ) -> Answer:
-    """Print what a vocabulary holds.
+    """Print the content of a vocabulary.
 
     Example: mapper vocabulary show lab.words
     """

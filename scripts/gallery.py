@@ -89,7 +89,7 @@ ENTRIES = (
     Entry(
         "block",
         "Round a block of streets",
-        "A synthetic LiDAR drive, scanned in motion, with cars, cyclists and pedestrians, which are in no map.",
+        "A synthetic LiDAR drive, scanned in motion, with cars, cyclists and pedestrians, all in no map.",
         (
             "synth logs/block --sensor lidar --moving --rings 32 --seed 2 --seconds 20",
             "build logs/block --out runs/block",

@@ -24,12 +24,12 @@ def depth(
     plane_at: Annotated[
         list[float] | None,
         typer.Option(
-            metavar="METRES", help="How far the plane is in each LOG; once for each, in their order."
+            metavar="METRES", help="Distance of the plane in each LOG; once per log, in their order."
         ),
     ] = None,
     fit_plane: Annotated[
         bool,
-        typer.Option("--fit-plane", help="Use whatever planes the logs show, in about 100 frames of each."),
+        typer.Option("--fit-plane", help="Use any planes that the logs show, in about 100 frames of each."),
     ] = False,
     patch: Annotated[
         str | None,
@@ -40,9 +40,7 @@ def depth(
     ] = None,
     keep_tilt: Annotated[
         bool,
-        typer.Option(
-            "--keep-tilt", help="Count a plane that is not quite across the camera's axis as an error."
-        ),
+        typer.Option("--keep-tilt", help="Count a plane's tilt against the camera's axis as an error."),
     ] = False,
     out: Annotated[
         Path | None, typer.Option(help="Folder to create: sensor.toml, numbers and pictures.")
@@ -52,7 +50,7 @@ def depth(
     stride: Stride = None,
     set_: Overrides = None,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace OUT, once the new one is whole.")
+        bool, typer.Option("--overwrite", help="Replace OUT, once the new one is complete.")
     ] = False,
     *,
     output: Output,

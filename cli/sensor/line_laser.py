@@ -36,25 +36,26 @@ def line_laser(
         ),
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="Of line-laser-calibrate.  [default: the thesis's sensor]")
+        Path | None, typer.Option(help="File of line-laser-calibrate.  [default: the thesis's sensor]")
     ] = None,
     wheels: Annotated[
         Path | None, typer.Option(help="encoders.txt or wheels.txt; without it there is no map.")
     ] = None,
     labels: Annotated[
-        Path | None, typer.Option(help="True stripes (image,column,row_px,range_m): print how right each is.")
+        Path | None,
+        typer.Option(help="True stripes (image,column,row_px,range_m): print how accurate each method is."),
     ] = None,
     times: Annotated[
-        Path | None, typer.Option(help="A stamp a line, for each image; else names or times.txt tell.")
+        Path | None, typer.Option(help="Stamps, one per line and image; otherwise from names or times.txt.")
     ] = None,
     set_: Knobs = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
     *,
     output: Output,
 ) -> Answer:
-    """Range what a laser's stripe falls on in images.
+    """Measure the ranges of a laser's stripe in images.
 
-    With the wheels' readings, map it too.
+    With wheel readings, make a map as well.
 
     Example: mapper sensor line-laser drive/images --calibration C.toml --wheels drive/encoders.txt --out seen
     """
@@ -106,15 +107,17 @@ def calibrate(
         Path | None,
         typer.Option(help="Calibration file to create, and a picture beside it.  [default: line-laser.toml]"),
     ] = None,
-    reach: Annotated[float, typer.Option(help="How far ahead the laser meets the floor, m.")] = 1.9,
+    reach: Annotated[float, typer.Option(help="Distance ahead at which the laser meets the floor, m.")] = 1.9,
     wheelbase: Annotated[float | None, typer.Option(help="Between the vehicle's axles, m.")] = None,
-    sensor_x: Annotated[float, typer.Option(help="How far ahead of the rear axle ranges begin, m.")] = 0.0,
+    sensor_x: Annotated[
+        float, typer.Option(help="Distance from the rear axle ahead to the origin of ranges, m.")
+    ] = 0.0,
     set_: Knobs = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT.")] = False,
     *,
     output: Output,
 ) -> Answer:
-    """Fit a line laser's laws to images of boards.
+    """Fit a line laser's range and lateral laws to images of boards.
 
     The boards face the sensor at known distances; two or more have known widths.
 
@@ -160,7 +163,7 @@ def accuracy(
 ) -> Answer:
     """Print how well each method finds the stripe in rendered rooms.
 
-    The rooms have lamps, red things and noise. The thesis's Table 2.1 is measured again, too.
+    The rooms have lamps, red objects and noise. The thesis's Table 2.1 is measured again, too.
 
     Example: mapper sensor line-laser-accuracy --seeds 5 --set stripe.edge_threshold=100
     """
