@@ -1,12 +1,12 @@
-"""Damaged JPEGs that are taken for whole ones, and how wrong their pixels are; the time of the check.
+"""Damaged JPEGs that are accepted as undamaged, how wrong their pixels are, and the time of the check.
 
     python benchmarks/damaged_jpegs.py [--log LOG/rgb] [--cases 240] [--seeds 3]
 
-Damage is to the entropy-coded data alone: 1 to 20 bytes are changed, or 1 to 200 bytes are cut out. Images
-are of a synthetic log, and of a folder, encoded again in several ways. "before" are those that libjpeg-turbo
-decodes without a warning, "after" those of them that the check of their codes passes, too. A pixel is wrong
-if one of its channels is off by more than 30; of the files that are taken the table has how many have more
-than 1 % of wrong pixels, and the median share.
+Only the entropy-coded data is damaged: 1 to 20 bytes are changed, or 1 to 200 bytes are cut out. Images are
+those of a synthetic log and of a folder, encoded again in several ways. "before" counts those that
+libjpeg-turbo decodes without a warning, "after" those of them that also pass the check of their codes. A
+pixel is wrong if one of its channels is off by more than 30; of the accepted files the table counts those
+with more than 1 % of wrong pixels, and gives the median share.
 """
 
 import argparse

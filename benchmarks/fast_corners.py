@@ -1,4 +1,4 @@
-"""FAST corners with two thresholds: the kernels of uniform ORB against OpenCV's detector.
+"""FAST corners with two thresholds: the kernels of uniform ORB compared with OpenCV's detector.
 
     python benchmarks/fast_corners.py [--data ../shared/data] [--images 20]
 

@@ -1,4 +1,4 @@
-"""The hard set: synthetic logs on which tracking has reason to fail, as arguments of ``mapper synth``."""
+"""The hard set: synthetic logs that are hard to track, as arguments of ``mapper synth``."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

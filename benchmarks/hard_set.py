@@ -1,4 +1,4 @@
-"""The hard set: logs on which tracking has reason to fail, and whether a run that fails says so.
+"""The hard set: logs that are hard to track, and whether a run that fails reports it.
 
     python benchmarks/hard_set.py CACHE [--data DATA] [--only NAME…] [--seed 1] [--set key=value] [--json OUT]
     python benchmarks/hard_set.py CACHE --neighbours --only NAME
@@ -7,11 +7,12 @@ Logs are made once by `mapper synth` and kept in CACHE. With DATA also `tum_fr1_
 `mulran_kaist03` in it are mapped, at several strides. Each log is tracked, searched for loops and solved with
 the default settings, and doubtful frames are placed as in a run; no map is made.
 
-`ATE` RMSE of what is placed, SE(3)-aligned, in metres; `path` is the truth's. `tracked`, `doubtful` and
-`lost` frames. `f/r` is the share of right frames that are called doubtful. `wrong`: windows of 1 s whose
-relative pose is off by more than 0.2 m or 5 degrees and, where covariances are known, by more than 5 sigma;
-`silent`: those without a frame that is doubtful or lost (evaluators/metrics/silent_failures.py). `false`:
-accepted loops farther than 0.2 m or 0.1 rad from the truth, of all accepted (evaluators/metrics/loops.py).
+`ATE`: RMSE of the placed frames, SE(3)-aligned, in metres; `path`: length of the true path. `tracked`,
+`doubtful` and `lost`: frames. `f/r`: share of right frames that are called doubtful. `wrong`: windows of 1 s
+whose relative pose is off by more than 0.2 m or 5 degrees and, where covariances are known, by more than
+5 sigma; `silent`: those of them without a doubtful or lost frame (evaluators/metrics/silent_failures.py).
+`false`: accepted loops farther than 0.2 m or 0.1 rad from the truth, of all accepted
+(evaluators/metrics/loops.py).
 """
 
 import argparse

@@ -1,11 +1,11 @@
-"""Registration without a guess: the Hough space against KISS-Matcher with GICP, in one process.
+"""Registration without a guess: Hough voting compared with KISS-Matcher with GICP, in one process.
 
     python benchmarks/hough_registration.py [--pairs 20] [--data ../shared/data] [--methods …] [--only …]
 
-Each source is turned by any yaw and set off by up to 10 m (25 m in the rows that say so). An answer is right
-within 0.3 m and 1° of the truth; "wrong" counts answers that were given as trusted and are not. Times are CPU
-time, and a shared machine can double them: compare them within a run. KITTI's truth is good to some
-centimetres; KAIST's rotations differ by 0.1 to 0.3° from what GICP and point-to-plane ICP agree on to
+Each source is rotated by any yaw and offset by up to 10 m (25 m in the rows that say so). A result is right
+within 0.3 m and 1° of the truth; "wrong" counts results that were trusted but are not right. Times are CPU
+times, and a shared machine can double them: compare them within a run. KITTI's truth is accurate to some
+centimetres; KAIST's rotations differ by 0.1 to 0.3° from those of GICP and point-to-plane ICP, which agree to
 0.04°. Errors on synthetic scans are those of the method.
 """
 

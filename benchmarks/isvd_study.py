@@ -1,4 +1,4 @@
-"""Which choices that Somlyai's thesis leaves open move ISVD's error: one experiment per choice.
+"""Effect on ISVD's error of choices that Somlyai's thesis leaves open: one experiment per choice.
 
     python benchmarks/isvd_study.py LOG… [--draws 10] [--only ratio tolerance] [--cache FOLDER]
 

@@ -1,8 +1,8 @@
-"""Odometry for scans on LiDAR logs with truth, and KISS-ICP's own pipeline beside it in the same run.
+"""Odometry for scans on LiDAR logs with truth, compared with KISS-ICP's own pipeline in the same run.
 
     python benchmarks/lidar_odometry.py LOG… [--kinds gicp icp kiss-icp hough-ndt]
 
-Times are CPU milliseconds a scan in one thread, without reading; `ratio` is the peer's time over ours.
+Times are CPU milliseconds per scan in one thread, without reading; `ratio` is the peer's time over ours.
 """
 
 import argparse

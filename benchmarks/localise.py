@@ -1,13 +1,13 @@
 """Measure ``mapper localise``: logs of another day in maps of the same place, in other places, kidnapped.
 
 Synthetic flats (RGB-D) and streets (LiDAR) are made with ``mapper synth`` twice, the second time on another
-day: other light, loose furniture and parked cars elsewhere or gone, another way through. Each second log is
-localised in the map of the first, and in the map of the next seed, which has to be refused. Two pieces of it,
-glued together, are a sensor that was carried away. Logs that are given are split in halves.
+day: other light, loose furniture and parked cars moved or gone, another path. Each second log is
+localised in the map of the first, and in the map of the next seed, which has to be refused. Two pieces of it
+joined together simulate a sensor that was carried away. Given logs are split in halves.
 
-Truth is brought into the map's frame by the rigid motion that fits the map's own trajectory to its truth
-best, so the map's own bends count as errors; beside it stands the error relative to the nearest frame of the
-map, which leaves these out. NEES is of the latter, per degree of freedom: 1 where covariances are honest.
+The truth is aligned to the map's frame by the rigid motion that fits the map's own trajectory to its truth
+best, so bends of the map count as errors; the error relative to the nearest frame of the map, which excludes
+them, is printed as well. NEES is of the latter, per degree of freedom: 1 if covariances are consistent.
 
     python benchmarks/localise.py OUT [--seeds 31 32 33] [--log LOG ...]
 """

@@ -3,11 +3,11 @@
     python -m benchmarks.long_logs rgbd [--frames 2400]
     python -m benchmarks.long_logs lidar [--frames 3000]
 
-"rgbd" walks through a building that is as large as the log is long, "lidar" drives along a street. Frames are
-simulated in other threads as they are read, so that no log is in memory or on the disk. A row stands for a
-tenth of the frames: resident memory at its end, beyond that before the first frame; CPU milliseconds a frame
-in the thread that tracks, searches loops and takes checkpoints; CPU milliseconds a frame for checkpoints, in
-that thread and in the one that writes them; size of the checkpoints on the disk.
+"rgbd" walks through a building that grows with the log, "lidar" drives along a street. Frames are simulated
+in other threads as they are read, so that no log is in memory or on disk. Each row covers a tenth of the
+frames: growth of resident memory since before the first frame; CPU milliseconds per frame in the thread that
+tracks, searches for loops and takes checkpoints; CPU milliseconds per frame for checkpoints, in that thread
+and in the one that writes them; size of the checkpoints on disk.
 """
 
 import argparse

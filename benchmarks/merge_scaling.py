@@ -1,12 +1,12 @@
-"""How merging grows: bytes per square kilometre, seconds per job, shuffle, memory; and OctoMap beside it.
+"""Cost of merging: bytes per square kilometre, seconds per job, shuffle, memory; compared with OctoMap.
 
     python benchmarks/merge_scaling.py [--log logs/street] [--work /tmp/merge] [--resolutions 0.2 0.1]
 
 Runs are overlapping pieces of one drive through a synthetic street, fused at the true poses, so that only
-merging is measured; without --log the drive is made first. --copies lays the runs side by side, for a map of
-many blocks. Every merge is the real command in a process of its own; peak memory is that of its largest
-process. OctoMap merges the same maps voxel by voxel through ``updateNode``, as its C++ users do; what its
-Python binding costs is bounded by a call that does nothing else.
+merging is measured; without --log the drive is made first. --copies places the runs side by side, for a map
+of many blocks. Every merge is the real command in a separate process; peak memory is that of its largest
+process. OctoMap merges the same maps voxel by voxel through ``updateNode``, as its C++ users do; the cost of
+its Python binding is bounded by a call that does nothing else.
 """
 
 import argparse

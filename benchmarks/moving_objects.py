@@ -1,16 +1,16 @@
-"""Removal of moving objects by point, on synthetic streets and flats: mapper beside DUFOMap and its like.
+"""Removal of moving points on synthetic streets and flats: mapper compared with DUFOMap and others.
 
     python benchmarks/moving_objects.py [--quick] [--peers VENV/bin/python]
 
-Peers run in an environment of their own, and are left out where it or a package is missing:
+Peers run in a separate environment, and are left out if it or a package is missing:
 
     python -m venv peers && peers/bin/pip install dufomap==1.1.1 dynamic-object-removal==0.6.0
 
 Metrics are those of the DynamicMap benchmark (Zhang et al. 2023) by point: SA is the share of static points
-that stay, DA that of moving points that go, AA = sqrt(SA · DA). Poses are the truth's with Gaussian errors.
-"returns" counts the points that are kept out of the cloud, "removed" those in removed voxels, "map" those in
-voxels that the finished octree does not call occupied. All methods get the same points; times are CPU
-seconds a scan, of one thread, mapper's with casting and fusing.
+that are kept, DA that of moving points that are removed, AA = sqrt(SA · DA). Poses are the true ones with
+Gaussian errors. "returns" counts points that are kept out of the cloud, "removed" those in removed voxels,
+"map" those in voxels that are not occupied in the finished octree. All methods get the same points; times are
+CPU seconds per scan of one thread, for mapper including casting and fusing.
 """
 
 import argparse

@@ -1,10 +1,11 @@
-"""Octree insertion, writing and queries against pyoctomap, in one process on the same scans.
+"""Octree insertion, writing and queries compared with pyoctomap, in one process on the same scans.
 
     python benchmarks/octree_insert.py [--data ../shared/data] [--frames 20] [--repeats 3]
 
-Times are CPU time per scan. ``lazy_eval=True`` is OctoMap's faster way. "no binding" takes off what pyoctomap
-needs for a cloud of the same size whose points all lie in the sensor's own voxel: the wrapper and one key per
-point: a lower bound for the ratio to the bare C++ library. Both maps' leaves are compared bit by bit.
+Times are CPU time per scan. ``lazy_eval=True`` is OctoMap's faster mode. "no binding" subtracts pyoctomap's
+time for a cloud of the same size whose points all lie in the sensor's own voxel, which is that of the wrapper
+and one key per point: a lower bound for the ratio to the bare C++ library. Both maps' leaves are compared bit
+by bit.
 """
 
 import argparse

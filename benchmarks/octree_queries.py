@@ -1,4 +1,4 @@
-"""Octree queries against pyoctomap, one call each per point or ray through its binding, on the same map.
+"""Octree queries compared with pyoctomap, which takes one call per point or ray, on the same map.
 
     python benchmarks/octree_queries.py [--data ../shared/data] [--frames 10]
 

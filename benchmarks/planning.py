@@ -1,4 +1,4 @@
-"""Planning and distance transforms against their plain peers, in one process, results compared first.
+"""Planning and distance transforms compared with simple implementations, in one process; results must agree.
 
 Run: .venv/bin/python benchmarks/planning.py
 """

@@ -1,10 +1,11 @@
-"""Published pose graphs: the cost reached, and the time against GTSAM's own Levenberg–Marquardt.
+"""Published pose graphs: final cost, and time compared with GTSAM's own Levenberg–Marquardt.
 
     python benchmarks/pose_graphs.py [--data ../shared/data/posegraph] [--only sphere2500 …]
 
-Both start from the file's estimates and end when an iteration gains less than 1e-8 of the error. Times are
-CPU seconds of solving alone, the file being read; ours holds everything between a ``PoseGraph`` and its
-``Solution``, the start and every factor's error included. ``GraphConfig(robust="none")``, else defaults.
+Both start from the file's estimates and stop when an iteration gains less than 1e-8 of the error. Times are
+CPU seconds of solving without reading the file; ours includes everything from a ``PoseGraph`` to its
+``Solution``, also the initial poses and every factor's error. ``GraphConfig(robust="none")``, otherwise
+defaults.
 """
 
 import argparse

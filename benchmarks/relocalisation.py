@@ -1,11 +1,12 @@
-"""Fast rotation, a covered lens, and the way back: twelve nearby synthetic logs for both keyframe odometries.
+"""Relocalisation after fast rotation and a covered lens: twelve similar logs, both keyframe odometries.
 
     python benchmarks/relocalisation.py [--settings 12] [--set loops.kind=none]
 
-A log turns on the spot at 1.7 to 2.1 rad/s for 12 s, with motion blur, 5 to 10 % of the frames missing and 1
-to 2 s of darkness after the first turn. "frames" counts those from the first after the darkness whose true
-pose shows a place seen before (nearer than 0.3 m and 20 degrees) to the one that is placed, 0 being that one;
-"lost" leaves out the dark ones. ATE RMSE of the solved graph after SE(3) alignment.
+In each log the camera turns on the spot at 1.7 to 2.1 rad/s for 12 s, with motion blur, 5 to 10 % of the
+frames missing and 1 to 2 s of darkness after the first turn. "frames" counts the frames from the first after
+the darkness that shows a known place (within 0.3 m and 20 degrees of an earlier true pose) to the first that
+is placed; 0 is that frame itself. "lost" excludes the dark frames. ATE RMSE of the solved graph after SE(3)
+alignment.
 """
 
 import argparse

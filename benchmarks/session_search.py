@@ -1,9 +1,9 @@
-"""Growth of the search of sessions in each other: one query a keyframe, in an index of all sessions before.
+"""Cost of searching sessions in each other: one query per keyframe, in an index of all earlier sessions.
 
     python benchmarks/session_search.py [--sessions 200] [--keyframes 100]
 
-Descriptors alone are simulated: images of 1000 words drawn from the vocabulary, scans of random heights. What
-is verified does not grow with the number of sessions: at most 300 pairs of places for each.
+Only descriptors are simulated: images of 1000 words drawn from the vocabulary, scans of random heights.
+Verification does not grow with the number of sessions: at most 300 pairs of places for each.
 """
 
 import argparse

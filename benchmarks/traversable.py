@@ -1,4 +1,4 @@
-"""Traversable floor against the exact geometry of small worlds: precision, recall, the path, time.
+"""Traversable floor compared with the exact geometry of small worlds: precision, recall, the path, time.
 
 Run: PYTHONPATH=. .venv/bin/python benchmarks/traversable.py [WORLD ...]
 """

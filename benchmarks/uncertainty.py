@@ -1,11 +1,10 @@
-"""Consistency of covariances: NEES/6 of relative poses against the truth; 1 is honest.
+"""Consistency of covariances: NEES/6 of relative poses against the truth; 1 is consistent.
 
     python benchmarks/uncertainty.py LOG… [--set key=value]
 
 Each log with truth is tracked, searched for loops and solved. Printed per log: NEES/6, mean and median, of
 the poses of tracked frames relative to those 1 s before, of odometry factors and of loops. The truth is
-interpolated; its own noise and clock are a floor that NEES counts as ours: at 0.3 m/s an error of 5 ms of
-its clock is 1.5 mm.
+interpolated; its noise and clock errors count as ours: at 0.3 m/s a clock error of 5 ms is 1.5 mm.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Checks that pip finds a wheel of every dependency, core and with all extras, for the interpreters and machines that
-# are supported; nothing is installed or built. What has none is named, and the exit status is 1.
+# Checks that pip finds a wheel of every dependency, core and with all extras, for the supported interpreters and
+# machines; nothing is installed or built. Missing wheels are named, and the exit status is then 1.
 # usage: bash scripts/check_wheels.sh [PYTHON_VERSION…]
 #   PYTHON_VERSION   such as 3.13; without, 3.11 3.12 3.13
 # It needs a network, for PyPI's metadata. scripts/smoke_test_wheel.sh runs the package, where there is an interpreter.

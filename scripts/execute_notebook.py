@@ -2,7 +2,7 @@
 
     python scripts/execute_notebook.py examples/first_map.ipynb
 
-Cells run as plain Python in an empty folder, without Jupyter, so that tests can run them, too.
+Cells run as plain Python in an empty folder, without Jupyter, so that tests can run them too.
 """
 
 import ast

@@ -2,8 +2,8 @@
 
     python scripts/gallery.py --logs DIR [--work DIR] [--only NAME …]
 
-DIR holds the logs as shared/data has them: tum_fr1_xyz, kitti_00 and mulran_kaist03. Synthetic logs are made.
-Runs that are in the work folder already are used as they are. Pictures are shrunk to a page's width.
+DIR has the recorded logs tum_fr1_xyz, kitti_00 and mulran_kaist03; synthetic logs are made. Existing runs in
+the work folder are used as they are. Pictures are shrunk to a page's width.
 """
 
 import argparse

@@ -1,15 +1,14 @@
-"""Run the commands that README.md and the pages show on the real logs, and write what they print into them.
+"""Run the commands that README.md and the pages show on real logs, and write their output into the pages.
 
     python scripts/refresh_outputs.py --logs DIR [--work DIR] [--page NAME …] [--slow]
 
-DIR holds the logs as shared/data has them: tum_fr1_xyz, kitti_00, posegraph/sphere2500.g2o. Each page gets
-an emptied folder of its own below the work folder, with these logs under the names that pages use. Blocks
-are those that the tests run, and those marked "real logs"; blocks marked "slow", which take many minutes,
-only with --slow.
+DIR has the logs tum_fr1_xyz, kitti_00 and posegraph/sphere2500.g2o. Each page gets its own empty folder in
+the work folder, with these logs under the names that pages use. The blocks that the tests run and those
+marked "real logs" are run; blocks marked "slow", which take many minutes, only with --slow.
 
-A line "…" stays where a page leaves lines out: as many rows before and behind it are shown as before. An
-output of ten lines or fewer, or of which only two rows would be left out, is shown whole. The exit status is
-1 if a command failed; its output stays as it was.
+A line "…" for omitted output stays, with as many rows before and after it as before. An output of ten lines
+or fewer, or of which only two rows would be left out, is shown in full. The exit status is 1 if a command
+failed; its output is then not changed.
 """
 
 import argparse

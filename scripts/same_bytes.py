@@ -1,15 +1,15 @@
-"""Prove that a change of the code changes no output: SHA-256 of all that the verbs of mapper write and print.
+"""Check that a code change changes no output: SHA-256 of everything that mapper's verbs write and print.
 
     python scripts/same_bytes.py record OUT.json [--tree DIR] [--data DIR] [--work DIR] [--only CASE …]
     python scripts/same_bytes.py compare BEFORE.json AFTER.json [--renamed OLD=NEW …] [--only CASE …]
 
 ``record`` runs the cases of same_bytes.toml with the code of a source tree, by default its own, in an emptied
-work folder; it takes about 12 minutes. ``compare`` lists what differs, with the lines where it is text, and
-exits with 1 if anything does; what is the same once OLD is NEW, in names and texts, counts as the same.
+work folder; it takes about 12 minutes. ``compare`` lists the differences, for text with the lines, and exits
+with 1 if there are any; differences that vanish when OLD is replaced by NEW in names and texts do not count.
 
-Two runs of one tree differ in times, memory and paths alone. Before the hash is taken, the numbers that
-same_bytes.toml lists, with reasons, become "…", the paths of the work folder, the data and the tree become
-WORK, DATA and TREE, and cells of sweeps, named by a hash of all settings, their labels. All else counts.
+Two runs of one tree differ only in times, memory and paths. Before hashing, the numbers that same_bytes.toml
+lists, with reasons, become "…", the paths of the work folder, the data and the tree become WORK, DATA and
+TREE, and cells of sweeps, which are named by a hash of all settings, get their labels. All else counts.
 """
 
 import argparse

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Makes .venv, installs the project with all its extras, compiles kernels and bytecode; does nothing the second time.
+# Makes .venv, installs the project with all its extras, compiles kernels and bytecode; the second time it does nothing.
 # usage: bash scripts/setup.sh [--dev]
-#   --dev   adds what the tests need, and axe-core by npm, where that is
+#   --dev   adds what the tests need, and axe-core if npm is installed
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 

@@ -1,8 +1,8 @@
-"""Hooks of MkDocs: pages that are made from the code, and links from pages to files of the repository.
+"""Hooks of MkDocs: pages generated from the code, and links from pages to files of the repository.
 
-Where a page says ``<!-- generated: settings -->`` or the like, the reference takes the place of that line and
-of the paragraph below it. README.md is the first page. A file of the repository that a page links to is
-copied into the site as text, so that the site is complete without a network.
+A line such as ``<!-- generated: settings -->`` in a page and the paragraph below it are replaced by the
+reference. README.md is the first page. Files of the repository that pages link to are copied into the site as
+text, so that the site is complete without a network.
 """
 
 import os

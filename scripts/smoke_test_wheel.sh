@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Builds the wheel and tries it in an empty environment: synth, build, export and eval of both sensors' logs.
+# Builds the wheel and tests it in an empty environment: synth, build, export and eval of both sensors' logs.
 # usage: bash scripts/smoke_test_wheel.sh [--extras NAMES] [PYTHON…]
 #   --extras NAMES   install these extras too, such as all or viewer,mesh; without, core alone
 #   PYTHON           interpreters to try, one after the other; without, python3

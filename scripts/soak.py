@@ -1,9 +1,9 @@
 """Soak test: for a given time, builds and changes of a run that are killed, or meet a full disk or damage.
 
-After every trial it checks that the earlier run is as it was, that nothing under a final name is written by
-half, and that what went wrong was told in one line; now and then a trial is left to its end, and has to give
-the reference's bytes. In trials of "resume" a build is killed again and again, goes on each time, and has to
-end in these bytes, too.
+After every trial it checks that the earlier run is unchanged, that no file with a final name is incomplete,
+and that the failure was reported in one line; now and then a trial runs to its end, and has to give the
+reference's bytes. In trials of "resume" a build is killed repeatedly, resumes each time, and has to end in
+these bytes, too.
 
 Example: python scripts/soak.py --minutes 30 --folder /tmp/soak
          python scripts/soak.py --minutes 30 --folder /tmp/xyz --trials resume --log LOG

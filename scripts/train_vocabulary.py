@@ -1,4 +1,4 @@
-"""Train the vocabulary that comes with the toolkit, on synthetic logs only; a few minutes.
+"""Train the vocabulary that is included in the toolkit, on synthetic logs only; takes a few minutes.
 
     python scripts/train_vocabulary.py [--out mapper/places/orb.words]
 

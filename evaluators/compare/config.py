@@ -68,11 +68,11 @@ class CompareConfig(Config):
 
     source: SourceConfig = SourceConfig()
     methods: tuple[str, ...] = ()
-    """Names of those to compare; empty is all that can use the log."""
+    """Names of the methods to compare; empty is all that can use the log."""
     pairs: NonNegativeInt = 30
     """Pairs of frames to register, spread evenly over the log."""
     seed: NonNegativeInt = 0
-    """Of the errors of the guesses."""
+    """Seed of the guesses' errors."""
     rgbd: RgbdCompareConfig = RgbdCompareConfig()
     lidar: LidarCompareConfig = LidarCompareConfig()
 

@@ -47,11 +47,11 @@ class SweepConfig(Config):
     configuration: Annotated[tuple[ConfigurationConfig, ...], Field(min_length=1)] = (
         ConfigurationConfig(name="default"),
     )
-    """They win over the method's settings."""
+    """Configurations; they override the method's settings."""
     seeds: tuple[NonNegativeInt, ...] = ()
     """Each build is repeated with these in place of every seed of its configuration, if it has any."""
     keep: Literal["nothing", "trajectory", "run"] = "trajectory"
-    """What is kept of each build beside its numbers: "trajectory" with manifest, configuration and summary
+    """What is kept of each build besides its numbers: "trajectory" with manifest, configuration and summary
     picture, or the whole run folder."""
 
     @model_validator(mode="after")

@@ -16,7 +16,7 @@ class MeshConfig(Config):
     truncation_voxels: Annotated[float, Field(ge=1.0)] = 4.0
     """How far from the surface distances count; thinner than the depth noise tears holes."""
     max_depth_m: PositiveFloat | None = None
-    """Deeper measurements are left out; None is where those that count in the octree end."""
+    """Deeper measurements are left out; None uses the octree's limit."""
     frame_stride: PositiveInt = 5
     """Every n-th tracked frame is fused."""
     min_observations: PositiveInt = 3
@@ -27,10 +27,10 @@ class OctomapConfig(Config):
     """The octree of ``mapper export --as octomap``."""
 
     level: Annotated[int, Field(ge=0, le=12)] = 0
-    """Levels of the tree that are left away: voxels are 2**level times as wide as the map's."""
+    """Levels of the tree that are dropped: voxels are 2**level times as wide as the map's."""
     parent: Parent = "mean"
-    """Log-odds of a wider voxel: "mean" of what it holds (Zhao et al. 2020, eq. 14), or "max", by which
-    nothing occupied is overlooked."""
+    """Log-odds of a wider voxel: "mean" of its content (Zhao et al. 2020, eq. 14), or "max", which misses
+    nothing occupied."""
 
 
 class RerunConfig(Config):
@@ -41,4 +41,4 @@ class RerunConfig(Config):
     image_width_px: PositiveInt = 480
     """Wider images are shrunk."""
     cloud_points: PositiveInt = 20_000
-    """A frame's cloud is thinned to about so many points."""
+    """A frame's cloud is thinned to about this many points."""

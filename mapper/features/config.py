@@ -20,11 +20,11 @@ class SurfConfig(Config):
     threshold: PositiveFloat = 500.0
     """First threshold of the Hessian's determinant, grey levels²; halved while there are too few features."""
     min_threshold: PositiveFloat = 25.0
-    """Last threshold; raise it where noise gives features."""
+    """Last threshold; raise it if noise produces features."""
     min_features: PositiveInt = 300
     """With fewer features the threshold is halved."""
     octaves: PositiveInt = 4
-    """Number of times that the filter's size doubles: more find larger features."""
+    """Number of times that the filter's size doubles; more find larger features."""
     layers: PositiveInt = 3
     """Filter sizes per octave in which points are found."""
 
@@ -39,7 +39,7 @@ class SiftConfig(Config):
     threshold: PositiveFloat = 0.04
     """First contrast threshold; halved while there are too few features."""
     min_threshold: PositiveFloat = 0.01
-    """Last threshold; raise it where noise gives features."""
+    """Last threshold; raise it if noise produces features."""
     min_features: PositiveInt = 300
     """With fewer features the threshold is halved."""
 
@@ -54,7 +54,7 @@ class AkazeConfig(Config):
     threshold: PositiveFloat = 0.001
     """First threshold of the detector's response; halved while there are too few features."""
     min_threshold: PositiveFloat = 0.0001
-    """Last threshold; raise it where noise gives features."""
+    """Last threshold; raise it if noise produces features."""
     min_features: PositiveInt = 300
     """With fewer features the threshold is halved."""
 
@@ -69,11 +69,11 @@ class OrbConfig(Config):
     threshold: PositiveInt = 20
     """First FAST threshold, grey levels; halved while there are too few features."""
     min_threshold: PositiveInt = 5
-    """Last threshold; raise it where noise gives features."""
+    """Last threshold; raise it if noise produces features."""
     min_features: PositiveInt = 300
     """With fewer features the threshold is halved."""
     levels: PositiveInt = 8
-    """Number of pyramid levels. More find features again from farther away or nearer."""
+    """Number of pyramid levels. More let features be found again over larger changes of distance."""
     scale_factor: ScaleFactor = 1.2
     """Size of a pixel on one pyramid level relative to the next finer one."""
 
@@ -88,11 +88,11 @@ class UniformOrbConfig(Config):
     threshold: PositiveInt = 20
     """FAST threshold, grey levels, tried first in every cell."""
     min_threshold: PositiveInt = 7
-    """FAST threshold of cells in which the first finds nothing; raise it where noise gives features."""
+    """FAST threshold for cells in which the first finds nothing; raise it if noise produces features."""
     cell_px: PositiveInt = 30
     """Edge of the cells in which corners are searched. Smaller cells spread features more evenly."""
     levels: PositiveInt = 8
-    """Number of pyramid levels. More find features again from farther away or nearer."""
+    """Number of pyramid levels. More let features be found again over larger changes of distance."""
     scale_factor: ScaleFactor = 1.2
     """Size of a pixel on one pyramid level relative to the next finer one."""
 

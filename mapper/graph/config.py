@@ -15,23 +15,23 @@ class WheelNoiseConfig(Config):
     max_gap_s: PositiveFloat = 0.2
     """Largest gap between two readings across which wheel poses are interpolated."""
     least_m: PositiveFloat = 0.01
-    """Error of the position that every step has, also a short one."""
+    """Error of the position in every step, however short."""
     path_share: NonNegativeFloat = 0.05
-    """Error of the position that is added, as a share of the metres driven. More, where wheels slip."""
+    """Additional error of the position, as a share of the distance driven. Raise it where wheels slip."""
     least_rad: PositiveFloat = 0.01
-    """Error of the heading that every step has, also a short one."""
+    """Error of the heading in every step, however short."""
     turn_share: NonNegativeFloat = 0.05
-    """Error of the heading that is added, as a share of the radians turned. More for a robot that turns on
-    the spot."""
+    """Additional error of the heading, as a share of the angle turned. Raise it for a robot that turns on the
+    spot."""
     rad_per_m: NonNegativeFloat = 0.02
-    """Error of the heading that is added per metre driven."""
+    """Additional error of the heading per metre driven."""
 
 
 class WheelFactorsConfig(WheelNoiseConfig):
     """Settings of wheel factors beside another odometry."""
 
     use: bool = True
-    """Connect keyframes by wheel odometry, where a log has it."""
+    """Connect keyframes by wheel odometry, if the log has it."""
 
 
 class GraphConfig(Config):
@@ -41,18 +41,18 @@ class GraphConfig(Config):
     """"batch": least squares over all factors, by GTSAM; "proportional": each loop's error is distributed
     along the path in turn (Somlyai, PhD thesis, §4.3); "none": keep the odometry's own estimate."""
     robust: Literal["gnc", "none"] | KernelKind = "gnc"
-    """Rejection of false loops: "gnc" classifies each (Yang et al. 2020), the kernels
-    "cauchy", "huber" and "dcs" (Agarwal et al. 2013) weigh each by its residual, "none" keeps all.
-    Odometry and wheel factors are never weighed down."""
+    """Rejection of false loops: "gnc" classifies each (Yang et al. 2020), the kernels "cauchy", "huber" and
+    "dcs" (Agarwal et al. 2013) weight each by its residual, "none" keeps all. Odometry and wheel factors
+    always keep their full weight."""
     robust_width: PositiveFloat = 4.1
-    """Residual, in sigmas of all six directions together, from which a loop weighs less. 99 % of measurements
-    with consistent information lie within 4.1. "gnc" rejects every loop beyond, but widens the limit for all
-    by as much as the median loop shows information to be over-confident."""
+    """Residual, in sigmas of all six directions together, beyond which a loop gets less weight. 99 % of
+    measurements with consistent information lie within 4.1. "gnc" rejects every loop beyond it, but widens
+    the limit for all if the median loop shows that the information is over-confident."""
     initial: Literal["auto", "given", "chordal"] = "auto"
-    """Where the batch solve begins: at the "given" estimates, at a "chordal" relaxation that needs none, or
-    "auto": the relaxation, where the estimates fit badly, loops are no outliers, and its cost is lower."""
+    """Initial poses of the batch solve: the "given" estimates, a "chordal" relaxation that needs none, or
+    "auto": the relaxation if the estimates fit badly, no loops are outliers, and its cost is lower."""
     wheels: WheelFactorsConfig = WheelFactorsConfig()
     max_iterations: PositiveInt = 100
     """Limit for each connected component's last solve."""
     relative_error: PositiveFloat = 1e-8
-    """Stop when an iteration improves the error by less than this share."""
+    """Stop when an iteration reduces the error by less than this share."""

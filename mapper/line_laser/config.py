@@ -17,7 +17,7 @@ class RangeLaw(Config):
     scale_mm: PositiveFloat
     exponent: NegativeFloat
     covariance: Covariance | None = None
-    """Of (ln scale, exponent); None if unknown."""
+    """Covariance of (ln scale, exponent); None if unknown."""
 
 
 class LateralLaw(Config):
@@ -26,16 +26,16 @@ class LateralLaw(Config):
     slope: PositiveFloat
     offset: float
     covariance: Covariance | None = None
-    """Of (slope, offset)."""
+    """Covariance of (slope, offset)."""
 
 
 class VehicleConfig(Config):
     """Settings of the vehicle that carries the sensor."""
 
     wheelbase_m: PositiveFloat | None = None
-    """Between the axles; encoder readings need it."""
+    """Distance between the axles; required for encoder readings."""
     sensor_x_m: float = 0.0
-    """How far ahead of the rear axle ranges begin."""
+    """Distance from the rear axle ahead to the origin of ranges."""
 
 
 class LineLaserCalibration(Config):
@@ -44,7 +44,7 @@ class LineLaserCalibration(Config):
     width_px: PositiveInt
     height_px: PositiveInt
     reach_m: PositiveFloat
-    """Where the laser meets the floor: what lies farther is never lit."""
+    """Distance at which the laser meets the floor; nothing farther is lit."""
     range: RangeLaw
     lateral: LateralLaw
     vehicle: VehicleConfig = VehicleConfig()
@@ -80,19 +80,21 @@ class StripeConfig(Config):
 
     hue_from_deg: Degrees = 355.0
     hue_to_deg: Degrees = 10.0
-    """The hues of the laser (figure 2.2); they may pass through 0."""
+    """Range of the laser's hues, from and to (figure 2.2); it may pass through 0."""
     saturation_threshold: Level = 64
-    """Of pixels whose hue is used: grey has none; the thesis gives no threshold."""
+    """Threshold of the saturation of pixels whose hue is used: grey has none; the thesis gives no
+    threshold."""
     intensity_threshold: Level = 250
-    """Of the red channel (eq. 2.39; figure 2.3)."""
+    """Threshold of the red channel (eq. 2.39; figure 2.3)."""
     weight_threshold: Level = 40
-    """Of 2R − G − B (eq. 2.41); the thesis gives none, and without one half of all grey noise is red."""
+    """Threshold of 2R − G − B (eq. 2.41); the thesis gives none, and without one half of all grey noise is
+    red."""
     edge_threshold: Level = 150
-    """Of the Laplacian of Gaussian (figure 2.5)."""
+    """Threshold of the Laplacian of Gaussian (figure 2.5)."""
     edge_sigma_px: PositiveFloat = 1.5
-    """Of that Gaussian; the thesis gives none."""
+    """Standard deviation of that Gaussian; the thesis gives none."""
     join_px: Annotated[int, Field(ge=0, le=100)] = 6
-    """Pixels of a column with at most so many others in between are one stripe."""
+    """Pixels of a column with at most this many others between them are one stripe."""
 
 
 class LineLaserMapConfig(Config):
@@ -105,7 +107,7 @@ class LineLaserMapConfig(Config):
     width_cells: PositiveInt = 240
     """e: its columns."""
     floor_margin_m: NonNegativeFloat = 0.08
-    """What seems to lie so little before or behind the laser's reach is the floor."""
+    """Points within this distance of the laser's reach are the floor."""
     resolution_m: PositiveFloat = 0.02
     """Edge of a cell of the world's grid."""
     hit_probability: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.7
@@ -122,7 +124,7 @@ class LineLaserConfig(Config):
     stripe: StripeConfig = StripeConfig()
     map: LineLaserMapConfig = LineLaserMapConfig()
     rate_hz: PositiveFloat | None = None
-    """Images a second where neither file names nor a times.txt give stamps; None is 10."""
+    """Images per second if neither file names nor a times.txt give stamps; None is 10."""
 
 
 class LineLaserSynthConfig(Config):
@@ -131,7 +133,7 @@ class LineLaserSynthConfig(Config):
     seed: Annotated[int, Field(ge=0)] = 0
     rate_hz: PositiveFloat = 5.0
     duration_s: PositiveFloat | None = None
-    """Length of the log; None is once round."""
+    """Length of the log; None is one round."""
     speed_mps: PositiveFloat = 0.3
     wheelbase_m: PositiveFloat = 0.26
     sensor_x_m: float = 0.2
@@ -155,12 +157,12 @@ class LineLaserSynthConfig(Config):
     ambient: PositiveFloat = 0.55
     """Brightness of the room; from 1 on, white walls are as bright as a pixel can be."""
     lamps: NonNegativeFloat = 0.3
-    """Lamps, windows and what shines, per metre of wall."""
+    """Lamps, windows and other bright things, per metre of wall."""
     red_things: NonNegativeFloat = 1.0
     """Red things per metre of wall."""
     dull_things: NonNegativeFloat = 0.3
     """Things that return no laser light, per metre of wall."""
     gloss: Ratio = 0.15
-    """Share of light that the floor mirrors."""
+    """Share of light that the floor reflects like a mirror."""
     noise_levels: NonNegativeFloat = 3.0
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 85

@@ -20,16 +20,16 @@ class ImageVerificationConfig(Config):
     match: MatchConfig = MatchConfig(filter="none", max_ratio=0.85)
     """How descriptors are paired."""
     min_matches: PositiveInt = 45
-    """Fewer paired features are no loop (Zhao et al. 2020, §1.3, step 5)."""
+    """A loop needs at least this many paired features (Zhao et al. 2020, §1.3, step 5)."""
     registration: IsvdConfig = IsvdConfig()
     """ISVD on the paired points gives the first motion."""
     max_depth_m: PositiveFloat = 5.0
     """Depth beyond it is not used."""
     min_inliers: PositiveInt = 30
-    """Fewer pairs that agree with the motion in the image are no loop. Fewer, where images have little
-    texture."""
+    """A loop needs at least this many pairs that agree with the motion in the image. Lower it where images
+    have little texture."""
     min_inlier_ratio: Ratio = 0.45
-    """A smaller share of the pairs that agrees is no loop. Less, where much of what is seen moves."""
+    """A loop needs at least this share of pairs that agree. Lower it where much of the view moves."""
     measure: Literal["reprojection", "isvd"] = "reprojection"
     """Which of the two tests' motions becomes the constraint."""
 
@@ -38,16 +38,16 @@ class GateConfig(Config):
     """Drift gate: how far a loop may move a node, by the drift of odometry on the path between its ends."""
 
     slack_m: PositiveFloat = 0.2
-    """What a loop may move a node, however short the path. More, where the odometry loses its way in places:
-    more true loops hold, and more false ones."""
+    """How far a loop may move a node, however short the path. Raise it where the odometry fails in places:
+    more true loops are accepted, and more false ones."""
     slack_rad: PositiveFloat = 0.1
-    """What a loop may turn a node, however short the path."""
+    """How far a loop may turn a node, however short the path."""
     drift_ratio: NonNegativeFloat = 0.05
-    """What is added to ``slack_m``, in metres per metre of path."""
+    """Addition to ``slack_m``, in metres per metre of path."""
     drift_rad_per_m: NonNegativeFloat = 0.02
-    """What is added to ``slack_rad`` per metre of path."""
+    """Addition to ``slack_rad`` per metre of path."""
     drift_rad_per_rad: NonNegativeFloat = 0.05
-    """What is added to ``slack_rad`` per radian turned."""
+    """Addition to ``slack_rad`` per radian turned."""
 
 
 class NoLoopsConfig(Config):
@@ -61,27 +61,27 @@ class KeyframeLoopsConfig(Config):
 
     kind: str
     min_gap_s: PositiveFloat = 5.0
-    """Places younger than this are left to the odometry."""
+    """Places more recent than this are left to the odometry."""
     min_gap_m: NonNegativeFloat = 0.0
-    """Places less far back along the path are left to the odometry."""
+    """Places nearer than this along the path are left to the odometry."""
     min_motion_m: NonNegativeFloat = 0.02
-    """No loop is searched before the sensor has moved so far since the last search, or turned by
+    """Loops are searched only after the sensor has moved this far since the last search, or turned by
     ``min_motion_rad``."""
     min_motion_rad: NonNegativeFloat = 0.02
-    """No loop is searched before the sensor has turned so much since the last search, or moved by
+    """Loops are searched only after the sensor has turned this much since the last search, or moved by
     ``min_motion_m``."""
     max_distance_m: PositiveFloat = 1.0
-    """Largest distance of a nearby place, before the drift since is added."""
+    """Largest distance of a nearby place, to which the drift since then is added."""
     max_candidates: PositiveInt = 4
     """Candidates compared per keyframe, the most similar first; the first loop found ends the search. More
     finds more loops and takes longer."""
     gate: GateConfig = GateConfig()
     min_agreeing: NonNegativeInt = 1
-    """So many loops found from other keyframes nearby must agree before one is accepted. 0 accepts every loop
-    that passes the other tests: more hold, also false ones."""
+    """This many loops found from other keyframes nearby must agree before one is accepted. 0 accepts every
+    loop that passes the other tests: more true and more false ones."""
     agreement_path_m: PositiveFloat = 3.0
-    """How far along the path two loops' ends may lie apart to be compared. More, where keyframes lie farther
-    apart."""
+    """Largest distance along the path between the ends of two loops that are compared. Raise it where
+    keyframes are farther apart."""
 
 
 class PlaceLoopsConfig(KeyframeLoopsConfig):
@@ -89,8 +89,8 @@ class PlaceLoopsConfig(KeyframeLoopsConfig):
 
     kind: Literal["places"] = "places"
     propose: Literal["auto", "places", "nearby"] = "auto"
-    """By a bag of words, by the current estimate of the poses, or "auto": by both, or by poses alone where
-    descriptors have no words."""
+    """Proposals by a bag of words, by the current estimate of the poses, or "auto": by both, or by poses
+    alone if the descriptors have no words."""
     places: PlacesConfig = PlacesConfig()
     max_angle_rad: PositiveFloat = 0.8
     """Largest angle between the viewing directions of nearby places."""
@@ -105,7 +105,7 @@ class ScanVerificationConfig(Config):
     reach_m: PositiveFloat = 48.0
     """Farther points are dropped."""
     constellation: ConstellationConfig = ConstellationConfig(ground=GroundConfig(cell_m=1.0, voxel_m=0.75))
-    """Centres that vote; the points are thin, so a cell of the ground has to be larger."""
+    """Centres that vote; the points are sparse, so a cell of the ground has to be larger."""
     voting: VotingConfig = VotingConfig(angles=120, peaks=10)
     pair_distances_m: Annotated[tuple[PositiveFloat, ...], Field(min_length=1)] = (2.0, 0.5)
     """Largest distance between the points of a GICP pair, from coarse to fine."""
@@ -114,21 +114,21 @@ class ScanVerificationConfig(Config):
     margin_m: PositiveFloat = 0.3
     """Margin of the free-space check along a ray, after GICP."""
     min_agreeing_ratio: Ratio = 0.3
-    """A smaller share of the obstacles that agrees, in either direction, is no loop."""
+    """A loop needs at least this share of obstacles that agree, in both directions."""
     max_contradicting_ratio: Ratio = 0.06
-    """A larger share of the visible obstacles in the other scan's free space is no loop. More, where much of
-    what stands moves: parked cars leave."""
+    """A loop may have at most this share of visible obstacles in the other scan's free space. Raise it where
+    standing objects move, such as parked cars."""
     max_moved_ratio: Ratio = 0.0
-    """A further share that may contradict where three quarters of what stands agree, less down to a half:
-    between two days cars leave and things are moved. ``mapper localise`` allows 0.14 unless more is set;
-    more, where yards are rearranged."""
+    """A further share that may contradict if three quarters of the obstacles agree, decreasing to none at a
+    half: between two days cars leave and objects are moved. ``mapper localise`` allows 0.14 unless more is
+    set. Raise it where yards are rearranged."""
     min_compared: PositiveInt = 100
-    """Fewer points that agree or contradict prove nothing: bare yards are all alike."""
+    """A loop needs at least this many points that agree or contradict, as all bare yards look alike."""
     min_lead: NonNegativeFloat = 0.07
-    """By how much a motion's share that agrees, less the share that contradicts, has to lead that of others:
-    where two fit alike, as in a square yard, neither is accepted."""
+    """Lead of a motion's score, the share that agrees less the share that contradicts, over that of others:
+    if two fit equally well, as in a square yard, neither is accepted."""
     sigma_rad: NonNegativeFloat = 0.001
-    """Error of the rotation that all points share: of deskewing, calibration and voxels."""
+    """Error of the rotation that all points share, from deskewing, calibration and voxels."""
     sigma_m: NonNegativeFloat = 0.015
     """Error of the translation that all points share."""
 
@@ -158,15 +158,15 @@ class ThesisLoopsConfig(Config):
     keyframe_interval: PositiveInt = 20
     """One keyframe, the sharpest, in this many frames."""
     sharp_ratio: PositiveFloat = 1.2
-    """A frame is sharp when it has this many times the median number of features of the last frames."""
+    """A frame is sharp if it has this many times the median number of features of the last frames."""
     median_frames: PositiveInt = 20
-    """Number of frames of that median. More, where the camera is shaken for long."""
+    """Number of frames of that median. Raise it if the camera shakes for long."""
     max_distance_m: PositiveFloat = 0.5
     """Largest distance of a near keyframe; the thesis leaves it open, as it does the angle."""
     max_angle_rad: PositiveFloat = 0.5
     """Largest angle between the two viewing directions."""
     min_gap_s: PositiveFloat = 2.0
-    """Younger keyframes are not compared."""
+    """More recent keyframes are not compared."""
     max_candidates: PositiveInt = 4
     """Keyframes compared per frame, the nearest first; the first loop found ends the search. More finds more
     loops and takes longer."""

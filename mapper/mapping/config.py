@@ -19,7 +19,7 @@ class LevelConfig(Config):
     plane_tolerance_m: PositiveFloat = 0.03
     """Largest standard deviation of a plane's points from it: the noise of the sensor."""
     heading: Literal["walls", "start"] = "walls"
-    """What x and y lie along: most walls, where these agree, so that a slice shows them straight; or the
+    """Direction of x and y: along most walls if these agree, so that they are straight in a slice; or the
     first pose's heading."""
 
 
@@ -42,7 +42,7 @@ class CloudConfig(Config):
     """Settings of the coloured cloud."""
 
     voxel_m: PositiveFloat = 0.02
-    """The cloud has one point, the mean, per cube of this edge."""
+    """The cloud has one mean point per cube of this edge."""
     frame_stride: PositiveInt = 10
     """Every n-th tracked frame adds its points."""
 
@@ -127,7 +127,7 @@ class Edits(Config):
     erase: tuple[Region, ...] = ()
     """Occupied voxels in these regions become free, and points of the cloud there are left out."""
     keep: tuple[Region, ...] = ()
-    """What lies in none of these regions, if there are any, is left out of octree, cloud and grids."""
+    """If there are any, everything outside these regions is left out of octree, cloud and grids."""
     keepout: tuple[Region, ...] = ()
     """Floor in these regions is blocked in the traversable floor; the other maps do not change."""
 

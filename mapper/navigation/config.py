@@ -21,9 +21,9 @@ class TraversableConfig(Config):
     robot_radius_m: NonNegativeFloat = 0.0
     """Floor nearer than this to an obstacle is not traversable; 0 leaves that to the planner."""
     footprint_m: NonNegativeFloat = 0.3
-    """Half the width of what carried the sensor: the floor that it swept is free where nothing was seen."""
+    """Half the width of the sensor's carrier: the floor that it swept is free where nothing was seen."""
     max_gap_m: NonNegativeFloat = 0.1
-    """Unknown gaps in the floor up to this wide, as rays along the floor leave them, are closed."""
+    """Unknown gaps in the floor up to this width, such as rays along the floor leave, are closed."""
 
 
 class CostmapConfig(Config):

@@ -22,38 +22,39 @@ class OctreeConfig(Config):
     """Edge of a voxel. Half of it takes 6 to 8 times the memory and time; smaller than the sensor's noise it
     shows no more."""
     hit_probability: Annotated[float, Field(ge=0.5, lt=1.0)] = 0.7
-    """Probability that a voxel is occupied in which one ray ends. More, where few frames see each surface."""
+    """Probability that a voxel in which one ray ends is occupied. Raise it where few frames see each
+    surface."""
     miss_probability: Annotated[float, Field(gt=0.0, le=0.5)] = 0.4
-    """Probability that a voxel is occupied through which one ray passes. Less frees sooner what has left, and
-    thins surfaces that rays graze."""
+    """Probability that a voxel through which one ray passes is occupied. Lower values free voxels sooner
+    after an object has left, but thin surfaces that rays graze."""
     clamp_min_probability: Annotated[float, Field(gt=0.0, lt=0.5)] = 0.1192
-    """Least probability of a voxel: no further ray makes it freer. Nearer to 0.5, a thing that arrives is
+    """Lowest probability of a voxel, which no further ray reduces. Nearer to 0.5, an object that arrives is
     mapped sooner."""
     clamp_max_probability: Annotated[float, Field(gt=0.5, lt=1.0)] = 0.971
-    """Largest probability of a voxel: no further ray makes it fuller. Nearer to 0.5, a thing that leaves is
-    freed sooner."""
+    """Highest probability of a voxel, which no further ray increases. Nearer to 0.5, voxels are freed sooner
+    after an object has left."""
     occupied_probability: Probability = 0.5
-    """A voxel counts as occupied above it. More leaves out what few rays have hit."""
+    """A voxel counts as occupied above this probability. Higher values leave out what few rays have hit."""
     max_range_m: Annotated[float, Field(gt=0.0, allow_inf_nan=True)] | None = None
-    """Beyond it a ray only frees space, up to this range. None is as far as ``depth_noise`` allows."""
+    """Returns beyond this range only free space, up to it. None is as far as ``depth_noise`` allows."""
     depth_noise: DepthNoiseConfig | None = None
-    """Noise of a depth camera, with which a return counts while its standard deviation is at most a voxel.
-    None: ``odometry.depth_noise``, else a build measures it on the planes that the log shows. Without effect
-    where ``max_range_m`` is a number."""
+    """Noise of a depth camera; returns count while their standard deviation is at most a voxel. None uses
+    ``odometry.depth_noise``, or else the noise measured on the planes in the log. No effect if
+    ``max_range_m`` is set."""
     discretize: bool = True
     """Cast one ray per end voxel (fast), not one per point; both are OctoMap's own modes."""
     attributes: bool = False
     """Keep mean colour, hit count and time of the last hit of the voxels where rays end."""
     stays_within_m: NonNegativeFloat = 1e-9
-    """Fusing again along another trajectory keeps a frame's cached update if no end of a ray moves further;
-    the default tolerates the rounding of poses that were text."""
+    """Fusing again along another trajectory keeps a frame's cached update if no end of a ray moves by more
+    than this; the default tolerates the rounding of poses stored as text."""
     max_memory_mb: PositiveFloat | None = None
-    """Size of the voxels beyond which a build has them in a file in the run's folder: the system keeps in
-    memory what it has room for, and the map is the same. For maps that are larger than memory; tables of
-    their blocks and the 2D maps still have to fit. None is all in memory."""
+    """Size of the voxels beyond which a build keeps them in a file in the run's folder, of which the system
+    caches what fits; the map is the same. For maps larger than memory; tables of their blocks and the 2D maps
+    still have to fit. None keeps all in memory."""
     moving: Literal["removed", "kept"] = "removed"
     """Whether fusing frees the voxels in which something moved, and keeps surfaces that rays only grazed; see
-    ``mapper.octree.moving_objects``. "kept" is OctoMap's map."""
+    ``mapper.octree.moving_objects``. "kept" gives OctoMap's map."""
 
     @property
     def max_memory_bytes(self) -> float:

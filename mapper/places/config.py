@@ -29,7 +29,7 @@ class PlacesConfig(Config):
     """Decision whether two images show the same place (Zhao et al. 2020, §1.3)."""
 
     path: Path | None = None
-    """File of the vocabulary; None is the one trained on synthetic logs that comes with the toolkit."""
+    """File of the vocabulary; None is the included one, which was trained on synthetic logs."""
     min_similarity: Ratio = 0.32
     """Similarity of two images' words (eq. 10), as published. It suits images of about 1000 features; 0.22
     suits 500, 0.45 suits 2000."""
@@ -42,7 +42,7 @@ class ScanContextConfig(Config):
     """Scan Context: decision whether two scans show the same place (Kim & Kim 2018)."""
 
     rings: PositiveInt = 20
-    """Number of rings around the sensor. More tell places apart better, and forgive less offset."""
+    """Number of rings around the sensor. More distinguish places better, but tolerate less offset."""
     sectors: PositiveInt = 60
     """Number of sectors of a full turn. Fewer are faster; more resolve the heading better."""
     reach_m: PositiveFloat = 48.0

@@ -27,10 +27,10 @@ class AcceptanceConfig(Config):
 
     near_voxels: PositiveFloat = 3.5
     surface_voxels: PositiveFloat = 0.33
-    """A source point agrees that lies this near to a target point, and to the surface about it."""
+    """A source point agrees if it is this near to a target point and to the surface around it."""
     min_agreeing_ratio: Annotated[float, Field(gt=0.0, le=1.0)] = 0.3
-    """Of the surfaces that face any one direction, so large a share has to agree. On streets and in yards,
-    against scans and dense maps, nearly all right answers had more, and every wrong one 0.28 or less."""
+    """Share of the surfaces facing any one direction that has to agree. On streets and in yards, against
+    scans and dense maps, nearly all right results had more, and every wrong one 0.28 or less."""
 
 
 class RefinedConfig(Config):
@@ -39,7 +39,7 @@ class RefinedConfig(Config):
     voxel_m: PositiveFloat = VOXEL_M["lidar"]
     """Scans are reduced to one point in each such voxel; every other length is a multiple of it."""
     neighbours: Annotated[int, Field(ge=5)] = 10
-    """Nearest points that give each normal and covariance."""
+    """Number of nearest points for each normal and covariance."""
     pair_distances_voxels: Distances = (7.0, 3.5)
     """Largest distance between the points of a pair, from coarse to fine."""
     max_iterations: PositiveInt = 40
@@ -72,7 +72,7 @@ class NdtConfig(Config):
     voxel_m: PositiveFloat = VOXEL_M["lidar"]
     """The source is reduced to one point in each such voxel; every other length is a multiple of it."""
     neighbours: Annotated[int, Field(ge=5)] = 10
-    """Nearest points that give each normal by which the answer is assessed."""
+    """Number of nearest points for each normal, with which the result is assessed."""
     cells_voxels: Distances = (7.0, 3.5)
     """Edges of the target's cells, each with one Gaussian, from coarse to fine."""
     min_points: Annotated[int, Field(ge=4)] = 6
@@ -88,7 +88,7 @@ class KissMatcherConfig(RefinedConfig):
     kind: Literal["kiss-matcher"] = "kiss-matcher"
     feature_voxels: PositiveFloat = 3.33
     """Features are computed on clouds reduced to voxels this many times larger: a quarter of the time of 1,
-    and as many right answers."""
+    with as many right results."""
 
 
 AnyRegistration = (
@@ -104,12 +104,12 @@ class IsvdConfig(Config):
     threshold: Literal["power", "halving"] = "power"
     """How the largest pair distance shrinks: α·j^β (alg. 7), or by half from ``start_error_mm`` (alg. 6)."""
     alpha_mm: PositiveFloat = 1200.0
-    """α of the power law, as published: the first limit. Larger where frames lie farther apart."""
+    """α of the power law, as published: the first limit. Raise it where frames are farther apart."""
     beta: Annotated[float, Field(lt=0.0)] = -2.6
-    """β of the power law, as published. Nearer to 0, where frames lie farther apart, the limit shrinks
-    slower."""
+    """β of the power law, as published. Nearer to 0 the limit shrinks more slowly, for frames that are
+    farther apart."""
     start_error_mm: PositiveFloat = 1000.0
-    """e_start of the halving threshold, which the thesis leaves open. Larger where frames lie farther
+    """e_start of the halving threshold, which the thesis leaves open. Raise it where frames are farther
     apart."""
     step: Literal["svd", "icp"] = "svd"
     """The motion in each iteration: the SVD of the pairs (alg. 6, 7), or ICP on their points (alg. 5)."""
@@ -122,6 +122,6 @@ class IsvdConfig(Config):
     agreement_mm: PositiveFloat = 50.0
     """Pairs this close after the motion agree with it."""
     min_agreeing: Annotated[int, Field(ge=3)] = 20
-    """A motion that fewer pairs agree with is refused."""
+    """A motion with fewer agreeing pairs is rejected."""
     min_agreement_ratio: Ratio = 0.25
-    """A motion that a smaller share of the pairs agrees with is refused."""
+    """A motion with a smaller share of agreeing pairs is rejected."""

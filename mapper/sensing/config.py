@@ -15,11 +15,11 @@ class DepthNoiseConfig(Config):
     """
 
     constant_m: NonNegativeFloat = 0.0
-    """a: what noise there is at any depth."""
+    """a: noise at any depth."""
     linear: float = 0.0
-    """b: what is added, in metres per metre of depth."""
+    """b: additional noise, in metres per metre of depth."""
     quadratic_per_m: NonNegativeFloat = 0.0
-    """c: what is added, in metres per square metre of depth."""
+    """c: additional noise, in metres per square metre of depth."""
 
     @model_validator(mode="after")
     def _is_positive(self) -> Self:

@@ -119,7 +119,7 @@ def test_kinds_say_what_they_are_and_which_settings_they_have():
 
 def test_a_setting_that_a_class_overrides_keeps_the_meaning_of_the_class_above():
     (scans,) = [one for one in described("lidar") if one.key == "loops.min_gap_m" and one.default == 20.0]
-    assert scans.doc == "Places less far back along the path are left to the odometry."
+    assert scans.doc == "Places nearer than this along the path are left to the odometry."
 
 
 def test_a_sensor_has_its_own_defaults():

@@ -20,13 +20,13 @@ class LevellingConfig(Config):
     min_height_m: float = 0.3
     """Least height of the sensor above the plane."""
     max_height_m: float = 4.0
-    """Largest height of the sensor above the plane. More for a sensor on a mast."""
+    """Largest height of the sensor above the plane. Raise it for a sensor on a mast."""
     cell_m: PositiveFloat = 1.0
     """One point per cubic cell is used, so that near ground does not outvote the rest."""
     reach_m: PositiveFloat = 40.0
     """Points farther away along an axis are not used."""
     samples: PositiveInt = 400
-    """Planes tried."""
+    """Number of planes that are tried."""
     seed: NonNegativeInt = 0
     """Seed of the random samples."""
 
@@ -41,17 +41,17 @@ class GroundConfig(Config):
     window_m: PositiveFloat = 8.0
     """Edge of the neighbourhood of a cell, in which the lowest flat cell is searched."""
     max_rise_m: PositiveFloat = 0.5
-    """Largest mean height of a ground cell above the lowest flat cell of its neighbourhood. More on
+    """Largest mean height of a ground cell above the lowest flat cell of its neighbourhood. Raise it on
     slopes."""
     radius_m: PositiveFloat = 60.0
     """Half the edge of the grid: points farther away along an axis are dropped."""
     min_obstacle_m: float = 0.5
     """Least height of an obstacle above the ground."""
     max_obstacle_m: float = 8.0
-    """Higher points are dropped. The paper has 4 m; the scans of a tilted sensor are mostly walls, with more
-    up to 8."""
+    """Higher points are dropped. The paper has 4 m; a tilted sensor sees mostly walls, and more of them up to
+    8 m."""
     voxel_m: PositiveFloat = 0.4
-    """Obstacles are thinned to one point per voxel, so that sparse and dense clouds weigh alike."""
+    """Obstacles are thinned to one point per voxel, so that sparse and dense clouds have equal weight."""
 
 
 class CellsConfig(Config):
@@ -61,7 +61,7 @@ class CellsConfig(Config):
     cell_m: PositiveFloat = 2.0
     """Edge of a cell."""
     min_voxels_ratio: NonNegativeFloat = 0.5
-    """An occupied cell has so many times the voxels of the cloud's median cell."""
+    """An occupied cell has at least this many times the voxels of the cloud's median cell."""
 
 
 class ObjectsConfig(Config):
@@ -73,7 +73,7 @@ class ObjectsConfig(Config):
     fine_m: PositiveFloat = 0.4
     """Inside a group, cells of this edge that touch make one object."""
     min_voxels_ratio: NonNegativeFloat = 0.5
-    """An object has so many times the voxels of the cloud's median coarse cell."""
+    """An object has at least this many times the voxels of the cloud's median coarse cell."""
 
 
 class ConstellationConfig(Config):
@@ -84,7 +84,7 @@ class ConstellationConfig(Config):
     ground: GroundConfig = GroundConfig()
     """Ground removal, and which points are obstacles."""
     centres: Annotated[CellsConfig | ObjectsConfig, Field(discriminator="kind")] = CellsConfig()
-    """What votes."""
+    """Centres that vote: of occupied cells or of objects."""
 
 
 class VotingConfig(Config):
@@ -93,7 +93,7 @@ class VotingConfig(Config):
     max_offset_m: PositiveFloat = 10.0
     """Largest offset searched along each axis."""
     margin_m: NonNegativeFloat = 2.0
-    """The accumulator reaches so much farther: a peak at its edge would be cut."""
+    """Extra range of the accumulator, as a peak at its edge would be cut off."""
     bin_m: PositiveFloat = 1.0
     """Edge of a bin of dx and dy; one bin is centred on zero."""
     angles: PositiveInt = 180
@@ -119,9 +119,9 @@ class OverlapConfig(Config):
     step_rad: PositiveFloat = 0.0175
     """First step of the heading."""
     halvings: NonNegativeInt = 2
-    """So often both steps are halved."""
+    """Number of times that both steps are halved."""
     candidates: PositiveInt = 6
-    """Number of peaks, those with most overlap, that pass to the free-space check."""
+    """Number of peaks, those with most overlap, that get the free-space check."""
     distinct_m: PositiveFloat = 1.0
     """Motions nearer to each other than this, and than ``distinct_rad``, are the same."""
     distinct_rad: PositiveFloat = 0.05
@@ -136,13 +136,13 @@ class HoughAcceptanceConfig(Config):
     """When the answer is accepted; otherwise there is none."""
 
     min_agreeing_ratio: Ratio = 0.1
-    """Share of each scan's obstacles that the other measured, too. Right answers had 0.12 and more."""
+    """Share of each scan's obstacles that the other measured, too. Right results had 0.12 or more."""
     min_lead: NonNegativeFloat = 0.1
-    """By how much the score leads that of any other motion."""
+    """Smallest lead of the score over that of any other motion."""
     pair_m: PositiveFloat = 0.5
-    """A point of the refined clouds counts as an inlier that lies so near to one of the other."""
+    """A point of the refined clouds is an inlier if it is this near to one of the other cloud."""
     refined: PositiveInt = 3
-    """Largest number of candidates that are refined, where their scores are near."""
+    """Largest number of candidates with similar scores that are refined."""
 
 
 class GicpStagesConfig(Config):
@@ -177,7 +177,7 @@ class HoughConfig(Config):
     voxel_m: PositiveFloat = 0.4
     """The clouds that are refined have one point per voxel."""
     neighbours: Annotated[int, Field(ge=5)] = 10
-    """Nearest points that give each of these its normal."""
+    """Number of nearest points for the normal of each of these."""
     refinement: Annotated[GicpStagesConfig | NdtStagesConfig, Field(discriminator="kind")]
     """Registration that refines the motion found by voting."""
 
