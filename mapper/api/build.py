@@ -53,31 +53,31 @@ def build(
     """Build a run: track every frame, close loops, solve the graph once, and fuse all frames into the maps.
 
     Args:
-        log: A log, or its path; see :func:`open_log`. A log that is opened already is mapped as it is; give
+        log: A log, or its path; see :func:`open_log`. An open log is mapped as it is; give
             the ``source`` settings by which it was opened, too, if the run is to find the same frames later.
-        out: Run folder to create; until it is whole it is called ``OUT.partial``. None is ``runs/LOG``, with
-            a number while that is taken.
+        out: Run folder to create, called ``OUT.partial`` until it is complete. None is ``runs/LOG``, with a
+            number if that exists.
         config: All settings, or a TOML or JSON file of them, or a mapping of some as ``settings`` takes it;
             None is what suits the log's sensor.
         settings: Values by dotted name on top, such as ``{"octree.resolution_m": 0.1}``.
         odometry: Your own instead of the toolkit's: an object of the
             :class:`~mapper.odometry.base.Odometry` protocol; or a function that is called with each frame in
             turn and returns the body's pose in a world of its own, (4, 4), or None where it is lost; or a
-            :class:`~mapper.core.trajectory.Trajectory`. Poses are taken to drift by 1 % of the path;
-            ``odometry.least_m``, ``path_share`` and so on say otherwise.
+            :class:`~mapper.core.trajectory.Trajectory`. Poses are assumed to drift by 1 % of the path;
+            ``odometry.least_m``, ``path_share`` and so on change that.
         progress: Receives stages, counts and notes; or a function that is called with lines of text, such
             as ``print``. None is silent.
         observer: Receives every tracked frame and the results.
-        overwrite: Replace a run that is there, once the new one is whole.
+        overwrite: Replace an existing run, once the new one is complete.
 
     Returns:
-        The finished run; :attr:`Run.verdict <mapper.run.folder.Run.verdict>` tells whether to trust it.
+        The finished run; :attr:`Run.verdict <mapper.run.folder.Run.verdict>` says whether to trust it.
 
     Raises:
         SourceError: The log cannot be opened.
         ConfigError: A setting is unknown, has no such value, or does not fit the log.
-        TrackingError: Too few frames could be tracked; what there is stays in ``OUT.partial``.
-        RunError: OUT is there already, or cannot be made.
+        TrackingError: Too few frames could be tracked; the partial results stay in ``OUT.partial``.
+        RunError: OUT exists already, or cannot be made.
 
     Example:
         >>> run = mapper.build(log_folder, out=new_folder, settings={"octree.resolution_m": 0.1})

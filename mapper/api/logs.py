@@ -15,7 +15,7 @@ from mapper.sources.config import SourceConfig
 def open_log(path: AnyPath, *, config: AnyPath | None = None, settings: Settings | None = None) -> Log:
     """Open a recorded log, recognised by its files; no frame is read yet.
 
-    Iterating reads and decodes one frame after the other: :class:`~mapper.core.frames.RgbdFrame` or
+    Iterating reads and decodes one frame at a time: :class:`~mapper.core.frames.RgbdFrame` or
     :class:`~mapper.core.frames.Scan`. ``log[10]`` is one frame, ``log[:20]`` the log of the first twenty.
 
     Args:
@@ -28,7 +28,7 @@ def open_log(path: AnyPath, *, config: AnyPath | None = None, settings: Settings
         The log, with ``stamps_ns``, ``sensor`` ("rgbd" or "lidar"), and ``truth`` and ``wheels`` where known.
 
     Raises:
-        SourceError: Nothing is there, no format fits, or the log is malformed.
+        SourceError: The path does not exist, no format fits, or the log is malformed.
         ConfigError: A setting is unknown or has no such value.
 
     Example:

@@ -22,7 +22,7 @@ def read_octree(path: AnyPath, config: OctreeConfig | None = None) -> OctreeMap:
             defaults. The resolution is always the file's.
 
     Raises:
-        RunError: A folder that is no run, or whose map is not as it was written.
+        RunError: The folder is not a run, or its map is not as it was written.
         MapFileError: The file cannot be read, is truncated, foreign or damaged.
         MapSizeError: Its leaves, expanded to voxels, would not fit into memory.
     """
