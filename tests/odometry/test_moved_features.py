@@ -14,6 +14,7 @@ from mapper.odometry.local_map.earlier_depth import EarlierDepth
 
 NOW = 40
 """Frame that is looked at: 1.3 s after the first."""
+STILL = np.zeros(6)
 
 
 @pytest.fixture
@@ -83,11 +84,27 @@ def test_a_visitor_is_not_in_the_view_for_loops(odometry, frames):
 def test_a_wrong_pose_displaces_the_surfaces(odometry, earlier_depth, offset_m, displaced):
     pose = odometry._last
     T_camera_world = exp(np.zeros(3), np.array([0.0, 0.0, offset_m])) @ pose.T_camera_world
-    found = earlier_depth.displacement(pose.observation, T_camera_world, pose.reference)
+    found = earlier_depth.displacement(pose.observation, T_camera_world, pose.reference, STILL)
     assert (found.ratio > 0.4) == displaced
     if displaced:
         assert found.distance_m == pytest.approx(offset_m, abs=0.05)
         assert found.since_s >= 0.4
+
+
+@pytest.mark.parametrize(
+    ("change_mps", "displaced"), [(0.0, True), (0.5, True), (3.0, False)], ids=["steady", "slower", "faster"]
+)
+def test_surfaces_shift_while_the_depth_image_is_not_measured_yet(
+    odometry, earlier_depth, change_mps, displaced
+):
+    """Depth that is late shifts by the time times the difference of the velocities in the two images."""
+    pose, keyframes = odometry._last, odometry._map.keyframes
+    late = exp(np.zeros(3), np.array([0.0, 0.0, 0.06])) @ pose.T_camera_world
+    for keyframe in keyframes:
+        keyframe.twist_camera = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    twist_camera = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0 + change_mps])
+    found = earlier_depth.displacement(pose.observation, late, pose.reference, twist_camera)
+    assert (found.ratio > 0.4) == displaced
 
 
 def test_what_moves_near_by_does_not_displace_the_farther_surfaces(odometry, earlier_depth, frames):
@@ -96,7 +113,7 @@ def test_what_moves_near_by_does_not_displace_the_farther_surfaces(odometry, ear
     moved = odometry.observe(
         RgbdFrame(frame.stamp_ns, frame.image, moved_m, frame.camera, frame.T_body_camera)
     )
-    found = earlier_depth.displacement(moved, pose.T_camera_world, pose.reference)
+    found = earlier_depth.displacement(moved, pose.T_camera_world, pose.reference, STILL)
     assert found.ratio > 0.3
     assert found.far_ratio < 0.1
 
@@ -106,7 +123,7 @@ def test_without_older_keyframes_nothing_is_known(odometry, earlier_depth):
     origin_ns = odometry._map.keyframes[0].stamp_ns
     early = replace(pose.observation, stamp_ns=origin_ns + 100_000_000)
     assert not earlier_depth.moved(early, pose.T_camera_world, pose.reference).any()
-    assert earlier_depth.displacement(early, pose.T_camera_world, pose.reference).ratio == 0.0
+    assert earlier_depth.displacement(early, pose.T_camera_world, pose.reference, STILL).ratio == 0.0
 
 
 def test_the_depths_noise_counts_only_while_many_features_have_moved(odometry):

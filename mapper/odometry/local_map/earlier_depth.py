@@ -10,7 +10,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mapper.core.geometry import Points, Transform
+from mapper.core.geometry import Array, Points, Transform
+from mapper.core.linear import turned
 from mapper.core.timebase import NS_PER_S
 from mapper.odometry.local_map.depth_kernels import between, cell_of, place_in_cells
 from mapper.odometry.local_map.depth_surfaces import DepthCells
@@ -28,6 +29,9 @@ _SAME_M, _SAME_SIGMAS, _SAME_RATIO = 0.02, 3.0, 0.01
 """Surfaces that are no farther apart are the same."""
 _SMOOTH = 1.1
 """Largest ratio of neighbouring cells' depths on one surface."""
+_UNSYNCHRONISED_S = 0.03
+"""Largest difference in time between a pixel's depth and its colour: images up to 20 ms apart are paired, and a
+row is read up to half a readout from the stamp. Meanwhile the surfaces shift before a moving camera."""
 _ELSEWHERE_M = 0.4
 """Surfaces that are farther apart are others, one of which hides the other."""
 _MIN_COMPARED_RATIO = 0.1
@@ -92,9 +96,16 @@ class EarlierDepth:
         return moved
 
     def displacement(
-        self, observation: ImageObservation, T_camera_world: Transform, reference: int
+        self, observation: ImageObservation, T_camera_world: Transform, reference: int, twist_camera: Array
     ) -> Displacement:
-        """Return how much of the depth image lies elsewhere than 0.4 s before; arguments as for ``moved``."""
+        """Return how much of the depth image lies elsewhere than 0.4 s before.
+
+        Args:
+            observation: The frame.
+            T_camera_world: (4, 4) its pose.
+            reference: Keyframe that sees the place; the newest up to it that is old enough is compared.
+            twist_camera: (6,) velocity of the camera in its own axes, rad/s and m/s; 0 if it is unknown.
+        """
         earlier = self._earlier(observation, reference, most=1)
         if observation.depth_cells is None or not earlier:
             return Displacement()
@@ -108,6 +119,8 @@ class EarlierDepth:
             cells.camera.parameters,
             cells.cell_px,
             self._noise,
+            _UNSYNCHRONISED_S * twist_camera,
+            _UNSYNCHRONISED_S * keyframe.twist_camera,
         )
         is_beside = beside_m > 0.0
         if not is_beside.any() or len(compared) < _MIN_COMPARED_RATIO * len(points):
@@ -177,11 +190,12 @@ def _in_free_space(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _apart(  # type: ignore[no-untyped-def]
-    points, T_camera_world, inverse_depth, T_keyframe_world, optics, cell_px, noise
+    points, T_camera_world, inverse_depth, T_keyframe_world, optics, cell_px, noise, motion, keyframe_motion
 ):
     """Return (M,) which points lie on a keyframe's surfaces or beside them, and how far beside; 0 is on them.
 
     The inverse depth of a plane is linear in the image, so it is interpolated between the cells' middles.
+    ``motion`` and ``keyframe_motion`` (6,) are the cameras' own in the time by which their depth may be late.
     """
     T = between(T_keyframe_world, T_camera_world)
     rows, columns = inverse_depth.shape
@@ -201,12 +215,30 @@ def _apart(  # type: ignore[no-untyped-def]
             continue
         s, t = down - line, across - column
         upper, lower = (1.0 - t) * a + t * b, (1.0 - t) * c + t * d
-        apart = abs(z - 1.0 / ((1.0 - s) * upper + s * lower))
+        inverse = (1.0 - s) * upper + s * lower
+        apart = abs(z - 1.0 / inverse)
         sigma_m = noise[0] + z * (noise[1] + z * noise[2])
         if apart > _ELSEWHERE_M:
             continue
-        if apart > _SAME_M + _SAME_RATIO * z + _SAME_SIGMAS * sigma_m:
+        there = turned(T, points[n]) + T[:3, 3]
+        shift = turned(T, _shift(motion, points[n])) - _shift(keyframe_motion, there)
+        # A plane n · p = 1 that is shifted lies 1 + n · shift times as far off along each ray.
+        nx = ((1.0 - s) * (b - a) + s * (d - c)) * optics[0] / cell_px
+        ny = (lower - upper) * optics[1] / cell_px
+        nz = inverse - (nx * there[0] + ny * there[1]) / z
+        shift_m = abs(nx * shift[0] + ny * shift[1] + nz * shift[2]) / inverse
+        if apart > _SAME_M + _SAME_RATIO * z + _SAME_SIGMAS * sigma_m + shift_m:
             beside_m[count] = apart
         compared[count] = n
         count += 1
     return compared[:count], beside_m[:count]
+
+
+@njit(cache=True, nogil=True)
+def _shift(motion, point):  # type: ignore[no-untyped-def]
+    """Return (3,) by how much a small motion of the camera, (6,) rotation and translation, shifts a point."""
+    shift = np.empty(3)
+    shift[0] = motion[3] + motion[1] * point[2] - motion[2] * point[1]
+    shift[1] = motion[4] + motion[2] * point[0] - motion[0] * point[2]
+    shift[2] = motion[5] + motion[0] * point[1] - motion[1] * point[0]
+    return shift

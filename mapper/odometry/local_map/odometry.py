@@ -127,7 +127,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         observation = tracked_pose.observation
         information = frame_information(self._map, tracked_pose)
         displaced = self._earlier_depth.displacement(
-            observation, tracked_pose.T_camera_world, tracked_pose.reference
+            observation, tracked_pose.T_camera_world, tracked_pose.reference, self._shutter.twist_camera
         )
         covariance = covariance_of(information)
         doubt = self._doubts.assess(
