@@ -30,8 +30,8 @@ _SAME_M, _SAME_SIGMAS, _SAME_RATIO = 0.02, 3.0, 0.01
 _SMOOTH = 1.1
 """Largest ratio of neighbouring cells' depths on one surface."""
 _UNSYNCHRONISED_S = 0.03
-"""Largest difference in time between a pixel's depth and its colour: images up to 20 ms apart are paired, and a
-row is read up to half a readout from the stamp. Meanwhile the surfaces shift before a moving camera."""
+"""Largest time between the depth and the colour of a pixel: images up to 20 ms apart are paired, and rows are
+read up to half a readout from the stamp. Meanwhile the surfaces shift before a moving camera."""
 _ELSEWHERE_M = 0.4
 """Surfaces that are farther apart are others, one of which hides the other."""
 _MIN_COMPARED_RATIO = 0.1
@@ -220,15 +220,16 @@ def _apart(  # type: ignore[no-untyped-def]
         sigma_m = noise[0] + z * (noise[1] + z * noise[2])
         if apart > _ELSEWHERE_M:
             continue
-        there = turned(T, points[n]) + T[:3, 3]
-        shift = turned(T, _shift(motion, points[n])) - _shift(keyframe_motion, there)
-        # A plane n · p = 1 that is shifted lies 1 + n · shift times as far off along each ray.
-        nx = ((1.0 - s) * (b - a) + s * (d - c)) * optics[0] / cell_px
-        ny = (lower - upper) * optics[1] / cell_px
-        nz = inverse - (nx * there[0] + ny * there[1]) / z
-        shift_m = abs(nx * shift[0] + ny * shift[1] + nz * shift[2]) / inverse
-        if apart > _SAME_M + _SAME_RATIO * z + _SAME_SIGMAS * sigma_m + shift_m:
-            beside_m[count] = apart
+        same_m = _SAME_M + _SAME_RATIO * z + _SAME_SIGMAS * sigma_m
+        if apart > same_m:
+            there = turned(T, points[n]) + T[:3, 3]
+            shift = turned(T, _shift(motion, points[n])) - _shift(keyframe_motion, there)
+            # A plane n · p = 1 that is shifted lies 1 + n · shift times as far off along each ray.
+            nx = ((1.0 - s) * (b - a) + s * (d - c)) * optics[0] / cell_px
+            ny = (lower - upper) * optics[1] / cell_px
+            nz = inverse - (nx * there[0] + ny * there[1]) / z
+            if apart > same_m + abs(nx * shift[0] + ny * shift[1] + nz * shift[2]) / inverse:
+                beside_m[count] = apart
         compared[count] = n
         count += 1
     return compared[:count], beside_m[:count]
