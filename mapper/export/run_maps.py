@@ -19,7 +19,6 @@ from mapper.octree.slice import OccupancyGrid
 from mapper.run import files
 from mapper.run.cloud import Cloud, read_cloud
 from mapper.run.folder import Run
-from mapper.run.results import load_results
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.frame_tree import FrameTree
 from mapper.sources.ros.mcap_file import open_mcap
@@ -52,7 +51,7 @@ def maps_of(run: Run) -> Maps:
 
 def editor_of(run: Run) -> MapEditor:
     """Return the editor of a run's finished maps."""
-    path_world, room_m = load_results(run).tracked.positions_world, run.config.traversable.head_room_m
+    path_world, room_m = run.tracked_trajectory.positions_world, run.config.traversable.head_room_m
     return MapEditor(edits_of(run.manifest.edits), path_world, room_m)
 
 

@@ -34,7 +34,7 @@ from mapper.run.folder import Run, moved_log, open_run, paths_of, refuse_another
 from mapper.run.frame_outcomes import FrameRecord
 from mapper.run.manifest import DepthReach, Solve, Status, Timing
 from mapper.run.observers import NULL_OBSERVER, Observer
-from mapper.run.results import RunResults, load_results
+from mapper.run.results import RunResults
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
 from mapper.run.warnings import FLOOR, floor_warnings
 from mapper.run.writer import RunWriter, write_run
@@ -179,7 +179,7 @@ def fuse_into(
     checkpoints: Checkpoints | None = None,
 ) -> None:
     """Fuse the trajectory of an unfinished run and write everything that is made from the maps."""
-    results = load_results(Run(writer.folder, config, writer.manifest))
+    results = Run(writer.folder, config, writer.manifest).results
     if not config.mcap.frame_times:
         results = replace(results, frame_ms={})
     trajectory = results.trajectory

@@ -33,6 +33,9 @@ from mapper.run.manifest import (
     read_manifest,
 )
 from mapper.run.pose_covariances import UncertainPoses, read_poses
+from mapper.run.results import RunResults, aligned_truth
+from mapper.run.verdict import verdict_of
+from mapper.run.warnings import find_warnings
 from mapper.runtime.atomic import partial_of
 from mapper.sources import open_source
 from mapper.sources.base import Log
@@ -182,15 +185,19 @@ class Run:
         return read_tum(self.file(files.KEYFRAMES))
 
     @cached_property
+    def results(self) -> RunResults:
+        """All of the above, with the truth aligned with the trajectory; its maps may still be missing."""
+        truth = None if self.truth is None else aligned_truth(self.truth, self.trajectory)
+        return RunResults(
+            self.trajectory, self.graph, self.records, self.loops, self.frame_ms, truth, self.poses
+        )
+
+    @cached_property
     def verdict(self) -> Verdict:
         """Whether it is to be trusted, and why not; of a run of before 2026-11-22 it is found now."""
-        from mapper.run.results import load_results
-        from mapper.run.verdict import verdict_of
-        from mapper.run.warnings import find_warnings
-
         if self.manifest.verdict is not None:
             return self.manifest.verdict
-        return verdict_of(find_warnings(load_results(self), self.manifest))
+        return verdict_of(find_warnings(self.results, self.manifest))
 
     @cached_property
     def octree(self) -> "OctreeMap":

@@ -21,7 +21,7 @@ from mapper.octree.octomap_file import bt_bytes, read_octree
 from mapper.octree.slice import OccupancyGrid
 from mapper.run import files
 from mapper.run.folder import Run
-from mapper.run.results import RunResults, load_results
+from mapper.run.results import RunResults
 
 _SIZED_LEVELS = 4
 _VIEW_PX = 1600
@@ -69,7 +69,7 @@ def chapter_of(run: Run, name: str, figures: Sequence[Figure]) -> Chapter:
     Raises:
         MapperError: A file of the run cannot be read.
     """
-    return Chapter(name, run, load_results(run), tuple(figures))
+    return Chapter(name, run, run.results, tuple(figures))
 
 
 def refuse_same_names(chapters: Sequence[Chapter]) -> None:

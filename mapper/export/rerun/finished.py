@@ -10,7 +10,7 @@ from mapper.export.run_maps import maps_of, snapshots_of
 from mapper.mapping.cloud import thinned_to_view
 from mapper.mapping.fusion import Maps
 from mapper.run.folder import Run
-from mapper.run.results import RunResults, load_results
+from mapper.run.results import RunResults
 
 
 def show_run(run: Run, target: str) -> None:
@@ -21,7 +21,7 @@ def show_run(run: Run, target: str) -> None:
         ViewerError: No viewer can be started or reached.
         MapperError: A file of the run cannot be read.
     """
-    results, maps, snapshots = load_results(run), maps_of(run), list(snapshots_of(run))
+    results, maps, snapshots = run.results, maps_of(run), list(snapshots_of(run))
     name, corners = run.path.name, extent(results, maps)
     with recorded(target, name=name, has_images=bool(snapshots), looking_at=corners) as log:
         log.images(snapshots)
