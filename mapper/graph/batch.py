@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mapper.core.errors import GraphError
-from mapper.graph.model import BetweenFactor
 from mapper.runtime.progress import Report
 
 if TYPE_CHECKING:
     import gtsam
+
+    from mapper.graph.model import BetweenFactor
 
 # χ² has no unit: once a step gains less than this, only rounding is left.
 _ABSOLUTE_ERROR = 1e-10

@@ -19,7 +19,7 @@ from mapper.graph.terms import anchor, between, values_of
 if TYPE_CHECKING:
     import gtsam
 
-_HELD = PoseSigmas(rotation_rad=1e-6, translation_m=1e-6)
+_HELD = PoseSigmas(rotation_rad=1e-6, translation_m=1e-6).information
 """Of the first node: next to nothing beside any factor's, and yet within the digits of a solve."""
 _DIMENSION = 6
 
