@@ -91,8 +91,8 @@ def plan(
     from mapper.navigation.config import PlanConfig
     from mapper.navigation.planner import plan_2d, plan_3d
     from mapper.navigation.storey_planner import plan_storeys
-    from mapper.octree.octomap_file import read_octree
-    from mapper.octree.slice import with_obstacles
+    from mapper.octree.grid import with_obstacles
+    from mapper.octree.reading import read_octree
     from mapper.run import files
     from mapper.run.folder import Run, open_run
     from mapper.run.manifest import is_merged_map

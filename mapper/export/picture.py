@@ -28,7 +28,7 @@ from mapper.export.palette import DOUBTFUL, END, ESTIMATE, FACTORS, PLAN, START,
 from mapper.export.panels import color_of
 from mapper.export.path_band import SIGMAS, band_image
 from mapper.graph.model import PoseGraph, Solution
-from mapper.octree.slice import FREE, OCCUPIED, OccupancyGrid
+from mapper.octree.grid import FREE, OCCUPIED, OccupancyGrid
 from mapper.run.pose_covariances import UncertainPoses
 
 if TYPE_CHECKING:

@@ -22,11 +22,12 @@ from mapper.navigation.floor import driven_ground, reachable_floor
 from mapper.navigation.traversable import traversable
 from mapper.octree.casting import Caster, reach_m
 from mapper.octree.config import OctreeConfig
+from mapper.octree.grid import OccupancyGrid
 from mapper.octree.map import OctreeMap
 from mapper.octree.moving_objects import MovingObjects, remove_moving_objects
 from mapper.octree.scan_update import ScanUpdate, pack
 from mapper.octree.scan_update_file import CachedUpdate, ScanUpdateFile, ScanUpdateWriter, cache_update
-from mapper.octree.slice import OccupancyGrid, cut_slice, floor_below
+from mapper.octree.slice import cut_slice, floor_below
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import Log

@@ -16,7 +16,8 @@ from scipy.spatial import cKDTree
 from mapper.core.errors import ConfigError
 from mapper.core.geometry import Array, Points, Transform, apply, inverse
 from mapper.merging.placing import Placed
-from mapper.octree.map import OctreeMap, log_odds
+from mapper.octree.map import OctreeMap
+from mapper.octree.sensor_model import log_odds
 
 _TOLERANCE_VOXELS = 2.0
 _MIN_VOXELS = 8

@@ -13,7 +13,7 @@ from mapper.navigation.config import TraversableConfig
 from mapper.navigation.floor import Floor, floor_of, margin_for
 from mapper.navigation.traversable import Storey, traversable
 from mapper.octree.columns import block_extent, columns_of, occupied_voxels
-from mapper.octree.octomap_file import read_octree
+from mapper.octree.reading import read_octree
 
 MOST_COLUMNS = 1 << 25
 """More columns in the map's bounding box, and its floor would take more than about 2 GB."""

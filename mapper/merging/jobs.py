@@ -27,7 +27,7 @@ from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.ground_height import lowest_occupied
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
-from mapper.octree.octomap_file import read_octree
+from mapper.octree.reading import read_octree
 from mapper.octree.resampling import blocks_reached, resampled
 from mapper.octree.scan_update_file import ScanUpdateWriter, open_scan_updates
 from mapper.octree.slice import see_band

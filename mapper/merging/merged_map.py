@@ -22,10 +22,10 @@ from mapper.mapping.config import Region
 from mapper.merging.joint_graph import Tie
 from mapper.navigation.config import CostmapConfig, TraversableConfig
 from mapper.octree.config import OctreeConfig, SliceConfig
+from mapper.octree.grid import OccupancyGrid
 from mapper.octree.grid_file import stored_grid
 from mapper.octree.map import OctreeMap
-from mapper.octree.octomap_file import read_octree
-from mapper.octree.slice import OccupancyGrid
+from mapper.octree.reading import read_octree
 from mapper.run import files
 from mapper.run.manifest import is_merged_map
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, partial_of, write_text

@@ -31,6 +31,7 @@ from mapper.merging.placing import Placed
 from mapper.merging.stages import Stages
 from mapper.navigation.floor import Floor, driven_ground
 from mapper.navigation.traversable import Storey, traversable
+from mapper.octree.grid import OccupancyGrid, shrunk, with_obstacles
 from mapper.octree.ground_height import (
     NOTHING,
     DrivenGround,
@@ -39,7 +40,7 @@ from mapper.octree.ground_height import (
     lay_on_floor,
     nearest_heights,
 )
-from mapper.octree.slice import OccupancyGrid, floor_below, free_path, grid_of, shrunk, with_obstacles
+from mapper.octree.slice import floor_below, free_path, grid_of
 
 _MOST_CELLS = 2000  # more than a page has pixels
 _MAX_TILT = np.cos(np.deg2rad(5.0))

@@ -14,8 +14,8 @@ from mapper.navigation.distance import DistanceField, distance_field
 from mapper.navigation.line_of_sight import in_sight, path_length, shortened
 from mapper.navigation.search import Cell, shortest_path
 from mapper.navigation.voxels import LIMIT_BYTES, VoxelGrid, cut_box, known_box, layer
+from mapper.octree.grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.map import OctreeMap
-from mapper.octree.slice import OCCUPIED, UNKNOWN, OccupancyGrid
 
 _BYTES_PER_VOXEL = 30  # a distance field's 14, the mask of free voxels, and the search's costs and steps
 _ROUNDING_M = 1e-6

@@ -15,8 +15,8 @@ from mapper.navigation.search import shortest_path
 from mapper.navigation.traversable import Storey
 from mapper.navigation.voxels import layer
 from mapper.octree.columns import NOWHERE
+from mapper.octree.grid import UNKNOWN, OccupancyGrid
 from mapper.octree.ground_height import nearest_heights
-from mapper.octree.slice import UNKNOWN, OccupancyGrid
 
 
 def plan_storeys(

@@ -2,7 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import cv2
 import numpy as np
@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array
 from mapper.octree.columns import NOWHERE
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, gather
-from mapper.octree.map import OctreeMap
+
+if TYPE_CHECKING:
+    from mapper.octree.map import OctreeMap
 
 _CELL_M = 3.0
 _MAX_SLOPE = 0.3
@@ -85,7 +87,7 @@ class DrivenGround:
 
 
 def ground_heights(
-    octree: OctreeMap,
+    octree: "OctreeMap",
     *,
     first: NDArray[np.int64],
     shape: tuple[int, int],
@@ -144,7 +146,7 @@ def nearest_heights(heights: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDAr
 
 
 def lowest_occupied(
-    octree: OctreeMap, *, first: NDArray[np.int64], shape: tuple[int, int]
+    octree: "OctreeMap", *, first: NDArray[np.int64], shape: tuple[int, int]
 ) -> NDArray[np.int32]:
     """Return the (H, W) top of each column's lowest occupied voxel, in voxels above z = 0.
 

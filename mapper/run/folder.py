@@ -46,8 +46,8 @@ from mapper.sources.trajectory_files import read_tum
 if TYPE_CHECKING:  # compiled code, which takes longer to load than most files of a run
     from matplotlib.axes import Axes
 
+    from mapper.octree.grid import OccupancyGrid
     from mapper.octree.map import OctreeMap
-    from mapper.octree.slice import OccupancyGrid
     from mapper.run.cloud import Cloud
 
 _NAMED = 5
@@ -202,7 +202,7 @@ class Run:
     @cached_property
     def octree(self) -> "OctreeMap":
         """Occupancy map, with colours and times if it was built with ``octree.attributes``."""
-        from mapper.octree.octomap_file import read_octree
+        from mapper.octree.reading import read_octree
 
         return read_octree(self.file(files.OCTREE_MAP))
 

@@ -17,8 +17,9 @@ from mapper.export.path_band import SIGMAS
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure
 from mapper.mapping.thumbnails import encode_jpeg
-from mapper.octree.octomap_file import bt_bytes, read_octree
-from mapper.octree.slice import OccupancyGrid
+from mapper.octree.grid import OccupancyGrid
+from mapper.octree.octomap_file import bt_bytes
+from mapper.octree.reading import read_octree
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.run.results import RunResults
