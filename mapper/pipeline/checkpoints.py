@@ -16,7 +16,7 @@ import shutil
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -63,7 +63,7 @@ class Checkpoints:
         Args:
             writer: Of the run.
             identity: What decides the result.
-            progress: Receives what the user should know.
+            progress: Receives notes.
             every_s: Seconds between two checkpoints, at least; 0 keeps one of every frame, and waits for it.
         """
         self.folder = writer.folder / files.CHECKPOINTS
@@ -207,7 +207,7 @@ class Checkpoints:
         writer.clock.seconds.update(state["seconds"])
 
     def resumed_at(self, step: Literal["track", "solve", "fuse"], frame: int) -> None:
-        """Tell, in the manifest too, where the build goes on."""
+        """Report where the build goes on, and record it in the manifest."""
         here = Resumption(at=now_text(), step=step, frame=frame)
         timing = self.writer.manifest.timing
         timing = timing.model_copy(update={"resumed": (*timing.resumed, here)})
@@ -275,6 +275,13 @@ class Checkpoints:
                 "is stopped"
             )
             shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def open_checkpoints(
+    writer: RunWriter, identity: Mapping[str, Any], progress: Progress, *, every_s: float | None
+) -> AbstractContextManager[Checkpoints | None]:
+    """Return the checkpoints of a build as a context; None makes none."""
+    return nullcontext() if every_s is None else Checkpoints(writer, identity, progress, every_s=every_s)
 
 
 def kept_result(
