@@ -77,7 +77,7 @@ def cut_slice(
     ground_m = None
     if config.above == "ground":
         ground_m = ground_heights(octree, first=first, shape=shape, floor_z_m=floor_z_m, driven=driven)
-    seen = see_band(octree, config, first=first, shape=shape, ground_m=ground_m, floor_z_m=floor_z_m)
+    seen = band_flags(octree, config, first=first, shape=shape, ground_m=ground_m, floor_z_m=floor_z_m)
     if driven is not None:
         free_path(seen, driven, config, resolution_m=octree.resolution_m, floor_z_m=floor_z_m)
     return grid_of(seen, config, first=first, resolution_m=octree.resolution_m, floor_z_m=floor_z_m)
@@ -91,14 +91,22 @@ def free_path(
     resolution_m: float,
     floor_z_m: float,
 ) -> None:
-    """Flag the columns as free that what carried the sensor passed; of a level band, those of its storey."""
+    """Flag the columns as free that what carried the sensor passed; of a level band, those of its storey.
+
+    Args:
+        seen: (H, W) flags of ``band_flags`` in the columns of ``driven``; changed in place.
+        driven: The ground that was driven on.
+        config: Heights of the band.
+        resolution_m: Edge of a voxel.
+        floor_z_m: Height of the floor in the world.
+    """
     swept = driven.swept
     if config.above == "floor":
         swept = swept & (np.abs(driven.heights * resolution_m - floor_z_m) <= config.min_height_m)
     seen[swept] = _SEEN_FREE
 
 
-def see_band(
+def band_flags(
     octree: "OctreeMap",
     config: SliceConfig,
     *,
@@ -144,7 +152,14 @@ def grid_of(
     resolution_m: float,
     floor_z_m: float,
 ) -> OccupancyGrid:
-    """Return the flags of ``see_band`` as a grid, cropped to its known cells.
+    """Return the flags of ``band_flags`` as a grid, cropped to its known cells.
+
+    Args:
+        seen: (H, W) the flags.
+        config: Heights of the band, for the error, and the smallest group of occupied cells.
+        first: (2,) x and y keys of the column of row 0 and column 0.
+        resolution_m: Edge of a voxel.
+        floor_z_m: Height of the floor in the world, for the error.
 
     Raises:
         DataError: No voxel of the band is known.
