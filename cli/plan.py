@@ -124,7 +124,7 @@ def plan(
 
 
 def _keep_out(built: "Run | MergedMap") -> "Callable[[Points], NDArray[np.bool_]] | None":
-    """Return what tells of points whether they lie in a keep-out region; None if there are none."""
+    """Return the function that marks points in keep-out regions; None if there are no regions."""
     import numpy as np
 
     from mapper.export.run_maps import editor_of

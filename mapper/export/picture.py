@@ -115,7 +115,7 @@ def _draw_doubtful(axes: "Axes", poses: UncertainPoses) -> None:
     """Draw the stretches whose poses may be wrong over the estimate."""
     count = int(poses.is_doubtful.sum())
     label = f"{count} doubtful frame{'' if count == 1 else 's'}"
-    for first, last in stretches(poses.is_doubtful, beside=1):
+    for first, last in stretches(poses.is_doubtful, margin=1):
         ends = poses.trajectory.positions_world[first : last + 1, :2].T
         axes.plot(*ends, ".-", color=hex_of(DOUBTFUL), linewidth=2.6, markersize=4.0, label=label)
         label = ""

@@ -34,7 +34,7 @@ def maps_of(run: Run) -> Maps:
         DataError: A grid cannot be read.
     """
     moved = Cloud(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))
-    if (run.path / files.DYNAMIC).exists():  # runs of before 2026-11-22 have none
+    if (run.path / files.DYNAMIC).exists():  # runs made before 2026-11-22 have none
         moved = read_cloud(run.file(files.DYNAMIC))
     return Maps(
         octree=run.octree,

@@ -169,7 +169,7 @@ class MergedMap:
         """Return the poses in the map of the frames that a run's maps are made from.
 
         Raises:
-            RunError: The map is of before 2026-11-22, or its file is missing.
+            RunError: The map was made before 2026-11-22, or its file is missing.
         """
         path = self.path / run.folder / files.TRAJECTORY
         if not path.is_file():
@@ -190,7 +190,7 @@ class MergedMap:
         """Floor that a robot can drive on, of the storey on which the first run begins.
 
         Raises:
-            RunError: There is none; the manifest's notes say why, unless the map is of before 2026-11-22.
+            RunError: There is none; the manifest's notes say why, unless the map was made before 2026-11-22.
         """
         if not (self.path / f"{files.TRAVERSABLE}.yaml").is_file():
             why = next(

@@ -100,7 +100,7 @@ def plan_3d(
         start_world: (3,) metres.
         goal_world: (3,) metres.
         config: Radius, and whether unknown voxels are blocked.
-        keep_out: Tells of (N, 3) points, metres, which of them are blocked besides.
+        keep_out: Returns which of (N, 3) points, metres, are blocked in addition.
         limit_bytes: Limit of the working space.
 
     Raises:

@@ -233,7 +233,7 @@ class OctreeMap:
     def are_near_occupied(
         self, points_world: Points | Points32, *, max_distance_m: float
     ) -> NDArray[np.bool_]:
-        """Return the (N,) mask of (N, 3) points, metres, in occupied voxels or so near to one's centre."""
+        """Return the (N,) mask of (N, 3) points, metres, in occupied voxels or near the centre of one."""
         near = self.are_occupied(points_world)
         nearest = self.nearest_obstacles(points_world[~near].astype(np.float64), max_range_m=max_distance_m)
         near[~near] = np.isfinite(nearest.distances_m)
@@ -242,7 +242,17 @@ class OctreeMap:
     def cast_rays(
         self, origins_world: Points, directions_world: Points, *, max_range_m: float, through_unknown: bool
     ) -> RayEnds:
-        """Return the first occupied voxel along rays; see :mod:`mapper.octree.first_obstacles`."""
+        """Return the first occupied voxel along N rays, as OctoMap's ``castRay`` finds it.
+
+        Args:
+            origins_world: (N, 3) metres.
+            directions_world: (N, 3) of any length but zero.
+            max_range_m: Rays end without a hit once a voxel's centre is further away.
+            through_unknown: Pass unknown voxels; otherwise a ray ends, without a hit, in the first.
+
+        Raises:
+            DataError: Shapes differ, a direction is zero or not finite, or an origin has no key.
+        """
         return first_obstacles(
             self.blocks,
             origins_world,
@@ -346,7 +356,7 @@ class OctreeMap:
         return coarse
 
     def forget(self, voxels: int) -> None:
-        """Count so many voxels less as known, after their log-odds were set to NaN."""
+        """Reduce the number of known voxels, after the log-odds of some were set to NaN."""
         self._known -= voxels
 
     def set_free(self, slots: NDArray[np.int64], voxels: NDArray[np.bool_]) -> int:

@@ -119,7 +119,7 @@ def _sizes(counts: Sequence[int]) -> list[int]:
 
 
 def parse_map(path: Path, data: bytes) -> tuple[OctreeConfig, list[NDArray[Any]]]:
-    """Return the settings and the arrays of a file's bytes, which begin with ``MAGIC``.
+    """Return the settings and the arrays of a file that begins with ``MAGIC``; their order is the module's.
 
     Args:
         path: Path of the file, for errors.
@@ -180,7 +180,11 @@ def _held(path: Path, steps: NDArray[np.int64], bits: NDArray[np.uint8], count: 
 def voxels_of(
     path: Path, columns: Sequence[NDArray[Any]]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.float32]]:
-    """Return the arguments of :meth:`OctreeMap.restore_blocks`, from the arrays of a file.
+    """Return the arguments of :meth:`OctreeMap.restore_blocks`.
+
+    Args:
+        path: Path of the file, for errors.
+        columns: Of ``parse_map``.
 
     Raises:
         MapFileError: The arrays contradict each other.
@@ -193,6 +197,12 @@ def restore_attributes(
     path: Path, columns: Sequence[NDArray[Any]], blocks: BlockStore, layer: AttributeLayer
 ) -> None:
     """Fill the attributes of a map that has its voxels, from the arrays of a file.
+
+    Args:
+        path: Path of the file, for errors.
+        columns: Of ``parse_map``.
+        blocks: The map's.
+        layer: The map's attributes, still empty.
 
     Raises:
         MapFileError: The arrays contradict each other or the map.

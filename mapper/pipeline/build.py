@@ -73,7 +73,7 @@ def build(
         progress: Receives stages, counts and notes.
         observer: Receives every tracked frame and the results.
         overwrite: Replace a run that is there, once the new one is whole.
-        fresh: Begin anew, whatever an unfinished build has left.
+        fresh: Begin anew, even if an unfinished build can be continued.
         checkpoint_s: Seconds between two checkpoints, at least; None makes none, and begins anew, as does a
             caller's own odometry.
 
@@ -87,7 +87,7 @@ def build(
         progress.note(warning.sentence)
     poses = odometry if isinstance(odometry, Trajectory) else None
     if odometry is not None and poses is None:
-        checkpoint_s = None  # what the state of a caller's own class is, only the caller knows
+        checkpoint_s = None  # the state of a caller's own class cannot be kept
     identity = identity_of(source, config, poses)
     keeps = partial(kept_from_before, identity=identity, fresh=fresh or checkpoint_s is None)
     with (
@@ -101,7 +101,7 @@ def build(
         solved = kept_result(checkpoints, "solved", lambda: steps.solve(steps.track(odometry)))
         observer.on_levelled(solved.level.T_level_world)
         steps.save(solved)
-        from mapper.pipeline.fuse import fuse_into  # its imports take time, which the first frame need not
+        from mapper.pipeline.fuse import fuse_into  # takes long to load: the first frame does not wait
 
         fuse_into(writer, source, config, progress, observer=observer, checkpoints=checkpoints)
     remove_checkpoints(out)

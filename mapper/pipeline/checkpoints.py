@@ -8,8 +8,8 @@ They lie in a folder of their own in ``OUT.partial``, and come from three steps:
 - while frames are fused, the file of their updates, with a digest of what of it is on the disk
   (``fuse_checkpoints``).
 
-What is written is taken in the thread that works, between two frames; another thread writes it and waits for
-the disk. A disk that is full ends the checkpoints, not the build.
+What is written is copied in the thread that works, between two frames; another thread writes it and waits
+for the disk. A disk that is full ends the checkpoints, not the build.
 """
 
 import shutil
@@ -135,16 +135,16 @@ class Checkpoints:
 
     def _replace_by(self, step: str, result: object) -> None:
         """Write a result, and delete the checkpoints that led to it, but for the journal it refers to."""
-        self.taken(StateFile(self.folder, step), 0, result)()
+        self.snapshot(StateFile(self.folder, step), 0, result)()
         kept = {IDENTITY, _TIMES, self.journal.path.name, f"{step}.0"}
         for path in self.folder.iterdir():
             if path.name not in kept:
                 path.unlink()
 
-    def taken(
+    def snapshot(
         self, states: StateFile, number: int, result: object, *, fixed: Mapping[str, object] | None = None
     ) -> Callable[[], None]:
-        """Copy a result, or a state on the way to it; return what writes it and the journal it refers to.
+        """Copy a result, or a state on the way to it; return the function that writes it and its journal.
 
         Args:
             states: Where to write it.
@@ -232,7 +232,7 @@ class Checkpoints:
         """Take a checkpoint now, and write it in another thread.
 
         Args:
-            take: Copies what changes, and returns what writes it.
+            take: Copies what changes, and returns the function that writes it.
         """
         self._last_s, self._last_cpu_s = time.monotonic(), time.process_time()
         began_s = time.thread_time()

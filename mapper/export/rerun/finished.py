@@ -28,7 +28,7 @@ def show_run(run: Run, target: str) -> None:
         log.poses(results.trajectory)
         log_run(log, results, maps)
         log.diagnostics(results.records)
-        log.about(in_words(run, name=run.path.name))
+        log.about(about_text(run, name=run.path.name))
 
 
 def log_run(log: RerunLog, results: RunResults, maps: Maps) -> None:
@@ -59,7 +59,7 @@ def extent(results: RunResults, maps: Maps) -> Array:
     return np.array([points_world.min(axis=0), points_world.max(axis=0)])
 
 
-def in_words(run: Run, *, name: str) -> str:
+def about_text(run: Run, *, name: str) -> str:
     """Return a run as Markdown: its log, counts, odometry and times."""
     manifest = run.manifest
     counts, timing, verdict = manifest.counts, manifest.timing, run.verdict
