@@ -25,7 +25,8 @@ from mapper.core.timebase import nearest
 from mapper.octree import kernels
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
-from mapper.octree.octomap_file import read_octree, write_bt, write_ot
+from mapper.octree.octomap_file import write_bt, write_ot
+from mapper.octree.reading import read_octree
 from mapper.sources import open_source
 from mapper.sources.config import SourceConfig
 from mapper.sources.trajectory_files import read_kitti

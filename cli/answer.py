@@ -74,7 +74,7 @@ def made(path: Path, **more: object) -> Answer:
 
 
 def record_in(folder: Path, name: str = MANIFEST_NAME) -> dict[str, Any]:
-    """Return the folder's path and what the JSON file in it tells."""
+    """Return the folder's path and the content of the JSON file in it."""
     return {"path": folder, **json.loads((folder / name).read_bytes())}
 
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from mapper.runtime.progress import Progress
     from mapper.sources.base import Log
 
-    Onlooker = Callable[[Log, BuildConfig], AbstractContextManager[Observer]]
+    ObserverFactory = Callable[[Log, BuildConfig], AbstractContextManager[Observer]]
 
 
 def build(
@@ -90,7 +90,7 @@ def build(
     """
     out = place_of(out, RUNS / name_of(log), overwrite=overwrite)
     overrides = merged(selection(first, last, stride, require_truth), set_)
-    onlooker = _onlooker(rerun, step=step, overwrite=overwrite)
+    make_observer = _observer_factory(rerun, step=step, overwrite=overwrite)
     if onto is None:
         run, metrics = built(
             log,
@@ -101,7 +101,7 @@ def build(
             fresh=fresh,
             output=output,
             prompts=step,
-            onlooker=onlooker,
+            make_observer=make_observer,
         )
     else:
         _refuse_both(config, onto, rerun)
@@ -131,7 +131,7 @@ def built(
     output: Output,
     fresh: bool = False,
     prompts: bool = False,
-    onlooker: "Onlooker | None" = None,
+    make_observer: "ObserverFactory | None" = None,
 ) -> "tuple[Run, Sequence[Metric]]":
     """Build a run and judge its trajectory by the truth, if the log has any."""
     from mapper.config.loading import load_config, load_source_config
@@ -147,8 +147,8 @@ def built(
     for note in source.notes:
         progress.note(note)
     preview = _preview(source, out, progress)
-    with nullcontext(preview) if onlooker is None else onlooker(source, config) as observer:
-        watching = preview if onlooker is None else Observers(observer, preview)
+    with nullcontext(preview) if make_observer is None else make_observer(source, config) as observer:
+        watching = preview if make_observer is None else Observers(observer, preview)
         run = build_run(
             source, config, out, progress=progress, observer=watching, overwrite=overwrite, fresh=fresh
         )
@@ -158,7 +158,7 @@ def built(
 
 
 def _preview(source: "Log", out: Path, progress: "Progress") -> "Observer":
-    """Return the observer that keeps a picture beside the files that are being written."""
+    """Return the observer that keeps a picture among the files that are being written."""
     from mapper.export.preview import PREVIEW, Preview
     from mapper.runtime.atomic import partial_of
 
@@ -166,7 +166,7 @@ def _preview(source: "Log", out: Path, progress: "Progress") -> "Observer":
     return Preview(shown.resolve(), source, on_first=lambda: progress.note(f"first picture: {shown}"))
 
 
-def _onlooker(rerun: str | None, *, step: bool, overwrite: bool) -> "Onlooker | None":
+def _observer_factory(rerun: str | None, *, step: bool, overwrite: bool) -> "ObserverFactory | None":
     """Return the observer of a build, refusing at once what would fail at its end."""
     from mapper.core.errors import ConfigError, ViewerError
 
@@ -181,7 +181,7 @@ def _onlooker(rerun: str | None, *, step: bool, overwrite: bool) -> "Onlooker | 
     refuse_existing(Path(target), overwrite=overwrite, option="--rerun")
 
     @contextmanager
-    def onlooker(source: "Log", config: "BuildConfig") -> "Iterator[Observer]":
+    def make_observer(source: "Log", config: "BuildConfig") -> "Iterator[Observer]":
         from mapper.export.rerun.live import live_recording
 
         is_built = False
@@ -194,7 +194,7 @@ def _onlooker(rerun: str | None, *, step: bool, overwrite: bool) -> "Onlooker | 
                 raise
             print(f"mapper: {error}", file=sys.stderr)
 
-    return onlooker
+    return make_observer
 
 
 def appended(

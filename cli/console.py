@@ -95,8 +95,8 @@ class Lines(_Notes):
             now, rate = time.monotonic(), pace.rate(done)
             if now - said > _SECONDS_BETWEEN_LINES and 0 < done < total:
                 said = now
-                told = [f"{done}/{total}", _rate_text(rate), _left_text(rate, total - done)]
-                self._show(f"{name}: {', '.join(text for text in told if text)}")
+                parts = [f"{done}/{total}", _rate_text(rate), _left_text(rate, total - done)]
+                self._show(f"{name}: {', '.join(text for text in parts if text)}")
 
         yield report
         self._show(f"{name}: {reached[0]}/{reached[1]} in {time.monotonic() - began:.1f} s")

@@ -51,7 +51,7 @@ def demo(
 
 
 def _is_made(log: Path, scene: "SynthConfig") -> bool:
-    """Tell whether an earlier demo left this very log, which takes longer to make than to map."""
+    """Return whether an earlier demo left this very log, which takes longer to make than to map."""
     made_from = log / "scene.json"
     return made_from.is_file() and json.loads(made_from.read_text())["config"] == scene.model_dump(
         mode="json"

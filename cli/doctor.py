@@ -77,13 +77,13 @@ def doctor(
 
 def _warmed(run: Path | None, progress: "Progress") -> "list[Finding]":
     from mapper.core.errors import ConfigError
-    from mapper.doctor.machine import look_at_kernels
+    from mapper.doctor.machine import check_kernels
     from mapper.pipeline.warm_up import compile_kernels
 
     if run is not None:
         raise ConfigError(f"--warm: compiles kernels for all builds, so it takes no run; got {run}")
     compile_kernels(progress=progress)
-    return [look_at_kernels()]
+    return [check_kernels()]
 
 
 def _accept(run: Path | None, names: "Sequence[str]") -> None:

@@ -18,7 +18,7 @@ def prepare_environment() -> None:
 
 
 def has_compiled_code() -> bool:
-    """Tell whether numba has compiled our kernels before; without it the first verb takes a minute longer."""
+    """Return whether numba has compiled our kernels before; else the first verb takes a minute longer."""
     import mapper
 
     cache = os.environ.get("NUMBA_CACHE_DIR") or Path(mapper.__file__).parent

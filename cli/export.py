@@ -40,8 +40,9 @@ def export(
     """
     from mapper.config.loading import overridden
     from mapper.export.exporters import export as export_run
-    from mapper.run.folder import MapFolder, moved_log, open_run
+    from mapper.run.folder import moved_log, open_run
     from mapper.run.manifest import is_merged_map
+    from mapper.run.map_folder import MapFolder
 
     built: MapFolder
     if is_merged_map(run):

@@ -89,8 +89,8 @@ def plan(
     from mapper.navigation.config import PlanConfig
     from mapper.navigation.planner import plan_2d, plan_3d
     from mapper.navigation.storey_planner import plan_storeys
-    from mapper.octree.octomap_file import read_octree
-    from mapper.octree.slice import with_obstacles
+    from mapper.octree.grid import with_obstacles
+    from mapper.octree.reading import read_octree
     from mapper.run import files
     from mapper.run.folder import Run, open_run
     from mapper.run.manifest import is_merged_map
@@ -122,7 +122,7 @@ def plan(
 
 
 def _keep_out(built: "Run | MergedMap") -> "Callable[[Points], NDArray[np.bool_]] | None":
-    """Return what tells of points whether they lie in a keep-out region; None if there are none."""
+    """Return the function that marks points in keep-out regions; None if there are no regions."""
     import numpy as np
 
     from mapper.export.run_maps import editor_of

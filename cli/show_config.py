@@ -54,9 +54,11 @@ def show_config(
     shown = [setting for setting in found if not setting.is_table] or found
     document = {"settings": [_document(setting, values) for setting in shown]}
     if docs or len({setting.key for setting in shown}) == 1:
-        beside = [] if docs else _neighbours(shown[0], every)
+        siblings = [] if docs else _neighbours(shown[0], every)
         *first, last = shown
-        text = "\n\n".join([*(_explained(each, values) for each in first), _explained(last, values, beside)])
+        text = "\n\n".join(
+            [*(_explained(each, values) for each in first), _explained(last, values, siblings)]
+        )
     else:
         text = rows_text([(setting.key, _in_short(setting, values)) for setting in shown])
     return Answer(document, text, "\n\n".join(_explained(setting, values) for setting in shown))
@@ -128,17 +130,17 @@ def _in_short(setting: "Setting", values: Mapping[str, Any]) -> str:
 
 
 def _neighbours(setting: "Setting", every: "Sequence[Setting]") -> list[tuple[str, str]]:
-    """Return a row of the settings beside it in its table."""
+    """Return a row of the other settings in its table."""
     table = setting.key.rpartition(".")[0]
-    beside = [
+    siblings = [
         name
         for name in dict.fromkeys(each.key for each in every)
         if name != setting.key and name.rpartition(".")[0] == table
     ]
-    if not beside:
+    if not siblings:
         return []
-    shown = [name.rpartition(".")[2] for name in beside[:_MOST_NEIGHBOURS]]
-    more = f", … (mapper config {table} lists {len(beside) + 1})" if len(beside) > len(shown) else ""
+    shown = [name.rpartition(".")[2] for name in siblings[:_MOST_NEIGHBOURS]]
+    more = f", … (mapper config {table} lists {len(siblings) + 1})" if len(siblings) > len(shown) else ""
     return [("beside", ", ".join(shown) + more)]
 
 

@@ -30,7 +30,7 @@ class Stepping:
         _say("stepping: Enter for the next frame, c and Enter to run on")
 
     def on_frame(self, step: "Step", /) -> None:
-        """Tell how the frame went, and wait."""
+        """Print how the frame went, and wait."""
         self._other.on_frame(step)
         self._frames += 1
         if not self._waits:

@@ -89,7 +89,7 @@ def _resumed_text(timing: Timing) -> str:
 
 
 def summary_text(run: Run, metrics: Sequence[Metric]) -> str:
-    """Return all that is to be told of a run, a line per fact."""
+    """Return the summary of a run, a line per fact."""
     counts, timing = run.manifest.counts, run.manifest.timing
     rows = [
         ("frames", counts.frames_text),

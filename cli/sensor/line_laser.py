@@ -75,8 +75,8 @@ def line_laser(
     truth = read_labels(labels, images=paths, width_px=known.width_px) if labels else {}
     T_world_sensor = None
     if wheels is not None:
-        T_world_sensor, told = sensor_poses(wheels, known)
-        notes += told
+        T_world_sensor, more = sensor_poses(wheels, known)
+        notes += more
     with atomic_folder(out, FOLDER, overwrite=overwrite) as folder:
         scans, more = scan_images(paths, stamps_ns, known, config, progress=progress)
         notes += more

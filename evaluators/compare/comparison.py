@@ -196,7 +196,7 @@ class MethodJob:
                 tracker.add(method.view(frame))
 
     def _follow(self, run: "MethodRun", reader: FrameReader) -> tuple[Stamps, list[Skipped]]:
-        """Show the method every frame; return the stamps of those that can be read, and the others."""
+        """Give the method every frame; return the stamps of those that can be read, and the others."""
         frames_ns: list[int] = []
         skipped: list[Skipped] = []
         with self.progress.stage(self.method) as report:
@@ -248,7 +248,7 @@ class MethodRun:
         self._broke = ""
 
     def add(self, frame: PreparedFrame) -> None:
-        """Show the method the next frame, unless it has broken down."""
+        """Give the method the next frame, unless it has failed."""
         if self._broke:
             return
         self._T_body_seen = np.eye(4) if self._method.sees_images else frame.T_body_scan
@@ -262,7 +262,7 @@ class MethodRun:
         self._frames += 1
 
     def record(self) -> dict[str, Any]:
-        """Return counts, CPU seconds, the poses of the body, and why the method broke down if it did."""
+        """Return counts, CPU seconds, the poses of the body, and why the method failed if it did."""
         began = time.process_time()
         trajectory = trajectory_from(())
         if self._tracker is not None and not self._broke:

@@ -148,7 +148,7 @@ def _caption(run: OdometryRun) -> str:
 
 
 def _by_guess(comparison: Comparison) -> dict[str, dict[str, Array]]:
-    """Return the errors of all registrations; methods that use no guess stand beside every kind."""
+    """Return the errors of all registrations; methods that use no guess are listed with every kind."""
     methods = dict.fromkeys(str(trial["method"]) for trial in comparison.trials)
     return {
         f"guess off by up to {guess.text}": {

@@ -74,7 +74,7 @@ def depth_at(
     keep_tilt: bool = False,
     progress: Progress = SILENT,
 ) -> tuple[DepthLevel, ResidualMap]:
-    """Measure a camera that stands still before a plane at a known distance.
+    """Measure a camera that stands still in front of a plane at a known distance.
 
     Every figure is the median over the frames. Unless ``keep_tilt``, the plane that depths are compared with
     is tilted as they show it, and goes through ``distance_m`` on the optical axis: a degree off the

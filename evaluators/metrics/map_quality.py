@@ -58,7 +58,7 @@ def map_quality(
     """
     world = world or ("truth" if reference.in_truth else "map")
     cloud = read_cloud(run.file(files.CLOUD), scale=1.0).points
-    T_map_reference = _laid_by_truth(run) if world == "truth" else np.eye(4)
+    T_map_reference = _aligned_by_truth(run) if world == "truth" else np.eye(4)
     how = "by the truth's poses" if world == "truth" else "in the run's own world"
     if register:
         refined = _registered(reference, cloud, T_map_reference, voxel_m=run.octree.resolution_m)
@@ -74,7 +74,7 @@ def map_quality(
     return MapQuality(tuple(metrics), check)
 
 
-def _laid_by_truth(run: Run) -> Transform:
+def _aligned_by_truth(run: Run) -> Transform:
     """Return T_map_truth, by all poses that have a true one.
 
     Positions alone would leave a log that hardly leaves its place to turn about it.

@@ -17,7 +17,7 @@ from mapper.evaluators.metrics.occupancy import (
 )
 from mapper.evaluators.metrics.scenes import SCENE, scene_distance
 from mapper.octree.map import OctreeMap
-from mapper.octree.octomap_file import read_octree
+from mapper.octree.reading import read_octree
 from mapper.run.files import OCTREE_MAP
 from mapper.sources.cloud_files import ENDINGS, read_cloud
 

@@ -20,8 +20,8 @@ def merged_map_metrics(
 ) -> tuple[list[Metric], list[str]]:
     """Return what a merged map is worth, and notes on runs of which no truth is known.
 
-    With a truth, a run's poses in the map are aligned with it by themselves, which tells of bent paths, and
-    those of all runs by one alignment, which tells of misplaced runs too.
+    With a truth, a run's poses in the map are aligned with it by themselves, which shows bent paths, and
+    those of all runs by one alignment, which shows misplaced runs too.
 
     Args:
         merged: A finished merged map.
@@ -82,7 +82,7 @@ def merged_map_quality(merged: MergedMap, reference: Reference, *, voxels: int) 
 
 
 def _with_truth(merged: MergedMap, run: RunInMap, name: str) -> Matched | str:
-    """Return a run's poses in the map beside its truth, or why there are none."""
+    """Return a run's poses in the map and its truth, or why there are none."""
     try:
         truth = open_run(Path(run.path)).truth
         if truth is None:

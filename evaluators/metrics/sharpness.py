@@ -160,8 +160,8 @@ def _is_double(offsets: Array, *, normal: Array, radius_m: float) -> bool:
     the parts differ most (Otsu 1979). The sheets' distance is that of the parts' means over their spread.
     """
     along = (offsets * normal).sum(axis=1)
-    beside = (offsets**2).sum(axis=1) - along * along <= 0.25 * radius_m * radius_m
-    ordered = np.sort(along[beside])
+    near_normal = (offsets**2).sum(axis=1) - along * along <= 0.25 * radius_m * radius_m
+    ordered = np.sort(along[near_normal])
     if len(ordered) < 3:
         return False
     sums, below = np.cumsum(ordered), np.arange(1, len(ordered))

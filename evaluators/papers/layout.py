@@ -14,7 +14,7 @@ _DIGITS = 3
 
 
 def compares(table: PaperTable) -> bool:
-    """Return whether any figure of ours stands beside a printed one."""
+    """Return whether any figure of ours is compared with a printed one."""
     return any(cell.published is not None and (cell.ours or cell.failures) for cell in table.cells)
 
 

@@ -127,8 +127,8 @@ def cells_of(table: str, results: Results, printed: Figures) -> tuple[PaperCell,
 
 def filled(name: str, table: PaperTable, cells: Sequence[PaperCell], results: Results) -> PaperTable:
     """Return a table with more cells, and with the notes of their measurements, each sentence once."""
-    told = (record["note"] for result in results.values() for _, record in _records_of(name, result))
-    notes = dict.fromkeys(str(note) for note in told if note)
+    texts = (record["note"] for result in results.values() for _, record in _records_of(name, result))
+    notes = dict.fromkeys(str(note) for note in texts if note)
     return replace(table, cells=(*table.cells, *cells), notes=(*table.notes, *notes))
 
 

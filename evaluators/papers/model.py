@@ -121,7 +121,7 @@ class PaperPath:
 
 @dataclass(frozen=True, slots=True)
 class Reproduction:
-    """A paper's tables measured again, and what belongs beside them.
+    """A paper's tables measured again, and what is shown with them.
 
     Attributes:
         paper: Author, title, year.

@@ -155,7 +155,7 @@ def _write_paths(path: Path, paths: Sequence[PaperPath]) -> None:
 
 
 def _page(title: str, panels: int, *, height_in: float = _HEIGHT_IN) -> tuple["Figure", int, int]:
-    """Return a page for so many panels, and how many are beside and below one another."""
+    """Return a page for a number of panels, and the numbers of its columns and rows."""
     across = min(_COLUMNS, panels)
     down = -(-panels // across)
     return page(title, columns=across, rows=down, width_in=_WIDTH_IN, height_in=height_in), across, down

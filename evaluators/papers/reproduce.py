@@ -63,7 +63,7 @@ class Request:
 def reproduce(
     request: Request, out: Path, *, workers: Workers = IN_PROCESS, progress: Progress = SILENT
 ) -> Reproduction:
-    """Measure what is not measured yet, and write all tables, ours beside the printed figures.
+    """Measure what is not measured yet, and write all tables, ours with the printed figures.
 
     Args:
         request: What to measure.

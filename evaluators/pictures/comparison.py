@@ -95,9 +95,9 @@ def write_registration_errors(
         title: Headline.
     """
     names = list(dict.fromkeys(name for kind in errors_m.values() for name in kind))
-    figure = page(title, columns=len(errors_m), rows=1, width_in=4.2, height_in=3.9, beside_in=_LEGEND_IN)
+    figure = page(title, columns=len(errors_m), rows=1, width_in=4.2, height_in=3.9, legend_in=_LEGEND_IN)
     for number, (kind, of_name) in enumerate(errors_m.items()):
-        axes = panel(figure, number, columns=len(errors_m), rows=1, beside_in=_LEGEND_IN)
+        axes = panel(figure, number, columns=len(errors_m), rows=1, legend_in=_LEGEND_IN)
         axes.axvline(max_error_m, color=FAINT, linewidth=0.8, linestyle="dashed")
         _draw_shares(axes, of_name, names)
         shares = "share of the pairs" if number == 0 else ""

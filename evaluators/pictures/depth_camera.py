@@ -159,14 +159,14 @@ def write_residuals(path: Path, maps: Sequence[ResidualMap], *, title: str) -> N
         row, column = divmod(number, columns)
         left_in, bottom_in = column * width_in + 0.1, (rows - 1 - row) * cell_in + 0.1
         axes = figure.add_axes(tuple([left_in, bottom_in, image_in, cell_in - _CAPTION_IN] / full))
-        beside = figure.add_axes(
+        colorbar_axes = figure.add_axes(
             tuple([left_in + image_in + 0.06, bottom_in, 0.12, cell_in - _CAPTION_IN] / full)
         )
         known = np.abs(one.error_m[~np.isnan(one.error_m)])
         most_mm = _MM * max(float(np.percentile(known, _CLIP_PERCENT)), 1e-6)
         axes.imshow(one.image, cmap="gray", vmin=0, vmax=255)
         shown = axes.imshow(_MM * one.error_m, cmap="RdBu_r", vmin=-most_mm, vmax=most_mm)
-        figure.colorbar(shown, cax=beside).ax.tick_params(labelsize=7, colors=FAINT)
+        figure.colorbar(shown, cax=colorbar_axes).ax.tick_params(labelsize=7, colors=FAINT)
         caption(axes, title=f"{one.caption}; mm")
         axes.set_axis_off()
     save(figure, path)

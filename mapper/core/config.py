@@ -99,12 +99,12 @@ def _delete(tree: Any, loc: Sequence[Any]) -> str:
     node: Any = tree
     parent: Any = tree
     names: list[Any] = []
-    is_kind_told = False
+    is_kind_seen = False
     for part in loc:
-        if isinstance(node, dict) and part == node.get("kind") and not is_kind_told:
-            is_kind_told = True
+        if isinstance(node, dict) and part == node.get("kind") and not is_kind_seen:
+            is_kind_seen = True
         elif isinstance(node, list) or part in node:
             names.append(part)
-            parent, node, is_kind_told = node, node[part], False
+            parent, node, is_kind_seen = node, node[part], False
     del parent[names[-1]]
     return ".".join(str(name) for name in names)

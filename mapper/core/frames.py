@@ -259,6 +259,6 @@ Sensor = Literal["rgbd", "lidar"]
 
 def _checksum(image: Image | DepthImage) -> int | None:
     first = image.flat[0]
-    if (image[0] == first).all() and (image == first).all():  # the first row tells it of nearly all images
+    if (image[0] == first).all() and (image == first).all():  # the first row decides it for nearly all images
         return None
     return int(isal_zlib.crc32(np.ascontiguousarray(image)))

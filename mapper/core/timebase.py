@@ -65,15 +65,15 @@ def seconds_text_from_ns(stamp_ns: int) -> str:
     return f"{sign}{whole}.{digits[:6]}{digits[6:].rstrip('0')}"
 
 
-def stretches(marked: ArrayLike, *, beside: int = 0) -> list[tuple[int, int]]:
+def stretches(marked: ArrayLike, *, margin: int = 0) -> list[tuple[int, int]]:
     """Return the first and the last index of each stretch of frames that are marked.
 
     Args:
         marked: (N,) bool.
-        beside: So many frames more on either side, where there are any.
+        margin: Number of frames to add on either side, as far as there are any.
     """
     edges = np.diff(np.concatenate([[False], np.asarray(marked, np.bool_), [False]]).astype(np.int8))
-    first, last = np.flatnonzero(edges == 1) - beside, np.flatnonzero(edges == -1) - 1 + beside
+    first, last = np.flatnonzero(edges == 1) - margin, np.flatnonzero(edges == -1) - 1 + margin
     return list(zip(first.clip(0).tolist(), last.clip(max=len(edges) - 2).tolist(), strict=True))
 
 

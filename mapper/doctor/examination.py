@@ -4,21 +4,21 @@ from collections.abc import Callable
 
 from mapper.doctor import machine
 from mapper.doctor.finding import Finding
-from mapper.doctor.libraries import Requirement, look_at_library, requirements
+from mapper.doctor.libraries import Requirement, check_library, requirements
 from mapper.doctor.self_tests import SELF_TESTS
-from mapper.doctor.system_libraries import look_at_system_libraries
+from mapper.doctor.system_libraries import check_system_libraries
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 
 _MACHINE: tuple[Callable[[], Finding], ...] = (
-    machine.look_at_python,
-    machine.look_at_glibc,
-    machine.look_at_threads,
-    machine.look_at_memory,
-    machine.look_at_disk,
-    machine.look_at_kernels,
-    machine.look_at_bytecode,
-    look_at_system_libraries,
+    machine.check_python,
+    machine.check_glibc,
+    machine.check_threads,
+    machine.check_memory,
+    machine.check_disk,
+    machine.check_kernels,
+    machine.check_bytecode,
+    check_system_libraries,
 )
 
 
@@ -28,7 +28,7 @@ def examine(*, progress: Progress = SILENT) -> list[Finding]:
     findings = [look() for look in _MACHINE]
     with progress.stage("try") as report:
         tried = ordered_map(
-            lambda name: look_at_library(name, wanted.get(name, Requirement())),
+            lambda name: check_library(name, wanted.get(name, Requirement())),
             SELF_TESTS,
             workers=machine.processors(),
         )

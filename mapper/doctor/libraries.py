@@ -55,7 +55,7 @@ def requirements() -> dict[str, Requirement]:
     return found
 
 
-def look_at_library(name: str, wanted: Requirement = _ANY) -> Finding:
+def check_library(name: str, wanted: Requirement = _ANY) -> Finding:
     """Return whether a library is installed, of at least a version, and passes its self-test."""
     least = wanted.least
     mend = f"pip install '{name}>={least}'"

@@ -19,7 +19,7 @@ _LEAST_DISK_GB = 1.0
 _THREADS = "OMP_NUM_THREADS"
 
 
-def look_at_python() -> Finding:
+def check_python() -> Finding:
     """Return our version and the interpreter's."""
     machine = f"{sys.platform} {platform.machine()}"
     text = f"mapper {mapper.__version__} on Python {platform.python_version()}, {machine}"
@@ -28,7 +28,7 @@ def look_at_python() -> Finding:
     return Finding("python", "well", text)
 
 
-def look_at_glibc() -> Finding:
+def check_glibc() -> Finding:
     """Return the C library's version; wheels are built for one and run on any later."""
     name, version = platform.libc_ver()
     text = f"{name or 'another C library than glibc'} {version}".strip()
@@ -47,7 +47,7 @@ def processors() -> int:
     return os.cpu_count() or 1
 
 
-def look_at_threads() -> Finding:
+def check_threads() -> Finding:
     """Return how many processors we may use, and whether libraries start threads of their own."""
     each = os.environ.get(_THREADS, "unset")
     text = f"{processors()} processors for us, {_THREADS} is {each}"
@@ -58,7 +58,7 @@ def look_at_threads() -> Finding:
     return Finding("threads", "well", text)
 
 
-def look_at_memory() -> Finding:
+def check_memory() -> Finding:
     """Return how much memory is there."""
     meminfo = Path("/proc/meminfo")
     if not meminfo.exists():
@@ -72,7 +72,7 @@ def look_at_memory() -> Finding:
     return Finding("memory", "well", text)
 
 
-def look_at_disk() -> Finding:
+def check_disk() -> Finding:
     """Return how much room there is for runs here, and for scratch files."""
     places = {"here": Path.cwd(), "scratch": Path(tempfile.gettempdir())}
     free_gb = {name: shutil.disk_usage(place).free / 1e9 for name, place in places.items()}
@@ -82,7 +82,7 @@ def look_at_disk() -> Finding:
     return Finding("disk", "well", text)
 
 
-def look_at_bytecode() -> Finding:
+def check_bytecode() -> Finding:
     """Return whether the next start need not compile Python's own modules and numpy's again."""
     modules = [module for name, module in sys.modules.items() if name.split(".")[0] in ("mapper", "numpy")]
     missing = sum(not has_bytecode(module) for module in modules)
@@ -93,7 +93,7 @@ def look_at_bytecode() -> Finding:
     return Finding("bytecode", "warning", text, "mapper doctor --warm keeps them, and halves the start")
 
 
-def look_at_kernels() -> Finding:
+def check_kernels() -> Finding:
     """Return where compiled kernels are kept, whether they can be, and how many there are by now."""
     folder, compiled = kernel_folder(), compiled_kernels()
     text = f"{len(compiled)} compiled kernels kept in {folder}"

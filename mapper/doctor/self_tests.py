@@ -100,8 +100,8 @@ def mcap(folder: Path) -> None:
         writer.add_message(channel, log_time=1, data=b"{}", publish_time=1)
         writer.finish()
     with path.open("rb") as file:
-        told = [message.data for _, _, message in make_reader(file).iter_messages()]
-    _expect(told == [b"{}"], f"read {told}")
+        messages = [message.data for _, _, message in make_reader(file).iter_messages()]
+    _expect(messages == [b"{}"], f"read {messages}")
 
 
 def foxglove(_folder: Path) -> None:
@@ -282,9 +282,9 @@ SELF_TESTS: dict[str, Callable[[Path], None]] = {
 """By the name under which pip knows the library."""
 
 
-def _expect(is_so: object, told: str) -> None:
+def _expect(is_so: object, message: str) -> None:
     if not is_so:
-        raise WrongAnswerError(told)
+        raise WrongAnswerError(message)
 
 
 def _expect_near(found: NDArray[np.floating], wanted: NDArray[np.floating]) -> None:

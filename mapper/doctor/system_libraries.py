@@ -18,7 +18,7 @@ PACKAGES = {
 """What ``readelf -d`` names in our wheels, beyond libc and what they bring themselves."""
 
 
-def look_at_system_libraries(wanted: Iterable[str] = tuple(PACKAGES)) -> Finding:
+def check_system_libraries(wanted: Iterable[str] = tuple(PACKAGES)) -> Finding:
     """Return which shared objects the loader does not find."""
     wanted = list(wanted)
     missing = [name for name in wanted if not _loads(name)]

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from mapper.export.grid import write_values
 from mapper.export.palette import FREE_CELL, OCCUPIED_CELL, UNKNOWN_CELL
 from mapper.navigation.costmap import INSCRIBED, LETHAL, NO_INFORMATION, Costmap, inflate
-from mapper.octree.slice import with_obstacles
-from mapper.run.folder import MapFolder
+from mapper.octree.grid import with_obstacles
+from mapper.run.map_folder import MapFolder
 from mapper.runtime.atomic import write_bytes
 from mapper.runtime.progress import Progress
 

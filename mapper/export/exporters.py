@@ -13,7 +13,7 @@ from mapper.runtime.progress import SILENT, Progress
 
 if TYPE_CHECKING:
     from mapper.config.build import BuildConfig
-    from mapper.run.folder import MapFolder
+    from mapper.run.map_folder import MapFolder
 
 Write = Callable[[Any, Path, Progress], None]
 """Writes one file of a ``Run``, or of any ``MapFolder``, atomically; long jobs report progress."""
@@ -29,7 +29,7 @@ class Exporter:
         file_name: Its name inside the run; some are there since the build. Empty for a folder, which is
             never in the run.
         endings: What another name may end with.
-        beside: Endings of the files that come with it.
+        sidecars: Endings of the files that are written with it.
         settings: The part of the configuration that it reads, if any.
         of_merged: Whether a merged map has it, too.
     """
@@ -38,7 +38,7 @@ class Exporter:
     function: str
     file_name: str
     endings: tuple[str, ...]
-    beside: tuple[str, ...] = ()
+    sidecars: tuple[str, ...] = ()
     settings: str | None = None
     of_merged: bool = False
 
@@ -71,7 +71,7 @@ EXPORTERS = {
         "stored_files:grid",
         "slice.yaml",
         (".yaml", ".yml"),
-        beside=(".pgm", ".png"),
+        sidecars=(".pgm", ".png"),
         of_merged=True,
     ),
     "costmap": Exporter(
@@ -79,7 +79,7 @@ EXPORTERS = {
         "costmap:costmap",
         "costmap.yaml",
         (".yaml", ".yml"),
-        beside=(".pgm", ".png"),
+        sidecars=(".pgm", ".png"),
         settings="costmap",
         of_merged=True,
     ),
@@ -153,7 +153,7 @@ def _recording(run: "MapFolder", exporter: Exporter, path: Path) -> Iterator[Non
     """Record in the manifest what an export writes into the run; files of the build stay as they are."""
     from mapper.run.files import names_of
 
-    written = {path.name, *(path.with_suffix(ending).name for ending in exporter.beside)}
+    written = {path.name, *(path.with_suffix(ending).name for ending in exporter.sidecars)}
     names = written & names_of("poses", "exported maps")
     inside = path.parent.resolve() == run.path.resolve()
     with run.changing(names) if inside and names else nullcontext():
@@ -176,7 +176,7 @@ def _refuse_out(path: Path, exporter: Exporter, *, kind: str, overwrite: bool) -
         raise ConfigError(
             f"{path}: {kind} files end with {' or '.join(exporter.endings)}; choose such a name"
         )
-    for file in (path, *(path.with_suffix(ending) for ending in exporter.beside)):
+    for file in (path, *(path.with_suffix(ending) for ending in exporter.sidecars)):
         if file.is_dir():
             raise RunError(f"{file}: is a folder; name a file")
         refuse_existing(file, overwrite=overwrite)

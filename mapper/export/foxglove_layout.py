@@ -20,13 +20,13 @@ _CURVES = (
 
 
 def layout(run: Run, path: Path, _progress: Progress) -> None:
-    """Write the layout of a run: the map beside the images, the curves and the loops."""
+    """Write the layout of a run: the map at the left, the images, the curves and the loops at the right."""
     write_text(path, layout_json(voxel_m=run.config.octree.resolution_m) + "\n")
 
 
 def layout_json(*, voxel_m: float) -> str:
     """Return the layout as JSON, for a map whose voxels have this edge."""
-    beside = fl.SplitContainer(
+    right = fl.SplitContainer(
         direction="column",
         items=[
             fl.SplitItem(proportion=3, content=_image()),
@@ -38,7 +38,7 @@ def layout_json(*, voxel_m: float) -> str:
         direction="row",
         items=[
             fl.SplitItem(proportion=3, content=_map(voxel_m)),
-            fl.SplitItem(proportion=2, content=beside),
+            fl.SplitItem(proportion=2, content=right),
         ],
     )
     text: str = fl.Layout(content=content).to_json()

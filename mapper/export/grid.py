@@ -11,6 +11,7 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import Array
 from mapper.export.page import round_length
 from mapper.export.palette import FREE_CELL, INK, OCCUPIED_CELL, PAPER, UNKNOWN_CELL
+from mapper.octree.grid import FREE, OCCUPIED, OccupancyGrid, shrunk
 from mapper.octree.grid_file import (
     FREE_PIXEL,
     FREE_THRESHOLD,
@@ -18,7 +19,6 @@ from mapper.octree.grid_file import (
     OCCUPIED_THRESHOLD,
     UNKNOWN_PIXEL,
 )
-from mapper.octree.slice import FREE, OCCUPIED, OccupancyGrid, shrunk
 from mapper.runtime.atomic import write_bytes, write_text
 
 _PICTURE_PX = 800

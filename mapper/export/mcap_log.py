@@ -81,7 +81,7 @@ from mapper.export.ros_messages import (
     record_definition,
 )
 from mapper.graph.model import BetweenFactor
-from mapper.octree.slice import OccupancyGrid
+from mapper.octree.grid import OccupancyGrid
 from mapper.runtime.atomic import atomic_file
 from mapper.sources.ros.typestore import definition
 

@@ -10,8 +10,8 @@ from mapper.core.errors import DataError
 from mapper.export.grid import write_grid, write_values
 from mapper.navigation.config import CostmapConfig
 from mapper.navigation.distance_transform import NONE, squares_to_centres
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, with_obstacles
-from mapper.run.folder import MapFolder
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, with_obstacles
+from mapper.run.map_folder import MapFolder
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_text
 from mapper.runtime.progress import Progress
 

@@ -1,6 +1,6 @@
 """The colours that every picture, page and viewer file shares, as (R, G, B) bytes.
 
-Lines and marks are told apart by people who see no difference of red and green: Okabe & Ito (2008).
+Lines and marks are distinct for people who cannot tell red from green: Okabe & Ito (2008).
 """
 
 from mapper.graph.model import Origin

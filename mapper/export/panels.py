@@ -46,10 +46,10 @@ def page(
     rows: int,
     width_in: float = _PANEL_IN,
     height_in: float = _PANEL_IN,
-    beside_in: float = 0.0,
+    legend_in: float = 0.0,
 ) -> "Figure":
-    """Return an empty page for so many panels of one size, a headline above and room for a legend beside."""
-    figure = new_figure(width_in * columns + beside_in, height_in * rows + _HEAD_IN)
+    """Return an empty page for panels of one size, with room for a headline and, at the right, a legend."""
+    figure = new_figure(width_in * columns + legend_in, height_in * rows + _HEAD_IN)
     _, page_in = figure.get_size_inches()
     figure.text(0.02, 1.0 - 0.2 / page_in, title, fontsize=12, fontweight="bold", color=INK, va="top")
     return figure
@@ -61,7 +61,7 @@ def panel(
     *,
     columns: int,
     rows: int,
-    beside_in: float = 0.0,
+    legend_in: float = 0.0,
     left_in: float = _LEFT_IN,
 ) -> "Axes":
     """Return the axes of a panel; panels are numbered from the upper left.
@@ -71,12 +71,12 @@ def panel(
         number: Which panel.
         columns: Of panels.
         rows: Of panels.
-        beside_in: The page's room for a legend.
+        legend_in: The page's room for a legend.
         left_in: Each panel's room for what stands at its left.
     """
     width_in, height_in = figure.get_size_inches()
     row, column = divmod(number, columns)
-    cell_width_in, cell_height_in = (width_in - beside_in) / columns, (height_in - _HEAD_IN) / rows
+    cell_width_in, cell_height_in = (width_in - legend_in) / columns, (height_in - _HEAD_IN) / rows
     below_in, above_in, right_in = 0.45, 0.3, 0.15
     axes = figure.add_axes(
         (

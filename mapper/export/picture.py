@@ -28,7 +28,7 @@ from mapper.export.palette import DOUBTFUL, END, ESTIMATE, FACTORS, PLAN, START,
 from mapper.export.panels import color_of
 from mapper.export.path_band import SIGMAS, band_image
 from mapper.graph.model import PoseGraph, Solution
-from mapper.octree.slice import FREE, OCCUPIED, OccupancyGrid
+from mapper.octree.grid import FREE, OCCUPIED, OccupancyGrid
 from mapper.run.pose_covariances import UncertainPoses
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ def _draw_doubtful(axes: "Axes", poses: UncertainPoses) -> None:
     """Draw the stretches whose poses may be wrong over the estimate."""
     count = int(poses.is_doubtful.sum())
     label = f"{count} doubtful frame{'' if count == 1 else 's'}"
-    for first, last in stretches(poses.is_doubtful, beside=1):
+    for first, last in stretches(poses.is_doubtful, margin=1):
         ends = poses.trajectory.positions_world[first : last + 1, :2].T
         axes.plot(*ends, ".-", color=hex_of(DOUBTFUL), linewidth=2.6, markersize=4.0, label=label)
         label = ""

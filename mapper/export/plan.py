@@ -11,7 +11,7 @@ from mapper.core.geometry import Points
 from mapper.export.mcap_log import PLAN_TOPICS, McapLog
 from mapper.export.picture import write_path
 from mapper.navigation.planner import Plan, point_text
-from mapper.octree.slice import OccupancyGrid
+from mapper.octree.grid import OccupancyGrid
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.runtime.atomic import write_text

@@ -9,7 +9,7 @@ import numpy as np
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Transform
-from mapper.octree.slice import OccupancyGrid
+from mapper.octree.grid import OccupancyGrid
 from mapper.sources.ros.typestore import (
     custom_typestore,
     make_header,

@@ -14,12 +14,11 @@ from mapper.mapping.edits import MapEditor
 from mapper.mapping.fusion import Maps, Snapshot
 from mapper.navigation.floor import reachable_floor
 from mapper.navigation.traversable import Storey, traversable
+from mapper.octree.grid import OccupancyGrid
 from mapper.octree.grid_file import stored_grid
-from mapper.octree.slice import OccupancyGrid
 from mapper.run import files
 from mapper.run.cloud import Cloud, read_cloud
 from mapper.run.folder import Run
-from mapper.run.results import load_results
 from mapper.sources.ros.decode import decode
 from mapper.sources.ros.frame_tree import FrameTree
 from mapper.sources.ros.mcap_file import open_mcap
@@ -35,7 +34,7 @@ def maps_of(run: Run) -> Maps:
         DataError: A grid cannot be read.
     """
     moved = Cloud(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))
-    if (run.path / files.DYNAMIC).exists():  # runs of before 2026-11-22 have none
+    if (run.path / files.DYNAMIC).exists():  # runs made before 2026-11-22 have none
         moved = read_cloud(run.file(files.DYNAMIC))
     return Maps(
         octree=run.octree,
@@ -52,7 +51,7 @@ def maps_of(run: Run) -> Maps:
 
 def editor_of(run: Run) -> MapEditor:
     """Return the editor of a run's finished maps."""
-    path_world, room_m = load_results(run).tracked.positions_world, run.config.traversable.head_room_m
+    path_world, room_m = run.tracked_trajectory.positions_world, run.config.traversable.head_room_m
     return MapEditor(edits_of(run.manifest.edits), path_world, room_m)
 
 

@@ -8,14 +8,14 @@ from mapper.core.plan_axes import plan_axes
 from mapper.export.html import table
 from mapper.export.picture import draw_summary
 from mapper.run import files
-from mapper.run.folder import Run
-from mapper.run.results import load_results
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from mapper.run.folder import Run
 
-def plot_run(run: Run, axes: "Axes | None" = None) -> "Axes":
+
+def plot_run(run: "Run", axes: "Axes | None" = None) -> "Axes":
     """Draw a run's path over its slice, seen from above; axes are in metres.
 
     Args:
@@ -26,7 +26,7 @@ def plot_run(run: Run, axes: "Axes | None" = None) -> "Axes":
         The axes.
     """
     axes = plan_axes(axes)
-    results = load_results(run)
+    results = run.results
     draw_summary(
         axes,
         grid=run.slice,
@@ -39,7 +39,7 @@ def plot_run(run: Run, axes: "Axes | None" = None) -> "Axes":
     return axes
 
 
-def run_html(run: Run) -> str:
+def run_html(run: "Run") -> str:
     """Return the HTML of a run's verdict, its sizes and its picture, which loads nothing from elsewhere."""
     counts = run.manifest.counts
     rows = [

@@ -62,7 +62,7 @@ class SolvedGraph:
 
 
 def write_solved_graph(out: Path, solved: SolvedGraph) -> None:
-    """Write the solved graph to a ``.g2o`` file, or to a new folder with everything beside it.
+    """Write the solved graph to a ``.g2o`` file, or to a new folder with everything else.
 
     Raises:
         RunError: The folder exists already, or cannot be made.

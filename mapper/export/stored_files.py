@@ -5,7 +5,8 @@ from pathlib import Path
 
 from mapper.core.errors import RunError
 from mapper.run import files
-from mapper.run.folder import MapFolder, Run
+from mapper.run.folder import Run
+from mapper.run.map_folder import MapFolder
 from mapper.runtime.atomic import atomic_file
 from mapper.runtime.progress import Progress
 from mapper.sources.trajectory_files import write_kitti

@@ -11,7 +11,7 @@ from mapper.export.ply import write_ply
 from mapper.mapping.cloud import height_colors
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.leaves import Leaves
-from mapper.octree.octomap_file import read_octree
+from mapper.octree.reading import read_octree
 from mapper.run import files
 from mapper.run.folder import Run
 from mapper.runtime.progress import Progress

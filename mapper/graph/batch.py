@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mapper.core.errors import GraphError
-from mapper.graph.model import BetweenFactor
 from mapper.runtime.progress import Report
 
 if TYPE_CHECKING:
     import gtsam
+
+    from mapper.graph.model import BetweenFactor
 
 # χ² has no unit: once a step gains less than this, only rounding is left.
 _ABSOLUTE_ERROR = 1e-10
@@ -63,6 +64,12 @@ def solve(
     Gauss–Newton as long as every step improves, for its steps take half the time; where one does not,
     Levenberg–Marquardt (Marquardt 1963) from there. Its steps are solved by Cholesky's factors or, where
     these are too inaccurate, as for straight paths of a thousand nodes, by orthogonal ones.
+
+    Args:
+        terms: GTSAM's factors.
+        more_terms: Further ones, so that neither list is copied.
+        start: Poses of all nodes to begin with.
+        effort: When to end.
 
     Returns:
         The solution and the iterations it took.
@@ -122,7 +129,7 @@ def _quick_descent(problem: gtsam.NonlinearFactorGraph, start: gtsam.Values, eff
 def _descend(optimizer: Any, effort: Effort) -> _Descent:
     import gtsam
 
-    # The optimizer lends out its values, and replaces them with its next step.
+    # The optimizer returns a reference to its values, which its next step overwrites.
     values, error = gtsam.Values(optimizer.values()), optimizer.error()
     for iteration in range(1, effort.max_iterations + 1):
         optimizer.iterate()

@@ -48,14 +48,14 @@ class _Place:
         parent: The node before it; its own for the root.
         depth: Steps from the root.
         T_root_node: Chained from the root.
-        spread: (6, 6) covariance accumulated since the root, in the root's tangent space.
+        covariance: (6, 6) accumulated since the root, in the root's tangent space.
     """
 
     root: int
     parent: int
     depth: int
     T_root_node: Transform
-    spread: Array
+    covariance: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +78,7 @@ class _Tree:
             return 0.0
         common = self.places[self._common(loop.i, loop.j)]
         to_j = adjoint(inverse(j.T_root_node))
-        drift = to_j @ (i.spread + j.spread - 2.0 * common.spread) @ to_j.T
+        drift = to_j @ (i.covariance + j.covariance - 2.0 * common.covariance) @ to_j.T
         error = np.concatenate(log(inverse(loop.T_i_j) @ inverse(i.T_root_node) @ j.T_root_node))
         return float(error @ np.linalg.solve(drift + np.linalg.inv(loop.information), error))
 
@@ -104,10 +104,10 @@ def _spanning_tree(factors: Sequence[BetweenFactor], others: Iterable[int]) -> _
         return _Tree(places)
     for node in {node for factor in factors for node in (factor.i, factor.j)}:
         places.pop(node, None)
-    spreads = np.linalg.inv(np.array([factor.information for factor in factors]))
+    covariances = np.linalg.inv(np.array([factor.information for factor in factors]))
     nodes = list(dict.fromkeys(node for factor in factors for node in (factor.i, factor.j)))
     index_of = {node: index for index, node in enumerate(nodes)}
-    by_rank = np.argsort(np.trace(spreads, axis1=1, axis2=2), kind="stable").tolist()
+    by_rank = np.argsort(np.trace(covariances, axis1=1, axis2=2), kind="stable").tolist()
     ends = np.sort([(index_of[factors[k].i], index_of[factors[k].j]) for k in by_rank], axis=1)
     _, surest = np.unique(ends, axis=0, return_index=True)  # of parallel factors
     ranks = coo_array((surest + 1.0, tuple(ends[surest].T)), shape=(len(nodes), len(nodes)))
@@ -122,7 +122,7 @@ def _spanning_tree(factors: Sequence[BetweenFactor], others: Iterable[int]) -> _
             parent = int(before[index])
             k = factor_of[frozenset((index, parent))]
             places[nodes[index]] = _grown(
-                places[nodes[parent]], nodes[parent], nodes[index], factors[k], spreads[k]
+                places[nodes[parent]], nodes[parent], nodes[index], factors[k], covariances[k]
             )
     return _Tree(places)
 
@@ -131,10 +131,9 @@ def _root(node: int) -> _Place:
     return _Place(node, node, 0, np.eye(4), np.zeros((6, 6)))
 
 
-def _grown(before: _Place, parent: int, node: int, factor: BetweenFactor, spread: Array) -> _Place:
+def _grown(before: _Place, parent: int, node: int, factor: BetweenFactor, covariance: Array) -> _Place:
     T_parent_node = factor.T_i_j if factor.j == node else inverse(factor.T_i_j)
     T_root_node = before.T_root_node @ T_parent_node
     to_root = adjoint(T_root_node if factor.j == node else before.T_root_node)
-    return _Place(
-        before.root, parent, before.depth + 1, T_root_node, before.spread + to_root @ spread @ to_root.T
-    )
+    covariance = before.covariance + to_root @ covariance @ to_root.T
+    return _Place(before.root, parent, before.depth + 1, T_root_node, covariance)

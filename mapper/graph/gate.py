@@ -6,6 +6,8 @@ import numpy as np
 
 from mapper.core.geometry import Array, Transform, inverse, log
 
+MEDIAN_CHI2 = 5.348
+"""Median of χ² with six degrees of freedom."""
 _LIMIT_CHI2 = 22.458
 """99.9 % of χ² with six degrees of freedom (Bar-Shalom, Li & Kirubarajan 2001, §1.5.4)."""
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array
 from mapper.graph.batch import Effort, Part, solve
 from mapper.graph.drift import innovations
+from mapper.graph.gate import MEDIAN_CHI2
 from mapper.graph.model import BetweenFactor
 from mapper.graph.terms import between
 
@@ -25,8 +26,6 @@ _ROUND = Effort(max_iterations=3, relative_error=1e-4)
 """Solver effort of a round: its result is only the start of the next."""
 _DECIDED = 1e-3
 """A weight this close to 0 or 1 has converged."""
-_MEDIAN_CHI2 = 5.348
-"""Median of χ² with six degrees of freedom."""
 _DRIFT_SLACK = 3.0
 """Systematic drift grows with the path, not its square root: long loops disagree more than short ones."""
 _UNUSED_LOOP_RATIO = 4.0
@@ -67,7 +66,7 @@ def graduate(part: Part, width: float) -> tuple[Array, Graduated]:
         GraphError: The solver fails.
     """
     apart = innovations(part.known, part.loops)
-    limit = width**2 * max(1.0, float(np.median(apart)) / _MEDIAN_CHI2)
+    limit = width**2 * max(1.0, float(np.median(apart)) / MEDIAN_CHI2)
     terms = [between(loop) for loop in part.loops]
     weights = (apart <= _DRIFT_SLACK**2 * limit).astype(np.float64)
     now = _round(part, terms, weights, Graduated(part.start, apart, 0))
@@ -114,7 +113,7 @@ def _refine_inliers(
     """Change the set of inliers where that lowers the truncated cost, while any loop is rejected.
 
     A true loop may stay rejected because the path was never optimised with it: loops near the limit are
-    added. False loops that agree with each other can outweigh fewer true ones beside them: clusters are
+    added. False loops that agree with each other can outweigh the true ones, if these are fewer: clusters are
     removed, first those farthest from the odometry's prediction.
     """
     clusters = sorted(_clusters(part.loops), key=lambda cluster: -float(apart[cluster].max()))
@@ -150,7 +149,7 @@ def _clusters(loops: Sequence[BetweenFactor]) -> list[NDArray[np.bool_]]:
             if not left[k]:
                 continue
             left[k], cluster[k] = False, True
-            beside = left & (np.abs(ends - ends[k]) <= _CLUSTER_NODES).all(axis=1)
-            rim += np.flatnonzero(beside).tolist()
+            close = left & (np.abs(ends - ends[k]) <= _CLUSTER_NODES).all(axis=1)
+            rim += np.flatnonzero(close).tolist()
         clusters.append(cluster)
     return clusters

@@ -19,7 +19,7 @@ from mapper.graph.terms import anchor, between, values_of
 if TYPE_CHECKING:
     import gtsam
 
-_HELD = PoseSigmas(rotation_rad=1e-6, translation_m=1e-6)
+_HELD = PoseSigmas(rotation_rad=1e-6, translation_m=1e-6).information
 """Of the first node: next to nothing beside any factor's, and yet within the digits of a solve."""
 _DIMENSION = 6
 
@@ -135,14 +135,14 @@ def _recover(
 ) -> dict[tuple[int, int], Array]:
     """Return the diagonal blocks of (RᵀR)⁻¹ and those of some pairs, from the last eliminated supernode down.
 
-    Nodes that a factor ties share a supernode: that of the one which is eliminated first.
+    Nodes that a factor connects share a supernode: that of the one which is eliminated first.
     """
     known: list[Array] = []
     blocks = {}
-    beside: dict[int, list[tuple[int, int]]] = {}
+    pairs_of: dict[int, list[tuple[int, int]]] = {}
     for pair in pairs:
         for node in pair:
-            beside.setdefault(node, []).append(pair)
+            pairs_of.setdefault(node, []).append(pair)
     for supernode in supernodes:
         front, behind = len(supernode.R), supernode.S.shape[1]
         R_inverse = np.linalg.inv(supernode.R)
@@ -165,7 +165,7 @@ def _recover(
         for node in supernode.nodes[: front // _DIMENSION]:
             own = covariance[part[node], part[node]]
             blocks[node, node] = 0.5 * (own + own.T)
-            for i, j in beside.get(node, ()):
+            for i, j in pairs_of.get(node, ()):
                 if i in part and j in part:
                     blocks[i, j] = covariance[part[i], part[j]]
     return blocks

@@ -10,14 +10,15 @@ import numpy as np
 
 from mapper.core.geometry import Array, Transform
 from mapper.graph.config import KernelKind
-from mapper.graph.model import BetweenFactor, PoseSigmas
 
 if TYPE_CHECKING:
     import gtsam
 
+    from mapper.graph.model import BetweenFactor
+
 # The anchor only removes the freedom to move the whole component, so at the solution it costs nothing
 # whatever its width; a far tighter one would spoil the conditioning for no gain.
-_ANCHOR = PoseSigmas(rotation_rad=1e-3, translation_m=1e-3)
+_ANCHOR_INFORMATION = np.eye(6) * 1e6  # 1 mrad, 1 mm
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +59,13 @@ def between(
     return gtsam.BetweenFactorPose3(factor.i, factor.j, _pose3(factor.T_i_j), noise)
 
 
-def anchor(node: int, T_world_node: Transform, sigmas: PoseSigmas = _ANCHOR) -> gtsam.PriorFactorPose3:
-    """Return the prior that holds a component's first node."""
+def anchor(
+    node: int, T_world_node: Transform, information: Array = _ANCHOR_INFORMATION
+) -> gtsam.PriorFactorPose3:
+    """Return the prior that holds a component's first node; its information is (6, 6)."""
     import gtsam
 
-    return gtsam.PriorFactorPose3(node, _pose3(T_world_node), _noise(sigmas.information))
+    return gtsam.PriorFactorPose3(node, _pose3(T_world_node), _noise(information))
 
 
 def values_of(T_world_node: Mapping[int, Transform], nodes: Iterable[int]) -> gtsam.Values:

@@ -26,11 +26,11 @@ class WheelNode:
 
 
 _SLACK_M, _SLACK_RAD = 0.2, 0.1
-"""How far a motion may be from the wheels' whatever their noise: of clocks, mountings and uneven floors."""
+"""Difference to the wheels' motion that is possible without noise: by clocks, mountings, uneven floors."""
 
 
 class WheelMeasurements:
-    """Wheel odometry beside another odometry: factors between its nodes, as these come."""
+    """Wheel measurements: factors between the nodes of another odometry, in the order in which these come."""
 
     def __init__(self, wheels: Trajectory | None, config: WheelFactorsConfig) -> None:
         """Start before the first node.
@@ -57,8 +57,8 @@ class WheelMeasurements:
         begin, end = self._at(0, begin_ns), self._at(1, end_ns)
         if begin is None or end is None:
             return ""
-        apart = _apart(T_begin_end, self._factor(begin, end))
-        return "" if apart.is_possible else f"{apart}, by the wheels"
+        comparison = _compared(T_begin_end, self._factor(begin, end))
+        return "" if comparison.is_possible else f"{comparison}, by the wheels"
 
     def _at(self, node: int, stamp_ns: int) -> WheelNode | None:
         if self._wheels is None:
@@ -81,16 +81,15 @@ def wheel_conflict(graph: PoseGraph, driven: Sequence[BetweenFactor]) -> str:
     """
     part_of = component_numbers(graph.with_factors(f for f in graph.factors if f.origin == "odometry"))
     both = [factor for factor in driven if part_of[factor.i] == part_of[factor.j]]
-    apart = [
-        _apart(inverse(graph.T_world_node[factor.i]) @ graph.T_world_node[factor.j], factor)
+    comparisons = [
+        _compared(inverse(graph.T_world_node[factor.i]) @ graph.T_world_node[factor.j], factor)
         for factor in both
     ]
-    wrong = [of for of in apart if not of.is_possible]
+    wrong = [comparison for comparison in comparisons if not comparison.is_possible]
     if not wrong:
         return ""
-    miss_m, miss_rad = (
-        median(values) for values in ([of.translation_m for of in wrong], [of.rotation_rad for of in wrong])
-    )
+    miss_m = median(comparison.translation_m for comparison in wrong)
+    miss_rad = median(comparison.rotation_rad for comparison in wrong)
     return (
         f"the wheels contradict the odometry in {len(wrong)} of {len(both)} steps between keyframes, by "
         f"{miss_m:.2f} m and {miss_rad:.2f} rad (median): did they slip, is their mounting or clock wrong, "
@@ -98,7 +97,7 @@ def wheel_conflict(graph: PoseGraph, driven: Sequence[BetweenFactor]) -> str:
     )
 
 
-def _apart(T_i_j: Transform, driven: BetweenFactor) -> Comparison:
+def _compared(T_i_j: Transform, driven: BetweenFactor) -> Comparison:
     covariance = np.asarray(np.linalg.inv(driven.information), np.float64)
     return compare(T_i_j, driven.T_i_j, covariance, slack_m=_SLACK_M, slack_rad=_SLACK_RAD)
 
@@ -110,6 +109,13 @@ def wheel_factor(
 
     The error grows with the path length and the turning in between, not with the displacement (Thrun,
     Burgard & Fox 2005, §5.4); wheels measure no height and no tilt, which get the same sigmas.
+
+    Args:
+        i: The node.
+        j: The later node.
+        odometer: Path length and turning between their times.
+        noise: Standard deviations, at least, by the path and by the turning.
+        origin: Of the factor: "odometry" where wheels are the odometry.
     """
     path_m, turn_rad = odometer.between(i.stamp_ns, j.stamp_ns)
     sigmas = PoseSigmas(

@@ -41,8 +41,8 @@ def find_images(
         inside = "; those in images/?" if (folder / "images").is_dir() else ""
         raise SourceError(f"{folder}: no images; want files ending in {' '.join(sorted(_ENDINGS))}{inside}")
     lists = (folder / _TIMES, folder.parent / _TIMES)
-    beside = next((path for path in lists if path.is_file()), None)
-    stamps_ns, notes = scan_stamps(images, chosen=times, beside=beside, rate_hz=rate_hz, wording=_IMAGES)
+    times_file = next((path for path in lists if path.is_file()), None)
+    stamps_ns, notes = scan_stamps(images, chosen=times, beside=times_file, rate_hz=rate_hz, wording=_IMAGES)
     order, more = time_order(stamps_ns, what="images")
     return [images[i] for i in order], stamps_ns[order], [*notes, *more]
 

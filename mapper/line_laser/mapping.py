@@ -12,7 +12,7 @@ from mapper.core.errors import DataError, MapSizeError
 from mapper.core.geometry import Array, Points
 from mapper.line_laser.config import LineLaserMapConfig
 from mapper.line_laser.ranging import LineScan
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.runtime.progress import SILENT, Progress
 
 _MARGIN_CELLS = 2

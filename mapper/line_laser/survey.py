@@ -10,7 +10,7 @@ from mapper.core.trajectory import Trajectory, trajectory_from
 from mapper.line_laser.config import LineLaserCalibration, LineLaserConfig, LineLaserMapConfig
 from mapper.line_laser.mapping import map_scans
 from mapper.line_laser.ranging import LineScan, scan_image
-from mapper.octree.slice import OccupancyGrid
+from mapper.octree.grid import OccupancyGrid
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import SILENT, Progress
 from mapper.sensing.wheel_kinematics import pose_at

@@ -42,7 +42,14 @@ class Proposer(Protocol[Known]):
     """Proposer of known places that a new one might be."""
 
     def propose(self, node: int, seen: Known, /, *, before: int, limit: int) -> list[Proposal]:
-        """Return the likeliest of the first ``before`` places that were added, the likeliest first."""
+        """Return the most likely known places, the most likely first.
+
+        Args:
+            node: Node of the new place, whose pose is known; the place itself is not added.
+            seen: Description of the new place.
+            before: Number of places, from the first that was added, that are compared.
+            limit: Largest number to return.
+        """
         ...
 
     def add(self, node: int, seen: Known) -> None:
@@ -92,7 +99,15 @@ class Verifier(Protocol[Place]):
 def verify_proposal(
     proposal: Proposal, node: int, i: Place, j: Place, verifier: Verifier[Place]
 ) -> LoopClosure:
-    """Return the loop closure of a node's place j with a proposed place i, accepted or rejected."""
+    """Return the loop closure of a node with a proposed place, accepted or rejected.
+
+    Args:
+        proposal: Of the known place.
+        node: The later node.
+        i: Description of the known place.
+        j: Description of the node's own place.
+        verifier: Compares the two.
+    """
     found = verifier.verify(i, j)
     return LoopClosure(
         i=proposal.node,

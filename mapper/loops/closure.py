@@ -13,6 +13,7 @@ from mapper.core.errors import DataError, RunError
 from mapper.core.geometry import Array, Transform, inverse, rotation_log, transform
 from mapper.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from mapper.graph.model import BetweenFactor, Solution
+from mapper.loops.config import KeyframeLoopsConfig
 from mapper.runtime.atomic import write_text
 from mapper.runtime.regular_files import read_text
 
@@ -104,6 +105,12 @@ def discrepancy(T_i_j: Transform, T_world_i: Transform, T_world_j: Transform) ->
 def exceeds(miss: Discrepancy, limit: Discrepancy) -> bool:
     """Return whether a discrepancy is larger than a limit in either part."""
     return miss.translation_m > limit.translation_m or miss.rotation_rad > limit.rotation_rad
+
+
+def has_moved(T_world_last: Transform, T_world_now: Transform, config: KeyframeLoopsConfig) -> bool:
+    """Return whether loops are searched at a pose, given that of the last search."""
+    moved = discrepancy(np.eye(4), T_world_last, T_world_now)
+    return exceeds(moved, Discrepancy(config.min_motion_m, config.min_motion_rad))
 
 
 def accepted_loops(loops: Iterable[LoopClosure]) -> list[LoopClosure]:

@@ -95,8 +95,8 @@ class KeyframeLoopDetector(Generic[Place]):
     """Loop detector that compares keyframes with known places.
 
     A candidate is measured (``Verifier``), its disagreement with the current estimate compared with the drift
-    that odometry and wheels may have since (``DriftGate``), and held back until a loop from another keyframe
-    nearby agrees (``ConsistencyCheck``).
+    that odometry and wheels may have since (``DriftGate``), and it is a hypothesis until a loop from another
+    keyframe nearby agrees (``ConsistencyCheck``).
     """
 
     def __init__(
@@ -179,7 +179,7 @@ class KeyframeLoopDetector(Generic[Place]):
             closure = self._gate.checked(verify_proposal(proposal, node, known, place, self._verifier))
             self._closures[closure.i, closure.j] = closure
             if closure.verdict == "accepted":
-                self._hold_back(closure)
+                self._add_hypothesis(closure)
                 break
         self._add_place(node, place)
 
@@ -231,7 +231,7 @@ class KeyframeLoopDetector(Generic[Place]):
         by_path = bisect_right(self._searches, max_path_m, key=lambda search: search.path_m)
         return self._preloaded + min(by_time, by_path)
 
-    def _hold_back(self, closure: LoopClosure) -> None:
+    def _add_hypothesis(self, closure: LoopClosure) -> None:
         """Keep a measured loop as a hypothesis, and accept all that are confirmed now."""
         self._closures[closure.i, closure.j] = replace(closure, verdict="rejected", reason=ALONE)
         for confirmed in self._consistency.add(closure):

@@ -14,7 +14,7 @@ from mapper.loops.odometry_chain import OdometryChain, allowed
 from mapper.loops.online_pose_estimator import OnlinePoseEstimator
 
 MIN_CONFLICTS = 4
-"""So many others must agree with a rejected loop before it speaks against odometry or wheels."""
+"""Number of others that must agree with a rejected loop before it counts against odometry or wheels."""
 
 
 class DriftGate:
@@ -44,7 +44,7 @@ class DriftGate:
         self._estimator = estimator
         self._rejected = rejected
         self._conflicts: dict[bool, list[LoopClosure]] = {True: [], False: []}
-        self._apart: dict[tuple[int, int], tuple[Comparison, bool]] = {}
+        self._compared: dict[tuple[int, int], tuple[Comparison, bool]] = {}
 
     def checked(self, closure: LoopClosure) -> LoopClosure:
         """Return a measured loop as it is, or rejected if odometry and wheels cannot have drifted by it."""
@@ -54,40 +54,40 @@ class DriftGate:
         if drift is None:
             return closure
         limit = allowed(self._config, drift.path)
-        apart = compare(
+        comparison = compare(
             closure.T_i_j,
             inverse(self._estimator.pose_of(closure.i)) @ self._estimator.pose_of(closure.j),
             drift.covariance + np.linalg.inv(closure.information),
             slack_m=limit.translation_m,
             slack_rad=limit.rotation_rad,
         )
-        if apart.is_possible:
+        if comparison.is_possible:
             return closure
-        self._apart[closure.i, closure.j] = apart, drift.by_wheels
+        self._compared[closure.i, closure.j] = comparison, drift.by_wheels
         for agreeing in self._rejected.add(closure):
-            self._conflicts[self._apart[agreeing.i, agreeing.j][1]].append(agreeing)
+            self._conflicts[self._compared[agreeing.i, agreeing.j][1]].append(agreeing)
         source = "wheels and odometry" if drift.by_wheels else "odometry"
-        reason = f"gate: {apart}, after {drift.path.path_m:.1f} m of path by {source}"
+        reason = f"gate: {comparison}, after {drift.path.path_m:.1f} m of path by {source}"
         return replace(closure, verdict="rejected", reason=reason)
 
     def notes(self) -> list[str]:
         """Return a sentence about the rejected loops that agree with each other, if there are many."""
         return [
-            _note([self._apart[loop.i, loop.j][0] for loop in loops], by_wheels)
+            _note([self._compared[loop.i, loop.j][0] for loop in loops], by_wheels)
             for by_wheels, loops in self._conflicts.items()
             if loops
         ]
 
 
-def _note(apart: list[Comparison], by_wheels: bool) -> str:
-    miss_m = median(of.translation_m for of in apart)
-    miss_rad = median(of.rotation_rad for of in apart)
+def _note(comparisons: list[Comparison], by_wheels: bool) -> str:
+    miss_m = median(comparison.translation_m for comparison in comparisons)
+    miss_rad = median(comparison.rotation_rad for comparison in comparisons)
     but, why = (
         ("the wheels", "or did the wheels slip (graph.wheels.use=false maps without them)?")
         if by_wheels
         else ("the odometry", "or did the odometry jump (loops.gate allows more drift)?")
     )
     return (
-        f"{len(apart)} loops agree with each other but not with {but}: median {miss_m:.2f} m and "
+        f"{len(comparisons)} loops agree with each other but not with {but}: median {miss_m:.2f} m and "
         f"{miss_rad:.2f} rad off; they are rejected. Do two places look alike, {why}"
     )

@@ -125,13 +125,13 @@ class ImageVerifier:
         miss_px = (
             points_j[:, :2] / points_j[:, 2:] * intrinsics[:2] + intrinsics[2:4] - measured[agree, :2]
         ) * (weights[agree, :1] ** 0.5)
-        T_ci_cj, information, honest = alignment.T_target_source, alignment.information, 1.0
+        T_ci_cj, information, scale = alignment.T_target_source, alignment.information, 1.0
         if config.measure == "reprojection":
             T_ci_cj = inverse(T_j_i)
             seen = T_j_i, points[agree], measured[agree], weights[agree], intrinsics
             # i's points were measured no better than j's pixels, so the information is halved.
             information = 0.5 * normal_matrix(*seen)
-            honest = 1.0 / residual_statistics(*seen).variance_factor
+            scale = 1.0 / residual_statistics(*seen).variance_factor
         assert information is not None  # ISVD converged
         to_camera = adjoint(inverse(j.T_body_camera))
         T_i_j = i.T_body_camera @ T_ci_cj @ inverse(j.T_body_camera)
@@ -139,7 +139,7 @@ class ImageVerifier:
         residual_px = float(np.sqrt((miss_px**2).sum(axis=1).mean()))
         prior = with_model_error(information, T_i_j)
         sigma_m = float(np.linalg.eigvalsh(np.linalg.inv(prior)[3:, 3:])[-1] ** 0.5)
-        information = with_model_error(honest * information, T_i_j)
+        information = with_model_error(scale * information, T_i_j)
         if sigma_m > MAX_SIGMA_M:
             reason = f"loose: translation known to {sigma_m:.2f} m, want {MAX_SIGMA_M} m"
             return Verification(matches, reason, inliers, alignment.inlier_rmse_m, residual_px)

@@ -11,7 +11,7 @@ from mapper.core.errors import FrameError
 from mapper.core.geometry import Transform
 from mapper.graph.model import PoseGraph
 from mapper.loops.base import Place, Proposal, Proposer, Verifier, verify_proposal
-from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy, exceeds
+from mapper.loops.closure import LoopClosure, has_moved
 from mapper.loops.config import PlaceLoopsConfig, ScanLoopsConfig
 from mapper.loops.consistency_check import ConsistencyCheck
 from mapper.loops.detector import ALONE, ViewOf
@@ -139,7 +139,7 @@ class MapConstraintDetector(Generic[Place]):
             closure = self._in_map(measured)
             self._closures[proposal.node, node] = closure
             if closure.verdict == "accepted":
-                self._hold_back(proposal.node, closure)
+                self._add_hypothesis(proposal.node, closure)
                 break
 
     def closures(self) -> Sequence[LoopClosure]:
@@ -159,10 +159,7 @@ class MapConstraintDetector(Generic[Place]):
         return {}
 
     def _has_moved(self, track: FrameResult) -> bool:
-        if self._last is None:
-            return True
-        moved = discrepancy(np.eye(4), self._last, track.T_world_body)
-        return exceeds(moved, Discrepancy(self._config.min_motion_m, self._config.min_motion_rad))
+        return self._last is None or has_moved(self._last, track.T_world_body, self._config)
 
     def _proposals(self, node: int, place: Place, *, is_near: bool) -> list[Proposal]:
         proposer = self._nearby if is_near else self._similar
@@ -175,7 +172,7 @@ class MapConstraintDetector(Generic[Place]):
         T_map_j = None if measured.T_i_j is None else self._known.T_map_node[measured.i] @ measured.T_i_j
         return replace(measured, i=self._map, T_i_j=T_map_j)
 
-    def _hold_back(self, place: int, closure: LoopClosure) -> None:
+    def _add_hypothesis(self, place: int, closure: LoopClosure) -> None:
         """Keep a measured constraint as a hypothesis, and accept all that are confirmed now."""
         self._closures[place, closure.j] = replace(closure, verdict="rejected", reason=ALONE)
         self._place_of[closure.j] = place

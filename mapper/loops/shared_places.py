@@ -6,12 +6,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Generic, NamedTuple
 
-import numpy as np
-
 from mapper.core.errors import RunError
 from mapper.core.geometry import Transform
 from mapper.loops.base import Place, Proposal, Proposer, verify_proposal
-from mapper.loops.closure import Discrepancy, LoopClosure, discrepancy, exceeds
+from mapper.loops.closure import LoopClosure, has_moved
 from mapper.loops.config import (
     ImageVerificationConfig,
     PlaceLoopsConfig,
@@ -60,7 +58,15 @@ def shared_place(
     T_first_node: Mapping[int, Transform],
     T_second_node: Mapping[int, Transform],
 ) -> SharedPlace:
-    """Return the place of an accepted loop between two runs, whose nodes have these poses."""
+    """Return the place of an accepted loop between two runs.
+
+    Args:
+        first: Number of the earlier run.
+        second: Number of the run whose keyframe was recognised.
+        loop: From a node i of the earlier run to a node j of the other.
+        T_first_node: (4, 4) poses of the earlier run's nodes in its world.
+        T_second_node: (4, 4) poses of the other's.
+    """
     assert loop.T_i_j is not None  # it was accepted
     T_first_place = T_first_node[loop.i]
     T_first_body = T_first_place @ loop.T_i_j
@@ -196,8 +202,9 @@ class _Search(Generic[Place]):
         self._runs += 1
         candidates = list[_Candidate]()
         for node, place in run.places.items():
-            if is_searched and (last is None or self._has_moved(run.T_map_node, last, node)):
-                last = node
+            T_map_node = run.T_map_node[node]
+            if is_searched and (last is None or has_moved(last, T_map_node, self._config)):
+                last = T_map_node
                 ranks = Counter[int]()
                 for proposal in self._proposer.propose(node, place, before=before, limit=_MOST_SIMILAR):
                     first, _ = self._known[proposal.node]
@@ -213,7 +220,3 @@ class _Search(Generic[Place]):
                 compared[first] += 1
                 chosen.append(_Pair(first, number, replace(candidate.proposal, node=known), candidate.node))
         return chosen[:_MAX_COMPARED]
-
-    def _has_moved(self, T_map_node: Mapping[int, Transform], last: int, node: int) -> bool:
-        moved = discrepancy(np.eye(4), T_map_node[last], T_map_node[node])
-        return exceeds(moved, Discrepancy(self._config.min_motion_m, self._config.min_motion_rad))

@@ -12,10 +12,10 @@ from mapper.core.geometry import Array, Points, Transform, apply
 from mapper.mapping.config import AppliedEdit, Edits, Region
 from mapper.navigation.traversable import Storey, trimmed
 from mapper.octree.columns import NOWHERE, Columns
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.ground_height import DrivenGround, nearest_heights
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_BITS, KEY_MASK, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 Mask = NDArray[np.bool_]
 

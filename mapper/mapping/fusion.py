@@ -22,11 +22,12 @@ from mapper.navigation.floor import driven_ground, reachable_floor
 from mapper.navigation.traversable import traversable
 from mapper.octree.casting import Caster, reach_m
 from mapper.octree.config import OctreeConfig
+from mapper.octree.grid import OccupancyGrid
 from mapper.octree.map import OctreeMap
 from mapper.octree.moving_objects import MovingObjects, remove_moving_objects
 from mapper.octree.scan_update import ScanUpdate, pack
 from mapper.octree.scan_update_file import CachedUpdate, ScanUpdateFile, ScanUpdateWriter, cache_update
-from mapper.octree.slice import OccupancyGrid, cut_slice, floor_below
+from mapper.octree.slice import cut_slice, floor_below
 from mapper.runtime.ordered_map import ordered_map
 from mapper.runtime.progress import Progress
 from mapper.sources.base import Log
@@ -78,7 +79,7 @@ class Maps:
         traversable: The floor that a robot can drive on, of the storey on which the path begins.
         storeys: The same of every storey, the lowest first, where floors lie over each other.
         keepout: The keep-out regions in the slice's cells; None if there are none.
-        has_path: Whether the path tells the height of the floor.
+        has_path: Whether the height of the floor is known from the path.
         edits: The edits by hand that are in them.
     """
 
@@ -155,20 +156,9 @@ def fuse_log(
     Raises:
         DataError: The edits leave nothing of the map, or nothing in the height of the slice.
     """
-    octree = OctreeMap(config.octree, folder=after.folder)
-    _add_scans(
-        octree,
-        source,
-        trajectory,
-        config,
-        progress=progress,
-        on_snapshot=on_snapshot,
-        before=before,
-        after=after,
+    octree, objects = _fuse_scans(
+        source, trajectory, config, progress, on_snapshot=on_snapshot, before=before, after=after
     )
-    objects = None
-    if config.octree.moving == "removed":
-        objects = _without_moving_objects(octree, config, after)
     (points_world, colors), (dynamic_points_world, dynamic_colors) = fuse_clouds(
         source, trajectory, config, objects, progress=progress
     )
@@ -220,13 +210,19 @@ def fuse_octree(
 ) -> OctreeMap:
     """Return the octree of ``fuse_log`` alone; frames whose cached update still holds are not read.
 
+    Args:
+        source: As for ``fuse_log``, as are all others.
+        trajectory: Final body poses in the levelled world.
+        config: Settings of the maps.
+        progress: Receives progress and notes.
+        before: The frames' updates from the last time.
+        after: Receives the frames' updates.
+        edits: Regions to erase and to keep.
+
     Raises:
         DataError: The edits leave nothing of the map.
     """
-    octree = OctreeMap(config.octree, folder=after.folder)
-    _add_scans(octree, source, trajectory, config, progress=progress, before=before, after=after)
-    if config.octree.moving == "removed":
-        _without_moving_objects(octree, config, after)
+    octree, _ = _fuse_scans(source, trajectory, config, progress, before=before, after=after)
     editor = MapEditor(edits, trajectory.positions_world, config.traversable.head_room_m)
     editor.erase(octree)
     editor.crop(octree)
@@ -234,33 +230,24 @@ def fuse_octree(
     return octree
 
 
-def _add_scans(
-    octree: OctreeMap,
+def _fuse_scans(
     source: Log,
     trajectory: Trajectory,
     config: FuseSettings,
-    *,
     progress: Progress,
+    *,
     before: ScanUpdateFile | None,
     after: ScanUpdateWriter,
     on_snapshot: Callable[[Snapshot | ScanSnapshot], None] | None = None,
-) -> None:
-    """Add every frame of the trajectory to the octree, and to the log if there is one."""
-    casters, moved, unreached = _Casters(config.octree), 0, 0
-
-    def prepare(job: _Job) -> _Fused:
-        return _prepared(job, config, casters.caster)
-
+) -> tuple[OctreeMap, MovingObjects | None]:
+    """Return the octree of all frames, and what moved, which is removed from it; None if it is kept."""
+    octree = OctreeMap(config.octree, folder=after.folder)
     if before is not None and (config.octree.attributes or not before.holds_for(config.octree)):
         before = None  # updates have no colours
-    jobs = _jobs(
-        source,
-        trajectory,
-        config,
-        before,
-        log_stride=0 if on_snapshot is None else config.mcap.image_stride,
-    )
-    prepared = ordered_map(prepare, jobs, workers=config.workers)
+    log_stride = 0 if on_snapshot is None else config.mcap.image_stride
+    jobs = _jobs(source, trajectory, config, before, log_stride=log_stride)
+    casters, moved, unreached = _Casters(config.octree), 0, 0
+    prepared = ordered_map(lambda job: _prepared(job, config, casters.caster), jobs, workers=config.workers)
     with progress.stage("fuse") as report:
         for done, fused in enumerate(prepared, start=1):
             report(done, len(trajectory))
@@ -283,13 +270,10 @@ def _add_scans(
         )
     if before is not None:
         progress.note(f"fused again: {moved} of {len(trajectory)} frames, which had moved or were not known")
-
-
-def _without_moving_objects(
-    octree: OctreeMap, config: FuseSettings, written: ScanUpdateWriter
-) -> MovingObjects:
-    with written.reopened() as updates:
-        return remove_moving_objects(octree, partial(_updates, updates, config.workers))
+    if config.octree.moving != "removed":
+        return octree, None
+    with after.reopened() as updates:
+        return octree, remove_moving_objects(octree, partial(_updates, updates, config.workers))
 
 
 def _updates(written: ScanUpdateFile, workers: int) -> Iterator[ScanUpdate]:
@@ -325,9 +309,9 @@ def _neighbours_hold(
 ) -> bool:
     """Return whether the poses before and after one still hold: a scan is deskewed between them."""
     return all(
-        before.holds(int(trajectory.stamps_ns[beside]), trajectory.T_world_body[beside], config=config)
-        for beside in (index - 1, index + 1)
-        if 0 <= beside < len(trajectory)
+        before.holds(int(trajectory.stamps_ns[neighbour]), trajectory.T_world_body[neighbour], config=config)
+        for neighbour in (index - 1, index + 1)
+        if 0 <= neighbour < len(trajectory)
     )
 
 

@@ -252,7 +252,7 @@ def _floor(
     surfaces = levels_of(heights_up_m, tolerance_m=tolerance_m, least=least_support(len(heights_up_m)))
     if surfaces:
         medians_m = np.array([np.median(heights_up_m[members]) for members in surfaces])
-        # A surface has fringes just beside it; the best supported of the lowest ones comes first.
+        # A surface has fringes just above and below it; the best supported of the lowest ones comes first.
         chosen = int(np.flatnonzero(medians_m <= medians_m.min() + _NEAR_FLOOR_M)[0])
         floor_m = float(medians_m[chosen])
         if (heights_m < floor_m - _NEAR_FLOOR_M).mean() <= _MAX_BELOW_FLOOR_RATIO:

@@ -36,7 +36,7 @@ class MeasuredNoise:
     Attributes:
         noise: Standard deviation of a depth, by depth.
         detail: Where it comes from; part of a sentence.
-        depths_m: (N,) depths of some pixels, to tell how many a limit leaves out.
+        depths_m: (N,) depths of some pixels, to count how many a limit leaves out.
     """
 
     noise: DepthNoiseConfig

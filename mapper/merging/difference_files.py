@@ -10,7 +10,7 @@ from mapper.export.palette import APPEARED, NOT_SEEN_AGAIN, VANISHED, Rgb
 from mapper.export.picture import write_layers
 from mapper.export.ply import write_ply
 from mapper.merging.differences import Cluster, Differences
-from mapper.octree.slice import shrunk
+from mapper.octree.grid import shrunk
 from mapper.run.folder import Run
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, atomic_folder, write_json
 

@@ -16,7 +16,8 @@ from scipy.spatial import cKDTree
 from mapper.core.errors import ConfigError
 from mapper.core.geometry import Array, Points, Transform, apply, inverse
 from mapper.merging.placing import Placed
-from mapper.octree.map import OctreeMap, log_odds
+from mapper.octree.map import OctreeMap
+from mapper.octree.sensor_model import log_odds
 
 _TOLERANCE_VOXELS = 2.0
 _MIN_VOXELS = 8
@@ -117,7 +118,15 @@ def differences_of(
 def compare_maps(
     before: OctreeMap, after: OctreeMap, T_before_after: Transform, *, tolerance_m: float, min_voxels: int
 ) -> Differences:
-    """Compare two maps of one resolution; see :func:`differences_of`."""
+    """Compare two maps of one resolution; see :func:`differences_of`.
+
+    Args:
+        before: The earlier map; the answer is in its world.
+        after: The later map.
+        T_before_after: (4, 4) pose of the later map's world in the earlier one's.
+        tolerance_m: A surface this near to one of the other map is the same.
+        min_voxels: Smaller clusters are counted, not listed.
+    """
     old, new = _surely_occupied(before), apply(T_before_after, _surely_occupied(after))
     old_is = _compared(old, after, inverse(T_before_after), tolerance_m)
     new_is = _compared(new, before, np.eye(4), tolerance_m)

@@ -121,7 +121,14 @@ def _kept(known: MergedMap, member: RunInMap, item: Placed, config: OctreeConfig
 def known_tiles(
     known: MergedMap, placed: Sequence[Placed], manifest: MapManifest, tiling: Tiling
 ) -> KnownTiles | None:
-    """Return the tiles that may hold; None if the maps are cut differently."""
+    """Return the tiles of a map that may hold in the one that is to be made; None if it is cut differently.
+
+    Args:
+        known: The earlier map.
+        placed: The runs of the map that is to be made, those of the earlier one first, from ``kept_in``.
+        manifest: Of the map that is to be made.
+        tiling: How that is cut.
+    """
     before = known.manifest
     kept = {number for number, item in enumerate(placed) if item.kept is not None}
     if before.tile_m != manifest.tile_m or not all(tile.overlaps for tile in before.tiles):

@@ -13,7 +13,7 @@ from mapper.navigation.config import TraversableConfig
 from mapper.navigation.floor import Floor, floor_of, margin_for
 from mapper.navigation.traversable import Storey, traversable
 from mapper.octree.columns import block_extent, columns_of, occupied_voxels
-from mapper.octree.octomap_file import read_octree
+from mapper.octree.reading import read_octree
 
 MOST_COLUMNS = 1 << 25
 """More columns in the map's bounding box, and its floor would take more than about 2 GB."""
@@ -31,7 +31,16 @@ def floor_over(
     resolution_m: float,
     floor_z_m: float,
 ) -> Floor:
-    """Return the floor of a map whose occupied voxels are given tile by tile; see ``floor_of``."""
+    """Return the floor of a map whose occupied voxels are given tile by tile; see ``floor_of``.
+
+    Args:
+        voxels: Of each tile, from ``occupied_voxels``.
+        extent: Of all tiles' blocks, from ``block_extent``.
+        config: Limits of the robot.
+        paths_map: Of every run, (N, 3) where its sensor was, metres.
+        resolution_m: Edge of a voxel.
+        floor_z_m: Height of the floor in the map.
+    """
     columns = columns_of(
         np.concatenate([np.empty(0, np.int64), *voxels]),
         extent,
@@ -65,7 +74,7 @@ def storeys_of_map(merged: MergedMap) -> tuple[Storey, ...]:
         floor_z_m=manifest.floor_z_m,
     )
     storeys = traversable(floor, manifest.traversable, with_links=True)
-    return kept_out(storeys, editors_of(manifest, paths_map))
+    return with_keepout(storeys, editors_of(manifest, paths_map))
 
 
 def editors_of_map(merged: MergedMap) -> list[MapEditor]:
@@ -100,7 +109,7 @@ def editors_of(manifest: MapManifest, paths_map: Sequence[Points]) -> list[MapEd
     return editors
 
 
-def kept_out(storeys: tuple[Storey, ...], editors: Sequence[MapEditor]) -> tuple[Storey, ...]:
+def with_keepout(storeys: tuple[Storey, ...], editors: Sequence[MapEditor]) -> tuple[Storey, ...]:
     """Return the storeys of a floor with the runs' keep-out regions blocked."""
     for editor in editors:
         storeys, _ = editor.edit_storeys(storeys)

@@ -27,10 +27,10 @@ from mapper.octree.config import OctreeConfig, SliceConfig
 from mapper.octree.ground_height import lowest_occupied
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
-from mapper.octree.octomap_file import read_octree
+from mapper.octree.reading import read_octree
 from mapper.octree.resampling import blocks_reached, resampled
 from mapper.octree.scan_update_file import ScanUpdateWriter, open_scan_updates
-from mapper.octree.slice import see_band
+from mapper.octree.slice import band_flags
 from mapper.octree.summing import Overlap
 from mapper.octree.tree import children_in, nodes_in_preorder, words_in_preorder
 from mapper.run.folder import open_run
@@ -321,7 +321,7 @@ def slice_column(
     seen, known = np.zeros(shape, np.uint8), np.zeros(shape, np.bool_)
     for tile in tiles:
         octree = read_octree(workspace.tile(tile))
-        seen |= see_band(octree, config, first=first, shape=shape, ground_m=ground_m, floor_z_m=floor_z_m)
+        seen |= band_flags(octree, config, first=first, shape=shape, ground_m=ground_m, floor_z_m=floor_z_m)
         x, y = (octree.leaves().keys[:, :2] - first).T
         known[y, x] = True
     save_array(workspace.piece(tiles[0], BAND), seen)

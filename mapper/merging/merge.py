@@ -36,13 +36,11 @@ from mapper.merging.merged_map import (
 from mapper.merging.octomap_files import write_whole_bt, write_whole_ot
 from mapper.merging.placing import Placed, Placing, warnings_about
 from mapper.merging.runs_in_map import described_runs, fuse_runs, runs_to_fuse, write_poses
-from mapper.merging.slicing import draw, slice_map
+from mapper.merging.slicing import Sliced, draw, slice_map
 from mapper.merging.stages import Cost, Stages
 from mapper.merging.tiling import tiling_for
-from mapper.navigation.traversable import Storey
 from mapper.octree.config import OctreeConfig
 from mapper.run import files
-from mapper.run.manifest import RunWarning
 from mapper.run.warnings import merge_warnings
 from mapper.runtime.atomic import MANIFEST_NAME, atomic_folder
 from mapper.runtime.executor import IN_PROCESS, Workers, make_executor
@@ -115,7 +113,7 @@ def merge(
         placing = replace(placing, placed=kept_in(known, placing.placed, config))
     placed = placing.placed
     tiling = tiling_for(config.resolution_m, tile_m)
-    bent, stiff = runs_to_fuse(placed, within_m=stays_within_m(config))
+    bent, rigid = runs_to_fuse(placed, within_m=stays_within_m(config))
     manifest = MapManifest(
         status="merging",
         octree=config,
@@ -135,7 +133,7 @@ def merge(
         ) as folder,
     ):
         manifest.save(folder)
-        warnings = [*placing.notes, *stiff, *warnings_about(placed)]
+        warnings = [*placing.notes, *rigid, *warnings_about(placed)]
         for note in warnings:
             progress.note(note)
         workspace = Workspace(folder, folder / SCRATCH, tiling, config)
@@ -150,20 +148,12 @@ def merge(
         write_whole_ot(folder / files.OCTREE_OT, workspace, joined, has_colors=has_colors)
         write_whole_bt(folder / files.OCTREE_BT, workspace, joined)
         sliced = slice_map(workspace, stages, joined, manifest, placed)
-        for note in sliced.missing:
+        manifest = _completed(manifest, workspace, split, joined, sliced.columns)
+        notes = [*sliced.missing, *_disagreements(manifest.runs)]
+        for note in notes:
             progress.note(note)
-        notes = [*warnings, *sliced.missing]
-        manifest = _completed(manifest, workspace, split, joined, sliced.columns, notes)
-        apart = [warning.text for run in manifest.runs for warning in _warnings_of(run)]
-        for note in apart:
-            progress.note(note)
-        manifest = manifest.model_copy(update={"notes": (*manifest.notes, *apart)})
-        _write_storeys(folder, sliced.storeys)
-        if sliced.grid is not None:
-            write_grid(folder, files.SLICE, sliced.grid)
-            if sliced.keepout is not None:
-                write_grid(folder, files.KEEPOUT, sliced.keepout)
-            draw(folder / files.SUMMARY, sliced.grid, placed, manifest)
+        manifest = manifest.model_copy(update={"notes": (*warnings, *notes)})
+        _write_grids(folder, sliced, placed, manifest)
         _clean(workspace, joined)
         manifest.save(folder)
     return Merged(
@@ -204,8 +194,17 @@ def _floor_z_m(first: Placed) -> float:
     return float(apply(first.T_map_world, middle[np.newaxis])[0, 2])
 
 
-def _write_storeys(folder: Path, storeys: Sequence[Storey]) -> None:
-    """Write the floor of the storey where the first run begins, and where there are several, that of each."""
+def _write_grids(folder: Path, sliced: Sliced, placed: Sequence[Placed], manifest: MapManifest) -> None:
+    """Write the slice with its picture, and the floor of the storey where the first run begins.
+
+    Where there are several storeys, the floor of each is written, too.
+    """
+    if sliced.grid is not None:
+        write_grid(folder, files.SLICE, sliced.grid)
+        if sliced.keepout is not None:
+            write_grid(folder, files.KEEPOUT, sliced.keepout)
+        draw(folder / files.SUMMARY, sliced.grid, placed, manifest)
+    storeys = sliced.storeys
     for storey in storeys:
         if storey.is_home:
             write_grid(folder, files.TRAVERSABLE, storey.grid)
@@ -301,9 +300,8 @@ def _completed(
     split: Sequence[SplitRun],
     joined: Mapping[int, JoinedTile],
     columns: Sequence[SlicedColumn],
-    notes: Sequence[str],
 ) -> MapManifest:
-    """Return the manifest of the map when it is whole."""
+    """Return the manifest of the map when it is whole, without notes."""
     runs_of = {tile: [run for run, part in enumerate(split) if tile in part.part_bytes] for tile in joined}
     counts = np.zeros((len(split), 3), np.int64)
     for tile, result in joined.items():
@@ -339,13 +337,19 @@ def _completed(
             "tiles": tiles,
             "voxels": sum(result.voxels for result in joined.values()),
             "area_km2": round(area_m2 / 1e6, 9),
-            "notes": tuple(notes),
         }
     )
 
 
-def _warnings_of(run: RunInMap) -> list[RunWarning]:
-    return merge_warnings(Path(run.path).name, agreement=run.agreement, shared_voxels=run.shared_voxels)
+def _disagreements(runs: Sequence[RunInMap]) -> list[str]:
+    """Return a line for each run whose walls are not where those of the runs before it are."""
+    return [
+        warning.text
+        for run in runs
+        for warning in merge_warnings(
+            Path(run.path).name, agreement=run.agreement, shared_voxels=run.shared_voxels
+        )
+    ]
 
 
 def _clean(workspace: Workspace, joined: Mapping[int, JoinedTile]) -> None:

@@ -22,10 +22,10 @@ from mapper.mapping.config import Region
 from mapper.merging.joint_graph import Tie
 from mapper.navigation.config import CostmapConfig, TraversableConfig
 from mapper.octree.config import OctreeConfig, SliceConfig
+from mapper.octree.grid import OccupancyGrid
 from mapper.octree.grid_file import stored_grid
 from mapper.octree.map import OctreeMap
-from mapper.octree.octomap_file import read_octree
-from mapper.octree.slice import OccupancyGrid
+from mapper.octree.reading import read_octree
 from mapper.run import files
 from mapper.run.manifest import is_merged_map
 from mapper.runtime.atomic import MANIFEST_NAME, FolderKind, partial_of, write_text
@@ -169,7 +169,7 @@ class MergedMap:
         """Return the poses in the map of the frames that a run's maps are made from.
 
         Raises:
-            RunError: The map is of before 2026-11-22, or its file is missing.
+            RunError: The map was made before 2026-11-22, or its file is missing.
         """
         path = self.path / run.folder / files.TRAJECTORY
         if not path.is_file():
@@ -190,7 +190,7 @@ class MergedMap:
         """Floor that a robot can drive on, of the storey on which the first run begins.
 
         Raises:
-            RunError: There is none; the manifest's notes say why, unless the map is of before 2026-11-22.
+            RunError: There is none; the manifest's notes say why, unless the map was made before 2026-11-22.
         """
         if not (self.path / f"{files.TRAVERSABLE}.yaml").is_file():
             why = next(

@@ -109,7 +109,7 @@ class Placing:
 
     @property
     def notes(self) -> list[str]:
-        """All that is to be told, a line each."""
+        """Notes for the user, a line each."""
         return [*(f"{path}: left out, {reason}" for path, reason in self.left_out.items()), *self.doubts]
 
 
@@ -221,7 +221,7 @@ def fit_poses(T_a_body: Array, T_b_body: Array) -> Transform:
 
 
 def _with_axes(T_a_body: Array) -> Array:
-    """Return (4 N, 3) positions, and the ends of the body's axes beside them."""
+    """Return (4 N, 3) positions, followed by the ends of the body's axes."""
     ends = T_a_body[:, :3, 3, np.newaxis] + _LEVER_M * T_a_body[:, :3, :3]
     return np.concatenate([T_a_body[:, :3, 3], ends.transpose(0, 2, 1).reshape(-1, 3)])
 

@@ -1,4 +1,4 @@
-"""Runs of a merged map: what the manifest tells of them, their poses, and their maps where they bent."""
+"""Runs of a merged map: their entries in the manifest, their poses, and their maps where these were bent."""
 
 import shutil
 from collections.abc import Sequence, Set
@@ -22,7 +22,7 @@ from mapper.sources.trajectory_files import write_tum
 
 def runs_to_fuse(placed: Sequence[Placed], *, within_m: float) -> tuple[set[int], list[str]]:
     """Return the numbers of the runs to fuse again, and a line for each that should be and cannot."""
-    again, stiff = set[int](), list[str]()
+    again, rigid = set[int](), list[str]()
     for number, item in enumerate(placed):
         if item.kept is not None:
             again |= {number} if item.kept.fused_again else set()
@@ -32,17 +32,17 @@ def runs_to_fuse(placed: Sequence[Placed], *, within_m: float) -> tuple[set[int]
         try:
             item.run.open_log()
         except MapperError as error:
-            stiff.append(
+            rigid.append(
                 f"{error}; so {item.run.path} is placed as a rigid body, and bends of up to "
                 f"{item.moved_m:.2g} m stay in its map"
             )
         else:
             again.add(number)
-    return again, stiff
+    return again, rigid
 
 
 def described_runs(placing: Placing, *, fused_again: Set[int]) -> tuple[RunInMap, ...]:
-    """Return what the manifest tells of the runs before they are merged."""
+    """Return the manifest's entries of the runs before they are merged."""
     first_nodes = (
         [None] * len(placing.placed) if placing.joint is None else placing.joint.first_nodes.values()
     )

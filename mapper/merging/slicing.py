@@ -14,7 +14,7 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import Points
 from mapper.export.picture import write_merged
 from mapper.mapping.edits import MapEditor
-from mapper.merging.floors import MOST_COLUMNS, Extent, editors_of, floor_over, kept_out
+from mapper.merging.floors import MOST_COLUMNS, Extent, editors_of, floor_over, with_keepout
 from mapper.merging.jobs import (
     BAND,
     GROUND,
@@ -31,15 +31,16 @@ from mapper.merging.placing import Placed
 from mapper.merging.stages import Stages
 from mapper.navigation.floor import Floor, driven_ground
 from mapper.navigation.traversable import Storey, traversable
+from mapper.octree.grid import OccupancyGrid, shrunk, with_obstacles
 from mapper.octree.ground_height import (
     NOTHING,
     DrivenGround,
     ground_from_lowest,
     known_floor,
-    lay_on_floor,
     nearest_heights,
+    snap_to_floor,
 )
-from mapper.octree.slice import OccupancyGrid, floor_below, free_path, grid_of, shrunk, with_obstacles
+from mapper.octree.slice import floor_below, free_path, grid_of
 
 _MOST_CELLS = 2000  # more than a page has pixels
 _MAX_TILT = np.cos(np.deg2rad(5.0))
@@ -71,7 +72,15 @@ def slice_map(
     manifest: MapManifest,
     placed: Sequence[Placed],
 ) -> Sliced:
-    """Find the floor under the runs' paths, and cut the slice above it."""
+    """Find the floor under the runs' paths, and cut the slice above it.
+
+    Args:
+        workspace: With the tiles and their pieces.
+        stages: Runs the jobs, one for each column of tiles.
+        joined: The tiles.
+        manifest: Of the map, without what is found here.
+        placed: Its runs.
+    """
     columns: dict[tuple[int, int], list[int]] = defaultdict(list)
     for tile in joined:
         x, y = workspace.window(tile)[0].tolist()
@@ -92,7 +101,7 @@ def slice_map(
         return Sliced(done, None, None, (), missing)
     seen = np.zeros(shape, np.uint8)
     for tiles in columns.values():
-        _over(np.bitwise_or, seen, first, workspace, tiles[0], BAND)
+        _join_piece(np.bitwise_or, seen, first, workspace, tiles[0], BAND)
     heights = {"resolution_m": manifest.octree.resolution_m, "floor_z_m": manifest.floor_z_m}
     if driven is not None:
         free_path(seen, driven, manifest.slice, **heights)
@@ -103,7 +112,7 @@ def slice_map(
         missing.append(f"no {error}")
     editors = editors_of(manifest, paths_map)
     keepout = None if grid is None else _keepout(grid, manifest, driven, editors)
-    storeys = () if floor is None else kept_out(traversable(floor, manifest.traversable), editors)
+    storeys = () if floor is None else with_keepout(traversable(floor, manifest.traversable), editors)
     return Sliced(done, grid, keepout, storeys, missing)
 
 
@@ -206,7 +215,7 @@ def _save_ground(
         if nearest is not None:
             inside, own = _overlap(corner - first, size, shape)
             level, distances = nearest
-            lay_on_floor(heights_m[own], level[inside], distances[inside], resolution_m=resolution_m)
+            snap_to_floor(heights_m[own], level[inside], distances[inside], resolution_m=resolution_m)
         save_array(workspace.piece(tiles[0], GROUND), heights_m)
 
 
@@ -232,11 +241,11 @@ class _Lowest:
         voxels = self.workspace.tiling.voxels
         for row in range(y // voxels * voxels, y + len(band), voxels):
             for tile in self.tiles.get(row, ()):
-                _over(np.minimum, band, np.array([x, y]), self.workspace, tile, LOWEST)
+                _join_piece(np.minimum, band, np.array([x, y]), self.workspace, tile, LOWEST)
         return band
 
 
-def _over(
+def _join_piece(
     join: np.ufunc, whole: NDArray[Any], first: NDArray[np.int64], workspace: Workspace, tile: int, piece: str
 ) -> None:
     """Join a tile's piece into a raster whose first column has these keys."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array
 from mapper.navigation.distance_transform import NONE, squares_to_centres
-from mapper.octree.slice import OCCUPIED, UNKNOWN, OccupancyGrid
+from mapper.octree.grid import OCCUPIED, UNKNOWN, OccupancyGrid
 
 NO_INFORMATION, LETHAL, INSCRIBED, FREE_SPACE = 255, 254, 253, 0
 """nav2_costmap_2d's cost values."""

@@ -10,8 +10,8 @@ from mapper.core.errors import DataError
 from mapper.core.geometry import Array, Points
 from mapper.navigation.distance_transform import NONE, squares_to_boxes
 from mapper.navigation.voxels import LIMIT_BYTES, Box, VoxelGrid, cut_box, layer
+from mapper.octree.grid import OccupancyGrid
 from mapper.octree.map import OctreeMap
-from mapper.octree.slice import OccupancyGrid
 
 Distances = NDArray[np.float32]
 

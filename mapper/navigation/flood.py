@@ -41,7 +41,7 @@ class Limits(NamedTuple):
 def limits_of(config: TraversableConfig, cell_m: float) -> Limits:
     """Return the limits of a robot in a map with voxels of an edge of ``cell_m``.
 
-    A step lower than a voxel cannot be told from noise and counts as one voxel.
+    A step lower than a voxel cannot be distinguished from noise and counts as one voxel.
     """
     step = max(1, int(config.max_step_m / cell_m + _ALLOWANCE))
     slope = float(np.tan(config.max_slope_rad))
@@ -59,7 +59,7 @@ def limits_of(config: TraversableConfig, cell_m: float) -> Limits:
 
 @njit(cache=True, nogil=True)
 def mark_surfaces(starts: Indices, tops: Tops, room: int, marked: Mask) -> None:
-    """Mark the voxels with so much room above."""
+    """Mark the voxels with at least ``room`` free voxels above."""
     for column in range(len(starts) - 1):
         end = starts[column + 1]
         for n in range(starts[column], end):
@@ -77,7 +77,18 @@ def flood(
     open_: Mask,
     reached: Mask,
 ) -> None:
-    """Mark the open surfaces that steps connect to the seeds, over gaps where no neighbour does."""
+    """Mark the open surfaces that steps connect to the seeds, over gaps where no neighbour does.
+
+    Args:
+        starts: As in ``Columns``.
+        tops: As in ``Columns``, (N,).
+        shape: H, W.
+        column_of: (N,) number of each voxel's column.
+        limits: Of the robot.
+        seeds: Indices of the voxels to begin at.
+        open_: (N,) mask of the voxels whose tops may be entered.
+        reached: (N,) result.
+    """
     height, width = shape
     total = 0
     for n in range(len(tops)):
@@ -102,7 +113,7 @@ def flood(
                         continue
                     found = -1
                     if 0 <= y < height and 0 <= x < width:
-                        found = _beside(starts, tops, y * width + x, tops[here], limits.step, open_)
+                        found = _within_step(starts, tops, y * width + x, tops[here], limits.step, open_)
                     if found < 0:
                         is_edge = True
                     elif not reached[found]:
@@ -119,7 +130,7 @@ def flood(
         row, column = column_of[here] // width, column_of[here] % width
         for y in range(max(row - reach, 0), min(row + reach + 1, height)):
             for x in range(max(column - reach, 0), min(column + reach + 1, width)):
-                found = _beside(starts, tops, y * width + x, tops[here], limits.step, open_)
+                found = _within_step(starts, tops, y * width + x, tops[here], limits.step, open_)
                 if (
                     found >= 0
                     and not reached[found]
@@ -131,7 +142,7 @@ def flood(
 
 
 @njit(cache=True, nogil=True)
-def _beside(starts: Indices, tops: Tops, column: int, top: int, step: int, open_: Mask) -> int:
+def _within_step(starts: Indices, tops: Tops, column: int, top: int, step: int, open_: Mask) -> int:
     """Return the open surface of a column that is nearest to a height and within a step of it, or −1."""
     found = -1
     for n in range(starts[column], starts[column + 1]):
@@ -177,8 +188,8 @@ def _plane(
 ) -> tuple[float, float, float]:
     """Return the least-squares plane through the floor around: height above ``top``, rises along x and y.
 
-    Floor that is so much higher or lower that no slope the robot can take leads there is not looked at: it is
-    another storey. Where the floor is a single line or point, the plane is level along it.
+    Floor that is too much higher or lower for any slope that the robot can take is left out: it is another
+    storey. Where the floor is a single line or point, the plane is level along it.
     """
     height, width = shape
     row, column, top = place
@@ -244,18 +255,34 @@ def mark_plane(
     tolerance: float,
     marked: Mask,
 ) -> None:
-    """Mark the candidates that lie in the plane of the floor beside them, if its slope is between two."""
+    """Mark the candidates that lie in the plane of the floor next to them.
+
+    Args:
+        starts: As in ``Columns``.
+        tops: As in ``Columns``, (N,).
+        shape: H, W.
+        column_of: (N,) number of each voxel's column.
+        limits: Of the robot.
+        candidates: (N,) mask of the voxels to look at.
+        floor: (N,) mask of the voxels that planes are laid through.
+        slopes: Least and largest slope of the plane, rise over run.
+        tolerance: Largest distance from the plane, in voxels.
+        marked: (N,) result.
+    """
     height, width = shape
     for n in range(len(tops)):
         if not candidates[n]:
             continue
         row, column = column_of[n] // width, column_of[n] % width
-        is_beside = False
+        is_at_floor = False
         for y in range(max(row - limits.window, 0), min(row + limits.window + 1, height)):
             for x in range(max(column - limits.window, 0), min(column + limits.window + 1, width)):
-                if not is_beside and _beside(starts, tops, y * width + x, tops[n], limits.step, floor) >= 0:
-                    is_beside = True
-        if is_beside:
+                if (
+                    not is_at_floor
+                    and _within_step(starts, tops, y * width + x, tops[n], limits.step, floor) >= 0
+                ):
+                    is_at_floor = True
+        if is_at_floor:
             place = (row, column, tops[n])
             above, a, b = _plane(starts, tops, shape, place, limits.window, limits, floor)
             slope = np.sqrt(a * a + b * b)

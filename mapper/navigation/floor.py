@@ -69,7 +69,7 @@ def reachable_floor(
 
 
 def margin_for(config: TraversableConfig, resolution_m: float) -> int:
-    """Return the columns that are needed around a map: what carried a sensor may have begun beside it."""
+    """Return the columns that are needed around a map: what carried a sensor may have begun outside it."""
     return int(np.ceil(config.footprint_m / resolution_m))
 
 
@@ -81,7 +81,7 @@ def floor_of(
     A surface is the top of an occupied voxel with head room above it, where unknown voxels count as free.
     From the ground under the paths, steps lead from surface to surface, over gaps in which nothing is known.
     Surfaces on which the plane through the floor around is too steep are not entered, unless a path led over
-    them. Without a path that tells the ground, all surfaces at the floor's height are where it begins.
+    them. Without a path whose ground is known, all surfaces at the floor's height are where it begins.
 
     Args:
         columns: The map's occupied voxels, with a margin of ``margin_for``; z is up.

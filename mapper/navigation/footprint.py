@@ -18,8 +18,14 @@ def with_footprint(
     """Return the columns with a voxel wherever ground of the path was not seen, and a mask of that ground.
 
     A column under the footprint has the ground of the path unless an obstacle lower than the sensor or,
-    beside the path itself, a drop was measured there. What is higher than the sensor did not stop what
+    outside the path's own column, a drop was measured there. What is higher than the sensor did not stop what
     carried it.
+
+    Args:
+        columns: The map's occupied voxels.
+        path: Ground along the path.
+        limits: Of the robot.
+        radius_m: Of the footprint.
     """
     if not len(path):
         return columns, np.zeros(len(columns.tops), np.bool_)
@@ -76,7 +82,7 @@ def _swept(
         rooms: (N,) number of voxels above the ground in which an obstacle blocks.
         radius: Of the footprint, in columns.
         step: Largest step of the robot, in voxels.
-        near: A surface so far from the path's ground, in the path's own column, is that ground.
+        near: A surface within this distance of the path's ground, in the path's own column, is that ground.
     """
     columns, found = [], []
     for i in range(len(places)):

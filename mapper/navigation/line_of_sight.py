@@ -47,7 +47,14 @@ def path_length(path: Array) -> float:
 
 
 def in_sight(field: DistanceField, begin: Array, end: Array, *, radius_m: float) -> bool:
-    """Return whether the line between two (3,) positions, z, y, x in cells, has a clearance."""
+    """Return whether a line has a clearance of ``radius_m`` all along.
+
+    Args:
+        field: Distances to obstacles.
+        begin: (3,) z, y, x in cells.
+        end: (3,) z, y, x in cells.
+        radius_m: The clearance.
+    """
     return bool(_visible(field.distances_m, field.resolution_m, radius_m, begin, end))
 
 

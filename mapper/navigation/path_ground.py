@@ -15,7 +15,7 @@ from mapper.octree.keys import KEY_ZERO
 _MAX_HEIGHT_M = 4.0
 """Sensors are carried no higher than this above the ground."""
 _CHANGE_PER_M = 10.0
-"""A change of the sensor's height by a metre costs as much as so many samples without ground below."""
+"""A change of the sensor's height by a metre costs as much as this number of samples without ground below."""
 _LONGEST_STEPS, _LEAST_BREAK_M = 5.0, 2.0
 _STEADY_M = 0.3
 _DRIVEN_M = 2.5
@@ -65,7 +65,7 @@ def path_ground(
     (Viterbi 1967). So a surface that is seen now and then gives the height where none is seen, and a table
     that a camera is held over does not raise the ground of a walk. A stretch is left out if its height is not
     that of the others and its ground, away from the floor's height, was not travelled along: a camera that
-    never leaves a desk tells nothing of the floor.
+    never leaves a desk shows nothing of the floor.
 
     Args:
         columns: The map's occupied voxels.
@@ -127,7 +127,7 @@ def _driven(
     kept = np.zeros(len(ground), np.bool_)
     usual: list[float] = []
     stretches = sorted(pairwise(bounds.tolist()), key=lambda one: one[0] - one[1])
-    for first, last in stretches:  # the longest first: it tells the usual height
+    for first, last in stretches:  # the longest first: its height is the usual one
         extent_m = float(np.linalg.norm(np.ptp(ground[first:last], axis=0)))
         on_floor = np.abs(ground[first:last, 2] - floor_z_m)[seen[first:last]] < _STEADY_M
         height_m = float(np.median(sensor_m[first:last]))
@@ -151,7 +151,7 @@ def _vote(
     room: float,
     votes: NDArray[np.float32],
 ) -> None:
-    """Write, for each height of the sensor, the share of the columns around with a surface so far below.
+    """Write, for each height of the sensor, the share of the columns around with a surface that far below.
 
     Args:
         starts: As in ``Columns``.
@@ -191,7 +191,7 @@ def _vote(
 
 @njit(cache=True, nogil=True)
 def _steadiest(votes: NDArray[np.float32], change_cost: float) -> NDArray[np.int64]:
-    """Return the (N,) heights of least cost: 1 less the votes for a height and beside it, plus changes."""
+    """Return the (N,) heights of least cost: 1 − votes for a height and its neighbours, plus changes."""
     count, states = votes.shape
     came_from = np.empty((count, states), np.int16)
     cost = np.zeros(states)

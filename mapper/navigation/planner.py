@@ -14,8 +14,8 @@ from mapper.navigation.distance import DistanceField, distance_field
 from mapper.navigation.line_of_sight import in_sight, path_length, shortened
 from mapper.navigation.search import Cell, shortest_path
 from mapper.navigation.voxels import LIMIT_BYTES, VoxelGrid, cut_box, known_box, layer
+from mapper.octree.grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.map import OctreeMap
-from mapper.octree.slice import OCCUPIED, UNKNOWN, OccupancyGrid
 
 _BYTES_PER_VOXEL = 30  # a distance field's 14, the mask of free voxels, and the search's costs and steps
 _ROUNDING_M = 1e-6
@@ -100,7 +100,7 @@ def plan_3d(
         start_world: (3,) metres.
         goal_world: (3,) metres.
         config: Radius, and whether unknown voxels are blocked.
-        keep_out: Tells of (N, 3) points, metres, which of them are blocked besides.
+        keep_out: Returns which of (N, 3) points, metres, are blocked in addition.
         limit_bytes: Limit of the working space.
 
     Raises:

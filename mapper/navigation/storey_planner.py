@@ -15,8 +15,8 @@ from mapper.navigation.search import shortest_path
 from mapper.navigation.traversable import Storey
 from mapper.navigation.voxels import layer
 from mapper.octree.columns import NOWHERE
+from mapper.octree.grid import UNKNOWN, OccupancyGrid
 from mapper.octree.ground_height import nearest_heights
-from mapper.octree.slice import UNKNOWN, OccupancyGrid
 
 
 def plan_storeys(
@@ -76,7 +76,7 @@ def plan_storeys(
         part_world = space.world(shortened(space.field, cells, radius_m=space.least_m))
         clearance_m = min(clearance_m, clearance_of(space.field, part_world))
         at = np.floor(np.array([space.in_cells(point) for point in part_world])[:, 1:]).astype(np.int64)
-        tops, _ = nearest_heights(heights[number])  # a gap that was closed has the height of floor beside it
+        tops, _ = nearest_heights(heights[number])  # closed gaps have the height of the floor around them
         part_world[:, 2] = tops[at[:, 0], at[:, 1]] * storeys[0].grid.resolution_m
         waypoints.append(part_world)
     waypoints_world = np.concatenate(waypoints)

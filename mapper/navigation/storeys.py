@@ -41,7 +41,7 @@ def storeys_of(floor: Floor, *, with_links: bool = False) -> tuple[list[Heights]
     sources = np.zeros(len(tops), np.bool_)
     sources[np.argmin(np.where(driven, tops, tops.max())) if driven.any() else np.argmin(tops)] = True
     _climb(starts, tops, columns.shape, column_of, limits.step, limits.gap, sources, storey)
-    # Floors over each other are told apart; all else goes to the nearer of them.
+    # Floors that lie over each other are separate storeys; all else goes to the nearer of them.
     shared = np.diff(starts)[column_of] > 1
     storey[~shared] = _NONE
     _climb(starts, tops, columns.shape, column_of, limits.step, limits.gap, shared, storey)
@@ -129,16 +129,16 @@ def _climb(
                 storey[n] = _free_storey(starts, column_of[n], n, storey, wanted)
             row, column = column_of[n] // width, column_of[n] % width
             for reach in (1, gap + 1):
-                beside = 0
+                level_surfaces = 0
                 for y in range(max(row - reach, 0), min(row + reach + 1, height)):
                     for x in range(max(column - reach, 0), min(column + reach + 1, width)):
                         for m in range(starts[y * width + x], starts[y * width + x + 1]):
                             climb = abs(tops[m] - tops[n])
-                            beside += climb <= step
+                            level_surfaces += climb <= step
                             if climb <= step and so_far + climb < cost[m]:
                                 cost[m] = so_far + climb
                                 heappush(heap, (cost[m], np.int64(m), np.int64(storey[n])))
-                if beside == 9:  # floor all around, itself included
+                if level_surfaces == 9:  # floor all around, itself included
                     break
         while rest < len(tops) and is_done[rest]:
             rest += 1
@@ -164,7 +164,7 @@ def _free_storey(starts: Indices, column: int, surface: int, storey: NDArray[np.
 def _extend(
     starts: Indices, tops: Tops, shape: tuple[int, int], column_of: Indices, step: int, reach: int, own: Mask
 ) -> None:
-    """Add the surfaces that up to so many steps lead to, in columns where the storey has none."""
+    """Add the surfaces that up to a number of steps lead to, in columns where the storey has none."""
     height, width = shape
     taken = np.zeros(height * width, np.bool_)
     queue = np.empty(len(tops), np.int64)

@@ -13,9 +13,9 @@ from mapper.navigation.flood import Indices, Limits, Mask
 from mapper.navigation.floor import Floor
 from mapper.navigation.storeys import Heights, storeys_of
 from mapper.octree.columns import NOWHERE, Tops
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.ground_height import nearest_heights
 from mapper.octree.keys import KEY_ZERO
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 _ALLOWANCE = 1e-6
 _NEAR_M = 1.0

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError, MapSizeError
 from mapper.core.geometry import Array
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_COUNT, KEY_ZERO, block_keys, gather
 from mapper.octree.map import OctreeMap
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 LIMIT_BYTES = 2 << 30
 """Default limit of the working space of a distance field or a plan."""

@@ -1,6 +1,6 @@
 """Voxel attributes where rays ended: mean colour, hit count, time of the last hit.
 
-A layer beside the log-odds, kept for those blocks only that have such a voxel: 14 KiB each, beside 2 KiB of
+A layer of its own, for those blocks only that have such a voxel: 14 KiB each, in addition to 2 KiB of
 log-odds. Sums are whole numbers, so colours do not depend on the order of scans.
 """
 

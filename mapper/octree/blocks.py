@@ -30,8 +30,8 @@ class BlockTable(NamedTuple):
     """The arrays of a block store, for compiled code.
 
     Attributes:
-        entries: (C, 2) int64 block codes by hash, −1 where vacant, each beside its row in ``values``: one
-            cache line answers. C is a power of two.
+        entries: (C, 2) int64 block codes by hash, −1 where vacant, each next to its row in ``values``:
+            a look-up reads one cache line. C is a power of two.
         values: (capacity, 512) float32 log-odds in Morton order inside the block; NaN is unknown.
     """
 

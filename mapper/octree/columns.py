@@ -1,6 +1,7 @@
 """Occupied voxels of an octree by column, in order of height, for ground plans and surfaces."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
@@ -8,7 +9,9 @@ from numpy.typing import NDArray
 
 from mapper.octree.blocks import check_memory
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_COUNT, KEY_MASK, KEY_ZERO, block_keys, gather
-from mapper.octree.map import OctreeMap
+
+if TYPE_CHECKING:
+    from mapper.octree.map import OctreeMap
 
 Tops = NDArray[np.int32]
 
@@ -70,7 +73,7 @@ def _keys(columns: NDArray[np.int64], tops: Tops) -> NDArray[np.int64]:
     return keys
 
 
-def block_extent(octree: OctreeMap) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def block_extent(octree: "OctreeMap") -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the (2,) x and y keys of the first column of any block, and those after the last column."""
     keys = block_keys(octree.blocks.codes)[:, :2]
     if not len(keys):
@@ -78,14 +81,14 @@ def block_extent(octree: OctreeMap) -> tuple[NDArray[np.int64], NDArray[np.int64
     return keys.min(axis=0), keys.max(axis=0) + (1 << BLOCK_BITS)
 
 
-def occupied_columns(octree: OctreeMap, *, margin: int = 0) -> Columns:
-    """Return the occupied voxels of a map by column, with a margin of so many columns around its blocks."""
+def occupied_columns(octree: "OctreeMap", *, margin: int = 0) -> Columns:
+    """Return the occupied voxels of a map by column, with a margin of some columns around its blocks."""
     return columns_of(
         occupied_voxels(octree), block_extent(octree), margin=margin, resolution_m=octree.resolution_m
     )
 
 
-def occupied_voxels(octree: OctreeMap) -> NDArray[np.int64]:
+def occupied_voxels(octree: "OctreeMap") -> NDArray[np.int64]:
     """Return the (N,) occupied voxels of a map, or of a part of one, for ``columns_of``."""
     voxels: NDArray[np.int64] = _occupied(
         octree.blocks.codes, octree.blocks.table.values, octree.occupied_log_odds

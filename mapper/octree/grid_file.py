@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapper.core.errors import MapFileError
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.runtime.regular_files import read_text
 
 FREE_PIXEL, OCCUPIED_PIXEL, UNKNOWN_PIXEL = 254, 0, 205

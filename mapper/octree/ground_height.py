@@ -2,7 +2,7 @@
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import cv2
 import numpy as np
@@ -12,14 +12,16 @@ from numpy.typing import NDArray
 from mapper.core.geometry import Array
 from mapper.octree.columns import NOWHERE
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, gather
-from mapper.octree.map import OctreeMap
+
+if TYPE_CHECKING:
+    from mapper.octree.map import OctreeMap
 
 _CELL_M = 3.0
 _MAX_SLOPE = 0.3
 _LOW_PERCENT = 20.0  # below it are reflections
 _START_M = 0.5
 _MIN_COLUMNS = 4
-_BESIDE_M = 1.0
+_NEAR_FLOOR_M = 1.0
 NOTHING = np.iinfo(np.int32).max
 """Value of ``lowest_occupied`` for a column without an occupied voxel."""
 
@@ -74,7 +76,8 @@ class DrivenGround:
 
     Attributes:
         heights: (H, W) int32 heights of the lowest such floor in voxels above z = 0; NOWHERE where there is
-            none. The columns are those of all blocks of the map and what the footprint passed over beside.
+            none. The columns are those of all blocks of the map, and any others that the
+            footprint passed over.
         swept: (H, W) mask of what the footprint passed over.
         first: (2,) x and y keys of the column of row 0 and column 0.
     """
@@ -85,7 +88,7 @@ class DrivenGround:
 
 
 def ground_heights(
-    octree: OctreeMap,
+    octree: "OctreeMap",
     *,
     first: NDArray[np.int64],
     shape: tuple[int, int],
@@ -114,7 +117,7 @@ def ground_heights(
     )
     heights_m = ground.under(first=first, shape=shape)
     if known is not None:
-        lay_on_floor(heights_m, *nearest_heights(known), resolution_m=octree.resolution_m)
+        snap_to_floor(heights_m, *nearest_heights(known), resolution_m=octree.resolution_m)
     return heights_m
 
 
@@ -123,12 +126,19 @@ def known_floor(driven: DrivenGround | None) -> NDArray[np.int32] | None:
     return None if driven is None or not (driven.heights > NOWHERE).any() else driven.heights
 
 
-def lay_on_floor(
+def snap_to_floor(
     heights_m: Array, level: NDArray[np.int32], distances: NDArray[np.float32], *, resolution_m: float
 ) -> None:
-    """Set the (H, W) ground within a metre of floor to the nearest floor, from ``nearest_heights``."""
-    beside = distances * resolution_m <= _BESIDE_M
-    heights_m[beside] = level[beside] * resolution_m
+    """Set the ground within a metre of floor to the nearest floor.
+
+    Args:
+        heights_m: (H, W) ground in the world, metres; changed in place.
+        level: (H, W) heights of the nearest floor, in voxels above z = 0, from ``nearest_heights``.
+        distances: (H, W) distances to it in columns, from there too.
+        resolution_m: Edge of a voxel.
+    """
+    near = distances * resolution_m <= _NEAR_FLOOR_M
+    heights_m[near] = level[near] * resolution_m
 
 
 def nearest_heights(heights: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
@@ -144,7 +154,7 @@ def nearest_heights(heights: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDAr
 
 
 def lowest_occupied(
-    octree: OctreeMap, *, first: NDArray[np.int64], shape: tuple[int, int]
+    octree: "OctreeMap", *, first: NDArray[np.int64], shape: tuple[int, int]
 ) -> NDArray[np.int32]:
     """Return the (H, W) top of each column's lowest occupied voxel, in voxels above z = 0.
 
@@ -165,9 +175,14 @@ def ground_from_lowest(
     floor_z_m: float,
     floor: NDArray[np.int32] | None = None,
 ) -> GroundHeights:
-    """Return the ground in cells from the result of ``lowest_occupied``; see ``ground_heights``.
+    """Return the ground in cells of a few metres; see ``ground_heights``.
 
-    ``floor`` are the (H, W) heights of floor that is known, in voxels.
+    Args:
+        lowest: (H, W) result of ``lowest_occupied``.
+        first: (2,) x and y keys of the column of row 0 and column 0.
+        resolution_m: Edge of a voxel.
+        floor_z_m: Height of the floor near x = y = 0, from which the ground is followed if no floor is known.
+        floor: (H, W) heights of known floor in voxels above z = 0, NOWHERE elsewhere; None if none is known.
     """
     columns = max(1, round(_CELL_M / resolution_m))
     low_m = _cells(lowest, columns, _LOW_PERCENT, NOTHING) * resolution_m
@@ -199,7 +214,7 @@ def _lowest_occupied(codes, slots, values, threshold, first, lowest):
 
 
 def _cells(tops: Rows, columns: int, percent: float, nothing: int) -> Array:
-    """Return a percentile of the heights in squares of so many columns; NaN where they are few."""
+    """Return a percentile of the heights in squares of such edges; NaN where few columns have one."""
     rows_of, columns_of = (-(-size // columns) for size in tops.shape)
     cells = np.full((rows_of, columns_of), np.nan)
     for row in range(rows_of):
@@ -218,9 +233,11 @@ def _follow(low_m: Array, heights_m: Array, *, max_step_m: float) -> None:
     while queue:
         row, column = queue.popleft()
         here_m = heights_m[row, column]
-        for beside in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
-            if not (0 <= beside[0] < low_m.shape[0] and 0 <= beside[1] < low_m.shape[1]):
+        for neighbour in ((row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)):
+            if not (0 <= neighbour[0] < low_m.shape[0] and 0 <= neighbour[1] < low_m.shape[1]):
                 continue
-            if np.isnan(heights_m[beside]):
-                heights_m[beside] = low_m[beside] if abs(low_m[beside] - here_m) <= max_step_m else here_m
-                queue.append(beside)
+            if np.isnan(heights_m[neighbour]):
+                heights_m[neighbour] = (
+                    low_m[neighbour] if abs(low_m[neighbour] - here_m) <= max_step_m else here_m
+                )
+                queue.append(neighbour)

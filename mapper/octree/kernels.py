@@ -5,7 +5,6 @@ repeat that mixture; without ``fastmath`` the compiler neither fuses nor reorder
 """
 
 from math import sqrt
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -21,15 +20,6 @@ _RAYS = 16  # rays that step together
 _STEPS = 8  # steps before ended rays are looked for
 _Y, _Z, _BETWEEN, _REACH, _END, _GOES_ON = (row * _RAYS for row in (1, 2, 3, 6, 6, 7))
 _NEVER = float64(np.finfo(np.float64).max)  # OctoMap's tMax along an axis that the ray does not move on
-
-
-class SensorModel(NamedTuple):
-    """OctoMap's sensor model in float32 log-odds: the increments of a hit and a miss, and the clamps."""
-
-    hit: np.float32
-    miss: np.float32
-    lowest: np.float32
-    highest: np.float32
 
 
 @njit(cache=True, nogil=True)

@@ -41,7 +41,18 @@ def nodes_at(
 def values_at_depth(
     store: BlockStore, points_world: Points, *, resolution_m: float, depth: int, parent: Parent
 ) -> NDArray[np.float32]:
-    """Return the (N,) log-odds of the nodes of one depth around points; NaN is unknown or out of range."""
+    """Return the (N,) log-odds of the nodes of one depth around points; NaN is unknown or out of range.
+
+    Args:
+        store: The map's blocks.
+        points_world: (N, 3) metres.
+        resolution_m: Edge of a voxel.
+        depth: Level of the tree, 0 (root) … 16 (voxels).
+        parent: Log-odds of a node above the voxels: ``max`` or ``mean`` of its known children.
+
+    Raises:
+        DataError: No such depth or parent.
+    """
     codes, values = nodes_at(store, depth=depth, parent=parent)
     values = np.append(values, np.float32(np.nan))
     wanted = codes_of(points_world, resolution_m) >> (3 * (KEY_BITS - depth))  # −1 stays −1

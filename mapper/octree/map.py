@@ -1,7 +1,6 @@
 """The occupancy map: OctoMap's result (Hornung et al. 2013) from sparse blocks and compiled kernels."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,15 +16,14 @@ from mapper.octree.boxes import BoxCounts, count_boxes
 from mapper.octree.casting import Cast, Caster, depth_limit_of, octree_config
 from mapper.octree.config import OctreeConfig, Parent
 from mapper.octree.first_obstacles import first_obstacles
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.keys import KEY_BITS, codes_of
 from mapper.octree.leaves import Leaves, RayEnds, centres_where, known_leaves
 from mapper.octree.nearest import Nearest, nearest_occupied
 from mapper.octree.scan_update import ScanUpdate
+from mapper.octree.sensor_model import SensorModel, log_odds, sensor_model
 from mapper.octree.summing import Overlap, add_blocks
 from mapper.octree.tree_reader import TreeLeaves, fill
-
-if TYPE_CHECKING:
-    from mapper.octree.slice import OccupancyGrid
 
 
 class OctreeMap:
@@ -151,15 +149,9 @@ class OctreeMap:
         self._known += kernels.merge(cells, positions, slots, self.blocks.table.values, self.sensor)
 
     @property
-    def sensor(self) -> kernels.SensorModel:
+    def sensor(self) -> SensorModel:
         """The sensor model in log-odds."""
-        config = self.config
-        return kernels.SensorModel(
-            hit=log_odds(config.hit_probability),
-            miss=log_odds(config.miss_probability),
-            lowest=log_odds(config.clamp_min_probability),
-            highest=log_odds(config.clamp_max_probability),
-        )
+        return sensor_model(self.config)
 
     @property
     def occupied_log_odds(self) -> np.float32:
@@ -173,13 +165,11 @@ class OctreeMap:
             points_world: (..., 3) metres, world frame.
 
         Returns:
-            (...) int8 of ``OCCUPIED``, ``FREE`` and ``UNKNOWN`` of :mod:`mapper.octree.slice`.
+            (...) int8 of ``OCCUPIED``, ``FREE`` and ``UNKNOWN`` of :mod:`mapper.octree.grid`.
 
         Raises:
             DataError: The points are not (..., 3) numbers.
         """
-        from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN
-
         values = self.log_odds_at(points_world)
         known = np.where(values >= self.occupied_log_odds, np.int8(OCCUPIED), np.int8(FREE))
         return np.where(np.isnan(values), np.int8(UNKNOWN), known)
@@ -221,7 +211,7 @@ class OctreeMap:
         """Return the (N, 3) float64 centres of all free voxels, metres, in Morton order."""
         return centres_where(self.blocks, self.resolution_m, lambda odds: odds < self.occupied_log_odds)
 
-    def slice(self, z_min: float, z_max: float | None = None) -> "OccupancyGrid":
+    def slice(self, z_min: float, z_max: float | None = None) -> OccupancyGrid:
         """Return the 2D map of the voxels with centres between two heights; occupied beats free.
 
         Args:
@@ -243,7 +233,7 @@ class OctreeMap:
     def are_near_occupied(
         self, points_world: Points | Points32, *, max_distance_m: float
     ) -> NDArray[np.bool_]:
-        """Return the (N,) mask of (N, 3) points, metres, in occupied voxels or so near to one's centre."""
+        """Return the (N,) mask of (N, 3) points, metres, in occupied voxels or near the centre of one."""
         near = self.are_occupied(points_world)
         nearest = self.nearest_obstacles(points_world[~near].astype(np.float64), max_range_m=max_distance_m)
         near[~near] = np.isfinite(nearest.distances_m)
@@ -252,7 +242,17 @@ class OctreeMap:
     def cast_rays(
         self, origins_world: Points, directions_world: Points, *, max_range_m: float, through_unknown: bool
     ) -> RayEnds:
-        """Return the first occupied voxel along rays; see :mod:`mapper.octree.first_obstacles`."""
+        """Return the first occupied voxel along N rays, as OctoMap's ``castRay`` finds it.
+
+        Args:
+            origins_world: (N, 3) metres.
+            directions_world: (N, 3) of any length but zero.
+            max_range_m: Rays end without a hit once a voxel's centre is further away.
+            through_unknown: Pass unknown voxels; otherwise a ray ends, without a hit, in the first.
+
+        Raises:
+            DataError: Shapes differ, a direction is zero or not finite, or an origin has no key.
+        """
         return first_obstacles(
             self.blocks,
             origins_world,
@@ -356,7 +356,7 @@ class OctreeMap:
         return coarse
 
     def forget(self, voxels: int) -> None:
-        """Count so many voxels less as known, after their log-odds were set to NaN."""
+        """Reduce the number of known voxels, after the log-odds of some were set to NaN."""
         self._known -= voxels
 
     def set_free(self, slots: NDArray[np.int64], voxels: NDArray[np.bool_]) -> int:
@@ -413,8 +413,3 @@ class OctreeMap:
             codes, node_values = levels.nodes_at(self.blocks, depth=depth, parent=parent)
             return Leaves(levels.keys_at_depth(codes), node_values, self.resolution_m, depth)
         return known_leaves(self.blocks, self.blocks.sorted_slots(), self.resolution_m)
-
-
-def log_odds(probability: float) -> np.float32:
-    """Return ln(p / (1 − p)) rounded to float32, as OctoMap stores it."""
-    return np.float32(np.log(probability / (1.0 - probability)))

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zstandard
@@ -22,12 +22,14 @@ from pydantic import ValidationError
 from mapper.core.config import drop_unknown
 from mapper.core.errors import MapFileError
 from mapper.octree.attributes import AttributeLayer
-from mapper.octree.blocks import BLOCK_BYTES, check_memory, find_slots
+from mapper.octree.blocks import BLOCK_BYTES, BlockStore, check_memory, find_slots
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import BLOCK_VOXELS
-from mapper.octree.map import OctreeMap
 from mapper.runtime.atomic import writing
 from mapper.runtime.checked_file import CheckedFormat
+
+if TYPE_CHECKING:
+    from mapper.octree.map import OctreeMap
 
 MAGIC = b"\x89mapper-octree\r\n"
 
@@ -41,7 +43,7 @@ _ATTRIBUTE_BYTES = BLOCK_VOXELS * 28
 """Memory of a block's attributes: three sums of colour, their weight, hits and a stamp per voxel."""
 
 
-def write_map(path: Path, octree: OctreeMap) -> None:
+def write_map(path: Path, octree: "OctreeMap") -> None:
     """Write a map with its sensor model and all attributes; atomic.
 
     Beside the map, this takes a tenth of its memory and 100 MB; attributes are copied as a whole.
@@ -78,7 +80,7 @@ def write_map(path: Path, octree: OctreeMap) -> None:
 
 
 def _attribute_columns(
-    octree: OctreeMap, layer: AttributeLayer
+    octree: "OctreeMap", layer: AttributeLayer
 ) -> tuple[list[NDArray[Any]], tuple[int, int]]:
     slots, arrays = layer.slots, layer.arrays
     rows = arrays.rows[slots]
@@ -116,20 +118,19 @@ def _sizes(counts: Sequence[int]) -> list[int]:
     return [count * np.dtype(kind).itemsize for count, kind in _columns(counts)]
 
 
-def parse_map(path: Path, data: bytes, config: OctreeConfig | None) -> OctreeMap:
-    """Return the map of a file's bytes, which begin with ``MAGIC``.
+def parse_map(path: Path, data: bytes) -> tuple[OctreeConfig, list[NDArray[Any]]]:
+    """Return the settings and the arrays of a file that begins with ``MAGIC``; their order is the module's.
 
     Args:
         path: Path of the file, for errors.
         data: All of its bytes.
-        config: Sensor model, in place of the file's, for scans inserted later; the resolution is the file's.
 
     Raises:
         MapFileError: The file is of another version, truncated or damaged.
         MapSizeError: The map would not fit into memory.
     """
     head, body = _FORMAT.split(path, data)
-    counts, own_config = _parse_header(path, head)
+    counts, config = _parse_header(path, head)
     plain_bytes = sum(_sizes(counts))
     check_memory(counts[0] * BLOCK_BYTES + counts[2] * _ATTRIBUTE_BYTES + plain_bytes, f"the map in {path}")
     plain = _decompressed(path, body, plain_bytes)
@@ -138,16 +139,7 @@ def parse_map(path: Path, data: bytes, config: OctreeConfig | None) -> OctreeMap
     for count, kind in _columns(counts):
         columns.append(np.frombuffer(plain, kind, count=count, offset=at))
         at += columns[-1].nbytes
-    if config is None:
-        config = own_config
-    else:
-        kept = {"resolution_m": own_config.resolution_m, "attributes": own_config.attributes}
-        config = config.model_copy(update=kept)
-    octree = OctreeMap(config)
-    _fill(path, octree, *columns[:3])
-    if octree.attributes is not None:
-        _fill_attributes(path, octree, octree.attributes, columns[3:])
-    return octree
+    return config, columns
 
 
 def _parse_header(path: Path, head: bytes) -> tuple[list[int], OctreeConfig]:
@@ -185,28 +177,44 @@ def _held(path: Path, steps: NDArray[np.int64], bits: NDArray[np.uint8], count: 
     return held
 
 
-def _fill(
-    path: Path,
-    octree: OctreeMap,
-    steps: NDArray[np.int64],
-    bits: NDArray[np.uint8],
-    values: NDArray[np.float32],
-) -> None:
-    known = _held(path, steps, bits, len(values))
-    octree.restore_blocks(np.cumsum(steps), known, values)
+def voxels_of(
+    path: Path, columns: Sequence[NDArray[Any]]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.float32]]:
+    """Return the arguments of :meth:`OctreeMap.restore_blocks`.
+
+    Args:
+        path: Path of the file, for errors.
+        columns: Of ``parse_map``.
+
+    Raises:
+        MapFileError: The arrays contradict each other.
+    """
+    steps, bits, values = columns[:3]
+    return np.cumsum(steps), _held(path, steps, bits, len(values)), values
 
 
-def _fill_attributes(
-    path: Path, octree: OctreeMap, layer: AttributeLayer, columns: list[NDArray[Any]]
+def restore_attributes(
+    path: Path, columns: Sequence[NDArray[Any]], blocks: BlockStore, layer: AttributeLayer
 ) -> None:
-    steps, bits, red, green, blue, weights, hits, last_seen_ns = columns
+    """Fill the attributes of a map that has its voxels, from the arrays of a file.
+
+    Args:
+        path: Path of the file, for errors.
+        columns: Of ``parse_map``.
+        blocks: The map's.
+        layer: The map's attributes, still empty.
+
+    Raises:
+        MapFileError: The arrays contradict each other or the map.
+    """
+    steps, bits, red, green, blue, weights, hits, last_seen_ns = columns[3:]
     held = _held(path, steps, bits, len(hits))
     slots = np.empty(len(steps), np.int64)
-    if find_slots(octree.blocks.table, np.cumsum(steps), slots):
+    if find_slots(blocks.table, np.cumsum(steps), slots):
         raise MapFileError(f"{path}: has attributes of blocks that it does not have; it is damaged")
     rows = layer.claim(slots)
-    blocks, voxels = np.nonzero(held)
-    index = rows[blocks], voxels
+    held_blocks, voxels = np.nonzero(held)
+    index = rows[held_blocks], voxels
     layer.arrays.color_sums[index] = np.column_stack([red, green, blue])
     layer.arrays.color_weights[index] = weights
     layer.arrays.hits[index] = hits

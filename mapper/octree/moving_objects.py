@@ -14,18 +14,18 @@ What moves is away for a time without a break, while rays that miss a thin thing
 leg, lie between rays that hit it. So misses are counted in the longest stretch of scans that do not hit the
 voxel; what precedes the first hit and what follows the last are one stretch.
 
-A voxel with h hits held something that moved if no surface is beside it and it was seen through at least
+A voxel with h hits held something that moved if no surface is next to it and it was seen through at least
 twice and in more than h/2 scans. A sparse sensor seldom observes all voxels around in one scan; for it, 8
-passes and more than 2h are enough. A surface is a voxel that was hit and has a voxel beside it that no
-scan observed: the ground, a wall. Feet and wheels touch the ground: a voxel that was hit beside a voxel of
+passes and more than 2h are enough. A surface is a voxel that was hit and has a voxel next to it that no
+scan observed: the ground, a wall. Feet and wheels touch the ground: a voxel that was hit next to a voxel of
 a moving object that was hit too, in 9 of 10 of its hits, belongs to the object; this is repeated once. As
 rings may lie more than a voxel apart, two voxels from it are near enough for one with at least 3 and more
-than 2h passes; without that, poles beside traffic would go. Where a log begins or ends, much of an object was
-never seen through: up to 0.4 m away, what was so near in all of its hits belongs to it, too.
+than 2h passes; without that, poles next to traffic would go. Where a log begins or ends, much of an object
+was never seen through: what was within 0.4 m of the object in all of its own hits belongs to it, too.
 
-Where the foot of an object shares a voxel with the ground, that voxel stays. Its returns are told from the
-ground's scan by scan: those on the ground, at most two voxels below a removed voxel that the same scan hit
-and at most one aside, belong to the object. The cloud is made without them.
+Where the foot of an object shares a voxel with the ground, that voxel stays. Its returns are separated from
+the ground's scan by scan: those on the ground, at most two voxels below a removed voxel that the same scan
+hit and at most one aside, belong to the object. The cloud is made without them.
 
 What remains of the voxels that were ever hit is occupied, unless its void misses alone outweigh its hits.
 """
@@ -73,7 +73,7 @@ class MovingObjects:
     Attributes:
         blocks: The blocks of the map.
         removed: The plane of these voxels, by the blocks' slots.
-        surfaces: The plane of the voxels that were hit and have a voxel beside them that no scan observed.
+        surfaces: The plane of the voxels that were hit and have a voxel next to them that no scan observed.
         resolution_m: Edge of a voxel.
     """
 
@@ -139,10 +139,10 @@ def remove_moving_objects(octree: OctreeMap, scans: Callable[[], Iterable[ScanUp
     often |= (passes >= _LEAST_PASSES) & (passes > _PASSES_RATIO * hits)
     inside = _inside(octree)
     surfaces = ever & ~inside
-    beside_surfaces = dilated(surfaces, neighbours_of(blocks.codes), absent=NONE_SET)
-    moved = often & _gathered(inside & ~beside_surfaces, ever, count)
+    near_surfaces = dilated(surfaces, neighbours_of(blocks.codes), absent=NONE_SET)
+    moved = often & _gathered(inside & ~near_surfaces, ever, count)
     passed = (passes >= _LEAST_PASSES_NEARBY) & (passes > _PASSES_RATIO * hits)
-    beside, nearby = np.zeros((2, count), np.int32)
+    adjacent, nearby = np.zeros((2, count), np.int32)
     counted = np.zeros_like(ever)
     for done in range(max(_ATTACHED_ROUNDS, ceil(_ATTACHED_M / octree.resolution_m))):
         removed = _scattered(moved, ever)
@@ -152,12 +152,12 @@ def remove_moving_objects(octree: OctreeMap, scans: Callable[[], Iterable[ScanUp
             if np.array_equal(near, before):
                 continue
             neighbours = neighbours_of(scan.codes)
-            for counts in (beside, nearby):
+            for counts in (adjacent, nearby):
                 near, before = (dilated(plane, neighbours, absent=NONE_SET) for plane in (near, before))
                 _count_one(hit & near & ~before, slots, ever, starts, counts)
         counted = removed
         least = hits * (_ATTACHED_RATIO if done < _ATTACHED_ROUNDS else 1.0)
-        attached = (beside >= least) | (passed & (nearby >= least))
+        attached = (adjacent >= least) | (passed & (nearby >= least))
         if not (attached & ~moved).any():
             break
         moved |= attached

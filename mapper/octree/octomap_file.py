@@ -3,23 +3,22 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapper.core.errors import DataError, MapFileError, MapSizeError
-from mapper.core.paths import AnyPath
+from mapper.core.errors import MapFileError
 from mapper.octree import tree_reader
 from mapper.octree.attributes import UNSET
-from mapper.octree.blocks import check_memory
 from mapper.octree.color_tree import COLOR_NODE, colored
-from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import KEY_BITS
-from mapper.octree.map import OctreeMap, log_odds
-from mapper.octree.map_file import MAGIC, parse_map
+from mapper.octree.sensor_model import SensorModel
 from mapper.octree.tree import NODE, children_in, nodes_in_preorder, preorder_of, words_in_preorder
 from mapper.runtime import atomic
-from mapper.runtime.regular_files import read_regular
+
+if TYPE_CHECKING:
+    from mapper.octree.map import OctreeMap
 
 _FULL = b"# Octomap OcTree file"
 _BINARY = b"# Octomap OcTree binary file"
@@ -43,7 +42,7 @@ class _Header:
     resolution_m: float
 
 
-def write_ot(path: Path, octree: OctreeMap) -> None:
+def write_ot(path: Path, octree: "OctreeMap") -> None:
     """Write all log-odds as an OcTree, pruned, or as a ColorOcTree if the map has colours; atomic."""
     pieces: Iterable[NDArray[np.void]] = ()
     count, tree_name = 0, "OcTree"
@@ -63,19 +62,19 @@ def write_ot(path: Path, octree: OctreeMap) -> None:
     )
 
 
-def write_bt(path: Path, octree: OctreeMap) -> None:
+def write_bt(path: Path, octree: "OctreeMap") -> None:
     """Write the maximum-likelihood map (each voxel free or occupied) as an OcTree, pruned; atomic."""
     words, node_count = _bt_words(octree)
     write_tree(path, [words], binary=True, node_count=node_count, resolution_m=octree.resolution_m)
 
 
-def bt_bytes(octree: OctreeMap) -> int:
+def bt_bytes(octree: "OctreeMap") -> int:
     """Return the size of the file that :func:`write_bt` writes."""
     words, node_count = _bt_words(octree)
     return len(_header_bytes(_BINARY, node_count, octree.resolution_m, "OcTree")) + words.nbytes
 
 
-def _bt_words(octree: OctreeMap) -> tuple[NDArray[np.uint16], int]:
+def _bt_words(octree: "OctreeMap") -> tuple[NDArray[np.uint16], int]:
     """Return the words of a ``.bt`` file and the number of nodes that they describe."""
     if not len(octree):
         return np.empty(0, "<u2"), 0
@@ -116,56 +115,41 @@ def _header_bytes(first_line: bytes, node_count: int, resolution_m: float, tree_
     ).encode("ascii")
 
 
-def read_octree(path: AnyPath, config: OctreeConfig | None = None) -> OctreeMap:
-    """Return the map of a ``.bt`` or ``.ot`` file of an OcTree or a ColorOcTree, or of an ``.octree`` file.
+@dataclass(frozen=True, slots=True, eq=False)
+class OctomapTree:
+    """Content of an OctoMap file.
 
-    Leaves of a ``.bt`` file take the clamping values of the sensor model. A file with colours makes a map
-    with attributes. The kind of file follows from its first bytes, not from its name.
+    Attributes:
+        resolution_m: Edge of a voxel.
+        leaves: Leaves of the pruned tree; None of an empty tree.
+        colors: (L, 3) uint8 colours of the leaves, white where there are none; None of a ``.bt`` file.
+    """
+
+    resolution_m: float
+    leaves: tree_reader.TreeLeaves | None = None
+    colors: NDArray[np.uint8] | None = None
+
+
+def parse_tree(path: Path, data: bytes, sensor: SensorModel) -> OctomapTree:
+    """Return the tree of a file's bytes.
 
     Args:
-        path: The file.
-        config: Sensor model for scans inserted later; None takes that of an ``.octree`` file, or OctoMap's
-            defaults. The resolution is always the file's.
+        path: Path of the file, for errors.
+        data: All of its bytes.
+        sensor: Its limits are the log-odds of the leaves of a ``.bt`` file.
 
     Raises:
-        MapFileError: The file cannot be read, is truncated, foreign or damaged.
-        MapSizeError: Its leaves, expanded to voxels, would not fit into memory.
+        MapFileError: The file is truncated, foreign or damaged.
     """
-    path = Path(path)
-    try:
-        size = path.stat().st_size
-        check_memory(size, f"the map in {path}")
-        return _parse(path, read_regular(path, most_bytes=size), config)
-    except OSError as error:
-        raise MapFileError(f"{path}: cannot be read: {error.strerror}") from None
-    except DataError as error:
-        raise MapFileError(f"{path}: {error}") from None
-    except MemoryError:
-        raise MapSizeError(f"{path}: does not fit into memory") from None
-
-
-def _parse(path: Path, data: bytes, config: OctreeConfig | None) -> OctreeMap:
-    if data.startswith(MAGIC):
-        return parse_map(path, data, config)
     header, start = _parse_header(path, data)
-    config = (config or OctreeConfig()).model_copy(update={"resolution_m": header.resolution_m})
     if header.node_count == 0:
         if start != len(data):
             raise MapFileError(f"{path}: size 0, but {len(data) - start} bytes follow; it is damaged")
-        return OctreeMap(config)
+        return OctomapTree(header.resolution_m)
     payload = memoryview(data)[start:]
     if header.binary:
-        octree = OctreeMap(config)
-        octree.restore(_binary_leaves(path, header, payload, config))
-        return octree
-    leaves, colors = _full_leaves(path, header, payload)
-    if (colors != UNSET).any():
-        config = config.model_copy(update={"attributes": True})
-    octree = OctreeMap(config)
-    octree.restore(leaves)
-    if octree.attributes is not None:
-        octree.attributes.restore_colors(leaves.codes, leaves.depths, colors)
-    return octree
+        return OctomapTree(header.resolution_m, _binary_leaves(path, header, payload, sensor))
+    return OctomapTree(header.resolution_m, *_full_leaves(path, header, payload))
 
 
 def _parse_header(path: Path, data: bytes) -> tuple[_Header, int]:
@@ -208,7 +192,7 @@ def _parse_header(path: Path, data: bytes) -> tuple[_Header, int]:
 
 
 def _binary_leaves(
-    path: Path, header: _Header, payload: memoryview, config: OctreeConfig
+    path: Path, header: _Header, payload: memoryview, sensor: SensorModel
 ) -> tree_reader.TreeLeaves:
     # A word describes at most eight nodes, which bounds the memory that a damaged count asks for.
     if len(payload) % 2 or header.node_count > 1 + 4 * len(payload):
@@ -219,8 +203,8 @@ def _binary_leaves(
     leaves, nodes, fault = tree_reader.leaves_of_words(
         np.frombuffer(payload, dtype="<u2"),
         header.node_count,
-        log_odds(config.clamp_min_probability),
-        log_odds(config.clamp_max_probability),
+        sensor.lowest,
+        sensor.highest,
     )
     if fault:
         raise MapFileError(f"{path}: {_FAULTS[fault]}")

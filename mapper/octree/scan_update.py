@@ -67,7 +67,7 @@ def pack(cast: Cast) -> ScanUpdate:
 
 
 def decompressed(data: bytes, *, blocks: int) -> ScanUpdate:
-    """Return the update of so many blocks from the bytes of ``ScanUpdate.compressed``.
+    """Return the update of a number of blocks from the bytes of ``ScanUpdate.compressed``.
 
     Raises:
         DataError: The bytes are damaged.

@@ -1,7 +1,6 @@
 """2D navigation map: a horizontal band of the octree projected onto the ground plane."""
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -11,97 +10,16 @@ from numpy.typing import NDArray
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import Array
-from mapper.core.plan_axes import plan_axes
 from mapper.octree.columns import block_extent
 from mapper.octree.config import SliceConfig
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.ground_height import DrivenGround, ground_heights, known_floor, nearest_heights
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, block_keys, gather
-from mapper.octree.map import OctreeMap
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-UNKNOWN, FREE, OCCUPIED = -1, 0, 100
-"""ROS OccupancyGrid codes, ordered so that the maximum over a column is its state."""
+    from mapper.octree.map import OctreeMap
 
 _SEEN_FREE, _SEEN_OCCUPIED = 1, 2
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class OccupancyGrid:
-    """2D occupancy grid in the ground plane.
-
-    Attributes:
-        cells: (H, W) int8 of UNKNOWN, FREE and OCCUPIED; row 0 has the lowest y, column 0 the lowest x.
-        origin_world_m: (2,) x and y of the lower left corner of cell (0, 0), metres.
-        resolution_m: Edge of a cell.
-    """
-
-    cells: NDArray[np.int8]
-    origin_world_m: Array
-    resolution_m: float
-
-    @property
-    def grid(self) -> NDArray[np.int8]:
-        """(H, W) int8: ``cells``."""
-        return self.cells
-
-    @property
-    def resolution(self) -> float:
-        """Edge of a cell, metres: ``resolution_m``."""
-        return self.resolution_m
-
-    @property
-    def origin(self) -> Array:
-        """(2,) x and y of the lower left corner, metres, world frame: ``origin_world_m``."""
-        return self.origin_world_m
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of ``cells``."""
-        rows, columns = self.cells.shape
-        return rows, columns
-
-    def plot(self, axes: "Axes | None" = None) -> "Axes":
-        """Draw the grid: free cells white, occupied ones black, unknown ones grey.
-
-        Args:
-            axes: Matplotlib's axes to draw on; None makes a figure of pyplot's.
-
-        Returns:
-            The axes, in metres of the world.
-        """
-        axes = plan_axes(axes)
-        x, y = self.origin_world_m.tolist()
-        rows, columns = self.shape
-        extent = (x, x + columns * self.resolution_m, y, y + rows * self.resolution_m)
-        shades = np.select([self.cells == FREE, self.cells == OCCUPIED], [1.0, 0.0], 0.8)
-        axes.imshow(shades, cmap="gray", vmin=0.0, vmax=1.0, origin="lower", extent=extent)
-        return axes
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        return np.array(self.cells, dtype=dtype, copy=copy)
-
-    def __post_init__(self) -> None:
-        if self.cells.ndim != 2 or self.cells.size == 0 or self.cells.dtype != np.int8:
-            raise DataError(
-                f"grid: cells {self.cells.shape} {self.cells.dtype}, want (H, W) int8 of some size"
-            )
-        codes = np.unique(self.cells)
-        if not np.isin(codes, (UNKNOWN, FREE, OCCUPIED)).all():
-            raise DataError(f"grid: codes {codes.tolist()}, want only {UNKNOWN}, {FREE} and {OCCUPIED}")
-        if self.origin_world_m.shape != (2,) or not np.isfinite(self.origin_world_m).all():
-            raise DataError(f"grid: origin {self.origin_world_m}, want two finite numbers")
-        if not 0.0 < self.resolution_m < np.inf:
-            raise DataError(f"grid: resolution {self.resolution_m} m, want > 0")
-
-
-def with_obstacles(grid: OccupancyGrid, others: OccupancyGrid | None) -> OccupancyGrid:
-    """Return a grid with what is occupied in another of the same cells, if there is one, occupied too."""
-    if others is None:
-        return grid
-    cells = np.where(others.cells == OCCUPIED, others.cells, grid.cells)
-    return OccupancyGrid(cells, grid.origin_world_m, grid.resolution_m)
 
 
 def floor_below(
@@ -125,19 +43,7 @@ def floor_below(
     return nearest_heights(known)[0][y : y + height, x : x + width]
 
 
-def shrunk(grid: OccupancyGrid, most_cells: int) -> OccupancyGrid:
-    """Return a grid of no more cells along an edge, for a picture: a cell is the maximum of those in it."""
-    factor = -(-max(grid.cells.shape) // most_cells)
-    if factor == 1:
-        return grid
-    padding = [(0, -size % factor) for size in grid.cells.shape]
-    cells = np.pad(grid.cells, padding, constant_values=UNKNOWN)
-    rows, columns = (size // factor for size in cells.shape)
-    cells = cells.reshape(rows, factor, columns, factor).max(axis=(1, 3))
-    return OccupancyGrid(cells, grid.origin_world_m, factor * grid.resolution_m)
-
-
-def cut_between(octree: OctreeMap, z_min: float, z_max: float | None) -> OccupancyGrid:
+def cut_between(octree: "OctreeMap", z_min: float, z_max: float | None) -> OccupancyGrid:
     """Return the band between two heights of the world; without the upper one, the voxels at the lower."""
     if z_max is None:
         z_min = octree.resolution_m * (z_min // octree.resolution_m)
@@ -146,7 +52,7 @@ def cut_between(octree: OctreeMap, z_min: float, z_max: float | None) -> Occupan
 
 
 def cut_slice(
-    octree: OctreeMap, config: SliceConfig, *, floor_z_m: float = 0.0, driven: DrivenGround | None = None
+    octree: "OctreeMap", config: SliceConfig, *, floor_z_m: float = 0.0, driven: DrivenGround | None = None
 ) -> OccupancyGrid:
     """Return the band between two heights above the floor as a grid just large enough for it.
 
@@ -171,7 +77,7 @@ def cut_slice(
     ground_m = None
     if config.above == "ground":
         ground_m = ground_heights(octree, first=first, shape=shape, floor_z_m=floor_z_m, driven=driven)
-    seen = see_band(octree, config, first=first, shape=shape, ground_m=ground_m, floor_z_m=floor_z_m)
+    seen = band_flags(octree, config, first=first, shape=shape, ground_m=ground_m, floor_z_m=floor_z_m)
     if driven is not None:
         free_path(seen, driven, config, resolution_m=octree.resolution_m, floor_z_m=floor_z_m)
     return grid_of(seen, config, first=first, resolution_m=octree.resolution_m, floor_z_m=floor_z_m)
@@ -185,15 +91,23 @@ def free_path(
     resolution_m: float,
     floor_z_m: float,
 ) -> None:
-    """Flag the columns as free that what carried the sensor passed; of a level band, those of its storey."""
+    """Flag the columns as free that what carried the sensor passed; of a level band, those of its storey.
+
+    Args:
+        seen: (H, W) flags of ``band_flags`` in the columns of ``driven``; changed in place.
+        driven: The ground that was driven on.
+        config: Heights of the band.
+        resolution_m: Edge of a voxel.
+        floor_z_m: Height of the floor in the world.
+    """
     swept = driven.swept
     if config.above == "floor":
         swept = swept & (np.abs(driven.heights * resolution_m - floor_z_m) <= config.min_height_m)
     seen[swept] = _SEEN_FREE
 
 
-def see_band(
-    octree: OctreeMap,
+def band_flags(
+    octree: "OctreeMap",
     config: SliceConfig,
     *,
     first: NDArray[np.int64],
@@ -238,7 +152,14 @@ def grid_of(
     resolution_m: float,
     floor_z_m: float,
 ) -> OccupancyGrid:
-    """Return the flags of ``see_band`` as a grid, cropped to its known cells.
+    """Return the flags of ``band_flags`` as a grid, cropped to its known cells.
+
+    Args:
+        seen: (H, W) the flags.
+        config: Heights of the band, for the error, and the smallest group of occupied cells.
+        first: (2,) x and y keys of the column of row 0 and column 0.
+        resolution_m: Edge of a voxel.
+        floor_z_m: Height of the floor in the world, for the error.
 
     Raises:
         DataError: No voxel of the band is known.

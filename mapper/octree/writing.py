@@ -1,16 +1,19 @@
 """Writing of a map in the format that a file's name says."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mapper.core.errors import MapFileError
-from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import write_map
 from mapper.octree.octomap_file import write_bt, write_ot
+
+if TYPE_CHECKING:
+    from mapper.octree.map import OctreeMap
 
 _WRITERS = {".octree": write_map, ".ot": write_ot, ".bt": write_bt}
 
 
-def write_octree(path: Path, octree: OctreeMap) -> None:
+def write_octree(path: Path, octree: "OctreeMap") -> None:
     """Write a map to a file; atomic.
 
     Args:

@@ -22,7 +22,7 @@ from mapper.pipeline.track import (
     refuse_a_fragment,
     save_places,
     track_log,
-    wheels_beside,
+    wheel_measurements,
 )
 from mapper.run.edits_file import edits_text, parse_edits, write_edits
 from mapper.run.folder import Run, open_run
@@ -143,7 +143,7 @@ def _after(
     detector = build_keyframe_loop_detector(config.loops, config.graph.solve)
     views = reobserve(first, before.trajectory, set(graph.stamps_ns.values()), config, progress=progress)
     detector.preload(graph, {node: views[stamp_ns] for node, stamp_ns in graph.stamps_ns.items()})
-    odometry = odometry_for(config.odometry, session, wheels_beside(session, config))
+    odometry = odometry_for(config.odometry, session, wheel_measurements(session, config))
     offset_odometry = NodeOffset(odometry, first_node=max(graph.T_world_node) + 1)
     return Start(offset_odometry, detector, graph.without_loops(), before.loops)
 

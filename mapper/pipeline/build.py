@@ -1,6 +1,5 @@
 """From a recorded log to a run folder: track, solve, level, fuse."""
 
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,6 +18,7 @@ from mapper.pipeline.checkpoints import (
     EVERY_S,
     Checkpoints,
     kept_result,
+    open_checkpoints,
     remove_checkpoints,
 )
 from mapper.pipeline.components import largest_component
@@ -73,7 +73,7 @@ def build(
         progress: Receives stages, counts and notes.
         observer: Receives every tracked frame and the results.
         overwrite: Replace a run that is there, once the new one is whole.
-        fresh: Begin anew, whatever an unfinished build has left.
+        fresh: Begin anew, even if an unfinished build can be continued.
         checkpoint_s: Seconds between two checkpoints, at least; None makes none, and begins anew, as does a
             caller's own odometry.
 
@@ -85,55 +85,24 @@ def build(
     warnings = depth_cautions(source)
     for warning in warnings:
         progress.note(warning.sentence)
-    identity = identity_of(source, config, odometry if isinstance(odometry, Trajectory) else None)
-    if odometry is not None and not isinstance(odometry, Trajectory):
-        checkpoint_s = None  # what the state of a caller's own class is, only the caller knows
-    fresh = fresh or checkpoint_s is None
-    with ExitStack() as stack:
-        writer = stack.enter_context(
-            write_run(
-                out,
-                first_manifest(source),
-                config,
-                overwrite=overwrite,
-                keeps=lambda left: kept_from_before(left, identity, fresh=fresh),
-            )
-        )
-        checkpoints = None
-        if checkpoint_s is not None:
-            checkpoints = stack.enter_context(Checkpoints(writer, identity, progress, every_s=checkpoint_s))
+    poses = odometry if isinstance(odometry, Trajectory) else None
+    if odometry is not None and poses is None:
+        checkpoint_s = None  # the state of a caller's own class cannot be kept
+    identity = identity_of(source, config, poses)
+    keeps = partial(kept_from_before, identity=identity, fresh=fresh or checkpoint_s is None)
+    with (
+        write_run(out, first_manifest(source), config, overwrite=overwrite, keeps=keeps) as writer,
+        open_checkpoints(writer, identity, progress, every_s=checkpoint_s) as checkpoints,
+    ):
         writer.warn(warnings)
-        if isinstance(odometry, Trajectory):
-            write_tum(writer.folder / files.ODOMETRY, odometry)
-        solved = kept_result(
-            checkpoints,
-            "solved",
-            partial(
-                _solved,
-                source,
-                config,
-                writer,
-                progress,
-                odometry=odometry,
-                observer=observer,
-                checkpoints=checkpoints,
-            ),
-        )
+        if poses is not None:
+            write_tum(writer.folder / files.ODOMETRY, poses)
+        steps = _Steps(source, config, writer, progress, observer, checkpoints)
+        solved = kept_result(checkpoints, "solved", lambda: steps.solve(steps.track(odometry)))
         observer.on_levelled(solved.level.T_level_world)
-        tracking = solved.tracking
-        if implausible := _height_warning(source, tracking.tracked_trajectory()):
-            progress.note(implausible)
-            writer.warn([RunWarning(kind="depth", sentence=implausible, weight="doubt")])
-        with writer.clock.stage("solve"):
-            save_solved(writer, from_tracking(tracking, source.truth))
-            save_places(writer, tracking)
-        from mapper.pipeline.fuse import fuse_into  # what it loads would delay the first frame
+        steps.save(solved)
+        from mapper.pipeline.fuse import fuse_into  # takes long to load: the first frame does not wait
 
-        level = solved.level
-        writer.update(
-            solve=solved.report,
-            levelling=Levelling(method=level.method, detail=level.detail, has_floor=level.has_floor),
-        )
         fuse_into(writer, source, config, progress, observer=observer, checkpoints=checkpoints)
     remove_checkpoints(out)
     return open_run(out)
@@ -148,39 +117,61 @@ class _Solved:
     level: Level
 
 
-def _solved(
-    source: Log,
-    config: BuildConfig,
-    writer: RunWriter,
-    progress: Progress,
-    *,
-    odometry: Odometry[Any] | Trajectory | None,
-    observer: Observer,
-    checkpoints: Checkpoints | None,
-) -> _Solved:
-    """Track a log, solve its graph and level the world."""
-    kept = None if checkpoints is None else TrackingCheckpoints(checkpoints)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Steps:
+    """The steps of one build from the log to the solved graph, with what they share."""
 
-    def tracked() -> TrackingResult:
-        with writer.clock.stage("track"):
-            start = first_session(source, config, odometry)
+    source: Log
+    config: BuildConfig
+    writer: RunWriter
+    progress: Progress
+    observer: Observer
+    checkpoints: Checkpoints | None
+
+    def track(self, odometry: Odometry[Any] | Trajectory | None) -> TrackingResult:
+        """Track every frame; keep the largest component of the path."""
+        tracking = kept_result(self.checkpoints, "tracked", lambda: self._track_log(odometry))
+        self.writer.warn(tracking.warnings)
+        save_tracking(self.writer, from_tracking(tracking, self.source.truth))
+        refuse_a_fragment(tracking, self.config, sensor=self.source.sensor)
+        return tracking
+
+    def _track_log(self, odometry: Odometry[Any] | Trajectory | None) -> TrackingResult:
+        with self.writer.clock.stage("track"):
             tracking = track_log(
-                source, config, progress=progress, start=start, observer=observer, checkpoints=kept
+                self.source,
+                self.config,
+                progress=self.progress,
+                start=first_session(self.source, self.config, odometry),
+                observer=self.observer,
+                checkpoints=None if self.checkpoints is None else TrackingCheckpoints(self.checkpoints),
             )
-            return largest_component(tracking, progress=progress)
+            return largest_component(tracking, progress=self.progress)
 
-    tracking = kept_result(checkpoints, "tracked", tracked)
-    writer.warn(tracking.warnings)
-    save_tracking(writer, from_tracking(tracking, source.truth))
-    refuse_a_fragment(tracking, config, sensor=source.sensor)
-    with writer.clock.stage("solve"):
-        solved = solve(tracking.graph, tracking.loops, config.graph)
-    tracking = replace(tracking, graph=solved.graph, loops=solved.loops)
-    tracking = largest_component(tracking, progress=progress)
-    with writer.clock.stage("level"):
-        level = _level(source, tracking.tracked_trajectory(), config)
-    tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
-    return _Solved(tracking, solved.report, level)
+    def solve(self, tracking: TrackingResult) -> _Solved:
+        """Solve the graph, and level the world."""
+        with self.writer.clock.stage("solve"):
+            solved = solve(tracking.graph, tracking.loops, self.config.graph)
+        tracking = replace(tracking, graph=solved.graph, loops=solved.loops)
+        tracking = largest_component(tracking, progress=self.progress)
+        with self.writer.clock.stage("level"):
+            level = _level(self.source, tracking.tracked_trajectory(), self.config)
+        tracking = replace(tracking, graph=tracking.graph.moved(level.T_level_world))
+        return _Solved(tracking, solved.report, level)
+
+    def save(self, solved: _Solved) -> None:
+        """Write the solved poses, the graph and the places."""
+        tracking, level = solved.tracking, solved.level
+        if implausible := _height_warning(self.source, tracking.tracked_trajectory()):
+            self.progress.note(implausible)
+            self.writer.warn([RunWarning(kind="depth", sentence=implausible, weight="doubt")])
+        with self.writer.clock.stage("solve"):
+            save_solved(self.writer, from_tracking(tracking, self.source.truth))
+            save_places(self.writer, tracking)
+        self.writer.update(
+            solve=solved.report,
+            levelling=Levelling(method=level.method, detail=level.detail, has_floor=level.has_floor),
+        )
 
 
 def _height_warning(source: Log, trajectory: Trajectory) -> str:

@@ -8,15 +8,15 @@ They lie in a folder of their own in ``OUT.partial``, and come from three steps:
 - while frames are fused, the file of their updates, with a digest of what of it is on the disk
   (``fuse_checkpoints``).
 
-What is written is taken in the thread that works, between two frames; another thread writes it and waits for
-the disk. A disk that is full ends the checkpoints, not the build.
+What is written is copied in the thread that works, between two frames; another thread writes it and waits
+for the disk. A disk that is full ends the checkpoints, not the build.
 """
 
 import shutil
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -63,7 +63,7 @@ class Checkpoints:
         Args:
             writer: Of the run.
             identity: What decides the result.
-            progress: Receives what the user should know.
+            progress: Receives notes.
             every_s: Seconds between two checkpoints, at least; 0 keeps one of every frame, and waits for it.
         """
         self.folder = writer.folder / files.CHECKPOINTS
@@ -135,16 +135,16 @@ class Checkpoints:
 
     def _replace_by(self, step: str, result: object) -> None:
         """Write a result, and delete the checkpoints that led to it, but for the journal it refers to."""
-        self.taken(StateFile(self.folder, step), 0, result)()
+        self.snapshot(StateFile(self.folder, step), 0, result)()
         kept = {IDENTITY, _TIMES, self.journal.path.name, f"{step}.0"}
         for path in self.folder.iterdir():
             if path.name not in kept:
                 path.unlink()
 
-    def taken(
+    def snapshot(
         self, states: StateFile, number: int, result: object, *, fixed: Mapping[str, object] | None = None
     ) -> Callable[[], None]:
-        """Copy a result, or a state on the way to it; return what writes it and the journal it refers to.
+        """Copy a result, or a state on the way to it; return the function that writes it and its journal.
 
         Args:
             states: Where to write it.
@@ -207,7 +207,7 @@ class Checkpoints:
         writer.clock.seconds.update(state["seconds"])
 
     def resumed_at(self, step: Literal["track", "solve", "fuse"], frame: int) -> None:
-        """Tell, in the manifest too, where the build goes on."""
+        """Report where the build goes on, and record it in the manifest."""
         here = Resumption(at=now_text(), step=step, frame=frame)
         timing = self.writer.manifest.timing
         timing = timing.model_copy(update={"resumed": (*timing.resumed, here)})
@@ -232,7 +232,7 @@ class Checkpoints:
         """Take a checkpoint now, and write it in another thread.
 
         Args:
-            take: Copies what changes, and returns what writes it.
+            take: Copies what changes, and returns the function that writes it.
         """
         self._last_s, self._last_cpu_s = time.monotonic(), time.process_time()
         began_s = time.thread_time()
@@ -275,6 +275,13 @@ class Checkpoints:
                 "is stopped"
             )
             shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def open_checkpoints(
+    writer: RunWriter, identity: Mapping[str, Any], progress: Progress, *, every_s: float | None
+) -> AbstractContextManager[Checkpoints | None]:
+    """Return the checkpoints of a build as a context; None makes none."""
+    return nullcontext() if every_s is None else Checkpoints(writer, identity, progress, every_s=every_s)
 
 
 def kept_result(

@@ -30,11 +30,12 @@ from mapper.pipeline.fuse_checkpoints import MarkedUpdates, known_updates
 from mapper.pipeline.judge import judge
 from mapper.run import files
 from mapper.run.edits_file import edits_text, parse_edits, write_edits
-from mapper.run.folder import Run, moved_log, open_run, paths_of, refuse_another_log
+from mapper.run.folder import Run, moved_log, open_run
 from mapper.run.frame_outcomes import FrameRecord
+from mapper.run.input_logs import paths_of, refuse_another_log
 from mapper.run.manifest import DepthReach, Solve, Status, Timing
 from mapper.run.observers import NULL_OBSERVER, Observer
-from mapper.run.results import RunResults, load_results
+from mapper.run.results import RunResults
 from mapper.run.stored_tracking import StoredTracking, load_tracking, save_solved
 from mapper.run.warnings import FLOOR, floor_warnings
 from mapper.run.writer import RunWriter, write_run
@@ -105,7 +106,7 @@ def fuse_changed(
         ConfigError: The edits are not valid.
         DataError: They leave nothing of the map.
     """
-    refuse_another_log(run, source)
+    refuse_another_log(run.manifest.input, source, run=run.path)
     text = edits_text(run.path) if edits is None else edits
     wanted = parse_edits(text, run.path)
     status: Status = "building"
@@ -178,8 +179,22 @@ def fuse_into(
     observer: Observer = NULL_OBSERVER,
     checkpoints: Checkpoints | None = None,
 ) -> None:
-    """Fuse the trajectory of an unfinished run and write everything that is made from the maps."""
-    results = load_results(Run(writer.folder, config, writer.manifest))
+    """Fuse the trajectory of an unfinished run and write everything that is made from the maps.
+
+    Args:
+        writer: Of the run, with its trajectory, graph and frame records.
+        source: The log that was tracked.
+        config: All settings.
+        progress: Receives stages, counts and notes.
+        before: File of the frames' updates from the last time; None casts every frame.
+        edits: Edits by hand.
+        observer: Receives the results.
+        checkpoints: Keep the updates that are cast; ``before`` is then theirs.
+
+    Raises:
+        DataError: The edits leave nothing of the map, or nothing in the height of the slice.
+    """
+    results = Run(writer.folder, config, writer.manifest).results
     if not config.mcap.frame_times:
         results = replace(results, frame_ms={})
     trajectory = results.trajectory

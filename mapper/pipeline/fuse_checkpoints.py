@@ -28,7 +28,7 @@ _KNOWN = "updates.bin"
 def known_updates(checkpoints: Checkpoints, config: OctreeConfig) -> Path | None:
     """Return the file of the updates that earlier processes have cast; None if there are none.
 
-    What was torn is cut off. Without an earlier process that had come so far, nothing is told.
+    What was torn is cut off. That the build goes on is reported only if an earlier process had begun to fuse.
     """
     folder = checkpoints.folder
     new, known = checkpoints.writer.folder / files.SCAN_UPDATES, folder / _KNOWN
@@ -58,7 +58,7 @@ def known_updates(checkpoints: Checkpoints, config: OctreeConfig) -> Path | None
 
 
 class MarkedUpdates(ScanUpdateWriter):
-    """Writer of scan updates that tells, every few seconds, how much of the file is on the disk."""
+    """Writer of scan updates that records, every few seconds, how much of the file is on the disk."""
 
     def __init__(self, path: Path, config: OctreeConfig, checkpoints: Checkpoints) -> None:
         super().__init__(path, config)
@@ -72,10 +72,10 @@ class MarkedUpdates(ScanUpdateWriter):
         super().add(frame)
         self._frames += 1
         if self._checkpoints.is_due():
-            self._checkpoints.keep(self._taken)
+            self._checkpoints.keep(self._snapshot)
 
-    def _taken(self) -> Callable[[], None]:
-        """Take the length of the file; return what marks it."""
+    def _snapshot(self) -> Callable[[], None]:
+        """Note the length of the file; return the function that writes the mark."""
         self.flush()
         frames, end = self._frames, self._path.stat().st_size
         seconds = self._checkpoints.writer.clock.so_far()
@@ -101,7 +101,7 @@ def _marks(file: StateFile) -> list[Mapping[str, Any]]:
 
 
 def _holds(path: Path, mark: Mapping[str, Any]) -> bool:
-    """Return whether a file begins with what a mark tells."""
+    """Return whether a file begins with the bytes that a mark describes."""
     digest = hashlib.sha256()
     try:
         if path.stat().st_size < mark["bytes"]:

@@ -29,7 +29,7 @@ _FRAMES: Mapping[Sensor, int] = {"rgbd": 40, "lidar": 15}
 _LEAD = 4
 """A trial begins 1 / ``_LEAD`` of its frames before the stretch in question, to have a map there."""
 
-# By kind of odometry: settings of which one value is tried, so many times the run's own.
+# By kind of odometry: settings of which one other value is tried: this factor times the run's own.
 _FACTORS: Mapping[str, Mapping[str, float]] = {
     "local-map": {"detector.max_features": 2, "search_px": 2, "max_depth_m": 2},
     "pnp": {"detector.max_features": 2, "max_depth_m": 2},
@@ -53,6 +53,13 @@ def judge(
 
     Where frames were lost or doubtful, other settings are tried on the stretch with most of them, unless the
     manifest has a trial already.
+
+    Args:
+        writer: Of the run; its manifest has the warnings of tracking and fusing.
+        source: The log.
+        config: As the run was built.
+        results: Of the solved run.
+        progress: Receives the stage of the trial.
     """
     warnings = find_warnings(results, writer.manifest)
     trial = writer.manifest.trial

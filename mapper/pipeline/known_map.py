@@ -52,7 +52,7 @@ class KnownMap:
 def load_known_map(path: Path, *, progress: Progress = SILENT) -> KnownMap:
     """Return a run, or a merged map whose runs are still there, with its places.
 
-    A run of before places were stored has them observed again from its log.
+    A run made before places were stored has them observed again from its log.
 
     Raises:
         RunError: There is no such map, it has no places, its runs have changed or were observed by other

@@ -14,6 +14,7 @@ from mapper.core.timebase import NS_PER_S
 from mapper.export.picture import write_localised
 from mapper.graph.components import component_numbers, components
 from mapper.graph.config import GraphConfig
+from mapper.graph.gate import MEDIAN_CHI2
 from mapper.graph.model import PoseGraph
 from mapper.graph.optimize import optimize
 from mapper.loops.closure import Discrepancy, accepted_loops, exceeds, why_none_accepted
@@ -32,7 +33,7 @@ from mapper.pipeline.track import (
     depth_cautions,
     from_tracking,
     track_log,
-    wheels_beside,
+    wheel_measurements,
 )
 from mapper.run import files
 from mapper.run.localised import LocalisedManifest, find_stretches
@@ -50,8 +51,6 @@ _LEAST_CONSTRAINTS = 3
 _FAR, _FAR_BEYOND = 3.0, 0.2
 """Times ``loops.agreement_path_m``: the path from the nearest constraint from which on frames are doubtful,
 between two constraints, and where there is one on one side only: there nothing would show a jump."""
-_MEDIAN_CHI2 = 5.348
-"""Median of χ² with six degrees of freedom."""
 
 
 def localise(
@@ -105,7 +104,7 @@ def localise(
             tracking = _supported(replace(tracking, graph=solved.graph, loops=solved.loops))
             _refuse_unplaced(source, known, tracking)
             tracking = component_of(tracking, map_node, progress=progress)
-            tracking = replace(tracking, graph=_with_honest_constraints(tracking.graph, config.graph))
+            tracking = replace(tracking, graph=_with_scaled_constraints(tracking.graph, config.graph))
         tracking = _doubtful_unless_confirmed(tracking, loops_between_days(config.loops, source.sensor))
         writer.update(solve=solved.report)
         with writer.clock.stage("write"):
@@ -131,7 +130,7 @@ def _refuse_unfit(source: Log, known: KnownMap, config: BuildConfig) -> None:
 
 def _start(source: Log, known: KnownMap, config: BuildConfig) -> Start:
     map_node = known.places.map_node
-    odometry = odometry_for(config.odometry, source, wheels_beside(source, config))
+    odometry = odometry_for(config.odometry, source, wheel_measurements(source, config))
     detector = build_map_constraint_detector(loops_between_days(config.loops, source.sensor), known.places)
     graph = PoseGraph({map_node: np.eye(4)}, {map_node: 0})
     return Start(NodeOffset(odometry, first_node=map_node + 1), detector, graph)
@@ -169,17 +168,17 @@ def _supported(tracking: TrackingResult) -> TrackingResult:
     return replace(tracking, graph=graph.with_factors(factors), loops=loops)
 
 
-def _with_honest_constraints(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
+def _with_scaled_constraints(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
     """Return the graph solved again, with the constraints' information scaled to how well they agree.
 
-    Their information is that of the pixels or points and knows nothing of the errors that the map's own poses
-    have. Divided by their median χ², over that of consistent measurements, it does.
+    Their information is that of the pixels or points, without the errors of the map's own poses. These are
+    included by dividing it by the ratio of their median χ² to that of consistent measurements.
     """
     exact = config.model_copy(update={"robust": "none"})
     solution = optimize(graph, exact)
     is_constraint = [factor.origin == "loop" for factor in graph.factors]
     chi2 = 2.0 * np.array(solution.factor_errors)[is_constraint]
-    scale = 1.0 / max(1.0, float(np.median(chi2)) / _MEDIAN_CHI2)
+    scale = 1.0 / max(1.0, float(np.median(chi2)) / MEDIAN_CHI2)
     constraints = compress(graph.factors, is_constraint)
     scaled = [replace(factor, information=scale * factor.information) for factor in constraints]
     graph = graph.with_poses(solution.T_world_node)
@@ -193,8 +192,8 @@ def _doubtful_unless_confirmed(
     """Return the result with the frames doubtful whose pose no constraint nearby confirms.
 
     Between two constraints that the odometry agrees with, it has neither drifted far nor jumped. Before the
-    first and after the last of a part of the path nothing tells, least of all where the map was searched in
-    vain.
+    first and after the last constraint of a part of the path nothing shows this, least of all where the map
+    was searched in vain.
     """
     graph, doubts = tracking.graph, dict[int, str]()
     held = {loop.j for loop in accepted_loops(tracking.loops)}

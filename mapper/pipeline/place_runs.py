@@ -38,7 +38,7 @@ def place_by_shared_places(
     they are, and each run is placed as a rigid body. Places of all runs are held in memory.
 
     Args:
-        runs: At least one; the first must have places. A run of before places were stored has them observed
+        runs: At least one; the first must have places. A run made before places were stored has them observed
             again from its log.
         workers: Where places are compared.
         progress: Receives stages and notes.

@@ -1,7 +1,7 @@
 """The first pass over a log: every frame tracked in order, and the pose graph that grows from it."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -131,7 +131,7 @@ def first_session(
             f"odometry.kind={config.odometry.kind} counts none; want loops.kind=places, scans or none"
         )
     if odometry is None:
-        odometry = odometry_for(config.odometry, source, wheels_beside(source, config))
+        odometry = odometry_for(config.odometry, source, wheel_measurements(source, config))
     elif isinstance(odometry, Trajectory):
         odometry = build_odometry(config.odometry, odometry)
     loops = config.loops
@@ -151,26 +151,29 @@ def track_log(
 ) -> TrackingResult:
     """Track every frame of a log, in time order; reading and detecting run ahead in threads.
 
-    A frame that cannot be read is skipped and reported, not fatal. With a ``start`` the graph and the loops
-    returned are those of all sessions, the tracks those of this log. With ``checkpoints``, tracking goes on
-    behind the frames that they know, which the observer does not receive.
+    A frame that cannot be read is skipped and reported, not fatal.
+
+    Args:
+        source: The log.
+        config: All settings.
+        progress: Receives the stage, its counts, and notes.
+        start: Odometry, loop detector and graph to begin with: the graph and the loops that are returned are
+            those of all sessions, the tracks those of this log. None is those of a first session.
+        observer: Receives every frame that is tracked now.
+        checkpoints: Tracking goes on after the frames that these have; None makes none.
+
+    Raises:
+        ConfigError: The odometry needs wheels or poses and there are none, or the loops need feature counts.
     """
     start = start or first_session(source, config)
     odometry, checks = start.odometry, ReadingChecks(source)
-    first_pass = _FirstPass(start, wheels_beside(source, config))
-    searches = start.searches or VerificationLog(None)
     known: Sequence[FrameCheckpoint] = ()
     if checkpoints is not None:
         state = checkpoints.restore(odometry, checks)
         odometry, known = state.odometry, state.frames
-    for frame in known:
-        if isinstance(frame.result, Skipped):
-            first_pass.skipped.append(frame.result)
-            continue
-        searches.repeat(frame.search)
-        first_pass.add(frame.result, searches.view)
-        first_pass.frame_ms[frame.result.stamp_ns] = frame.frame_ms
-    searches.repeat(None)
+    searches = start.searches or VerificationLog(None)
+    first_pass = _FirstPass(start, wheel_measurements(source, config))
+    first_pass.repeat(known, searches)
     entries = map(checks.log.entry_at, range(len(known), len(source)))
     observations = ordered_map(partial(_observe, odometry), entries, workers=config.workers)
     with progress.stage("track") as report:
@@ -185,8 +188,7 @@ def track_log(
                 result = odometry.track(observation)
                 view = partial(odometry.view, observation, result.twist)
                 first_pass.add(result, view)
-                ms = 1e3 * (observed_s + time.perf_counter() - began)
-                first_pass.frame_ms[result.stamp_ns] = ms
+                ms = first_pass.frame_ms[result.stamp_ns] = 1e3 * (observed_s + time.perf_counter() - began)
                 observer.on_frame(Step(entry, result, view, odometry.matches, start.detector))
             search = searches.take()
             if checkpoints is not None:
@@ -217,7 +219,7 @@ class _FirstPass:
 
         Args:
             start: Graph, loops and loop detector of these.
-            wheels: Measurements beside the odometry.
+            wheels: Measurements of the log's wheels.
         """
         before = start.graph
         self.skipped: list[Skipped] = []
@@ -238,33 +240,26 @@ class _FirstPass:
         self._graph.add_factors(track.factors)
         self._tracks.append(track)
 
+    def repeat(self, frames: Iterable[FrameCheckpoint], searches: VerificationLog) -> None:
+        """Add frames that an earlier process has tracked, with what its searches for loops found."""
+        for frame in frames:
+            if isinstance(frame.result, Skipped):
+                self.skipped.append(frame.result)
+                continue
+            searches.repeat(frame.search)
+            self.add(frame.result, searches.view)
+            self.frame_ms[frame.result.stamp_ns] = frame.frame_ms
+        searches.repeat(None)
+
     def result(self, odometry: Odometry[Any], checks: ReadingChecks, progress: Progress) -> TrackingResult:
         """Return the result of all frames; nothing is added afterwards."""
-        detector, doubts, tracks = self._start.detector, checks.doubts(), self._tracks
-        if isinstance(odometry, HindsightOdometry):
-            tracks = [odometry.in_hindsight(track) for track in tracks]
-        tracks = [
-            replace(track, doubts=track.doubts or tuple(doubts.get(track.stamp_ns, ())))
-            if track.node is not None
-            else track
-            for track in tracks
-        ]
+        tracks = _in_hindsight(self._tracks, odometry, checks)
         self._graph.add_factors(odometry.finish())
-        conflict = wheel_conflict(self._graph, self._wheel_factors)
-        warnings = [
-            *(RunWarning(kind="frozen", sentence=note, weight="doubt") for note in checks.frozen()),
-            *(RunWarning(kind="far returns", sentence=note) for note in checks.far_returns()),
-            *(RunWarning(kind="conflict", sentence=note, weight="doubt") for note in detector.notes()),
-        ]
-        if conflict:
-            warnings.append(RunWarning(kind="conflict", sentence=conflict, weight="doubt"))
-        if isinstance(odometry, SensorCheck):
-            wrong = odometry.calibration_doubts()
-            warnings += [RunWarning(kind="camera", sentence=sentence, weight="doubt") for sentence in wrong]
-            warnings += [RunWarning(kind="shutter", sentence=note) for note in odometry.sensor_notes()]
+        warnings = self._warnings(odometry, checks)
         for warning in warnings:
             progress.note(warning.sentence)
         self._graph.add_factors(self._wheel_factors)
+        detector = self._start.detector
         loops = (*self._start.loops, *detector.closures())
         self._graph.add_factors(loop.factor for loop in accepted_loops(loops))
         return TrackingResult(
@@ -277,9 +272,40 @@ class _FirstPass:
             detector.places(),
         )
 
+    def _warnings(self, odometry: Odometry[Any], checks: ReadingChecks) -> list[RunWarning]:
+        """Return what is suspicious about the frames that were read."""
+        conflicts = self._start.detector.notes()
+        if conflict := wheel_conflict(self._graph, self._wheel_factors):
+            conflicts = [*conflicts, conflict]
+        warnings = [
+            *(RunWarning(kind="frozen", sentence=note, weight="doubt") for note in checks.frozen()),
+            *(RunWarning(kind="far returns", sentence=note) for note in checks.far_returns()),
+            *(RunWarning(kind="conflict", sentence=note, weight="doubt") for note in conflicts),
+        ]
+        if isinstance(odometry, SensorCheck):
+            wrong = odometry.calibration_doubts()
+            warnings += [RunWarning(kind="camera", sentence=sentence, weight="doubt") for sentence in wrong]
+            warnings += [RunWarning(kind="shutter", sentence=note) for note in odometry.sensor_notes()]
+        return warnings
 
-def wheels_beside(source: Log, config: BuildConfig) -> WheelMeasurements:
-    """Return the wheels that a log has beside its odometry; nothing where they are the odometry."""
+
+def _in_hindsight(
+    tracks: Iterable[FrameResult], odometry: Odometry[Any], checks: ReadingChecks
+) -> list[FrameResult]:
+    """Return the frames' results with the doubts that later frames and the readings add."""
+    if isinstance(odometry, HindsightOdometry):
+        tracks = map(odometry.in_hindsight, tracks)
+    doubts = checks.doubts()
+    return [
+        replace(track, doubts=track.doubts or tuple(doubts.get(track.stamp_ns, ())))
+        if track.node is not None
+        else track
+        for track in tracks
+    ]
+
+
+def wheel_measurements(source: Log, config: BuildConfig) -> WheelMeasurements:
+    """Return the log's wheel measurements, for factors; none where wheels are the odometry."""
     wheels = None if config.odometry.kind in _BY_POSES else source.wheels
     return WheelMeasurements(wheels, config.graph.wheels)
 

@@ -120,9 +120,9 @@ class TrackingCheckpoints:
             return
         checkpoints.journal.append(_FRAME + pack(dumps(frame, archive=checkpoints.archive.place_of)))
         if checkpoints.is_due():
-            checkpoints.keep(partial(self._taken, odometry))
+            checkpoints.keep(partial(self._snapshot, odometry))
 
-    def _taken(self, odometry: Odometry[Any]) -> Callable[[], None]:
-        """Copy the state of the odometry; return what writes it."""
+    def _snapshot(self, odometry: Odometry[Any]) -> Callable[[], None]:
+        """Copy the state of the odometry; return the function that writes it."""
         number, self._number = self._number, self._number + 1
-        return self._checkpoints.taken(self._states, number, odometry, fixed=self._fixed)
+        return self._checkpoints.snapshot(self._states, number, odometry, fixed=self._fixed)

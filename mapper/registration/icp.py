@@ -43,7 +43,15 @@ def cloud_of(scan: Scan, config: RefinedConfig) -> Prepared:
 def refined(
     target: Prepared, source: Prepared, T_target_source: Transform, config: RefinedConfig, *, kind: Refiner
 ) -> Alignment:
-    """Return the motion refined at one pair distance after another, assessed."""
+    """Return the motion refined at one pair distance after another, assessed.
+
+    Args:
+        target: Cloud that stays.
+        source: Cloud that moves.
+        T_target_source: (4, 4) guess.
+        config: Pair distances, from coarse to fine, iterations and acceptance.
+        kind: What is minimised.
+    """
     alignment = refine(
         target,
         source,

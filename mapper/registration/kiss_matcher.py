@@ -17,7 +17,7 @@ from mapper.runtime.extras import extra
 _CROWD = 5  # points this near together, in feature voxels, are certain to have a normal and a feature
 _CROWD_VOXELS = 1.5
 _MIN_FEATURES = 20
-_MAX_MATCHES = 5000  # of more the library draws so many at random, unseeded
+_MAX_MATCHES = 5000  # of more the library draws this number at random, unseeded
 _GROWTH = 1.25
 _MAX_NOISE_M = 1.0  # the library accepts no more, and prints that
 

@@ -14,8 +14,8 @@ from mapper.registration.kd_tree import KdTree, kd_tree, neighbours_of
 
 _NEIGHBOURS = 10
 _FEWEST_NEIGHBOURS = 5
-_BESIDE = 3
-"""So many other points lie within a point's spacing."""
+_SPACING_NEIGHBOUR = 3
+"""Number of other points within a point's spacing."""
 _VOXELS_ACROSS = 2**20  # within, positions in voxels are exact to a millionth of one
 _LINE = 1e-12
 """Least squared length of a normal before it is normalised, relative to the spread's; points on a line have
@@ -82,7 +82,7 @@ def _surroundings(tree: KdTree, neighbours: int) -> tuple[Array, Array]:
     if neighbours >= _FEWEST_NEIGHBOURS:
         about, squared = neighbours_of(tree.points, tree.axes, tree.cuts, tree.points, neighbours)
         _fit_normals(tree.points, about, normals)
-        spacing_m = np.sqrt(squared[:, _BESIDE])
+        spacing_m = np.sqrt(squared[:, _SPACING_NEIGHBOUR])
     return normals, spacing_m
 
 

@@ -19,9 +19,9 @@ _THREADS = 4
 
 
 def check_run(folder: Path, *, progress: Progress = SILENT) -> list[Finding]:
-    """Compare every file of a run or a localised log with the size and the SHA-256 that its manifest tells.
+    """Compare every file of a run or a localised log with its size and SHA-256 in the manifest.
 
-    The files of a run of before 2026-11-22, which has neither, are read and counted instead.
+    The files of a run made before 2026-11-22, which has neither, are read and counted instead.
 
     Args:
         folder: The run, or the localised log.

@@ -55,7 +55,7 @@ def changing(folder: Path, names: Iterable[str]) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        with suppress(WriteError):  # what happened first is told
+        with suppress(WriteError):  # the first error is the one to report
             _replace_digests(folder, names, lambda: digests_of(folder, names))
         raise
     _replace_digests(folder, names, lambda: digests_of(folder, names))

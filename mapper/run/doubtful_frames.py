@@ -15,13 +15,13 @@ from mapper.odometry.base import REPEATED
 from mapper.run.frame_outcomes import FrameRecord
 
 MAX_GAP_NS = 2 * NS_PER_S
-"""Where tracked frames are farther apart, a frame keeps its own pose if its image shows any."""
+"""Where tracked frames are farther apart, a frame keeps its own pose, unless its image is a repeated one."""
 
 _VELOCITY_NS = NS_PER_S // 10
 """Time over which the velocity at the ends of a gap is measured, at least: half and double are as good."""
 _CLEARLY = 2.0
-"""The cubic is followed where its variance is so many times less than that of the line: beside a gap that a
-loop tore open the velocity is wrong."""
+"""The cubic is followed where its variance is this many times less than that of the line: next to a gap that
+a loop has opened the velocity is wrong."""
 _WINDOWS = 200
 _MIN_WINDOWS = 3
 _LEAST_VARIANCE = 1e-8
@@ -66,13 +66,13 @@ def placed_by_neighbours(
 def estimates_of_doubtful(
     trajectory: Trajectory, graph: PoseGraph, records: Sequence[FrameRecord]
 ) -> dict[int, Estimate]:
-    """Return, by stamp, where each doubtful frame lies that is no node.
+    """Return, by stamp, the pose of each doubtful frame that is not a node.
 
     The frame gets the information-weighted mean of two estimates, in the tangent of the first: its own pose,
     T_world_node · T_node_body with the covariance of its tracking, and the motion from the tracked frame
-    before it to the one after it. This is at constant velocity, or along a cubic with the path's velocity at
-    both ends where that errs clearly less. How far off they are is measured on this log's tracked frames,
-    over gaps of the same duration. A frame whose own covariance is unknown goes where the motion leads; one
+    before it to the one after it. That motion has a constant velocity, or follows a cubic with the path's
+    velocity at both ends where this errs clearly less. Both errors are measured on this log's tracked frames,
+    over gaps of the same duration. A frame whose own covariance is unknown gets the motion's pose; one
     without tracked frames around it, or in a gap as long as the log's tracked stretches, keeps its own pose,
     as do others in gaps of more than ``MAX_GAP_NS`` unless their image repeats.
 

@@ -4,10 +4,9 @@ from collections.abc import Iterable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import zip_longest
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING
 
 from mapper.config.build import BuildConfig
 from mapper.config.loading import load_run_config
@@ -22,10 +21,9 @@ from mapper.odometry.config import GivenOdometryConfig
 from mapper.run import files
 from mapper.run.digests import changing, checked, regular
 from mapper.run.doubtful_frames import without_doubtful
-from mapper.run.fingerprint import fingerprint
 from mapper.run.frame_outcomes import FrameRecord, read_frame_ms, read_records, stamps_of
+from mapper.run.input_logs import open_inputs
 from mapper.run.manifest import (
-    InputLog,
     Manifest,
     Verdict,
     is_localised_log,
@@ -33,67 +31,22 @@ from mapper.run.manifest import (
     read_manifest,
 )
 from mapper.run.pose_covariances import UncertainPoses, read_poses
+from mapper.run.results import RunResults, aligned_truth
+from mapper.run.verdict import verdict_of
+from mapper.run.warnings import find_warnings
 from mapper.runtime.atomic import partial_of
 from mapper.sources import open_source
 from mapper.sources.base import Log
-from mapper.sources.chained import chained, sessions_of
-from mapper.sources.config import SourceConfig
 from mapper.sources.trajectory_files import read_tum
 
 if TYPE_CHECKING:  # compiled code, which takes longer to load than most files of a run
     from matplotlib.axes import Axes
 
+    from mapper.octree.grid import OccupancyGrid
     from mapper.octree.map import OctreeMap
-    from mapper.octree.slice import OccupancyGrid
     from mapper.run.cloud import Cloud
 
 _NAMED = 5
-
-
-class MapFolder(Protocol):
-    """What a run and a merged map have in common: maps, and the settings of what is made from them."""
-
-    @property
-    def path(self) -> Path:
-        """Its folder."""
-        ...
-
-    @property
-    def config(self) -> BuildConfig:
-        """Settings."""
-        ...
-
-    @property
-    def octree(self) -> "OctreeMap":
-        """Occupancy map."""
-        ...
-
-    @property
-    def slice(self) -> "OccupancyGrid":
-        """2D navigation map."""
-        ...
-
-    @property
-    def traversable(self) -> "OccupancyGrid":
-        """Floor that a robot can drive on."""
-        ...
-
-    @property
-    def keepout(self) -> "OccupancyGrid | None":
-        """Keep-out regions in the slice's cells; None if there are none."""
-        ...
-
-    def file(self, name: str, /) -> Path:
-        """Return the path of one of its files."""
-        ...
-
-    def changing(self, names: Iterable[str], /) -> AbstractContextManager[None]:
-        """Return a context in which files of the folder may be written."""
-        ...
-
-    def with_config(self, config: BuildConfig, /) -> Self:
-        """Return the same map with other settings."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -111,7 +64,7 @@ class Run:
     manifest: Manifest
 
     def file(self, name: str) -> Path:
-        """Return the path of one of its files, after comparing it with what the manifest tells of it.
+        """Return the path of one of its files, after comparing it with its digest in the manifest.
 
         Raises:
             RunError: It is missing, or is not as it was written, or is no regular file.
@@ -141,7 +94,7 @@ class Run:
 
     @cached_property
     def poses(self) -> UncertainPoses | None:
-        """The poses of ``trajectory`` with their covariance; None in a run of before 2026-11-22."""
+        """The poses of ``trajectory`` with their covariance; None in a run made before 2026-11-22."""
         path = self.file(files.POSES)
         return read_poses(path) if path.exists() else None
 
@@ -182,20 +135,24 @@ class Run:
         return read_tum(self.file(files.KEYFRAMES))
 
     @cached_property
-    def verdict(self) -> Verdict:
-        """Whether it is to be trusted, and why not; of a run of before 2026-11-22 it is found now."""
-        from mapper.run.results import load_results
-        from mapper.run.verdict import verdict_of
-        from mapper.run.warnings import find_warnings
+    def results(self) -> RunResults:
+        """All of the above, with the truth aligned with the trajectory; its maps may still be missing."""
+        truth = None if self.truth is None else aligned_truth(self.truth, self.trajectory)
+        return RunResults(
+            self.trajectory, self.graph, self.records, self.loops, self.frame_ms, truth, self.poses
+        )
 
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Whether it is to be trusted, and why not; that of a run made before 2026-11-22 is found now."""
         if self.manifest.verdict is not None:
             return self.manifest.verdict
-        return verdict_of(find_warnings(load_results(self), self.manifest))
+        return verdict_of(find_warnings(self.results, self.manifest))
 
     @cached_property
     def octree(self) -> "OctreeMap":
         """Occupancy map, with colours and times if it was built with ``octree.attributes``."""
-        from mapper.octree.octomap_file import read_octree
+        from mapper.octree.reading import read_octree
 
         return read_octree(self.file(files.OCTREE_MAP))
 
@@ -208,7 +165,7 @@ class Run:
 
     @cached_property
     def slice(self) -> "OccupancyGrid":
-        """2D navigation map: the band of heights above the floor that ``config.slice`` tells."""
+        """2D navigation map: the band of heights above the floor of ``config.slice``."""
         from mapper.octree.grid_file import stored_grid
 
         return stored_grid(self, files.SLICE)
@@ -268,11 +225,7 @@ class Run:
             RunError: It is no longer there, or is not what it was.
             SourceError: It cannot be opened.
         """
-        source = _open(self, self.manifest.input, self.config.source)
-        for log in self.manifest.input.appended:
-            source = chained(source, _open(self, log, log.source), shift_ns=log.shift_ns)
-        refuse_another_log(self, source)
-        return source
+        return open_inputs(self.manifest.input, self.config.source, run=self.path)
 
     def files(self) -> list[Path]:
         """Return the folder's files, by name."""
@@ -344,34 +297,6 @@ def moved_log(run: Run, *logs: Path) -> Run:
     )
     moved = known.model_copy(update={"path": first, "appended": appended})
     return replace(run, manifest=run.manifest.model_copy(update={"input": moved}))
-
-
-def _open(run: Run, log: InputLog, config: SourceConfig) -> Log:
-    path = Path(log.path)
-    if not path.exists():
-        raise RunError(f"{path}: the log of {run.path} is no longer there; give its new place with --log")
-    return open_source(path, config)
-
-
-def refuse_another_log(run: Run, source: Log) -> None:
-    """Refuse a log that is not the one that a run was built from.
-
-    Raises:
-        RunError: Its fingerprint differs, or that of a log that was appended.
-    """
-    logs = (run.manifest.input, *run.manifest.input.appended)
-    for path, log in zip_longest(paths_of(source), logs):
-        if path is None or log is None:
-            raise RunError(
-                f"{source.path}: {run.path} was made from {len(logs)} logs; open them with Run.open_log"
-            )
-        if fingerprint(path) != log.fingerprint:
-            raise RunError(f"{path}: changed since {run.path} was built from it; build it again")
-
-
-def paths_of(source: Log) -> list[Path]:
-    """Return the paths of the logs that a log is made of."""
-    return [session.log.path for session in sessions_of(source)]
 
 
 def _not_a_run(path: Path) -> str:

@@ -63,7 +63,7 @@ class FrameRecord:
         node: Graph node that its pose is relative to; None unless placed.
         is_keyframe: The frame is that node.
         diagnostics: Figures on its tracking; all zero for a skipped frame.
-        doubts: Why the pose may be wrong, a phrase each.
+        doubts: Why the pose may be wrong, a few words each.
         sigmas: Standard deviations of the pose relative to its node, or of a keyframe's to the keyframe
             before it: rotation about and translation along the body's x, y, z (rad, m). None if unknown.
         pose_in_node: Of a doubtful frame that is no node: its pose as tracked, x y z (m) and qx qy qz qw, to

@@ -83,7 +83,7 @@ def wheel_warnings(results: RunResults) -> Iterator[RunWarning]:
 
 
 def uncertainty_warnings(results: RunResults) -> Iterator[RunWarning]:
-    """Yield a warning if little is known of where the path ends."""
+    """Yield a warning if the end of the path is uncertain."""
     poses = results.poses
     if poses is None:
         return
@@ -104,7 +104,7 @@ def uncertainty_warnings(results: RunResults) -> Iterator[RunWarning]:
 
 
 def step_warnings(results: RunResults, timeline: TimeLine) -> Iterator[RunWarning]:
-    """Yield a warning if two parts of the path hang together by steps that little is known of."""
+    """Yield a warning if uncertain steps connect two parts of the path."""
     try:
         relative = marginals_of(results.graph).relative
     except GraphError:

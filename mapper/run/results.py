@@ -11,7 +11,6 @@ from mapper.core.trajectory import Trajectory
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure
 from mapper.run.doubtful_frames import without_doubtful
-from mapper.run.folder import Run
 from mapper.run.frame_outcomes import FrameRecord
 from mapper.run.pose_covariances import UncertainPoses
 
@@ -42,14 +41,6 @@ class RunResults:
     def tracked(self) -> Trajectory:
         """The poses of the frames that maps are made from: those that are not doubtful."""
         return without_doubtful(self.trajectory, self.records)
-
-
-def load_results(run: Run) -> RunResults:
-    """Return the results of a run; its maps may still be missing."""
-    trajectory, truth = run.trajectory, run.truth
-    if truth is not None:
-        truth = aligned_truth(truth, trajectory)
-    return RunResults(trajectory, run.graph, run.records, run.loops, run.frame_ms, truth, run.poses)
 
 
 def aligned_truth(truth: Trajectory, trajectory: Trajectory) -> Trajectory | None:

@@ -45,12 +45,12 @@ def find_warnings(results: RunResults, manifest: Manifest) -> list[RunWarning]:
         manifest: With the input's notes, the skipped frames and the levelling.
     """
     known = [warning for warning in manifest.warnings if warning.kind in INPUT_KINDS]
-    told = {warning.sentence for warning in known}
+    reported = {warning.sentence for warning in known}
     notes = [note for source in (manifest.input, *manifest.input.appended) for note in source.notes]
     timeline = TimeLine.of(results, manifest)
     found = [
         *known,
-        *(RunWarning(kind="log", sentence=note) for note in notes if note not in told),
+        *(RunWarning(kind="log", sentence=note) for note in notes if note not in reported),
         *_skipped(results.records, manifest),
         *_gaps(timeline),
         *_lost(results.records, timeline),
@@ -128,7 +128,7 @@ def floor_warnings(config: TraversableConfig, resolution_m: float, *, has_path: 
     Args:
         config: Limits of the robot.
         resolution_m: Edge of a voxel.
-        has_path: Whether the path tells the height of the floor.
+        has_path: Whether the height of the floor is known from the path.
     """
     found = []
     if config.max_step_m < resolution_m * (1.0 - 1e-6):
@@ -197,7 +197,7 @@ def _lost(records: Sequence[FrameRecord], timeline: TimeLine) -> Iterator[RunWar
     if not lost:
         return
     share = lost / len(records)
-    first, last = max(stretches(is_lost, beside=1), key=lambda run: timeline.duration_s(*run))
+    first, last = max(stretches(is_lost, margin=1), key=lambda run: timeline.duration_s(*run))
     longest_s = timeline.duration_s(first, last)
     is_long = longest_s > _BROKEN_LOST_S and last - first > _BROKEN_LOST_FRAMES
     weight: Weight = "note" if share <= _MAX_LOST_SHARE else "doubt"

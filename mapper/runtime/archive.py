@@ -21,7 +21,7 @@ RECENT_BYTES = 128 << 20
 
 
 class Archive:
-    """Archive on top of a journal, which has records of its owner's beside it.
+    """Archive on top of a journal, to which its owner may write other records.
 
     All calls come from one thread, but for those of the journal's own ``write``.
     """

@@ -74,7 +74,7 @@ def reference_of(data: Archivable) -> Archived[Any] | None:
 
 
 def refer(data: Archivable, reference: Archived[Any]) -> None:
-    """Let data know its reference."""
+    """Store the reference to some data in the data."""
     object.__setattr__(data, "_archived", reference)
 
 

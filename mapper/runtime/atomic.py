@@ -73,7 +73,7 @@ def writing(path: Path, part: Path | None = None) -> Iterator[None]:
     """Name the file or folder that is being written in what the system says about it.
 
     Args:
-        path: Its final name, which errors tell.
+        path: Its final name, for errors.
         part: Its name while it is not whole, if that is another.
 
     Raises:
@@ -90,7 +90,7 @@ def writing(path: Path, part: Path | None = None) -> Iterator[None]:
 def _write_error(path: Path, part: Path, error: OSError) -> WriteError | None:
     """Return the error of a write to a path; None for an error of something else.
 
-    Writes to an open file tell no name, and those of NumPy no number either.
+    Errors of writes to an open file have no file name, and those of NumPy no error number either.
     """
     named = error.filename2 or error.filename
     if isinstance(named, str | os.PathLike):

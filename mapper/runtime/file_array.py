@@ -47,7 +47,7 @@ class FileArray:
         return np.frombuffer(mapped, self._kind).reshape(rows, self._columns)
 
     def _reserve(self, size: int) -> None:
-        """Give the file so many bytes of the disk: a page that finds no place there would end the process."""
+        """Allocate bytes of the disk for the file: a page without room there would end the process."""
         reserve = getattr(os, "posix_fallocate", None)  # not on macOS and Windows
         if reserve is not None:
             reserve(self._file.fileno(), 0, size)

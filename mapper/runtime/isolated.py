@@ -85,7 +85,7 @@ def _kill_idle() -> None:
 
 @contextmanager
 def memory_limited(more_bytes: int) -> Iterator[None]:
-    """Let this process allocate so much more while inside (Linux)."""
+    """Limit the memory that this process may allocate in addition while inside (Linux)."""
     statm = Path("/proc/self/statm")
     if not statm.exists():
         yield

@@ -12,7 +12,7 @@ _MOST_NAMED = 3
 
 
 def place_of(out: Path | None, usual: Path, *, overwrite: bool = False) -> Path:
-    """Return where a result goes: as told, else the usual place, or with ``-2`` and so on while it is taken.
+    """Return where a result goes: as given, else the usual place, or with ``-2`` and so on while it is taken.
 
     With ``overwrite`` the usual place is replaced.
     """
@@ -38,7 +38,7 @@ def joined_names(paths: Sequence[Path]) -> str:
 
 
 def _is_taken(path: Path) -> bool:
-    """Tell whether there is something, or another process is making it."""
+    """Return whether there is something, or another process is making it."""
     if path.exists() or path.is_symlink():
         return True
     partial = partial_of(path.resolve())

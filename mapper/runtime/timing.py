@@ -44,7 +44,7 @@ class Stopwatch:
 
 
 def forget_peak_memory() -> None:
-    """Let ``peak_memory_mb`` begin anew, after what is free went back to the system; where it can (Linux)."""
+    """Reset ``peak_memory_mb``, after freed memory was returned to the system; on Linux only."""
     gc.collect()
     with suppress(OSError, AttributeError, TypeError):  # TypeError: Windows
         ctypes.CDLL(None).malloc_trim(0)
@@ -52,7 +52,7 @@ def forget_peak_memory() -> None:
 
 
 def peak_memory_mb() -> float:
-    """Return the largest resident memory this process has had, in megabytes of 10⁶ bytes; 0 if none tells."""
+    """Return the largest resident memory this process has had, in megabytes of 10⁶ bytes; 0 if unknown."""
     status = Path("/proc/self/status")
     if status.exists():  # ru_maxrss also counts what the process that started us held before exec
         for line in status.read_text(encoding="ascii", errors="replace").splitlines():

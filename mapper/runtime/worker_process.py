@@ -97,7 +97,7 @@ def _unpacked(packed: bytes) -> Any:
 
 
 def _exit_with_parent() -> None:
-    """Exit once the parent has: a killed one cannot end its workers, and a second run must not meet them."""
+    """Exit once the parent has: a killed one cannot end its workers, which a second run must not find."""
     parent = parent_process()
     if parent is not None:
         parent.join()

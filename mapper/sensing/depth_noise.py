@@ -42,7 +42,7 @@ def feature_depth_sigma_m(
     """Return (N,) standard deviations of the depths of features: the sensor's noise, and the slope.
 
     The depth is read at the detected pixel. Through the error of that pixel it is the depth of another point,
-    and on a slope or beside an edge the difference exceeds the noise. The variation of the depth within one
+    and on a slope or next to an edge the difference exceeds the noise. The variation of the depth within one
     σ along either axis is taken from the image after DIF, so that noise is not counted twice.
 
     Args:

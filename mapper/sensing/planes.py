@@ -69,17 +69,17 @@ def fit_planes(depth_m: Array, rays: Array) -> Planes:
     coefficients = _solved(directions, inverse_depth, measured)
     used = measured
     for _ in range(_ROUNDS):
-        on_plane_m, sigma_m = _beside(coefficients, directions, depth_m, used)
+        on_plane_m, sigma_m = _on_plane(coefficients, directions, depth_m, used)
         limit_m = _OUTLIER_SIGMAS * np.maximum(sigma_m, _LEAST_SIGMA_M)
         used = measured & (np.abs(depth_m - on_plane_m) <= limit_m[:, None])
         # Gauss–Newton: z changes by −z² · ray with the coefficients.
         rows = -directions * on_plane_m[..., None] ** 2
         coefficients = coefficients + _solved(rows, depth_m - on_plane_m, used)
-    on_plane_m, sigma_m = _beside(coefficients, directions, depth_m, used)
+    on_plane_m, sigma_m = _on_plane(coefficients, directions, depth_m, used)
     return Planes(coefficients, on_plane_m, used, sigma_m)
 
 
-def _beside(
+def _on_plane(
     coefficients: Array, directions: Array, depth_m: Array, used: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
     """Return (T, N) depth on the planes, and (T,) how far the pixels in use scatter about it."""

@@ -113,5 +113,5 @@ def test_nearest_is_exact_at_the_size_of_the_unix_epoch():
 def test_stretches_reach_to_the_frames_beside_them():
     marked = [True, False, False, True, True, False, True]
     assert stretches(marked) == [(0, 0), (3, 4), (6, 6)]
-    assert stretches(np.array(marked), beside=1) == [(0, 1), (2, 5), (5, 6)]
+    assert stretches(np.array(marked), margin=1) == [(0, 1), (2, 5), (5, 6)]
     assert stretches([False] * 5) == stretches([]) == []

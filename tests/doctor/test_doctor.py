@@ -9,9 +9,9 @@ import pytest
 from mapper.core.errors import DataError
 from mapper.doctor import libraries, machine
 from mapper.doctor.finding import Finding
-from mapper.doctor.libraries import Requirement, look_at_library, tried, usual_patience_s
+from mapper.doctor.libraries import Requirement, check_library, tried, usual_patience_s
 from mapper.doctor.self_tests import SELF_TESTS, WrongAnswerError, _expect_near
-from mapper.doctor.system_libraries import apt_line, look_at_system_libraries
+from mapper.doctor.system_libraries import apt_line, check_system_libraries
 from tests.support.command_line import invoke
 from tests.support.paths import ROOT
 
@@ -49,13 +49,13 @@ def test_requirements_know_what_is_optional(monkeypatch):
 
 
 def test_an_optional_library_that_is_absent_is_well_and_told():
-    finding = look_at_library("no-such-library", Requirement("1.5", "viewer"))
+    finding = check_library("no-such-library", Requirement("1.5", "viewer"))
     assert finding.verdict == "well"
     assert finding.detail == "optional, not installed: pip install 'octree-mapper[viewer]'"
 
 
 def test_a_library_that_works_is_well():
-    finding = look_at_library("gtsam", Requirement("4.3"))
+    finding = check_library("gtsam", Requirement("4.3"))
     assert (finding.verdict, finding.remedy) == ("well", "")
     assert finding.detail.startswith("4.")
 
@@ -96,16 +96,16 @@ def test_patience_grows_with_the_processes_that_wait(monkeypatch):
 
 
 def test_a_library_that_is_missing_or_old_is_told_with_the_line_that_mends_it():
-    missing = look_at_library("no-such-library", Requirement("1.5"))
+    missing = check_library("no-such-library", Requirement("1.5"))
     assert (missing.detail, missing.remedy) == ("not installed", "pip install 'no-such-library>=1.5'")
 
-    old = look_at_library("numpy", Requirement("99.1"))
+    old = check_library("numpy", Requirement("99.1"))
     assert old.detail.endswith(", want at least 99.1")
     assert old.remedy == "pip install 'numpy>=99.1'"
 
 
 def test_missing_system_libraries_come_with_the_apt_line():
-    finding = look_at_system_libraries(["libstdc++.so.6", "libnothing.so.7"])
+    finding = check_system_libraries(["libstdc++.so.6", "libnothing.so.7"])
     assert finding.detail == "missing libnothing.so.7"
     assert finding.remedy == "find the package with: apt-file search libnothing.so.7"
     assert apt_line(["libGL.so.1", "libEGL.so.1"]) == "sudo apt-get install libgl1 libegl1"
@@ -113,36 +113,36 @@ def test_missing_system_libraries_come_with_the_apt_line():
 
 def test_a_cache_that_cannot_be_written_fails(monkeypatch, tmp_path):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    assert "0 compiled" in machine.look_at_kernels().detail
-    assert machine.look_at_kernels().remedy == "mapper doctor --warm compiles them"
+    assert "0 compiled" in machine.check_kernels().detail
+    assert machine.check_kernels().remedy == "mapper doctor --warm compiles them"
 
     monkeypatch.setattr(machine.os, "access", lambda _path, _mode: False)
-    finding = machine.look_at_kernels()
+    finding = machine.check_kernels()
     assert (finding.verdict, "NUMBA_CACHE_DIR" in finding.remedy) == ("failed", True)
 
 
 def test_modules_that_each_start_compiles_are_a_warning(monkeypatch):
     monkeypatch.setattr(machine, "has_bytecode", lambda _module: True)
-    assert machine.look_at_bytecode().verdict == "well"
+    assert machine.check_bytecode().verdict == "well"
 
     monkeypatch.setattr(machine, "has_bytecode", lambda module: module.__name__ != "numpy.linalg")
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    finding = machine.look_at_bytecode()
+    finding = machine.check_bytecode()
     assert (finding.verdict, finding.detail[:5]) == ("warning", "1 of ")
     assert finding.detail.endswith("PYTHONDONTWRITEBYTECODE is set")
 
 
 def test_threads_of_the_libraries_own_are_a_warning(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    assert machine.look_at_threads().verdict == "well"
+    assert machine.check_threads().verdict == "well"
     monkeypatch.setenv("OMP_NUM_THREADS", "8")
-    assert machine.look_at_threads().verdict == "warning"
+    assert machine.check_threads().verdict == "warning"
 
 
 def test_what_is_scarce_is_a_warning(monkeypatch):
     for limit, look in (
-        ("_LEAST_MEMORY_GB", machine.look_at_memory),
-        ("_LEAST_DISK_GB", machine.look_at_disk),
+        ("_LEAST_MEMORY_GB", machine.check_memory),
+        ("_LEAST_DISK_GB", machine.check_disk),
     ):
         monkeypatch.setattr(machine, limit, 1e9)
         assert look().verdict == "warning"

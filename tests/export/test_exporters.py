@@ -13,9 +13,9 @@ from mapper.config.loading import load_config, overridden
 from mapper.core.errors import ConfigError, DependencyError, MapSizeError, RunError, WriteError
 from mapper.export.exporters import EXPORTERS, export
 from mapper.graph.g2o import read_g2o
+from mapper.octree.grid import OCCUPIED, UNKNOWN
 from mapper.octree.grid_file import read_grid
-from mapper.octree.octomap_file import read_octree
-from mapper.octree.slice import OCCUPIED, UNKNOWN
+from mapper.octree.reading import read_octree
 from mapper.pipeline.build import build
 from mapper.run.checks import check_run
 from mapper.run.folder import moved_log, open_run
@@ -191,7 +191,7 @@ def test_what_is_written_is_read_by_others(untouched, kind, tmp_path):
     assert export(untouched, kind, out) == out
 
     CHECKS[kind](untouched, out)
-    beside = {out.with_suffix(ending) for ending in EXPORTERS[kind].beside}
+    beside = {out.with_suffix(ending) for ending in EXPORTERS[kind].sidecars}
     assert set(out.parent.iterdir()) == {out, *beside}
 
 
@@ -215,7 +215,7 @@ def test_without_a_name_it_stays_in_the_run(run, kind, tmp_path):
 
 def test_a_file_that_is_there_is_spared_unless_told(untouched, kind, tmp_path):
     out = out_of(tmp_path, kind)
-    for ending in (out.suffix, *EXPORTERS[kind].beside):
+    for ending in (out.suffix, *EXPORTERS[kind].sidecars):
         file = out.with_suffix(ending)
         file.write_bytes(b"precious")
         with pytest.raises(RunError, match=r"taken.* exists already; .*--overwrite"):

@@ -19,7 +19,7 @@ from mapper.export.foxglove_messages import sample_segments
 from mapper.export.mcap_log import McapLog
 from mapper.graph.model import BetweenFactor, PoseSigmas
 from mapper.mapping.thumbnails import encode_jpeg, shrunk_camera
-from mapper.octree.slice import OccupancyGrid
+from mapper.octree.grid import OccupancyGrid
 
 FIRST_NS = 1305031102175304001  # not a multiple of what float seconds can hold
 PERIOD_NS = 33_333_337

@@ -11,7 +11,7 @@ from mapper.export.palette import BACKDROP, DOUBTFUL, ESTIMATE, FACTORS, TRUTH
 from mapper.export.path_band import band_image
 from mapper.export.picture import write_summary
 from mapper.mapping.cloud import height_colors
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.run.pose_covariances import UncertainPoses
 
 

@@ -24,7 +24,7 @@ from mapper.line_laser.files import find_images, read_shots
 from mapper.line_laser.mapping import map_scans
 from mapper.line_laser.ranging import line_scan, local_grid, scan_image
 from mapper.line_laser.survey import drive, scan_images, sensor_poses
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
 
 CONFIG = LineLaserConfig()
 GREY = np.full((360, 640, 3), 90, np.uint8)

@@ -9,7 +9,7 @@ from mapper.mapping.edits import MapEditor, covered
 from mapper.navigation.config import TraversableConfig
 from mapper.navigation.floor import driven_ground, reachable_floor
 from mapper.navigation.traversable import traversable
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
 from tests.support.floor_scenes import two_storeys
 from tests.support.octree_maps import as_dict, mapped
 

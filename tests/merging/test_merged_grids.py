@@ -17,10 +17,11 @@ from mapper.navigation.floor import driven_ground, floor_of, margin_for
 from mapper.navigation.traversable import traversable
 from mapper.octree.columns import occupied_columns
 from mapper.octree.config import SliceConfig
+from mapper.octree.grid import FREE, OCCUPIED
 from mapper.octree.grid_file import read_grid
 from mapper.octree.map import OctreeMap
-from mapper.octree.octomap_file import read_octree
-from mapper.octree.slice import FREE, OCCUPIED, cut_slice
+from mapper.octree.reading import read_octree
+from mapper.octree.slice import cut_slice
 from tests.support.command_line import mapper
 from tests.support.floor_scenes import two_storeys
 from tests.support.merged_runs import BAND, ROBOT, make_run, merged_map_of

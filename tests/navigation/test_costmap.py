@@ -3,7 +3,7 @@ import pytest
 
 from mapper.core.errors import DataError
 from mapper.navigation.costmap import FREE_SPACE, INSCRIBED, LETHAL, NO_INFORMATION, inflate
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 
 def grid_of(cells):

@@ -6,8 +6,8 @@ from mapper.navigation.distance import distance_2d, distance_3d, signed_distance
 from mapper.navigation.distance_transform import NONE, squares_to_boxes, squares_to_centres
 from mapper.navigation.voxels import Box, cut_box, known_box
 from mapper.octree.config import OctreeConfig
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.map import OctreeMap
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 SHAPES = [(1, 17, 30), (7, 5, 9), (1, 1, 20), (13, 1, 1), (9, 10, 18)]
 

@@ -7,7 +7,8 @@ from mapper.navigation.config import TraversableConfig
 from mapper.navigation.floor import driven_ground, reachable_floor
 from mapper.navigation.traversable import traversable
 from mapper.octree.config import SliceConfig
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, cut_slice
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
+from mapper.octree.slice import cut_slice
 from tests.support.floor_scenes import WORLDS, bridge, courtyard, ramps, retaining_wall, rooms, two_storeys
 from tests.support.floor_worlds import SENSOR_M, Slab, World, score
 

@@ -11,7 +11,7 @@ from mapper.export.mcap_log import McapLog
 from mapper.export.plan import write_plan
 from mapper.navigation.config import PlanConfig
 from mapper.navigation.planner import plan_2d
-from mapper.octree.slice import FREE, OccupancyGrid
+from mapper.octree.grid import FREE, OccupancyGrid
 from mapper.run.folder import Run
 from mapper.run.manifest import Input, Manifest
 from mapper.sources.trajectory_files import write_tum

@@ -8,8 +8,8 @@ from mapper.navigation.line_of_sight import path_length
 from mapper.navigation.planner import plan_2d, plan_3d
 from mapper.navigation.search import shortest_path
 from mapper.octree.config import OctreeConfig
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from mapper.octree.map import OctreeMap
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 CELL = 0.05
 POINT = PlanConfig(radius_m=0.0)

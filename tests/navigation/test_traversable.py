@@ -7,9 +7,11 @@ from mapper.navigation.floor import driven_ground, reachable_floor
 from mapper.navigation.traversable import traversable
 from mapper.octree import blocks
 from mapper.octree.config import OctreeConfig, SliceConfig
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
 from mapper.octree.map import OctreeMap
-from mapper.octree.octomap_file import read_octree, write_ot
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, cut_slice
+from mapper.octree.octomap_file import write_ot
+from mapper.octree.reading import read_octree
+from mapper.octree.slice import cut_slice
 
 CELL = 0.05
 

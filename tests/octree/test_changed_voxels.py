@@ -5,7 +5,8 @@ import pyoctomap
 import pytest
 
 from mapper.octree.map_file import write_map
-from mapper.octree.octomap_file import read_octree, write_bt, write_ot
+from mapper.octree.octomap_file import write_bt, write_ot
+from mapper.octree.reading import read_octree
 from tests.support.octomap_oracle import voxels
 from tests.support.octree_maps import COLORED, as_dict, mapped
 

@@ -11,7 +11,7 @@ from mapper.octree import blocks
 from mapper.octree.config import OctreeConfig
 from mapper.octree.map import OctreeMap
 from mapper.octree.map_file import MAGIC, write_map
-from mapper.octree.octomap_file import read_octree
+from mapper.octree.reading import read_octree
 
 HEADER = len(MAGIC) + 12
 

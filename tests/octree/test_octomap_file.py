@@ -8,8 +8,10 @@ from mapper.core.errors import MapFileError, MapSizeError
 from mapper.octree import blocks
 from mapper.octree.config import OctreeConfig
 from mapper.octree.keys import KEY_BITS
-from mapper.octree.map import OctreeMap, log_odds
-from mapper.octree.octomap_file import read_octree, write_bt, write_ot
+from mapper.octree.map import OctreeMap
+from mapper.octree.octomap_file import write_bt, write_ot
+from mapper.octree.reading import read_octree
+from mapper.octree.sensor_model import log_odds
 from mapper.octree.tree_reader import TreeLeaves
 from tests.support.octomap_oracle import fr1_xyz_scans, fuse, voxels
 from tests.support.octree_maps import octree_of

@@ -9,8 +9,9 @@ from mapper.core.frames import Scan
 from mapper.core.geometry import exp
 from mapper.octree import blocks, kernels
 from mapper.octree.config import OctreeConfig
-from mapper.octree.map import OctreeMap, log_odds
+from mapper.octree.map import OctreeMap
 from mapper.octree.octomap_file import write_ot
+from mapper.octree.sensor_model import log_odds
 from tests.support.octomap_oracle import fr1_xyz_scans, fuse, kitti_scans, voxels
 from tests.support.octree_maps import as_dict, octree_of
 from tests.support.paths import FR1_XYZ, KITTI

@@ -5,8 +5,10 @@ import pytest
 
 from mapper.core.errors import DataError, MapFileError
 from mapper.octree.config import SliceConfig
-from mapper.octree.octomap_file import read_octree, write_bt, write_ot
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, cut_slice
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
+from mapper.octree.octomap_file import write_bt, write_ot
+from mapper.octree.reading import read_octree
+from mapper.octree.slice import cut_slice
 from tests.support.octree_maps import octree_of
 
 

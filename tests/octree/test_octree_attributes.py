@@ -8,8 +8,10 @@ from mapper.core.geometry import exp
 from mapper.octree import attributes as layer_module
 from mapper.octree.attributes import NEVER_SEEN
 from mapper.octree.config import OctreeConfig
-from mapper.octree.map import OctreeMap, log_odds
-from mapper.octree.octomap_file import read_octree, write_bt, write_ot
+from mapper.octree.map import OctreeMap
+from mapper.octree.octomap_file import write_bt, write_ot
+from mapper.octree.reading import read_octree
+from mapper.octree.sensor_model import log_odds
 
 BOTH_MODES = pytest.mark.parametrize("discretize", [True, False], ids=["discretize", "every-point"])
 

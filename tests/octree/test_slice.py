@@ -5,8 +5,9 @@ import pytest
 
 from mapper.core.errors import DataError
 from mapper.octree.config import OctreeConfig, SliceConfig
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, shrunk
 from mapper.octree.map import OctreeMap
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, cut_slice, shrunk
+from mapper.octree.slice import cut_slice
 
 CELL = 0.05
 

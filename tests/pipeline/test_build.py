@@ -12,7 +12,7 @@ from mapper.core.errors import ConfigError, RunError, TrackingError
 from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.export.run_maps import maps_of
 from mapper.octree.grid_file import read_grid
-from mapper.octree.octomap_file import read_octree
+from mapper.octree.reading import read_octree
 from mapper.pipeline.build import build
 from mapper.pipeline.fuse import fuse
 from mapper.run.folder import open_run

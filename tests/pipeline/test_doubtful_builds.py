@@ -11,7 +11,7 @@ from mapper.core.errors import TrackingError
 from mapper.core.geometry import exp
 from mapper.evaluators.metrics.trajectory import align, associate, ate
 from mapper.export.mesh import _views
-from mapper.octree.octomap_file import read_octree
+from mapper.octree.reading import read_octree
 from mapper.octree.scan_update_file import open_scan_updates
 from mapper.pipeline.append import append
 from mapper.pipeline.build import build

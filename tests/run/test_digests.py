@@ -15,7 +15,6 @@ from mapper.run.checks import check_run
 from mapper.run.digests import changing
 from mapper.run.folder import open_run
 from mapper.run.manifest import read_manifest
-from mapper.run.results import load_results
 from tests.support.command_line import mapper
 from tests.support.files import files_of
 
@@ -95,7 +94,7 @@ def test_a_pipe_is_no_file_of_a_run(run, name, digests_known):
 def test_a_bit_that_was_turned_is_found(run, name):
     turn_a_bit(run.path / name)
     with pytest.raises(RunError, match=rf"{name}: has SHA-256 .*; only mapper build makes it again"):
-        load_results(run)
+        _ = run.results
 
 
 def test_a_file_that_is_gone_is_no_file_that_never_was(run):

@@ -10,9 +10,9 @@ from mapper.navigation.floor import reachable_floor
 from mapper.navigation.traversable import traversable
 from mapper.octree.columns import NOWHERE
 from mapper.octree.config import OctreeConfig
+from mapper.octree.grid import FREE, OCCUPIED, UNKNOWN
 from mapper.octree.keys import BLOCK_BITS, BLOCK_VOXELS, KEY_ZERO, codes_of_blocks
 from mapper.octree.map import OctreeMap
-from mapper.octree.slice import FREE, OCCUPIED, UNKNOWN
 
 THICK_M = 0.2
 PITCH_M = 0.1

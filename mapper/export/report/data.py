@@ -17,11 +17,12 @@ from mapper.export.path_band import SIGMAS
 from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure
 from mapper.mapping.thumbnails import encode_jpeg
-from mapper.octree.octomap_file import bt_bytes, read_octree
-from mapper.octree.slice import OccupancyGrid
+from mapper.octree.grid import OccupancyGrid
+from mapper.octree.octomap_file import bt_bytes
+from mapper.octree.reading import read_octree
 from mapper.run import files
 from mapper.run.folder import Run
-from mapper.run.results import RunResults, load_results
+from mapper.run.results import RunResults
 
 _SIZED_LEVELS = 4
 _VIEW_PX = 1600
@@ -69,7 +70,7 @@ def chapter_of(run: Run, name: str, figures: Sequence[Figure]) -> Chapter:
     Raises:
         MapperError: A file of the run cannot be read.
     """
-    return Chapter(name, run, load_results(run), tuple(figures))
+    return Chapter(name, run, run.results, tuple(figures))
 
 
 def refuse_same_names(chapters: Sequence[Chapter]) -> None:

@@ -203,12 +203,12 @@ def _verdict(number: int, chapter: Chapter) -> str:
     """Return why a run is not trusted, and below it what is worth knowing."""
     verdict = chapter.run.verdict
     notes = [warning.text for warning in chapter.run.manifest.warnings if warning.weight == "note"]
-    told = "".join(
+    items = "".join(
         f'<li class="{kind}">{escape(text)}</li>'
         for kind, texts in (("heavy", verdict.sentences), ("note", notes))
         for text in texts
     )
-    listed = f"<ul>{told}</ul>" if told else ""
+    listed = f"<ul>{items}</ul>" if items else ""
     title = f"{escape(chapter.name)}: {verdict.state}"
     return f'<div class="verdict" data-of="{number}"><h3>{title}</h3>{listed}</div>'
 

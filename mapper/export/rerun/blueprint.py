@@ -10,7 +10,7 @@ _DISTANCE = 0.85  # in diagonals of what is looked at
 
 
 def blueprint_for(looking_at: Array | None, camera: str | None) -> rrb.Blueprint:
-    """Return the map beside the images, the plan and the curves.
+    """Return the map at the left, the images, the plan and the curves at the right.
 
     Args:
         looking_at: (2, 3) lower and upper corner of what the 3D views look at first, metres.
@@ -30,7 +30,7 @@ def blueprint_for(looking_at: Array | None, camera: str | None) -> rrb.Blueprint
         ),
     )
     images = [] if camera is None else [rrb.Spatial2DView(name="camera", origin=camera)]
-    beside = rrb.Vertical(
+    right = rrb.Vertical(
         *images,
         rrb.Tabs(
             rrb.Spatial2DView(name="slice", origin="/slice"),
@@ -49,7 +49,7 @@ def blueprint_for(looking_at: Array | None, camera: str | None) -> rrb.Blueprint
         row_shares=[*(3 for _ in images), 3, 2, 2],
     )
     return rrb.Blueprint(
-        rrb.Horizontal(maps, beside, column_shares=[3, 2]),
+        rrb.Horizontal(maps, right, column_shares=[3, 2]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline="stamp"),

@@ -10,7 +10,7 @@ from mapper.export.run_maps import maps_of, snapshots_of
 from mapper.mapping.cloud import thinned_to_view
 from mapper.mapping.fusion import Maps
 from mapper.run.folder import Run
-from mapper.run.results import RunResults, load_results
+from mapper.run.results import RunResults
 
 
 def show_run(run: Run, target: str) -> None:
@@ -21,14 +21,14 @@ def show_run(run: Run, target: str) -> None:
         ViewerError: No viewer can be started or reached.
         MapperError: A file of the run cannot be read.
     """
-    results, maps, snapshots = load_results(run), maps_of(run), list(snapshots_of(run))
+    results, maps, snapshots = run.results, maps_of(run), list(snapshots_of(run))
     name, corners = run.path.name, extent(results, maps)
     with recorded(target, name=name, has_images=bool(snapshots), looking_at=corners) as log:
         log.images(snapshots)
         log.poses(results.trajectory)
         log_run(log, results, maps)
         log.diagnostics(results.records)
-        log.about(in_words(run, name=run.path.name))
+        log.about(about_text(run, name=run.path.name))
 
 
 def log_run(log: RerunLog, results: RunResults, maps: Maps) -> None:
@@ -59,7 +59,7 @@ def extent(results: RunResults, maps: Maps) -> Array:
     return np.array([points_world.min(axis=0), points_world.max(axis=0)])
 
 
-def in_words(run: Run, *, name: str) -> str:
+def about_text(run: Run, *, name: str) -> str:
     """Return a run as Markdown: its log, counts, odometry and times."""
     manifest = run.manifest
     counts, timing, verdict = manifest.counts, manifest.timing, run.verdict

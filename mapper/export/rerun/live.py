@@ -16,7 +16,7 @@ from mapper.core.errors import FrameError
 from mapper.core.frames import RgbdFrame, Scan, Sensor
 from mapper.core.geometry import Array, Transform, inverse
 from mapper.export.palette import ACCEPTED, ESTIMATE, FACTORS, REJECTED, Rgb
-from mapper.export.rerun.finished import extent, in_words, log_run
+from mapper.export.rerun.finished import about_text, extent, log_run
 from mapper.export.rerun.recording import RerunLog, recorded, transform_of
 from mapper.features.frame_view import ImageView
 from mapper.mapping.fusion import Maps
@@ -82,7 +82,7 @@ class LiveRerun:
         for name in ("estimates", "factors", "loops"):
             self._log.log(f"{_LIVE}/{name}", rr.Clear(recursive=True), stamp_ns=self._last_ns)
         log_run(self._log, results, maps)
-        self._log.about(in_words(run, name=run.manifest.input.title))
+        self._log.about(about_text(run, name=run.manifest.input.title))
         self._log.look_at(extent(results, maps))
 
     def _move(self, track: FrameResult) -> None:

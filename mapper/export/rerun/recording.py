@@ -47,9 +47,9 @@ from mapper.graph.model import PoseGraph
 from mapper.loops.closure import LoopClosure, Verdict
 from mapper.mapping.cloud import height_colors
 from mapper.mapping.fusion import Snapshot
+from mapper.octree.grid import OccupancyGrid
 from mapper.octree.keys import KEY_ZERO
 from mapper.octree.map import OctreeMap
-from mapper.octree.slice import OccupancyGrid
 from mapper.run.frame_outcomes import FrameRecord, stamps_of
 
 APPLICATION = "mapper"

@@ -99,7 +99,7 @@ def _piped(recording: "rr.RecordingStream", path: Path, blueprint: "rrb.Blueprin
     """Save a recording to a file through a pipe.
 
     Rerun's own writer of files ends when the disk is full, and the program may then wait for it forever. Here
-    the rest is read and dropped, and the error told at the end.
+    the rest is read and dropped, and the error raised at the end.
     """
     read, write = os.pipe()
     errors: list[OSError] = []

@@ -36,7 +36,16 @@ def score_planes(points, triples, min_cosine, low_m, high_m, tolerance_m, below_
     """Return the best plane (nx, ny, nz, d) with n·p + d = 0, n up, and its score; a score < 0 is none.
 
     A plane's score is its number of inliers less ``below_weight`` times the number of points clearly below
-    it: nothing lies below the ground. ``d`` is the origin's height above the plane, within low … high.
+    it: nothing lies below the ground.
+
+    Args:
+        points: (N, 3) metres.
+        triples: (K, 3) indices of the points through which planes are laid.
+        min_cosine: Least z of the normal.
+        low_m: Least height of the origin above the plane, d.
+        high_m: Largest.
+        tolerance_m: Largest distance of an inlier.
+        below_weight: Of a point more than twice as far below.
     """
     best = np.zeros(4)
     best_score = -1.0
@@ -72,7 +81,13 @@ def score_planes(points, triples, min_cosine, low_m, high_m, tolerance_m, below_
 def column_heights(points, T, cell_m, edge):
     """Return (edge, edge) count, lowest, highest and mean z of the points in each column of a centred grid.
 
-    The points are moved by T first; empty columns hold 0, +inf, −inf and 0.
+    Empty columns hold 0, +inf, −inf and 0.
+
+    Args:
+        points: (N, 3) metres.
+        T: (4, 4) from the points' frame to the grid's, whose origin is the middle of the grid.
+        cell_m: Edge of a column.
+        edge: Number of columns along x and along y.
     """
     count = np.zeros((edge, edge), int32)
     low = np.full((edge, edge), np.inf, float32)

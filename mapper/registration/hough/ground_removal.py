@@ -103,6 +103,12 @@ def find_obstacles(
 ) -> tuple[Points32, NDArray[np.float32]]:
     """Return the points that are neither ground nor too high, one per voxel.
 
+    Args:
+        points_body: (N, 3) float32 metres, body frame.
+        T_level_body: (4, 4) from the body frame to the level frame.
+        ground: Of the same points, from ``find_ground``.
+        config: Heights, radius and voxels.
+
     Returns:
         (M, 3) float32 in the level frame, and (M,) their heights above the ground, metres.
     """

@@ -35,7 +35,16 @@ def draw_volume(obstacles, heights, voxel_m, edge, low_m, layers):
 
 @njit(cache=True, nogil=True)
 def overlap_of(volume, points, heights, motion, voxel_m, low_m):
-    """Return the sum of the volume at the points turned and moved by a motion (dx, dy, α)."""
+    """Return the sum of the volume at the points turned and moved by a planar motion.
+
+    Args:
+        volume: (Z, Y, X) of ``draw_volume``, its origin in the middle of x and y.
+        points: (N, 2) or (N, 3) x and y, metres, level frame.
+        heights: (N,) above the ground, metres.
+        motion: (3,) dx and dy in metres, α in radians.
+        voxel_m: Edge of a voxel of the volume.
+        low_m: Height of its lowest layer above the ground.
+    """
     dx_m, dy_m, alpha_rad = motion
     layers, edge, _ = volume.shape
     cosine, sine = np.cos(alpha_rad) / voxel_m, np.sin(alpha_rad) / voxel_m
@@ -55,6 +64,17 @@ def hill_climb(volume, points, heights, motion, voxel_m, low_m, step_m, step_rad
     """Return the (dx, dy, α) of a local maximum of the overlap near ``motion``, and its overlap.
 
     The best of six neighbours is taken until none is better; then the steps are halved.
+
+    Args:
+        volume: As for ``overlap_of``, as are the points, the heights, the motion and the lengths.
+        points: See there.
+        heights: See there.
+        motion: Where the search begins.
+        voxel_m: See there.
+        low_m: See there.
+        step_m: First step along x and y.
+        step_rad: First step of α.
+        halvings: How often the steps are halved.
     """
     here = motion.copy()
     best = overlap_of(volume, points, heights, here, voxel_m, low_m)

@@ -1,0 +1,106 @@
+"""2D occupancy grid in the ground plane, with the codes of ROS."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapper.core.errors import DataError
+from mapper.core.geometry import Array
+from mapper.core.plan_axes import plan_axes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+UNKNOWN, FREE, OCCUPIED = -1, 0, 100
+"""ROS OccupancyGrid codes, ordered so that the maximum over a column is its state."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OccupancyGrid:
+    """2D occupancy grid in the ground plane.
+
+    Attributes:
+        cells: (H, W) int8 of UNKNOWN, FREE and OCCUPIED; row 0 has the lowest y, column 0 the lowest x.
+        origin_world_m: (2,) x and y of the lower left corner of cell (0, 0), metres.
+        resolution_m: Edge of a cell.
+    """
+
+    cells: NDArray[np.int8]
+    origin_world_m: Array
+    resolution_m: float
+
+    @property
+    def grid(self) -> NDArray[np.int8]:
+        """(H, W) int8: ``cells``."""
+        return self.cells
+
+    @property
+    def resolution(self) -> float:
+        """Edge of a cell, metres: ``resolution_m``."""
+        return self.resolution_m
+
+    @property
+    def origin(self) -> Array:
+        """(2,) x and y of the lower left corner, metres, world frame: ``origin_world_m``."""
+        return self.origin_world_m
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of ``cells``."""
+        rows, columns = self.cells.shape
+        return rows, columns
+
+    def plot(self, axes: "Axes | None" = None) -> "Axes":
+        """Draw the grid: free cells white, occupied ones black, unknown ones grey.
+
+        Args:
+            axes: Matplotlib's axes to draw on; None makes a figure of pyplot's.
+
+        Returns:
+            The axes, in metres of the world.
+        """
+        axes = plan_axes(axes)
+        x, y = self.origin_world_m.tolist()
+        rows, columns = self.shape
+        extent = (x, x + columns * self.resolution_m, y, y + rows * self.resolution_m)
+        shades = np.select([self.cells == FREE, self.cells == OCCUPIED], [1.0, 0.0], 0.8)
+        axes.imshow(shades, cmap="gray", vmin=0.0, vmax=1.0, origin="lower", extent=extent)
+        return axes
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.array(self.cells, dtype=dtype, copy=copy)
+
+    def __post_init__(self) -> None:
+        if self.cells.ndim != 2 or self.cells.size == 0 or self.cells.dtype != np.int8:
+            raise DataError(
+                f"grid: cells {self.cells.shape} {self.cells.dtype}, want (H, W) int8 of some size"
+            )
+        codes = np.unique(self.cells)
+        if not np.isin(codes, (UNKNOWN, FREE, OCCUPIED)).all():
+            raise DataError(f"grid: codes {codes.tolist()}, want only {UNKNOWN}, {FREE} and {OCCUPIED}")
+        if self.origin_world_m.shape != (2,) or not np.isfinite(self.origin_world_m).all():
+            raise DataError(f"grid: origin {self.origin_world_m}, want two finite numbers")
+        if not 0.0 < self.resolution_m < np.inf:
+            raise DataError(f"grid: resolution {self.resolution_m} m, want > 0")
+
+
+def with_obstacles(grid: OccupancyGrid, others: OccupancyGrid | None) -> OccupancyGrid:
+    """Return a grid with what is occupied in another of the same cells, if there is one, occupied too."""
+    if others is None:
+        return grid
+    cells = np.where(others.cells == OCCUPIED, others.cells, grid.cells)
+    return OccupancyGrid(cells, grid.origin_world_m, grid.resolution_m)
+
+
+def shrunk(grid: OccupancyGrid, most_cells: int) -> OccupancyGrid:
+    """Return a grid of no more cells along an edge, for a picture: a cell is the maximum of those in it."""
+    factor = -(-max(grid.cells.shape) // most_cells)
+    if factor == 1:
+        return grid
+    padding = [(0, -size % factor) for size in grid.cells.shape]
+    cells = np.pad(grid.cells, padding, constant_values=UNKNOWN)
+    rows, columns = (size // factor for size in cells.shape)
+    cells = cells.reshape(rows, factor, columns, factor).max(axis=(1, 3))
+    return OccupancyGrid(cells, grid.origin_world_m, factor * grid.resolution_m)

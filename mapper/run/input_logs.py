@@ -1,0 +1,59 @@
+"""Logs that a run was made from: opened again, and compared with what they were."""
+
+from itertools import zip_longest
+from pathlib import Path
+
+from mapper.core.errors import RunError
+from mapper.run.fingerprint import fingerprint
+from mapper.run.manifest import Input, InputLog
+from mapper.sources import open_source
+from mapper.sources.base import Log
+from mapper.sources.chained import chained, sessions_of
+from mapper.sources.config import SourceConfig
+
+
+def open_inputs(known: Input, config: SourceConfig, *, run: Path) -> Log:
+    """Return the log that a run was made from, with the same frames selected and all that was appended.
+
+    Args:
+        known: The logs, from the run's manifest.
+        config: Settings of the first log.
+        run: The run's folder, for errors.
+
+    Raises:
+        RunError: A log is no longer there, or is not what it was.
+        SourceError: It cannot be opened.
+    """
+    source = _open(known, config, run)
+    for log in known.appended:
+        source = chained(source, _open(log, log.source, run), shift_ns=log.shift_ns)
+    refuse_another_log(known, source, run=run)
+    return source
+
+
+def _open(log: InputLog, config: SourceConfig, run: Path) -> Log:
+    path = Path(log.path)
+    if not path.exists():
+        raise RunError(f"{path}: the log of {run} is no longer there; give its new place with --log")
+    return open_source(path, config)
+
+
+def refuse_another_log(known: Input, source: Log, *, run: Path) -> None:
+    """Refuse a log that is not the one that a run was made from.
+
+    Raises:
+        RunError: Its fingerprint differs, or that of a log that was appended.
+    """
+    logs = (known, *known.appended)
+    for path, log in zip_longest(paths_of(source), logs):
+        if path is None or log is None:
+            raise RunError(
+                f"{source.path}: {run} was made from {len(logs)} logs; open them with Run.open_log"
+            )
+        if fingerprint(path) != log.fingerprint:
+            raise RunError(f"{path}: changed since {run} was built from it; build it again")
+
+
+def paths_of(source: Log) -> list[Path]:
+    """Return the paths of the logs that a log is made of."""
+    return [session.log.path for session in sessions_of(source)]

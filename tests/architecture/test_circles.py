@@ -1,0 +1,57 @@
+"""No circle of imports, those inside functions included: every module can be read after those it imports."""
+
+import ast
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from tests.support.paths import ROOT
+
+PREFIXES = {"mapper": "", "evaluators": "mapper.", "cli": "mapper."}
+
+
+def modules() -> dict[str, Path]:
+    """Return the path of each of our modules."""
+    found = {}
+    for package, prefix in PREFIXES.items():
+        for path in (ROOT / package).rglob("*.py"):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            if parts[:2] not in {("mapper", "cli"), ("mapper", "evaluators")}:  # links to these packages
+                found[prefix + ".".join(parts).removesuffix(".__init__")] = path
+    return found
+
+
+def imports(node: ast.AST) -> Iterator[str]:
+    """Yield what is imported, unless for type checkers alone."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
+            continue
+        if isinstance(child, ast.ImportFrom):
+            yield from (f"{child.module}.{alias.name}" for alias in child.names)
+        elif isinstance(child, ast.Import):
+            yield from (alias.name for alias in child.names)
+        yield from imports(child)
+
+
+def importing() -> dict[str, set[str]]:
+    """Return the modules that each module imports; a name that is no module is one of its parent's."""
+    known = modules()
+    graph: dict[str, set[str]] = {}
+    for module, path in known.items():
+        names = imports(ast.parse(path.read_text()))
+        found = {name if name in known else name.rpartition(".")[0] for name in names}
+        graph[module] = (found & known.keys()) - {module}
+    return graph
+
+
+def test_no_circle_of_modules():
+    graph = importing()
+    assert "mapper.octree.map" in graph["mapper.octree.reading"]
+    assert "mapper.octree.writing" in graph["mapper.octree.map"]  # imported inside a method
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail("; ".join(f"{b} imports {a}" for a, b in pairwise(error.args[1])))
