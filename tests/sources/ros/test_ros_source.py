@@ -149,6 +149,42 @@ def test_depth_that_is_not_registered_is_refused(tmp_path):
         opened(tmp_path / "b.mcap", small)
 
 
+def test_depth_that_tf_places_elsewhere_is_refused_unless_it_is_chosen_or_called_registered(tmp_path):
+    beside = np.eye(4)
+    beside[0, 3] = 0.015
+    taken = "depth in frame d is taken to be registered to colour in optical"
+
+    def with_depth_of(topic, T):
+        depths = [image(t, topic, picture(i)[1], "16UC1", frame="d") for i, t in enumerate(stamps(3))]
+        return [transforms(("optical", "d", T)), *depths, *(one for one in shots(3) if one.topic != DEPTH)]
+
+    why = r"/cam/depth/image is not registered to /cam/color/image_raw: tf has its frame d 15 mm from"
+    with pytest.raises(SourceError, match=why):
+        opened(tmp_path / "a.mcap", with_depth_of("/cam/depth/image", beside))
+    chosen = SourceConfig(topics=TopicsConfig(depth="/cam/depth/image"))
+    assert taken in open_source(tmp_path / "a.mcap", chosen).notes
+    assert taken in opened(tmp_path / "b.mcap", with_depth_of("/cam/depth_registered/image", beside)).notes
+    assert taken in opened(tmp_path / "c.mcap", with_depth_of("/cam/depth/image", np.eye(4))).notes
+
+
+def test_depth_of_one_camera_is_not_paired_with_colour_of_another(tmp_path):
+    messages = []
+    for i, t in enumerate(stamps(6)):
+        rgb, units = picture(i)
+        for camera, without in (("a", "depth"), ("b", "color")):  # each would be taken for its number alone
+            one = [
+                image(t, f"/{camera}/color/image_raw", rgb, "rgb8", frame=f"{camera}_optical"),
+                image(t, f"/{camera}/depth/image_raw", units, "16UC1", frame=f"{camera}_optical"),
+                camera_info(t, f"/{camera}/color/camera_info"),
+            ]
+            messages += [message for message in one if i or without not in message.topic]
+    source = opened(tmp_path / "a.mcap", messages)
+    assert source.notes[0].startswith("colour /a/color/image_raw, depth /a/depth/image_raw;")
+    config = SourceConfig(topics=TopicsConfig(color="/b/color/image_raw"))
+    source = open_source(tmp_path / "a.mcap", config)
+    assert source.notes[0].startswith("colour /b/color/image_raw, depth /b/depth/image_raw;")
+
+
 def test_a_camera_that_nothing_tells_is_an_error_with_a_remedy(tmp_path):
     messages = [message for message in shots(2) if "info" not in message.topic]
     with pytest.raises(SourceError, match=r"no camera info for /cam/color/image_raw; .*source.camera.fx_px"):
