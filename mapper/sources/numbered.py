@@ -20,6 +20,7 @@ from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.calibration import PRIMESENSE, SEVEN_SCENES
+from mapper.sources.calibration_file import calibration_file
 from mapper.sources.config import SourceConfig
 from mapper.sources.pairing import pair_anew
 from mapper.sources.rgbd import FramePair, find_calibration, rgbd_log
@@ -81,6 +82,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     Raises:
         SourceError: The folder holds several sequences, or a pose file or the calibration is malformed.
     """
+    opened = path
     if sequences := _sequences(path):
         if len(sequences) > 1:
             names = ", ".join(folder.name for folder in sequences)
@@ -91,8 +93,9 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         raise SourceError(f"{path}: no colour and depth images with the same numbers; want {LOOKED_FOR}")
     is_seven_scenes = _SEVEN_SCENES.fullmatch(images.pairs[0].colour.name) is not None
     known = SEVEN_SCENES if is_seven_scenes else PRIMESENSE
+    beside = next((folder for folder in (path, opened) if calibration_file(folder)), path)
     calibration, units_per_m = find_calibration(
-        path, config.camera, known=known, depth_units_per_m=DEPTH_UNITS_PER_M
+        beside, config.camera, known=known, depth_units_per_m=DEPTH_UNITS_PER_M
     )
     notes = list(images.notes)
     if calibration is known:
