@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 __all__ = ["open_source"]
 
-# The first that recognises a path reads it. Images of ICL-NUIM and Poznań are numbered too, so these come
-# before numbered images; any log's folder may have clouds in it, so clouds come last.
-_FORMATS = ("icl_nuim", "tum", "mbag", "poznan", "numbered", "kitti", "ros.files", "clouds")
+# The first that recognises a path reads it. Images of ICL-NUIM and Poznań are numbered too, and stamps are
+# numbers, so these come before numbered images; any log's folder may have clouds in it, so clouds come last.
+_FORMATS = ("icl_nuim", "tum", "mbag", "poznan", "stamped_images", "numbered", "kitti", "ros.files", "clouds")
 """Modules, imported one after the other when a log is opened, until one recognises it."""
 _DEFAULTS = SourceConfig()
 

@@ -85,6 +85,7 @@ def rgbd_log(
     kind: str,
     truth: Trajectory | None,
     notes: Iterable[str],
+    are_units_assumed: bool = False,
 ) -> Log:
     """Return the log of some image files, with the readings of an accelerometer where there are any.
 
@@ -98,6 +99,7 @@ def rgbd_log(
         kind: As of :class:`Log`.
         truth: As of :class:`Log`.
         notes: What finding all these had to leave out or assume.
+        are_units_assumed: As of :class:`Log`.
 
     Raises:
         SourceError: No colour image can be read, they are not of the calibration's size, an image is a link
@@ -132,6 +134,7 @@ def rgbd_log(
         entry_at=entry_at,
         truth=truth,
         accelerations=accelerations,
+        are_units_assumed=are_units_assumed,
         notes=[*notes, *acceleration_notes],
     )
 
@@ -140,6 +143,8 @@ def find_calibration(
     folder: Path, config: CameraConfig | None, *, known: Calibration | None, depth_units_per_m: float
 ) -> tuple[Calibration, float]:
     """Return a log's intrinsics and depth units: the user's, else a file's, else the known camera's.
+
+    The calibration has depth units only where the user or a file states them.
 
     Args:
         folder: Where a file of them may lie.
@@ -152,19 +157,20 @@ def find_calibration(
     """
     path = calibration_file(folder)
     stated = known if path is None else read_calibration(path)
-    units_per_m = depth_units_per_m if stated is None else stated.depth_units_per_m or depth_units_per_m
+    stated_units_per_m = None if stated is None else stated.depth_units_per_m
     if config is not None:
-        units_per_m = config.depth_factor or units_per_m
+        stated_units_per_m = config.depth_factor or stated_units_per_m
+    units_per_m = stated_units_per_m or depth_units_per_m
     if chosen := configured(config):
         if stated is not None:  # the sign is the convention of the log's truth
             chosen = replace(chosen, fy_px=math.copysign(chosen.fy_px, stated.fy_px))
-        return chosen, units_per_m
+        stated = chosen
     if stated is None:
         raise SourceError(
             f"{folder}: intrinsics unknown; put a calibration.toml with fx_px, fy_px, cx_px and cy_px there, "
             f"or --set source.camera.fx_px=… and so on{_renamed(folder)}"
         )
-    return stated, units_per_m
+    return replace(stated, depth_units_per_m=stated_units_per_m), units_per_m
 
 
 def _renamed(folder: Path) -> str:
