@@ -84,6 +84,12 @@ def test_numbers_that_advance_as_times_are_times(tmp_path, unit):
     assert any(note.startswith(f"numbers in file names are taken for {unit}") for note in log.notes)
 
 
+def test_a_folder_of_a_log_names_it(tmp_path):
+    written(tmp_path / "office")
+    with pytest.raises(SourceError, match=r"known format .*; office in it is one"):
+        open_source(tmp_path)
+
+
 def test_numbers_of_too_many_digits_are_no_numbers(tmp_path):
     for i in range(N):
         write_picture(tmp_path / "rgb" / f"{i:025d}.png", tmp_path / "depth" / f"{i:025d}.png", i)

@@ -15,8 +15,8 @@ from mapper.sources.images import FINE_UNITS_PER_M
 from mapper.sources.pairing import depth_offset_ns
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry
 from mapper.sources.ros.image_messages import MILLIMETRES_PER_M, has_float_depth, size_of
-from mapper.sources.ros.index import Series
-from mapper.sources.ros.messages import CameraMessage, FileMessage, ImageMessage
+from mapper.sources.ros.index import Series, why_unread
+from mapper.sources.ros.messages import IMAGES, CameraMessage, FileMessage, ImageMessage
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.time_line import ordered, paired
 from mapper.sources.ros.topics import CameraTopics, choose, frame_of, is_called_registered
@@ -50,7 +50,12 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     try:
         choice = choose(reader.series, reader.firsts, config.topics, path=recording.path)
     except SourceError as error:
-        raise SourceError("; ".join([str(error), *recording.notes])) from None
+        unread = (
+            why_unread(recording, series)
+            for series in reader.series.values()
+            if series.topic.type in IMAGES and series.topic.name not in reader.firsts
+        )
+        raise SourceError("; ".join([str(error), *filter(None, unread), *recording.notes])) from None
     if isinstance(choice.frames, CameraTopics):
         frames = _rgbd(reader, choice.frames, config)
     else:

@@ -11,11 +11,18 @@ from mapper.core.rotations import quaternion_from_rotation
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig, TopicsConfig
 from mapper.sources.images import decode_depth_units
-from mapper.sources.ros.encode_ros import SerializedMessage, cloud_message, imu_message, odometry_message
+from mapper.sources.ros.encode_ros import (
+    SerializedMessage,
+    cloud_message,
+    compressed_image_message,
+    imu_message,
+    odometry_message,
+)
 from mapper.sources.writers import write_log
 from tests.support.recordings import CAMERA, COLOR, DEPTH, camera_info, image, shots, write
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
 
+RVL = "16UC1; compressedDepth rvl"
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 T_BASE_LIDAR = exp(np.array([0.0, 0.0, 1.5]), np.array([0.2, 0.0, 1.1]))
 
@@ -283,6 +290,16 @@ def test_points_of_a_camera_are_told_to_look_forward(tmp_path):
     messages = [cloud_message("/points", Scan(t, points), frame="depth_optical") for t in stamps(2)]
     notes = opened(tmp_path / "a.mcap", messages).notes
     assert notes[-1].startswith("points are in depth_optical, whose z looks forward")
+
+
+def test_depth_in_a_coding_that_is_not_read_is_named_with_the_reason(tmp_path):
+    colour = [message for message in shots(3) if message.topic != DEPTH]
+    depth = [
+        compressed_image_message(t, "/cam/depth/compressedDepth", bytes(40), format_=RVL, frame="optical")
+        for t in stamps(3)
+    ]
+    with pytest.raises(SourceError, match=r"neither depth .*/cam/depth/compressedDepth: .* RVL is not"):
+        opened(tmp_path / "a.mcap", [*colour, *depth])
 
 
 def test_a_topic_whose_images_are_all_damaged_is_named(tmp_path):
