@@ -53,11 +53,11 @@ def evaluate(
         typer.Argument(
             metavar="RUN|TRAJECTORY",
             autocompletion=run_folders,
-            help="Run folder, merged map, or TUM or KITTI trajectory.",
+            help="Run folder, merged map, or TUM, KITTI or EuRoC trajectory.",
         ),
     ],
     truth: Annotated[
-        Path | None, typer.Option(help="TUM or KITTI trajectory of the truth; omit for the run's own.")
+        Path | None, typer.Option(help="TUM, KITTI or EuRoC trajectory of the truth; omit for the run's own.")
     ] = None,
     times: Annotated[
         Path | None,

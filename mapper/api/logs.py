@@ -62,7 +62,7 @@ def read_frame(name: AnyPath, config: SourceConfig) -> tuple[Frame, Sensor]:
                 f"{name}: is a folder; name a log's frame, as in {name}@0, "
                 f"or a run's cloud, as in {name}/cloud.ply"
             )
-        return read_scan(path, scale=config.cloud_scale), "lidar"
+        return read_scan(path, scale=config.cloud_scale, bin_columns=config.bin_columns), "lidar"
     opened = open_source(Path(log), config)
     if not index.isdecimal() or int(index) >= len(opened):
         raise SourceError(f"{name}: want a frame of {log} from @0 to @{len(opened) - 1}")

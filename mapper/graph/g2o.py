@@ -18,6 +18,8 @@ from mapper.runtime.progress import SILENT, Progress
 from mapper.runtime.regular_files import read_text
 
 _ORIGINS: tuple[Origin, ...] = get_args(Origin)
+_PARAMETERS = "PARAMS_"
+"""Begins tags of sensors' mountings, which the g2o library writes; no edge that is read here uses one."""
 _SHORTEST = 1e-9
 """A quaternion shorter than this has no direction."""
 
@@ -146,7 +148,7 @@ def _tables(path: Path) -> dict[str, _Table]:
     for line, text in enumerate(lines, start=1):
         body, _, note = text.partition("#")
         tag, *words = body.split() or [""]
-        if tag in ("", "FIX"):
+        if tag in ("", "FIX") or tag.startswith(_PARAMETERS):
             continue
         form = _FORMS.get(tag)
         if form is None:

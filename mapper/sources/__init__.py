@@ -1,5 +1,6 @@
 """Recorded logs as sequences of frames."""
 
+from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -14,10 +15,12 @@ if TYPE_CHECKING:
 
 __all__ = ["open_source"]
 
-# The first that recognises a path reads it. Images of ICL-NUIM and Poznań are numbered too, so these come
-# before numbered images; any log's folder may have clouds in it, so clouds come last.
-_FORMATS = ("icl_nuim", "tum", "mbag", "poznan", "numbered", "kitti", "ros.files", "clouds")
+# The first that recognises a path reads it. Images of ICL-NUIM and Poznań are numbered too, and stamps are
+# numbers, so these come before numbered images; any log's folder may have clouds in it, so clouds come last.
+_FORMATS = ("icl_nuim", "tum", "mbag", "poznan", "stamped_images", "numbered", "kitti", "ros.files", "clouds")
 """Modules, imported one after the other when a log is opened, until one recognises it."""
+_MOST_TRIED = 20
+"""Folders within a folder that are looked at, to say which is the log."""
 _DEFAULTS = SourceConfig()
 
 
@@ -56,9 +59,20 @@ def open_source(path: Path, config: SourceConfig = _DEFAULTS) -> "Log":
             return selected(log, config)
     if (path / MANIFEST_NAME).is_file():
         raise SourceError(f"{path}: holds what mapper made, not a log; mapper eval {path} judges it")
-    one_cloud = "; of clouds it has one, want two or more" if most_clouds(path) == 1 else ""
+    hint = "; of clouds it has one, want two or more" if most_clouds(path) == 1 else _inner_hint(path)
     raise SourceError(
         f"{path}: not a log of a known format (TUM, ICL-NUIM, Poznań, 7-Scenes, Redwood, KITTI, clouds, "
         ".mcap, .bag, .db3, .mbag); docs/your-sensor.md names the files of each"
-        f"{one_cloud}"
+        f"{hint}"
     )
+
+
+def _inner_hint(path: Path) -> str:
+    """Return advice to open a folder in this one that is a log; archives often hold a folder in a folder."""
+    folders = sorted(inner for inner in path.glob("*") if inner.is_dir())[:_MOST_TRIED]
+    formats = [import_module(f"mapper.sources.{name}") for name in _FORMATS]
+    for inner in folders:
+        with suppress(SourceError):  # of a file in it that cannot be read
+            if any(form.recognise(inner) for form in formats):
+                return f"; {inner.name} in it is one"
+    return ""

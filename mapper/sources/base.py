@@ -137,6 +137,7 @@ class Log:
         truth: True T_world_body, if the log has it.
         accelerations: Accelerometer readings, if the log has them.
         wheels: T_odom_body by wheel odometry, in a frame of its own that drifts, if the log has it.
+        are_units_assumed: Nothing says how many units of its depth images a metre has.
         notes: What opening it had to leave out or assume, a sentence each.
         sessions: The logs that a chained log is made of, oldest first; empty for any other.
     """
@@ -150,6 +151,7 @@ class Log:
     truth: Trajectory | None = None
     accelerations: Accelerations | None = None
     wheels: Trajectory | None = None
+    are_units_assumed: bool = False
     notes: Sequence[str] = ()
     sessions: "Sequence[Session]" = ()
 

@@ -1,18 +1,22 @@
-"""Calibration files beside a log: our TOML, and the YAML of ROS, OpenCV and ORB-SLAM."""
+"""Calibration files beside a log: our TOML, and those of ROS, OpenCV, ORB-SLAM, Kalibr, Open3D and others."""
 
+import json
 import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from mapper.core.errors import DataError, SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera
 from mapper.runtime.regular_files import read_text
 from mapper.sources.calibration import Calibration
 
-FILE_NAMES = (
+_FILE_NAMES = (
     "calibration.toml",
     "calibration.yaml",
     "calibration.yml",
@@ -20,13 +24,34 @@ FILE_NAMES = (
     "camera.yml",
     "camera_info.yaml",
     "camera_info.yml",
+    "*camchain*.yaml",  # Kalibr
+    "camera_intrinsic.json",  # Open3D's recorders, of a RealSense and of an Azure Kinect
+    "intrinsic.json",
+    "cam_params.json",  # Replica, as rendered for NICE-SLAM
+    "camera-intrinsics.txt",  # 3DMatch
+    "camera_intrinsics.txt",
+    "intrinsics.txt",
+    "intrinsic.txt",
+    "calibration.txt",  # ETH3D
+    "K.txt",
+    "intrinsic/intrinsic_color.txt",  # ScanNet
+    "intrinsic_color.txt",
+    "info.txt",  # BundleFusion
+    "_info.txt",
 )
+"""Globs in a log's folder, the first that is there counts."""
 
 _Numbers = Mapping[str, Sequence[float]]
 
 
+def calibration_file(folder: Path) -> Path | None:
+    """Return the file of intrinsics beside a log; None without one."""
+    found = (path for name in _FILE_NAMES for path in sorted(folder.glob(name)) if path.is_file())
+    return next((path for path in found if not path.name.endswith("info.txt") or _is_sensor_info(path)), None)
+
+
 def read_calibration(path: Path) -> Calibration:
-    """Read intrinsics from TOML, or from the YAML of ROS's camera_info, OpenCV or ORB-SLAM.
+    """Read intrinsics from TOML, JSON, YAML, or text of a matrix or of fx fy cx cy.
 
     TOML keys: fx_px fy_px cx_px cy_px, and optionally width_px height_px, distortion (k1 k2 p1 p2 k3) and
     depth_factor (image units per metre).
@@ -35,12 +60,17 @@ def read_calibration(path: Path) -> Calibration:
         SourceError: The file cannot be read, lacks a number, or (TOML) has a key of another meaning.
     """
     text = read_text(path, error=SourceError)
+    numbers: _Numbers
     try:
         if path.suffix == ".toml":
             numbers = _toml_numbers(tomllib.loads(text))
             unknown = sorted(set(numbers) - _KEYS)
             if unknown:
                 raise DataError(f"{unknown[0]}: unknown key; known are {', '.join(sorted(_KEYS))}")
+        elif path.suffix == ".json":
+            numbers = _json_numbers(json.loads(text))
+        elif path.suffix == ".txt":
+            numbers = _info_numbers(text) if _INFO_KEY in text else _text_numbers(text)
         else:
             numbers = _yaml_numbers(text)
         return _interpret(numbers, f"{path}")
@@ -65,7 +95,7 @@ def calibration_text(camera: PinholeCamera, *, depth_units_per_m: float) -> str:
     return "".join(f"{key} = {value!r}\n" for key, value in values.items())
 
 
-# What each number is called: by us, by ROS, by OpenCV and by ORB-SLAM ("Camera.fx" counts as "fx").
+# What each number is called: by us, ROS, OpenCV, Kalibr and ORB-SLAM ("Camera.fx" counts as "fx").
 _NAMES = {
     "fx": ("fx_px", "fx"),
     "fy": ("fy_px", "fy"),
@@ -73,9 +103,11 @@ _NAMES = {
     "cy": ("cy_px", "cy"),
     "width": ("width_px", "width", "image_width"),
     "height": ("height_px", "height", "image_height"),
+    "size": ("resolution",),
     "depth_factor": ("depth_factor", "depthmapfactor"),
     "matrix": ("camera_matrix", "k"),
-    "distortion": ("distortion", "distortion_coefficients", "d"),
+    "intrinsics": ("intrinsics",),
+    "distortion": ("distortion", "distortion_coefficients", "distortion_coeffs", "d"),
     "k1": ("k1",),
     "k2": ("k2",),
     "p1": ("p1",),
@@ -93,6 +125,9 @@ def _interpret(numbers: _Numbers, origin: str) -> Calibration:
             raise DataError(f"{meaning}: {', '.join(f'{value:g}' for value in values)} is not finite")
     if len(K := found.get("matrix", ())) == 9:
         found = {"fx": K[0:1], "cx": K[2:3], "fy": K[4:5], "cy": K[5:6], **found}
+    for several, names in (("intrinsics", ("fx", "fy", "cx", "cy")), ("size", ("width", "height"))):
+        if len(values := found.get(several, ())) == len(names):
+            found = {**{name: [value] for name, value in zip(names, values, strict=True)}, **found}
     one = {meaning: values[0] for meaning, values in found.items() if len(values) == 1}
     missing = [meaning for meaning in ("fx", "fy", "cx", "cy") if meaning not in one]
     if missing:
@@ -127,6 +162,9 @@ def _toml_numbers(table: Mapping[str, Any]) -> dict[str, Sequence[float]]:
     return numbers
 
 
+_HEAD_BYTES = 1 << 16
+_INFO_KEY = "m_calibrationColorIntrinsic"
+_ANY_LINE = re.IGNORECASE | re.MULTILINE
 _YAML_ENTRY = re.compile(
     r"^[ \t]*(?:\w+\.)?(?P<key>\w+)[ \t]*:[ \t]*(?P<value>\[[^\]]*\]|(?:\n[ \t]*-[ \t][^\n]*)+|[^\n#]*)",
     re.MULTILINE,
@@ -134,9 +172,15 @@ _YAML_ENTRY = re.compile(
 
 
 def _yaml_numbers(text: str) -> dict[str, Sequence[float]]:
-    """Take the numbers of "key: 1.0", "key: [1.0, …]", "- 1.0" lines, and a matrix's nested "data: […]"."""
-    if model := re.search(r"equidistant|fisheye|kannalabrandt", text, re.IGNORECASE):
-        raise DataError(f"{model[0]} lens; only Brown–Conrady (plumb_bob) distortion is supported")
+    """Take the numbers of "key: 1.0", "key: [1.0, …]", "- 1.0" lines, and a matrix's nested "data: […]".
+
+    Raises:
+        DataError: The lens has another model, or a number stands for two cameras.
+    """
+    if model := re.search(r"equidistant|fisheye|kannalabrandt|:\s*(?:omni|eucm|ds|fov)\s*$", text, _ANY_LINE):
+        raise DataError(
+            f"{model[0].strip(': ')} lens; only Brown–Conrady (plumb_bob) distortion is supported"
+        )
     numbers: dict[str, Sequence[float]] = {}
     parent = ""
     for entry in _YAML_ENTRY.finditer(text):
@@ -146,7 +190,58 @@ def _yaml_numbers(text: str) -> dict[str, Sequence[float]]:
             continue
         words = re.split(r"[\s,]+", re.sub(r"^\s*-\s", " ", value.strip("[]"), flags=re.MULTILINE).strip())
         try:
-            numbers[parent if key == "data" else key] = [float(word) for word in words]
+            found = [float(word) for word in words]
         except ValueError:
             continue  # text: a name, a frame, a lens model
+        key = parent if key == "data" else key
+        if key in _KEYS and numbers.setdefault(key, found) != found:
+            raise DataError(f"{key} is there twice; keep the colour camera's alone")
+        numbers[key] = found
     return numbers
+
+
+def _json_numbers(table: Any) -> _Numbers:
+    """Take Open3D's matrix, which it writes column by column, or the table "camera" of Replica."""
+    camera = table.get("camera", table) if isinstance(table, dict) else None
+    if not isinstance(camera, dict):
+        raise DataError("no table of numbers")
+    numbers = _toml_numbers({key: value for key, value in camera.items() if _is_numeric(value)})
+    if len(K := numbers.get("intrinsic_matrix", ())) == 9:
+        is_by_column = not (K[2] or K[5])
+        numbers["k"] = np.reshape(K, (3, 3)).T.ravel().tolist() if is_by_column else K
+    short = {"w": "width", "h": "height", "scale": "depth_factor"} if camera is not table else {}
+    return {short.get(key, key): values for key, values in numbers.items()}
+
+
+def _is_numeric(value: Any) -> bool:
+    values = value if isinstance(value, list) else [value]
+    return all(isinstance(one, int | float) for one in values)
+
+
+def _text_numbers(text: str) -> _Numbers:
+    """Take a matrix of 3×3, 3×4 or 4×4 numbers, or a line of fx fy cx cy and distortion coefficients."""
+    lines = [line.split("#")[0].replace(",", " ").split() for line in text.splitlines()]
+    rows = [[float(word) for word in words] for words in lines if words]
+    if len(rows) == 1 and 4 <= len(rows[0]) <= 4 + len(NO_DISTORTION):
+        return {"intrinsics": rows[0][:4], "d": rows[0][4:] or list(NO_DISTORTION)}
+    if (len(rows), *{len(row) for row in rows}) not in ((3, 3), (3, 4), (4, 4)):
+        raise DataError(
+            "want a 3×3 matrix, or a line of fx fy cx cy; a calibration.toml beside it goes first"
+        )
+    return {"camera_matrix": [value for row in rows[:3] for value in row[:3]]}
+
+
+def _is_sensor_info(path: Path) -> bool:
+    with suppress(OSError), path.open("rb") as file:
+        return _INFO_KEY.encode() in file.read(_HEAD_BYTES)
+    return False
+
+
+def _info_numbers(text: str) -> _Numbers:
+    """Take BundleFusion's 4×4 matrix, sizes and depth units of lines "m_name = numbers"."""
+    pairs = (line.partition("=") for line in text.splitlines())
+    words = {name.strip(): value.split() for name, _, value in pairs}
+    names = {"m_colorWidth": "width", "m_colorHeight": "height", "m_depthShift": "depth_factor"}
+    numbers = {ours: [float(word) for word in words[name]] for name, ours in names.items() if name in words}
+    K = [float(word) for word in words.get(_INFO_KEY, [])]
+    return {**numbers, "camera_matrix": [*K[0:3], *K[4:7], *K[8:11]]}

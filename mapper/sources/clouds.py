@@ -56,17 +56,18 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     )
 
 
-def read_scan(path: Path, *, scale: float | None = None) -> Scan:
+def read_scan(path: Path, *, scale: float | None = None, bin_columns: int | None = None) -> Scan:
     """Return the cloud of one file as a scan at time zero.
 
     Args:
         path: A file of one of ``cloud_files.ENDINGS``.
         scale: Metres per unit of the file; None is 1, and refuses what looks like millimetres.
+        bin_columns: Numbers of a record in a .bin file; None is KITTI's four, and refuses others.
 
     Raises:
         FrameError: The file is missing, damaged, empty or not in metres around the sensor.
     """
-    return ScanEntry(0, path, scale).load()
+    return ScanEntry(0, path, scale, bin_columns).load()
 
 
 def _folders(path: Path) -> list[Path]:

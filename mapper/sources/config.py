@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Self
 
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from mapper.core.config import Config
 
@@ -134,3 +134,6 @@ class SourceConfig(Config):
     """Poses of a LiDAR log, in TUM's or KITTI's text; None looks for groundtruth.txt and poses.txt."""
     cloud_scale: PositiveFloat | None = None
     """Metres per unit of a LiDAR log's files; None is 1, and refuses what looks like millimetres."""
+    bin_columns: int | None = Field(default=None, ge=3, le=64)
+    """float32 numbers of a point in a LiDAR log's .bin files, of which the first three are x y z, e.g. 5 for
+    nuScenes; None is KITTI's 4, and refuses what shows another number."""

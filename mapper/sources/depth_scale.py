@@ -20,6 +20,9 @@ _FRAMES = 8
 _MIN_MEASURED_SHARE = 0.05
 _NEAR_M, _FAR_M = 0.1, 8.0
 """Least median and largest 90th percentile of depth that cameras deliver; farther surfaces return little."""
+_USUALLY_NEAR_M = 0.3
+"""Least depth of most cameras and ways to hold them: where nothing tells the units, what is nearer may be
+millimetres taken for TUM's fifths of these."""
 
 _PAIR_WITHIN_NS = NS_PER_S // 2
 _MAX_POSE_GAP_NS = NS_PER_S // 5
@@ -79,20 +82,23 @@ def depth_warnings(log: Log) -> list[str]:
 
 def _range_warning(log: Log, frames: Collection[RgbdFrame]) -> list[str]:
     spans_m = [
-        np.percentile(frame.depth_m[frame.depth_m > 0.0], (50.0, 90.0))
+        np.percentile(frame.depth_m[frame.depth_m > 0.0], (5.0, 50.0, 90.0))
         for frame in frames
         if frame.depth_m.any()
     ]
-    median_m, far_m = np.median(spans_m, axis=0)
+    near_m, median_m, far_m = np.median(spans_m, axis=0)
+    least_m = _NEAR_M
     if median_m < _NEAR_M:
         found = f"half of it is within {median_m:.2g} m"
+    elif log.are_units_assumed and near_m < _USUALLY_NEAR_M:
+        found, least_m = f"a twentieth of it is within {near_m:.2g} m", _USUALLY_NEAR_M
     elif far_m > _FAR_M:
         found = f"a tenth of it is beyond {far_m:.2g} m"
     else:
         return []
     units_per_m = _units_per_m(log)
     setting = "source.camera.depth_factor" + ("" if units_per_m is None else f"={units_per_m:g}")
-    return [f"depth: {found}, but cameras measure {_NEAR_M:g} to {_FAR_M:g} m; is {setting} right?"]
+    return [f"depth: {found}, but cameras measure {least_m:g} to {_FAR_M:g} m; is {setting} right?"]
 
 
 def _scale_of_log(log: Log, frames: Mapping[int, RgbdFrame]) -> float | None:

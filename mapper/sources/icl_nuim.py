@@ -55,7 +55,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     calibration, units_per_m = find_calibration(
         path, config.camera, known=ICL_NUIM, depth_units_per_m=DEPTH_UNITS_PER_M
     )
-    if calibration is ICL_NUIM and not _has_truth(path):
+    if calibration.origin == ICL_NUIM.origin and not _has_truth(path):
         notes.append(
             f"camera assumed to be the {ICL_NUIM.origin}; if not, put a calibration.toml beside the log"
         )

@@ -100,7 +100,10 @@ def decode_depth_units(data: bytes, where: str) -> NDArray[np.uint16]:
     """
     units = _decoded(data, cv2.IMREAD_UNCHANGED, where)
     if units.dtype != np.uint16 or units.ndim != 2:
-        raise FrameError(f"{where}: depth image of {units.dtype} {units.shape}, want one channel of 16 bits")
+        raise FrameError(
+            f"{where}: depth image of {units.dtype} {units.shape}, want one channel of 16 bits, as "
+            "in a PNG of millimetres"
+        )
     return cast(NDArray[np.uint16], units)
 
 

@@ -6,17 +6,23 @@ are the camera's; else they are the LiDAR's own. Raw recordings (Geiger et al. 2
 ``velodyne_points/data`` and their times in ``velodyne_points/timestamps.txt``, without poses.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from mapper.core.errors import SourceError
 from mapper.core.geometry import Transform, nearest_rotation, transform
+from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.config import SourceConfig
 from mapper.sources.scan_folder import STAMP_FILES, clouds_in, first_of, most_clouds, scan_log
 from mapper.sources.text import parse_numbers, rows
 
+_ALONG_Z_RATIO = 0.9
+_CAMERAS_NOTE = (
+    "the true poses move along their z, as a camera's do; without calib.txt they count as the LiDAR's"
+)
 _ROUGHLY_RIGID = 1e-3  # calib.txt has 12 digits; anything further off is no rotation
 
 
@@ -42,16 +48,31 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     if not files:
         raise SourceError(f"{sequence}: no scan matches source.pattern={config.pattern}")
     at = sequence.resolve()
-    return scan_log(
+    T_camera_lidar = _read_calibration(sequence / "calib.txt")
+    log = scan_log(
         sequence,
         files,
         kind="kitti",
         stamps_file=first_of([sequence, scans.parent], STAMP_FILES),
         truth_file=first_of([sequence, at.parent.parent / "poses"], ["poses.txt", f"{at.name}.txt"]),
         config=config,
-        T_posed_lidar=_read_calibration(sequence / "calib.txt"),
+        T_posed_lidar=T_camera_lidar,
         notes=notes,
     )
+    if T_camera_lidar is None and log.truth is not None and _moves_as_a_camera(log.truth):
+        note = (
+            "the true poses move along their z, as a camera's do; without calib.txt they count as the LiDAR's"
+        )
+        return replace(log, notes=[*log.notes, note])
+    return log
+
+
+def _moves_as_a_camera(truth: Trajectory) -> bool:
+    """Tell whether poses move along z, a camera's forward; a LiDAR's z points up."""
+    T = truth.T_world_body
+    moved_world = np.diff(T[:, :3, 3], axis=0)
+    along_z_m = np.abs((moved_world * T[:-1, :3, 2]).sum(axis=1)).sum()
+    return bool(along_z_m > _ALONG_Z_RATIO * truth.path_length_m > 0.0)
 
 
 def _sequences(path: Path) -> list[Path]:

@@ -20,6 +20,7 @@ from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Log
 from mapper.sources.calibration import PRIMESENSE, SEVEN_SCENES
+from mapper.sources.calibration_file import calibration_file
 from mapper.sources.config import SourceConfig
 from mapper.sources.pairing import pair_anew
 from mapper.sources.rgbd import FramePair, find_calibration, rgbd_log
@@ -32,8 +33,11 @@ LOOKED_FOR = "frame-000000.color.png and .depth.png (7-Scenes), numbered images 
 _COLOUR_FOLDER = re.compile(r"rgb|colou?r|image", re.IGNORECASE)
 _DEPTH_FOLDER = re.compile(r"(?:^|[^a-z])depth", re.IGNORECASE)
 _IMAGE_ENDINGS = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
-_NUMBERED = re.compile(r"\D*(?P<number>\d+)(?:-(?P<microseconds>\d+))?\D*")
+_NUMBERED = re.compile(r"\D*(?P<number>\d{1,18})(?:-(?P<microseconds>\d+))?\D*")
 _SEVEN_SCENES = re.compile(r"frame-\d+\.color\.\w+")
+_LEAST_STEP_US = (
+    2000  # of numbers that are microseconds: 500 images a second; nobody keeps every 2000th image
+)
 _ROUGHLY_RIGID = 1e-2  # text of a few digits; anything further off is no rotation
 
 
@@ -56,18 +60,23 @@ class NumberedImages:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Place:
+class Place:
     """Images of one kind in a folder.
 
     Attributes:
         name: Of the folder.
         numbered: Path and microseconds of the images whose names have one number, by that number.
-        total: How many images there are, whatever their names.
+        images: All images, whatever their names.
     """
 
     name: str
     numbered: Mapping[int, tuple[Path, int | None]]
-    total: int
+    images: Sequence[Path]
+
+    @property
+    def total(self) -> int:
+        """How many images there are."""
+        return len(self.images)
 
 
 def recognise(path: Path) -> bool:
@@ -81,6 +90,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
     Raises:
         SourceError: The folder holds several sequences, or a pose file or the calibration is malformed.
     """
+    opened = path
     if sequences := _sequences(path):
         if len(sequences) > 1:
             names = ", ".join(folder.name for folder in sequences)
@@ -91,11 +101,12 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         raise SourceError(f"{path}: no colour and depth images with the same numbers; want {LOOKED_FOR}")
     is_seven_scenes = _SEVEN_SCENES.fullmatch(images.pairs[0].colour.name) is not None
     known = SEVEN_SCENES if is_seven_scenes else PRIMESENSE
+    beside = next((folder for folder in (path, opened) if calibration_file(folder)), path)
     calibration, units_per_m = find_calibration(
-        path, config.camera, known=known, depth_units_per_m=DEPTH_UNITS_PER_M
+        beside, config.camera, known=known, depth_units_per_m=DEPTH_UNITS_PER_M
     )
     notes = list(images.notes)
-    if calibration is known:
+    if calibration.origin == known.origin:
         notes.append(
             f"camera assumed to be the {known.origin}; if not, put a calibration.toml beside the log"
         )
@@ -123,14 +134,7 @@ def find_images(folder: Path) -> NumberedImages | None:
     """
     if not folder.is_dir():
         return None
-    inside = sorted((path for path in folder.iterdir() if path.is_dir()), key=lambda p: (len(p.name), p.name))
-    depth_places = [_in_folder(path) for path in inside if _DEPTH_FOLDER.search(path.name)]
-    colour_places = [
-        _in_folder(path)
-        for path in inside
-        if _COLOUR_FOLDER.match(path.name) and not _DEPTH_FOLDER.search(path.name)
-    ]
-    beside = (_in_folder(folder, r"colou?r|rgb"), _in_folder(folder, r"depth"))
+    colour_places, depth_places, beside = image_places(folder)
     colour, depth = max(
         [*product(colour_places, depth_places), beside], key=lambda places: len(_common(*places))
     )
@@ -158,19 +162,52 @@ def find_images(folder: Path) -> NumberedImages | None:
     return NumberedImages(pairs, notes)
 
 
+def image_places(folder: Path) -> tuple[Sequence[Place], Sequence[Place], tuple[Place, Place]]:
+    """Return a folder's folders of colour and those of depth images, and both kinds side by side in it."""
+    inside = sorted((path for path in folder.iterdir() if path.is_dir()), key=lambda p: (len(p.name), p.name))
+    depth_places = [_in_folder(path) for path in inside if _DEPTH_FOLDER.search(path.name)]
+    colour_places = [
+        _in_folder(path)
+        for path in inside
+        if _COLOUR_FOLDER.match(path.name) and not _DEPTH_FOLDER.search(path.name)
+    ]
+    return colour_places, depth_places, (_in_folder(folder, r"colou?r|rgb"), _in_folder(folder, r"depth"))
+
+
 def stamped(images: Sequence[NumberedPair], *, rate_hz: float) -> tuple[list[FramePair], list[str]]:
     """Return the pairs with stamps from their names, or else from their numbers at a rate."""
+    notes = []
     if all(pair.microseconds is not None for pair in images):
         stamps_ns = [1000 * (pair.microseconds or 0) for pair in images]
-        notes = []
+    elif unit := _unit_of([pair.number for pair in images]):
+        stamps_ns = [pair.number * unit.ns for pair in images]
+        notes.append(f"numbers in file names are taken for {unit.name}: they advance by {unit.step}")
     else:
         stamps_ns = [stamp_at(pair.number, rate_hz=rate_hz) for pair in images]
-        notes = [f"file names carry no time; {rate_hz:g} frames a second assumed (source.rate_hz)"]
+        notes.append(f"file names carry no time; {rate_hz:g} frames a second assumed (source.rate_hz)")
     pairs = [
         FramePair(stamp_ns, pair.colour, stamp_ns, pair.depth)
         for stamp_ns, pair in zip(stamps_ns, images, strict=True)
     ]
     return pairs, notes
+
+
+@dataclass(frozen=True, slots=True)
+class _Unit:
+    """What numbers count that are times, and by how many of these they usually advance."""
+
+    name: str
+    ns: int
+    step: int
+
+
+def _unit_of(numbers: Sequence[int]) -> _Unit | None:
+    """Return the unit of increasing numbers that advance as times do; None where they count images."""
+    step = int(np.median(np.diff(numbers))) if len(numbers) > 1 else 0
+    if step < _LEAST_STEP_US:
+        return None
+    is_us = step < _LEAST_STEP_US * 1000
+    return _Unit("microseconds", 1000, step) if is_us else _Unit("nanoseconds", 1, step)
 
 
 def stamp_at(number: int, *, rate_hz: float) -> int:
@@ -182,7 +219,7 @@ def _sequences(path: Path) -> list[Path]:
     return sorted(folder for folder in path.glob("seq-*") if find_images(folder) is not None)
 
 
-def _in_folder(folder: Path, word: str = "") -> _Place:
+def _in_folder(folder: Path, word: str = "") -> Place:
     """Return the images of a folder whose names contain the word."""
     images = [
         path
@@ -194,10 +231,10 @@ def _in_folder(folder: Path, word: str = "") -> _Place:
         if name := _NUMBERED.fullmatch(path.stem):
             microseconds = name["microseconds"]
             numbered[int(name["number"])] = (path, None if microseconds is None else int(microseconds))
-    return _Place(folder.name, numbered, len(images))
+    return Place(folder.name, numbered, images)
 
 
-def _common(colour: _Place, depth: _Place) -> Set[int]:
+def _common(colour: Place, depth: Place) -> Set[int]:
     return colour.numbered.keys() & depth.numbered.keys()
 
 

@@ -13,7 +13,7 @@ from mapper.core.timebase import NS_PER_S
 from mapper.core.trajectory import Trajectory
 from mapper.sources.base import Accelerations, ImageFiles, Log
 from mapper.sources.calibration import Calibration, configured
-from mapper.sources.calibration_file import FILE_NAMES, read_calibration
+from mapper.sources.calibration_file import calibration_file, read_calibration
 from mapper.sources.config import CameraConfig
 from mapper.sources.images import check_size, read_colour, read_depth_m, read_grey, scan_of
 from mapper.sources.listed_files import refuse_links_out
@@ -85,6 +85,7 @@ def rgbd_log(
     kind: str,
     truth: Trajectory | None,
     notes: Iterable[str],
+    are_units_assumed: bool = False,
 ) -> Log:
     """Return the log of some image files, with the readings of an accelerometer where there are any.
 
@@ -98,6 +99,7 @@ def rgbd_log(
         kind: As of :class:`Log`.
         truth: As of :class:`Log`.
         notes: What finding all these had to leave out or assume.
+        are_units_assumed: As of :class:`Log`.
 
     Raises:
         SourceError: No colour image can be read, they are not of the calibration's size, an image is a link
@@ -132,6 +134,7 @@ def rgbd_log(
         entry_at=entry_at,
         truth=truth,
         accelerations=accelerations,
+        are_units_assumed=are_units_assumed,
         notes=[*notes, *acceleration_notes],
     )
 
@@ -141,8 +144,10 @@ def find_calibration(
 ) -> tuple[Calibration, float]:
     """Return a log's intrinsics and depth units: the user's, else a file's, else the known camera's.
 
+    The calibration has depth units only where the user or a file states them.
+
     Args:
-        folder: Where a file of ``FILE_NAMES`` may lie.
+        folder: Where a file of them may lie.
         config: What the user set.
         known: The camera that the log's format or name implies.
         depth_units_per_m: The format's own depth image units per metre, where nothing else states them.
@@ -150,21 +155,28 @@ def find_calibration(
     Raises:
         SourceError: None of the three exists, or the file is malformed.
     """
-    path = next((folder / name for name in FILE_NAMES if (folder / name).is_file()), None)
+    path = calibration_file(folder)
     stated = known if path is None else read_calibration(path)
-    units_per_m = depth_units_per_m if stated is None else stated.depth_units_per_m or depth_units_per_m
+    stated_units_per_m = None if stated is None else stated.depth_units_per_m
     if config is not None:
-        units_per_m = config.depth_factor or units_per_m
+        stated_units_per_m = config.depth_factor or stated_units_per_m
+    units_per_m = stated_units_per_m or depth_units_per_m
     if chosen := configured(config):
         if stated is not None:  # the sign is the convention of the log's truth
             chosen = replace(chosen, fy_px=math.copysign(chosen.fy_px, stated.fy_px))
-        return chosen, units_per_m
+        stated = chosen
     if stated is None:
         raise SourceError(
             f"{folder}: intrinsics unknown; put a calibration.toml with fx_px, fy_px, cx_px and cy_px there, "
-            "or --set source.camera.fx_px=… and so on"
+            f"or --set source.camera.fx_px=… and so on{_renamed(folder)}"
         )
-    return stated, units_per_m
+    return replace(stated, depth_units_per_m=stated_units_per_m), units_per_m
+
+
+def _renamed(folder: Path) -> str:
+    """Return advice on a file that may hold intrinsics under a name of its own, as ORB-SLAM's TUM1.yaml."""
+    found = [path.name for ending in ("yaml", "yml") for path in sorted(folder.glob(f"*.{ending}"))]
+    return f"; if {found[0]} has them, call it camera.yaml" if len(found) == 1 else ""
 
 
 def _camera_of(pairs: Sequence[FramePair], calibration: Calibration) -> PinholeCamera:

@@ -113,7 +113,7 @@ def scan_log(
         sensor="lidar",
         stamps_ns=stamps_ns[order],
         entry_at=lambda index: ScanEntry(
-            int(stamps_ns[order[index]]), files[order[index]], config.cloud_scale
+            int(stamps_ns[order[index]]), files[order[index]], config.cloud_scale, config.bin_columns
         ),
         truth=truth,
         notes=[*notes, *stamp_notes, *order_notes, *truth_notes],

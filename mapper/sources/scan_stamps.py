@@ -26,7 +26,7 @@ _UNITS_PER_S = (1, 1_000, 1_000_000, NS_PER_S)
 def in_order(paths: Iterable[Path]) -> list[Path]:
     """Return clouds by the stamps in their names, or else by the names, whose numbers count as numbers."""
     by_name = sorted(paths, key=lambda path: (_natural(path.name), path.name))
-    stamps_ns = _stamps_in(by_name)
+    stamps_ns = _stamps_of(by_name)
     if stamps_ns is None:
         return by_name
     return [by_name[i] for i in np.argsort(stamps_ns, kind="stable")]
@@ -61,7 +61,7 @@ def scan_stamps(
     Raises:
         SourceError: The list is malformed, or has not one stamp for every cloud.
     """
-    named = None if chosen else _stamps_in(files)
+    named = None if chosen else _stamps_of(files)
     if named is not None:
         return named, []
     if listed := chosen or beside:
@@ -112,8 +112,13 @@ def _listed(path: Path, files: Sequence[Path], wording: Wording) -> Stamps:
     return np.array(stamps_ns, dtype=np.int64)[lines]
 
 
-def _stamps_in(files: Sequence[Path]) -> Stamps | None:
-    stamps_ns = [_stamp_in(path.stem) for path in files]
+def _stamps_of(files: Sequence[Path]) -> Stamps | None:
+    return stamps_in([path.stem.removesuffix(".pcd") for path in files])  # nuScenes' STAMP.pcd.bin
+
+
+def stamps_in(stems: Sequence[str]) -> Stamps | None:
+    """Return the stamps that names without their endings end with, nanoseconds; None if one has none."""
+    stamps_ns = [_stamp_in(stem) for stem in stems]
     if any(stamp_ns is None for stamp_ns in stamps_ns):
         return None
     return np.array(stamps_ns, dtype=np.int64)

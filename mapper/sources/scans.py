@@ -20,6 +20,8 @@ class ScanEntry:
     path: Path
     scale: float | None = None
     """Metres per unit of the file; None is 1, and checked."""
+    bin_columns: int | None = None
+    """Numbers of a record in a .bin file; None is KITTI's four, and checked."""
     files: ImageFiles | None = None
 
     def load(self, *, colour: bool = True) -> Scan:
@@ -28,7 +30,7 @@ class ScanEntry:
         Raises:
             FrameError: The file is missing, damaged, empty or not in metres around the sensor.
         """
-        cloud = read_cloud(self.path, scale=self.scale)
+        cloud = read_cloud(self.path, scale=self.scale, bin_columns=self.bin_columns)
         points_body, rows, far = valid_returns(cloud.points)
         if len(points_body) < MIN_POINTS:
             raise FrameError(

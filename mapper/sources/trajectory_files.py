@@ -1,6 +1,7 @@
 """Trajectories as TUM and KITTI text."""
 
 import math
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -15,9 +16,17 @@ from mapper.runtime.atomic import write_text
 from mapper.runtime.regular_files import read_text
 from mapper.sources.text import poses_from_numbers
 
+_EUROC = re.compile(r"\s*\d{16,19}\s*,")
+_W_FIRST = re.compile(r"\bq\w*w\b.*\bq\w*x\b")
+_NUMBER = re.compile(r"[-+.]?\d|nan|inf", re.IGNORECASE)
+
 
 def read_tum(path: Path) -> Trajectory:
-    """Read ``stamp tx ty tz qx qy qz qw`` lines (Sturm et al. 2012); quaternions are normalised.
+    """Read ``stamp tx ty tz qx qy qz qw`` lines (Sturm et al. 2012), or EuRoC's (Burri et al. 2016).
+
+    EuRoC's have whole nanoseconds, commas, w before x, and velocities and biases after the pose, which are
+    left out. A header above the first pose that names qw before qx tells the order, too. Quaternions are
+    normalised.
 
     Of two poses with the same stamp the first counts: fr2_desk's truth rounds two samples to one stamp.
 
@@ -27,7 +36,7 @@ def read_tum(path: Path) -> Trajectory:
     stamps_ns: list[int] = []
     numbers: list[list[float]] = []
     places: list[str] = []
-    for number, words in _rows(path):
+    for number, words in _tum_rows(path):
         place = f"{path}:{number}"
         if len(words) != 8:
             raise DataError(f"{place}: {len(words)} columns, want 8: stamp tx ty tz qx qy qz qw")
@@ -100,6 +109,24 @@ def write_kitti(path: Path, trajectory: Trajectory) -> None:
     """Write one row-major 3×4 matrix a line, with every digit; KITTI text has no stamps."""
     rows = (" ".join(repr(float(v)) for v in T[:3].ravel()) for T in trajectory.T_world_body)
     write_text(path, "\n".join(rows) + "\n")
+
+
+def _tum_rows(path: Path) -> Iterable[tuple[int, list[str]]]:
+    """Yield the number and the words of each line, in TUM's units and order."""
+    is_w_first = has_begun = False
+    for number, line in enumerate(read_text(path, may_be_pipe=True).splitlines(), start=1):
+        words = line.replace(",", " ").split()
+        is_comment = bool(words) and words[0].startswith("#")
+        if not has_begun and (is_comment or not any(map(_NUMBER.match, words))):
+            is_w_first = is_w_first or _W_FIRST.search(line.lower()) is not None
+        elif words and not is_comment:
+            is_euroc = len(words) >= 8 and _EUROC.match(line) is not None
+            if is_euroc:
+                words = [f"{words[0]}e-9", *words[1:8]]
+            if (is_euroc or is_w_first) and len(words) == 8:
+                words = [*words[:4], *words[5:], words[4]]
+            yield number, words
+        has_begun = has_begun or (bool(words) and not is_comment)
 
 
 def _rows(path: Path) -> Iterable[tuple[int, list[str]]]:

@@ -1,7 +1,11 @@
-"""TUM RGB-D folders: rgb.txt, depth.txt, groundtruth.txt (Sturm et al. 2012)."""
+"""TUM RGB-D folders: rgb.txt, depth.txt, groundtruth.txt (Sturm et al. 2012).
+
+Without these lists the pairs of associations.txt are read: ``stamp rgb/name stamp depth/name``.
+"""
 
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,11 +29,17 @@ from mapper.sources.text import (
 )
 
 DEPTH_UNITS_PER_M = 5000.0
+MILLIMETRES_PER_M = 1000.0
+
+_MILLIMETRES_NOTE = "depth taken to be in millimetres; if not, source.camera.depth_factor (TUM's is 5000)"
+_UNITS_NOTE = "depth taken as TUM's 5000 units a metre; source.camera.depth_factor=1000 reads millimetres"
+_LIST = "rgb.txt"
+_ASSOCIATIONS = ("associations.txt", "associated.txt", "association.txt", "associate.txt", "assoc.txt")
 
 
 def recognise(path: Path) -> bool:
-    """Tell whether a path is a folder with TUM's list of colour images."""
-    return (path / "rgb.txt").is_file()
+    """Tell whether a path is a folder with TUM's list of colour images, or with a list of pairs."""
+    return (path / _LIST).is_file() or _associations(path) is not None
 
 
 def read_log(path: Path, config: SourceConfig) -> Log:
@@ -40,16 +50,52 @@ def read_log(path: Path, config: SourceConfig) -> Log:
             pair, or the camera is unknown.
     """
     notes: list[str] = []
-    colour = _read_list(path, "rgb.txt", notes)
-    depth = _read_list(path, "depth.txt", notes)
+    name = path.resolve().name
+    if (associations := _associations(path)) and not (path / _LIST).is_file():
+        colour, depth = _read_associations(associations, notes)
+    else:
+        colour, depth = (_read_list(path, one, notes) for one in (_LIST, "depth.txt"))
+        name = _name_of(path)
+    return log_of_images(
+        path, colour, depth, config, depth_units_per_m=DEPTH_UNITS_PER_M, name=name, notes=notes
+    )
+
+
+def log_of_images(
+    path: Path,
+    colour: ImageList,
+    depth: ImageList,
+    config: SourceConfig,
+    *,
+    depth_units_per_m: float,
+    name: str,
+    notes: Sequence[str],
+) -> Log:
+    """Return the log of images by their stamps, with the truth of TUM's groundtruth.txt.
+
+    Args:
+        path: Folder of the log.
+        colour: Colour images.
+        depth: Depth images.
+        config: Pairing and camera.
+        depth_units_per_m: Depth image units per metre, where nothing states them.
+        name: As of :class:`Log`.
+        notes: What finding the images had to leave out.
+
+    Raises:
+        SourceError: As :func:`read_log`.
+    """
     pairs, pair_notes = pair_images(colour, depth, config, path=path)
-    name = _name_of(path)
+    known = freiburg_camera(path.resolve().name, name)
     calibration, units_per_m = find_calibration(
         path,
         config.camera,
-        known=freiburg_camera(path.resolve().name, name),
-        depth_units_per_m=DEPTH_UNITS_PER_M,
+        known=known,
+        depth_units_per_m=depth_units_per_m if known is None else DEPTH_UNITS_PER_M,
     )
+    are_units_assumed = known is None and calibration.depth_units_per_m is None
+    if are_units_assumed:
+        pair_notes.append(_MILLIMETRES_NOTE if units_per_m == MILLIMETRES_PER_M else _UNITS_NOTE)
     truth, truth_notes = read_truth(path / "groundtruth.txt")
     return rgbd_log(
         pairs,
@@ -60,6 +106,7 @@ def read_log(path: Path, config: SourceConfig) -> Log:
         kind="tum",
         truth=truth,
         notes=[*notes, *pair_notes, *truth_notes],
+        are_units_assumed=are_units_assumed,
     )
 
 
@@ -84,10 +131,34 @@ def read_truth(path: Path) -> tuple[Trajectory | None, list[str]]:
 def _read_list(folder: Path, name: str, notes: list[str]) -> ImageList:
     """Read ``stamp filename`` lines in time order, without the files that do not exist."""
     path = folder / name
+    rows = [(where, *words) for where, words in table(path, "stamp", "filename")]
+    return _images(folder, rows, notes, path=path)
+
+
+def _associations(folder: Path) -> Path | None:
+    return next((path for name in _ASSOCIATIONS if (path := folder / name).is_file()), None)
+
+
+def _read_associations(path: Path, notes: list[str]) -> tuple[ImageList, ImageList]:
+    """Read lines of two stamps and files, depth first where its path says that it is."""
+    colour, depth = [], []
+    for where, words in table(path, "stamp", "rgb/filename", "stamp", "depth/filename"):
+        first, second = words[:2], words[2:]
+        if "depth" in first[1].lower() and "depth" not in second[1].lower():
+            first, second = second, first
+        colour.append((where, *first))
+        depth.append((where, *second))
+    images = (_images(path.parent, rows, notes, path=path) for rows in (colour, depth))
+    return next(images), next(images)
+
+
+def _images(folder: Path, rows: Sequence[tuple[str, ...]], notes: list[str], *, path: Path) -> ImageList:
+    """Return the images of rows of place, stamp and filename that exist, in time order."""
     stamps_ns, paths = [], []
-    for where, words in table(path, "stamp", "filename"):
-        stamps_ns.append(parse_stamp(words[0], where=where))
-        paths.append(within(folder, words[1], where=where))
+    for where, stamp, filename in rows:
+        stamps_ns.append(parse_stamp(stamp, where=where))
+        paths.append(within(folder, filename, where=where))
+    name = path.name
     if not paths:
         raise SourceError(f"{path}: empty list; want lines of: stamp filename")
     exists = present(paths)

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mapper.core.errors import DataError
 from mapper.core.geometry import exp, inverse
@@ -39,6 +40,31 @@ def test_tum_accepts_commas_comments_and_unnormalised_quaternions(tmp_path):
     trajectory = read_tum(path)
     assert trajectory.stamps_ns.tolist() == [1_000_000_000, 2_000_000_000]
     np.testing.assert_array_equal(trajectory.T_world_body[:, :3, :3], [np.eye(3)] * 2)
+
+
+EUROC_HEADER = (
+    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
+)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{EUROC_HEADER}, v_RS_R_x\n1403636580838555648,1,2,3,0.5,0.5,-0.5,0.5,9,9,9,8,8,8,7,7,7\n",
+        "1403636580838555648, 1, 2, 3, 0.5, 0.5, -0.5, 0.5\n",
+        "1403636580838555648,1,2,3,0.5,0.5,-0.5,0.5,\n",
+        "# stamp x y z qw qx qy qz\n1403636580.838555648 1 2 3 0.5 0.5 -0.5 0.5\n",
+        "timestamp,x,y,z,qw,qx,qy,qz\n1403636580.838555648,1,2,3,0.5,0.5,-0.5,0.5\n",
+        "timestamp,tx,ty,tz,qx,qy,qz,qw\n1403636580.838555648,1,2,3,0.5,-0.5,0.5,0.5\n",
+    ],
+)
+def test_euroc_text_and_headers_tell_the_order_of_quaternions(tmp_path, text):
+    (tmp_path / "data.csv").write_text(text)
+    trajectory = read_tum(tmp_path / "data.csv")
+    assert trajectory.stamps_ns.tolist() == [1403636580838555648]
+    np.testing.assert_array_equal(trajectory.positions_world, [[1.0, 2.0, 3.0]])
+    R = Rotation.from_quat([0.5, -0.5, 0.5, 0.5]).as_matrix()
+    np.testing.assert_allclose(trajectory.T_world_body[0, :3, :3], R, atol=1e-12)
 
 
 def test_of_two_equal_stamps_the_first_counts(tmp_path):

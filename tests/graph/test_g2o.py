@@ -153,7 +153,7 @@ def test_the_first_node_is_fixed(tmp_path):
 
 def test_files_of_others_need_no_notes(tmp_path):
     path = tmp_path / "foreign.g2o"
-    path.write_text(f"# made elsewhere\n\n{EDGE}{VERTICES}FIX 0\n")
+    path.write_text(f"# made elsewhere\n\nPARAMS_SE3OFFSET 0 0 0 0 0 0 0 1\n{EDGE}{VERTICES}FIX 0\n")
     graph = read_g2o(path)
     assert graph.stamps_ns == {0: 0, 1: 1}
     assert [factor.origin for factor in graph.factors] == ["odometry"]

@@ -66,6 +66,23 @@ def test_poses_with_a_calibration_are_the_cameras(tmp_path):
     np.testing.assert_allclose(open_source(folder).truth.T_world_body, T_WORLD_LIDAR, atol=1e-9)
 
 
+def test_poses_that_move_as_a_cameras_are_told_where_a_calibration_is_missing(tmp_path):
+    def notes_of(name, T, calibration=None):
+        folder = scans(tmp_path / name)
+        poses(folder / "poses.txt", T)
+        if calibration:
+            (folder / "calib.txt").write_text(calibration)
+        return [note for note in open_source(folder).notes if "as a camera's do" in note]
+
+    T_world_camera = np.array([exp(np.array([0, 0.02 * i, 0]), np.array([0, 0.1, i])) for i in range(N)])
+    assert notes_of("camera", T_world_camera) == [
+        "the true poses move along their z, as a camera's do; without calib.txt they count as the LiDAR's"
+    ]
+    assert notes_of("calibrated", T_world_camera, CALIBRATION) == []
+    assert notes_of("lidar", T_WORLD_LIDAR) == []
+    assert notes_of("still", np.array([np.eye(4)] * N)) == []
+
+
 @pytest.mark.parametrize("opened", ["", "sequences", "sequences/07"])
 def test_the_layout_of_the_benchmark(tmp_path, opened):
     sequence = scans(tmp_path / "sequences/07")

@@ -44,5 +44,5 @@ def write_tiny_log(log: Path, n: int, *, ending: str = ".png") -> Path:
         truth_lines.append(f"{seconds_text_from_ns(stamp_ns + 1_000_000)} {0.01 * i} 0 1.5 0 0 0.6 0.8")
     for name, lines in (("rgb", colour_lines), ("depth", depth_lines), ("groundtruth", truth_lines)):
         (log / f"{name}.txt").write_text("\n".join(lines) + "\n")
-    (log / "calibration.toml").write_text(CALIBRATION)
+    (log / "calibration.toml").write_text(CALIBRATION + "depth_factor = 5000\n")
     return log

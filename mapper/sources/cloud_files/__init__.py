@@ -1,6 +1,7 @@
 """Readers of cloud files: one point cloud each, in the usual formats."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 from mapper.core.errors import FrameError
@@ -27,18 +28,21 @@ _READERS: Mapping[str, Callable[[Path], Columns]] = {
 ENDINGS = tuple(_READERS)
 
 
-def read_cloud(path: Path, *, scale: float | None = None) -> RawCloud:
+def read_cloud(path: Path, *, scale: float | None = None, bin_columns: int | None = None) -> RawCloud:
     """Return the cloud of a file, without missing returns.
 
     Args:
         path: A file; its ending decides the format.
         scale: Metres per unit of the file. None is 1, and refuses what looks like millimetres.
+        bin_columns: Numbers of a record in a .bin file. None is KITTI's four, and refuses others.
 
     Raises:
         FrameError: The file cannot be read or is damaged, holds too few points, or its points are not in
             metres around the sensor.
     """
     reader = _READERS.get(path.suffix.lower())
+    if reader is read_bin:
+        reader = partial(read_bin, columns=bin_columns)
     if reader is None:
         raise FrameError(f"{path}: not the ending of a cloud; want one of {' '.join(ENDINGS)}")
     try:

@@ -8,40 +8,49 @@ import numpy as np
 
 from mapper.core.errors import FrameError
 from mapper.sources.cloud_files.parsing import MIN_POINTS, Column, Columns, refusing_damage
+from mapper.sources.cloud_files.records import KITTIS, other_width
 
-RECORD_BYTES = 16
-
-_LEAST_INTENSITY, _MAX_NEGATIVE_RATIO = -1.0, 0.01
-"""Records of three or five numbers read as four have coordinates for intensities. Some sensors' programs
-write a time before the end of the sweep there, in seconds."""
 _HEADER_LINES = 100
 _HEAD_BYTES = 1 << 16
+_NUMBER_BYTES = 4
 _MAX_CLASS = 1000
 _QUOTED = 60
 EMPTY = "the file is empty"
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*([eE][-+]?\d+)?|\.\d+([eE][-+]?\d+)?|nan|inf)", re.IGNORECASE)
 
 
-def read_bin(path: Path) -> Columns:
-    """Read KITTI's records of float32 x y z intensity (Geiger et al. 2013).
+def read_bin(path: Path, columns: int | None = None) -> Columns:
+    """Read records of float32 that begin with x y z.
+
+    Args:
+        path: The file.
+        columns: Numbers of a record; None is the four of KITTI (Geiger et al. 2013), and checked.
 
     Raises:
         FrameError: The file is not a whole number of records, or of other ones.
     """
     size = path.stat().st_size
-    if size % RECORD_BYTES:
+    numbers = np.fromfile(path, dtype="<f4") if size % _NUMBER_BYTES == 0 else np.empty(0, "<f4")
+    if columns is None and (other := other_width(numbers)):
+        width, is_certain = other
+        if is_certain:
+            doubles = ", unless they are 4 float64: save these as .npy" if width == 8 else ""
+            raise FrameError(
+                f"{path}: records of {width} float32, not KITTI's 4 (x y z intensity); "
+                f"--set source.bin_columns={width} takes the first 3 for x y z{doubles}"
+            )
         raise FrameError(
-            f"{path}: {size} bytes, want a multiple of {RECORD_BYTES}, KITTI's float32 x y z intensity; "
-            "copy it again if it was cut, else save it as .npy or .pcd"
+            f"{path}: every fourth float32 is negative as coordinates are, not as KITTI's intensities; "
+            f"--set source.bin_columns={width} if records have {width}, or {KITTIS} if they have 4"
         )
-    records = np.fromfile(path, dtype="<f4").reshape(-1, RECORD_BYTES // 4)
-    negative = int((records[:, 3] < _LEAST_INTENSITY).sum())
-    if negative > _MAX_NEGATIVE_RATIO * len(records):
+    record_bytes = (columns or KITTIS) * _NUMBER_BYTES
+    if size % record_bytes:
+        what = "KITTI's float32 x y z intensity" if columns is None else f"{columns} float32"
         raise FrameError(
-            f"{path}: intensity is below {_LEAST_INTENSITY:g} in {negative} of {len(records)} records of "
-            "float32 x y z intensity, so these are others, perhaps of x y z alone; save it as .npy or .pcd"
+            f"{path}: {size} bytes, want a multiple of {record_bytes}, {what}; copy it again if it was cut, "
+            "else --set source.bin_columns to the numbers of a record"
         )
-    return _xyz(records)
+    return _xyz(numbers.reshape(-1, columns or KITTIS))
 
 
 def read_npy(path: Path) -> Columns:

@@ -112,6 +112,17 @@ def first_messages(recording: Recording, series: Iterable[Series]) -> dict[str, 
     return firsts
 
 
+def why_unread(recording: Recording, series: Series) -> str:
+    """Return why the first message of a topic cannot be read; empty if it can."""
+    try:
+        message = decode(series.topic, recording.read(series.place(0)))
+        if isinstance(message, ImageMessage):
+            size_of(message, where=series.topic.name)
+    except (DataError, FrameError) as error:
+        return str(error)
+    return ""
+
+
 def stamp_of(topic: Topic, data: memoryview) -> int:
     """Return the stamp with which a message with a header begins, nanoseconds.
 

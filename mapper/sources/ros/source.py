@@ -3,6 +3,8 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from mapper.core.errors import SourceError
 from mapper.core.frames import NO_DISTORTION, PinholeCamera, Sensor
 from mapper.core.timebase import Stamps
@@ -13,13 +15,15 @@ from mapper.sources.images import FINE_UNITS_PER_M
 from mapper.sources.pairing import depth_offset_ns
 from mapper.sources.ros.entries import CloudEntry, rgbd_entry
 from mapper.sources.ros.image_messages import MILLIMETRES_PER_M, has_float_depth, size_of
-from mapper.sources.ros.index import Series
-from mapper.sources.ros.messages import CameraMessage, FileMessage, ImageMessage
+from mapper.sources.ros.index import Series, why_unread
+from mapper.sources.ros.messages import IMAGES, CameraMessage, FileMessage, ImageMessage
 from mapper.sources.ros.reader import RecordingReader
 from mapper.sources.ros.time_line import ordered, paired
-from mapper.sources.ros.topics import CameraTopics, choose, frame_of
+from mapper.sources.ros.topics import CameraTopics, choose, frame_of, is_called_registered
 
 _SAME_LENS_RATIO = 0.01
+_SAME_PLACE_M = 0.005
+"""Colour cameras lie farther beside the depth camera, 15 mm at least; frames of one lens may be turned."""
 _JPEG_START = b"\xff\xd8"
 _BROWN_CONRADY = ("plumb_bob", "brown_conrady", "rational_polynomial")
 
@@ -46,7 +50,12 @@ def recording_log(reader: RecordingReader, config: SourceConfig) -> Log:
     try:
         choice = choose(reader.series, reader.firsts, config.topics, path=recording.path)
     except SourceError as error:
-        raise SourceError("; ".join([str(error), *recording.notes])) from None
+        unread = (
+            why_unread(recording, series)
+            for series in reader.series.values()
+            if series.topic.type in IMAGES and series.topic.name not in reader.firsts
+        )
+        raise SourceError("; ".join([str(error), *filter(None, unread), *recording.notes])) from None
     if isinstance(choice.frames, CameraTopics):
         frames = _rgbd(reader, choice.frames, config)
     else:
@@ -84,6 +93,8 @@ def _rgbd(reader: RecordingReader, topics: CameraTopics, config: SourceConfig) -
     camera = _camera(reader, topics, config)
     _refuse_unregistered(reader, topics, camera)
     frame, depth_frame = frame_of(first_color), frame_of(first_depth)
+    if config.topics.depth is None and not is_called_registered(depth.topic.name):
+        _refuse_apart(reader, topics, frame, depth_frame)
     if frame != depth_frame:
         notes.append(f"depth in frame {depth_frame} is taken to be registered to colour in {frame}")
     factor = None if config.camera is None else config.camera.depth_factor
@@ -121,6 +132,21 @@ def _lidar(reader: RecordingReader, clouds: Series, config: SourceConfig) -> _Fr
         return CloudEntry(reader.located(clouds, int(i[index])), T_body_frame)
 
     return _Frames("lidar", body, clouds.stamps_ns[i], entry_at, notes)
+
+
+def _refuse_apart(reader: RecordingReader, topics: CameraTopics, frame: str, depth_frame: str) -> None:
+    """Refuse depth that tf places elsewhere than colour: its pixels show other points than colour's."""
+    T_color_depth = reader.tree.find(frame, depth_frame)
+    if T_color_depth is None:
+        return
+    apart_m = float(np.linalg.norm(T_color_depth[:3, 3]))
+    if apart_m > _SAME_PLACE_M:
+        name, color = topics.depth.topic.name, topics.color.topic.name
+        raise SourceError(
+            f"{reader.recording.path}: {name} is not registered to {color}: tf has its frame {depth_frame} "
+            f"{apart_m * 1e3:.0f} mm from {frame}; record depth that is, such as aligned_depth_to_color, or "
+            f"if it is all the same, --set source.topics.depth={name}"
+        )
 
 
 def _first_image(reader: RecordingReader, series: Series) -> ImageMessage:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product, takewhile
 from pathlib import Path
 
 from mapper.core.errors import SourceError
@@ -80,8 +81,9 @@ def choose(
     """
     pick = _Picker(series, path)
     depths = {name for name, first in firsts.items() if isinstance(first, ImageMessage) and is_depth(first)}
-    color = pick.one("color", config.color, IMAGES, _color_rank, where=lambda name: name not in depths)
-    depth = pick.one("depth", config.depth, IMAGES, _depth_rank, where=depths.__contains__)
+    colors = pick.candidates("color", config.color, IMAGES, where=lambda name: name not in depths)
+    depth_images = pick.candidates("depth", config.depth, IMAGES, where=depths.__contains__)
+    color, depth = _of_one_camera(colors, depth_images, firsts)
     points = pick.one("points", config.points, CLOUDS, _cloud_rank, where=lambda name: len(series[name]) > 1)
     imu = pick.one("imu", config.imu, IMUS, _plain_rank, where=lambda name: _feels_gravity(firsts.get(name)))
     truth = pick.one("truth", config.truth, POSES, _plain_rank, where=lambda name: name == TRUTH)
@@ -136,12 +138,19 @@ class _Picker:
         where: Callable[[str], bool],
     ) -> Series | None:
         """Return the topic that is wanted, else the one of the lowest rank, else None."""
+        return min(
+            self.candidates(role, wanted, types, where=where),
+            key=lambda one: (*rank(one.topic.name), -len(one), one.topic.name),
+            default=None,
+        )
+
+    def candidates(
+        self, role: str, wanted: str | None, types: Collection[str], *, where: Callable[[str], bool]
+    ) -> list[Series]:
+        """Return the topic that is wanted, else all that may be meant."""
         there = self.all(types)
         if wanted is None:
-            candidates = [one for one in there if where(one.topic.name)]
-            return min(
-                candidates, key=lambda one: (*rank(one.topic.name), -len(one), one.topic.name), default=None
-            )
+            return [one for one in there if where(one.topic.name)]
         names = [one.topic.name for one in there]
         if wanted not in names:
             what = f"of type {self._series[wanted].topic.type}" if wanted in self._series else "not there"
@@ -149,7 +158,7 @@ class _Picker:
                 f"{self._path}: source.topics.{role}={wanted} is {what}; "
                 f"topics for that: {', '.join(names) or 'none'}"
             )
-        return self._series[wanted]
+        return [self._series[wanted]]
 
     def refuse_own_runs(self) -> None:
         """Refuse the log of a run, whose clouds and images are results."""
@@ -158,6 +167,36 @@ class _Picker:
                 f"{self._path}: a run that mapper wrote: its trajectory, its map and images without depth; "
                 "build from the log that it was made from, or look at the run: mapper view"
             )
+
+
+def _of_one_camera(
+    colors: Sequence[Series], depths: Sequence[Series], firsts: Mapping[str, Message]
+) -> tuple[Series | None, Series | None]:
+    """Return the colour and depth topic that fit best, of one coordinate frame or namespace where any are.
+
+    Depth of one camera is not registered to the colour of another, however alike their images are.
+    """
+
+    def rank(pair: tuple[Series, Series]) -> tuple[object, ...]:
+        color, depth = (one.topic.name for one in pair)
+        frames = [frame_of(firsts.get(name)) for name in (color, depth)]
+        apart, shared = frames[0] != frames[1] or not frames[0], _shared_namespaces(color, depth)
+        fewest = min(map(len, pair))
+        other = apart and not shared
+        return other, _color_rank(color), _depth_rank(depth), apart, -shared, -fewest, color, depth
+
+    if colors and depths:
+        return min(product(colors, depths), key=rank)
+    color = min(
+        colors, key=lambda one: (_color_rank(one.topic.name), -len(one), one.topic.name), default=None
+    )
+    return color, min(depths, key=lambda one: one.topic.name, default=None)
+
+
+def _shared_namespaces(name: str, other: str) -> int:
+    """Return how many namespaces two topics begin with in common."""
+    parts = zip(name.strip("/").split("/")[:-1], other.strip("/").split("/")[:-1], strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], parts))
 
 
 def _choice_note(choice: str, by_user: str | None, option: str) -> str:
@@ -171,8 +210,12 @@ def _color_rank(name: str) -> tuple[int, ...]:
 
 
 def _depth_rank(name: str) -> tuple[int, ...]:
-    lower = name.lower()
-    return int("aligned" not in lower and "registered" not in lower), int(_is_packed(name))
+    return int(not is_called_registered(name)), int(_is_packed(name))
+
+
+def is_called_registered(name: str) -> bool:
+    """Tell whether the name of a depth topic says that it is registered to colour."""
+    return any(word in name.lower() for word in ("aligned", "registered", "to_rgb", "to_color"))
 
 
 def _cloud_rank(name: str) -> tuple[int, ...]:

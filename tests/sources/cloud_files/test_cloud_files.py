@@ -157,23 +157,6 @@ def test_a_bin_of_other_records_names_its_bytes(tmp_path):
     assert refusal_of(path).startswith("100 bytes, want a multiple of 16, KITTI's float32 x y z intensity; ")
 
 
-@pytest.mark.parametrize("width", [3, 5])
-def test_a_bin_of_other_records_is_refused_though_its_size_would_do(tmp_path, width):
-    path = tmp_path / "cloud.bin"
-    rng = np.random.default_rng(1)
-    rng.uniform(-40.0, 40.0, (400, width)).astype("<f4").tofile(path)
-    assert refusal_of(path).startswith("intensity is below -1 in ")
-
-
-def test_a_bin_may_have_times_before_the_end_of_the_sweep_for_intensities(tmp_path):
-    path = tmp_path / "cloud.bin"
-    rng = np.random.default_rng(1)
-    records = rng.uniform(-40.0, 40.0, (400, 4)).astype("<f4")
-    records[:, 3] = rng.uniform(-0.1, 0.0, 400)
-    records.tofile(path)
-    assert len(read_cloud(path).points) == 400
-
-
 @pytest.mark.parametrize("encoding", [Encoding.BINARY, Encoding.BINARY_COMPRESSED])
 def test_pcd_keeps_times_and_colours(tmp_path, encoding):
     path = tmp_path / "cloud.pcd"

@@ -11,11 +11,18 @@ from mapper.core.rotations import quaternion_from_rotation
 from mapper.sources import open_source
 from mapper.sources.config import CameraConfig, SourceConfig, TopicsConfig
 from mapper.sources.images import decode_depth_units
-from mapper.sources.ros.encode_ros import SerializedMessage, cloud_message, imu_message, odometry_message
+from mapper.sources.ros.encode_ros import (
+    SerializedMessage,
+    cloud_message,
+    compressed_image_message,
+    imu_message,
+    odometry_message,
+)
 from mapper.sources.writers import write_log
 from tests.support.recordings import CAMERA, COLOR, DEPTH, camera_info, image, shots, write
 from tests.support.tum_logs import FIRST_NS, PERIOD_NS, picture
 
+RVL = "16UC1; compressedDepth rvl"
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 T_BASE_LIDAR = exp(np.array([0.0, 0.0, 1.5]), np.array([0.2, 0.0, 1.1]))
 
@@ -149,6 +156,42 @@ def test_depth_that_is_not_registered_is_refused(tmp_path):
         opened(tmp_path / "b.mcap", small)
 
 
+def test_depth_that_tf_places_elsewhere_is_refused_unless_it_is_chosen_or_called_registered(tmp_path):
+    beside = np.eye(4)
+    beside[0, 3] = 0.015
+    taken = "depth in frame d is taken to be registered to colour in optical"
+
+    def with_depth_of(topic, T):
+        depths = [image(t, topic, picture(i)[1], "16UC1", frame="d") for i, t in enumerate(stamps(3))]
+        return [transforms(("optical", "d", T)), *depths, *(one for one in shots(3) if one.topic != DEPTH)]
+
+    why = r"/cam/depth/image is not registered to /cam/color/image_raw: tf has its frame d 15 mm from"
+    with pytest.raises(SourceError, match=why):
+        opened(tmp_path / "a.mcap", with_depth_of("/cam/depth/image", beside))
+    chosen = SourceConfig(topics=TopicsConfig(depth="/cam/depth/image"))
+    assert taken in open_source(tmp_path / "a.mcap", chosen).notes
+    assert taken in opened(tmp_path / "b.mcap", with_depth_of("/cam/depth_registered/image", beside)).notes
+    assert taken in opened(tmp_path / "c.mcap", with_depth_of("/cam/depth/image", np.eye(4))).notes
+
+
+def test_depth_of_one_camera_is_not_paired_with_colour_of_another(tmp_path):
+    messages = []
+    for i, t in enumerate(stamps(6)):
+        rgb, units = picture(i)
+        for camera, without in (("a", "depth"), ("b", "color")):  # each would be taken for its number alone
+            one = [
+                image(t, f"/{camera}/color/image_raw", rgb, "rgb8", frame=f"{camera}_optical"),
+                image(t, f"/{camera}/depth/image_raw", units, "16UC1", frame=f"{camera}_optical"),
+                camera_info(t, f"/{camera}/color/camera_info"),
+            ]
+            messages += [message for message in one if i or without not in message.topic]
+    source = opened(tmp_path / "a.mcap", messages)
+    assert source.notes[0].startswith("colour /a/color/image_raw, depth /a/depth/image_raw;")
+    config = SourceConfig(topics=TopicsConfig(color="/b/color/image_raw"))
+    source = open_source(tmp_path / "a.mcap", config)
+    assert source.notes[0].startswith("colour /b/color/image_raw, depth /b/depth/image_raw;")
+
+
 def test_a_camera_that_nothing_tells_is_an_error_with_a_remedy(tmp_path):
     messages = [message for message in shots(2) if "info" not in message.topic]
     with pytest.raises(SourceError, match=r"no camera info for /cam/color/image_raw; .*source.camera.fx_px"):
@@ -247,6 +290,16 @@ def test_points_of_a_camera_are_told_to_look_forward(tmp_path):
     messages = [cloud_message("/points", Scan(t, points), frame="depth_optical") for t in stamps(2)]
     notes = opened(tmp_path / "a.mcap", messages).notes
     assert notes[-1].startswith("points are in depth_optical, whose z looks forward")
+
+
+def test_depth_in_a_coding_that_is_not_read_is_named_with_the_reason(tmp_path):
+    colour = [message for message in shots(3) if message.topic != DEPTH]
+    depth = [
+        compressed_image_message(t, "/cam/depth/compressedDepth", bytes(40), format_=RVL, frame="optical")
+        for t in stamps(3)
+    ]
+    with pytest.raises(SourceError, match=r"neither depth .*/cam/depth/compressedDepth: .* RVL is not"):
+        opened(tmp_path / "a.mcap", [*colour, *depth])
 
 
 def test_a_topic_whose_images_are_all_damaged_is_named(tmp_path):

@@ -1,0 +1,111 @@
+"""Records of other widths than KITTI's are told, and KITTI's are read whatever their intensities."""
+
+import numpy as np
+import pytest
+
+from mapper.core.errors import FrameError
+from mapper.sources import open_source
+from mapper.sources.cloud_files import read_cloud
+from mapper.sources.config import SourceConfig
+from tests.support.command_line import mapper
+
+N = 1680  # whole records of every width up to 8
+
+
+def sweep(*, shuffled=False):
+    """Sixteen rings of a sensor in a hall, in the order of firing: lower and upper ones take turns."""
+    rng = np.random.default_rng(1)
+    azimuth = np.repeat(np.linspace(0.0, 2.0 * np.pi, N // 16), 16)
+    down = np.tile(np.deg2rad([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15]), N // 16)
+    range_m = 8.0 + 3.0 * np.sin(3.0 * azimuth)
+    xyz = np.column_stack([np.cos(azimuth) * np.cos(down), np.sin(azimuth) * np.cos(down), np.sin(down)])
+    xyz *= range_m[:, None]
+    return rng.permutation(xyz) if shuffled else xyz
+
+
+def written(path, *columns):
+    np.column_stack(columns).astype("<f4").tofile(path)
+    return path
+
+
+RNG = np.random.default_rng(2)
+INTENSITIES = {
+    "share": RNG.uniform(0.0, 1.0, N),
+    "byte": RNG.integers(0, 256, N),
+    "16 bits": RNG.integers(0, 65536, N),
+    "signed byte": RNG.integers(-128, 128, N),
+    "dB": RNG.uniform(-40.0, 10.0, N),
+    "unknown": np.full(N, -1.0),
+    "unknown, -999": np.full(N, -999.0),
+    "often unknown": np.where(RNG.random(N) < 0.3, -100.0, RNG.uniform(0.0, 255.0, N)),
+    "no number": np.full(N, np.nan),
+    "infinite": np.full(N, -np.inf),
+    "seconds before the end": np.linspace(-0.1, 0.0, N),
+    "microseconds before the end": np.linspace(-1e5, 0.0, N),
+}
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+@pytest.mark.parametrize("intensity", INTENSITIES.values(), ids=INTENSITIES.keys())
+def test_kittis_records_are_read_whatever_their_intensities(tmp_path, intensity, shuffled):
+    xyz = sweep(shuffled=shuffled)
+    cloud = read_cloud(written(tmp_path / "a.bin", xyz, intensity))
+    np.testing.assert_array_equal(cloud.points, xyz.astype(np.float32))
+
+
+@pytest.mark.parametrize("rows", [np.zeros((600, 4)), np.full((600, 4), np.nan)])
+def test_kittis_records_may_be_padded(tmp_path, rows):
+    padded = np.vstack([rows, np.column_stack([sweep(), INTENSITIES["byte"]]), rows])
+    assert len(read_cloud(written(tmp_path / "a.bin", padded)).points) == N
+
+
+RING, TIME = np.tile(np.arange(16), N // 16), np.linspace(0.0, 0.1, N)
+OTHERS = {
+    3: [],
+    5: [INTENSITIES["byte"], RING],
+    6: [INTENSITIES["byte"], RING, TIME],
+    7: [INTENSITIES["share"], RING, TIME, INTENSITIES["byte"]],
+    8: [np.ones(N), INTENSITIES["share"], np.zeros((N, 3))],
+}
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+@pytest.mark.parametrize(("width", "columns"), OTHERS.items())
+def test_other_records_are_told_and_the_remedy_works(tmp_path, width, columns, shuffled):
+    xyz = sweep(shuffled=shuffled)
+    path = written(tmp_path / "a.bin", xyz, *columns)
+    assert path.stat().st_size % 16 == 0
+    with pytest.raises(FrameError, match=rf"records of {width} float32, .*source.bin_columns={width} takes"):
+        read_cloud(path)
+    np.testing.assert_array_equal(read_cloud(path, bin_columns=width).points, xyz.astype(np.float32))
+
+
+def test_what_shows_no_width_is_refused_if_its_intensities_are_like_coordinates(tmp_path):
+    path = written(tmp_path / "a.bin", np.random.default_rng(1).uniform(-40.0, 40.0, (N, 3)))
+    why = (
+        "every fourth float32 is negative as coordinates are.*source.bin_columns=3 if records have 3, or 4 if"
+    )
+    with pytest.raises(FrameError, match=why):
+        read_cloud(path)
+    assert len(read_cloud(path, bin_columns=4).points) == N * 3 // 4
+
+
+def test_a_cut_file_is_told_as_one(tmp_path):
+    path = written(tmp_path / "a.bin", sweep(), INTENSITIES["byte"])
+    path.write_bytes(path.read_bytes()[:-4])
+    assert path.stat().st_size % 16
+    with pytest.raises(FrameError, match=r"26876 bytes, want a multiple of 16, .*copy it again"):
+        read_cloud(path)
+    with pytest.raises(FrameError, match="want a multiple of 20, 5 float32"):
+        read_cloud(path, bin_columns=5)
+
+
+def test_scans_of_nuscenes_have_their_stamps_and_a_setting_reads_them(tmp_path):
+    stamps_ns = [1532402927647951000 + i * 50_000_000 for i in range(3)]
+    for stamp_ns in stamps_ns:
+        written(tmp_path / f"n015__LIDAR_TOP__{stamp_ns // 1000}.pcd.bin", sweep(), *OTHERS[5])
+    refused = mapper("inspect", tmp_path, status=1)
+    assert "--set source.bin_columns=5" in refused.stderr
+    log = open_source(tmp_path, SourceConfig(bin_columns=5))
+    assert log.stamps_ns.tolist() == stamps_ns
+    assert len(log.entry_at(0).load().points_body) == N
