@@ -229,6 +229,20 @@ def test_a_wrong_pose_contradicts_free_space():
     assert contradiction(key, description, np.eye(4)) > 0.03
 
 
+def test_a_scan_is_right_when_the_half_of_the_view_that_was_missing_returns():
+    config = INDOOR.model_copy(update={"keyframe_distance_m": 0.2})
+    odometry = ScanOdometry(config, GicpMatcher(config))
+    for k in range(23):
+        pose = exp(np.array([0.0, 0.0, 0.02 * k]), np.array([0.1 * k, 0.0, 0.0]))
+        scan = room_scan(k * 100_000_000, pose, seed=k)
+        if 6 <= k < 22:  # until all keyframes that scans are compared with are halves
+            scan = replace(scan, points_body=scan.points_body[scan.points_body[:, 1] > 0.0])
+        track = odometry.track(odometry.observe(scan))
+
+        assert track.doubts == ()
+        assert k == 0 or track.diagnostics.method == "map"
+
+
 def field_scan(x_m):
     """Return rings on flat ground 1.7 m below, and four round bushes, from x metres along."""
     azimuth = np.linspace(-np.pi, np.pi, 900, endpoint=False)

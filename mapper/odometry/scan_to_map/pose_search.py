@@ -9,7 +9,14 @@ from mapper.core.geometry import Transform, angle_between, exp, inverse
 from mapper.odometry.scan_to_map.config import ScanOdometryConfig
 from mapper.odometry.scan_to_map.motion_model import MotionModel
 from mapper.odometry.scan_to_map.observed_part import MEASURED, Blend, observed_part
-from mapper.odometry.scan_to_map.scan_fit import ScanFit, ScanKeyframe, contradiction, described, fit_of
+from mapper.odometry.scan_to_map.scan_fit import (
+    ScanFit,
+    ScanKeyframe,
+    contradiction,
+    described,
+    directions_of,
+    fit_of,
+)
 from mapper.odometry.scan_to_map.scan_matcher import DeskewedScan, ScanMatcher
 from mapper.odometry.scan_to_map.usual_fit import Jump, Shares, UsualFit, jump_between
 from mapper.registration.base import Aligner
@@ -93,6 +100,7 @@ class PoseSearch:
         T_world_predicted = motion.predicted(time_ns)
         spread = motion.spread(time_ns)
         is_believed = self._config.usual_ratio == 0.0
+        directions = directions_of(deskewed)
 
         def assessed(found: Transform | None, key: ScanKeyframe, method: str) -> PoseCandidate | None:
             if found is None:
@@ -105,7 +113,8 @@ class PoseSearch:
             )
             if fit is None:
                 return None
-            shares = Shares(fit.overlap, fit.agreement, fit.contradicting)
+            view = key.view_share(directions)
+            shares = Shares(min(1.0, fit.overlap / view), min(1.0, fit.agreement / view), fit.contradicting)
             T_world_middle, blend = found, MEASURED
             if not is_believed:
                 voxel_m = deskewed.prepared.voxel_m

@@ -23,6 +23,8 @@ _MARGIN_M = 0.2
 _CHECKED_POINTS = 2000
 _SPACED_VOXELS, _SPACED_PIXELS = 2.0, 2.0
 """Points farther apart are of no surface: rain, dust and ghosts stand where rays pass, under any pose."""
+_VIEW_RAD = 0.175  # ten degrees: larger than the gaps between rings
+_AS_LARGE = 0.8  # views of one sensor in other surroundings differ by less
 _GRAZING = 0.01  # least sine of the angle between a ray and a surface
 _PIXELS = 1.5  # a ray that is compared with a point is off by up to so many
 _SMALL_SHARE = 0.03
@@ -60,6 +62,19 @@ class ScanKeyframe:
         """Its points and rays for the free-space check."""
         return described(self.deskewed)
 
+    @cached_property
+    def directions(self) -> int:
+        """Number of directions in which it has returns."""
+        return directions_of(self.deskewed)
+
+    def view_share(self, directions: int) -> float:
+        """Return the share of its view in that of a scan with returns in so many directions, at most 1.
+
+        More of the scan cannot have partners: half of the keyframe's returns were lost, or something stood
+        close before the sensor.
+        """
+        return min(1.0, self.directions / (_AS_LARGE * directions))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanFit:
@@ -89,6 +104,12 @@ class ScanFit:
     degeneracy: Degeneracy
     observability: Array
     unobservable: str
+
+
+def directions_of(deskewed: DeskewedScan) -> int:
+    """Return the number of directions, of ten degrees, in which a scan has returns."""
+    scan = deskewed.scan
+    return int(np.isfinite(range_image(scan.points_body, scan.origin_body, _VIEW_RAD)).sum())
 
 
 def described(deskewed: DeskewedScan) -> ScanDescription:

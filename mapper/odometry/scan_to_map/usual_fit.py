@@ -25,7 +25,7 @@ _LEAST_JUMP_M, _LEAST_JUMP_RAD = 0.15, 0.09
 
 @dataclass(frozen=True, slots=True)
 class Shares:
-    """Shares of one scan's points under a pose.
+    """Shares of one scan's points under a pose, of as many as the keyframe's view can cover.
 
     Attributes:
         overlap: With a partner on the keyframe.
