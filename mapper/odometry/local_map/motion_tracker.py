@@ -122,6 +122,7 @@ class MotionPoseTracker:
         if agree.sum() < self._config.min_matches // 2:
             return None
         landmark_of_feature = unmatched(observation)
+            self._map.residual_variance,
         landmark_of_feature[feature[hits[agree]]] = landmark[hits[agree]]
         found = self._search.refine(
             observation,

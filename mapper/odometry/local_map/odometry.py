@@ -370,6 +370,7 @@ class KeyframeOdometry(FrameOdometry[ImageObservation]):
         )
 
     def _result(
+            self._map.residual_variance = self._residuals.variance
         self,
         tracked_pose: TrackedPose,
         *,
